@@ -1,0 +1,44 @@
+"""Import optional dependencies, or name the extra that brings them."""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
+from .exceptions import MissingExtraError
+
+_EXTRA_OF = {
+    "pytorch_kinematics": "robot",
+    "coal": "robot",
+    "qpsolvers": "robot",
+    "piqp": "robot",
+    "clarabel": "robot",
+    "scipy": "robot",
+    "sapien": "sim",
+    "cv2": "sim",
+    "gymnasium": "sim",
+    "h5py": "sim",
+    "matplotlib": "experiments",
+    "pyvista": "experiments",
+    "viser": "experiments",
+    "typer": "experiments",
+    "rich": "experiments",
+    "gpytorch": "peers",
+    "river": "peers",
+    "sklearn": "peers",
+}
+
+
+def require(module: str) -> ModuleType:
+    """Import ``module`` and return it.
+
+    Raises:
+        MissingExtraError: it is not installed; the message names the extra.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        root = module.split(".")[0]
+        if error.name is not None and error.name.split(".")[0] != root:
+            raise  # the package is there and something inside it is broken: do not hide it
+        raise MissingExtraError(root, _EXTRA_OF.get(root, "all")) from None

@@ -1,0 +1,1 @@
+"""HOW the hand touches the object: contacts, grasp matrices, contact forces."""

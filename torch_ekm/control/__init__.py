@@ -1,0 +1,1 @@
+"""WHICH motor increment to command."""

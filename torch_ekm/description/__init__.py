@@ -1,0 +1,1 @@
+"""WHAT the robot is: hands and objects as data, read from URDF and transmission files."""

@@ -1,0 +1,120 @@
+"""What a hand is, as data: joints, actuators, springs, pads, sensors.
+
+Nothing here computes. A :class:`HandDescription` is read from a URDF and the
+transmission file beside it by :func:`torch_ekm.description.load_hand`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """One motor, as its position controller shows it.
+
+    ``a = offset + J_a[row] q``, and ``lower <= a <= upper``, all [rad].
+    """
+
+    name: str
+    lower: float
+    upper: float
+    offset: float = 0.0
+    tendon: bool = False
+    """True: it can only pull (tension ``-lam >= 0``); False: a looped cable, both directions."""
+    stiffness: float = np.inf
+    """Series stiffness of tendon and servo [N m/rad]; infinite: rigid."""
+
+
+@dataclass(frozen=True)
+class ContactPad:
+    """The part of a link that is meant to touch objects: a capsule (or ball, if both ends coincide).
+
+    ``start`` and ``end`` are the ends of the capsule's axis in the link's frame [m].
+    """
+
+    name: str
+    link: str
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radius: float
+    """Radius of the capsule [m]; the surface's curvature there is 1/radius."""
+    direction: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    """Outward direction of the middle of the pad, in the link's frame (palmar side)."""
+    torsional_friction: float = 0.0
+    """Soft-finger coefficient gamma [m]: spin moment at most gamma times the normal force."""
+
+
+@dataclass(frozen=True)
+class HallSensor:
+    """One Hall channel: reading ``open`` at ``lower`` and ``closed`` at ``upper`` of its joint, 8 bit."""
+
+    joint: str
+    channel: int
+    open: float = 255.0
+    closed: float = 0.0
+
+
+@dataclass(frozen=True)
+class HandDescription:
+    """A hand: its URDF and everything that a URDF cannot say.
+
+    Shapes: ``n_q`` joints, ``n_a`` actuators, ``n_k`` rigid couplings. Angles [rad],
+    lengths [m], torques [N m]. Vectors over joints are in the order of ``joint_names``.
+    """
+
+    name: str
+    urdf_path: Path
+    transmission_path: Path
+    base_link: str
+    """The hand frame: every pose and Jacobian in torch_ekm is expressed in it."""
+    link_names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    joint_lower: Array
+    joint_upper: Array
+    actuators: tuple[Actuator, ...]
+    actuation_jacobian: Array
+    """J_a = da/dq, ``(n_a, n_q)``, constant moment arms."""
+    coupling: Array
+    """C with ``C dq = 0``, ``(n_k, n_q)``: rigid couplings and locked joints."""
+    spring_stiffness: Array
+    """Diagonal of K_s, ``(n_q,)`` [N m/rad]."""
+    spring_rest: Array
+    """q0, ``(n_q,)`` [rad]."""
+    joint_friction: Array
+    """Coulomb friction torque of each joint, ``(n_q,)`` [N m]."""
+    pads: tuple[ContactPad, ...]
+    hall_sensors: tuple[HallSensor, ...] = ()
+    planar_normal: tuple[float, float, float] | None = None
+    """Normal of the plane in which a planar hand moves (hand frame); None: a spatial hand."""
+    notes: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def n_q(self) -> int:
+        return len(self.joint_names)
+
+    @property
+    def n_a(self) -> int:
+        return len(self.actuators)
+
+    @property
+    def actuator_names(self) -> tuple[str, ...]:
+        return tuple(actuator.name for actuator in self.actuators)
+
+    @property
+    def actuator_lower(self) -> Array:
+        return np.array([actuator.lower for actuator in self.actuators])
+
+    @property
+    def actuator_upper(self) -> Array:
+        return np.array([actuator.upper for actuator in self.actuators])
+
+    @property
+    def actuator_offset(self) -> Array:
+        return np.array([actuator.offset for actuator in self.actuators])

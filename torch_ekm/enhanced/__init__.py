@@ -1,0 +1,1 @@
+"""The enhanced model f + g."""

@@ -1,0 +1,202 @@
+"""Every error that torch_ekm raises on purpose.
+
+One root, :class:`EKMError`, so that a control loop can catch all of them in one
+clause. Each child carries the offending data as attributes, lists the valid
+choices where there are any, and says in its message what would be right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+
+class EKMError(Exception):
+    """Root of all errors raised by torch_ekm."""
+
+
+# -- what the user asked for does not exist -----------------------------------------------
+
+
+class MissingExtraError(EKMError, ImportError):
+    """An optional dependency is not installed.
+
+    Attributes:
+        module: the module that could not be imported.
+        extra: the extra of torch_ekm that brings it.
+    """
+
+    def __init__(self, module: str, extra: str) -> None:
+        self.module, self.extra = module, extra
+        super().__init__(
+            f"this part of torch_ekm needs the package '{module}', which is not installed; "
+            f"it comes with the extra '{extra}': pip install 'torch_ekm[{extra}]'"
+        )
+
+
+class UnknownNameError(EKMError, KeyError):
+    """A name is not in the list of valid ones, which the message gives.
+
+    Attributes:
+        kind: what was looked up ("hand", "object", "link", ...).
+        name: the name that was not found.
+        valid: the names that would have been right.
+    """
+
+    def __init__(self, kind: str, name: str, valid: Iterable[str]) -> None:
+        self.kind, self.name, self.valid = kind, name, tuple(valid)
+        super().__init__(f"unknown {kind} '{name}'; valid are: {', '.join(self.valid) or '(none)'}")
+
+    def __str__(self) -> str:  # KeyError prints the repr of its argument
+        return str(self.args[0])
+
+
+# -- a description of a hand or object is wrong -------------------------------------------
+
+
+class DescriptionError(EKMError, ValueError):
+    """A URDF or transmission file cannot be used; the message names the file and the place."""
+
+    def __init__(self, source: object, problem: str) -> None:
+        self.source, self.problem = str(source), problem
+        super().__init__(f"{source}: {problem}")
+
+
+class JointMismatchError(DescriptionError):
+    """Joints named in one place are not those of the other.
+
+    Attributes:
+        missing: joints that the URDF has and that are needed here.
+        unexpected: joints named here that the URDF lacks.
+    """
+
+    def __init__(
+        self, source: object, missing: Iterable[str], unexpected: Iterable[str], valid: Iterable[str]
+    ) -> None:
+        self.missing, self.unexpected = tuple(missing), tuple(unexpected)
+        self.valid = tuple(valid)
+        parts = []
+        if self.missing:
+            parts.append(f"missing joints: {', '.join(self.missing)}")
+        if self.unexpected:
+            parts.append(f"joints that the URDF does not have: {', '.join(self.unexpected)}")
+        super().__init__(source, f"{'; '.join(parts)}; the URDF's joints are: {', '.join(self.valid)}")
+
+
+# -- numbers that cannot be right -----------------------------------------------------------
+
+
+class ShapeError(EKMError, ValueError):
+    """A tensor has the wrong shape.
+
+    Attributes:
+        name: the argument.
+        expected: the expected shape, in words or symbols.
+        actual: the shape that came.
+    """
+
+    def __init__(self, name: str, expected: str, actual: Iterable[int], hint: str = "") -> None:
+        self.name, self.expected, self.actual = name, expected, tuple(actual)
+        super().__init__(
+            f"{name} must have shape {expected}, got {self.actual}" + (f"; {hint}" if hint else "")
+        )
+
+
+class NonFiniteError(EKMError, ValueError):
+    """A value is NaN or infinite. Nothing was changed.
+
+    Attributes:
+        name: the argument.
+        where: indices of the offending entries (the first few).
+    """
+
+    def __init__(self, name: str, where: Any = ()) -> None:
+        self.name, self.where = name, where
+        super().__init__(
+            f"{name} must be finite; NaN or infinity at {list(where) if where else 'some entry'}; "
+            "the call was refused and no state was changed"
+        )
+
+
+class ParameterError(EKMError, ValueError):
+    """A parameter lies outside its valid range, which the message gives."""
+
+    def __init__(self, name: str, value: object, valid: str) -> None:
+        self.name, self.value, self.valid = name, value, valid
+        super().__init__(f"{name} = {value!r} is not valid; it must be {valid}")
+
+
+# -- the grasp cannot be modelled -----------------------------------------------------------
+
+
+class GraspError(EKMError):
+    """Root of the errors about a grasp."""
+
+
+class NoContactError(GraspError):
+    """Nothing touches the object, so there is no manipulation Jacobian."""
+
+
+class SingularGraspError(GraspError):
+    """Some motion meets no stiffness and no constraint, or a step is impossible.
+
+    Attributes:
+        direction: unit state increment ``(n_s,)`` along which the system is singular.
+    """
+
+    def __init__(self, message: str, direction: Any = None) -> None:
+        self.direction = direction
+        super().__init__(message)
+
+
+class UnstableGraspError(GraspError):
+    """The locked-actuator stiffness ``N^T D N`` is not positive: the grasp buckles.
+
+    Attributes:
+        stiffness: its smallest eigenvalue (scaled units).
+        direction: unit state increment ``(n_s,)`` along which the grasp buckles.
+    """
+
+    def __init__(self, message: str, stiffness: float | None = None, direction: Any = None) -> None:
+        self.stiffness, self.direction = stiffness, direction
+        super().__init__(message)
+
+
+class NotGraspableError(GraspError):
+    """No contact forces inside the friction cones balance the object.
+
+    Attributes:
+        violation: smallest possible norm of the object's unbalanced wrench.
+    """
+
+    def __init__(self, message: str, violation: float | None = None) -> None:
+        self.violation = violation
+        super().__init__(message)
+
+
+class ObjectLostError(GraspError):
+    """The object has left the hand (dropped, thrown, or not seen any more)."""
+
+
+# -- solvers and control --------------------------------------------------------------------
+
+
+class SolverError(EKMError):
+    """A numerical solver did not succeed.
+
+    Attributes:
+        solver: its name.
+        status: what it said.
+    """
+
+    def __init__(self, solver: str, status: str, hint: str = "") -> None:
+        self.solver, self.status = solver, status
+        super().__init__(f"solver '{solver}' failed: {status}" + (f"; {hint}" if hint else ""))
+
+
+class EquilibriumError(SolverError):
+    """No quasi-static equilibrium was found (see ``status`` for how far the solver came)."""
+
+
+class UnreachableTargetError(EKMError):
+    """A target lies outside what the object's workspace or the actuators allow."""

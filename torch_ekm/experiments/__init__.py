@@ -1,0 +1,1 @@
+"""Claims: protocols, metrics, figures, reports."""

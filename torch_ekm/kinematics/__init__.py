@@ -1,0 +1,1 @@
+"""WHERE its points are: forward kinematics, Jacobians, the actuation map."""

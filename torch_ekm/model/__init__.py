@@ -1,0 +1,1 @@
+"""The kinematic model f(s, da): potential, stiffness, manipulation Jacobian."""

@@ -1,0 +1,1 @@
+"""Learners g(x) of a model's residual; nothing here knows about robots."""

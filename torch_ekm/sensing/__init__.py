@@ -1,0 +1,1 @@
+"""From raw readings to joint angles and poses."""

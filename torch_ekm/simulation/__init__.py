@@ -1,0 +1,1 @@
+"""Ground truth: a simulated hand, and the plant contract."""

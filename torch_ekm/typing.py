@@ -1,0 +1,29 @@
+"""Shape annotations, in one place.
+
+``Float[Tensor, "*batch n_q"]`` documents a shape everywhere; jaxtyping and beartype
+check it at run time in the tests only. Without jaxtyping (the core needs torch and
+numpy alone) the annotations are inert.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torch import Tensor as Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool as Bool
+    from jaxtyping import Float as Float
+    from jaxtyping import Int as Int
+else:
+    try:
+        from jaxtyping import Bool, Float, Int
+    except ModuleNotFoundError:
+
+        class _Inert:
+            def __class_getitem__(cls, item):
+                return Tensor
+
+        Bool = Float = Int = _Inert
+
+__all__ = ["Bool", "Float", "Int", "Tensor"]
