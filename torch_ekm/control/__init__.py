@@ -1,1 +1,27 @@
 """WHICH motor increment to command."""
+
+from .controller import ControllerOptions as ControllerOptions
+from .controller import Decision as Decision
+from .controller import LookAndMoveController as LookAndMoveController
+from .focus import FocusedPose as FocusedPose
+from .focus import PoseTarget as PoseTarget
+from .qp import ControlProblem as ControlProblem
+from .qp import ControlSolution as ControlSolution
+from .qp import build_qp as build_qp
+from .qp import solve_qp as solve_qp
+from .stopping import StoppingRule as StoppingRule
+from .stopping import StopReason as StopReason
+
+__all__ = [
+    "ControlProblem",
+    "ControlSolution",
+    "ControllerOptions",
+    "Decision",
+    "FocusedPose",
+    "LookAndMoveController",
+    "PoseTarget",
+    "StopReason",
+    "StoppingRule",
+    "build_qp",
+    "solve_qp",
+]

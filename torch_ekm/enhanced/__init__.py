@@ -1,1 +1,6 @@
 """The enhanced model f + g."""
+
+from .encoding import GraspEncoding as GraspEncoding
+from .enhanced_model import EnhancedModel as EnhancedModel
+
+__all__ = ["EnhancedModel", "GraspEncoding"]

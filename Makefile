@@ -1,0 +1,39 @@
+# `make demo` and `make test` work on a fresh clone with Python 3.11 and make alone.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+JOBS ?= 2
+
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: demo test lint types imports check install clean
+
+install: $(VENV)/installed
+
+# torch first, at exactly the version of constraints.txt: a later resolver would bring CUDA builds
+$(VENV)/installed: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch numpy
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+demo: install
+	$(BIN)/torch-ekm demo --out demo_output
+
+test: install
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: install
+	$(BIN)/pyright
+
+imports: install
+	$(BIN)/lint-imports
+
+check: lint types imports test
+
+clean:
+	rm -rf $(VENV) demo_output .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,28 @@
+"""Settings that all tests share."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import pytest
+import torch
+
+torch.set_num_threads(1)  # many small matrices: threads only get into each other's way
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--device", default="cpu", help="device on which the learners' tests run")
+
+
+@pytest.fixture
+def device(request: pytest.FixtureRequest) -> torch.device:
+    """Device of the run: ``pytest --device cuda`` runs the suite on a GPU."""
+    return torch.device(request.config.getoption("--device"))
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    """Seeded source of randomness."""
+    return torch.Generator().manual_seed(7)

@@ -1,0 +1,275 @@
+"""Look-and-move: from a pose error to the motor increment that the (enhanced) model predicts will mend it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from ..enhanced.enhanced_model import EnhancedModel
+from ..exceptions import GraspError, NoContactError, NonFiniteError, ShapeError
+from ..model.state import GraspState
+from ..typing import Float, Tensor
+from .focus import FocusedPose, PoseTarget
+from .qp import ControlProblem, ControlSolution, solve_qp
+from .stopping import StopReason
+
+if TYPE_CHECKING:
+    from ..model.kinematic_model import KinematicModel
+
+_DEGREE = np.pi / 180
+
+
+@dataclass(frozen=True)
+class ControllerOptions:
+    """Every figure of the controller, in SI units (angles [rad])."""
+
+    focus_step: float = 1.5 * _DEGREE
+    """Limiting function: at most this much of the focused error is asked for in one step."""
+    actuator_step: float = 4 * _DEGREE
+    """|da| of one actuator in one step."""
+    effort_weight: float = 1e-2
+    """W = effort_weight I, per deg^2 of actuator motion."""
+    off_rotation_weight: float = 0.3
+    """Weight of rotation off the focused axis, per deg^2."""
+    off_translation_weight: float = 0.05
+    """Weight of translation off the focus, per mm^2."""
+    off_step_rotation: float = 0.5 * _DEGREE
+    off_step_translation: float = 0.5e-3
+    """How much off-axis error is corrected in one step: [rad], [m]."""
+    grip_force: float | None = 5.0
+    """Wanted normal force of the opposing finger (the one that presses most) [N]; None: not regulated."""
+    grip_weight: float = 0.5
+    """Weight of grip force errors, per N^2."""
+    grip_step: float = 0.7
+    """At most this much of a grip force error is corrected in one step [N]."""
+    grip_min: float = 0.8
+    """Soft lower bound on every finger's normal force [N]."""
+    joint_margin: float = 0.5 * _DEGREE
+    """Joints are kept this far from their stops."""
+    fixed_actuators: tuple[str, ...] = ()
+    """Actuators that must not move."""
+    sqp_iterations: int = 6
+    sqp_damping: float = 0.6
+    """Damped iterations for a model that is not linear in the action."""
+    sqp_tolerance: float = 1e-3 * _DEGREE
+    solver: str = "piqp"
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the controller wants done, what it expects, and how sure the numbers are."""
+
+    delta_a: Float[Tensor, " n_a"]
+    """Increment to command, relative to the encoders [rad]."""
+    status: StopReason
+    """RUNNING, or why no increment can be given."""
+    desired: Float[Tensor, " n_x"]
+    """dx_d, the limited error of the focused pose."""
+    predicted: Float[Tensor, " n_s"]
+    """(f + g)(s, da)."""
+    nominal: Float[Tensor, " n_s"]
+    """f(s, da) = J_m da: what the kinematic model alone predicts."""
+    limited: bool = False
+    """The step could not be met in full because actuators stand at their limits."""
+    slack: float = 0.0
+    """Largest focused error that the step leaves unmet [unit of the focus]."""
+    linearization: Any = None
+    solution: ControlSolution | None = None
+    message: str = ""
+    info: dict[str, Any] = field(default_factory=dict)
+
+
+class LookAndMoveController:
+    """Optimal look-and-move controller on a kinematic model or an enhanced one.
+
+    At each step it solves (section III.B of the E-KM paper, made feasible)::
+
+        min_da  da^T W da + off-axis and grip-force errors, weighted + rho |sl|_1
+        s.t.    M_c E_p (f + g)(s, da) + sl = dx_d,    dx_d = e min(1, 1/|S^-1 e|)
+                a_min <= a + da <= a_max,  |da| <= da_max
+                q_min <= q + dq <= q_max,  f_n + (df_n/da) da >= f_min     (soft)
+
+    With ``g`` the equality is nonlinear and is solved by a damped SQP on ``J_m + dg/da``:
+    searching along the model's own direction instead turns the object off axis.
+    Grip force is regulated on what the fingertips measure; only its *sensitivity* comes from the
+    model, because a grip force computed from a wrong model drops the object.
+
+    Args:
+        model: a :class:`KinematicModel`, or an :class:`EnhancedModel` around one.
+        focus: what of the pose must be reached.
+        options: figures; defaults suit the iCub hand.
+    """
+
+    def __init__(
+        self,
+        model: KinematicModel | EnhancedModel,
+        focus: FocusedPose,
+        options: ControllerOptions | None = None,
+    ) -> None:
+        self.enhanced = model if isinstance(model, EnhancedModel) else None
+        self.kinematic: KinematicModel = model.model if isinstance(model, EnhancedModel) else model  # type: ignore[assignment]
+        self.focus = focus
+        self.options = options if options is not None else ControllerOptions()
+        hand = self.kinematic.hand
+        self._a_lower, self._a_upper = hand.actuator_lower, hand.actuator_upper
+        self._fixed = [hand.actuator_names.index(name) for name in self.options.fixed_actuators]
+        self._pad_index = {pad.name: i for i, pad in enumerate(hand.pads)}
+        self._moving = np.flatnonzero(hand.joint_upper > hand.joint_lower)
+
+    def decide(
+        self,
+        state: GraspState,
+        a: Float[Tensor, " n_a"],
+        target: PoseTarget,
+        fingertip_force: Float[Tensor, " n_pads"] | None = None,
+    ) -> Decision:
+        """Choose the next increment.
+
+        Args:
+            state: measured joint angles and object pose.
+            a: actuator encoders [rad].
+            target: where the object shall be.
+            fingertip_force: measured normal force of each pad [N]; None: no grip rows.
+
+        Returns:
+            A :class:`Decision`. A grasp that cannot be modelled gives ``delta_a = 0`` and a
+            status that says so, never an exception.
+
+        Raises:
+            NonFiniteError: an observation is NaN or infinite.
+            ShapeError: an observation has the wrong size.
+            SolverError: the QP solver failed (it cannot be infeasible: all rows have slack).
+        """
+        n_a, n_q = len(self._a_lower), state.q.shape[-1]
+        _check("a", a, n_a)
+        if fingertip_force is not None:
+            _check("fingertip_force", fingertip_force, len(self._pad_index))
+        error = target.error(state)
+        _check("target", error, 6)
+        desired = self.limit(self.focus.matrix @ error)
+        zero, still = a.new_zeros(n_a), a.new_zeros(n_q + 6)
+        try:
+            lin = self.kinematic.linearize(state)
+        except NoContactError as failure:
+            return Decision(zero, StopReason.OBJECT_LOST, desired, still, still, message=str(failure))
+        except GraspError as failure:
+            return Decision(zero, StopReason.UNSTABLE_GRASP, desired, still, still, message=str(failure))
+
+        J_m = lin.manipulation_jacobian
+        da, value, J = zero, still, J_m
+        solution: ControlSolution | None = None
+        iterations = self.options.sqp_iterations if self.enhanced is not None else 1
+        for _ in range(iterations):
+            if self.enhanced is not None:
+                value, J = self.enhanced.linearize(state, da, J_m)
+            # (f + g)(da + d) ~ value + J d  =  (value - J da) + J (da + d)
+            offset = value - J @ da
+            problem = self._problem(state, a, error, desired, lin, J, offset, fingertip_force)
+            solution = solve_qp(problem, self.options.solver)
+            best = torch.as_tensor(solution.u * _DEGREE, dtype=a.dtype)
+            change = best - da
+            done = float(change.abs().max()) <= self.options.sqp_tolerance
+            da = best if self.enhanced is None or done else da + self.options.sqp_damping * change
+            if done:
+                break
+        nominal = J_m @ da
+        predicted = nominal if self.enhanced is None else self.enhanced.linearize(state, da, J_m)[0]
+        assert solution is not None
+        slack = float(np.abs(solution.slack).max()) * _DEGREE
+        return Decision(
+            da,
+            StopReason.RUNNING,
+            desired,
+            predicted,
+            nominal,
+            limited=slack > 0.05 * float(desired.abs().max()) and self._at_limit(a, da),
+            slack=slack,
+            linearization=lin,
+            solution=solution,
+        )
+
+    def limit(self, error: Float[Tensor, " n_x"]) -> Float[Tensor, " n_x"]:
+        """Limiting function ``dx_d = e min(1, 1/|S^-1 e|)``: keeps the direction, identity near the goal."""
+        size = float(torch.linalg.vector_norm(error)) / self.options.focus_step
+        return error * min(1.0, 1.0 / size) if size > 0 else error
+
+    def _problem(
+        self,
+        state: GraspState,
+        a: Tensor,
+        error: Tensor,
+        desired: Tensor,
+        lin: Any,
+        J: Tensor,
+        offset: Tensor,
+        force: Tensor | None,
+    ) -> ControlProblem:
+        """Rows in scaled units: u in degrees of actuator, rotations in degrees, translations in mm."""
+        opt, n_q = self.options, state.q.shape[-1]
+        J_p, c_p = J[n_q:], offset[n_q:]
+        E = self.focus.matrix @ J_p  # [rad/rad] = [deg/deg]
+        d = (desired - self.focus.matrix @ c_p) / _DEGREE
+        off = self.focus.off_matrix
+        is_translation = off[:, :3].abs().sum(-1) > 0
+        step = torch.where(is_translation, opt.off_step_translation, opt.off_step_rotation).to(off.dtype)
+        unit = torch.where(is_translation, 1e-3, _DEGREE).to(off.dtype)
+        weight = torch.where(is_translation, opt.off_translation_weight, opt.off_rotation_weight)
+        wanted = (off @ error).clamp(-step, step) - off @ c_p
+        least_squares = [
+            (_np((off @ J_p) * _DEGREE / unit[:, None]), _np(wanted / unit), _np(weight).astype(float))
+        ]
+        soft: list[tuple[np.ndarray, np.ndarray]] = []
+        if force is not None and opt.grip_force is not None:
+            rows, want, low = self._grip(lin, force)
+            least_squares.append((rows, want, np.full(len(want), opt.grip_weight)))
+            soft.append((-rows, -low))
+        q, J_q, c_q = _np(state.q), _np(J[:n_q]), _np(offset[:n_q])
+        hand, moving = self.kinematic.hand, self._moving
+        reach = np.abs(J_q).sum(1) * opt.actuator_step + 2 * opt.joint_margin
+        for sign, stop in ((1.0, hand.joint_upper), (-1.0, hand.joint_lower)):
+            room = sign * (stop - q) - opt.joint_margin
+            near = moving[room[moving] < reach[moving]]
+            if near.size:  # rows only where a stop is within reach of this step; at the stop: go no further
+                soft.append((sign * J_q[near], (np.maximum(room, 0.0) - sign * c_q)[near] / _DEGREE))
+        lower = np.clip(self._a_lower - _np(a), -opt.actuator_step, opt.actuator_step) / _DEGREE
+        upper = np.clip(self._a_upper - _np(a), -opt.actuator_step, opt.actuator_step) / _DEGREE
+        lower[self._fixed] = upper[self._fixed] = 0.0
+        W = opt.effort_weight * np.eye(len(lower))
+        return ControlProblem(W, lower, upper, (_np(E), _np(d)), least_squares, soft)
+
+    def _grip(self, lin: Any, force: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows ``(df_n/da) u``, the wanted change and the lowest allowed change of the normal forces [N].
+
+        The finger that presses most opposes all others: it is regulated to ``grip_force``, and the
+        others to equal shares of it, so that no finger is left without a grip.
+        """
+        opt = self.options
+        assert opt.grip_force is not None
+        rows = _np(lin.contact_force_sensitivity)[list(lin.normal_rows)] * _DEGREE
+        measured = _np(force)[[self._pad_index[name] for name in lin.contacts.finger]]
+        wanted = np.full(len(measured), opt.grip_force / max(len(measured) - 1, 1))
+        wanted[int(np.argmax(measured))] = opt.grip_force
+        want = np.clip(wanted - measured, -opt.grip_step, opt.grip_step)
+        low = np.minimum(opt.grip_min - measured, opt.grip_step)
+        return rows, want, low
+
+    def _at_limit(self, a: Tensor, da: Tensor) -> bool:
+        after, margin = _np(a + da), 0.01 * _DEGREE
+        moved = np.ones(len(after), dtype=bool)
+        moved[self._fixed] = False
+        return bool((((after <= self._a_lower + margin) | (after >= self._a_upper - margin)) & moved).any())
+
+
+def _np(x: Tensor) -> np.ndarray:
+    return x.detach().cpu().numpy().astype(np.float64)
+
+
+def _check(name: str, value: Tensor, size: int) -> None:
+    if tuple(value.shape) != (size,):
+        raise ShapeError(name, f"({size},)", value.shape)
+    finite = torch.isfinite(value)
+    if not bool(finite.all()):
+        raise NonFiniteError(name, torch.nonzero(~finite)[:3].tolist())

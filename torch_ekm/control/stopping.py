@@ -1,0 +1,62 @@
+"""When a controller stops, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from ..exceptions import ParameterError
+
+
+class StopReason(Enum):
+    """Why a manipulation ended; ``RUNNING`` while it has not."""
+
+    RUNNING = "running"
+    REACHED = "reached"
+    STALLED = "stalled"
+    STEP_LIMIT = "step limit"
+    ACTUATOR_LIMITS = "actuator limits"
+    UNSTABLE_GRASP = "unstable grasp"
+    OBJECT_LOST = "object lost"
+
+
+@dataclass(frozen=True)
+class StoppingRule:
+    """Explicit parameters of the stopping rule; the same for every controller that is compared.
+
+    * reached: ``|e| <= tolerance`` in ``settle_steps`` observations in a row;
+    * stalled: within the last ``stall_window`` steps the smallest ``|e|`` fell by less than
+      ``stall_progress``;
+    * actuator limits: as stalled, while some actuator that matters stood at its limit;
+    * step limit: ``max_steps`` commands were given.
+    """
+
+    tolerance: float
+    """[unit of the focused pose: rad for a rotation]"""
+    settle_steps: int = 2
+    stall_window: int = 8
+    stall_progress: float = 1e-3
+    """[same unit]"""
+    max_steps: int = 60
+
+    def __post_init__(self) -> None:
+        for name in ("tolerance", "settle_steps", "stall_window", "max_steps"):
+            if not getattr(self, name) > 0:
+                raise ParameterError(name, getattr(self, name), "positive")
+
+    def judge(self, errors: list[float], limited: bool = False) -> StopReason:
+        """Judge the history of ``|e|``, one entry for each observation, the newest last.
+
+        Args:
+            limited: the last step was cut short by an actuator's limit.
+        """
+        recent = errors[-self.settle_steps :]
+        if len(recent) == self.settle_steps and max(recent) <= self.tolerance:
+            return StopReason.REACHED
+        if len(errors) > self.stall_window:
+            before, after = min(errors[: -self.stall_window]), min(errors[-self.stall_window :])
+            if before - after < self.stall_progress:
+                return StopReason.ACTUATOR_LIMITS if limited else StopReason.STALLED
+        if len(errors) > self.max_steps:
+            return StopReason.STEP_LIMIT
+        return StopReason.RUNNING

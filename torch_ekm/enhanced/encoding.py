@@ -1,0 +1,57 @@
+"""From the state of a grasp to the inputs of a learner."""
+
+from __future__ import annotations
+
+import torch
+
+from ..exceptions import ParameterError, UnknownNameError
+from ..model.state import GraspState
+from ..typing import Float, Tensor
+
+
+class GraspEncoding:
+    """``x_s = [(q_sel - q_ref) / q_scale; (o - o_ref) / o_scale; Log(R R_ref^T) / r_scale]``.
+
+    Scaled so that the workspace of a pinch is of the order of 1 in each input.
+
+    Args:
+        reference: the state at the origin of the coordinates (e.g. the first grasp).
+        joints: indices of the joints to use (those of the grasping fingers); none if empty.
+        q_scale: [rad].
+        position_scale: [m].
+        rotation_scale: [rad].
+    """
+
+    def __init__(
+        self,
+        reference: GraspState,
+        joints: list[int],
+        *,
+        q_scale: float = 0.3,
+        position_scale: float = 0.01,
+        rotation_scale: float = 0.3,
+    ) -> None:
+        for name, value in (
+            ("q_scale", q_scale),
+            ("position_scale", position_scale),
+            ("rotation_scale", rotation_scale),
+        ):
+            if not value > 0:
+                raise ParameterError(name, value, "a positive length or angle")
+        n_q = reference.q.shape[-1]
+        for joint in joints:
+            if not 0 <= joint < n_q:
+                raise UnknownNameError("joint index", str(joint), [f"0..{n_q - 1}"])
+        self.reference, self.joints = reference, joints
+        self.q_scale, self.position_scale, self.rotation_scale = q_scale, position_scale, rotation_scale
+
+    @property
+    def n_features(self) -> int:
+        return len(self.joints) + 6
+
+    def __call__(self, state: GraspState) -> Float[Tensor, "*batch n_features"]:
+        x = state.coordinates(self.reference)
+        n_q = state.q.shape[-1]
+        dq = x[..., self.joints] - self.reference.q[..., self.joints]
+        do, dphi = x[..., n_q : n_q + 3], x[..., n_q + 3 :]
+        return torch.cat([dq / self.q_scale, do / self.position_scale, dphi / self.rotation_scale], dim=-1)

@@ -1,0 +1,166 @@
+"""f + g: any model of increments, corrected by any learner of its residual."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from torch import nn
+from torch.func import jacrev
+
+from ..exceptions import NonFiniteError, ShapeError
+from ..typing import Float, Tensor
+
+
+@runtime_checkable
+class LinearizableModel(Protocol):
+    """A model that knows its own derivative with respect to the action."""
+
+    def linearize(self, state: Any) -> Any:
+        """Return an object with ``manipulation_jacobian`` ``(n_out, n_action)``."""
+        ...
+
+
+class EnhancedModel(nn.Module):
+    """Enhanced model ``ds = f(s, da) + g(s, da)`` (eq. 3 of the E-KM paper).
+
+    The learner ``g`` sees ``x = [encode(s); action_scale * da]`` and learns the residual
+    ``y = (ds - f(s, da)) * output_scale`` of the selected outputs (eq. 9). Before its first
+    update ``g = 0``, so ``f + g == f`` exactly.
+
+    Args:
+        model: any callable ``f(state, action) -> increment``. If it has ``linearize(state)``
+            with a ``manipulation_jacobian`` J_m, then ``f = J_m da`` and J_m is used
+            instead of automatic differentiation.
+        learner: a residual learner (see :mod:`torch_ekm.residual`) with
+            ``in_features = dim(encode(s)) + dim(a)``.
+        encode: turns the state into the learner's inputs ``(*batch, d)``; the identity if None
+            (the state is then a tensor).
+        outputs: indices of the increment that the learner corrects; all if None.
+        action_scale: factor from the action's unit to the learner's.
+        output_scale: factor, or one for each output, from the increment's unit to the learner's.
+
+    The training increment is the one *commanded relative to the encoder*: the measured one
+    hides the dead zone, which is much of what there is to learn.
+    """
+
+    def __init__(
+        self,
+        model: Callable[[Any, Tensor], Tensor],
+        learner: nn.Module,
+        *,
+        encode: Callable[[Any], Tensor] | None = None,
+        outputs: list[int] | None = None,
+        action_scale: float = 1.0,
+        output_scale: float | Float[Tensor, " n_out"] = 1.0,
+    ) -> None:
+        super().__init__()
+        self.model = model
+        self.learner = learner
+        self.encode = encode if encode is not None else _identity
+        self.outputs = outputs
+        self.action_scale = action_scale
+        self.register_buffer("output_scale", torch.as_tensor(output_scale))
+
+    def features(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_x"]:
+        """``x = [encode(s); action_scale * da]``."""
+        return torch.cat([self.encode(state), self.action_scale * action], dim=-1)
+
+    def forward(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_s"]:
+        """``f(s, da) + g(s, da)``."""
+        nominal = self.model(state, action)
+        return nominal + self.correction(state, action, nominal)
+
+    def correction(self, state: Any, action: Tensor, like: Tensor) -> Float[Tensor, "*batch n_s"]:
+        """``g(s, da)`` in the increment's unit, zero in the outputs that are not learned.
+
+        Args:
+            like: any increment of the right shape (usually ``f(s, da)``).
+        """
+        mean = self.learner(self.features(state, action)) / self.output_scale
+        return self._scatter(mean, like)
+
+    @torch.no_grad()
+    def update(
+        self,
+        state: Any,
+        action: Float[Tensor, "*batch n_a"],
+        increment: Float[Tensor, "*batch n_s"],
+        nominal: Float[Tensor, "*batch n_s"] | None = None,
+    ) -> Any:
+        """Train on one motion: ``y = ds - f(s, da)`` (eq. 9).
+
+        Args:
+            state: state before the motion.
+            action: increment that was commanded.
+            increment: what happened, ``ds``.
+            nominal: ``f(s, da)`` if it is known already; computed if None.
+
+        Returns:
+            The learner's report.
+
+        Raises:
+            NonFiniteError: an entry is NaN or infinite; nothing was changed.
+            ShapeError: the increment has not the shape of the model's prediction.
+        """
+        if nominal is None:
+            nominal = self.model(state, action)
+        if increment.shape != nominal.shape:
+            raise ShapeError("increment", f"{tuple(nominal.shape)}, that of the prediction", increment.shape)
+        for name, value in (("action", action), ("increment", increment), ("prediction", nominal)):
+            finite = torch.isfinite(value)
+            if not bool(finite.all()):
+                raise NonFiniteError(name, torch.nonzero(~finite)[:3].tolist())
+        residual = self._gather(increment - nominal) * self.output_scale
+        return self.learner.update(self.features(state, action), residual)
+
+    def linearize(
+        self,
+        state: Any,
+        action: Float[Tensor, " n_a"],
+        nominal_jacobian: Float[Tensor, "n_s n_a"] | None = None,
+    ) -> tuple[Float[Tensor, " n_s"], Float[Tensor, "n_s n_a"]]:
+        """``(f + g, d(f + g)/d da)`` at one state and action.
+
+        Args:
+            nominal_jacobian: J_m if it is known already (then ``f = J_m da``).
+        """
+        J = nominal_jacobian
+        if J is None and isinstance(self.model, LinearizableModel):
+            J = self.model.linearize(state).manipulation_jacobian
+        if J is not None:
+            nominal = J @ action
+        else:
+            nominal = self.model(state, action)
+            J = jacrev(lambda a: self.model(state, a))(action)
+        mean, dmean = self.learner.linearize(self.features(state, action))
+        n_a = action.shape[-1]
+        value = nominal + self._scatter(mean / self.output_scale, nominal)
+        slope = dmean[..., -n_a:] * self.action_scale / self.output_scale.reshape(-1, 1)
+        jacobian = J.clone()
+        if self.outputs is None:
+            jacobian = jacobian + slope
+        else:
+            jacobian[self.outputs] += slope
+        return value, jacobian
+
+    def predict(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> torch.distributions.Normal:
+        """Distribution of the learned outputs' increment, in the increment's unit."""
+        nominal = self._gather(self.model(state, action))
+        g = self.learner.predict(self.features(state, action))
+        return torch.distributions.Normal(nominal + g.mean / self.output_scale, g.stddev / self.output_scale)
+
+    def _gather(self, increment: Tensor) -> Tensor:
+        return increment if self.outputs is None else increment[..., self.outputs]
+
+    def _scatter(self, values: Tensor, like: Tensor) -> Tensor:
+        if self.outputs is None:
+            return values
+        out = torch.zeros_like(like)
+        index = torch.tensor(self.outputs, device=like.device)
+        return out.index_copy(-1, index, values.to(like.dtype))
+
+
+def _identity(state: Tensor) -> Tensor:
+    return state
