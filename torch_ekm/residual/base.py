@@ -1,0 +1,247 @@
+"""The contract of a learner: what every residual model is, and the checks that all share."""
+
+from __future__ import annotations
+
+import enum
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import nn
+from torch.distributions import Normal
+
+from ..exceptions import NonFiniteError, ParameterError, ShapeError
+from ..typing import Bool, Float, Int, Tensor
+
+
+class UpdateEvent(enum.IntEnum):
+    """What an update did with a sample."""
+
+    REFUSED = 0  #: masked out, or not finite under ``on_invalid="skip"``: nothing changed
+    ABSORBED = 1  #: taken in; the learner has no basis, or projected the sample onto it
+    ADDED = 2  #: became a new basis point
+    REPLACED = 3  #: became a basis point, and another was deleted for it
+
+
+@dataclass(frozen=True)
+class UpdateReport:
+    """What an update did. All tensors have shape ``(*time, *batch_shape)``.
+
+    Attributes:
+        event: an :class:`UpdateEvent` per sample.
+        novelty: share of the prior variance at x that the basis does not explain, 0 to 1
+            (0 for learners without a basis).
+        surprise: mean squared standardised innovation before the update, expected to be 1
+            (NaN for learners without uncertainty).
+        weight: weight given to the sample, 1 unless a robust update distrusted it.
+    """
+
+    event: Int[Tensor, "*time_and_batch"]
+    novelty: Float[Tensor, "*time_and_batch"]
+    surprise: Float[Tensor, "*time_and_batch"]
+    weight: Float[Tensor, "*time_and_batch"]
+
+    @property
+    def accepted(self) -> Bool[Tensor, "*time_and_batch"]:
+        """Samples that changed the state."""
+        return self.event != UpdateEvent.REFUSED
+
+    @staticmethod
+    def stack(reports: list[UpdateReport]) -> UpdateReport:
+        """Reports of successive samples as one, time first."""
+        names = ("event", "novelty", "surprise", "weight")
+        return UpdateReport(*(torch.stack([getattr(r, n) for r in reports]) for n in names))
+
+
+class ResidualLearner(nn.Module, ABC):
+    """g(x), learned from a stream: ``y ~ N(g(x), R)``, and ``g = 0`` before the first sample.
+
+    Shapes: a learner is a fleet of independent models of shape ``batch_shape`` (one model: ``()``).
+    Queries are ``(*any, *batch_shape, in_features)``; an update takes one sample per model,
+    ``(*batch_shape, in_features)``, or a time-ordered block with the time first,
+    ``(n, *batch_shape, in_features)``.
+
+    A subclass implements ``forward``, ``predict``, ``_absorb`` and ``reset``. It keeps all it has
+    learned in buffers of fixed size, so that ``state_dict``, ``deepcopy``, ``.to()`` move all of it.
+
+    Args:
+        in_features: width of x.
+        out_features: width of y.
+        batch_shape: shape of the fleet.
+        on_invalid: what to do with a sample that is not finite: ``"raise"`` a NonFiniteError, or
+            ``"skip"`` it and count it in ``n_refused``. ``"skip"`` never waits for a GPU.
+
+    Raises:
+        ParameterError: a size is not a positive integer, or ``on_invalid`` is unknown.
+    """
+
+    n_refused: Tensor
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        batch_shape: tuple[int, ...] = (),
+        on_invalid: Literal["raise", "skip"] = "raise",
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> None:
+        super().__init__()
+        self.in_features = check_count("in_features", in_features)
+        self.out_features = check_count("out_features", out_features)
+        self.batch_shape = torch.Size(check_count("batch_shape", n) for n in batch_shape)
+        if on_invalid not in ("raise", "skip"):
+            raise ParameterError("on_invalid", on_invalid, "'raise' or 'skip'")
+        self.on_invalid = on_invalid
+        self.register_buffer("n_refused", torch.zeros(self.batch_shape, dtype=torch.int64, device=device))
+        # An empty float tensor follows .to() and so remembers dtype and device for all subclasses.
+        self.register_buffer("_like", torch.empty(0, dtype=dtype, device=device), persistent=False)
+
+    # -- what a learner is ------------------------------------------------------------------
+
+    @abstractmethod
+    def forward(self, x: Float[Tensor, "*any in_features"]) -> Float[Tensor, "*any out_features"]:
+        """Posterior mean E[g(x)], differentiable in x."""
+
+    @abstractmethod
+    def predict(self, x: Float[Tensor, "*any in_features"], *, observation: bool = False) -> Normal:
+        """N(E[g(x)], Var[g(x)]), or the law of y = g(x) + noise with ``observation=True``."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget all samples; hyperparameters stay."""
+
+    @abstractmethod
+    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        """Take in one checked sample per model; models outside ``mask`` must not change."""
+
+    def linearize(
+        self, x: Float[Tensor, "*any in_features"]
+    ) -> tuple[Float[Tensor, "*any out_features"], Float[Tensor, "*any out_features in_features"]]:
+        """``(g(x), dg/dx)``. Learners with a closed form override this autograd version."""
+        x = self._check_query(x).detach().requires_grad_(True)
+        with torch.enable_grad():
+            mean = self(x)
+            # one backward pass per output; queries do not interact, so their sum separates them
+            rows = [
+                torch.autograd.grad(mean[..., j].sum(), x, retain_graph=True, allow_unused=True)[0]
+                if mean.requires_grad
+                else None
+                for j in range(self.out_features)
+            ]
+        rows = [torch.zeros_like(x) if row is None else row for row in rows]
+        return mean.detach(), torch.stack(rows, dim=-2)
+
+    # -- learning -----------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def update(
+        self,
+        x: Float[Tensor, "*time_and_batch in_features"],
+        y: Float[Tensor, "*time_and_batch out_features"],
+        mask: Bool[Tensor, "*time_and_batch"] | None = None,
+    ) -> UpdateReport:
+        """Take in one sample per model, or a time-ordered block of them, in place.
+
+        Args:
+            x: inputs ``(*batch_shape, in)`` or ``(n, *batch_shape, in)``.
+            y: targets, the same with ``out``.
+            mask: models that have a sample, ``(*batch_shape)`` or ``(n, *batch_shape)``; all if None.
+
+        Raises:
+            ShapeError: a shape does not fit. The state is untouched.
+            NonFiniteError: NaN or infinity in an unmasked sample, under ``on_invalid="raise"``;
+                a block is refused as a whole. The state is untouched.
+        """
+        x, y = self._cast(x), self._cast(y)
+        time = self._check_pair(x, y, mask)
+        mask = self._refuse(x, y, mask, len(time))
+        if mask is not None:  # a NaN times zero is a NaN: clear what must not be used
+            x, y = x.where(mask[..., None], 0.0), y.where(mask[..., None], 0.0)
+        if not time:
+            return self._absorb(x, y, mask)
+        return UpdateReport.stack(
+            [self._absorb(x[t], y[t], None if mask is None else mask[t]) for t in range(time[0])]
+        )
+
+    # -- checks ---------------------------------------------------------------------------------
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Floating type of the state."""
+        return self._like.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the state."""
+        return self._like.device
+
+    def _cast(self, x: Tensor) -> Tensor:
+        return torch.as_tensor(x, dtype=self._like.dtype, device=self._like.device)
+
+    def _check_query(self, x: Tensor) -> Tensor:
+        x = self._cast(x)
+        n = len(self.batch_shape) + 1
+        if x.shape[-1:] != (self.in_features,) or (n > 1 and not self._fits(x.shape[-n:-1])):
+            raise ShapeError("x", self._expected("*any", "in"), x.shape)
+        return x
+
+    def _fits(self, shape: torch.Size) -> bool:
+        """A query may leave out the fleet's axes, or have them with size 1, to ask all models."""
+        pairs = zip(reversed(shape), reversed(self.batch_shape), strict=False)
+        return all(a == b or a == 1 for a, b in pairs)
+
+    def _check_pair(self, x: Tensor, y: Tensor, mask: Tensor | None) -> torch.Size:
+        n = len(self.batch_shape) + 1
+        if x.dim() not in (n, n + 1) or x.shape[x.dim() - n :] != (*self.batch_shape, self.in_features):
+            raise ShapeError("x", self._expected("[n]", "in"), x.shape)
+        if y.shape != (*x.shape[:-1], self.out_features):
+            expected = ", ".join(map(str, (*x.shape[:-1], self.out_features)))
+            raise ShapeError("y", f"({expected})", y.shape, "one target for each input")
+        if mask is not None and (mask.shape != x.shape[:-1] or mask.dtype != torch.bool):
+            raise ShapeError("mask", f"{tuple(x.shape[:-1])} of bool", mask.shape)
+        if x.numel() == 0:
+            raise ShapeError("x", self._expected("[n >= 1]", "in"), x.shape, "the batch is empty")
+        return x.shape[: x.dim() - n]
+
+    def _expected(self, lead: str, end: str) -> str:
+        width = self.in_features if end == "in" else self.out_features
+        return "(" + ", ".join([lead, *map(str, self.batch_shape), str(width)]) + ")"
+
+    def _refuse(self, x: Tensor, y: Tensor, mask: Tensor | None, n_time: int) -> Tensor | None:
+        if self.on_invalid == "skip":
+            finite = x.isfinite().all(-1) & y.isfinite().all(-1)
+            refused = ~finite if mask is None else mask & ~finite
+            self.n_refused += refused.sum(0) if n_time else refused
+            return finite if mask is None else mask & finite
+        if mask is not None:
+            x, y = x.where(mask[..., None], 0.0), y.where(mask[..., None], 0.0)
+        # A sum is cheap and finite unless an entry is not (or it overflows: then look closely).
+        if not math.isfinite(x.sum() + y.sum()):
+            for name, value in (("x", x), ("y", y)):
+                where = (~value.isfinite()).nonzero()
+                if len(where):
+                    raise NonFiniteError(name, [tuple(w) for w in where[:5].tolist()])
+        return mask
+
+    def extra_repr(self) -> str:
+        """One line for ``print(model)``."""
+        fleet = f", batch_shape={tuple(self.batch_shape)}" if self.batch_shape else ""
+        return f"in_features={self.in_features}, out_features={self.out_features}{fleet}"
+
+
+def check_count(name: str, value: int) -> int:
+    """``value`` as a positive int, or ParameterError."""
+    if isinstance(value, bool) or int(value) != value or value < 1:
+        raise ParameterError(name, value, "an integer of at least 1")
+    return int(value)
+
+
+def check_positive(name: str, value: float) -> float:
+    """``value`` as a positive finite float, or ParameterError."""
+    if not (math.isfinite(value) and value > 0):
+        raise ParameterError(name, value, "positive and finite")
+    return float(value)
