@@ -248,7 +248,7 @@ class LookAndMoveController:
         """
         opt = self.options
         assert opt.grip_force is not None
-        rows = _np(lin.contact_force_sensitivity)[list(lin.normal_rows)] * _DEGREE
+        rows = _np(lin.normal_force_sensitivity) * _DEGREE
         measured = _np(force)[[self._pad_index[name] for name in lin.contacts.finger]]
         wanted = np.full(len(measured), opt.grip_force / max(len(measured) - 1, 1))
         wanted[int(np.argmax(measured))] = opt.grip_force

@@ -1,0 +1,131 @@
+"""f + g for any callable f."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch.func import jacrev
+
+from torch_ekm.enhanced import EnhancedModel, GraspEncoding
+from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
+from torch_ekm.kinematics.se3 import exp
+from torch_ekm.model.state import GraspState
+from torch_ekm.residual import ActionLinearKernel, SparseOnlineGP
+
+N_S, N_A = 3, 2
+
+
+def model(state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+    """A wrong model of :func:`world`: somebody else's, and nonlinear."""
+    return torch.stack([action[..., 0], action[..., 1] * state[..., 0].cos(), action.prod(-1)], dim=-1)
+
+
+def world(state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+    gain = 1.3 + 0.3 * state[..., :1].sin()
+    return model(state, action) * gain + 0.2 * action[..., :1]
+
+
+def enhanced(linear: bool = False, **options) -> EnhancedModel:
+    n_x = N_S + N_A
+    n_out = len(options.get("outputs") or range(3))
+    kernel = ActionLinearKernel(n_x, N_A) if linear else None
+    learner = SparseOnlineGP(n_x, n_out, capacity=80, kernel=kernel, noise_variance=1e-4)
+    return EnhancedModel(model, learner, **options)
+
+
+def sample(generator: torch.Generator, n: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
+    state = torch.rand(n, N_S, generator=generator, dtype=torch.float64)
+    action = torch.randn(n, N_A, generator=generator, dtype=torch.float64)
+    return state, action
+
+
+def train(ekm: EnhancedModel, generator: torch.Generator, n: int = 300) -> EnhancedModel:
+    for state, action in zip(*sample(generator, n), strict=True):
+        ekm.update(state, action, world(state, action))
+    return ekm
+
+
+def test_untrained_equals_the_model_bit_for_bit(generator: torch.Generator) -> None:
+    state, action = sample(generator, 5)
+    assert torch.equal(enhanced()(state, action), model(state, action))
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_correction_removes_most_of_the_error(linear: bool, generator: torch.Generator) -> None:
+    ekm = train(enhanced(linear), generator)
+    state, action = sample(generator, 200)
+    truth = world(state, action)
+    # the third output is quadratic in the action: the action-linear kernel cannot follow it
+    rows = slice(0, 2 if linear else 3)
+    before = (truth - model(state, action))[:, rows].square().mean().sqrt()
+    after = (truth - ekm(state, action))[:, rows].square().mean().sqrt()
+    assert after < 0.25 * before
+
+
+def test_scales_and_output_choice_cancel(generator: torch.Generator) -> None:
+    state, action = sample(generator)
+    state, action = state[0], action[0]
+    ekm = enhanced(
+        outputs=[2, 0], action_scale=0.5, output_scale=torch.tensor([10.0, 2.0], dtype=torch.float64)
+    )
+    for _ in range(30):  # one point, again and again: g must become the residual there
+        ekm.update(state, action, world(state, action))
+    residual = world(state, action) - model(state, action)
+    g = ekm(state, action) - model(state, action)
+    torch.testing.assert_close(g[[0, 2]], residual[[0, 2]], rtol=2e-2, atol=1e-3)
+    assert g[1] == 0
+
+
+@pytest.mark.parametrize("outputs", [None, [2, 0]])
+def test_linearize_agrees_with_autograd(outputs: list[int] | None, generator: torch.Generator) -> None:
+    ekm = train(enhanced(outputs=outputs, action_scale=0.7, output_scale=3.0), generator, 60)
+    state, action = sample(generator)
+    value, jacobian = ekm.linearize(state[0], action[0])
+    torch.testing.assert_close(value, ekm(state[0], action[0]), rtol=0, atol=1e-12)
+    expected = jacrev(lambda a: ekm(state[0], a))(action[0])
+    torch.testing.assert_close(jacobian, expected, rtol=0, atol=1e-9)
+
+
+def test_action_linear_kernel_predicts_no_motion_without_action(generator: torch.Generator) -> None:
+    ekm = train(enhanced(linear=True), generator, 50)
+    state, action = sample(generator)
+    assert ekm(state[0], torch.zeros_like(action[0])).abs().max() == 0
+
+
+def test_predict_is_in_the_increments_unit(generator: torch.Generator) -> None:
+    ekm = train(enhanced(output_scale=100.0), generator, 50)
+    state, action = sample(generator, 4)
+    law = ekm.predict(state, action)
+    torch.testing.assert_close(law.mean, ekm(state, action))
+    assert (law.stddev < 0.011).all()  # unit prior variance over a scale of 100
+
+
+def test_bad_samples_leave_the_learner_untouched(generator: torch.Generator) -> None:
+    ekm = train(enhanced(), generator, 20)
+    before = {name: value.clone() for name, value in ekm.learner.named_buffers()}
+    state, action = sample(generator)
+    good = world(state[0], action[0])
+    with pytest.raises(NonFiniteError, match="increment"):
+        ekm.update(state[0], action[0], good * torch.nan)
+    with pytest.raises(NonFiniteError, match="action"):
+        ekm.update(state[0], action[0] * torch.inf, good, good)
+    with pytest.raises(ShapeError, match="increment"):
+        ekm.update(state[0], action[0], good[:2])
+    for name, value in ekm.learner.named_buffers():
+        assert torch.equal(value, before[name]), name
+
+
+def test_grasp_encoding_is_zero_at_the_reference_and_scaled(generator: torch.Generator) -> None:
+    draw = lambda n: torch.randn(n, generator=generator, dtype=torch.float64)  # noqa: E731
+    reference = GraspState(draw(4), draw(3), exp(draw(3)))
+    encode = GraspEncoding(reference, [1, 3], q_scale=0.5, position_scale=0.01, rotation_scale=0.2)
+    assert encode.n_features == 8
+    torch.testing.assert_close(encode(reference), torch.zeros(8, dtype=torch.float64), atol=1e-12, rtol=0)
+    ds = torch.zeros(10, dtype=torch.float64)
+    ds[3], ds[4], ds[9] = 0.5, 0.02, 0.1
+    expected = torch.tensor([0, 1, 2, 0, 0, 0, 0, 0.5], dtype=torch.float64)
+    torch.testing.assert_close(encode(reference.plus(ds)), expected, atol=1e-9, rtol=0)
+    with pytest.raises(UnknownNameError):
+        GraspEncoding(reference, [4])
+    with pytest.raises(ParameterError, match="q_scale"):
+        GraspEncoding(reference, [0], q_scale=0.0)
