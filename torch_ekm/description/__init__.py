@@ -1,1 +1,35 @@
 """WHAT the robot is: hands and objects as data, read from URDF and transmission files."""
+
+from .hand import Actuator as Actuator
+from .hand import ContactPad as ContactPad
+from .hand import HallSensor as HallSensor
+from .hand import HandDescription as HandDescription
+from .objects import ObjectDescription as ObjectDescription
+from .registry import data_folder as data_folder
+from .registry import list_hands as list_hands
+from .registry import list_objects as list_objects
+from .registry import load_hand as load_hand
+from .registry import load_object as load_object
+from .shape import Shape as Shape
+from .urdf import UrdfJoint as UrdfJoint
+from .urdf import UrdfLink as UrdfLink
+from .urdf import UrdfModel as UrdfModel
+from .urdf import read_urdf as read_urdf
+
+__all__ = [
+    "Actuator",
+    "ContactPad",
+    "HallSensor",
+    "HandDescription",
+    "ObjectDescription",
+    "Shape",
+    "UrdfJoint",
+    "UrdfLink",
+    "UrdfModel",
+    "data_folder",
+    "list_hands",
+    "list_objects",
+    "load_hand",
+    "load_object",
+    "read_urdf",
+]

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from .urdf import UrdfModel
+
 Array = NDArray[np.float64]
 
 
@@ -82,7 +84,7 @@ class HandDescription:
     actuation_jacobian: Array
     """J_a = da/dq, ``(n_a, n_q)``, constant moment arms."""
     coupling: Array
-    """C with ``C dq = 0``, ``(n_k, n_q)``: rigid couplings and locked joints."""
+    """C with ``C dq = 0``, ``(n_k, n_q)``: rigid couplings and locked joints; ``C q = C q0`` at all times."""
     spring_stiffness: Array
     """Diagonal of K_s, ``(n_q,)`` [N m/rad]."""
     spring_rest: Array
@@ -94,6 +96,8 @@ class HandDescription:
     planar_normal: tuple[float, float, float] | None = None
     """Normal of the plane in which a planar hand moves (hand frame); None: a spatial hand."""
     notes: dict[str, str] = field(default_factory=dict)
+    urdf: UrdfModel | None = field(default=None, repr=False)
+    """The tree of links and joints as it was read, with inertias and collision shapes."""
 
     @property
     def n_q(self) -> int:

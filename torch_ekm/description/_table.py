@@ -1,0 +1,112 @@
+"""Read a TOML table strictly: unknown keys, wrong types and non-finite figures are errors with a place."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from ..exceptions import DescriptionError
+
+_NOTHING = object()
+
+
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """The whole file as a dict.
+
+    Raises:
+        DescriptionError: no such file, or not TOML.
+    """
+    if not path.is_file():
+        raise DescriptionError(path, f"no such {what}")
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise DescriptionError(path, f"not well-formed TOML: {error}") from None
+
+
+class Table:
+    """One TOML table and where it stands. Angles: ``key`` in rad or ``key_deg`` in degrees, not both."""
+
+    def __init__(self, path: Path, place: str, data: Any, valid: Iterable[str]) -> None:
+        self.path, self.place = path, place
+        if not isinstance(data, dict):
+            raise self.error(f"must be a table, got {data!r}")
+        self.data: dict[str, Any] = data
+        valid = tuple(valid)
+        for key in data:
+            if key not in valid:
+                raise self.error(f"unknown key '{key}'; valid keys are: {', '.join(valid)}")
+
+    def error(self, problem: str) -> DescriptionError:
+        return DescriptionError(self.path, f"{self.place}: {problem}")
+
+    def _get(self, key: str, default: Any) -> Any:
+        if key in self.data:
+            return self.data[key]
+        if default is _NOTHING:
+            raise self.error(f"the key '{key}' is missing")
+        return default
+
+    def text(self, key: str, default: Any = _NOTHING) -> str:
+        value = self._get(key, default)
+        if not isinstance(value, str) or not value:
+            raise self.error(f"'{key}' must be a non-empty string, got {value!r}")
+        return value
+
+    def flag(self, key: str, default: bool) -> bool:
+        value = self._get(key, default)
+        if not isinstance(value, bool):
+            raise self.error(f"'{key}' must be true or false, got {value!r}")
+        return value
+
+    def number(
+        self, key: str, default: Any = _NOTHING, minimum: float = -math.inf, positive: bool = False
+    ) -> float:
+        value = self._get(key, default)
+        if value is default and key not in self.data:
+            return float(default)
+        value = self._finite(key, value)
+        if value < minimum or (positive and value <= 0):
+            raise self.error(
+                f"'{key}' must be {'positive' if positive else f'at least {minimum:g}'}, got {value:g}"
+            )
+        return value
+
+    def angle(self, key: str, default: Any = _NOTHING) -> float:
+        """[rad]"""
+        if self._in_degrees(key):
+            return math.radians(self.number(f"{key}_deg"))
+        return self.number(key, default)
+
+    def vector(self, key: str, size: int, default: Any = _NOTHING) -> tuple[float, ...]:
+        value = self._get(key, default)
+        if not isinstance(value, list | tuple) or len(value) != size:
+            raise self.error(f"'{key}' must be a list of {size} numbers, got {value!r}")
+        return tuple(self._finite(key, entry) for entry in value)
+
+    def angles(self, key: str, size: int, default: Any = _NOTHING) -> tuple[float, ...]:
+        """[rad]"""
+        if self._in_degrees(key):
+            return tuple(math.radians(value) for value in self.vector(f"{key}_deg", size))
+        return self.vector(key, size, default)
+
+    def weights(self, key: str) -> dict[str, float]:
+        """A table of numbers, e.g. moment arms by joint name; not empty."""
+        value = self._get(key, _NOTHING)
+        if not isinstance(value, dict) or not value:
+            raise self.error(f"'{key}' must be a table of joint = number, got {value!r}")
+        return {name: self._finite(f"{key}.{name}", entry) for name, entry in value.items()}
+
+    def _in_degrees(self, key: str) -> bool:
+        both = [k for k in (key, f"{key}_deg") if k in self.data]
+        if len(both) == 2:
+            raise self.error(f"give either '{key}' [rad] or '{key}_deg', not both")
+        return both == [f"{key}_deg"]
+
+    def _finite(self, key: str, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise self.error(f"'{key}' must be a finite number, got {value!r}")
+        return float(value)

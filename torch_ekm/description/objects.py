@@ -1,0 +1,80 @@
+"""What an object is, as data: shapes, mass, friction, the place of its marker board."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..exceptions import DescriptionError
+from ._table import Table, read_toml
+from .shape import Shape
+from .urdf import UrdfModel, pose
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ObjectDescription:
+    """A rigid object. Lengths [m], masses [kg]; everything in the object's own frame."""
+
+    name: str
+    urdf_path: Path
+    mass: float
+    com: Array
+    """Centre of mass, ``(3,)`` [m]."""
+    inertia: Array
+    """About ``com``, ``(3, 3)`` [kg m^2]."""
+    friction: float
+    """Coulomb coefficient against a finger pad."""
+    torsional_friction: float
+    """Soft-contact coefficient gamma [m]; 0: a hard surface."""
+    shapes: tuple[Shape, ...]
+    marker_transform: Array
+    """Pose of the marker board's frame (z out of the board), ``(4, 4)``."""
+    grasp_axis: Array
+    """Unit direction along which the fingers press, ``(3,)``."""
+    grasp_width: float
+    """Thickness between the fingers at the origin, along ``grasp_axis`` [m]."""
+    notes: dict[str, str] = field(default_factory=dict)
+
+
+def read_object(path: Path, urdf: UrdfModel) -> ObjectDescription:
+    """The object described by a URDF of one link and the TOML file at ``path``.
+
+    Raises:
+        DescriptionError: no such file, not one link, no inertia, no primitive shape, a wrong figure.
+    """
+    if len(urdf.links) != 1:
+        names = ", ".join(link.name for link in urdf.links)
+        raise DescriptionError(urdf.path, f"an object must be a single link, found {names}")
+    body = urdf.links[0]
+    if body.mass <= 0:
+        raise DescriptionError(urdf.path, f"link '{body.name}' needs an <inertial> with a positive mass")
+    if body.has_mesh or not body.collisions:
+        problem = f"link '{body.name}' needs <collision> shapes made of box, cylinder, sphere or capsule only"
+        raise DescriptionError(urdf.path, problem)
+    top = Table(path, "top level", read_toml(path, "object file"), ("object", "marker", "notes"))
+    keys = ("name", "friction", "torsional_friction", "grasp_axis", "grasp_width")
+    table = Table(path, "[object]", top.data.get("object"), keys)
+    marker = Table(path, "[marker]", top.data.get("marker", {}), ("xyz", "rpy", "rpy_deg"))
+    axis = np.array(table.vector("grasp_axis", 3, (0.0, 1.0, 0.0)))
+    if np.linalg.norm(axis) < 1e-9:
+        raise table.error("'grasp_axis' must not be zero")
+    xyz, rpy = marker.vector("xyz", 3, (0.0, 0.0, 0.0)), marker.angles("rpy", 3, (0.0, 0.0, 0.0))
+    return ObjectDescription(
+        name=table.text("name"),
+        urdf_path=urdf.path,
+        mass=body.mass,
+        com=body.com,
+        inertia=body.inertia,
+        friction=table.number("friction", minimum=0.0),
+        torsional_friction=table.number("torsional_friction", 0.0, minimum=0.0),
+        shapes=body.collisions,
+        marker_transform=pose(np.array(xyz), np.array(rpy)),
+        grasp_axis=axis / np.linalg.norm(axis),
+        grasp_width=table.number("grasp_width", positive=True),
+        notes={str(key): str(value) for key, value in top.data.get("notes", {}).items()},
+    )

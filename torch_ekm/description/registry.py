@@ -1,0 +1,70 @@
+"""The hands and objects that come with torch_ekm, by name; any other by path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..exceptions import DescriptionError, UnknownNameError
+from .hand import HandDescription
+from .objects import ObjectDescription, read_object
+from .transmission import read_transmission
+from .urdf import read_urdf
+
+_HANDS = {
+    "icub_right": "icub_right_hand.urdf",
+    "icub_left": "icub_left_hand.urdf",
+    "planar_two_finger": "planar_two_finger.urdf",
+}
+_OBJECTS = ("toothpaste", "applier", "box", "weighted_box", "bottle", "can")
+
+
+def data_folder() -> Path:
+    """Where the URDF files are: inside an installed package, or in the repository of an editable one."""
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "_urdf", package.parent / "urdf"):
+        if (folder / "objects").is_dir():
+            return folder
+    raise DescriptionError(package, "the URDF files that belong to torch_ekm were not installed with it")
+
+
+def list_hands() -> tuple[str, ...]:
+    """Names that :func:`load_hand` knows."""
+    return tuple(_HANDS)
+
+
+def list_objects() -> tuple[str, ...]:
+    """Names that :func:`load_object` knows."""
+    return _OBJECTS
+
+
+def load_hand(name: str | Path) -> HandDescription:
+    """A hand by name, or from a path to a URDF with ``<stem>.transmission.toml`` beside it.
+
+    Raises:
+        UnknownNameError: ``name`` is neither a known hand nor a path to a ``.urdf`` file.
+        DescriptionError: a file is missing or wrong; the message names file and place.
+        JointMismatchError: URDF and transmission file name different joints.
+    """
+    path = _resolve("hand", name, {key: data_folder() / file for key, file in _HANDS.items()})
+    return read_transmission(path.with_suffix(".transmission.toml"), read_urdf(path))
+
+
+def load_object(name: str | Path) -> ObjectDescription:
+    """An object by name, or from a path to a URDF with ``<stem>.object.toml`` beside it.
+
+    Raises:
+        UnknownNameError: ``name`` is neither a known object nor a path to a ``.urdf`` file.
+        DescriptionError: a file is missing or wrong; the message names file and place.
+    """
+    folder = data_folder() / "objects"
+    path = _resolve("object", name, {key: folder / f"{key}.urdf" for key in _OBJECTS})
+    return read_object(path.with_suffix(".object.toml"), read_urdf(path))
+
+
+def _resolve(kind: str, name: str | Path, known: dict[str, Path]) -> Path:
+    if isinstance(name, str) and name in known:
+        return known[name]
+    path = Path(name)
+    if path.suffix != ".urdf":
+        raise UnknownNameError(kind, str(name), (*known, "a path to a .urdf file"))
+    return path

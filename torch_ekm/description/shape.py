@@ -1,0 +1,77 @@
+"""A primitive solid, placed in the frame of a link or an object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Kind = Literal["box", "cylinder", "sphere", "capsule"]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One convex primitive; lengths [m].
+
+    ========== =========================== ==========================================
+    kind       size                        axis (of the shape's own frame)
+    ========== =========================== ==========================================
+    box        (x, y, z), full extents     centre at the origin
+    cylinder   (radius, length)            z, centre at the origin
+    sphere     (radius,)
+    capsule    (radius, length)            z; ``length`` is that of the cylindrical part
+    ========== =========================== ==========================================
+    """
+
+    kind: Kind
+    size: tuple[float, ...]
+    transform: NDArray[np.float64]
+    """Pose of the shape in the frame of its link or object, ``(4, 4)``."""
+
+    @property
+    def volume(self) -> float:
+        """[m^3]"""
+        if self.kind == "box":
+            return float(np.prod(self.size))
+        radius = self.size[0]
+        ball = 4 / 3 * np.pi * radius**3
+        if self.kind == "sphere":
+            return float(ball)
+        rod = np.pi * radius**2 * self.size[1]
+        return float(rod if self.kind == "cylinder" else rod + ball)
+
+
+def merge_capsules(shapes: tuple[Shape, ...], tolerance: float = 1e-7) -> tuple[Shape, ...]:
+    """Read a cylinder with a ball of the same radius on either end as one capsule.
+
+    The URDF standard has no capsule and some readers reject the widespread extension, so a capsule
+    is written as cylinder + two spheres; here it becomes one smooth convex body again. Two capsules
+    in line may share a ball. ``tolerance`` [m].
+    """
+    spheres = [shape for shape in shapes if shape.kind == "sphere"]
+    used: set[int] = set()
+    merged: list[Shape] = []
+    for shape in shapes:
+        if shape.kind != "cylinder":
+            merged.append(shape)
+            continue
+        radius, length = shape.size
+        half = shape.transform[:3, 2] * length / 2
+        centre = shape.transform[:3, 3]
+        caps = [
+            next((s for s in spheres if _is_ball(s, centre + sign * half, radius, tolerance)), None)
+            for sign in (-1.0, 1.0)
+        ]
+        if caps[0] is None or caps[1] is None:
+            merged.append(shape)
+        else:
+            used.update(id(cap) for cap in caps)
+            merged.append(Shape("capsule", shape.size, shape.transform))
+    return tuple(shape for shape in merged if id(shape) not in used)
+
+
+def _is_ball(shape: Shape, centre: NDArray[np.float64], radius: float, tolerance: float) -> bool:
+    offset = float(np.abs(shape.transform[:3, 3] - centre).max())
+    return offset < tolerance and abs(shape.size[0] - radius) < tolerance

@@ -1,0 +1,210 @@
+"""Read a transmission file: what a URDF cannot say about a hand.
+
+Actuators and their moment arms (J_a), rigid couplings (C dq = 0), joint springs and friction,
+contact pads, Hall sensors. The format is documented in ``docs/your_own_hand.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ..exceptions import DescriptionError, JointMismatchError
+from ._table import Table, read_toml
+from .hand import Actuator, ContactPad, HallSensor, HandDescription
+from .urdf import UrdfModel
+
+_ACTUATOR = ("name", "range", "range_deg", "offset", "offset_deg", "moment_arms", "tendon", "stiffness")
+_PAD = ("name", "link", "start", "end", "radius", "direction", "torsional_friction")
+T = TypeVar("T")
+
+
+def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
+    """The hand described by ``urdf`` and the transmission file at ``path``.
+
+    Raises:
+        DescriptionError: no such file, malformed TOML, an unknown key, a figure that is not finite,
+            reversed ranges, dependent rows in ``[J_a; C]``, a motion that no spring, actuator or
+            coupling holds.
+        JointMismatchError: the file names joints that the URDF lacks, or leaves some out.
+    """
+    top = Table(
+        path,
+        "top level",
+        read_toml(path, "transmission file"),
+        ("hand", "joints", "actuators", "couplings", "pads", "hall_sensors", "notes"),
+    )
+    joints = urdf.moving_joints
+    names = tuple(joint.name for joint in joints)
+    if not names:
+        raise DescriptionError(urdf.path, "there is no revolute or continuous joint")
+    hand = Table(path, "[hand]", top.data.get("hand"), ("name", "base_link", "planar_normal"))
+    base = hand.text("base_link", urdf.root)
+    _check_base(path, base, urdf)
+
+    springs = _joint_table(path, top.data.get("joints", {}), names)
+    actuators = _each(top, "actuators", lambda place, data: _actuator(path, place, data), minimum=1)
+    couplings = _each(top, "couplings", lambda place, data: Table(path, place, data, ("name", "joints")))
+    J_a = _rows(path, names, [(f"actuator '{a.name}'", arms) for a, arms in actuators])
+    C = _rows(path, names, [(table.place, table.weights("joints")) for table in couplings])
+    K_s = springs[:, 0]
+    _check_mechanism(path, names, J_a, C, K_s)
+    pads = _each(top, "pads", lambda place, data: _pad(path, place, data, urdf))
+    _check_unique(path, "actuator", [actuator.name for actuator, _ in actuators])
+    _check_unique(path, "pad", [pad.name for pad in pads])
+    normal = hand.vector("planar_normal", 3) if "planar_normal" in hand.data else None
+    return HandDescription(
+        name=hand.text("name"),
+        urdf_path=urdf.path,
+        transmission_path=path,
+        base_link=base,
+        link_names=tuple(link.name for link in urdf.links),
+        joint_names=names,
+        joint_lower=np.array([joint.lower for joint in joints]),
+        joint_upper=np.array([joint.upper for joint in joints]),
+        actuators=tuple(actuator for actuator, _ in actuators),
+        actuation_jacobian=J_a,
+        coupling=C,
+        spring_stiffness=K_s,
+        spring_rest=springs[:, 1],
+        joint_friction=springs[:, 2],
+        pads=tuple(pads),
+        hall_sensors=tuple(_each(top, "hall_sensors", lambda place, data: _hall(path, place, data, names))),
+        planar_normal=None if normal is None else (normal[0], normal[1], normal[2]),
+        notes={str(key): str(value) for key, value in top.data.get("notes", {}).items()},
+        urdf=urdf,
+    )
+
+
+def _each(top: Table, key: str, read: Callable[[str, Any], T], minimum: int = 0) -> list[T]:
+    entries = top.data.get(key, [])
+    if not isinstance(entries, list) or len(entries) < minimum:
+        raise DescriptionError(top.path, f"[[{key}]]: at least {minimum} such table(s) must be given")
+    results = []
+    for k, data in enumerate(entries):
+        label = data.get("name", data.get("joint", k + 1)) if isinstance(data, dict) else k + 1
+        results.append(read(f"[[{key}]] '{label}'", data))
+    return results
+
+
+def _actuator(path: Path, place: str, data: Any) -> tuple[Actuator, dict[str, float]]:
+    table = Table(path, place, data, _ACTUATOR)
+    lower, upper = table.angles("range", 2)
+    if lower >= upper:
+        raise table.error(f"range reversed or empty: {lower:g} to {upper:g} rad")
+    actuator = Actuator(
+        name=table.text("name"),
+        lower=lower,
+        upper=upper,
+        offset=table.angle("offset", 0.0),
+        tendon=table.flag("tendon", False),
+        stiffness=table.number("stiffness", np.inf, positive=True),
+    )
+    return actuator, table.weights("moment_arms")
+
+
+def _pad(path: Path, place: str, data: Any, urdf: UrdfModel) -> ContactPad:
+    table = Table(path, place, data, _PAD)
+    link, links = table.text("link"), [link.name for link in urdf.links]
+    if link not in links:
+        raise table.error(f"unknown link '{link}'; the URDF's links are: {', '.join(links)}")
+    start = table.vector("start", 3)
+    end = table.vector("end", 3, start)
+    direction = np.array(table.vector("direction", 3, (0.0, 1.0, 0.0)))
+    if np.linalg.norm(direction) < 1e-9:
+        raise table.error("'direction' must not be zero")
+    direction = direction / np.linalg.norm(direction)
+    return ContactPad(
+        name=table.text("name"),
+        link=link,
+        start=(start[0], start[1], start[2]),
+        end=(end[0], end[1], end[2]),
+        radius=table.number("radius", positive=True),
+        direction=(float(direction[0]), float(direction[1]), float(direction[2])),
+        torsional_friction=table.number("torsional_friction", 0.0, minimum=0.0),
+    )
+
+
+def _hall(path: Path, place: str, data: Any, names: tuple[str, ...]) -> HallSensor:
+    table = Table(path, place, data, ("joint", "channel", "open", "closed"))
+    joint = table.text("joint")
+    if joint not in names:
+        raise JointMismatchError(path, (), (joint,), names)
+    channel = table.number("channel", minimum=0)
+    if channel != int(channel):
+        raise table.error(f"'channel' must be a whole number, got {channel:g}")
+    return HallSensor(joint, int(channel), table.number("open", 255.0), table.number("closed", 0.0))
+
+
+def _joint_table(path: Path, data: Any, names: tuple[str, ...]) -> np.ndarray:
+    """Rows (spring stiffness [N m/rad], rest [rad], Coulomb friction [N m]) in the order of ``names``."""
+    given = Table(path, "[joints]", data, data if isinstance(data, dict) else ()).data
+    missing = [name for name in names if name not in given]
+    unexpected = [name for name in given if name not in names]
+    if missing or unexpected:
+        raise JointMismatchError(path, missing, unexpected, names)
+    rows = []
+    for name in names:
+        table = Table(path, f"[joints] {name}", given[name], ("spring", "rest", "rest_deg", "friction"))
+        spring, friction = (table.number(key, 0.0, minimum=0.0) for key in ("spring", "friction"))
+        rows.append((spring, table.angle("rest", 0.0), friction))
+    return np.array(rows)
+
+
+def _rows(path: Path, names: tuple[str, ...], entries: list[tuple[str, dict[str, float]]]) -> np.ndarray:
+    matrix = np.zeros((len(entries), len(names)))
+    for row, (_, weights) in enumerate(entries):
+        unexpected = [name for name in weights if name not in names]
+        if unexpected:
+            raise JointMismatchError(path, (), unexpected, names)
+        for name, weight in weights.items():
+            matrix[row, names.index(name)] = weight
+    return matrix
+
+
+def _check_mechanism(
+    path: Path, names: tuple[str, ...], J_a: np.ndarray, C: np.ndarray, K_s: np.ndarray
+) -> None:
+    """``[J_a; C]`` must have full row rank, and K_s must hold what it leaves free."""
+    B = np.vstack([J_a, C])
+    _, singular, V = np.linalg.svd(B)
+    rank = int((singular > 1e-9 * singular[0]).sum())
+    if rank < len(B):
+        parts = f"{len(J_a)} actuators and {len(C)} couplings give only {rank} independent rows"
+        raise DescriptionError(path, f"moment arms and couplings must be linearly independent: {parts}")
+    N = V[rank:].T
+    if N.size:
+        stiffness, modes = np.linalg.eigh(N.T @ (K_s[:, None] * N))
+        if stiffness[0] <= 1e-9 * max(1.0, stiffness[-1]):
+            loose = np.abs(N @ modes[:, 0])
+            joints = ", ".join(
+                name for name, part in zip(names, loose, strict=True) if part > 0.3 * loose.max()
+            )
+            problem = "no spring, actuator or coupling holds the joints"
+            raise DescriptionError(path, f"{problem} {joints}: give them a positive 'spring' in [joints]")
+
+
+def _check_base(path: Path, base: str, urdf: UrdfModel) -> None:
+    """The hand frame must not move: only fixed joints between the root and it."""
+    parents = {joint.child: joint for joint in urdf.joints}
+    links = [link.name for link in urdf.links]
+    if base not in links:
+        raise DescriptionError(path, f"[hand]: unknown base_link '{base}'; links are: {', '.join(links)}")
+    link = base
+    while link in parents:
+        if parents[link].kind != "fixed":
+            joint = parents[link].name
+            raise DescriptionError(
+                path, f"[hand]: base_link '{base}' moves with joint '{joint}'; choose a fixed link"
+            )
+        link = parents[link].parent
+
+
+def _check_unique(path: Path, kind: str, names: Iterable[str]) -> None:
+    names = list(names)
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise DescriptionError(path, f"{kind} names must be unique, repeated: {', '.join(twice)}")
