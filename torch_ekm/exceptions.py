@@ -137,6 +137,22 @@ class NoContactError(GraspError):
     """Nothing touches the object, so there is no manipulation Jacobian."""
 
 
+class PenetrationError(GraspError):
+    """A finger lies deeper inside the object than a contact can explain.
+
+    Attributes:
+        finger: name of the contact pad.
+        depth: how deep [m].
+    """
+
+    def __init__(self, finger: str, depth: float, limit: float) -> None:
+        self.finger, self.depth = finger, depth
+        super().__init__(
+            f"'{finger}' lies {1e3 * depth:.1f} mm inside the object, more than {1e3 * limit:.1f} mm: "
+            "the object's pose or the joint angles cannot be right"
+        )
+
+
 class SingularGraspError(GraspError):
     """Some motion meets no stiffness and no constraint, or a step is impossible.
 
@@ -200,3 +216,34 @@ class EquilibriumError(SolverError):
 
 class UnreachableTargetError(EKMError):
     """A target lies outside what the object's workspace or the actuators allow."""
+
+
+# -- sensors ----------------------------------------------------------------------------------
+
+
+class CalibrationError(EKMError):
+    """A sensor cannot be calibrated from these measurements.
+
+    Attributes:
+        sensor: its name.
+    """
+
+    def __init__(self, sensor: str, problem: str) -> None:
+        self.sensor, self.problem = sensor, problem
+        super().__init__(f"calibration of {sensor}: {problem}")
+
+
+class NonMonotoneFitError(CalibrationError):
+    """A calibration curve that turns back would give two readings to one angle.
+
+    Attributes:
+        reading: where the fitted curve turns.
+    """
+
+    def __init__(self, sensor: str, reading: float, valid: str) -> None:
+        self.reading = reading
+        super().__init__(
+            sensor,
+            f"the fitted curve turns back at reading {reading:.1f}, within {valid}; sweep the joint "
+            "over its whole range, slowly, and leave out readings taken while it was blocked",
+        )

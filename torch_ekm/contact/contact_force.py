@@ -1,0 +1,300 @@
+"""Contact and actuator forces of a grasp at a measured state: the relaxed minimal-force problem."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .._extras import require
+from ..exceptions import ParameterError
+from .friction import FrictionCone, cutting_planes, directions
+
+Array = NDArray[np.float64]
+FRICTION = ("cuts", "cone", "pyramid_inner", "pyramid_outer")
+BALANCE = ("relaxed", "equality")
+
+
+class ForceStatus(Enum):
+    """What became of the force problem."""
+
+    SOLVED = "solved"
+    NOT_GRASPABLE = "not_graspable"
+    """No forces inside the cones and bounds balance the object."""
+    FAILED = "failed"
+    """The solver gave up; nothing is known."""
+
+
+@dataclass(frozen=True)
+class ForceOptions:
+    """Weights and forms of the force problem.
+
+    Raises:
+        ParameterError: a value outside its range.
+    """
+
+    force_weight: float = 1e-6
+    """eps: weight of |mu|^2 against the squared, whitened joint residual [1/N^2]."""
+    actuator_weight: float = 1.0
+    """k: weight of |lam r/L|^2 relative to |mu|^2, r the norm of the actuator's moment arms."""
+    torque_std: float = 0.02
+    """Standard deviation of unmodelled joint torque, Sigma_tau^(1/2) [N m]."""
+    length: float = 0.03
+    """L: moments are divided by it [m]."""
+    min_normal: float = 0.0
+    """Lower bound of every normal force [N]."""
+    max_force: float = 1e3
+    """Upper bound of every normal force [N]."""
+    max_actuator: float = math.inf
+    """Bound of every actuator force [N or N m]."""
+    friction: str = "cuts"
+    """"cuts": exact, cutting planes on QPs; "cone": exact, one conic program (Clarabel); "pyramid_inner",
+    "pyramid_outer": polyhedra with ``faces`` faces."""
+    faces: int = 16
+    balance: str = "relaxed"
+    """"relaxed": joint balance soft; "equality": both balances hard (the paper's form)."""
+    tolerance: float = 2e-7
+    """Largest friction violation left by cutting planes [N]."""
+    max_cuts: int = 30
+    solver: str = "piqp"
+    """QP solver, one of qpsolvers' names."""
+
+    def __post_init__(self) -> None:
+        if self.friction not in FRICTION:
+            raise ParameterError("friction", self.friction, f"one of {', '.join(FRICTION)}")
+        if self.balance not in BALANCE:
+            raise ParameterError("balance", self.balance, f"one of {', '.join(BALANCE)}")
+        for name in ("force_weight", "torque_std", "length", "tolerance"):
+            if not getattr(self, name) > 0:
+                raise ParameterError(name, getattr(self, name), "positive")
+        if self.faces < 4:
+            raise ParameterError("faces", self.faces, "at least 4 (16 or more advised)")
+
+
+@dataclass(frozen=True)
+class BalanceEquations:
+    """Equilibrium at one state, reduced to the permitted motions (rigid couplings taken out).
+
+    ```
+    object_matrix mu = object_load                         G mu = V_p
+    hand_matrix mu + actuator_matrix lam + bound_matrix tau - r = -hand_load
+    ```
+    """
+
+    object_matrix: Array
+    """G, ``(n_w, n_h)``."""
+    object_load: Array
+    """V_p, ``(n_w,)``."""
+    hand_matrix: Array
+    """(J_h Z)^T, ``(n_z, n_h)``."""
+    actuator_matrix: Array
+    """(J_a Z)^T, ``(n_z, n_a)``."""
+    hand_load: Array
+    """Z^T V_q, ``(n_z,)``."""
+    cones: tuple[FrictionCone, ...]
+    moment_rows: Array
+    """Rows of ``object_load`` that are moments, bool ``(n_w,)``."""
+    tendon: Array
+    """Actuators that only pull, bool ``(n_a,)``."""
+    spin_columns: tuple[int, ...] = ()
+    """Components of ``mu`` that are moments."""
+    bound_matrix: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    """Z^T of unit joint torques with bounds of their own (stops, dry friction), ``(n_z, n_t)``."""
+    bound_lower: Array = field(default_factory=lambda: np.zeros(0))
+    bound_upper: Array = field(default_factory=lambda: np.zeros(0))
+    weight: Array | None = None
+    """(Z^T Z)^-1: whitens r where the permitted motions are not orthonormal."""
+    measured_normal: Array | None = None
+    """Measured normal forces [N], NaN where there is none."""
+    normal_std: float = 0.3
+    """Their standard deviation [N]."""
+
+
+@dataclass(frozen=True)
+class ForceSolution:
+    """Forces in the order of the problem's unknowns; NaN unless solved."""
+
+    status: ForceStatus
+    mu: Array
+    """[N], moment rows [N m]."""
+    lam: Array
+    """Minus the actuator forces along +a [N or N m]."""
+    bound: Array
+    """Torques of stops and dry friction [N m]."""
+    residual: Array
+    """r: unexplained generalised torque, ``(n_z,)`` [N m]. Large: wrong spring, wrong rest angle, slipping."""
+    violation: float
+    """Smallest norm of the unbalanced object wrench (moments divided by L) [N]; about 0 when solved."""
+    solves: int
+    """Number of QPs."""
+
+
+def force_problem(
+    eq: BalanceEquations, options: ForceOptions, extra: Array | None = None, soft: bool = False
+):
+    """Build the QP in ``x = [mu; lam; tau]``, all scaled to newtons.
+
+    ```
+    min  eps (|mu|^2 + k |lam r/L|^2) + |r|^2 / sigma^2 + sum (f_n - measured)^2 / sigma_n^2
+    s.t. G mu = V_p,  f_n >= f_min,  friction,  -lam >= 0 for tendons,  bounds
+    ```
+
+    Args:
+        eq: the balance.
+        options: weights and forms.
+        extra: more rows ``g mu <= 0`` (cutting planes).
+        soft: put the object balance into the cost, to measure how far it is from possible.
+
+    Returns:
+        ``qpsolvers.Problem`` and the scale of the unknowns, ``unknowns = scale * x``.
+    """
+    qpsolvers = require("qpsolvers")
+    L = options.length
+    n_h, n_a, n_t = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1], len(eq.bound_lower)
+    n = n_h + n_a + n_t
+    scale = np.ones(n)
+    scale[list(eq.spin_columns)] = L
+    scale[n_h:] = L
+    arm = np.linalg.norm(
+        eq.actuator_matrix, axis=0
+    )  # typical moment arm: 1 for motors in rad, a radius for cables in m
+    scale[n_h : n_h + n_a] /= np.where(arm > 0, arm, 1.0)
+    row_scale = np.where(eq.moment_rows, 1 / L, 1.0)
+    balance = np.zeros((len(eq.object_load), n))
+    balance[:, :n_h] = eq.object_matrix * row_scale[:, None] * scale[:n_h]
+    load = eq.object_load * row_scale
+    joint = np.empty((len(eq.hand_load), n))
+    joint[:, :n_h] = eq.hand_matrix
+    joint[:, n_h : n_h + n_a] = eq.actuator_matrix
+    if n_t:
+        joint[:, n_h + n_a :] = eq.bound_matrix
+    joint *= scale
+
+    P = np.diag(np.concatenate([np.ones(n_h), np.full(n_a, options.actuator_weight), np.full(n_t, 1e-3)]))
+    P *= options.force_weight
+    q = np.zeros(n)
+    hard, rhs = balance, load
+    if options.balance == "relaxed":
+        W = 1 / options.torque_std**2 if eq.weight is None else eq.weight / options.torque_std**2
+        WJ = W * joint if eq.weight is None else W @ joint
+        P += joint.T @ WJ
+        q += WJ.T @ eq.hand_load
+    else:
+        hard, rhs = np.concatenate([balance, joint]), np.concatenate([load, -eq.hand_load])
+    if soft:
+        P = P * 1e-9 + hard.T @ hard
+        q = q * 1e-9 - hard.T @ rhs
+        hard, rhs = None, None
+    normals = [cone.start for cone in eq.cones]
+    if eq.measured_normal is not None:
+        known = np.isfinite(eq.measured_normal)
+        for i, column in enumerate(normals):
+            if known[i]:
+                P[column, column] += 1 / eq.normal_std**2
+                q[column] -= eq.measured_normal[i] / eq.normal_std**2
+
+    rows = []
+    for cone in eq.cones:
+        d, cosine = directions(cone.dim, options.faces if "pyramid" in options.friction else 8)
+        if cone.dim:
+            rows.append(
+                cone.rows(d, n_h, cosine if options.friction == "pyramid_inner" and cone.dim > 1 else 1.0)
+            )
+    if extra is not None:
+        rows.append(extra)
+    inequality = np.zeros((sum(len(r) for r in rows), n))
+    if rows:
+        inequality[:, :n_h] = np.concatenate(rows) * scale[:n_h]
+    lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
+    lower[normals], upper[normals] = options.min_normal, options.max_force
+    lower[n_h : n_h + n_a] = -options.max_actuator / scale[n_h : n_h + n_a]
+    upper[n_h : n_h + n_a] = np.where(eq.tendon, 0.0, options.max_actuator / scale[n_h : n_h + n_a])
+    if n_t:
+        lower[n_h + n_a :], upper[n_h + n_a :] = eq.bound_lower / L, eq.bound_upper / L
+    h = np.zeros(len(inequality))
+    return qpsolvers.Problem(P, q, inequality, h, hard, rhs, lower, upper), scale
+
+
+def contact_forces(eq: BalanceEquations, options: ForceOptions | None = None) -> ForceSolution:
+    """Forces that balance the object exactly and the joints as well as possible.
+
+    The object balance is hard (mass and contact geometry are known best), the joint balance soft:
+    an equality there is infeasible for nearly every measured state. Friction is exact by cutting
+    planes, or by one conic program, or a polyhedron, as the options say.
+
+    Never raises for an impossible grasp: read ``status`` and ``violation``.
+    """
+    options = options or ForceOptions()
+    if options.friction == "cone":
+        from .conic import solve_conic
+
+        return solve_conic(eq, options)
+    cuts = np.zeros((0, eq.object_matrix.shape[1]))
+    solution, scale, solves = None, None, 0
+    for _ in range(options.max_cuts):
+        problem, scale = force_problem(eq, options, cuts)
+        solution = solve_qp(problem, options.solver)
+        solves += 1
+        if not solution.found or options.friction != "cuts":
+            break
+        new = cutting_planes(eq.cones, (scale * solution.x)[: cuts.shape[1]], options.tolerance)
+        if not len(new):
+            break
+        cuts = np.concatenate([cuts, new])
+    assert solution is not None and scale is not None
+    if not solution.found:
+        return _failure(eq, options, cuts, solves)
+    return unpack(eq, options, scale * solution.x, solves)
+
+
+def solve_qp(problem, solver: str):
+    """Solve a ``qpsolvers.Problem``; tight tolerances where the solver is PIQP."""
+    qpsolvers = require("qpsolvers")
+    settings = {"eps_abs": 1e-10, "eps_rel": 1e-11} if solver == "piqp" else {}
+    return qpsolvers.solve_problem(problem, solver, **settings)
+
+
+def unpack(eq: BalanceEquations, options: ForceOptions, unknowns: Array, solves: int) -> ForceSolution:
+    """Split ``[mu; lam; tau]`` and certify it: joint residual and object violation from the equations."""
+    n_h, n_a = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1]
+    mu, lam, bound = np.split(unknowns, [n_h, n_h + n_a])
+    residual = eq.hand_load + eq.hand_matrix @ mu + eq.actuator_matrix @ lam
+    if len(bound):
+        residual = residual + eq.bound_matrix @ bound
+    unbalanced = (eq.object_matrix @ mu - eq.object_load) * np.where(eq.moment_rows, 1 / options.length, 1.0)
+    return ForceSolution(
+        ForceStatus.SOLVED, mu, lam, bound, residual, float(np.linalg.norm(unbalanced)), solves
+    )
+
+
+def _failure(eq: BalanceEquations, options: ForceOptions, cuts: Array, solves: int) -> ForceSolution:
+    """Find out whether the balance is impossible or the solver failed."""
+    problem, scale = force_problem(eq, options, cuts, soft=True)
+    solution = solve_qp(problem, options.solver)
+    n_h, n_a = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1]
+    status, violation = ForceStatus.FAILED, math.nan
+    if solution.found:
+        violation = unpack(eq, options, scale * solution.x, solves).violation
+        status = ForceStatus.NOT_GRASPABLE
+    nan = np.full
+    return ForceSolution(
+        status,
+        nan(n_h, np.nan),
+        nan(n_a, np.nan),
+        nan(len(eq.bound_lower), np.nan),
+        nan(len(eq.hand_load), np.nan),
+        violation,
+        solves + 1,
+    )
+
+
+def margins(cones: Sequence[FrictionCone], mu: Array) -> tuple[Array, Array]:
+    """Per contact ``mu_s f_n - |u|`` [N] and the same relative to ``mu_s f_n`` (1: no friction used, 0: slips)."""
+    slack = np.array([cone.slack(mu) for cone in cones])
+    limit = np.array([cone.mu_s * mu[cone.start] for cone in cones])
+    relative = np.divide(slack, limit, out=np.zeros_like(slack), where=limit > 1e-12)
+    return slack, relative

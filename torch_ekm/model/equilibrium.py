@@ -1,0 +1,276 @@
+"""Exact quasi-static configurations: Newton on the equilibrium equations, with continuation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from ..contact.contact_kinematics import ContactKinematics, constraint_matrix
+from ..contact.contact_set import ContactSet
+from ..contact.surface import TrackedContacts
+from ..exceptions import EquilibriumError
+from ..typing import Float, Tensor
+from .force_balance import pack_forces
+from .kinematic_model import KinematicModel
+from .linearization import GraspForces
+from .potential import gravity_gradient, gravity_hessian, spring_torque
+from .state import GraspState
+from .stiffness import geometric_stiffness
+
+
+@dataclass(frozen=True)
+class Equilibrium:
+    """A configuration at rest."""
+
+    state: GraspState
+    a: Float[Tensor, " n_a"]
+    """Actuator positions (of compliant actuators: what is commanded) [rad]."""
+    mu: Float[Tensor, " n_h"]
+    lam: Float[Tensor, " n_a"]
+    stop: Float[Tensor, " n_k"]
+    """Torques on held joints [N m]."""
+    contacts: ContactSet
+    residual: float
+    """Largest entry of the scaled equations that were solved."""
+
+    @property
+    def n_c(self) -> int:
+        return self.contacts.n_c
+
+
+class EquilibriumSolver:
+    """Solves the nonlinear equations of rest for given actuator positions.
+
+    ```
+    V_s(s) + A(s)^T mu + B^T lam - E_h^T tau = 0       balance (couplings reduced out)
+    gap_i(s) = 0                                        contacts close
+    [t; spin rows of A]((s_k + s)/2) (s - s_k) = 0      and roll from the previous configuration s_k
+    a(s) - lam/K_a = a                                  actuators, with their series stiffness
+    q_j = const                                         held joints
+    ```
+
+    The contact points are exact functions of the state (:class:`TrackedContacts`). Rolling in space is not holonomic,
+    so the answer depends on the path from the first configuration: large moves are cut into steps of at most
+    ``max_step``, whose midpoint rule leaves an error of third order. Newton's matrix is the model's stiffness D; only
+    the speed of convergence depends on it, not the answer.
+
+    Args:
+        model: gives hand, object and options (contacts are taken as rolling whatever the options say).
+        state: a configuration with the fingers in contact.
+        contacts: its contacts; by default from the model's detector.
+        held: joints that do not move (at a stop), by index.
+        max_step: largest change of an actuator in one continuation step [rad].
+        tolerance: on the scaled equations (N m, rad).
+    """
+
+    def __init__(
+        self,
+        model: KinematicModel,
+        state: GraspState,
+        contacts: ContactSet | None = None,
+        *,
+        held: tuple[int, ...] = (),
+        max_step: float = 0.02,
+        tolerance: float = 1e-12,
+        max_iterations: int = 60,
+    ) -> None:
+        self.model, self.held, self.max_step = model, list(held), max_step
+        self.tolerance, self.max_iterations = tolerance, max_iterations
+        contacts = model.contacts(state) if contacts is None else contacts
+        links = [model.link_names.index(name) for name in contacts.link]
+
+        def link_pose(q: Tensor) -> Tensor:
+            return model.kinematics(q).transforms[links]
+
+        self.surfaces = TrackedContacts(contacts, link_pose, state.q, state.position, state.rotation)
+        self.start = state
+        reduction = model.reduction
+        self.Z = reduction.scaled_basis
+        self.B = reduction.actuation @ self.Z[: model.hand.n_q]
+        self.compliance = 1 / reduction.stiffness  # 0 for rigid actuators
+        self.offset = torch.as_tensor(model.hand.actuator_offset, dtype=self.Z.dtype)
+
+    def actuators(self, state: GraspState) -> Float[Tensor, " n_a"]:
+        """``a(q) = offset + J_a q`` [rad]."""
+        return self.offset + self.model.reduction.actuation @ state.q
+
+    @torch.no_grad()
+    def find(
+        self,
+        normal_force: Float[Tensor, " n_c"] | None = None,
+        *,
+        forces: GraspForces | None = None,
+        normal_std: float = 0.05,
+        steps: int = 8,
+    ) -> Equilibrium:
+        """An equilibrium near the first configuration, with normal forces near those wished for.
+
+        Starts from the relaxed forces there; the joint torques that they leave unexplained are then faded
+        out, the actuators staying where they are.
+
+        Args:
+            normal_force: wished normal forces [N].
+            forces: start from these in place of the relaxed ones.
+            normal_std: how much a wish may be missed [N]; small: rather leave torque to fade out.
+            steps: of the fading.
+
+        Raises:
+            EquilibriumError: no forces balance the object, or Newton fails on the way.
+        """
+        if forces is None:
+            forces = self._forces(normal_force, normal_std)
+        if not forces.solved:
+            raise EquilibriumError(
+                "newton", f"no forces balance the object at the start: {forces.status[0].value}"
+            )
+        _, kin = self._geometry(self.start)
+        stop = forces.stop_torque[self.held]
+        a = self.actuators(self.start) - self.compliance * forces.lam
+        at = Equilibrium(self.start, a, forces.mu, forces.lam, stop, kin.contacts, float("inf"))
+        unexplained = self._balance(at.state, kin, at.mu, at.lam, at.stop)
+        gap = kin.contacts.gap
+        fraction, size = 1.0, 1.0 / steps
+        while fraction > 0:
+            target = max(0.0, fraction - size)
+            try:
+                at = self._newton(at, a, target * unexplained, target * gap)
+                fraction = target
+            except EquilibriumError:
+                size /= 2
+                if size < 1e-3:
+                    raise
+        return at
+
+    @torch.no_grad()
+    def move(self, start: Equilibrium, a: Float[Tensor, " n_a"]) -> Equilibrium:
+        """The equilibrium reached from ``start`` when the actuators go straight to ``a`` [rad].
+
+        Raises:
+            EquilibriumError: the path ends before (a fold: the grasp buckles, or a contact is lost).
+        """
+        at, total = start, a - start.a
+        steps = max(1, int(torch.ceil(total.abs().amax() / self.max_step - 1e-9)))
+        done, size = 0.0, 1.0 / steps
+        while done < 1 - 1e-12:
+            target = min(1.0, done + size)
+            try:
+                at = self._newton(at, start.a + target * total)
+                done = target
+            except EquilibriumError as error:
+                size /= 2
+                if size * steps < 1 / 64:
+                    raise EquilibriumError(
+                        "newton", f"{100 * done:.0f} % of the way: {error.status}"
+                    ) from error
+        return at
+
+    def _forces(self, wish: Tensor | None, std: float) -> GraspForces:
+        model = self.model
+        _, kin = self._geometry(self.start)
+        A = constraint_matrix(kin)
+        V_q, V_p = self._potential(self.start)
+        return model.balance(self.start.q, kin, A, V_q, V_p, self.held, wish, None, std)
+
+    def _geometry(self, state: GraspState) -> tuple[ContactSet, ContactKinematics]:
+        contacts = self.surfaces(state.q, state.position, state.rotation)
+        return contacts, self.model.contact_kinematics(state, contacts, rolling=True)
+
+    def _potential(self, state: GraspState) -> tuple[Tensor, Tensor]:
+        model = self.model
+        V_q = spring_torque(state.q, model.spring_stiffness, model.spring_rest)  # type: ignore[arg-type]
+        V_p = gravity_gradient(model.weight, state.rotation @ model.com)  # type: ignore[arg-type, operator]
+        return V_q, V_p
+
+    def _balance(
+        self, state: GraspState, kin: ContactKinematics, mu: Tensor, lam: Tensor, stop: Tensor
+    ) -> Tensor:
+        A = constraint_matrix(kin) @ self.Z
+        n_q = self.model.hand.n_q
+        F = self.Z.mT @ torch.cat(self._potential(state)) + A.mT @ mu + self.B.mT @ lam
+        return F - self.Z[:n_q][self.held].mT @ stop
+
+    def _newton(
+        self, at: Equilibrium, a: Tensor, unexplained: Tensor | None = None, gap: Tensor | None = None
+    ) -> Equilibrium:
+        """One continuation step from ``at``."""
+        model, Z = self.model, self.Z
+        n_q, n_z, L = model.hand.n_q, Z.shape[1], model.options.length
+        state, mu, lam, stop = at.state, at.mu, at.lam, at.stop
+        E_h = Z[:n_q][self.held]
+        before = self.surfaces.pinned_offset(at.state.q, at.state.position, at.state.rotation)
+        best, stalled = float("inf"), 0
+        for _ in range(self.max_iterations):
+            contacts, kin = self._geometry(state)
+            A_s = constraint_matrix(kin)
+            closing = self._closing(kin, at.state, state, before, gap)
+            row_scale = torch.tensor([1 / L if row % 6 < 3 else 1.0 for row in kin.rows], dtype=Z.dtype)
+            F = self._balance(state, kin, mu, lam, stop)
+            if unexplained is not None:
+                F = F - unexplained
+            G = [
+                F,
+                row_scale * closing,
+                self.actuators(state) - self.compliance * lam - a,
+                (state.q - self.start.q)[self.held],
+            ]
+            error = torch.cat(G)
+            size = float(error.abs().max())
+            if not size < 1e6:
+                break
+            if size < self.tolerance or (size < 100 * self.tolerance and size >= 0.5 * best):
+                return Equilibrium(state, a, mu, lam, stop, contacts, size)
+            stalled = stalled + 1 if size > 0.9 * best else 0
+            best = min(best, size)
+            if stalled > 12:
+                break
+            forces = pack_forces(kin, mu, lam, **_EMPTY)
+            D = geometric_stiffness(kin, forces.force, forces.spin_moment, model.precedes)  # type: ignore[arg-type]
+            joints = torch.arange(n_q)
+            D[joints, joints] += model.spring_stiffness  # type: ignore[operator]
+            D[n_q:, n_q:] += gravity_hessian(model.weight, state.rotation @ model.com)  # type: ignore[arg-type, operator]
+            A = row_scale[:, None] * (A_s @ Z)
+            E = torch.cat([A, self.B, E_h])
+            corner = torch.diag(torch.cat([A.new_zeros(len(A)), self.compliance, A.new_zeros(len(E_h))]))
+            matrix = torch.cat([torch.cat([Z.mT @ D @ Z, E.mT], 1), torch.cat([E, -corner], 1)])
+            try:
+                step = torch.linalg.solve(matrix, -error)
+            except torch.linalg.LinAlgError:
+                break
+            dz, dmu, dlam, dstop = step.split([n_z, len(A), len(self.B), len(E_h)])
+            ds = Z @ dz
+            damping = min(1.0, 0.3 / max(float(dz.abs().max()), 1e-300))
+            state = state.plus(damping * ds)
+            mu, lam, stop = mu + damping * row_scale * dmu, lam + damping * dlam, stop - damping * dstop
+        raise EquilibriumError("newton", f"stopped at a residual of {best:.1e}")
+
+    def _closing(
+        self,
+        kin: ContactKinematics,
+        before: GraspState,
+        state: GraspState,
+        offset: Tensor,
+        gap: Tensor | None,
+    ) -> Tensor:
+        """Violation of the contact equations, one per row of A [m, rad]."""
+        ds = state.minus(before)
+        middle = before.plus(0.5 * ds)
+        _, kin_m = self._geometry(middle)
+        value = constraint_matrix(kin_m) @ ds
+        now = kin.contacts.gap if gap is None else kin.contacts.gap - gap
+        value[kin.normal_rows] = -now
+        pinned = [i for i, p in enumerate(kin.contacts.pinned) if p]
+        if pinned:
+            moved = self.surfaces.pinned_offset(state.q, state.position, state.rotation) - offset
+            rows = (kin.frame.mT @ (state.rotation @ moved[..., None]))[..., 0]
+            full = torch.zeros(kin.contacts.n_c, 6, dtype=value.dtype)
+            full[:, :3] = rows
+            translations = full.flatten()[kin.rows]
+            mask = torch.tensor([row // 6 in pinned and row % 6 < 3 for row in kin.rows])
+            value = torch.where(mask, translations, value)
+        return value
+
+
+_EMPTY = {
+    name: torch.zeros(0) for name in ("residual", "stop_torque", "margin", "relative_margin", "violation")
+} | {"status": ()}

@@ -1,0 +1,146 @@
+"""The force problem of one state, from the model's matrices, and its answer as tensors."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ..contact.contact_force import BalanceEquations, ForceStatus, contact_forces, margins
+from ..contact.contact_kinematics import ContactKinematics
+from ..contact.friction import friction_cones
+from ..description.hand import HandDescription
+from ..typing import Bool, Float, Tensor
+from .linearization import GraspForces
+from .options import ModelOptions
+from .reduction import Reduction
+
+
+class ForceBalance:
+    """Builds :class:`BalanceEquations` for each state of a batch and solves them one by one.
+
+    Joints near a limit get a one-sided stop torque, locked joints a free one, and dry friction a box,
+    beside the soft joint residual.
+    """
+
+    def __init__(self, hand: HandDescription, options: ModelOptions, reduction: Reduction) -> None:
+        self.options = options
+        self.joint_basis = reduction.joint_basis.double().numpy()
+        self.pose_basis = reduction.pose_basis.double().numpy()
+        self.actuation = (reduction.actuation.double().numpy() @ self.joint_basis).T
+        self.tendon = torch.tensor([actuator.tendon for actuator in hand.actuators])
+        self.lower, self.upper = hand.joint_lower, hand.joint_upper
+        self.friction = hand.joint_friction
+        self.movable = (np.abs(self.joint_basis) > 1e-9).any(1)
+        gram = self.joint_basis.T @ self.joint_basis
+        self.weight = None if np.allclose(gram, np.eye(len(gram))) else np.linalg.inv(gram)
+        # smallest joint torques that make up a generalised residual
+        self.lift = self.joint_basis @ np.linalg.inv(gram)
+        # in a plane the third row of the pose basis is the rotation
+        self.moment_rows = (np.abs(self.pose_basis[3:]) > 1e-9).any(0)
+
+    def near_stop(self, q: Float[Tensor, "*batch n_q"]) -> Bool[Tensor, "*batch n_q"]:
+        """Joints within the tolerance of a limit (or beyond it)."""
+        tolerance = self.options.stop_tolerance
+        lower, upper, movable = (
+            torch.as_tensor(v, device=q.device) for v in (self.lower, self.upper, self.movable)
+        )
+        return ((q <= lower + tolerance) | (q >= upper - tolerance)) & movable
+
+    def __call__(
+        self,
+        q: Tensor,
+        kin: ContactKinematics,
+        A: Tensor,
+        V_q: Tensor,
+        V_p: Tensor,
+        locked: list[int],
+        measured_normal: Tensor | None,
+        last: tuple[Tensor, Tensor] | None,
+        normal_std: float = 0.3,
+    ) -> GraspForces:
+        """Solve every state; where there is no answer use ``last = (mu, lam)`` or zeros."""
+        batch, n_q = q.shape[:-1], q.shape[-1]
+        flat = [
+            x.detach().reshape(-1, *x.shape[len(batch) :]).double().cpu().numpy() for x in (q, A, V_q, V_p)
+        ]
+        measured = None
+        if measured_normal is not None:
+            measured = measured_normal.detach().reshape(-1, kin.contacts.n_c).double().cpu().numpy()
+        cones = friction_cones(
+            kin.models, kin.contacts.friction.tolist(), kin.contacts.torsional_friction.tolist()
+        )
+        spins = tuple(at for at, row in enumerate(kin.rows) if row % 6 >= 3)
+        results = []
+        for k in range(len(flat[0])):
+            q_k, A_k, V_q_k, V_p_k = (x[k] for x in flat)
+            joints, lower, upper = self._bounded(q_k, locked)
+            eq = BalanceEquations(
+                object_matrix=-self.pose_basis.T @ A_k[:, n_q:].T,
+                object_load=self.pose_basis.T @ V_p_k,
+                hand_matrix=self.joint_basis.T @ A_k[:, :n_q].T,
+                actuator_matrix=self.actuation,
+                hand_load=self.joint_basis.T @ V_q_k,
+                cones=cones,
+                moment_rows=self.moment_rows,
+                tendon=self.tendon.numpy(),
+                spin_columns=spins,
+                bound_matrix=-self.joint_basis[joints].T,
+                bound_lower=lower,
+                bound_upper=upper,
+                weight=self.weight,
+                measured_normal=None if measured is None else measured[k],
+                normal_std=normal_std,
+            )
+            solution = contact_forces(eq, self.options.forces)
+            mu, lam = solution.mu, solution.lam
+            residual, torque = np.zeros(n_q), np.zeros(n_q)
+            if solution.status is ForceStatus.SOLVED:
+                residual = self.lift @ solution.residual
+                np.add.at(torque, joints, solution.bound)
+            elif last is not None:
+                mu, lam = (x.detach().double().cpu().numpy() for x in last)
+            else:
+                mu, lam = np.zeros_like(mu), np.zeros_like(lam)
+            slack, relative = margins(cones, mu)
+            results.append((mu, lam, residual, torque, slack, relative, solution))
+
+        def stack(i: int) -> Tensor:
+            value = torch.from_numpy(np.stack([r[i] for r in results])).to(q)
+            return value.reshape(*batch, *value.shape[1:])
+
+        violation = torch.tensor([r[6].violation for r in results], dtype=q.dtype, device=q.device)
+        return pack_forces(
+            kin,
+            stack(0),
+            stack(1),
+            residual=stack(2),
+            stop_torque=stack(3),
+            margin=stack(4),
+            relative_margin=stack(5),
+            status=tuple(r[6].status for r in results),
+            violation=violation.reshape(batch),
+        )
+
+    def _bounded(self, q: np.ndarray, locked: list[int]) -> tuple[list[int], np.ndarray, np.ndarray]:
+        """Joints with a torque of their own, and its bounds: stops push inwards, locks both ways, friction a box."""
+        lower, upper = np.zeros(len(q)), np.zeros(len(q))
+        if self.options.joint_stops:
+            tolerance = self.options.stop_tolerance
+            upper[(q <= self.lower + tolerance) & self.movable] = np.inf
+            lower[(q >= self.upper - tolerance) & self.movable] = -np.inf
+        lower[locked], upper[locked] = -np.inf, np.inf
+        if self.options.joint_friction:
+            lower, upper = lower - self.friction, upper + self.friction
+        joints = [int(j) for j in np.flatnonzero((lower < 0) | (upper > 0))]
+        return joints, lower[joints], upper[joints]
+
+
+def pack_forces(kin: ContactKinematics, mu: Tensor, lam: Tensor, **rest) -> GraspForces:
+    """Forces in hand axes from components in contact frames."""
+    n_c = kin.contacts.n_c
+    full = mu.new_zeros(*mu.shape[:-1], 6 * n_c)
+    full[..., kin.rows] = mu
+    full = full.unflatten(-1, (n_c, 6))
+    spin = full[..., 3]
+    force = (kin.frame @ full[..., :3, None])[..., 0]
+    return GraspForces(mu=mu, lam=lam, force=force, spin_moment=spin, normal=full[..., 0], **rest)

@@ -1,0 +1,116 @@
+"""What the kinematic model says about one state: forces, and how everything answers to the actuators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from ..contact.contact_force import ForceStatus
+from ..contact.contact_set import ContactSet
+from ..exceptions import ShapeError
+from ..typing import Bool, Float, Tensor
+from .state import GraspState
+
+
+class ModelStatus(Enum):
+    """How far a linearization can be trusted."""
+
+    OK = "ok"
+    REUSED_FORCES = "reused_forces"
+    """The force problem had no answer; D uses the forces of the previous step."""
+    NO_FORCES = "no_forces"
+    """The force problem had no answer; D leaves out S, T and rolling."""
+    UNSTABLE = "unstable"
+    """The grasp buckles; the Jacobian is formal (only with ``on_unstable="flag"``)."""
+
+
+@dataclass(frozen=True)
+class GraspForces:
+    """Forces at one state, hand frame. Where ``status`` is not SOLVED: those used in their stead."""
+
+    mu: Float[Tensor, "*batch n_h"]
+    """Finger on object, contact frames ``[n_in, t1, t2]`` [N], spin moments [N m]."""
+    lam: Float[Tensor, "*batch n_a"]
+    """Minus the actuator force along +a [N m]; a tendon's tension is ``-lam``."""
+    force: Float[Tensor, "*batch n_c 3"]
+    """f_i in hand axes [N]."""
+    spin_moment: Float[Tensor, "*batch n_c"]
+    """About the inward normal [N m]."""
+    normal: Float[Tensor, "*batch n_c"]
+    """f_n [N]."""
+    residual: Float[Tensor, "*batch n_q"]
+    """e, unexplained joint torque [N m]: large means a wrong spring, a wrong rest angle, or slipping."""
+    stop_torque: Float[Tensor, "*batch n_q"]
+    """Torque of joint stops, locks and dry friction on the joint [N m]."""
+    margin: Float[Tensor, "*batch n_c"]
+    """``mu_s f_n - |f_t|`` [N] (soft fingers: with the scaled spin moment): 0 at the friction cone."""
+    relative_margin: Float[Tensor, "*batch n_c"]
+    """``margin / (mu_s f_n)``: 1 without tangential load, 0 at the friction cone."""
+    status: tuple[ForceStatus, ...]
+    """One per state of the batch."""
+    violation: Float[Tensor, "*batch"]
+    """Smallest norm of the unbalanced object wrench, moments divided by L [N]."""
+
+    @property
+    def solved(self) -> bool:
+        """Every state of the batch was solved."""
+        return all(status is ForceStatus.SOLVED for status in self.status)
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """``ds = J_m da`` and the force sensitivities at one state (or a batch).
+
+    Rows of ``J_m``: joints [rad/rad], object point [m/rad], object rotation [rad/rad].
+    """
+
+    state: GraspState
+    contacts: ContactSet
+    forces: GraspForces
+    manipulation_jacobian: Float[Tensor, "*batch n_s n_a"]
+    """J_m."""
+    contact_force_sensitivity: Float[Tensor, "*batch n_h n_a"]
+    """dmu/da [N/rad]: change of the force vectors, read in the present contact frames."""
+    actuator_force_sensitivity: Float[Tensor, "*batch n_a n_a"]
+    """dlam/da [N m/rad]."""
+    normal_force_sensitivity: Float[Tensor, "*batch n_c n_a"]
+    """d f_n/da [N/rad], the turning of the normals included: rows for regulating the grip."""
+    margin_sensitivity: Float[Tensor, "*batch n_c n_a"]
+    """d margin/da [N/rad]."""
+    normal_rows: tuple[int, ...]
+    """Position of each contact's normal force in ``mu``."""
+    held_joints: Bool[Tensor, "*batch n_q"]
+    """Joints that a stop or a lock holds."""
+    stability: Float[Tensor, "*batch"]
+    """Smallest eigenvalue of the stiffness with locked actuators, translations in units of L [N m/rad]."""
+    status: ModelStatus
+
+    @property
+    def n_q(self) -> int:
+        return self.state.q.shape[-1]
+
+    @property
+    def joint_jacobian(self) -> Float[Tensor, "*batch n_q n_a"]:
+        """dq/da."""
+        return self.manipulation_jacobian[..., : self.n_q, :]
+
+    @property
+    def object_jacobian(self) -> Float[Tensor, "*batch 6 n_a"]:
+        """d(o, phi)/da: rows x, y, z [m/rad], then rotation [rad/rad], hand axes."""
+        return self.manipulation_jacobian[..., self.n_q :, :]
+
+    @property
+    def margins(self) -> Float[Tensor, "*batch n_c"]:
+        """``mu_s f_n - |f_t|`` of each contact [N]."""
+        return self.forces.margin
+
+    def step(self, delta_a: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_s"]:
+        """``ds = J_m da``.
+
+        Raises:
+            ShapeError: ``delta_a`` does not have one entry per actuator.
+        """
+        n_a = self.manipulation_jacobian.shape[-1]
+        if delta_a.shape[-1:] != (n_a,):
+            raise ShapeError("delta_a", f"(*batch, {n_a})", delta_a.shape, "one entry per actuator")
+        return (self.manipulation_jacobian @ delta_a[..., None])[..., 0]

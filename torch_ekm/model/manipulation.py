@@ -1,0 +1,182 @@
+"""The quasi-static step of an elastic hand: three algebraically identical forms.
+
+```
+D ds + E^T dnu = F da        E = [A; B],  dnu = [dmu; dlam]
+E ds           = R da        R = [0; I]
+```
+
+``F`` is 0 for rigid actuators and ``B^T K_a`` for compliant ones, whose rows then stand in D
+(``D + B^T K_a B``) instead of in E. All inputs may carry batch dimensions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from ..exceptions import SingularGraspError, UnstableGraspError
+from ..typing import Float, Tensor
+
+
+@dataclass(frozen=True)
+class Step:
+    """Answer of the grasp to a unit motion of each actuator."""
+
+    motion: Float[Tensor, "*batch n n_a"]
+    """J: ds = J da."""
+    reaction: Float[Tensor, "*batch m n_a"]
+    """dnu/da, multipliers of the rows of E."""
+    stability: Float[Tensor, "*batch"]
+    """Smallest eigenvalue of sym(N^T D N), the stiffness with the actuators locked; inf if N is empty."""
+
+
+def two_stage(
+    D: Float[Tensor, "*batch n n"],
+    E: Float[Tensor, "*batch m n"],
+    R: Float[Tensor, "m n_a"],
+    F: Float[Tensor, "*batch n n_a"] | None = None,
+    *,
+    rank_tolerance: float = 1e-8,
+    stiffness_tolerance: float = 1e-9,
+    on_unstable: str = "raise",
+) -> Step:
+    """``J = P - N (N^T D N)^-1 N^T (D P - F)``, ``P = E^+ R``, ``N = null(E)``.
+
+    Only the stiffness with the actuators locked, ``N^T D N``, is inverted, by LU: it is not symmetric
+    for rolling and soft fingers. Redundant rows of E are allowed as long as they agree with R.
+
+    Args:
+        D: stiffness, in coordinates scaled so that its entries compare.
+        E: rows that hold exactly.
+        R: how fast each row is driven by each actuator.
+        F: generalised forces of compliant actuators, per unit of da.
+        rank_tolerance: singular values of E below this share of the largest are zero.
+        stiffness_tolerance: eigenvalues of N^T D N within this share of |D| are zero.
+        on_unstable: "raise", or "flag" (return the formal answer; read ``stability``).
+
+    Raises:
+        SingularGraspError: a motion without stiffness and constraint, or rigid actuators that
+            contradict each other; the direction comes along.
+        UnstableGraspError: N^T D N has a negative eigenvalue: the grasp buckles.
+    """
+    pinv, N = _range_and_null(E, rank_tolerance)
+    P = pinv @ R
+    lost = E @ P - R
+    if lost.numel() and float(lost.abs().max()) > 1e-6:
+        _raise_contradiction(lost, P)
+    load = D @ P if F is None else D @ P - F
+    stability = torch.full(D.shape[:-2], torch.inf, dtype=D.dtype, device=D.device)
+    J = P
+    if N.shape[-1]:
+        K = N.mT @ D @ N
+        values = torch.linalg.eigvalsh(0.5 * (K + K.mT))
+        stability = values[..., 0]
+        size = torch.linalg.matrix_norm(D)
+        if bool((stability <= stiffness_tolerance * size).any()):
+            _judge(K, N, stability, stiffness_tolerance * size, on_unstable)
+        J = P - N @ torch.linalg.solve(K, N.mT @ load)
+    unbalanced = D @ J if F is None else D @ J - F
+    return Step(J, -(pinv.mT @ unbalanced), stability)
+
+
+def kkt_form(
+    D: Float[Tensor, "*batch n n"],
+    E: Float[Tensor, "*batch m n"],
+    R: Float[Tensor, "m n_a"],
+    F: Float[Tensor, "*batch n n_a"] | None = None,
+    compliance: Float[Tensor, " m"] | None = None,
+) -> tuple[Float[Tensor, "*batch n n_a"], Float[Tensor, "*batch m n_a"]]:
+    """``[[D, E^T], [E, -compliance]] [J; dnu/da] = [F; R]``: motion and multipliers at once.
+
+    Args:
+        compliance: ``1/K`` of each row (tendon, servo, contact); 0 or None: rigid.
+    """
+    n, m = D.shape[-1], E.shape[-2]
+    corner = torch.zeros(*D.shape[:-2], m, m, dtype=D.dtype, device=D.device)
+    if compliance is not None:
+        corner = corner - torch.diag(compliance)
+    matrix = torch.cat([torch.cat([D, E.mT], -1), torch.cat([E, corner], -1)], -2)
+    top = torch.zeros(*D.shape[:-2], n, R.shape[-1], dtype=D.dtype, device=D.device) if F is None else F
+    rhs = torch.cat([top, R.expand(*D.shape[:-2], *R.shape)], -2)
+    J, dnu = torch.linalg.solve(matrix, rhs).split([n, m], dim=-2)
+    return J, dnu
+
+
+def null_space_form(
+    D: Float[Tensor, "n n"],
+    A: Float[Tensor, "n_h n"],
+    B: Float[Tensor, "n_a n"],
+    rank_tolerance: float = 1e-8,
+) -> Float[Tensor, "n n_a"]:
+    """``J = R K^-1 R^T B^T (B R K^-1 R^T B^T)^-1``, ``R = null(A)``, ``K = R^T D R``: the paper's form.
+
+    For comparison: it needs K itself to be invertible, which a stable grasp does not promise, and it is
+    silently wrong if there are more actuators than mobility.
+    """
+    _, basis = _range_and_null(A, rank_tolerance)
+    K = basis.mT @ D @ basis
+    X = basis @ torch.linalg.solve(K, basis.mT @ B.mT)
+    return X @ torch.linalg.inv(B @ X)
+
+
+def _range_and_null(E: Tensor, rank_tolerance: float) -> tuple[Tensor, Tensor]:
+    """``E^+`` and an orthonormal null-space basis; QR where E has full row rank, else SVD."""
+    m, n = E.shape[-2:]
+    if m == 0:
+        eye = torch.eye(n, dtype=E.dtype, device=E.device).expand(*E.shape[:-2], n, n)
+        return E.mT, eye
+    if m <= n:
+        Q, upper = torch.linalg.qr(E.mT, mode="complete")
+        triangle = upper[..., :m, :]
+        diagonal = triangle.diagonal(dim1=-2, dim2=-1).abs()
+        if bool((diagonal.amin(-1) > rank_tolerance * diagonal.amax(-1)).all()):
+            inverse = torch.linalg.solve_triangular(
+                triangle, torch.eye(m, dtype=E.dtype, device=E.device).expand(triangle.shape), upper=True
+            )
+            # |T^-1|_F |T|_F bounds the condition number from above
+            cond = torch.linalg.matrix_norm(inverse) * torch.linalg.matrix_norm(triangle)
+            if bool((cond < 1 / rank_tolerance).all()):
+                return Q[..., :m] @ inverse.mT, Q[..., m:]
+    U, sigma, Vh = torch.linalg.svd(E, full_matrices=True)
+    rank = (sigma > rank_tolerance * sigma[..., :1].clamp_min(1e-300)).sum(-1)
+    r = int(rank.max())
+    if int(rank.min()) != r:
+        raise SingularGraspError("the states of a batch have constraints of different rank: treat them apart")
+    pinv = (Vh[..., :r, :].mT / sigma[..., None, :r]) @ U[..., :r].mT
+    return pinv, Vh[..., r:, :].mT
+
+
+def _raise_contradiction(lost: Tensor, P: Tensor) -> None:
+    worst = lost.abs().flatten(0, -2).amax(0).argmax()
+    direction = P.flatten(0, -3)[0][:, worst] if P.dim() > 2 else P[:, worst]
+    raise SingularGraspError(
+        f"actuator {int(worst)} cannot move alone: the contacts, couplings and the other rigid actuators forbid it "
+        f"(rows violated by {float(lost.abs().max()):.2g}); there are more rigid actuators than mobility. "
+        "Give the actuators or the contacts a finite stiffness",
+        direction=(direction / torch.linalg.vector_norm(direction).clamp_min(1e-300)).detach(),
+    )
+
+
+def _judge(K: Tensor, N: Tensor, stability: Tensor, tolerance: Tensor, on_unstable: str) -> None:
+    """Name the worst direction of the worst state of a batch."""
+    flat_K, flat_N = K.reshape(-1, *K.shape[-2:]), N.reshape(-1, *N.shape[-2:])
+    at = int(stability.reshape(-1).argmin())
+    value = float(stability.reshape(-1)[at])
+    _, vectors = torch.linalg.eigh(0.5 * (flat_K[at] + flat_K[at].mT))
+    direction = (flat_N[at] @ vectors[:, 0]).detach()
+    if abs(value) <= float(tolerance.reshape(-1)[at]):
+        if on_unstable == "flag" and float(torch.linalg.det(flat_K[at]).abs()) > 0:
+            return
+        raise SingularGraspError(
+            f"a motion meets neither stiffness nor constraint (eigenvalue {value:.2g}); "
+            "give its joints a spring, a stiffness floor, or a lock",
+            direction=direction,
+        )
+    if on_unstable == "raise":
+        raise UnstableGraspError(
+            f"the stiffness with locked actuators has the eigenvalue {value:.3g} <= 0: the grasp buckles along "
+            "the direction given; grip less hard or place the fingers wider",
+            stiffness=value,
+            direction=direction,
+        )

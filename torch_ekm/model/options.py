@@ -1,0 +1,65 @@
+"""What the kinematic model takes into account."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from ..contact.contact_force import ForceOptions
+from ..contact.contact_model import ContactModel
+from ..exceptions import ParameterError
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """Options of :class:`~torch_ekm.model.KinematicModel`.
+
+    Raises:
+        ParameterError: a value outside its range.
+    """
+
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    """g in the **hand frame** [m/s^2], constant while the hand's pose is static."""
+    length: float = 0.03
+    """L, size of the object: translations are divided by it before ranks are decided [m]."""
+    contact_model: ContactModel | None = None
+    """One model for all contacts; None: what each contact's friction coefficients say."""
+    hand_stiffness: bool = True
+    """Keep S, the change of moment arms with posture. False only for ablation."""
+    object_stiffness: bool = True
+    """Keep T, the object's lever arms. False only for ablation."""
+    rolling: bool = True
+    """Contact points run over the surfaces. False treats them as pinned."""
+    actuator_compliance: bool = True
+    """Use the actuators' series stiffness K_a where it is finite. False: all rigid."""
+    contact_stiffness: float = math.inf
+    """K_c of every force row of a contact [N/m]; infinite: rigid contacts."""
+    stiffness_floor: float = 0.0
+    """Added to every joint's stiffness [N m/rad]: a floor for springless free joints, e.g. 1e-4."""
+    max_overlap: float = 0.005
+    """Deepest penetration of finger and object that is still modelled [m]."""
+    joint_stops: bool = True
+    """A joint that its stop holds does not move."""
+    stop_tolerance: float = math.radians(0.5)
+    """How near to a limit a joint counts as touching its stop [rad]."""
+    stop_torque: float = 1e-4
+    """Torque above which a stop holds its joint [N m]; below, the joint may leave."""
+    slack_tension: float | None = None
+    """Tendons whose tension is at most this [N m] are slack and move nothing. None: the servo keeps them taut."""
+    joint_friction: bool = False
+    """Let each joint's Coulomb friction take up part of the joint residual."""
+    on_unstable: str = "raise"
+    """"raise" UnstableGraspError, or "flag": return the formal Jacobian with status "unstable"."""
+    forces: ForceOptions = field(default_factory=ForceOptions)
+
+    def __post_init__(self) -> None:
+        if self.on_unstable not in ("raise", "flag"):
+            raise ParameterError("on_unstable", self.on_unstable, "'raise' or 'flag'")
+        for name in ("length", "contact_stiffness", "max_overlap"):
+            if not getattr(self, name) > 0:
+                raise ParameterError(name, getattr(self, name), "positive")
+        for name in ("stiffness_floor", "stop_tolerance", "stop_torque"):
+            if not getattr(self, name) >= 0:
+                raise ParameterError(name, getattr(self, name), "not negative")
+        if len(self.gravity) != 3 or not all(math.isfinite(g) for g in self.gravity):
+            raise ParameterError("gravity", self.gravity, "three finite numbers [m/s^2]")

@@ -1,0 +1,138 @@
+"""Permitted motions: rigid couplings, locked joints and the plane of a planar hand taken out; scaling."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import nn
+
+from ..description.hand import HandDescription
+from ..typing import Bool, Float, Tensor
+from .manipulation import Step, two_stage
+from .options import ModelOptions
+
+
+class Reduction(nn.Module):
+    """``ds = Z dz``: increments that couplings and the plane of motion allow, and the step within them.
+
+    Rigid couplings ``C dq = 0`` and joints whose limits coincide leave ``n_z`` freedoms:
+    ``D_zz = Z^T D Z``, ``A Z``, ``B Z``. Translations are scaled by L, forces by 1/L, so that all
+    entries are in N m/rad before a rank is decided.
+
+    Args:
+        hand: the hand.
+        options: L, compliances.
+        dtype: of the buffers.
+    """
+
+    def __init__(self, hand: HandDescription, options: ModelOptions, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.options = options
+        joint = joint_basis(hand).to(dtype)
+        pose = torch.eye(6, dtype=dtype)
+        if hand.planar_normal is not None:
+            pose = planar_pose_basis(torch.tensor(hand.planar_normal, dtype=dtype))
+        self.joint_basis: Tensor
+        self.pose_basis: Tensor
+        self.basis: Tensor
+        self.scaled_basis: Tensor
+        self.actuation: Tensor
+        self.stiffness: Tensor
+        self.register_buffer("joint_basis", joint, persistent=False)
+        self.register_buffer("pose_basis", pose, persistent=False)
+        self.register_buffer("basis", torch.block_diag(joint, pose), persistent=False)
+        pose_scaled = pose.clone()
+        pose_scaled[:3] *= options.length
+        self.register_buffer("scaled_basis", torch.block_diag(joint, pose_scaled), persistent=False)
+        J_a = torch.as_tensor(hand.actuation_jacobian).to(dtype)
+        self.register_buffer("actuation", J_a, persistent=False)
+        stiffness = torch.tensor([actuator.stiffness for actuator in hand.actuators], dtype=dtype)
+        if not options.actuator_compliance:
+            stiffness = torch.full_like(stiffness, torch.inf)
+        self.register_buffer("stiffness", stiffness, persistent=False)
+
+    def solve(
+        self,
+        D: Float[Tensor, "*batch n_s n_s"],
+        A: Float[Tensor, "*batch n_h n_s"],
+        rows: list[int],
+        held: Bool[Tensor, " n_q"],
+        slack: Bool[Tensor, " n_a"],
+    ) -> tuple[Step, Float[Tensor, "*batch n_h n_a"], Float[Tensor, "*batch n_a n_a"]]:
+        """J_m, dmu/da and dlam/da in full coordinates.
+
+        ```
+        D' = Z^T D Z + B_c^T K_a B_c (+ A^T K_c A)     compliant rows stand in the stiffness
+        E  = [A Z; B_r Z; e_j^T Z]                     rigid rows: contacts, rigid actuators, held joints
+        ```
+
+        Args:
+            D, A: stiffness and constraint matrix.
+            rows: which of the 6 n_c contact components are the rows of A.
+            held: joints that do not move.
+            slack: tendons without tension; they move nothing.
+        """
+        n_q, n_a, L = self.joint_basis.shape[0], self.actuation.shape[0], self.options.length
+        S = self.scaled_basis
+        D = S.mT @ D @ S
+        row_scale = torch.tensor(
+            [1 / L if row % 6 < 3 else 1.0 for row in rows], dtype=D.dtype, device=D.device
+        )
+        A = row_scale[:, None] * (A @ S)
+        B = self.actuation @ S[:n_q]
+        finite = torch.isfinite(self.stiffness)
+        rigid = (~finite & ~slack).nonzero()[:, 0]
+        soft = (finite & ~slack).nonzero()[:, 0]
+        eye = torch.eye(n_a, dtype=D.dtype, device=D.device)
+        F = None
+        if len(soft):
+            K_B = self.stiffness[soft, None] * B[soft]
+            D = D + B[soft].mT @ K_B
+            F = K_B.mT @ eye[soft]
+        K_c = self.options.contact_stiffness
+        stiff_contacts = math.isinf(K_c)
+        if not stiff_contacts:
+            D = D + K_c * L * L * (A.mT @ A)
+        batch = D.shape[:-2]
+        arm = torch.linalg.vector_norm(B[rigid], dim=-1, keepdim=True).clamp_min(1e-12)
+        fixed = [B[rigid] / arm, S[:n_q][held]]
+        n_h = A.shape[-2]
+        parts = [A] if stiff_contacts else []
+        parts += [part.expand(*batch, *part.shape) for part in fixed if len(part)]
+        E = torch.cat(parts, dim=-2) if parts else D.new_zeros(*batch, 0, D.shape[-1])
+        R = D.new_zeros(E.shape[-2], n_a)
+        first = n_h if stiff_contacts else 0
+        R[first : first + len(rigid)] = eye[rigid] / arm
+        step = two_stage(D, E, R, F, on_unstable=self.options.on_unstable)
+        dlam = D.new_zeros(*batch, n_a, n_a)
+        dlam[..., rigid, :] = step.reaction[..., first : first + len(rigid), :] / arm
+        if len(soft):
+            dlam[..., soft, :] = self.stiffness[soft, None] * (B[soft] @ step.motion - eye[soft])
+        dmu = step.reaction[..., :n_h, :] if stiff_contacts else K_c * L * L * (A @ step.motion)
+        return Step(S @ step.motion, step.reaction, step.stability), row_scale[:, None] * dmu, dlam
+
+
+def joint_basis(hand: HandDescription) -> Float[Tensor, "n_q n_z"]:
+    """Orthonormal basis of the joint motions that the rigid couplings allow (float64)."""
+    C = torch.as_tensor(hand.coupling, dtype=torch.float64).reshape(-1, hand.n_q)
+    eye = torch.eye(hand.n_q, dtype=torch.float64)
+    fixed = torch.as_tensor(hand.joint_upper <= hand.joint_lower)
+    C = torch.cat([C, eye[fixed]])
+    free = ~(C != 0).any(0)  # joints outside every coupling keep their own axis: the basis stays sparse
+    coupled = (~free).nonzero()[:, 0]
+    blocks = [eye[:, free]]
+    if len(coupled):
+        _, sigma, Vh = torch.linalg.svd(C[:, coupled], full_matrices=True)
+        rank = int((sigma > 1e-10 * sigma.amax()).sum())
+        blocks.append(eye[:, coupled] @ Vh[rank:].mT)
+    return torch.cat(blocks, dim=1)
+
+
+def planar_pose_basis(normal: Float[Tensor, 3]) -> Float[Tensor, "6 3"]:
+    """Two translations in the plane and the rotation about its normal."""
+    normal = normal / torch.linalg.vector_norm(normal)
+    tangents = torch.linalg.svd(normal[None])[2][1:].mT
+    basis = torch.zeros(6, 3, dtype=normal.dtype)
+    basis[:3, :2], basis[3:, 2] = tangents, normal
+    return basis

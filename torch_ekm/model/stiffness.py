@@ -1,0 +1,93 @@
+"""The load-dependent stiffness ``D = dF/ds`` in closed form."""
+
+from __future__ import annotations
+
+import torch
+
+from ..contact.contact_kinematics import ContactKinematics
+from ..kinematics.se3 import hat
+from ..typing import Bool, Float, Tensor
+from .potential import posture_stiffness
+
+
+def precedence(upstream: Bool[Tensor, "n_link n_q"]) -> Bool[Tensor, "n_q n_q"]:
+    """``[a, b]``: joint a is proximal to joint b on the same branch, or equal to it.
+
+    That is so where a moves every link that b moves.
+    """
+    moved = upstream.mT
+    return (moved[:, None, :] | ~moved[None, :, :]).all(-1)
+
+
+def geometric_stiffness(
+    kin: ContactKinematics,
+    force: Float[Tensor, "*batch n_c 3"],
+    spin_moment: Float[Tensor, "*batch n_c"],
+    precedes: Bool[Tensor, "n_q n_q"],
+    *,
+    hand: bool = True,
+    obj: bool = True,
+    rolling: bool = True,
+) -> Float[Tensor, "*batch n_s n_s"]:
+    """``dF/ds`` at constant contact forces: hand part S, object part T, rolling and soft-finger spin.
+
+    ```
+      sum_i blkdiag(S_i + W_i, 0, -[f_i]x [r_i]x)
+    + sum_i Omega_i^T [f_i]x M_i [n_i]x Omega_i                                   rolling, M = (K_f + K_o)^+
+    + sum_i Omega_i^T (-[m_i]x Omega_o + mu_4i K_o,i M_i [n_i]x Omega_i)          soft finger
+    S_i[a, b] = f_i . (z_a x (z_b x (x_i - o_b)))    a proximal to b or equal, symmetric
+    W_i[a, b] = (z_b x z_a) . m_i                    b strictly proximal to a, else 0
+    ```
+
+    Not symmetric for rolling or soft fingers in space, where the contacts are not holonomic.
+
+    Args:
+        kin: the contacts.
+        force: ``f_i`` of the finger on the object, hand axes [N], held constant there.
+        spin_moment: ``mu_4i`` about the inward normal [N m], held constant about the moving normal.
+        precedes: from :func:`precedence`.
+        hand: keep S and W.
+        obj: keep the object's lever arms (T).
+        rolling: keep the motion of contact points over the surfaces.
+    """
+    n_q = kin.axis.shape[-2]
+    D = torch.zeros(*force.shape[:-2], n_q + 6, n_q + 6, dtype=force.dtype, device=force.device)
+    f_hat = hat(force)
+    if hand:
+        D[..., :n_q, :n_q] = posture_stiffness(force, kin.point_jacobian.mT, kin.axis, precedes)
+    if obj:
+        D[..., n_q + 3 :, n_q + 3 :] = -(f_hat @ hat(kin.lever)).sum(-3)
+    Omega = kin.relative_spin
+    normal = kin.contacts.normal
+    roll = kin.mobility @ hat(normal)  # -M (w x n): the contact point runs M (w_rel x n)
+    if rolling:
+        D = D + (Omega.mT @ (f_hat @ roll) @ Omega).sum(-3)
+    if bool((spin_moment != 0).any()):
+        D = D + _spin_terms(kin, spin_moment, precedes, roll, Omega, hand=hand, rolling=rolling)
+    return D
+
+
+def _spin_terms(
+    kin: ContactKinematics,
+    spin_moment: Tensor,
+    precedes: Tensor,
+    roll: Tensor,
+    Omega: Tensor,
+    *,
+    hand: bool,
+    rolling: bool,
+) -> Tensor:
+    n_q = kin.axis.shape[-2]
+    moment = -kin.contacts.normal * spin_moment[..., None]
+    inner = torch.zeros_like(Omega)
+    inner[..., n_q + 3 :] = -hat(moment)
+    if rolling:
+        inner = inner + spin_moment[..., None, None] * (kin.contacts.object_curvature @ roll @ Omega)
+    D = (Omega.mT @ inner).sum(-3)
+    if hand:
+        # (z_b x z_a) . m = z_a . (m x z_b), for b strictly proximal to a, both upstream of the contact
+        J_w = kin.spin_jacobian
+        W = (J_w.mT @ hat(moment) @ J_w).sum(-3)
+        strictly = (precedes & ~precedes.mT).mT.to(W.dtype)
+        D[..., :n_q, :n_q] += W * strictly
+    return D
