@@ -1,1 +1,12 @@
 """Ground truth: a simulated hand, and the plant contract."""
+
+from .config import PlantConfig as PlantConfig
+from .parameters import PlantParameters as PlantParameters
+from .pinch import PinchPlan as PinchPlan
+from .pinch import PinchPlanner as PinchPlanner
+from .pinch import PinchRequest as PinchRequest
+from .plant import Observation as Observation
+from .plant import Plant as Plant
+from .plant import PlantStatus as PlantStatus
+from .simulated_hand import PlantSnapshot as PlantSnapshot
+from .simulated_hand import SimulatedHand as SimulatedHand

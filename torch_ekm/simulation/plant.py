@@ -32,7 +32,7 @@ class Observation:
     """Estimated joint angles [rad] (Hall sensors)."""
     a: Float[Tensor, " n_a"]
     """Actuator encoders [rad]."""
-    position: Float[Tensor, "3"]
+    position: Float[Tensor, " 3"]
     """Object point o [m] (markers)."""
     rotation: Float[Tensor, "3 3"]
     """Object orientation R."""

@@ -1,0 +1,65 @@
+"""How a simulated hand is run: time, gravity, and the grasp it is given."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from ..exceptions import ParameterError
+
+_DEG = math.pi / 180
+
+
+@dataclass(frozen=True)
+class PlantConfig:
+    """Settings of a :class:`SimulatedHand`; SI units, the hand frame.
+
+    Raises:
+        ParameterError: a figure outside its range.
+    """
+
+    gravity: tuple[float, float, float] = (0.0, 0.0, 9.81)
+    """[m/s^2]. Nominal: the palm faces down, the fingers hang, and the pinch line is level. It stays
+    fixed during a manipulation, as the paper assumes (section II.A)."""
+    time_step: float = 1e-3
+    """[s]; 2 ms is fine for long runs."""
+    ramp_time: float = 0.2
+    """Time in which a command is carried out [s]."""
+    command_time: float = 0.5
+    """Least simulated time of one command, ramp and settling [s]."""
+    settle_limit: float = 1.0
+    """A command ends at the latest after this time, settled or not [s]."""
+    pinch_force: float = 5.0
+    """Normal force of the thumb in the planned grasp [N]."""
+    thumb: str | None = None
+    """Pad that opposes the others; None: the one whose name begins with "thumb", else the first."""
+    fingers: tuple[str, ...] | None = None
+    """Opposing pads; None: index and middle where there are such, else the second."""
+    along: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    """Direction in the hand of the object's long axis, about which a pinch can turn it."""
+    offset_along: float = 0.010
+    """Grasp points are drawn within +-this along the object's long axis [m]."""
+    offset_across: float = 0.002
+    """... and within +-this across it [m]."""
+    tilt: float = 5 * _DEG
+    """The object's long axis is drawn within +-this of ``along`` [rad]."""
+    relative_to: str = "encoder"
+    """Commands are increments of the "encoder" or of the "setpoint"."""
+
+    def __post_init__(self) -> None:
+        for name in ("time_step", "ramp_time", "command_time", "settle_limit", "pinch_force"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ParameterError(name, value, "finite and greater than 0")
+        for name in ("offset_along", "offset_across", "tilt"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise ParameterError(name, value, "finite and not negative")
+        if self.time_step > 0.005:
+            raise ParameterError("time_step", self.time_step, "at most 5 ms")
+        if not all(math.isfinite(value) for value in (*self.gravity, *self.along)):
+            raise ParameterError("gravity, along", (self.gravity, self.along), "finite")
+        length = math.sqrt(sum(value * value for value in self.along))
+        if length < 1e-9:
+            raise ParameterError("along", self.along, "a direction, not zero")
+        object.__setattr__(self, "along", tuple(value / length for value in self.along))

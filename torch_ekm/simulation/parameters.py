@@ -1,0 +1,126 @@
+"""What the simulated hand really is, where it differs from its description."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+from ..exceptions import ParameterError
+
+_DEG = math.pi / 180
+
+
+@dataclass(frozen=True)
+class PlantParameters:
+    """The plant, relative to its nominal description; ``exact()`` is the description itself.
+
+    Units are SI, angles [rad]. Factors multiply the description's figure.
+
+    Raises:
+        ParameterError: a figure is not finite, or outside its range.
+    """
+
+    # -- the mechanism
+    moment_arm: float | tuple[float, ...] = 1.0
+    """Factor on J_a: pulley radii at the joints; one for all, or one per actuator. Above 1 the
+    joints turn less than the model says."""
+    spring: float = 1.0
+    """Factor on the joint springs K_s."""
+    servo_stiffness: float = 1.0
+    """Factor on the series stiffness of tendon and servo."""
+    joint_friction: float = 0.0
+    """Factor on the description's Coulomb friction of the joints; the kinematic model has none."""
+    link_weight: bool = False
+    """Gravity pulls at the fingers too (the kinematic model leaves their weight out)."""
+
+    # -- the object
+    friction: float = 1.0
+    """Factor on the friction coefficient."""
+    mass: float = 1.0
+    """Factor on the object's mass and inertia."""
+    com_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Shift of the centre of mass, object frame [m]."""
+    object_scale: float = 1.0
+    """Factor on the object's shapes (its mass stays)."""
+
+    # -- the position controller
+    actuator_bias: float = 0.0
+    """Bound of a constant error of each actuator [rad]; drawn once, from ``hardware_seed``."""
+    actuator_error: float = 0.0
+    """Bound of an error drawn anew at every command [rad], uniform."""
+    dead_zone: float = 0.0
+    """Coulomb dead band: an actuator stops short of its set-point by this [rad]."""
+    threshold: float = 0.0
+    """Commands smaller than this do nothing [rad]."""
+    backlash: float = 0.0
+    """Full width of the play between motor and tendon [rad]."""
+
+    # -- the sensors
+    joint_noise: float = 0.0
+    """Standard deviation of a joint angle [rad]."""
+    position_noise: float = 0.0
+    """Standard deviation of the object's position, per axis [m]."""
+    rotation_noise: float = 0.0
+    """Standard deviation of the object's orientation, per axis [rad]."""
+    force_noise: float = 0.0
+    """Standard deviation of a fingertip force [N]."""
+
+    hardware_seed: int = 0
+    """Which specimen of the hand: signs and sizes of the constant errors."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            entries = value if isinstance(value, tuple) else (value,)
+            if not all(math.isfinite(entry) for entry in entries):
+                raise ParameterError(field.name, value, "finite")
+            if field.name in _POSITIVE and not all(entry > 0 for entry in entries):
+                raise ParameterError(field.name, value, "greater than 0")
+            if field.name not in _POSITIVE | {"com_shift"} and not all(entry >= 0 for entry in entries):
+                raise ParameterError(field.name, value, "0 or more")
+
+    def replace(self, **changes: object) -> PlantParameters:
+        """A copy with some figures changed."""
+        known = {field.name for field in dataclasses.fields(self)}
+        for name in changes:
+            if name not in known:
+                raise ParameterError("parameter", name, f"one of {', '.join(sorted(known))}")
+        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
+
+    @classmethod
+    def exact(cls) -> PlantParameters:
+        """The nominal description and perfect sensors: nothing to learn."""
+        return cls()
+
+    @classmethod
+    def nominal_mismatch(cls) -> PlantParameters:
+        """The mismatch that the residual learners are for: what a used iCub hand is thought to have.
+
+        Tendons run on pulleys 1.3 times as large as modelled and stretch twice as much; joints rub;
+        the position controller has a constant and a fresh error, play and a Coulomb dead zone
+        (together the +-1 deg that the E-KM paper reports, section III.C.4); the fingers have weight,
+        the object is 10 % heavier, its centre 2 mm off. Sensors: 0.3 deg per joint, 0.2 mm and
+        0.15 deg for the object (a marker board seen from 0.4 m), 0.1 N per fingertip.
+        """
+        return cls(
+            moment_arm=1.3,
+            spring=0.8,
+            servo_stiffness=0.5,
+            joint_friction=0.5,
+            link_weight=True,
+            friction=0.9,
+            mass=1.1,
+            com_shift=(0.002, 0.002, 0.0),
+            actuator_bias=0.5 * _DEG,
+            actuator_error=0.5 * _DEG,
+            dead_zone=0.9 * _DEG,
+            backlash=0.5 * _DEG,
+            joint_noise=0.3 * _DEG,
+            position_noise=0.0002,
+            rotation_noise=0.15 * _DEG,
+            force_noise=0.1,
+        )
+
+
+_POSITIVE = {"moment_arm", "spring", "servo_stiffness", "friction", "mass", "object_scale"}

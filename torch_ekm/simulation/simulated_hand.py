@@ -1,0 +1,333 @@
+"""The simulated hand: ground truth for everything that is learned."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..description import HandDescription, ObjectDescription, load_hand, load_object
+from ..exceptions import EquilibriumError, GraspError, ParameterError
+from ..kinematics.se3 import exp
+from ..typing import Float, Tensor
+from .config import PlantConfig
+from .parameters import PlantParameters
+from .pinch import PinchPlan, PinchPlanner, PinchRequest
+from .plant import Observation, PlantStatus
+from .scene import HandScene
+from .servo import Servo, ServoState
+from .transmission import Transmission, TransmissionState
+
+Array = NDArray[np.float64]
+
+_RIGID = 8.0  # [N m/rad] what a looped cable and its servo have where the description says "rigid"
+_FORCE_WINDOW = 10  # steps over which a fingertip force is averaged
+_STILL = 2e-3  # [rad/s] and [m/s x 10]: slower than this is settled
+_ATTEMPTS = 6
+
+
+class PlantSnapshot(NamedTuple):
+    """Everything needed to go back to a moment; give it to :meth:`SimulatedHand.restore`."""
+
+    physics: bytes
+    transmission: TransmissionState
+    servo: ServoState
+    generator: dict[str, Any]
+    normal: Array
+    time: float
+    plan: PinchPlan
+
+
+class SimulatedHand:
+    """A hand with tendons that holds an object, in SAPIEN; implements :class:`Plant`.
+
+    ::
+
+        plant = SimulatedHand("icub_right", "box", parameters=PlantParameters.nominal_mismatch())
+        observation = plant.reset(seed=0)
+        observation = plant.command(delta_a)
+
+    Everything is in the hand frame, SI units. ``observation.info["truth"]`` is for reports; a
+    controller that reads it cheats. The same seed gives the same run, bit by bit.
+
+    Args:
+        hand: a description, or the name or path that :func:`load_hand` takes.
+        object: a description, or the name or path that :func:`load_object` takes.
+        config: time, gravity, the grasp.
+        parameters: what the plant really is; :meth:`PlantParameters.exact` by default.
+    """
+
+    def __init__(
+        self,
+        hand: HandDescription | str = "icub_right",
+        object: ObjectDescription | str = "box",
+        config: PlantConfig | None = None,
+        parameters: PlantParameters | None = None,
+    ) -> None:
+        self.hand = load_hand(hand) if isinstance(hand, str) else hand
+        self.object = load_object(object) if isinstance(object, str) else object
+        self.config = PlantConfig() if config is None else config
+        self.parameters = PlantParameters.exact() if parameters is None else parameters
+        self._thumb, self._fingers = _opposition(self.hand, self.config)
+        self._transmission = self._new_transmission()
+        self._servo = self._new_servo()
+        self._planner = PinchPlanner(
+            self.hand,
+            self.object,
+            self._transmission,
+            self.config.gravity,
+            self._thumb,
+            self._fingers,
+            along=self.config.along,
+            mass_factor=self.parameters.mass,
+            com_shift=self.parameters.com_shift,
+            friction=self.parameters.friction,
+            object_scale=self.parameters.object_scale,
+        )
+        self._scene: HandScene | None = None
+        self._plan: PinchPlan | None = None
+        self._generator = np.random.default_rng(0)
+        self._normal = np.zeros(len(self.hand.pads))
+        self._time = 0.0
+
+    # -- the plant contract -------------------------------------------------------------------------
+
+    def reset(self, seed: int) -> Observation:
+        """Grasp the object anew: plan a pinch, close on the held object, release it, let it settle.
+
+        Raises:
+            EquilibriumError: no pinch could be planned.
+            GraspError: the planned pinches did not hold the object.
+        """
+        self._generator = np.random.default_rng(seed)
+        failure: Exception | None = None
+        for _ in range(_ATTEMPTS):
+            try:
+                plan = self._planner.plan(self._request())
+            except EquilibriumError as error:
+                failure = error
+                continue
+            self._grasp(plan)
+            if self.status is PlantStatus.HELD:
+                return self.observe()
+        if failure is not None:
+            raise failure
+        raise GraspError(
+            f"none of {_ATTEMPTS} planned pinches of '{self.object.name}' held it (seed {seed}); "
+            "a higher pinch_force, friction or another gravity direction may help"
+        )
+
+    def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
+        """Move the actuators by ``delta_a`` [rad], let the hand settle, read the sensors.
+
+        Raises:
+            ShapeError, NonFiniteError: ``delta_a`` is not ``n_a`` finite numbers; nothing moves.
+        """
+        self._need_scene()
+        start = self._servo.encoder
+        goal = self._servo.plan(torch.as_tensor(delta_a).detach().cpu().double().numpy(), self._generator)
+        steps = max(1, round(self.config.ramp_time / self.config.time_step))
+        self._run(steps, lambda part: start + part * (goal - start))
+        self._settle(self.config.command_time - self.config.ramp_time)
+        return self.observe()
+
+    def observe(self) -> Observation:
+        """Read the sensors; their noise is drawn anew."""
+        scene = self._need_scene()
+        q, (position, rotation) = scene.q, scene.object_pose
+        p, draw = self.parameters, self._generator.standard_normal
+        noise = exp(torch.from_numpy(p.rotation_noise * draw(3))).numpy()
+        touching = self._normal > 0
+        force = np.maximum(0.0, self._normal + p.force_noise * draw(len(self._normal)) * touching)
+        truth = {
+            "q": torch.from_numpy(q),
+            "position": torch.from_numpy(position),
+            "rotation": torch.from_numpy(rotation),
+            "fingertip_force": torch.from_numpy(self._normal.copy()),
+            "actuator_torque": torch.from_numpy(self._transmission.actuator_torque(q, self._servo.output)),
+        }
+        return Observation(
+            q=torch.from_numpy(q + p.joint_noise * draw(len(q))),
+            a=torch.from_numpy(self._servo.encoder),
+            position=torch.from_numpy(position + p.position_noise * draw(3)),
+            rotation=torch.from_numpy(noise @ rotation),
+            fingertip_force=torch.from_numpy(force),
+            time=self._time,
+            status=self.status,
+            info={"truth": truth},
+        )
+
+    def close(self) -> None:
+        """Drop the scene; the next :meth:`reset` makes a new one."""
+        self._scene = None
+
+    # -- beyond the contract ------------------------------------------------------------------------
+
+    @property
+    def status(self) -> PlantStatus:
+        """LOST when fewer than two pads touch the object, or it has left its place in the hand."""
+        scene, plan = self._need_scene(), self._plan
+        assert plan is not None
+        away = np.linalg.norm(scene.object_pose[0] - plan.position)
+        held = (self._normal > 0).sum() >= 2 and away < 0.05
+        return PlantStatus.HELD if held else PlantStatus.LOST
+
+    @property
+    def plan(self) -> PinchPlan:
+        """The pinch that the last :meth:`reset` planned."""
+        if self._plan is None:
+            raise GraspError("there is no grasp yet: call reset(seed) first")
+        return self._plan
+
+    @property
+    def rotation_axis(self) -> Float[Tensor, " 3"]:
+        """Unit vector of the hand frame about which this pinch can turn the object.
+
+        Thumb and fingers flex in nearly parallel planes; the axis is the normal of those planes
+        that the contacts show: the line through the finger contacts, made square to the line from
+        the thumb to them. With one opposing finger it is ``config.along``.
+        """
+        points = self.plan.points
+        across = points[1:].mean(axis=0) - points[0]
+        across /= np.linalg.norm(across)
+        along = np.array(self.config.along)
+        axis = points[-1] - points[1] if len(points) > 2 else along
+        axis = axis - across * (axis @ across)
+        axis *= np.sign(axis @ along) / np.linalg.norm(axis)
+        return torch.from_numpy(axis)
+
+    def hand_state(self) -> tuple[Array, Array, Array]:
+        """True joint angles [rad], object position [m] and rotation, for pictures."""
+        scene = self._need_scene()
+        return scene.q, *scene.object_pose
+
+    def snapshot(self) -> PlantSnapshot:
+        """This moment, to come back to."""
+        scene = self._need_scene()
+        return PlantSnapshot(
+            scene.snapshot(),
+            self._transmission.snapshot(),
+            self._servo.snapshot(),
+            dict(self._generator.bit_generator.state),
+            self._normal.copy(),
+            self._time,
+            self.plan,
+        )
+
+    def restore(self, snapshot: PlantSnapshot) -> Observation:
+        """Go back to ``snapshot``, noise included; two restored runs are alike bit by bit."""
+        scene = self._need_scene()
+        scene.restore(snapshot.physics)
+        self._transmission.restore(snapshot.transmission)
+        self._servo.restore(snapshot.servo)
+        self._generator.bit_generator.state = snapshot.generator
+        self._normal, self._time, self._plan = snapshot.normal.copy(), snapshot.time, snapshot.plan
+        return self.observe()
+
+    def wait(self, duration: float) -> None:
+        """Let time pass with the motors at rest [s]."""
+        motor = self._servo.encoder
+        self._run(max(1, round(duration / self.config.time_step)), lambda part: motor)
+
+    # -- inside -------------------------------------------------------------------------------------
+
+    def _need_scene(self) -> HandScene:
+        if self._scene is None:
+            raise GraspError("there is no grasp yet: call reset(seed) first")
+        return self._scene
+
+    def _new_transmission(self) -> Transmission:
+        hand, p = self.hand, self.parameters
+        factor = np.asarray(p.moment_arm, dtype=np.float64)
+        if factor.ndim and factor.shape != (hand.n_a,):
+            raise ParameterError("moment_arm", p.moment_arm, f"one factor, or {hand.n_a} (one per actuator)")
+        stiffness = np.array([actuator.stiffness for actuator in hand.actuators])
+        return Transmission(
+            hand,
+            hand.actuation_jacobian * np.broadcast_to(factor, (hand.n_a,))[:, None],
+            p.servo_stiffness * np.where(np.isfinite(stiffness), stiffness, _RIGID),
+            p.spring * hand.spring_stiffness,
+            p.joint_friction * hand.joint_friction,
+        )
+
+    def _new_servo(self) -> Servo:
+        hand, p = self.hand, self.parameters
+        specimen = np.random.default_rng(p.hardware_seed)
+        return Servo(
+            hand.actuator_lower,
+            hand.actuator_upper,
+            bias=p.actuator_bias * specimen.uniform(-1.0, 1.0, size=hand.n_a),
+            fresh_error=p.actuator_error,
+            dead_zone=p.dead_zone,
+            threshold=p.threshold,
+            backlash=p.backlash,
+            relative_to=self.config.relative_to,
+        )
+
+    def _request(self) -> PinchRequest:
+        c = self.config
+        along, across, first, second = self._generator.uniform(-1.0, 1.0, size=4).tolist()
+        return PinchRequest(
+            c.pinch_force, along * c.offset_along, across * c.offset_across, (first * c.tilt, second * c.tilt)
+        )
+
+    def _grasp(self, plan: PinchPlan) -> None:
+        c, p = self.config, self.parameters
+        self._scene = scene = HandScene(
+            self.hand, self.object, c.gravity, c.time_step, p.object_scale, p.link_weight
+        )
+        scene.set_object(p.mass, p.com_shift)
+        scene.set_friction(p.friction * self.object.friction)
+        scene.set_drive_stiffness(self._transmission.drive_stiffness)
+        self._plan = plan
+        scene.q = plan.q
+        scene.object_pose = (plan.position, plan.rotation)
+        scene.hold_object(True)
+        self._transmission.relax(plan.q)
+        slack = self._transmission.offset + self._transmission.J_a @ plan.q
+        self._servo.place(slack)
+        self._run(round(0.2 / c.time_step), lambda part: slack + part * (plan.motor - slack))
+        self._servo.place(plan.motor)
+        self._run(round(0.3 / c.time_step), lambda part: plan.motor)
+        scene.hold_object(False)
+        self._settle(1.0)
+        self._time = 0.0
+
+    def _settle(self, least: float) -> None:
+        """Wait at least that long [s], and until things are still."""
+        self.wait(max(least, self.config.time_step))
+        limit = self.config.settle_limit - self.config.command_time
+        waited = 0.0
+        scene = self._need_scene()
+        while waited < limit:
+            linear, angular = scene.object_speed
+            if max(10 * linear, angular) < _STILL:
+                break
+            self.wait(0.05)
+            waited += 0.05
+
+    def _run(self, steps: int, motor_at: Any) -> None:
+        scene, transmission, servo = self._need_scene(), self._transmission, self._servo
+        normal = np.zeros_like(self._normal)
+        window = min(_FORCE_WINDOW, steps)
+        for k in range(1, steps + 1):
+            output = servo.move_to(motor_at(k / steps))
+            scene.step(transmission.drive_targets(scene.q, output))
+            if k > steps - window:
+                touches = scene.touches()
+                for i, pad in enumerate(self.hand.pads):
+                    if pad.link in touches:
+                        normal[i] += touches[pad.link].normal / window
+        self._normal = normal
+        self._time += steps * self.config.time_step
+
+
+def _opposition(hand: HandDescription, config: PlantConfig) -> tuple[str, tuple[str, ...]]:
+    names = [pad.name for pad in hand.pads]
+    thumb = config.thumb or next((name for name in names if name.startswith("thumb")), names[0])
+    if config.fingers is not None:
+        return thumb, config.fingers
+    chosen = tuple(name for name in names if name.startswith(("index", "middle")))
+    return thumb, chosen or tuple(name for name in names if name != thumb)[:1]
