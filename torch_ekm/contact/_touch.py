@@ -1,0 +1,112 @@
+"""Where a capsule touches a primitive: one point, its normal, both curvatures."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..description import ContactPad, Shape
+from ._primitives import signed_distance, surface_curvature
+
+Array = NDArray[np.float64]
+
+
+class Pad:
+    """A capsule with its axis along z of ``transform`` (link frame), ``half`` its half length."""
+
+    def __init__(self, coal, pad: ContactPad) -> None:
+        start, end = np.array(pad.start), np.array(pad.end)
+        self.radius = pad.radius
+        self.half = float(np.linalg.norm(end - start)) / 2
+        self.transform = np.eye(4)
+        self.transform[:3, 3] = (start + end) / 2
+        if self.half > 0:
+            axis = (end - start) / (2 * self.half)
+            side = np.linalg.svd(axis[None])[2][1]
+            self.transform[:3, :3] = np.stack([side, np.cross(axis, side), axis], axis=-1)
+            self.geometry = coal.Capsule(self.radius, 2 * self.half)
+        else:
+            self.geometry = coal.Sphere(self.radius)
+
+
+class Solid:
+    """A primitive of the object, for coal and for the closed form."""
+
+    def __init__(self, coal, shape: Shape) -> None:
+        make = {"box": coal.Box, "cylinder": coal.Cylinder, "sphere": coal.Sphere, "capsule": coal.Capsule}
+        self.shape = shape
+        self.geometry = make[shape.kind](*shape.size)
+        self.distance = signed_distance(shape)
+
+
+class Touch:
+    """One contact in the hand frame."""
+
+    __slots__ = ("finger_curvature", "gap", "normal", "object_curvature", "pinned", "point")
+
+    def __init__(self, point: Array, normal: Array, gap: float, K_f: Array, K_o: Array, pinned: bool) -> None:
+        self.point, self.normal, self.gap = point, normal, gap
+        self.finger_curvature, self.object_curvature, self.pinned = K_f, K_o, pinned
+
+
+def touch(pad: Pad, T_pad: Array, solid: Solid, T_solid: Array, R: float) -> Touch:
+    """The contact of a pad with one primitive; the equations are those of ``ContactDetector``.
+
+    Args:
+        T_pad, T_solid: poses in the hand frame, ``(4, 4)``.
+        R: crown radius of the pad [m].
+    """
+    rotation = T_solid[:3, :3]
+    m = tuple((rotation.T @ (T_pad[:3, 3] - T_solid[:3, 3])).tolist())
+    t = tuple((rotation.T @ T_pad[:3, 2]).tolist())
+    s = _closest(solid, m, t, pad.half, 1 / R) if pad.half > 0 else 0.0
+    c = (m[0] + s * t[0], m[1] + s * t[1], m[2] + s * t[2])
+    d, n_local = solid.distance(*c)
+    gap = d - pad.radius
+    principal, sharp = surface_curvature(solid.shape, c, n_local)
+
+    n = rotation @ n_local
+    K_o = np.zeros((3, 3))
+    for curvature, direction in principal:
+        e = rotation @ direction
+        K_o += curvature * np.outer(e, e)
+    K_f = (np.eye(3) - np.outer(n, n)) / pad.radius
+    if abs(s) < pad.half:  # on the side: 1/R instead of 1/rho along the axis
+        e = T_pad[:3, 2] - n * (n @ T_pad[:3, 2])
+        e /= np.linalg.norm(e)
+        K_f += (1 / R - 1 / pad.radius) * np.outer(e, e)
+    point = T_pad[:3, 3] + s * T_pad[:3, 2] - (pad.radius + gap / 2) * n
+    return Touch(point, n, gap, K_f, K_o, sharp)
+
+
+def _closest(solid: Solid, m: tuple, t: tuple, half: float, epsilon: float) -> float:
+    """``argmin d(m + s t) + epsilon s^2/2`` over ``|s| <= half``: the zero of an increasing function.
+
+    Its slope is at least ``epsilon``, so a value below 1e-12 leaves less than ``1e-12/epsilon`` [m].
+    Regula falsi (Illinois) with a bisection every third step, for the steps that the function has at the
+    edges and inside of a body.
+    """
+
+    def slope(s: float) -> float:
+        n = solid.distance(m[0] + s * t[0], m[1] + s * t[1], m[2] + s * t[2])[1]
+        return n[0] * t[0] + n[1] * t[1] + n[2] * t[2] + epsilon * s
+
+    a, b = -half, half
+    fa, fb = slope(a), slope(b)
+    if fa >= 0:
+        return a
+    if fb <= 0:
+        return b
+    moved = ""
+    for k in range(120):
+        s = a + (b - a) / 2 if k % 3 == 2 else a - fa * (b - a) / (fb - fa)
+        fs = slope(s)
+        if abs(fs) < 1e-12 or b - a < 1e-13:
+            return s
+        if fs > 0:
+            b, fb, fa = s, fs, fa / 2 if moved == "b" else fa
+            moved = "b"
+        else:
+            a, fa, fb = s, fs, fb / 2 if moved == "a" else fb
+            moved = "a"
+    return a + (b - a) / 2

@@ -1,0 +1,175 @@
+"""Contacts from joint angles and object pose: where the finger pads meet the object's primitives.
+
+coal finds what is near; the contact point, normal and curvatures are then computed in closed form,
+because the witness points of a distance query jump along a line of contact.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from .._extras import require
+from ..description import HandDescription, ObjectDescription
+from ..exceptions import NonFiniteError, ParameterError, ShapeError
+from ..kinematics import HandKinematics, LinkPoses
+from ..typing import Float, Tensor
+from ._touch import Pad, Solid, Touch, touch
+from .contact_set import ContactSet
+
+Array = NDArray[np.float64]
+
+
+class ContactDetector:
+    r"""One contact per (pad, object): ``s* = argmin_s d(c(s)) + s^2/(2 R)``, ``x = c(s*) - (rho + gap/2) n``.
+
+    ``c(s) = m + s t`` is the axis of the pad's capsule (radius ``rho``), ``d`` the signed distance to the
+    object, ``n = grad d`` the object's outward normal and ``gap = d(c(s*)) - rho``. ``d`` is convex for a
+    convex primitive, also inside it, so deep overlaps need no other method. The second term gives the pad a
+    slight crown (radius ``R`` along its axis): without it a capsule lying on a flat face has no single
+    contact point, and the point would jump from one end to the other as the finger tilts. With it, ``s*`` is
+    a continuous function of the state, ``|ds*/dtilt| <= R``. Where the pad touches with a round end, and
+    for balls, the crown plays no part.
+
+    The contact point lies midway between the two surfaces. Curvatures: pad ``1/rho`` across and
+    ``1/R`` along its axis on the side, ``1/rho`` all around on a round end; object from the feature
+    that is touched (face 0, cylinder ``1/radius`` across, ...), an edge or corner is ``pinned``.
+    Of an object made of several primitives the nearest one counts.
+
+    Args:
+        hand: its pads are tested; other parts of the links are not.
+        obj: the object.
+        margin: pads farther away than this [m] are left out; ``math.inf`` keeps them all.
+        crown_radius: R [m].
+        kinematics: of the same hand, to share one; made here if None.
+
+    Raises:
+        MissingExtraError: coal is not installed.
+        ParameterError: ``margin`` or ``crown_radius`` is out of range.
+    """
+
+    def __init__(
+        self,
+        hand: HandDescription,
+        obj: ObjectDescription,
+        margin: float = 0.002,
+        crown_radius: float = 0.5,
+        kinematics: HandKinematics | None = None,
+    ) -> None:
+        if not margin >= 0:
+            raise ParameterError("margin", margin, "at least 0 [m]")
+        if not 0 < crown_radius < math.inf:
+            raise ParameterError("crown_radius", crown_radius, "positive and finite [m]")
+        self.hand, self.obj, self.margin, self.crown_radius = hand, obj, margin, crown_radius
+        self.kinematics = kinematics if kinematics is not None else HandKinematics(hand)
+        self._coal = require("coal")
+        self._links = [hand.link_names.index(pad.link) for pad in hand.pads]
+        self._pads = [Pad(self._coal, pad) for pad in hand.pads]
+        self._shapes = [Solid(self._coal, shape) for shape in obj.shapes]
+        self._request = self._coal.DistanceRequest()
+        self._result = self._coal.DistanceResult()
+
+    def __call__(
+        self,
+        q: LinkPoses | Float[Tensor, " n_q"],
+        position: Float[Tensor, 3],
+        rotation: Float[Tensor, "3 3"],
+    ) -> ContactSet:
+        """Contacts in the hand frame, in the order of ``hand.pads``; empty if nothing is near.
+
+        Args:
+            q: joint angles [rad] of one posture, or its link poses.
+            position: object point o [m].
+            rotation: object orientation R.
+
+        Raises:
+            ShapeError: not a single posture or pose.
+            NonFiniteError: an entry is NaN or infinite.
+        """
+        _check("position", position, (3,))
+        _check("rotation", rotation, (3, 3))
+        if isinstance(q, LinkPoses):
+            poses = q
+        else:
+            _check("q", q, (self.hand.n_q,))
+            with torch.no_grad():
+                poses = self.kinematics(q.to(self.kinematics._axes.dtype))
+        if poses.transforms.dim() != 3:
+            raise ShapeError("poses", "(n_link, 4, 4)", poses.transforms.shape, "one posture at a time")
+        frames = poses.transforms[self._links].detach().to("cpu", torch.float64).numpy()
+        T_object = np.eye(4)
+        T_object[:3, :3] = rotation.detach().to("cpu", torch.float64).numpy()
+        T_object[:3, 3] = position.detach().to("cpu", torch.float64).numpy()
+        solids = [(solid, T_object @ solid.shape.transform) for solid in self._shapes]
+
+        found: list[tuple[int, Touch]] = []
+        for k, (pad, T_link) in enumerate(zip(self._pads, frames, strict=True)):
+            contact = self._nearest(pad, T_link, solids)
+            if contact is not None:
+                found.append((k, contact))
+        return self._contact_set(found, position.dtype, position.device)
+
+    def _nearest(self, pad: Pad, T_link: Array, solids: list[tuple[Solid, Array]]) -> Touch | None:
+        """The contact with the smallest gap over the object's primitives (the first one of equals)."""
+        T_pad = T_link @ pad.transform
+        best: Touch | None = None
+        for solid, T_solid in solids:
+            if math.isfinite(self.margin) and self._coarse_distance(pad, T_pad, solid, T_solid) > self.margin:
+                continue
+            contact = touch(pad, T_pad, solid, T_solid, self.crown_radius)
+            if contact.gap <= self.margin and (best is None or contact.gap < best.gap):
+                best = contact
+        return best
+
+    def _coarse_distance(self, pad: Pad, T_pad: Array, solid: Solid, T_solid: Array) -> float:
+        """coal's signed distance [m]; never larger than the gap."""
+        place = self._coal.Transform3s
+        self._result.clear()
+        return self._coal.distance(
+            pad.geometry,
+            place(T_pad[:3, :3], T_pad[:3, 3]),
+            solid.geometry,
+            place(T_solid[:3, :3], T_solid[:3, 3]),
+            self._request,
+            self._result,
+        )
+
+    def _contact_set(
+        self, found: list[tuple[int, Touch]], dtype: torch.dtype, device: torch.device
+    ) -> ContactSet:
+        pads = [self.hand.pads[k] for k, _ in found]
+        contacts = [contact for _, contact in found]
+
+        def tensor(values: list, *shape: int) -> Tensor:
+            array = np.array(values, dtype=np.float64).reshape(len(found), *shape)
+            return torch.from_numpy(array).to(device, dtype)
+
+        return ContactSet(
+            finger=tuple(pad.name for pad in pads),
+            link=tuple(pad.link for pad in pads),
+            point=tensor([c.point for c in contacts], 3),
+            normal=tensor([c.normal for c in contacts], 3),
+            gap=tensor([c.gap for c in contacts]),
+            finger_curvature=tensor([c.finger_curvature for c in contacts], 3, 3),
+            object_curvature=tensor([c.object_curvature for c in contacts], 3, 3),
+            friction=tensor([self.obj.friction for _ in contacts]),
+            # the softer of the two surfaces makes the patch that resists spinning
+            torsional_friction=tensor(
+                [max(pad.torsional_friction, self.obj.torsional_friction) for pad in pads]
+            ),
+            pinned=tuple(c.pinned for c in contacts),
+        )
+
+    def __repr__(self) -> str:
+        return f"ContactDetector('{self.hand.name}', '{self.obj.name}', margin={self.margin})"
+
+
+def _check(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
+    if tuple(value.shape) != shape:
+        raise ShapeError(name, str(shape), value.shape, "one posture and one pose at a time")
+    finite = torch.isfinite(value)
+    if not bool(finite.all()):
+        raise NonFiniteError(name, torch.nonzero(~finite)[:3].tolist())
