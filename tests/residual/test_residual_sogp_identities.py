@@ -143,16 +143,16 @@ def test_a_pruned_step_is_the_streaming_variational_step():
     gp.update(x[:20], y[:20])
     for n in range(20, N):  # up to the first sample that takes another point's place
         before = copy.deepcopy(gp)
-        if gp.update(x[n], y[n]).event == UpdateEvent.REPLACED and before.slot != gp.slot:
+        if gp.update(x[n], y[n]).event == UpdateEvent.REPLACED and before.posterior.slot != gp.posterior.slot:
             break
     else:
         pytest.fail("no sample replaced a basis point")
-    old = before.active.bool()
-    a, b = before.basis[old].numpy(), gp.basis[gp.active.bool()].numpy()
+    old = before.posterior.active.bool()
+    a, b = before.posterior.basis[old].numpy(), gp.posterior.basis[gp.posterior.active.bool()].numpy()
     assert not np.array_equal(a, b)
     Kaa = se(a, a)
-    mu_a = Kaa @ before.alpha[old].numpy()
-    S_a = Kaa + Kaa @ before._moments[0][old][:, old].numpy() @ Kaa
+    mu_a = Kaa @ before.posterior.alpha[old].numpy()
+    S_a = Kaa + Kaa @ before.posterior.moments[0][old][:, old].numpy() @ Kaa
     W_a = np.linalg.inv(S_a) - np.linalg.inv(Kaa)
     Kbb = se(b, b)
     Ea = np.linalg.solve(Kbb, se(b, a)).T
@@ -176,7 +176,7 @@ def test_deleting_the_newest_is_the_projection(monkeypatch):
     other.set_basis(x[:10])
     other._n_samples = 5
     assert other.update(x[10], y[10]).event == UpdateEvent.REPLACED
-    assert int(other.slot) == 10
+    assert int(other.posterior.slot) == 10
     torch.testing.assert_close(other(xs), gp(xs), atol=1e-11, rtol=0)
     torch.testing.assert_close(other.variance(xs), gp.variance(xs), atol=1e-11, rtol=0)
 
@@ -211,15 +211,15 @@ def test_kl_score_is_the_true_divergence():
     gp = learner(capacity=10, refresh_every=10**6)
     gp.update(x[:10], y[:10])
     gp.refresh()
-    c, q, w = gp._moments.diagonal(dim1=-2, dim2=-1)
-    scores = kl_score(gp.alpha, c, q, w / S2, gp.age)[:10]
+    c, q, w = gp.posterior.moments.diagonal(dim1=-2, dim2=-1)
+    scores = kl_score(gp.posterior.alpha, c, q, w / S2, gp.posterior.age)[:10]
     K = se(x[:10].numpy(), x[:10].numpy())
 
     def posterior(W, h):
         P = np.linalg.inv(K) + W
         return np.linalg.solve(P, h), np.linalg.inv(P)
 
-    W, h = gp._moments[2, :10, :10].numpy() / S2, gp._vectors[1, :10].numpy() / S2
+    W, h = gp.posterior.moments[2, :10, :10].numpy() / S2, gp.posterior.vectors[1, :10].numpy() / S2
     mu, S = posterior(W, h)
     for i in range(10):
         keep = [j for j in range(10) if j != i]

@@ -10,10 +10,11 @@ from torch.distributions import Normal
 from ..exceptions import ParameterError, ShapeError
 from ..typing import Float, Tensor
 from .action_linear import ActionLinearKernel
-from .base import ResidualLearner, UpdateEvent, UpdateReport, check_count, check_positive
+from .adaptation import PrequentialAdaptation
+from .base import ResidualLearner, UpdateReport, check_count, check_positive
 from .deletion import DELETION_SCORES
 from .kernels import Kernel, SquaredExponential, log_parameter
-from .natural import posterior_from_natural
+from .posterior import SparsePosterior
 from .running_scale import RunningScale
 
 
@@ -37,13 +38,13 @@ class SparseOnlineGP(ResidualLearner):
     divergence; beyond the capacity the point with the lowest score is deleted, again by KL
     projection (Csato & Opper, Neural Computation 14, 2002).
 
-    Master copy is the natural form ``exp(-1/2 f' Omega f / s2 + h'f / s2)``: Omega is a sum of
-    squares, so it stays positive, and it holds neither kernel nor noise, so both may change without
-    stored data. (alpha, C, Q) are caches, carried along by rank-one steps and rebuilt from the
-    natural form by Cholesky every ``refresh_every`` samples: the textbook recursion, which never
-    rebuilds, ends in NaN on smooth trajectories.
+    The state is kept in natural form and the caches that predict are rebuilt from it by Cholesky every
+    ``refresh_every`` samples (:class:`~torch_ekm.residual.posterior.SparsePosterior`): the textbook
+    recursion, which never rebuilds, ends in NaN on smooth trajectories. The state is float64 whatever
+    ``dtype`` says, which is that of inputs and outputs: float32 cannot hold K^-1 of a smooth kernel.
 
-    The outputs share the basis and one noise-to-signal ratio; each has its own scale and noise.
+    The outputs share the basis and one noise-to-signal ratio in the gain; each has its own scale and
+    its own observation noise.
 
     Args:
         in_features, out_features, batch_shape, on_invalid, dtype, device: see ResidualLearner.
@@ -51,9 +52,8 @@ class SparseOnlineGP(ResidualLearner):
         kernel: covariance function in the learner's (normalised) units; default squared exponential
             with lengthscale sqrt(in_features) and unit variance.
         noise_variance: s2 in the (normalised) output's squared units, one number or one per output.
-        novelty_tolerance: smallest ``gamma / k**`` of a new basis point; by default 1e-4 in
-            float64 and 1e-2 in float32.
-        jitter: nugget on k(x, x) at basis points, relative to k**; default 1e-8, 1e-6 in float32.
+        novelty_tolerance: smallest ``gamma / k**`` of a new basis point.
+        jitter: nugget on k(x, x) at basis points, relative to k**.
         projection: ``"kl"``, or ``"fitc"``, which counts a projected sample's novelty as noise and so
             is less confident.
         deletion: score by which a basis point goes, a name in ``DELETION_SCORES``: ``"kl"`` exact
@@ -69,19 +69,15 @@ class SparseOnlineGP(ResidualLearner):
             prior mean stays 0.
         normalize_for: samples after which the units stand still.
         refresh_every: samples between two rebuilds of the caches.
+        adapt: learn kernel and noise online, see PrequentialAdaptation; one step per rebuild.
+        adapt_rate: its step on the logarithms of the hyperparameters.
+        adapt_network_rate: its step on a deep kernel's weights.
 
     Raises:
         ParameterError: a parameter is outside its range.
     """
 
-    basis: Tensor
-    active: Tensor
-    count: Tensor
-    slot: Tensor
-    age: Tensor
     pending: Tensor
-    _moments: Tensor
-    _vectors: Tensor
 
     def __init__(
         self,
@@ -91,8 +87,8 @@ class SparseOnlineGP(ResidualLearner):
         capacity: int = 100,
         kernel: Kernel | None = None,
         noise_variance: float | Tensor = 0.01,
-        novelty_tolerance: float | None = None,
-        jitter: float | None = None,
+        novelty_tolerance: float = 1e-4,
+        jitter: float = 1e-6,
         projection: Literal["kl", "fitc"] = "kl",
         deletion: str = "kl",
         forgetting: float = 1.0,
@@ -100,6 +96,9 @@ class SparseOnlineGP(ResidualLearner):
         normalize: bool = False,
         normalize_for: int = 1000,
         refresh_every: int = 16,
+        adapt: bool = False,
+        adapt_rate: float = 0.03,
+        adapt_network_rate: float = 0.003,
         batch_shape: tuple[int, ...] = (),
         on_invalid: Literal["raise", "skip"] = "raise",
         dtype: torch.dtype = torch.float64,
@@ -113,109 +112,104 @@ class SparseOnlineGP(ResidualLearner):
             dtype=dtype,
             device=device,
         )
-        factory = {"dtype": dtype, "device": device}
-        fleet = {"batch_shape": self.batch_shape, **factory}
-        double = dtype == torch.float64
-        self.capacity = check_count("capacity", capacity)
-        self.refresh_every = check_count("refresh_every", refresh_every)
-        self.novelty_tolerance = (
-            (1e-4 if double else 1e-2) if novelty_tolerance is None else novelty_tolerance
-        )
-        if not 0 <= self.novelty_tolerance < 1:
-            raise ParameterError("novelty_tolerance", novelty_tolerance, "in [0, 1)")
-        self.jitter = (1e-8 if double else 1e-6) if jitter is None else jitter
-        if not 0 <= self.jitter < 1:
-            raise ParameterError("jitter", jitter, "in [0, 1)")
+        for name, value in (("novelty_tolerance", novelty_tolerance), ("jitter", jitter)):
+            if not 0 <= value < 1:
+                raise ParameterError(name, value, "in [0, 1)")
         if not 0 < forgetting <= 1:
             raise ParameterError("forgetting", forgetting, "in (0, 1]")
         if projection not in ("kl", "fitc"):
             raise ParameterError("projection", projection, "'kl' or 'fitc'")
         if deletion not in (*DELETION_SCORES, "freeze"):
             raise ParameterError("deletion", deletion, f"one of {(*DELETION_SCORES, 'freeze')}")
-        self.forgetting, self.projection, self.deletion = float(forgetting), projection, deletion
-        self.robust = None if robust is None else check_positive("robust", robust)
-        self.kernel = SquaredExponential(self.in_features, **fleet) if kernel is None else kernel
+        self.capacity = check_count("capacity", capacity)
+        self.refresh_every = check_count("refresh_every", refresh_every)
+        self.forgetting = float(forgetting)
+        factory: dict[str, Any] = {"dtype": torch.float64, "device": device}
+        fleet = {"batch_shape": self.batch_shape, **factory}
+        self.kernel = SquaredExponential(self.in_features, **fleet) if kernel is None else kernel.double()
         self.log_noise_variance = log_parameter(
             "noise_variance", noise_variance, (*self.batch_shape, self.out_features), **factory
         )
         self.normalize_for = check_count("normalize_for", normalize_for) if normalize else 0
-        shifted = self.kernel.shift_invariant(self.in_features)
-        self.input_scale = RunningScale(self.in_features, shifted, **fleet) if normalize else None
-        self.output_scale = RunningScale(self.out_features, **fleet) if normalize else None
-
-        # One slot more than the capacity: a new point moves in before another is deleted.
-        M, shape = self.capacity + 1, self.batch_shape
-        self.register_buffer("basis", torch.zeros(*shape, M, self.in_features, **factory))
-        self.register_buffer("active", torch.zeros(*shape, M, **factory))
-        self.register_buffer("age", torch.zeros(*shape, M, **factory))  # sample number of each point
-        self.register_buffer("count", torch.zeros(shape, dtype=torch.int64, device=device))
-        self.register_buffer("slot", torch.zeros(shape, dtype=torch.int64, device=device))
-        self.register_buffer("pending", torch.zeros(shape, **factory))  # samples not yet forgotten
-        # [C; Q; Omega] and [alpha; h] each in one buffer: one product, one update serves all.
-        self.register_buffer("_moments", torch.zeros(*shape, 3, M, M, **factory))
-        self.register_buffer("_vectors", torch.zeros(*shape, 2, M, self.out_features, **factory))
-        self.register_buffer("_slots", torch.arange(M, device=device), persistent=False)
+        shifted = self.kernel.shift_invariant(self.in_features) if normalize else []
+        self.input_scale = RunningScale(self.in_features, shifted, **fleet)
+        self.output_scale = RunningScale(self.out_features, **fleet)
+        self.posterior = SparsePosterior(
+            self.in_features,
+            self.out_features,
+            self.capacity,
+            novelty_tolerance=novelty_tolerance,
+            jitter=jitter,
+            projection=projection,
+            deletion=deletion,
+            robust=None if robust is None else check_positive("robust", robust),
+            batch_shape=self.batch_shape,
+            device=device,
+        )
+        self.adaptation = None
+        if adapt:
+            self.adaptation = PrequentialAdaptation(
+                self.posterior,
+                self.kernel,
+                self.log_noise_variance,
+                window=self.refresh_every,
+                rate=check_positive("adapt_rate", adapt_rate),
+                network_rate=check_positive("adapt_network_rate", adapt_network_rate),
+                steps=1,
+            )
+        # samples whose forgetting is due at the next rebuild
+        self.register_buffer("pending", torch.zeros(self.batch_shape, **factory))
         self._n_samples = 0  # on the host, so that the rhythm of rebuilds never asks the GPU
 
     # -- predictions ----------------------------------------------------------------------------
 
     def forward(self, x: Tensor) -> Tensor:
         """``alpha' k(X, x)``, differentiable in x."""
-        z = self._normalized(self._check_query(x))
-        mean = (self._cross(z).unsqueeze(-2) @ self.alpha).squeeze(-2)
-        return mean if self.output_scale is None else mean * self.output_scale.scale
+        k = self._cross(self._units(self._check_query(x)))
+        return self._out((k.unsqueeze(-2) @ self.posterior.alpha).squeeze(-2), 1)
 
     def variance(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any out"]:
         """Latent variance ``k** + k'Ck`` of each output, differentiable in x."""
-        z = self._normalized(self._check_query(x))
-        k = self._cross(z)
-        v = self.kernel.diagonal(z) + ((k.unsqueeze(-2) @ self._moments[..., 0, :, :]).squeeze(-2) * k).sum(
-            -1
-        )
-        return self._output_variance(v)
+        z = self._units(self._check_query(x))
+        k = self._cross(z).unsqueeze(-1)
+        v = self.kernel.diagonal(z) + (k.mT @ (self.posterior.covariance @ k)).squeeze(-1).squeeze(-1)
+        return self._out(v.clamp_min(0.0).unsqueeze(-1), 2)
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """N(mean, var), with the observation noise added on request."""
         variance = self.variance(x)
         if observation:
-            variance = variance + self.noise_variance
+            variance = variance + self.noise_variance.to(self.dtype)
         return Normal(self(x), variance.sqrt(), validate_args=False)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """``(alpha'k, alpha' dk/dx)`` in closed form."""
-        z = self._normalized(self._check_query(x))
-        k, dk = self._cross_with_gradient(z)
-        mean, jacobian = (k.unsqueeze(-2) @ self.alpha).squeeze(-2), self.alpha.mT @ dk
-        if self.input_scale is not None and self.output_scale is not None:
-            mean = mean * self.output_scale.scale
-            jacobian = jacobian * (
-                self.output_scale.scale.unsqueeze(-1) / self.input_scale.scale.unsqueeze(-2)
-            )
-        return mean, jacobian
+        k, dk = self._cross_with_gradient(self._units(self._check_query(x)))
+        coefficients = self.posterior.alpha.mT
+        mean, jacobian = (coefficients @ k.unsqueeze(-1)).squeeze(-1), coefficients @ dk
+        return self._out(mean, 1), self._out_slope(jacobian, 1)
 
     def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> Prediction:
         """Mean, latent variance and both derivatives, in closed form::
 
         d mean/dx = alpha' dk/dx,   d var/dx = dk(x,x)/dx + 2 (Ck)' dk/dx
         """
-        z = self._normalized(self._check_query(x))
+        z = self._units(self._check_query(x))
         k, dk = self._cross_with_gradient(z)
-        Ck = (self._moments[..., 0, :, :] @ k.unsqueeze(-1)).squeeze(-1)
-        # Products with alpha and Ck share one pass over k and dk each.
-        left = torch.cat([self.alpha.expand(*Ck.shape, -1), Ck.unsqueeze(-1)], dim=-1).mT
-        values = (left @ k.unsqueeze(-1)).squeeze(-1)
-        slopes = left @ dk
-        mean, jacobian = values[..., :-1], slopes[..., :-1, :]
-        v = self.kernel.diagonal(z) + values[..., -1]
-        dv = self.kernel.diagonal_gradient(z) + 2.0 * slopes[..., -1, :]
-        if self.input_scale is not None and self.output_scale is not None:
-            out, inv = self.output_scale.scale, 1.0 / self.input_scale.scale
-            mean, dv = mean * out, dv * inv
-            jacobian = jacobian * out.unsqueeze(-1) * inv.unsqueeze(-2)
-            return Prediction(
-                mean, self._output_variance(v), jacobian, (out * out).unsqueeze(-1) * dv.unsqueeze(-2)
-            )
-        return Prediction(mean, self._output_variance(v), jacobian, dv.unsqueeze(-2).expand_as(jacobian))
+        column = k.unsqueeze(-1)
+        Ck = self.posterior.covariance @ column
+        alpha = self.posterior.alpha
+        # alpha and Ck side by side share one pass over k and one over dk
+        left = torch.cat([alpha.expand(*Ck.shape[:-1], alpha.shape[-1]), Ck], dim=-1).mT
+        values, slopes = (left @ column).squeeze(-1), left @ dk
+        v = (self.kernel.diagonal(z) + values[..., -1]).clamp_min(0.0).unsqueeze(-1)
+        dv = self.kernel.diagonal_gradient(z).unsqueeze(-2) + 2.0 * slopes[..., -1:, :]
+        return Prediction(
+            self._out(values[..., :-1], 1),
+            self._out(v, 2),
+            self._out_slope(slopes[..., :-1, :], 1),
+            self._out_slope(dv, 2),
+        )
 
     def action_jacobian(self, s: Float[Tensor, "*any n_s"]) -> Float[Tensor, "*any out n_a"]:
         """G(s) with ``mean(s, a) = G(s) a`` exactly: ``G = sum_i alpha_i k_s(s, s_i) (Lambda a_i)'``.
@@ -223,12 +217,8 @@ class SparseOnlineGP(ResidualLearner):
         Raises:
             ParameterError: the kernel is not action-linear.
         """
-        B, _ = self._action_features(s)
-        G = self.alpha.mT @ B
-        if self.input_scale is not None and self.output_scale is not None:
-            n_s = s.shape[-1]
-            G = G * self.output_scale.scale.unsqueeze(-1) / self.input_scale.scale[..., None, n_s:]
-        return G
+        _, B = self._action_features(s)
+        return self._out_slope(self.posterior.alpha.mT @ B, 1)
 
     def action_covariance(self, s: Float[Tensor, "*any n_s"]) -> Float[Tensor, "*any out n_a n_a"]:
         """V(s) with ``var(s, a)_j = a' V_j(s) a`` exactly: ``V = k_s(s,s) Lambda + B'CB``, B as in G.
@@ -236,50 +226,43 @@ class SparseOnlineGP(ResidualLearner):
         Raises:
             ParameterError: the kernel is not action-linear.
         """
-        B, prior = self._action_features(s)
-        V = (prior + B.mT @ self._moments[..., 0, :, :] @ B).unsqueeze(-3)
-        if self.input_scale is not None and self.output_scale is not None:
-            inv = 1.0 / self.input_scale.scale[..., s.shape[-1] :]
-            out = self.output_scale.scale.square()[..., None, None]
-            return V * (inv.unsqueeze(-1) * inv.unsqueeze(-2)).unsqueeze(-3) * out
-        return V.expand(*V.shape[:-3], self.out_features, *V.shape[-2:])
+        kernel, B = self._action_features(s)
+        V = kernel.action_prior(self._units(s)) + B.mT @ (self.posterior.covariance @ B)
+        if not self.normalize_for:
+            return V.unsqueeze(-3).expand(*V.shape[:-2], self.out_features, *V.shape[-2:]).to(self.dtype)
+        inverse = 1.0 / self.input_scale.scale[..., kernel.state_features :]
+        V = V * (inverse.unsqueeze(-1) * inverse.unsqueeze(-2))
+        return (V.unsqueeze(-3) * self.output_scale.scale.square()[..., None, None]).to(self.dtype)
 
     # -- what is known --------------------------------------------------------------------------
 
     @property
-    def alpha(self) -> Float[Tensor, "*batch slots out"]:
-        """Coefficients of the mean, in normalised output units; rows of free slots are 0."""
-        return self._vectors[..., 0, :, :]
-
-    @property
     def noise_variance(self) -> Float[Tensor, "*batch out"]:
         """Observation noise variance, in the outputs' own squared units."""
-        noise = self.log_noise_variance.exp()
-        return noise if self.output_scale is None else noise * self.output_scale.scale.square()
+        return self.log_noise_variance.exp() * self.output_scale.scale.square()
 
     @property
     def basis_inputs(self) -> Float[Tensor, "*batch slots in"]:
-        """Basis points in the inputs' own units; only slots with ``active == 1`` mean anything."""
-        if self.input_scale is None:
-            return self.basis
-        return self.basis * self.input_scale.scale.unsqueeze(-2) + self.input_scale.shift.unsqueeze(-2)
+        """Basis points in the inputs' own units; only slots with ``posterior.active == 1`` count."""
+        scale, shift = self.input_scale.scale.unsqueeze(-2), self.input_scale.shift.unsqueeze(-2)
+        return (self.posterior.basis * scale + shift).to(self.dtype)
 
     @property
     def condition_number(self) -> Float[Tensor, "*batch"]:
         """Condition of the basis' kernel matrix (2-norm)."""
-        return torch.linalg.cond(self._gram().double()).to(self.dtype)
+        return torch.linalg.cond(self.posterior.gram(self.kernel))
 
     # -- learning -------------------------------------------------------------------------------
 
     def reset(self) -> None:
         """Forget all samples and units; kernel and noise stay."""
-        for buffer in (self.basis, self.active, self.age, self.count, self.slot, self.pending):
-            buffer.zero_()
-        for buffer in (self._moments, self._vectors, self.n_refused):
-            buffer.zero_()
-        if self.input_scale is not None and self.output_scale is not None:
-            self.input_scale.reset()
-            self.output_scale.reset()
+        self.posterior.reset()
+        self.input_scale.reset()
+        self.output_scale.reset()
+        if self.adaptation is not None:
+            self.adaptation.reset()
+        self.pending.zero_()
+        self.n_refused.zero_()
         self._n_samples = 0
 
     @torch.no_grad()
@@ -296,225 +279,115 @@ class SparseOnlineGP(ResidualLearner):
         if x.shape[1:] != (*self.batch_shape, self.in_features) or not 1 <= len(x) <= self.capacity:
             raise ShapeError("x", self._expected(f"[n <= {self.capacity}]", "in"), x.shape)
         self.reset()
-        self.basis[..., : len(x), :] = x.movedim(0, -2)
-        self.active[..., : len(x)] = 1.0
-        self.count.fill_(len(x))
-        self.slot.fill_(len(x))
+        self.posterior.place(x.movedim(0, -2))
         self.refresh()
 
     @torch.no_grad()
     def refresh(self) -> None:
-        """Forget what is due, adopt new units and rebuild (alpha, C, Q) from the natural form.
+        """Forget what is due, adopt new units and rebuild the caches from the natural form.
 
         Call it after a change of the kernel's or the noise's parameters.
         """
-        C, Q, Omega = self._moments.unbind(-3)
-        alpha, h = self._vectors.unbind(-3)
+        posterior = self.posterior
         if self.forgetting < 1.0:
             factor = (self.forgetting**self.pending)[..., None, None]
-            Omega.mul_(factor)
-            h.mul_(factor)
+            posterior.precision.mul_(factor)
+            posterior.information.mul_(factor)
         self.pending.zero_()
-        if self._normalizing and self.input_scale is not None and self.output_scale is not None:
+        if self._normalizing:
             offset, ratio = self.input_scale.settle()
-            self.basis.add_(offset.unsqueeze(-2)).mul_(ratio.unsqueeze(-2))
-            h.mul_(self.output_scale.settle()[1].unsqueeze(-2))
-        s2 = self._shared_noise()[..., None, None]
-        new_Q, new_C, new_alpha = posterior_from_natural(self._gram(), Omega / s2, h / s2)
-        on = self.active.unsqueeze(-1)
-        Q.copy_(new_Q * on * on.mT)
-        C.copy_(new_C * on * on.mT)
-        alpha.copy_(new_alpha * on)
+            posterior.basis.add_(offset.unsqueeze(-2)).mul_(ratio.unsqueeze(-2))
+            posterior.information.mul_(self.output_scale.settle()[1].unsqueeze(-2))
+        posterior.rebuild(self.kernel, self._shared_noise())
+        if self.adaptation is not None:
+            self.adaptation.snapshot(posterior)
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        z = self._normalized(x)
-        t = y if self.output_scale is None else y / self.output_scale.scale
-        report = self._step(z, t, None if mask is None else mask.to(self.dtype))
-        self._n_samples += 1
-        if self._normalizing and self.input_scale is not None and self.output_scale is not None:
-            weight = report.weight if mask is None else report.weight * mask
-            self.input_scale.observe(x, torch.ones_like(weight) if mask is None else mask.to(self.dtype))
-            self.output_scale.observe(y, weight)
+        on = None if mask is None else mask.to(x.dtype)
+        z, t = self._units(x), y / self.output_scale.scale if self.normalize_for else y
+        report = self.posterior.absorb(z, t, self.kernel, self._shared_noise(), on, self._n_samples)
+        self.pending += 1.0 if on is None else on
+        if self._normalizing:
+            used = torch.ones_like(report.weight) if on is None else on
+            self.input_scale.observe(x, used)
+            self.output_scale.observe(y, report.weight * used)
+        n = self._n_samples = self._n_samples + 1
+        due = n % self.refresh_every == 0
+        if self.adaptation is not None:
+            self.adaptation.observe(z, t, on, (n - 1) % self.refresh_every)
+            if due:
+                robust, jitter = self.posterior.robust, self.posterior.jitter
+                self.adaptation.descend(self.kernel, self.log_noise_variance, jitter, robust)
         # Units are rough in the first samples: then rebuild at 1, 2, 4, 8, ... too.
-        n = self._n_samples
-        if n % self.refresh_every == 0 or (self._normalizing and n & (n - 1) == 0):
+        if due or (self._normalizing and n & (n - 1) == 0):
             self.refresh()
         return report
-
-    def _step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        """One sample per model, without a branch on data (a mask multiplies every change by 0).
-
-        e = Qk, gamma = k** - k'e, v = k** + k'Ck, D = s2 + v, i = y - mean. A novel sample takes
-        slot j with t = 1_j, others are projected with t = e and D = s2 + v - gamma. With s = Ck + t:
-        alpha += s i'/D, C -= s s'/D, Omega += t t', h += t y', and for novel ones Q += p p'/gamma,
-        p = e - 1_j.
-        """
-        M, tail = self.capacity + 1, (-2, -1)
-        here = self._slots == self.slot.unsqueeze(-1)
-        k = self.kernel.vector(x, self.basis) * self.active
-        prior = self.kernel.diagonal(x) * (1.0 + self.jitter)
-        products = (self._moments[..., :2, :, :].flatten(-3, -2) @ k.unsqueeze(-1)).unflatten(-2, (2, M))
-        Ck, e = products.squeeze(-1).unbind(-2)
-        kCk, ke = (products.squeeze(-1) @ k.unsqueeze(-1)).squeeze(-1).unbind(-1)
-        gamma, v = (prior - ke).clamp_min(0.0), prior + kCk
-        innovation = y - (k.unsqueeze(-2) @ self.alpha).squeeze(-2)
-
-        s2 = noise = self._shared_noise()
-        surprise = innovation.square().mean(-1) / (s2 + v)
-        weight = torch.ones_like(surprise)
-        if self.robust is not None:
-            weight = 1.0 / (1.0 + surprise / self.robust**2)
-            noise = s2 / weight
-        full = self.count == self.capacity
-        novel = gamma > self.novelty_tolerance * prior
-        if self.deletion == "freeze":
-            novel = novel & ~full
-        known = gamma * ~novel  # novelty that a projection drops
-        if self.projection == "fitc":
-            noise = noise + known
-        gain, precision = 1.0 / (noise + v - known), s2 / noise
-        if mask is not None:
-            novel, gain, precision = novel & (mask > 0), gain * mask, precision * mask
-
-        unit = here.to(e.dtype)
-        t = torch.where(novel.unsqueeze(-1), unit, e)
-        s = Ck + t
-        p = e - unit
-        grow = torch.where(novel, 1.0 / gamma, 0.0)
-        left, right = torch.stack([s, p, t], dim=-2), torch.stack([-gain, grow, precision], dim=-1)
-        self._rank_update(self._moments, (left * right.unsqueeze(-1)).unsqueeze(-1), left.unsqueeze(-1))
-        values = torch.stack([innovation * gain.unsqueeze(-1), y * precision.unsqueeze(-1)], dim=-2)
-        self._rank_update(self._vectors, torch.stack([s, t], dim=-2).unsqueeze(-1), values.unsqueeze(-1))
-
-        # The slot's content does not matter while it is free, so it can be written in any case.
-        where = self.slot[..., None]
-        if mask is None:
-            self.basis.scatter_(-2, where.unsqueeze(-1).expand_as(x.unsqueeze(-2)), x.unsqueeze(-2))
-            self.pending += 1.0
-        else:
-            self.basis.copy_(
-                torch.where((here & (mask > 0).unsqueeze(-1)).unsqueeze(-1), x.unsqueeze(-2), self.basis)
-            )
-            self.pending += mask
-        self.active.scatter_(-1, where, novel.to(e.dtype).unsqueeze(-1))
-        self.age.scatter_(-1, where, torch.full_like(where, self._n_samples, dtype=e.dtype))
-        excess = novel & full
-        self.count += novel & ~full
-        self.slot += novel & ~full
-        if self.deletion != "freeze" and self._any(excess):
-            self._delete(excess)
-        event = UpdateEvent.ABSORBED + novel.to(torch.int64) + excess
-        if mask is not None:
-            event = event * (mask > 0)
-        return UpdateReport(event, gamma / prior, surprise, weight)
-
-    def _delete(self, excess: Tensor) -> None:
-        """KL projection of the lowest-scored point onto the others, where ``excess``.
-
-        With a, c, q its entries in alpha, C, Q, stars its remaining columns and e = -Q*/q:
-        alpha -= (C*+Q*) a'/(c+q), C += Q*Q*'/q - (C*+Q*)(C*+Q*)'/(c+q), Q -= Q*Q*'/q,
-        Omega <- P'Omega P, h <- P'h, P = [I; e'].
-        """
-        M, dtype = self.capacity + 1, self._moments.dtype
-        c_diag, q_diag, w_diag = self._moments.diagonal(dim1=-2, dim2=-1).unbind(-2)
-        score = DELETION_SCORES[self.deletion](
-            self.alpha, c_diag, q_diag, w_diag / self._shared_noise().unsqueeze(-1), self.age
-        )
-        i = torch.where(self.active > 0, score, torch.inf).argmin(-1, keepdim=True)
-        at = self._slots == i
-        pick = i[..., None, None].expand(*self.batch_shape, 3, M, 1)
-        columns = self._moments.gather(-1, pick).squeeze(-1)  # C, Q, Omega: (..., 3, M)
-        c, q, w = columns.gather(-1, i.unsqueeze(-2).expand(*self.batch_shape, 3, 1)).unbind(-2)
-        away = (~at).to(dtype)
-        C, Q, Om = (columns * away.unsqueeze(-2)).unbind(-2)
-        on = excess.to(dtype).unsqueeze(-1)
-        q_inv = on / q
-        # c + q >= 0 is the point's remaining uncertainty; rounding must not turn it negative.
-        cq_inv = on / torch.maximum(c + q, 100 * torch.finfo(dtype).eps * q)
-        CQ, e = C + Q, -Q * q_inv
-        u = Om * on + 0.5 * w * e
-        zero = torch.zeros_like(Q)
-        left = torch.stack([Q * q_inv, -CQ * cq_inv, -Q * q_inv, zero, u, e], dim=-2)
-        right = torch.stack([Q, CQ, Q, zero, e, u], dim=-2)
-        halves = (*self.batch_shape, 3, 2, M)
-        self._rank_update(self._moments, left.view(halves).mT, right.view(halves).mT)
-        rows = self._vectors.gather(-2, i[..., None, None].expand(*self.batch_shape, 2, 1, self.out_features))
-        down = torch.stack([-CQ * cq_inv, e], dim=-2).unsqueeze(-1)
-        self._rank_update(self._vectors, down, rows.mT)
-
-        # The slot becomes free: its rows and columns are 0 by definition, not by cancellation.
-        free = torch.where(excess.unsqueeze(-1), i, self.slot.unsqueeze(-1))
-        self._moments.scatter_(-1, free[..., None, None].expand(*self.batch_shape, 3, M, 1), 0.0)
-        self._moments.scatter_(-2, free[..., None, None].expand(*self.batch_shape, 3, 1, M), 0.0)
-        self._vectors.scatter_(
-            -2, free[..., None, None].expand(*self.batch_shape, 2, 1, self.out_features), 0.0
-        )
-        self.active.scatter_(-1, free, 0.0)
-        self.slot.copy_(free.squeeze(-1))
 
     # -- pieces ---------------------------------------------------------------------------------
 
     @property
     def _normalizing(self) -> bool:
-        return self._n_samples <= self.normalize_for and self.input_scale is not None
-
-    def _normalized(self, x: Tensor) -> Tensor:
-        return x if self.input_scale is None else self.input_scale(x)
-
-    def _output_variance(self, v: Tensor) -> Tensor:
-        v = v.clamp_min(0.0).unsqueeze(-1)
-        if self.output_scale is None:
-            return v.expand(*v.shape[:-1], self.out_features)
-        return v * self.output_scale.scale.square()
+        return self._n_samples <= self.normalize_for and self.normalize_for > 0
 
     def _shared_noise(self) -> Tensor:
         """Noise by which the gain is computed: geometric mean over the (normalised) outputs."""
         return self.log_noise_variance.mean(-1).exp()
 
+    def _units(self, x: Tensor) -> Tensor:
+        """x, or its first columns, in the learner's units."""
+        if not self.normalize_for:
+            return x
+        n = x.shape[-1]
+        return (x - self.input_scale.shift[..., :n]) / self.input_scale.scale[..., :n]
+
+    def _out(self, value: Tensor, power: int) -> Tensor:
+        """``(*any, out or 1)`` in output units (squared if power is 2), in the interface's dtype."""
+        if self.normalize_for:
+            value = value * (self.output_scale.scale if power == 1 else self.output_scale.scale.square())
+        return value.expand(*value.shape[:-1], self.out_features).to(self.dtype)
+
+    def _out_slope(self, slope: Tensor, power: int) -> Tensor:
+        """``(*any, out or 1, columns)``: derivative by the last columns of x."""
+        if self.normalize_for:
+            scale = self.output_scale.scale if power == 1 else self.output_scale.scale.square()
+            slope = slope * scale.unsqueeze(-1)
+            slope = slope / self.input_scale.scale[..., None, self.in_features - slope.shape[-1] :]
+        return slope.expand(*slope.shape[:-2], self.out_features, slope.shape[-1]).to(self.dtype)
+
     def _cross(self, z: Tensor) -> Tensor:
-        return self.kernel.vector(z, self.basis) * self.active
+        return self.kernel.vector(z, self.posterior.basis) * self.posterior.active
 
     def _cross_with_gradient(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        k, dk = self.kernel.with_gradient(z, self.basis)
-        return k * self.active, dk * self.active.unsqueeze(-1)
+        # free slots need no mask here: their rows in alpha and C are 0
+        return self.kernel.with_gradient(z, self.posterior.basis)
 
-    def _gram(self) -> Tensor:
-        """K(X, X) with the nugget; the identity at free slots."""
-        on = self.active.unsqueeze(-1)
-        diagonal = self.kernel.diagonal(self.basis) * (1.0 + self.jitter)
-        K = self.kernel(self.basis, self.basis) * on * on.mT
-        K = 0.5 * (K + K.mT)
-        K.diagonal(dim1=-2, dim2=-1).copy_(torch.where(self.active > 0, diagonal, 1.0))
-        return K
-
-    def _action_features(self, s: Tensor) -> tuple[Tensor, Tensor]:
-        if not isinstance(self.kernel, ActionLinearKernel):
-            raise ParameterError(
-                "kernel", type(self.kernel).__name__, "an ActionLinearKernel for this method"
-            )
-        n_s = self.kernel.state_features
+    def _action_features(self, s: Tensor) -> tuple[ActionLinearKernel, Tensor]:
+        kernel = self.kernel
+        if not isinstance(kernel, ActionLinearKernel):
+            raise ParameterError("kernel", type(kernel).__name__, "an ActionLinearKernel for this method")
         s = self._cast(s)
-        if s.shape[-1:] != (n_s,):
-            raise ShapeError("s", f"(*any, {n_s})", s.shape)
-        if self.input_scale is not None:
-            s = (s - self.input_scale.shift[..., :n_s]) / self.input_scale.scale[..., :n_s]
-        B = self.kernel.action_features_of(s, self.basis) * self.active.unsqueeze(-1)
-        return B, self.kernel.action_prior(s)
+        if s.shape[-1:] != (kernel.state_features,):
+            raise ShapeError("s", f"(*any, {kernel.state_features})", s.shape)
+        return kernel, kernel.action_features_of(self._units(s), self.posterior.basis)
 
-    @staticmethod
-    def _rank_update(target: Tensor, left: Tensor, right: Tensor) -> None:
-        """target += left right', in place, over all leading axes at once."""
-        flat = (-1, *target.shape[-2:])
-        target.view(flat).baddbmm_(left.flatten(0, -3), right.flatten(0, -3).mT)
+    def _cast(self, x: Tensor) -> Tensor:
+        return torch.as_tensor(x, dtype=torch.float64, device=self.device)
 
-    @staticmethod
-    def _any(flag: Tensor) -> bool:
-        """Skip work that no model needs where looking is free: on the CPU, outside a compiled graph."""
-        return flag.is_cuda or torch.compiler.is_compiling() or bool(flag.any())
+    def _apply(self, fn, recurse=True):
+        """Device moves take all along; a change of dtype is one of the interface only."""
+
+        def keep_double(t: Tensor) -> Tensor:
+            moved = fn(t)
+            if t is self._like or not t.is_floating_point():
+                return moved
+            return t.to(moved.device)
+
+        return super()._apply(keep_double, recurse)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Number of samples seen: the rhythm of rebuilds continues after a reload."""
         return {"n_samples": self._n_samples}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
+        """See get_extra_state."""
         self._n_samples = int(state["n_samples"])
