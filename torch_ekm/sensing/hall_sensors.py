@@ -1,0 +1,147 @@
+"""The Hall channels of a hand, simulated: counts from joint angles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import torch
+
+from ..description import HandDescription
+from ..exceptions import ParameterError, ShapeError
+from ..typing import Bool, Float, Tensor
+
+
+class Stuck(Enum):
+    """How a channel fails. The last is the commonest on real hands at either end of the range."""
+
+    NO = "no"
+    LOW = "low"  # at 0
+    HIGH = "high"  # at full scale
+    FROZEN = "frozen"  # at what it first read
+
+
+@dataclass(frozen=True)
+class HallQuality:
+    """What spoils Hall readings; the defaults are the nominal ones.
+
+    Raises:
+        ParameterError: a value is out of range.
+    """
+
+    noise: float = 0.6
+    """Standard deviation before the converter [counts]."""
+    open_overdrive: tuple[float, float] = (-0.03, 0.06)
+    """Share of its range by which a channel's curve lies beyond full scale when its joint is open, drawn
+    from this interval; negative: it stops short. On 19 robots the open reading is 255 for most
+    proximal channels, and 491 to 505 of 510 (medians) for the sums of two."""
+    closed_overdrive: tuple[float, float] = (-0.16, 0.03)
+    """The same for the closed end: medians 0 to 22 of 255, and 127 of 765 for the little finger."""
+    half_turn_deg: tuple[float, float] = (50.0, 62.0)
+    """The magnet turns by plus and minus that much before its sensor."""
+    asymmetry_deg: float = 6.0
+    """Largest misalignment of a magnet."""
+    reversed_share: float = 0.0
+    """Probability that a channel is mounted the other way round."""
+
+    def __post_init__(self) -> None:
+        if not self.noise >= 0:
+            raise ParameterError("HallQuality.noise", self.noise, "zero or positive [counts]")
+        for name in ("open_overdrive", "closed_overdrive"):
+            low, high = getattr(self, name)
+            if not -0.5 < low <= high < 0.4:
+                raise ParameterError(f"HallQuality.{name}", (low, high), "increasing, within (-0.5, 0.4)")
+        low, high = self.half_turn_deg
+        if not 0 < low <= high or high + self.asymmetry_deg >= 90:
+            valid = "increasing, and below 90 deg with asymmetry_deg: the curve must not turn back"
+            raise ParameterError("HallQuality.half_turn_deg", self.half_turn_deg, valid)
+
+
+class HallSensors:
+    r"""``n = floor(clip(open + (closed - open) u(q) + noise, 0, 255))``, one channel per sensed joint.
+
+    ``u`` is the field of a magnet that turns before a linear sensor,
+    ``u = (sin(alpha (2 x - 1) + beta) - sin(beta - alpha)) / (sin(alpha + beta) - sin(beta - alpha))``
+    at ``x = (q - lower) / (upper - lower)``, stretched beyond the scale or short of it at
+    either end. Curved, monotone, and not a cubic: a cubic calibration has something left to miss.
+    Open reads 255 and closed 0 unless the hand's description or a reversed mounting says otherwise
+    (the iCub's MAIS boards send the upper 8 of 12 bits, hence the floor).
+
+    Args:
+        hand: its ``hall_sensors`` and joint limits.
+        quality: noise and the spread between channels.
+        seed: of the channels' own curves (a hand's identity, not the noise of a reading).
+
+    Raises:
+        ParameterError: the hand has no Hall sensors.
+    """
+
+    def __init__(self, hand: HandDescription, quality: HallQuality | None = None, seed: int = 0) -> None:
+        if not hand.hall_sensors:
+            raise ParameterError(
+                "hand.hall_sensors", (), "non-empty: give the transmission file [[hall_sensors]]"
+            )
+        self.quality = quality or HallQuality()
+        sensors = sorted(hand.hall_sensors, key=lambda sensor: sensor.channel)
+        self.joints = tuple(sensor.joint for sensor in sensors)
+        self._index = torch.tensor([hand.joint_names.index(joint) for joint in self.joints])
+        self._n_q = hand.n_q
+        rng, n, q = np.random.default_rng(seed), len(sensors), self.quality
+        self._lower = torch.from_numpy(hand.joint_lower.copy())[self._index]
+        self._upper = torch.from_numpy(hand.joint_upper.copy())[self._index]
+        self._alpha = torch.from_numpy(np.radians(rng.uniform(*q.half_turn_deg, n)))
+        self._beta = torch.from_numpy(np.radians(rng.uniform(-q.asymmetry_deg, q.asymmetry_deg, n)))
+        self._over = torch.from_numpy(
+            np.stack([rng.uniform(*q.open_overdrive, n), rng.uniform(*q.closed_overdrive, n)])
+        )
+        ends = torch.tensor([[s.open, s.closed] for s in sensors], dtype=torch.float64).T
+        turned = torch.from_numpy(rng.random(n) < q.reversed_share)
+        self._open = torch.where(turned, ends[1], ends[0])
+        self._closed = torch.where(turned, ends[0], ends[1])
+        self.stuck = [Stuck.NO] * n
+        """Failure of each channel; may be changed at any time."""
+        self._frozen: dict[int, Tensor] = {}
+
+    @property
+    def n_channels(self) -> int:
+        return len(self.joints)
+
+    def field(self, q: Float[Tensor, "*batch n_q"]) -> Float[Tensor, "*batch n_channels"]:
+        """Counts before noise, rounding and the ends of the scale.
+
+        Raises:
+            ShapeError: the last dimension is not the number of joints.
+        """
+        if q.shape[-1] != self._n_q:
+            raise ShapeError("q", f"(*batch, {self._n_q})", q.shape)
+        x = (q[..., self._index].to(torch.float64) - self._lower) / (self._upper - self._lower)
+        alpha, beta = self._alpha, self._beta
+        start, end = torch.sin(beta - alpha), torch.sin(beta + alpha)
+        # held at the ends of the magnet's half turn, so that joints beyond their stops stay monotone
+        phase = (alpha * (2 * x - 1) + beta).clamp(-torch.pi / 2, torch.pi / 2)
+        u = (torch.sin(phase) - start) / (end - start)
+        low, high = self._over
+        u = (u - low) / (1 - low - high)
+        return self._open + (self._closed - self._open) * u
+
+    def saturated(self, q: Float[Tensor, "*batch n_q"]) -> Bool[Tensor, "*batch n_channels"]:
+        """Truth: the channel is at an end of its scale."""
+        field = self.field(q)
+        return (field < 1) | (field >= 255)
+
+    def read(
+        self, q: Float[Tensor, "*batch n_q"], generator: torch.Generator
+    ) -> Float[Tensor, "*batch n_channels"]:
+        """Readings 0..255, whole numbers, of joint angles [rad]."""
+        counts = self.field(q)
+        noise = torch.randn(counts.shape, generator=generator, dtype=torch.float64)
+        counts = (counts + self.quality.noise * noise).clamp(0, 255).floor()
+        for k, failure in enumerate(self.stuck):
+            if failure is Stuck.NO:
+                self._frozen.pop(k, None)
+            elif failure is Stuck.FROZEN:
+                counts[..., k] = self._frozen.setdefault(k, counts[..., k].flatten()[0].clone())
+            else:
+                counts[..., k] = 0.0 if failure is Stuck.LOW else 255.0
+        return counts

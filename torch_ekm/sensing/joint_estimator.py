@@ -1,0 +1,96 @@
+"""All joint angles from Hall readings, encoders and couplings together."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+from ..description import HandDescription
+from ..exceptions import JointMismatchError, NonFiniteError, ParameterError, ShapeError
+from ..typing import Float, Tensor
+from .hall import HallCalibration
+
+
+class JointEstimate(NamedTuple):
+    """Joint angles of a hand."""
+
+    q: Float[Tensor, "*batch n_q"]
+    """[rad]"""
+    covariance: Float[Tensor, "*batch n_q n_q"]
+    """[rad^2]"""
+
+    @property
+    def std(self) -> Float[Tensor, "*batch n_q"]:
+        """Standard deviations [rad]."""
+        return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+
+
+class JointEstimator:
+    r"""``min_q sum_k ((q_k - h_k) / s_k)^2 + |(J_a q + a_0 - a) / s_a|^2 + |C q / s_c|^2``.
+
+    Hall channels know single joints (and nothing where they saturate), encoders know sums of them, rigid
+    couplings know differences: together they cover joints without a channel, and those whose channel
+    is saturated or stuck. A weak prior, uniform over each joint's range, keeps the rest finite.
+
+    Args:
+        hand: joints, actuation Jacobian and couplings; ``C q = 0`` is taken to hold, not just ``C dq = 0``.
+        calibration: of its Hall channels.
+        encoder_std: s_a, standard deviation of an actuator's encoder [rad].
+        coupling_std: s_c, play of a rigid coupling [rad].
+
+    Raises:
+        JointMismatchError: the calibration names joints that the hand does not have.
+        ParameterError: a standard deviation is not positive.
+    """
+
+    def __init__(
+        self,
+        hand: HandDescription,
+        calibration: HallCalibration,
+        encoder_std: float = 0.00873,  # 0.5 deg
+        coupling_std: float = 0.0005,
+    ) -> None:
+        for name, value in (("encoder_std", encoder_std), ("coupling_std", coupling_std)):
+            if not value > 0:
+                raise ParameterError(name, value, "positive [rad]")
+        unknown = [joint for joint in calibration.joints if joint not in hand.joint_names]
+        if unknown:
+            raise JointMismatchError(hand.name, (), unknown, hand.joint_names)
+        self.hand, self.calibration = hand, calibration
+        self._select = torch.zeros(calibration.n_channels, hand.n_q, dtype=torch.float64)
+        for k, joint in enumerate(calibration.joints):
+            self._select[k, hand.joint_names.index(joint)] = 1.0
+        self._J_a = torch.from_numpy(hand.actuation_jacobian.copy())
+        self._offset = torch.from_numpy(hand.actuator_offset)
+        self._encoder_std = encoder_std
+        C = torch.from_numpy(hand.coupling.copy())
+        lower, upper = (torch.from_numpy(x.copy()) for x in (hand.joint_lower, hand.joint_upper))
+        # a locked joint has no range: a small one keeps the information finite
+        prior = 12 / (upper - lower).clamp(min=1e-3) ** 2
+        self._middle = prior * (lower + upper) / 2
+        self._fixed = (
+            torch.diag(prior) + self._J_a.mT @ self._J_a / encoder_std**2 + C.mT @ C / coupling_std**2
+        )
+
+    def __call__(
+        self, readings: Float[Tensor, "*batch n_channels"], actuators: Float[Tensor, "*batch n_a"]
+    ) -> JointEstimate:
+        """Joint angles from Hall readings 0..255 and encoders [rad].
+
+        Raises:
+            ShapeError, NonFiniteError: readings or encoders that cannot be right.
+        """
+        if actuators.ndim == 0 or actuators.shape != (*readings.shape[:-1], self.hand.n_a):
+            raise ShapeError("actuators", f"{(*readings.shape[:-1], self.hand.n_a)}", actuators.shape)
+        if not bool(torch.isfinite(actuators).all()):
+            raise NonFiniteError("actuators", torch.nonzero(~torch.isfinite(actuators))[:3].tolist())
+        hall = self.calibration.estimate(readings)
+        weight = hall.std**-2
+        S = self._select
+        information = self._fixed + S.mT @ (weight[..., None] * S)
+        encoder = (actuators.to(torch.float64) - self._offset) / self._encoder_std**2
+        right = self._middle + (weight * hall.q) @ S + encoder @ self._J_a
+        factor = torch.linalg.cholesky(information)
+        q = torch.cholesky_solve(right[..., None], factor)[..., 0]
+        return JointEstimate(q, torch.cholesky_inverse(factor))
