@@ -20,6 +20,11 @@ from .transmission import Transmission
 
 Array = NDArray[np.float64]
 
+# Preferred joint angles as parts of their range, last joint first: the thumb bent and the fingers
+# nearly straight, since turning the object towards the fingers' flexion straightens the thumb.
+_THUMB_BENT = (0.65, 0.3, 0.3, 0.5)
+_FINGER_BENT = (0.4, 0.13, 0.12, 0.3)
+
 
 @dataclass(frozen=True)
 class PinchRequest:
@@ -203,8 +208,9 @@ class PinchPlanner:
         low, high = self.hand.joint_lower[self._moving], self.hand.joint_upper[self._moving]
         fraction = np.full(self.hand.n_q, 0.4)
         for pad in self.pads:
+            bent = _THUMB_BENT if pad is self.pads[0] else _FINGER_BENT
             for place, joint in enumerate(_chain(self.hand, pad.link)):
-                fraction[joint] = (0.5, 0.12, 0.3, 0.4)[min(place, 3)]
+                fraction[joint] = bent[min(place, 3)]
         return low + fraction[self._moving] * (high - low)
 
     def _bounds(self) -> tuple[Array, Array]:
@@ -321,7 +327,7 @@ class PinchPlanner:
         facing = np.concatenate([-g["facing"][:, :1], g["facing"][:, 1:]], axis=1)
         opposed = np.maximum(0.0, 0.98 - facing) / 0.05
         clear = np.maximum(0.0, 0.002 - g["clearance"]) / 1e-3
-        posture = (x[:, : len(self._moving)] - self._preferred()) / 0.6
+        posture = (x[:, : len(self._moving)] - self._preferred()) / 0.3
         taut = np.maximum(0.0, 0.02 - self._tension(g)[:, self._pulling]) / 0.01
         hard = 3 * self._equations(x, request, g)
         wishes = [cone, share, cap, pad, np.stack(place, axis=1), tilt, opposed, clear, posture, taut]
