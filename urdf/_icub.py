@@ -170,9 +170,9 @@ def urdf_text(left: bool) -> str:
             inertia = mirrored_inertia(Inertia(mass, com, np.diag(moments)), signs)
             solids = [mirrored(solid, signs) for solid in _solids(name)]
             frame = _joint_frame(xyz, rpy, _signs(parent, left), signs)
-            # an angle is an axial vector: it turns by -det(D) D with the frame mirrored by D
+            # D exp([z] q) D = exp([det(D) D z] q): axes are axial vectors
             turned: Vector = (
-                tuple(-np.prod(signs) * s * a for s, a in zip(signs, axis, strict=True)) if left else axis
+                tuple(np.prod(signs) * s * a for s, a in zip(signs, axis, strict=True)) if left else axis
             )  # type: ignore[assignment]
             lower, upper = (math.radians(limit) for limit in limits_deg)
             parts.append(joint_xml(name, parent, name, *frame, turned, (lower, upper), EFFORT, VELOCITY))

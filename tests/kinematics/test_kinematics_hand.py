@@ -1,0 +1,184 @@
+"""Forward kinematics and Jacobians: references, shapes, dtypes, derivatives, errors."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+
+from torch_ekm.description import load_hand
+from torch_ekm.exceptions import ParameterError, ShapeError, UnknownNameError
+from torch_ekm.kinematics import HandKinematics, LinkPoses
+from torch_ekm.kinematics.reference import reference_transforms
+from torch_ekm.kinematics.se3 import log
+
+HANDS = ("icub_right", "icub_left", "planar_two_finger")
+SHAPES = ((), (1,), (5,), (2, 3))
+
+
+def postures(name: str, *shape: int, seed: int = 3) -> torch.Tensor:
+    hand = load_hand(name)
+    lower, upper = torch.from_numpy(hand.joint_lower), torch.from_numpy(hand.joint_upper)
+    uniform = torch.rand(*shape, hand.n_q, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return lower + uniform * (upper - lower)
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_agrees_with_pytorch_kinematics(name: str) -> None:
+    pytest.importorskip("pytorch_kinematics")
+    hand, q = load_hand(name), postures(name, 2, 10)
+    expected = reference_transforms(hand, q)
+    # pytorch-kinematics builds the joints' origins in float32
+    torch.testing.assert_close(HandKinematics(hand)(q).transforms, expected, atol=3e-7, rtol=0)
+
+
+def test_the_planar_hand_by_hand() -> None:
+    """Two bars [mm]: ``x = 30 - 40 sin q0 - 30 sin(q0 + q1)``, ``y = 40 cos q0 + 30 cos(q0 + q1)``."""
+    kinematics = HandKinematics(load_hand("planar_two_finger"))
+    q = torch.tensor([0.2, 0.5, 0.7, 0.3], dtype=torch.float64)
+    tip = kinematics(q).of("right_tip")[:3, 3]
+    s0, s1 = torch.sin(q[2]), torch.sin(q[2] + q[3])
+    c0, c1 = torch.cos(q[2]), torch.cos(q[2] + q[3])
+    expected = torch.stack([0.03 - 0.04 * s0 - 0.03 * s1, 0.04 * c0 + 0.03 * c1, torch.zeros_like(s0)])
+    torch.testing.assert_close(tip, expected, atol=1e-12, rtol=0)
+    J = kinematics.jacobian(q, "right_tip")
+    zero, one = torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64)
+    arms = torch.stack([-tip[1] * one, -tip[1] * one])[0]
+    arms[1] = -0.03 * c1
+    assert torch.allclose(J[:, :2], torch.zeros(6, 2, dtype=torch.float64))
+    torch.testing.assert_close(J[0, 2:], arms, atol=1e-12, rtol=0)
+    torch.testing.assert_close(J[2:5, 2:], zero.expand(3, 2), atol=1e-11, rtol=0)
+    torch.testing.assert_close(J[5, 2:], one, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_jacobians_against_autograd(name: str) -> None:
+    """Rows (v; w): ``v = dx/dq``, ``[w]x = dR/dq R^T``, to 1e-10, every link."""
+    kinematics, q = HandKinematics(load_hand(name)), postures(name, 2)
+    point = torch.tensor([0.011, -0.004, 0.006], dtype=torch.float64)
+    for row in q:
+        T = kinematics(row).transforms
+        dT = torch.func.jacrev(lambda x: kinematics(x).transforms)(row)  # (n_link, 4, 4, n_q)
+        for k, link in enumerate(kinematics.link_names):
+            J = kinematics.jacobian(row, link, point)
+            v = torch.einsum("abj,b->aj", dT[k, :3, :3], point) + dT[k, :3, 3]
+            W = torch.einsum("abj,cb->jac", dT[k, :3, :3], T[k, :3, :3])
+            w = torch.stack([W[:, 2, 1], W[:, 0, 2], W[:, 1, 0]])
+            torch.testing.assert_close(J, torch.cat([v, w]), atol=1e-10, rtol=0)
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_jacobians_against_finite_differences(name: str) -> None:
+    kinematics, q = HandKinematics(load_hand(name)), postures(name, 3, seed=4)
+    h, n_q = 1e-5, q.shape[-1]
+    steps = h * torch.eye(n_q, dtype=torch.float64)
+    plus, minus = (kinematics(q[:, None] + sign * steps).transforms for sign in (1, -1))
+    v = (plus - minus)[..., :3, 3] / (2 * h)  # (3, n_q, n_link, 3)
+    w = log(plus[..., :3, :3] @ minus[..., :3, :3].mT) / (2 * h)
+    for k, link in enumerate(kinematics.link_names):
+        numeric = torch.cat([v[:, :, k], w[:, :, k]], dim=-1).mT
+        torch.testing.assert_close(kinematics.jacobian(q, link), numeric, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_batch_shapes(shape: tuple[int, ...]) -> None:
+    kinematics, q = HandKinematics(load_hand("icub_right")), postures("icub_right", *shape)
+    poses = kinematics(q)
+    assert poses.transforms.shape == (*shape, 26, 4, 4)
+    assert poses.of("thumb_3").shape == (*shape, 4, 4)
+    assert kinematics.jacobian(q, "thumb_tip").shape == (*shape, 6, 20)
+    axis, origin = kinematics.joint_axes(poses)
+    assert axis.shape == origin.shape == (*shape, 20, 3)
+    flat_q, flat_T = q.reshape(-1, 20), poses.transforms.reshape(-1, 26, 4, 4)
+    points = torch.rand(*shape, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    J = kinematics.jacobian(q, "index_2", points).reshape(-1, 6, 20)
+    for k, row in enumerate(flat_q):
+        torch.testing.assert_close(flat_T[k], kinematics(row).transforms, atol=1e-14, rtol=0)
+        one = kinematics.jacobian(row, "index_2", points.reshape(-1, 3)[k])
+        torch.testing.assert_close(J[k], one, atol=1e-14, rtol=0)
+
+
+def test_axes_and_upstream_make_the_jacobian() -> None:
+    """``J_v = z x (x - o)`` for upstream joints: what a contact model builds for many points at once."""
+    kinematics, q = HandKinematics(load_hand("icub_left")), postures("icub_left")
+    axis, origin = kinematics.joint_axes(q)
+    x = kinematics(q).of("ring_tip")[:3, 3]
+    moves = kinematics.upstream[kinematics.link_index("ring_tip")]
+    expected = (torch.linalg.cross(axis, x - origin) * moves[:, None]).mT
+    torch.testing.assert_close(kinematics.jacobian(q, "ring_tip")[:3], expected)
+    names = [joint for joint, up in zip(kinematics.joint_names, moves, strict=True) if up]
+    assert names == ["ring_0", "ring_1", "ring_2", "ring_3"]
+    assert not kinematics.upstream[kinematics.link_index("hand")].any()
+
+
+def test_float32_and_to() -> None:
+    hand, q = load_hand("icub_right"), postures("icub_right", 4)
+    double = HandKinematics(hand)
+    single = HandKinematics(hand, dtype=torch.float32)
+    moved = copy.deepcopy(double).to(torch.float32)
+    for module in (single, moved):
+        T = module(q.float()).transforms
+        assert T.dtype == torch.float32
+        torch.testing.assert_close(T.double(), double(q).transforms, atol=1e-6, rtol=0)
+    assert not list(double.parameters())
+    with pytest.raises(ParameterError, match="float32"):
+        double(q.float())
+
+
+def test_gradcheck_first_and_second_order() -> None:
+    kinematics = HandKinematics(load_hand("planar_two_finger"))
+    q = postures("planar_two_finger", 2).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: kinematics(x).transforms, q)
+    assert torch.autograd.gradgradcheck(lambda x: kinematics(x).of("left_tip")[..., :2, 3], q)
+    assert torch.autograd.gradcheck(lambda x: kinematics.jacobian(x, "right_tip"), q)
+
+
+def test_function_transforms() -> None:
+    """jacrev, jacfwd, hessian and vmap go through the forward kinematics."""
+    kinematics, q = HandKinematics(load_hand("icub_right")), postures("icub_right", 3)
+
+    def tip(x: torch.Tensor) -> torch.Tensor:
+        return kinematics(x).of("index_tip")[:3, 3]
+
+    forward = torch.func.vmap(torch.func.jacfwd(tip))(q)
+    reverse = torch.func.vmap(torch.func.jacrev(tip))(q)
+    torch.testing.assert_close(forward, reverse)
+    torch.testing.assert_close(forward, kinematics.jacobian(q, "index_tip")[:, :3], atol=1e-10, rtol=0)
+    assert torch.func.hessian(tip)(q[0]).shape == (3, 20, 20)
+
+
+def test_base_link_behind_a_fixed_joint(tmp_path) -> None:
+    """The hand frame may be any link that does not move."""
+    hand = load_hand("planar_two_finger")
+    text = hand.urdf_path.read_text()
+    mount = '<link name="wrist"/><joint name="mount" type="fixed"><parent link="wrist"/><child link="hand"/>'
+    mount += '<origin xyz="0.1 0.2 0.3" rpy="0.4 0.5 0.6"/></joint></robot>'
+    (tmp_path / "a.urdf").write_text(text.replace("</robot>", mount))
+    (tmp_path / "a.transmission.toml").write_text(hand.transmission_path.read_text())
+    mounted = load_hand(tmp_path / "a.urdf")
+    q = postures("planar_two_finger", 2)
+    expected = HandKinematics(hand)(q)
+    actual = HandKinematics(mounted)(q)
+    assert mounted.urdf is not None
+    assert mounted.urdf.root == "wrist"
+    for link in hand.link_names:
+        torch.testing.assert_close(actual.of(link), expected.of(link), atol=1e-13, rtol=0)
+    pytest.importorskip("pytorch_kinematics")
+    torch.testing.assert_close(actual.transforms, reference_transforms(mounted, q), atol=3e-7, rtol=0)
+
+
+def test_errors_list_what_would_be_right() -> None:
+    kinematics = HandKinematics(load_hand("planar_two_finger"))
+    for bad in (torch.zeros(3), torch.zeros(2, 5), torch.tensor(0.0)):
+        with pytest.raises(ShapeError, match="left_0, left_1, right_0, right_1"):
+            kinematics(bad.double())
+    q = torch.zeros(4, dtype=torch.float64)
+    with pytest.raises(UnknownNameError, match="left_tip"):
+        kinematics.jacobian(q, "tip")
+    with pytest.raises(UnknownNameError, match="right_tip"):
+        kinematics(q).of("tip")
+    with pytest.raises(ShapeError, match="point"):
+        kinematics.jacobian(q, "left_tip", torch.zeros(2, dtype=torch.float64))
+    assert isinstance(kinematics(q), LinkPoses)
+    assert "planar_two_finger" in repr(kinematics)
