@@ -1,4 +1,4 @@
-"""Small hands for the tests: joints in chains, ball fingertips, written without the package's own kinematics."""
+"""Small hands for the tests: joints in chains, ball fingertips, kinematics of their own."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Poses:
 
 
 class ChainKinematics(nn.Module):
-    """Fingers of revolute joints; joint j of a finger turns about ``axis`` at ``offset`` from its predecessor."""
+    """Fingers of revolute joints: (origin relative to the predecessor, axis) of each."""
 
     def __init__(self, fingers: list[list[tuple[np.ndarray, np.ndarray]]]):
         super().__init__()
@@ -185,7 +185,10 @@ def build(
     n_q = len(q)
     poses = kin(q).transforms
     tips = torch.stack(
-        [(poses[kin.link_names.index(l)] @ torch.tensor([*tip, 1.0], dtype=F64))[:3] for l in contact_links]
+        [
+            (poses[kin.link_names.index(name)] @ torch.tensor([*tip, 1.0], dtype=F64))[:3]
+            for name in contact_links
+        ]
     )
     normals = torch.as_tensor(np.asarray(normals), dtype=F64)
     normals = normals / normals.norm(dim=-1, keepdim=True)
@@ -222,29 +225,23 @@ def build(
     assert float((Zp.T @ (G @ mu - V_p)).abs().max()) < 1e-10
     lam = torch.full((len(np.atleast_2d(J_a)),), float(lam), dtype=F64)
     torque = A[:, :n_q].T @ mu + model.reduction.actuation.T @ lam
-    rest = (
-        q + torque / model.hand_springs
-        if hasattr(model, "hand_springs")
-        else q + torque / torch.as_tensor(np.asarray(springs, dtype=float))
-    )
+    rest = q + torque / torch.as_tensor(np.asarray(springs, dtype=float))
     model = make(rest.numpy())
     a = model.reduction.actuation @ q - lam / model.reduction.stiffness
     return Toy(model, state, contacts, mu, lam, a)
 
 
-def radial_finger(angle, lengths=(0.04, 0.03, 0.0), radius=0.05):
-    """Abduction about the radial axis, then flexion joints about the tangential axis; links point up (+z)."""
+def radial_finger(angle, radius=0.05):
+    """Abduction about the radial axis, then two flexion joints; links point up (+z)."""
     base = transform((radius * np.cos(angle), radius * np.sin(angle), 0.0), (0.0, 0.0, angle))
     x, y = np.array([1.0, 0, 0]), np.array([0.0, -1.0, 0])
-    return [(base, x), (np.eye(4), y)] + [
-        (transform((0, 0, length)), y) for length in lengths[: len(lengths) - 1]
-    ]
+    return [(base, x), (np.eye(4), y), (transform((0, 0, 0.04)), y)]
 
 
 def three_finger(pinned=False, grip=1.0, **kw):
     """Three fingers of three joints, three tendons (moment arms 9 and 8 mm), 50 g."""
     angles = np.array([0.0, 2.1, 4.2])
-    fingers = [radial_finger(t, (0.04, 0.03))[:3] for t in angles]
+    fingers = [radial_finger(t) for t in angles]
     q = np.array([0.05, 0.35, 0.3, -0.08, 0.3, 0.4, 0.03, 0.4, 0.25])
     J_a = np.zeros((3, 9))
     for i in range(3):
@@ -333,12 +330,12 @@ def finite_difference_jacobian(toy, start, step, read=None):
     solver = toy.solver()
     columns = []
     read = read or (lambda e: e.state.minus(start.state))
-    for l in range(len(start.a)):
+    for k_a in range(len(start.a)):
         total = 0.0
         for k, weight in ((1, 45.0), (2, -9.0), (3, 1.0)):
             for sign in (1.0, -1.0):
                 a = start.a.clone()
-                a[l] += sign * k * step
+                a[k_a] += sign * k * step
                 total = total + sign * weight * read(solver.move(start, a))
         columns.append(total / (60 * step))
     return torch.stack(columns, dim=-1)

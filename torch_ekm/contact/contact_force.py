@@ -15,6 +15,7 @@ from ..exceptions import ParameterError
 from .friction import FrictionCone, cutting_planes, directions
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 FRICTION = ("cuts", "cone", "pyramid_inner", "pyramid_outer")
 BALANCE = ("relaxed", "equality")
 
@@ -96,9 +97,9 @@ class BalanceEquations:
     hand_load: Array
     """Z^T V_q, ``(n_z,)``."""
     cones: tuple[FrictionCone, ...]
-    moment_rows: Array
+    moment_rows: Mask
     """Rows of ``object_load`` that are moments, bool ``(n_w,)``."""
-    tendon: Array
+    tendon: Mask
     """Actuators that only pull, bool ``(n_a,)``."""
     spin_columns: tuple[int, ...] = ()
     """Components of ``mu`` that are moments."""
@@ -126,7 +127,7 @@ class ForceSolution:
     bound: Array
     """Torques of stops and dry friction [N m]."""
     residual: Array
-    """r: unexplained generalised torque, ``(n_z,)`` [N m]. Large: wrong spring, wrong rest angle, slipping."""
+    """r: unexplained generalised torque, ``(n_z,)`` [N m]. Large: wrong spring or rest angle, slipping."""
     violation: float
     """Smallest norm of the unbalanced object wrench (moments divided by L) [N]; about 0 when solved."""
     solves: int
@@ -134,7 +135,12 @@ class ForceSolution:
 
 
 def force_problem(
-    eq: BalanceEquations, options: ForceOptions, extra: Array | None = None, soft: bool = False
+    eq: BalanceEquations,
+    options: ForceOptions,
+    extra: Array | None = None,
+    *,
+    soft: bool = False,
+    polyhedral: bool = True,
 ):
     """Build the QP in ``x = [mu; lam; tau]``, all scaled to newtons.
 
@@ -148,6 +154,7 @@ def force_problem(
         options: weights and forms.
         extra: more rows ``g mu <= 0`` (cutting planes).
         soft: put the object balance into the cost, to measure how far it is from possible.
+        polyhedral: False leaves the friction cones out.
 
     Returns:
         ``qpsolvers.Problem`` and the scale of the unknowns, ``unknowns = scale * x``.
@@ -198,7 +205,7 @@ def force_problem(
                 q[column] -= eq.measured_normal[i] / eq.normal_std**2
 
     rows = []
-    for cone in eq.cones:
+    for cone in eq.cones if polyhedral else ():
         d, cosine = directions(cone.dim, options.faces if "pyramid" in options.friction else 8)
         if cone.dim:
             rows.append(
@@ -233,22 +240,24 @@ def contact_forces(eq: BalanceEquations, options: ForceOptions | None = None) ->
         from .conic import solve_conic
 
         return solve_conic(eq, options)
-    cuts = np.zeros((0, eq.object_matrix.shape[1]))
-    solution, scale, solves = None, None, 0
-    for _ in range(options.max_cuts):
-        problem, scale = force_problem(eq, options, cuts)
+    n_h = eq.object_matrix.shape[1]
+    problem, scale = force_problem(eq, options)
+    cuts = np.zeros((0, n_h))
+    for solves in range(1, options.max_cuts + 1):
         solution = solve_qp(problem, options.solver)
-        solves += 1
-        if not solution.found or options.friction != "cuts":
-            break
-        new = cutting_planes(eq.cones, (scale * solution.x)[: cuts.shape[1]], options.tolerance)
+        if not solution.found:
+            return classify_failure(eq, options, cuts, solves)
+        unknowns = scale * solution.x
+        new = (
+            cutting_planes(eq.cones, unknowns[:n_h], options.tolerance) if options.friction == "cuts" else ()
+        )
         if not len(new):
             break
         cuts = np.concatenate([cuts, new])
-    assert solution is not None and scale is not None
-    if not solution.found:
-        return _failure(eq, options, cuts, solves)
-    return unpack(eq, options, scale * solution.x, solves)
+        rows = np.zeros((len(new), len(scale)))
+        rows[:, :n_h] = new * scale[:n_h]
+        problem.G, problem.h = np.concatenate([problem.G, rows]), np.append(problem.h, np.zeros(len(new)))
+    return unpack(eq, options, unknowns, solves)
 
 
 def solve_qp(problem, solver: str):
@@ -271,7 +280,9 @@ def unpack(eq: BalanceEquations, options: ForceOptions, unknowns: Array, solves:
     )
 
 
-def _failure(eq: BalanceEquations, options: ForceOptions, cuts: Array, solves: int) -> ForceSolution:
+def classify_failure(
+    eq: BalanceEquations, options: ForceOptions, cuts: Array | None, solves: int
+) -> ForceSolution:
     """Find out whether the balance is impossible or the solver failed."""
     problem, scale = force_problem(eq, options, cuts, soft=True)
     solution = solve_qp(problem, options.solver)
@@ -293,7 +304,7 @@ def _failure(eq: BalanceEquations, options: ForceOptions, cuts: Array, solves: i
 
 
 def margins(cones: Sequence[FrictionCone], mu: Array) -> tuple[Array, Array]:
-    """Per contact ``mu_s f_n - |u|`` [N] and the same relative to ``mu_s f_n`` (1: no friction used, 0: slips)."""
+    """Per contact ``mu_s f_n - |u|`` [N], and that relative to ``mu_s f_n``: 1 no friction used, 0 slips."""
     slack = np.array([cone.slack(mu) for cone in cones])
     limit = np.array([cone.mu_s * mu[cone.start] for cone in cones])
     relative = np.divide(slack, limit, out=np.zeros_like(slack), where=limit > 1e-12)

@@ -68,8 +68,8 @@ def friction_cones(
 def directions(dim: int, faces: int) -> tuple[Array, float]:
     """Unit normals of a polyhedron around the unit ball, and the cosine that makes it inscribed.
 
-    ``{d . u <= 1}`` for all returned d contains the ball; ``{d . u <= cosine}`` is contained in it. In the plane:
-    ``faces`` directions, cosine ``cos(pi/faces)``; for a soft finger a grid of such rings over the
+    ``{d . u <= 1}`` for all returned d contains the ball; ``{d . u <= cosine}`` is contained in it. In the
+    plane: ``faces`` directions, cosine ``cos(pi/faces)``; for a soft finger a grid of such rings over the
     latitudes and the two poles, cosine from the convex hull of the directions.
     """
     if dim == 0:
@@ -81,7 +81,7 @@ def directions(dim: int, faces: int) -> tuple[Array, float]:
     if dim == 2:
         return ring, float(np.cos(np.pi / faces))
     latitude = np.linspace(-np.pi / 2, np.pi / 2, faces // 2 + 1)[1:-1]
-    layers = [np.concatenate([np.cos(l) * ring, np.full((faces, 1), np.sin(l))], axis=-1) for l in latitude]
+    layers = [np.concatenate([np.cos(t) * ring, np.full((faces, 1), np.sin(t))], axis=-1) for t in latitude]
     points = np.concatenate([*layers, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
     hull = require("scipy.spatial").ConvexHull(points)
     return points, float((-hull.equations[:, -1]).min())

@@ -1,4 +1,4 @@
-"""Contacts as exact functions of the state: the primitive surfaces that touch, followed as hand and object move."""
+"""Contacts as exact functions of the state: the surfaces that touch, followed as hand and object move."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import torch
 
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
+from .contact_kinematics import FLAT, contact_frames
 from .contact_set import ContactSet
-
-FLAT = 1.0  # [1/m], as in contact_kinematics
 
 
 @dataclass(frozen=True)
@@ -30,9 +29,9 @@ class TrackedContacts:
     """Follows each contact of a :class:`ContactSet` on the surfaces that its curvatures describe.
 
     A body whose curvature is isotropic is a ball there, one with a flat direction a cylinder, one
-    without curvature a plane; for spheres, capsules, cylinders and boxes that is exact as long as the contact
-    stays on the same feature. Contact points, normals and gaps are then smooth functions of the state, without the
-    tolerance of a collision detector.
+    without curvature a plane; for spheres, capsules, cylinders and boxes that is exact as long as the
+    contact stays on the same feature. Contact points, normals and gaps are then smooth functions of the
+    state, without the tolerance of a collision detector.
 
     Args:
         contacts: contacts of one state.
@@ -40,8 +39,8 @@ class TrackedContacts:
         q, position, rotation: that state.
 
     Raises:
-        ParameterError: a finger that is flat at the contact, unequal curvatures, or a cylindrical finger lying on
-            a flat face (a line contact has no contact point).
+        ParameterError: a finger that is flat at the contact, two unequal curvatures, or a cylindrical finger
+            lying on a flat face (a line contact has no contact point).
     """
 
     def __init__(
@@ -115,7 +114,7 @@ class TrackedContacts:
         )
 
     def pinned_offset(self, q: Tensor, position: Tensor, rotation: Tensor) -> Float[Tensor, "n_c 3"]:
-        """``x_f(q) - x_o(p)`` of the material points of pinned contacts, object axes [m]; 0 for the others."""
+        """``x_f(q) - x_o(p)`` of pinned contacts' material points, object axes [m]; 0 for the others."""
         poses = self.link_pose(q)
         offset = torch.zeros_like(self.contacts.point)
         for i, (finger, obj) in enumerate(zip(self.finger, self.object, strict=True)):
@@ -127,14 +126,11 @@ class TrackedContacts:
 
 def _core(K: Tensor, surface_point: Tensor, outward: Tensor, name: str) -> Core:
     """Ball, cylinder or plane with the given curvature tensor at a surface point."""
-    values, vectors = torch.linalg.eigh(0.5 * (K + K.mT))
-    keep = [k for k in range(3) if float((vectors[:, k] @ outward).abs()) < 0.5]
-    if len(keep) == 2:  # eigenvalue 0 of the normal is separate
-        low, high = (float(values[k]) for k in keep)
-        flat_direction = vectors[:, keep[0]]
-    else:  # two zero eigenvalues mixed with the normal: at most one curved direction
-        low, high = float(values[0]), float(values[2])
-        flat_direction = torch.linalg.cross(vectors[:, 2], outward)
+    tangent = contact_frames(outward[None])[0, :, 1:]
+    k = tangent.mT @ K @ tangent
+    values, vectors = torch.linalg.eigh(0.5 * (k + k.mT))
+    low, high = values.tolist()
+    flat_direction = tangent @ vectors[:, 0]
     if high <= FLAT:
         return Core("plane", surface_point, outward, 0.0)
     if low <= FLAT:

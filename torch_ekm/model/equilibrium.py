@@ -11,7 +11,7 @@ from ..contact.contact_set import ContactSet
 from ..contact.surface import TrackedContacts
 from ..exceptions import EquilibriumError
 from ..typing import Float, Tensor
-from .force_balance import pack_forces
+from .force_balance import known_forces
 from .kinematic_model import KinematicModel
 from .linearization import GraspForces
 from .potential import gravity_gradient, gravity_hessian, spring_torque
@@ -50,10 +50,10 @@ class EquilibriumSolver:
     q_j = const                                         held joints
     ```
 
-    The contact points are exact functions of the state (:class:`TrackedContacts`). Rolling in space is not holonomic,
-    so the answer depends on the path from the first configuration: large moves are cut into steps of at most
-    ``max_step``, whose midpoint rule leaves an error of third order. Newton's matrix is the model's stiffness D; only
-    the speed of convergence depends on it, not the answer.
+    The contact points are exact functions of the state (:class:`TrackedContacts`). Rolling in space is not
+    holonomic, so the answer depends on the path from the first configuration: large moves are cut into steps
+    of at most ``max_step``, whose midpoint rule leaves an error of third order. Newton's matrix is the
+    model's stiffness D; only the speed of convergence depends on it, not the answer.
 
     Args:
         model: gives hand, object and options (contacts are taken as rolling whatever the options say).
@@ -165,6 +165,48 @@ class EquilibriumSolver:
                     ) from error
         return at
 
+    @torch.no_grad()
+    def grip(
+        self,
+        start: Equilibrium,
+        normal_force: Float[Tensor, " n_c"],
+        *,
+        tolerance: float = 1e-6,
+        max_rounds: int = 40,
+    ) -> Equilibrium:
+        """Move the actuators, as little as possible, until the normal forces are those wished for.
+
+        Newton with ``d f_n/da`` of the model; the object moves along.
+
+        Args:
+            start: an equilibrium.
+            normal_force: wished normal forces [N]; a NaN leaves that contact free.
+            tolerance: largest miss [N].
+
+        Raises:
+            EquilibriumError: not reached (three hard fingers can hold only certain combinations).
+        """
+        at, known = start, torch.isfinite(normal_force)
+        for _ in range(max_rounds):
+            forces = self.forces(at)
+            miss = (normal_force - forces.normal)[known]
+            if float(miss.abs().max()) <= tolerance:
+                return at
+            lin = self.model.linearize(at.state, at.contacts, forces=forces, locked=self._locked)
+            da = torch.linalg.pinv(lin.normal_force_sensitivity[known], rtol=1e-4) @ miss
+            da = da * min(1.0, 0.1 / float(da.abs().max()))
+            at = self.move(at, at.a + da)
+        raise EquilibriumError("grip", f"normal forces missed by {float(miss.abs().max()):.2g} N")
+
+    def forces(self, at: Equilibrium) -> GraspForces:
+        """The exact forces of an equilibrium, in the form that :meth:`KinematicModel.linearize` takes."""
+        kin = self.model.contact_kinematics(at.state, at.contacts, rolling=True)
+        return known_forces(kin, at.mu, at.lam)
+
+    @property
+    def _locked(self) -> list[str]:
+        return [self.model.hand.joint_names[j] for j in self.held]
+
     def _forces(self, wish: Tensor | None, std: float) -> GraspForces:
         model = self.model
         _, kin = self._geometry(self.start)
@@ -224,7 +266,7 @@ class EquilibriumSolver:
             best = min(best, size)
             if stalled > 12:
                 break
-            forces = pack_forces(kin, mu, lam, **_EMPTY)
+            forces = known_forces(kin, mu, lam)
             D = geometric_stiffness(kin, forces.force, forces.spin_moment, model.precedes)  # type: ignore[arg-type]
             joints = torch.arange(n_q)
             D[joints, joints] += model.spring_stiffness  # type: ignore[operator]
@@ -269,8 +311,3 @@ class EquilibriumSolver:
             mask = torch.tensor([row // 6 in pinned and row % 6 < 3 for row in kin.rows])
             value = torch.where(mask, translations, value)
         return value
-
-
-_EMPTY = {
-    name: torch.zeros(0) for name in ("residual", "stop_torque", "margin", "relative_margin", "violation")
-} | {"status": ()}

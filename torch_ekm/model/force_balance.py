@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ..contact.contact_force import BalanceEquations, ForceStatus, contact_forces, margins
 from ..contact.contact_kinematics import ContactKinematics
@@ -13,6 +14,8 @@ from ..typing import Bool, Float, Tensor
 from .linearization import GraspForces
 from .options import ModelOptions
 from .reduction import Reduction
+
+Mask = NDArray[np.bool_]
 
 
 class ForceBalance:
@@ -36,7 +39,7 @@ class ForceBalance:
         # smallest joint torques that make up a generalised residual
         self.lift = self.joint_basis @ np.linalg.inv(gram)
         # in a plane the third row of the pose basis is the rotation
-        self.moment_rows = (np.abs(self.pose_basis[3:]) > 1e-9).any(0)
+        self.moment_rows: Mask = np.any(np.abs(self.pose_basis[3:]) > 1e-9, axis=0)
 
     def near_stop(self, q: Float[Tensor, "*batch n_q"]) -> Bool[Tensor, "*batch n_q"]:
         """Joints within the tolerance of a limit (or beyond it)."""
@@ -122,7 +125,7 @@ class ForceBalance:
         )
 
     def _bounded(self, q: np.ndarray, locked: list[int]) -> tuple[list[int], np.ndarray, np.ndarray]:
-        """Joints with a torque of their own, and its bounds: stops push inwards, locks both ways, friction a box."""
+        """Joints with a torque of their own, and its bounds: stops push inwards, locks both ways."""
         lower, upper = np.zeros(len(q)), np.zeros(len(q))
         if self.options.joint_stops:
             tolerance = self.options.stop_tolerance
@@ -144,3 +147,28 @@ def pack_forces(kin: ContactKinematics, mu: Tensor, lam: Tensor, **rest) -> Gras
     spin = full[..., 3]
     force = (kin.frame @ full[..., :3, None])[..., 0]
     return GraspForces(mu=mu, lam=lam, force=force, spin_moment=spin, normal=full[..., 0], **rest)
+
+
+def known_forces(kin: ContactKinematics, mu: Tensor, lam: Tensor) -> GraspForces:
+    """Forces that are given, e.g. those of an exact equilibrium, with their margins."""
+    cones = friction_cones(
+        kin.models, kin.contacts.friction.tolist(), kin.contacts.torsional_friction.tolist()
+    )
+    pairs = [margins(cones, row) for row in mu.detach().reshape(-1, mu.shape[-1]).double().cpu().numpy()]
+    batch = mu.shape[:-1]
+    slack, relative = (
+        torch.from_numpy(np.stack([pair[k] for pair in pairs])).to(mu).reshape(*batch, -1) for k in (0, 1)
+    )
+    n_q = kin.axis.shape[-2]
+    zero = mu.new_zeros(*batch, n_q)
+    return pack_forces(
+        kin,
+        mu,
+        lam,
+        residual=zero,
+        stop_torque=zero,
+        margin=slack,
+        relative_margin=relative,
+        status=(ForceStatus.SOLVED,) * len(pairs),
+        violation=mu.new_zeros(batch),
+    )

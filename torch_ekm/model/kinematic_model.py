@@ -57,6 +57,7 @@ class KinematicModel(nn.Module):
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
+        self._detector_takes_poses = False
         self.hand, self.obj, self.options = hand, obj, options or ModelOptions()
         if kinematics is None:
             from ..kinematics import HandKinematics
@@ -65,7 +66,8 @@ class KinematicModel(nn.Module):
         if detector is None:
             from ..contact.collision import ContactDetector
 
-            detector = ContactDetector(hand, obj)
+            detector = ContactDetector(hand, obj, kinematics=kinematics)  # type: ignore[arg-type]
+            self._detector_takes_poses = True
         self.kinematics, self.detector = kinematics, detector
         self.link_names: tuple[str, ...] = tuple(kinematics.link_names)  # type: ignore[arg-type]
         self.reduction = Reduction(hand, self.options, dtype)
@@ -112,19 +114,29 @@ class KinematicModel(nn.Module):
         Raises:
             NoContactError: nothing touches the object.
         """
-        contacts = self.detector(state.q, state.position, state.rotation)
+        return self._detect(state, None)
+
+    def _detect(self, state: GraspState, poses: object | None) -> ContactSet:
+        posture = poses if self._detector_takes_poses and poses is not None else state.q
+        contacts = self.detector(posture, state.position, state.rotation)  # type: ignore[arg-type]
         if contacts.n_c == 0:
             raise NoContactError("no finger touches the object, so no actuator can move it")
         return contacts
 
     @torch.no_grad()
     def contact_kinematics(
-        self, state: GraspState, contacts: ContactSet, *, rolling: bool | None = None
+        self,
+        state: GraspState,
+        contacts: ContactSet,
+        *,
+        rolling: bool | None = None,
+        poses: object | None = None,
     ) -> ContactKinematics:
-        """Motion of the contact points, frames and lever arms at a state."""
-        poses = self.kinematics(state.q)
+        """Motion of the contact points, frames and lever arms at a state (``poses``: if known already)."""
+        poses = self.kinematics(state.q) if poses is None else poses
         axis, origin = self.kinematics.joint_axes(poses)  # type: ignore[operator]
-        upstream = self.kinematics.upstream[[self.link_names.index(name) for name in contacts.link]]  # type: ignore[index]
+        links = [self.link_names.index(name) for name in contacts.link]
+        upstream = self.kinematics.upstream[links]  # type: ignore[index]
         model = self.options.contact_model
         models = None if model is None else (model,) * contacts.n_c
         rolling = self.options.rolling if rolling is None else rolling
@@ -158,8 +170,11 @@ class KinematicModel(nn.Module):
             UnstableGraspError: the grasp buckles (unless ``on_unstable="flag"``).
             NonFiniteError, ShapeError, UnknownNameError: bad input.
         """
-        contacts = self._checked(state, contacts)
-        kin = self.contact_kinematics(state, contacts)
+        self._check_state(state, contacts)
+        poses = self.kinematics(state.q)
+        contacts = self._detect(state, poses) if contacts is None else contacts
+        self._check_contacts(state, contacts)
+        kin = self.contact_kinematics(state, contacts, poses=poses)
         n_q = self.hand.n_q
         A = constraint_matrix(kin)
         V_q = spring_torque(state.q, self.spring_stiffness, self.spring_rest)  # type: ignore[arg-type]
@@ -241,16 +256,14 @@ class KinematicModel(nn.Module):
         whole = Step(J.reshape(*batch, *J.shape[1:]), dmu[:0], stability.reshape(batch))
         return whole, dmu.reshape(*batch, *dmu.shape[1:]), dlam.reshape(*batch, n_a, n_a)
 
-    def _checked(self, state: GraspState, contacts: ContactSet | None) -> ContactSet:
+    def _check_state(self, state: GraspState, contacts: ContactSet | None) -> None:
         if state.q.shape[-1] != self.hand.n_q:
             names = ", ".join(self.hand.joint_names)
             raise ShapeError("q", f"(*batch, {self.hand.n_q})", state.q.shape, f"the joints are: {names}")
-        if contacts is None:
-            if state.q.dim() > 1:
-                raise ShapeError(
-                    "q", f"({self.hand.n_q},)", state.q.shape, "for a batch give the contacts too"
-                )
-            contacts = self.contacts(state)
+        if contacts is None and state.q.dim() > 1:
+            raise ShapeError("q", f"({self.hand.n_q},)", state.q.shape, "for a batch give the contacts too")
+
+    def _check_contacts(self, state: GraspState, contacts: ContactSet) -> None:
         if contacts.n_c == 0:
             raise NoContactError("no finger touches the object, so no actuator can move it")
         if contacts.batch_shape != state.q.shape[:-1]:
@@ -265,7 +278,6 @@ class KinematicModel(nn.Module):
         if deepest < -self.options.max_overlap:
             which = contacts.finger[int(contacts.gap.reshape(-1, contacts.n_c).amin(0).argmin())]
             raise PenetrationError(which, -deepest, self.options.max_overlap)
-        return contacts
 
     def _joint(self, name: str) -> int:
         if name not in self.hand.joint_names:

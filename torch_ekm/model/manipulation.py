@@ -151,8 +151,8 @@ def _raise_contradiction(lost: Tensor, P: Tensor) -> None:
     worst = lost.abs().flatten(0, -2).amax(0).argmax()
     direction = P.flatten(0, -3)[0][:, worst] if P.dim() > 2 else P[:, worst]
     raise SingularGraspError(
-        f"actuator {int(worst)} cannot move alone: the contacts, couplings and the other rigid actuators forbid it "
-        f"(rows violated by {float(lost.abs().max()):.2g}); there are more rigid actuators than mobility. "
+        f"actuator {int(worst)} cannot move alone: contacts, couplings and the other rigid actuators forbid "
+        f"it (rows violated by {float(lost.abs().max()):.2g}); there are more rigid actuators than mobility. "
         "Give the actuators or the contacts a finite stiffness",
         direction=(direction / torch.linalg.vector_norm(direction).clamp_min(1e-300)).detach(),
     )
@@ -175,8 +175,8 @@ def _judge(K: Tensor, N: Tensor, stability: Tensor, tolerance: Tensor, on_unstab
         )
     if on_unstable == "raise":
         raise UnstableGraspError(
-            f"the stiffness with locked actuators has the eigenvalue {value:.3g} <= 0: the grasp buckles along "
-            "the direction given; grip less hard or place the fingers wider",
+            f"the stiffness with locked actuators has the eigenvalue {value:.3g} <= 0: the grasp buckles "
+            "along the direction given; grip less hard or place the fingers wider",
             stiffness=value,
             direction=direction,
         )

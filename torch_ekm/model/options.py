@@ -45,7 +45,7 @@ class ModelOptions:
     stop_torque: float = 1e-4
     """Torque above which a stop holds its joint [N m]; below, the joint may leave."""
     slack_tension: float | None = None
-    """Tendons whose tension is at most this [N m] are slack and move nothing. None: the servo keeps them taut."""
+    """Tendons with at most this tension [N m] are slack and move nothing. None: servos keep all taut."""
     joint_friction: bool = False
     """Let each joint's Coulomb friction take up part of the joint residual."""
     on_unstable: str = "raise"

@@ -14,7 +14,7 @@ from .linearization import GraspForces
 def normal_motion(
     kin: ContactKinematics, J: Float[Tensor, "*batch n_s n_a"]
 ) -> Float[Tensor, "*batch n_c 3 n_a"]:
-    """``d n_i/da = w_o x n_i + K_o sdot_i``, ``sdot_i = M_i (w_rel x n_i)``: turning of the outward normals."""
+    """``d n_i/da = w_o x n_i + K_o sdot_i``, ``sdot_i = M_i (w_rel x n_i)``: turning of the normals."""
     normal = kin.contacts.normal
     w_o = J[..., None, -3:, :]
     w_rel = kin.relative_spin @ J[..., None, :, :]
@@ -44,7 +44,7 @@ def normal_sensitivity(
 def margin_sensitivity(
     kin: ContactKinematics, forces: GraspForces, dmu: Tensor, J: Tensor, normal: Tensor
 ) -> Float[Tensor, "*batch n_c n_a"]:
-    """``d (mu_s f_n - |u|)/da``, ``u = [f_t; m_n mu_s/gamma]`` [N/rad]; 0/0 at a central force counts as 0."""
+    """``d (mu_s f_n - |u|)/da``, ``u = [f_t; m_n mu_s/gamma]`` [N/rad]; ``d|u|`` counts as 0 at u = 0."""
     mu_s, gamma = kin.contacts.friction, kin.contacts.torsional_friction
     n_in = -kin.contacts.normal
     f_t = forces.force - forces.normal[..., None] * n_in
