@@ -123,7 +123,7 @@ def _choose(
     J = projection_jacobian(camera, X, rotation, position)
     freedom = max(2 * len(X) - 6, 1)
     variance = max(corner_std**2, float(np.sum(residual**2)) / freedom)
-    covariance = variance * np.linalg.inv(J.T @ J)
+    covariance = np.asarray(variance * np.linalg.inv(J.T @ J), dtype=np.float64)
     rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
     return BoardPose(rotation, position, covariance, rms, len(X), n_rejected, ambiguous)
 

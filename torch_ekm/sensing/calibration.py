@@ -91,9 +91,9 @@ def calibrate_camera(
     if min_views <= len(good) < len(views):
         views = good
         rms, K, k, _, _, std, _, errors = solve(views)
-    camera = PinholeCamera(
-        shape[1], shape[0], *map(float, K[[0, 1, 0, 1], [0, 1, 2, 2]]), tuple(map(float, k.ravel()[:5]))
-    )
+    fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    lens = tuple(float(c) for c in k.ravel()[:5])
+    camera = PinholeCamera(shape[1], shape[0], fx, fy, cx, cy, lens)
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     return CameraCalibration(
         camera,

@@ -106,7 +106,9 @@ def fit_channel(joint: str, readings: Float[Tensor, " n"], angles: Float[Tensor,
             name, "the joint moved by less than 10 deg in the sweep; sweep its whole range"
         )
     if float(readings.max() - readings.min()) < _MIN_SPAN:
-        return HallChannel(joint, (0.0,) * 4, 0.0, FULL_SCALE, start, end, 0.0, 0.0, 0.0, 0.0, 0, stuck=True)
+        return HallChannel(
+            joint, (0.0, 0.0, 0.0, 0.0), 0.0, FULL_SCALE, start, end, 0.0, 0.0, 0.0, 0.0, 0, stuck=True
+        )
     free = (readings > 0) & (readings < FULL_SCALE)
     n = int(free.sum())
     if n < _MIN_SAMPLES:
@@ -121,8 +123,8 @@ def fit_channel(joint: str, readings: Float[Tensor, " n"], angles: Float[Tensor,
     slope = (c[1] + r * (2 * c[2] + 3 * r * c[3])) / FULL_SCALE
     noise, misfit = _split(residual, slope)
     rms, worst = float((residual**2).mean().sqrt()), float(residual.abs().max())
-    coefficients = tuple(float(value) for value in c)
-    return HallChannel(joint, coefficients, low, high, start, end, noise, misfit, rms, worst, n)  # type: ignore[arg-type]
+    c0, c1, c2, c3 = (float(value) for value in c)
+    return HallChannel(joint, (c0, c1, c2, c3), low, high, start, end, noise, misfit, rms, worst, n)
 
 
 def _check_monotone(name: str, c: Tensor, low: float, high: float) -> None:
