@@ -71,8 +71,11 @@ def touch(pad: Pad, T_pad: Array, solid: Solid, T_solid: Array, R: float) -> Tou
         e = rotation @ direction
         K_o += curvature * np.outer(e, e)
     K_f = (np.eye(3) - np.outer(n, n)) / pad.radius
-    if abs(s) < pad.half:  # on the side: 1/R instead of 1/rho along the axis
-        e = T_pad[:3, 2] - n * (n @ T_pad[:3, 2])
+    lean = float(n @ T_pad[:3, 2])
+    # On the side: 1/R instead of 1/rho along the axis. There |lean| <= half/R, except deep inside a body
+    # on a ridge of d, where no side is touched.
+    if abs(s) < pad.half and abs(lean) < 2 * pad.half / R:
+        e = T_pad[:3, 2] - n * lean
         e /= np.linalg.norm(e)
         K_f += (1 / R - 1 / pad.radius) * np.outer(e, e)
     point = T_pad[:3, 3] + s * T_pad[:3, 2] - (pad.radius + gap / 2) * n

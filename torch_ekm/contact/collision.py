@@ -125,7 +125,7 @@ class ContactDetector:
         return best
 
     def _coarse_distance(self, pad: Pad, T_pad: Array, solid: Solid, T_solid: Array) -> float:
-        """coal's signed distance [m]; never larger than the gap."""
+        """coal's signed distance [m]: the gap without the crown, to its tolerance of 1e-6."""
         place = self._coal.Transform3s
         self._result.clear()
         return self._coal.distance(

@@ -1,0 +1,353 @@
+"""Contacts of capsule pads with primitives: against coal, against algebra, and as functions of the state."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from torch_ekm.contact._primitives import signed_distance, surface_curvature, tangents
+from torch_ekm.description import ContactPad, ObjectDescription, Shape, list_objects, load_hand, load_object
+from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
+from torch_ekm.kinematics import HandKinematics
+from torch_ekm.kinematics.se3 import exp
+
+coal = pytest.importorskip("coal")
+from torch_ekm.contact.collision import ContactDetector  # noqa: E402
+
+F64 = torch.float64
+EYE = torch.eye(3, dtype=F64)
+RADIUS, HALF = 0.0065, 0.00718
+SHAPES = {
+    "box": (0.09, 0.03, 0.04),
+    "cylinder": (0.02, 0.08),
+    "sphere": (0.025,),
+    "capsule": (0.015, 0.05),
+}
+
+
+def thing(kind: str, size: tuple[float, ...] | None = None) -> ObjectDescription:
+    shape = Shape(kind, size or SHAPES[kind], np.eye(4))  # type: ignore[arg-type]
+    return dataclasses.replace(load_object("box"), name=kind, shapes=(shape,))
+
+
+def probe(obj: ObjectDescription, ball: bool = False, **options) -> ContactDetector:
+    """A hand reduced to one pad on its base link, so that moving the object places it freely.
+
+    The capsule lies along x of the hand frame with its centre at the origin.
+    """
+    end = 0.0 if ball else HALF
+    pad = ContactPad("pad", "hand", (-end, 0.0, 0.0), (end, 0.0, 0.0), RADIUS)
+    hand = dataclasses.replace(load_hand("planar_two_finger"), pads=(pad,))
+    return ContactDetector(hand, obj, **{"margin": math.inf, **options})
+
+
+def touch(detector: ContactDetector, position, rotation: torch.Tensor = EYE):
+    return detector(torch.zeros(4, dtype=F64), torch.as_tensor(position, dtype=F64), rotation)
+
+
+def turned(x: float, y: float, z: float) -> torch.Tensor:
+    return exp(torch.tensor([x, y, z], dtype=F64))
+
+
+# -- by hand ------------------------------------------------------------------------------------
+
+
+def test_ball_on_a_box_face() -> None:
+    contacts = touch(probe(thing("box"), ball=True), [0.01, 0.02 + 0.015, 0.0])
+    assert contacts.finger == ("pad",)
+    torch.testing.assert_close(contacts.normal[0], torch.tensor([0.0, -1.0, 0.0], dtype=F64))
+    assert float(contacts.gap) == pytest.approx(0.02 - RADIUS)
+    midway = torch.tensor([0.0, (RADIUS + 0.02) / 2, 0.0], dtype=F64)
+    torch.testing.assert_close(contacts.point[0], midway)
+    across = torch.diag(torch.tensor([1.0, 0.0, 1.0], dtype=F64))
+    torch.testing.assert_close(contacts.finger_curvature[0], across / RADIUS)
+    assert not contacts.object_curvature.any()
+    assert contacts.pinned == (False,)
+
+
+def test_capsule_lying_on_a_face_touches_at_its_middle() -> None:
+    """Curvature 1/rho across, 1/R along the axis: not a ball's."""
+    contacts = touch(probe(thing("box"), crown_radius=0.5), [0.0, 0.015 + RADIUS, 0.0])
+    torch.testing.assert_close(contacts.point[0], torch.tensor([0.0, RADIUS, 0.0], dtype=F64))
+    assert float(contacts.gap) == pytest.approx(0.0, abs=1e-15)
+    expected = torch.diag(torch.tensor([2.0, 0.0, 1 / RADIUS], dtype=F64))
+    torch.testing.assert_close(contacts.finger_curvature[0], expected)
+
+
+def test_tilted_capsule_touches_with_its_round_end() -> None:
+    contacts = touch(probe(thing("box")), [0.0, 0.03, 0.0], turned(0, 0, 0.3))
+    n = contacts.normal[0]
+    isotropic = (EYE - torch.outer(n, n)) / RADIUS
+    torch.testing.assert_close(contacts.finger_curvature[0], isotropic)
+    # the end that leans on the face: the box turned by +0.3 rad comes nearer on the side of -x
+    assert float(contacts.point[0, 0]) < 0
+
+
+def test_cylinder_side_is_anisotropic() -> None:
+    """A can standing along z beside the pad: 1/0.02 around, 0 along; crossed with the pad's axis."""
+    contacts = touch(probe(thing("cylinder")), [0.0, 0.02 + RADIUS, 0.0])
+    torch.testing.assert_close(
+        contacts.object_curvature[0], torch.diag(torch.tensor([50.0, 0, 0], dtype=F64))
+    )
+    assert float(contacts.gap) == pytest.approx(0.0, abs=1e-15)
+
+
+def test_edges_and_corners_are_pinned() -> None:
+    edge = touch(probe(thing("box"), ball=True), [0.0, 0.015 + 0.004, 0.02 + 0.004])
+    corner = touch(probe(thing("box"), ball=True), [0.045 + 0.003, 0.015 + 0.003, 0.02 + 0.003])
+    rim = touch(probe(thing("cylinder"), ball=True), [0.02 + 0.003, 0.0, 0.04 + 0.003])
+    cap = touch(probe(thing("cylinder"), ball=True), [0.01, 0.0, 0.04 + 0.003])
+    assert (edge.pinned, corner.pinned, rim.pinned, cap.pinned) == ((True,), (True,), (True,), (False,))
+    assert not cap.object_curvature.any()
+    assert float(corner.gap) == pytest.approx(0.003 * math.sqrt(3) - RADIUS)
+
+
+def test_compound_object_counts_its_nearest_part() -> None:
+    tube = load_object("toothpaste")
+    detector = probe(tube, ball=True)
+    cap_side = touch(detector, [-0.05, 0.009 + RADIUS, 0.0])
+    assert float(cap_side.gap) == pytest.approx(0.0, abs=1e-9)
+    body = touch(detector, [0.0, 0.016 + RADIUS, 0.0])
+    assert float(body.gap) == pytest.approx(0.0, abs=1e-9)
+    assert body.n_c == 1
+
+
+# -- against coal -------------------------------------------------------------------------------
+
+poses = st.tuples(*[st.floats(-0.06, 0.06)] * 3, *[st.floats(-3.0, 3.0)] * 3)
+
+
+def coal_distance(obj: ObjectDescription, position: torch.Tensor, rotation: torch.Tensor) -> float:
+    shape = obj.shapes[0]
+    kinds = {"box": coal.Box, "cylinder": coal.Cylinder, "sphere": coal.Sphere, "capsule": coal.Capsule}
+    turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # the pad's axis is x
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    request.gjk_tolerance = request.epa_tolerance = 1e-10
+    request.gjk_max_iterations = 1000
+    return coal.distance(
+        coal.Capsule(RADIUS, 2 * HALF),
+        coal.Transform3s(turn, np.zeros(3)),
+        kinds[shape.kind](*shape.size),
+        coal.Transform3s(rotation.numpy(), position.numpy()),
+        request,
+        result,
+    )
+
+
+@pytest.mark.parametrize("kind", list(SHAPES))
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(pose=poses)
+def test_gap_is_coals_distance(kind: str, pose: tuple[float, ...]) -> None:
+    """Outside, and while only the surfaces overlap; the crown adds at most half^2/(2 R) = 0.05 mm."""
+    obj = thing(kind)
+    position, rotation = torch.tensor(pose[:3], dtype=F64), turned(*pose[3:])
+    expected = coal_distance(obj, position, rotation)
+    assume(expected > -0.8 * RADIUS)
+    contacts = touch(probe(obj), position, rotation)
+    sagitta = HALF**2 / (2 * 0.5)
+    assert -1e-7 < float(contacts.gap) - expected < sagitta + 1e-7
+    # a flat enough crown is no crown
+    flat = touch(probe(obj, crown_radius=1e4), position, rotation)
+    assert float(flat.gap) == pytest.approx(expected, abs=1e-7)
+
+
+@pytest.mark.parametrize("kind", list(SHAPES))
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(pose=poses)
+def test_invariants(kind: str, pose: tuple[float, ...]) -> None:
+    """Unit normal, tangent symmetric curvatures >= 0, the point on both surfaces shifted by half the gap."""
+    obj = thing(kind)
+    position, rotation = torch.tensor(pose[:3], dtype=F64), turned(*pose[3:])
+    contacts = touch(probe(obj), position, rotation)
+    n, x, gap = contacts.normal[0], contacts.point[0], float(contacts.gap)
+    assert float(n.norm()) == pytest.approx(1.0, abs=1e-9)
+    for K in (contacts.finger_curvature[0], contacts.object_curvature[0]):
+        assert float((K @ n).abs().max()) < 1e-8
+        torch.testing.assert_close(K, K.mT)
+        assert float(torch.linalg.eigvalsh(K).min()) > -1e-9
+    on_finger = x + gap / 2 * n
+    along = float(on_finger[0].clamp(-HALF, HALF))
+    distance = (on_finger - torch.tensor([along, 0, 0], dtype=F64)).norm()
+    if gap > -0.8 * RADIUS:
+        # within the crown: n leans by at most half/R from the perpendicular
+        assert float(distance) == pytest.approx(RADIUS, abs=1e-6)
+        on_object = rotation.mT @ (x - gap / 2 * n - position)
+        d, _ = signed_distance(obj.shapes[0])(*on_object.tolist())
+        assert d == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", list(SHAPES))
+def test_normals_are_gradients_and_curvature_their_derivative(kind: str) -> None:
+    """``n = grad d``; on a smooth feature ``dn/dx = K_o`` at the surface."""
+    shape = thing(kind).shapes[0]
+    distance = signed_distance(shape)
+    rng = np.random.default_rng(2)
+    checked = 0
+    for _ in range(300):
+        p = rng.uniform(-0.06, 0.06, 3)
+        d, n = distance(*p)
+        h = 1e-6
+        numeric = [(distance(*(p + h * e))[0] - distance(*(p - h * e))[0]) / (2 * h) for e in np.eye(3)]
+        if abs(d) < 1e-3 or d < 0:
+            continue  # inside there are ridges
+        np.testing.assert_allclose(numeric, n, atol=1e-5)
+        on = p - (d - 1e-7) * np.array(n)  # hardly outside the surface
+        principal, sharp = surface_curvature(shape, tuple(on), n)
+        if sharp:
+            continue
+        K = sum((k * np.outer(e, e) for k, e in principal), np.zeros((3, 3)))
+        for e in tangents(n):
+            step = 1e-8 * np.array(e)
+            dn = (np.array(distance(*(on + step))[1]) - distance(*(on - step))[1]) / 2e-8
+            if np.abs(dn).max() < 1e4:  # else the step crossed an edge
+                np.testing.assert_allclose(dn, K @ np.array(e), atol=1e-2 * max(1.0, np.abs(K).max()))
+                checked += 1
+    assert checked > 100
+
+
+# -- as a function of the state -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", list(SHAPES))
+def test_the_contact_point_moves_continuously_as_the_finger_tilts(kind: str) -> None:
+    """Through the line contact (tilt 0): no jump, and never faster than the crown lets it roll."""
+    turn = turned(0, math.pi / 2, 0) if kind in ("cylinder", "capsule") else EYE  # axis parallel to the pad
+    depth = {"box": 0.015, "cylinder": 0.02, "sphere": 0.025, "capsule": 0.015}[kind]
+    detector = probe(thing(kind), crown_radius=0.5)
+    tilts = np.linspace(-0.05, 0.05, 401)
+    points = torch.stack(
+        [touch(detector, [0.0, depth + RADIUS, 0.0], turned(0, 0, a) @ turn).point[0] for a in tilts]
+    )
+    steps = (points[1:] - points[:-1]).norm(dim=-1)
+    assert float(steps.max()) < 0.5 * (tilts[1] - tilts[0]) * 1.5
+    if kind == "box":  # from one end to the other, evenly
+        assert float(points[:, 0].max()) > 0.99 * HALF
+        assert float(points[:, 0].min()) < -0.99 * HALF
+
+
+def test_twice_the_same() -> None:
+    detector = probe(load_object("can"))
+    first, _, second = (
+        touch(detector, p, turned(0.1, 0.2, 0.3)) for p in ([0, 0.026, 0], [0, 0.03, 0], [0, 0.026, 0])
+    )
+    assert torch.equal(first.point, second.point)
+    assert torch.equal(first.finger_curvature, second.finger_curvature)
+
+
+@pytest.mark.parametrize("kind", list(SHAPES))
+def test_deep_overlap_still_says_the_way_out(kind: str) -> None:
+    """The pad's axis well inside the body: the normal leads out, the gap is the depth."""
+    depth = {"box": 0.015, "cylinder": 0.02, "sphere": 0.025, "capsule": 0.015}[kind]
+    turn = turned(0, math.pi / 2, 0) if kind in ("cylinder", "capsule") else EYE
+    contacts = touch(probe(thing(kind)), [0.0, depth - 0.010, 0.0], turn)
+    assert contacts.n_c == 1
+    assert float(contacts.normal[0, 1]) == pytest.approx(-1.0, abs=1e-6)
+    assert float(contacts.gap) == pytest.approx(-0.010 - RADIUS, abs=1e-9)
+
+
+def test_margin() -> None:
+    box = thing("box")
+    assert touch(probe(box, margin=0.002), [0.0, 0.015 + RADIUS + 0.0019, 0.0]).n_c == 1
+    far = touch(probe(box, margin=0.002), [0.0, 0.015 + RADIUS + 0.0021, 0.0])
+    assert far.n_c == 0
+    assert far.point.shape == (0, 3)
+    assert far.finger_curvature.shape == (0, 3, 3)
+
+
+# -- the whole hand -----------------------------------------------------------------------------
+
+
+def pinch(object_name: str, dtype: torch.dtype = F64, **options):
+    """The object between thumb, index and middle finger, moved onto the thumb."""
+    hand, obj = load_hand("icub_right"), load_object(object_name)
+    kinematics = HandKinematics(hand)
+    deg = {"thumb_0": 58, "thumb_1": 8, "thumb_2": 13, "thumb_3": 13}
+    deg |= {"index_1": 40, "index_2": 19, "index_3": 19, "middle_1": 40, "middle_2": 19, "middle_3": 19}
+    q = torch.tensor([math.radians(deg.get(name, 0.0)) for name in hand.joint_names], dtype=F64)
+    link = kinematics(q)
+    thumb, index, middle = (link.of(f"{finger}_tip")[:3, 3] for finger in ("thumb", "index", "middle"))
+    y = (index + middle) / 2 - thumb
+    y = y / y.norm()
+    x = torch.tensor([0.0, 1.0, 0.0], dtype=F64)
+    x = x - y * (x @ y)
+    x = x / x.norm()
+    rotation = torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
+    position = thumb + y * (obj.grasp_width / 2 + RADIUS)
+    detector = ContactDetector(hand, obj, kinematics=kinematics, **options)
+    return detector, q.to(dtype), position.to(dtype), rotation.to(dtype)
+
+
+@pytest.mark.parametrize("name", list_objects())
+def test_every_object_in_the_hand(name: str) -> None:
+    detector, q, position, rotation = pinch(name, margin=math.inf)
+    contacts = detector(q, position, rotation)
+    assert contacts.finger == ("thumb", "index", "middle", "ring", "little")
+    assert contacts.link == tuple(f"{finger}_3" for finger in contacts.finger)
+    assert abs(float(contacts.gap[0])) < 5e-4
+    # thumb and fingers press against each other
+    assert float(contacts.normal[0] @ contacts.normal[1]) < -0.8
+    assert torch.equal(contacts.friction, torch.full((5,), load_object(name).friction, dtype=F64))
+    near = pinch(name)[0](q, position, rotation)
+    assert near.n_c < 5
+    assert near.finger[0] == "thumb"
+
+
+def test_shared_poses_and_float32() -> None:
+    detector, q, position, rotation = pinch("box")
+    expected = detector(q, position, rotation)
+    again = detector(detector.kinematics(q), position, rotation)
+    assert torch.equal(expected.point, again.point)
+    single = detector(q.float(), position.float(), rotation.float())
+    assert single.point.dtype == single.friction.dtype == torch.float32
+    torch.testing.assert_close(single.point.double(), expected.point, atol=1e-5, rtol=0)
+
+
+def test_moving_hand_and_object_together_changes_nothing() -> None:
+    """Everything is relative: turning the pad's link with the object turns point and normal alike."""
+    obj = load_object("applier")
+    a = touch(probe(obj), [0.012, 0.018, 0.003], turned(0.2, 0.1, -0.1))
+    hand = load_hand("planar_two_finger")
+    pad = ContactPad("pad", "left_0", (-HALF, 0.0, 0.0), (HALF, 0.0, 0.0), RADIUS)
+    detector = ContactDetector(dataclasses.replace(hand, pads=(pad,)), obj, margin=math.inf)
+    q = torch.tensor([0.4, 0.0, 0.0, 0.0], dtype=F64)
+    T = detector.kinematics(q).of("left_0")
+    R, t = T[:3, :3], T[:3, 3]
+    moved = detector(q, R @ torch.tensor([0.012, 0.018, 0.003], dtype=F64) + t, R @ turned(0.2, 0.1, -0.1))
+    torch.testing.assert_close(moved.point[0], R @ a.point[0] + t, atol=1e-9, rtol=0)
+    torch.testing.assert_close(moved.normal[0], R @ a.normal[0], atol=1e-9, rtol=0)
+    torch.testing.assert_close(moved.finger_curvature[0], R @ a.finger_curvature[0] @ R.mT, atol=1e-5, rtol=0)
+
+
+def test_fast_enough_for_a_control_loop() -> None:
+    """Five fingers in well under the budget of 1 ms (a loaded machine is allowed five times that)."""
+    detector, q, position, rotation = pinch("can")
+    detector(q, position, rotation)
+    times = []
+    for _ in range(30):
+        start = time.perf_counter()
+        detector(q, position, rotation)
+        times.append(time.perf_counter() - start)
+    assert min(times) < 5e-3
+
+
+def test_errors() -> None:
+    detector, q, position, rotation = pinch("box")
+    with pytest.raises(ShapeError, match="q"):
+        detector(q[None], position, rotation)
+    with pytest.raises(ShapeError, match="poses"):
+        detector(detector.kinematics(q[None]), position, rotation)
+    with pytest.raises(ShapeError, match="rotation"):
+        detector(q, position, rotation[None])
+    with pytest.raises(NonFiniteError, match="position"):
+        detector(q, position * math.nan, rotation)
+    for bad in ({"margin": -1.0}, {"margin": math.nan}, {"crown_radius": 0.0}, {"crown_radius": math.inf}):
+        with pytest.raises(ParameterError):
+            ContactDetector(detector.hand, detector.obj, **bad)
+    assert "box" in repr(detector)
