@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 
@@ -28,7 +29,9 @@ class StoppingRule:
     * stalled: within the last ``stall_window`` steps the smallest ``|e|`` fell by less than
       ``stall_progress``;
     * actuator limits: as stalled, while some actuator that matters stood at its limit;
-    * step limit: ``max_steps`` commands were given.
+    * step limit: ``max_steps`` commands were given;
+    * object lost: the plant says so, or the object turned off the focus by more than
+      ``off_limit`` [rad]: it is dislocated, and no small step brings it back.
     """
 
     tolerance: float
@@ -38,9 +41,10 @@ class StoppingRule:
     stall_progress: float = 1e-3
     """[same unit]"""
     max_steps: int = 60
+    off_limit: float = 30 * math.pi / 180
 
     def __post_init__(self) -> None:
-        for name in ("tolerance", "settle_steps", "stall_window", "max_steps"):
+        for name in ("tolerance", "settle_steps", "stall_window", "max_steps", "off_limit"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
 

@@ -74,11 +74,14 @@ def run_manipulation(
     start = state = state_of(observation)
     errors = [_focus_error(focus, target, state)]
     done = Manipulation(StopReason.RUNNING, errors[0], None)
-    limited = False
+    limited, off_rotation = False, 0.0
+    off_rows = controller.focus.off_matrix
+    off_rows = off_rows[off_rows[:, 3:].abs().sum(-1) > 0]  # rotations
     while True:
         done.final = observation
-        if observation.status is PlantStatus.LOST:
+        if observation.status is PlantStatus.LOST or off_rotation > rule.off_limit:
             done.reason = StopReason.OBJECT_LOST
+            done.message = "" if observation.status is PlantStatus.LOST else "dislocated off the focused axis"
             break
         done.reason = rule.judge(errors, limited)
         if done.reason is not StopReason.RUNNING:
@@ -103,8 +106,7 @@ def run_manipulation(
         e_ekm = None
         if enhanced is not None:
             e_ekm = float(torch.linalg.vector_norm(prediction_error(increment, decision.predicted, focus)))
-        turned = after.minus(start)[-6:]
-        off = controller.focus.off_matrix @ turned
+        off_rotation = float(torch.linalg.vector_norm(off_rows @ after.minus(start)[-6:]))
         done.steps.append(
             Step(
                 errors[-1],
@@ -112,7 +114,7 @@ def run_manipulation(
                 increment,
                 float(torch.linalg.vector_norm(e_km)),
                 e_ekm,
-                float(torch.linalg.vector_norm(off[controller.focus.off_matrix[:, 3:].abs().sum(-1) > 0])),
+                off_rotation,
                 seconds,
             )
         )
