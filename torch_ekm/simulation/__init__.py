@@ -4,7 +4,8 @@ from .config import PlantConfig as PlantConfig
 from .parameters import PlantParameters as PlantParameters
 from .pinch import PinchPlan as PinchPlan
 from .pinch import PinchPlanner as PinchPlanner
-from .pinch import PinchRequest as PinchRequest
+from .pinch_problem import PinchProblem as PinchProblem
+from .pinch_problem import PinchRequest as PinchRequest
 from .plant import Observation as Observation
 from .plant import Plant as Plant
 from .plant import PlantStatus as PlantStatus

@@ -25,6 +25,8 @@ class PlantConfig:
     """[s]; 2 ms is fine for long runs."""
     ramp_time: float = 0.2
     """Time in which a command is carried out [s]."""
+    rate_limit: float = 100 * _DEG
+    """Fastest motion of a motor [rad/s]; a large command takes longer than ``ramp_time``."""
     command_time: float = 0.5
     """Least simulated time of one command, ramp and settling [s]."""
     settle_limit: float = 1.0
@@ -47,7 +49,7 @@ class PlantConfig:
     """Commands are increments of the "encoder" or of the "setpoint"."""
 
     def __post_init__(self) -> None:
-        for name in ("time_step", "ramp_time", "command_time", "settle_limit", "pinch_force"):
+        for name in ("time_step", "ramp_time", "rate_limit", "command_time", "settle_limit", "pinch_force"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ParameterError(name, value, "finite and greater than 0")

@@ -31,6 +31,10 @@ class PlantParameters:
     """Factor on the series stiffness of tendon and servo."""
     joint_friction: float = 0.0
     """Factor on the description's Coulomb friction of the joints; the kinematic model has none."""
+    tendon_elongation: float = 0.0
+    """Permanent lengthening of every tendon, at its actuator [rad]."""
+    tendon_creep: float = 0.0
+    """Further lengthening per torque and time [rad/(N m s)]."""
     link_weight: bool = False
     """Gravity pulls at the fingers too (the kinematic model leaves their weight out)."""
 
@@ -64,7 +68,19 @@ class PlantParameters:
     rotation_noise: float = 0.0
     """Standard deviation of the object's orientation, per axis [rad]."""
     force_noise: float = 0.0
-    """Standard deviation of a fingertip force [N]."""
+    """Standard deviation of the force of a fingertip that touches [N]."""
+    force_offset: float = 0.0
+    """Bound of a constant error of each fingertip [N]; drawn once, from ``hardware_seed``."""
+    force_hysteresis: float = 0.0
+    """Full width of the play between force and reading [N]."""
+    force_range: float = 0.0
+    """Full scale of an 8-bit converter [N]; 0: not quantised."""
+    latency: float = 0.0
+    """Age of the camera's picture [s]."""
+    frame_loss: float = 0.0
+    """Chance that the object is not seen in an observation."""
+    stuck_joints: tuple[str, ...] = ()
+    """Joints whose sensor keeps its first reading."""
 
     hardware_seed: int = 0
     """Which specimen of the hand: signs and sizes of the constant errors."""
@@ -72,6 +88,8 @@ class PlantParameters:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
+            if field.name == "stuck_joints":
+                continue
             entries = value if isinstance(value, tuple) else (value,)
             if not all(math.isfinite(entry) for entry in entries):
                 raise ParameterError(field.name, value, "finite")
@@ -79,6 +97,8 @@ class PlantParameters:
                 raise ParameterError(field.name, value, "greater than 0")
             if field.name not in _POSITIVE | {"com_shift"} and not all(entry >= 0 for entry in entries):
                 raise ParameterError(field.name, value, "0 or more")
+        if self.frame_loss > 1:
+            raise ParameterError("frame_loss", self.frame_loss, "a chance between 0 and 1")
 
     def replace(self, **changes: object) -> PlantParameters:
         """A copy with some figures changed."""
@@ -101,7 +121,8 @@ class PlantParameters:
         the position controller has a constant and a fresh error, play and a Coulomb dead zone
         (together the +-1 deg that the E-KM paper reports, section III.C.4); the fingers have weight,
         the object is 10 % heavier, its centre 2 mm off. Sensors: 0.3 deg per joint, 0.2 mm and
-        0.15 deg for the object (a marker board seen from 0.4 m), 0.1 N per fingertip.
+        0.15 deg for the object (a marker board seen from 0.4 m), 0.1 N each of noise, offset and
+        hysteresis per fingertip, in 8 bit.
         """
         return cls(
             moment_arm=1.3,
@@ -120,6 +141,9 @@ class PlantParameters:
             position_noise=0.0002,
             rotation_noise=0.15 * _DEG,
             force_noise=0.1,
+            force_offset=0.1,
+            force_hysteresis=0.1,
+            force_range=15.0,
         )
 
 

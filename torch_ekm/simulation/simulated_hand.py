@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,20 +11,21 @@ import torch
 from numpy.typing import NDArray
 
 from ..description import HandDescription, ObjectDescription, load_hand, load_object
-from ..exceptions import EquilibriumError, GraspError, ParameterError
-from ..kinematics.se3 import exp
+from ..exceptions import EquilibriumError, GraspError
 from ..typing import Float, Tensor
 from .config import PlantConfig
+from .mechanism import make_planner, make_servo, make_transmission, moment_arms
 from .parameters import PlantParameters
-from .pinch import PinchPlan, PinchPlanner, PinchRequest
+from .pinch import PinchPlan
+from .pinch_problem import PinchRequest
 from .plant import Observation, PlantStatus
 from .scene import HandScene
-from .servo import Servo, ServoState
-from .transmission import Transmission, TransmissionState
+from .sensors import Sensors, SensorState
+from .servo import ServoState
+from .transmission import TransmissionState
 
 Array = NDArray[np.float64]
 
-_RIGID = 8.0  # [N m/rad] what a looped cable and its servo have where the description says "rigid"
 _FORCE_WINDOW = 10  # steps over which a fingertip force is averaged
 _STILL = 2e-3  # [rad/s] and [m/s x 10]: slower than this is settled
 _ATTEMPTS = 6
@@ -34,6 +37,8 @@ class PlantSnapshot(NamedTuple):
     physics: bytes
     transmission: TransmissionState
     servo: ServoState
+    sensors: SensorState
+    parameters: PlantParameters
     generator: dict[str, Any]
     normal: Array
     time: float
@@ -70,22 +75,10 @@ class SimulatedHand:
         self.object = load_object(object) if isinstance(object, str) else object
         self.config = PlantConfig() if config is None else config
         self.parameters = PlantParameters.exact() if parameters is None else parameters
-        self._thumb, self._fingers = _opposition(self.hand, self.config)
-        self._transmission = self._new_transmission()
-        self._servo = self._new_servo()
-        self._planner = PinchPlanner(
-            self.hand,
-            self.object,
-            self._transmission,
-            self.config.gravity,
-            self._thumb,
-            self._fingers,
-            along=self.config.along,
-            mass_factor=self.parameters.mass,
-            com_shift=self.parameters.com_shift,
-            friction=self.parameters.friction,
-            object_scale=self.parameters.object_scale,
-        )
+        self._transmission = make_transmission(self.hand, self.parameters)
+        self._servo = make_servo(self.hand, self.config, self.parameters)
+        self._sensors = Sensors(self.parameters, self.hand.n_q, len(self.hand.pads), self.hand.joint_names)
+        self._planner = make_planner(self.hand, self.object, self.config, self.parameters)
         self._scene: HandScene | None = None
         self._plan: PinchPlan | None = None
         self._generator = np.random.default_rng(0)
@@ -128,35 +121,38 @@ class SimulatedHand:
         self._need_scene()
         start = self._servo.encoder
         goal = self._servo.plan(torch.as_tensor(delta_a).detach().cpu().double().numpy(), self._generator)
-        steps = max(1, round(self.config.ramp_time / self.config.time_step))
+        ramp = max(self.config.ramp_time, float(np.abs(goal - start).max()) / self.config.rate_limit)
+        steps = max(1, round(ramp / self.config.time_step))
         self._run(steps, lambda part: start + part * (goal - start))
         self._settle(self.config.command_time - self.config.ramp_time)
         return self.observe()
 
     def observe(self) -> Observation:
         """Read the sensors; their noise is drawn anew."""
-        scene = self._need_scene()
+        scene, draw = self._need_scene(), self._generator
         q, (position, rotation) = scene.q, scene.object_pose
-        p, draw = self.parameters, self._generator.standard_normal
-        noise = exp(torch.from_numpy(p.rotation_noise * draw(3))).numpy()
-        touching = self._normal > 0
-        force = np.maximum(0.0, self._normal + p.force_noise * draw(len(self._normal)) * touching)
+        status = self.status
+        joints = self._sensors.joints(q, draw)
+        seen_position, seen_rotation, seen = self._sensors.pose(position, rotation, draw)
+        force = self._sensors.forces(self._normal, draw)
+        if not seen and status is PlantStatus.HELD:
+            status = PlantStatus.NOT_SEEN
         truth = {
-            "q": torch.from_numpy(q),
-            "position": torch.from_numpy(position),
-            "rotation": torch.from_numpy(rotation),
-            "fingertip_force": torch.from_numpy(self._normal.copy()),
-            "actuator_torque": torch.from_numpy(self._transmission.actuator_torque(q, self._servo.output)),
+            "q": q,
+            "position": position,
+            "rotation": rotation,
+            "fingertip_force": self._normal.copy(),
+            "actuator_torque": self._transmission.actuator_torque(q, self._servo.output),
         }
         return Observation(
-            q=torch.from_numpy(q + p.joint_noise * draw(len(q))),
+            q=torch.from_numpy(joints),
             a=torch.from_numpy(self._servo.encoder),
-            position=torch.from_numpy(position + p.position_noise * draw(3)),
-            rotation=torch.from_numpy(noise @ rotation),
+            position=torch.from_numpy(seen_position),
+            rotation=torch.from_numpy(seen_rotation),
             fingertip_force=torch.from_numpy(force),
             time=self._time,
-            status=self.status,
-            info={"truth": truth},
+            status=status,
+            info={"truth": {name: torch.from_numpy(value) for name, value in truth.items()}},
         )
 
     def close(self) -> None:
@@ -210,6 +206,8 @@ class SimulatedHand:
             scene.snapshot(),
             self._transmission.snapshot(),
             self._servo.snapshot(),
+            self._sensors.snapshot(),
+            self.parameters,
             dict(self._generator.bit_generator.state),
             self._normal.copy(),
             self._time,
@@ -219,9 +217,12 @@ class SimulatedHand:
     def restore(self, snapshot: PlantSnapshot) -> Observation:
         """Go back to ``snapshot``, noise included; two restored runs are alike bit by bit."""
         scene = self._need_scene()
+        if snapshot.parameters != self.parameters:
+            self.change(**dataclasses.asdict(snapshot.parameters))
         scene.restore(snapshot.physics)
         self._transmission.restore(snapshot.transmission)
         self._servo.restore(snapshot.servo)
+        self._sensors.restore(snapshot.sensors)
         self._generator.bit_generator.state = snapshot.generator
         self._normal, self._time, self._plan = snapshot.normal.copy(), snapshot.time, snapshot.plan
         return self.observe()
@@ -231,6 +232,37 @@ class SimulatedHand:
         motor = self._servo.encoder
         self._run(max(1, round(duration / self.config.time_step)), lambda part: motor)
 
+    def change(self, **changes: Any) -> None:
+        """Change :class:`PlantParameters` by name, now and in mid-grasp; motors stay where they are.
+
+        A tendon with other moment arms is put on with the tension of the old one. ``object_scale``
+        and ``link_weight`` shape the scene: they act from the next :meth:`reset`.
+
+        Raises:
+            ParameterError: an unknown name or a wrong figure; nothing is changed.
+        """
+        old, new = self.parameters, self.parameters.replace(**changes)
+        moment_arms(self.hand, new)  # refuses before anything is touched
+        self.parameters = new
+        previous, servo = self._transmission, self._servo.snapshot()
+        self._transmission = make_transmission(self.hand, new)
+        self._servo = make_servo(self.hand, self.config, new)
+        self._servo.restore(servo)
+        self._sensors.set_parameters(new)
+        self._planner = make_planner(self.hand, self.object, self.config, self.parameters)
+        if self._scene is not None:
+            self._transmission.take_over(previous, self._scene.q)
+            self._transmission.lengthen(new.tendon_elongation - old.tendon_elongation)
+            self._apply(self._scene)
+
+    def tug(self, force: Array, torque: Array, duration: float = 0.05) -> Observation:
+        """Pull at the object [N, at its centre of mass] and twist it [N m], hand frame, then settle."""
+        motor = self._servo.encoder
+        push = (np.asarray(force, dtype=np.float64), np.asarray(torque, dtype=np.float64))
+        self._run(max(1, round(duration / self.config.time_step)), lambda part: motor, push)
+        self._settle(self.config.command_time)
+        return self.observe()
+
     # -- inside -------------------------------------------------------------------------------------
 
     def _need_scene(self) -> HandScene:
@@ -238,33 +270,12 @@ class SimulatedHand:
             raise GraspError("there is no grasp yet: call reset(seed) first")
         return self._scene
 
-    def _new_transmission(self) -> Transmission:
-        hand, p = self.hand, self.parameters
-        factor = np.asarray(p.moment_arm, dtype=np.float64)
-        if factor.ndim and factor.shape != (hand.n_a,):
-            raise ParameterError("moment_arm", p.moment_arm, f"one factor, or {hand.n_a} (one per actuator)")
-        stiffness = np.array([actuator.stiffness for actuator in hand.actuators])
-        return Transmission(
-            hand,
-            hand.actuation_jacobian * np.broadcast_to(factor, (hand.n_a,))[:, None],
-            p.servo_stiffness * np.where(np.isfinite(stiffness), stiffness, _RIGID),
-            p.spring * hand.spring_stiffness,
-            p.joint_friction * hand.joint_friction,
-        )
-
-    def _new_servo(self) -> Servo:
-        hand, p = self.hand, self.parameters
-        specimen = np.random.default_rng(p.hardware_seed)
-        return Servo(
-            hand.actuator_lower,
-            hand.actuator_upper,
-            bias=p.actuator_bias * specimen.uniform(-1.0, 1.0, size=hand.n_a),
-            fresh_error=p.actuator_error,
-            dead_zone=p.dead_zone,
-            threshold=p.threshold,
-            backlash=p.backlash,
-            relative_to=self.config.relative_to,
-        )
+    def _apply(self, scene: HandScene) -> None:
+        """Give the scene those parameters that are its own."""
+        p = self.parameters
+        scene.set_object(p.mass, p.com_shift)
+        scene.set_friction(p.friction * self.object.friction)
+        scene.set_drive_stiffness(self._transmission.drive_stiffness)
 
     def _request(self) -> PinchRequest:
         c = self.config
@@ -278,9 +289,10 @@ class SimulatedHand:
         self._scene = scene = HandScene(
             self.hand, self.object, c.gravity, c.time_step, p.object_scale, p.link_weight
         )
-        scene.set_object(p.mass, p.com_shift)
-        scene.set_friction(p.friction * self.object.friction)
-        scene.set_drive_stiffness(self._transmission.drive_stiffness)
+        self._transmission = make_transmission(self.hand, p)
+        self._transmission.lengthen(p.tendon_elongation)
+        self._sensors.forget()
+        self._apply(scene)
         self._plan = plan
         scene.q = plan.q
         scene.object_pose = (plan.position, plan.rotation)
@@ -290,10 +302,10 @@ class SimulatedHand:
         self._servo.place(slack)
         self._run(round(0.2 / c.time_step), lambda part: slack + part * (plan.motor - slack))
         self._servo.place(plan.motor)
+        self._time = 0.0
         self._run(round(0.3 / c.time_step), lambda part: plan.motor)
         scene.hold_object(False)
         self._settle(1.0)
-        self._time = 0.0
 
     def _settle(self, least: float) -> None:
         """Wait at least that long [s], and until things are still."""
@@ -308,26 +320,25 @@ class SimulatedHand:
             self.wait(0.05)
             waited += 0.05
 
-    def _run(self, steps: int, motor_at: Any) -> None:
+    def _run(
+        self, steps: int, motor_at: Callable[[float], Array], push: tuple[Array, Array] | None = None
+    ) -> None:
+        """Advance by ``steps``; ``motor_at(part)`` says where the motors are, part from 0 to 1."""
         scene, transmission, servo = self._need_scene(), self._transmission, self._servo
         normal = np.zeros_like(self._normal)
         window = min(_FORCE_WINDOW, steps)
         for k in range(1, steps + 1):
-            output = servo.move_to(motor_at(k / steps))
-            scene.step(transmission.drive_targets(scene.q, output))
+            output, q = servo.move_to(motor_at(k / steps)), scene.q
+            if push is not None:
+                scene.push(*push)
+            scene.step(transmission.drive_targets(q, output))
+            if self._sensors.wants_history and k % _FORCE_WINDOW == 0:
+                self._sensors.remember(self._time + k * self.config.time_step, *scene.object_pose)
             if k > steps - window:
                 touches = scene.touches()
                 for i, pad in enumerate(self.hand.pads):
                     if pad.link in touches:
                         normal[i] += touches[pad.link].normal / window
+        transmission.age(scene.q, servo.output, steps * self.config.time_step)
         self._normal = normal
         self._time += steps * self.config.time_step
-
-
-def _opposition(hand: HandDescription, config: PlantConfig) -> tuple[str, tuple[str, ...]]:
-    names = [pad.name for pad in hand.pads]
-    thumb = config.thumb or next((name for name in names if name.startswith("thumb")), names[0])
-    if config.fingers is not None:
-        return thumb, config.fingers
-    chosen = tuple(name for name in names if name.startswith(("index", "middle")))
-    return thumb, chosen or tuple(name for name in names if name != thumb)[:1]

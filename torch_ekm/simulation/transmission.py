@@ -17,6 +17,7 @@ class TransmissionState(NamedTuple):
     """All that a :class:`Transmission` remembers between steps."""
 
     anchor: Array
+    offset: Array
 
 
 class Transmission:
@@ -41,6 +42,7 @@ class Transmission:
         friction: Coulomb torque of each joint ``(n_q,)`` [N m].
         coupling_stiffness: k_c of the rigid couplings [N m/rad].
         bristle_stiffness: k_f [N m/rad].
+        creep: how fast a loaded tendon lengthens for good [rad/(N m s)].
     """
 
     def __init__(
@@ -52,13 +54,16 @@ class Transmission:
         friction: Array,
         coupling_stiffness: float = 8.0,
         bristle_stiffness: float = 3.0,
+        creep: float = 0.0,
     ) -> None:
         for name, value in (("stiffness", stiffness), ("spring_stiffness", spring_stiffness)):
             if not np.all(np.isfinite(value)) or np.any(value < 0):
                 raise ParameterError(name, value, "finite and not negative in every entry [N m/rad]")
         self.n_a, self.n_q = hand.n_a, hand.n_q
         self.J_a = np.array(actuation_jacobian, dtype=np.float64)
-        self.offset = hand.actuator_offset
+        self.offset = hand.actuator_offset.copy()
+        """a0, which grows as a tendon lengthens ``(n_a,)`` [rad]."""
+        self.creep = creep
         self._M = np.vstack([self.J_a, hand.coupling.reshape(-1, hand.n_q)])
         self._k = np.concatenate([stiffness, np.full(hand.coupling.shape[0], coupling_stiffness)])
         self._pulls_only = np.concatenate(
@@ -129,8 +134,23 @@ class Transmission:
             taut = ~slack
         return q.astype(np.float64)
 
+    def lengthen(self, amount: float) -> None:
+        """Make every tendon longer for good [rad at the actuator]; looped cables keep their length."""
+        self.offset = self.offset + amount * self._pulls_only[: self.n_a]
+
+    def age(self, q: Array, motor: Array, duration: float) -> None:
+        """Creep: ``da0/dt = creep * torque`` for every tendon."""
+        if self.creep > 0:
+            torque = self.actuator_torque(q, motor)
+            self.offset = self.offset + self.creep * duration * torque * self._pulls_only[: self.n_a]
+
+    def take_over(self, other: Transmission, q: Array) -> None:
+        """Go on from another transmission without a jolt: the same stretch at ``q``."""
+        self.offset = other.offset + (other.J_a - self.J_a) @ q
+        self._anchor = other._anchor.copy()
+
     def snapshot(self) -> TransmissionState:
-        return TransmissionState(self._anchor.copy())
+        return TransmissionState(self._anchor.copy(), self.offset.copy())
 
     def restore(self, state: TransmissionState) -> None:
-        self._anchor = state.anchor.copy()
+        self._anchor, self.offset = state.anchor.copy(), state.offset.copy()

@@ -1,0 +1,89 @@
+"""The parts of a plant, made from its descriptions and parameters."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..description import HandDescription, ObjectDescription
+from ..exceptions import ParameterError
+from .config import PlantConfig
+from .parameters import PlantParameters
+from .pinch import PinchPlanner
+from .pinch_problem import PinchProblem
+from .servo import Servo
+from .transmission import Transmission
+
+_RIGID = 8.0  # [N m/rad] what a looped cable and its servo have where the description says "rigid"
+
+
+def moment_arms(hand: HandDescription, parameters: PlantParameters) -> NDArray[np.float64]:
+    """J_a of the plant ``(n_a, n_q)``.
+
+    Raises:
+        ParameterError: there are neither one nor ``n_a`` factors.
+    """
+    factor = np.asarray(parameters.moment_arm, dtype=np.float64)
+    if factor.ndim and factor.shape != (hand.n_a,):
+        valid = f"one factor, or {hand.n_a} (one per actuator)"
+        raise ParameterError("moment_arm", parameters.moment_arm, valid)
+    return hand.actuation_jacobian * np.broadcast_to(factor, (hand.n_a,))[:, None]
+
+
+def make_transmission(hand: HandDescription, parameters: PlantParameters) -> Transmission:
+    """Tendons, springs and joint friction as they are, not yet lengthened."""
+    stiffness = np.array([actuator.stiffness for actuator in hand.actuators])
+    return Transmission(
+        hand,
+        moment_arms(hand, parameters),
+        parameters.servo_stiffness * np.where(np.isfinite(stiffness), stiffness, _RIGID),
+        parameters.spring * hand.spring_stiffness,
+        parameters.joint_friction * hand.joint_friction,
+        creep=parameters.tendon_creep,
+    )
+
+
+def make_servo(hand: HandDescription, config: PlantConfig, parameters: PlantParameters) -> Servo:
+    """The position controller of this specimen of the hand."""
+    specimen = np.random.default_rng([parameters.hardware_seed, 0])
+    return Servo(
+        hand.actuator_lower,
+        hand.actuator_upper,
+        bias=parameters.actuator_bias * specimen.uniform(-1.0, 1.0, size=hand.n_a),
+        fresh_error=parameters.actuator_error,
+        dead_zone=parameters.dead_zone,
+        threshold=parameters.threshold,
+        backlash=parameters.backlash,
+        relative_to=config.relative_to,
+    )
+
+
+def make_planner(
+    hand: HandDescription, obj: ObjectDescription, config: PlantConfig, parameters: PlantParameters
+) -> PinchPlanner:
+    """A planner that knows the plant as it is: what closes the hand is not what is studied here."""
+    thumb, fingers = opposition(hand, config)
+    problem = PinchProblem(
+        hand,
+        obj,
+        make_transmission(hand, parameters),
+        config.gravity,
+        thumb,
+        fingers,
+        along=config.along,
+        mass_factor=parameters.mass,
+        com_shift=parameters.com_shift,
+        friction=parameters.friction,
+        object_scale=parameters.object_scale,
+    )
+    return PinchPlanner(problem)
+
+
+def opposition(hand: HandDescription, config: PlantConfig) -> tuple[str, tuple[str, ...]]:
+    """Names of the pads that pinch: the thumb's, and those against it."""
+    names = [pad.name for pad in hand.pads]
+    thumb = config.thumb or next((name for name in names if name.startswith("thumb")), names[0])
+    if config.fingers is not None:
+        return thumb, config.fingers
+    chosen = tuple(name for name in names if name.startswith(("index", "middle")))
+    return thumb, chosen or tuple(name for name in names if name != thumb)[:1]

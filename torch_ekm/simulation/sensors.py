@@ -1,0 +1,108 @@
+"""What the sensors of a simulated hand make of the truth."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..kinematics.se3 import exp
+from .parameters import PlantParameters
+
+Array = NDArray[np.float64]
+
+
+class SensorState(NamedTuple):
+    """All that :class:`Sensors` remembers between readings."""
+
+    frames: tuple[tuple[float, Array, Array], ...]
+    seen: tuple[Array, Array]
+    felt: Array
+    stuck_at: Array | None
+
+
+class Sensors:
+    """Joint angles, object pose and fingertip forces as a calibrated hand would report them.
+
+    A stand-in for Hall sensors, camera and tactile fingertips after their own processing
+    (:mod:`torch_ekm.sensing` does that from raw readings)::
+
+        q^ = q + noise, except on stuck channels, which keep their first reading
+        o^ = o(t - latency) + noise,  R^ = exp([noise]x) R(t - latency),  or the last frame if lost
+        F^ = quantise(play(F) + offset + noise)     8 bit over ``force_range``
+
+    ``play`` is hysteresis: the reading follows the force only once it has moved by half the width.
+    The offset is drawn once for each specimen of the hand; a fingertip that touches nothing reads
+    its offset too, if there is one.
+    """
+
+    def __init__(self, parameters: PlantParameters, n_q: int, n_pads: int, joints: tuple[str, ...]) -> None:
+        self.n_q, self.n_pads, self._joints = n_q, n_pads, joints
+        self.set_parameters(parameters)
+        self.forget()
+
+    def set_parameters(self, parameters: PlantParameters) -> None:
+        self._p = parameters
+        specimen = np.random.default_rng([parameters.hardware_seed, 1])
+        self._offset = parameters.force_offset * specimen.uniform(-1.0, 1.0, size=self.n_pads)
+        self._stuck = np.array([name in parameters.stuck_joints for name in self._joints], dtype=bool)
+
+    def forget(self) -> None:
+        """A new grasp: no old frames, no hysteresis."""
+        self._frames: deque[tuple[float, Array, Array]] = deque()
+        self._seen = (np.zeros(3), np.eye(3))
+        self._felt = np.zeros(self.n_pads)
+        self._stuck_at: Array | None = None
+
+    @property
+    def wants_history(self) -> bool:
+        """Whether old poses matter, so that :meth:`remember` must be called."""
+        return self._p.latency > 0
+
+    def remember(self, time: float, position: Array, rotation: Array) -> None:
+        """Keep a camera frame for as long as the latency asks."""
+        self._frames.append((time, position, rotation))
+        while len(self._frames) > 1 and self._frames[1][0] <= time - self._p.latency:
+            self._frames.popleft()
+
+    def joints(self, q: Array, generator: np.random.Generator) -> Array:
+        """Estimated joint angles ``(n_q,)`` [rad]."""
+        reading = q + self._p.joint_noise * generator.standard_normal(self.n_q)
+        if self._stuck_at is None:
+            self._stuck_at = reading.copy()
+        return np.where(self._stuck, self._stuck_at, reading)
+
+    def pose(
+        self, position: Array, rotation: Array, generator: np.random.Generator
+    ) -> tuple[Array, Array, bool]:
+        """Estimated object pose in the hand frame [m], and whether the camera saw it this time."""
+        p = self._p
+        noise, turn, luck = generator.standard_normal(3), generator.standard_normal(3), generator.random()
+        if luck < p.frame_loss:
+            return self._seen[0], self._seen[1], False
+        if self.wants_history and self._frames:
+            _, position, rotation = self._frames[0]
+        shaken = exp(torch.from_numpy(p.rotation_noise * turn)).numpy() @ rotation
+        self._seen = (position + p.position_noise * noise, shaken)
+        return self._seen[0], self._seen[1], True
+
+    def forces(self, normal: Array, generator: np.random.Generator) -> Array:
+        """Estimated normal force of each pad ``(n_pads,)`` [N]."""
+        p = self._p
+        noise = p.force_noise * generator.standard_normal(self.n_pads)
+        self._felt = np.clip(self._felt, normal - p.force_hysteresis / 2, normal + p.force_hysteresis / 2)
+        reading = np.maximum(0.0, self._felt + self._offset + np.where(normal > 0, noise, 0.0))
+        if p.force_range > 0:  # an 8-bit converter
+            unit = p.force_range / 255
+            reading = unit * np.round(np.minimum(reading, p.force_range) / unit)
+        return reading
+
+    def snapshot(self) -> SensorState:
+        return SensorState(tuple(self._frames), self._seen, self._felt.copy(), self._stuck_at)
+
+    def restore(self, state: SensorState) -> None:
+        self._frames = deque(state.frames)
+        self._seen, self._felt, self._stuck_at = state.seen, state.felt.copy(), state.stuck_at
