@@ -1,0 +1,201 @@
+"""The force problem: exact where the answer is known, honest where there is none."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from contact_samples import F64, THREE, held
+
+from torch_ekm.contact.contact_force import (
+    BalanceEquations,
+    ForceOptions,
+    ForceStatus,
+    contact_forces,
+    force_problem,
+    margins,
+)
+from torch_ekm.contact.contact_kinematics import grasp_matrix, hand_jacobian
+from torch_ekm.contact.friction import directions, friction_cones
+from torch_ekm.exceptions import ParameterError
+
+WEIGHT = np.array([0.0, 0.0, -9.81 * 0.25, 0.0, 0.0, 0.0])
+
+
+def equations(load=WEIGHT, *, gamma=0.0, friction=0.6, grip=3.0, seed=0, **changes) -> BalanceEquations:
+    """Three fingers, one motor per finger; the joints are at rest under known balancing forces."""
+    kin = held(THREE, gamma=gamma, friction=friction, seed=seed)
+    G, J = grasp_matrix(kin).numpy(), hand_jacobian(kin).numpy()
+    cones = friction_cones(
+        kin.models, kin.contacts.friction.tolist(), kin.contacts.torsional_friction.tolist()
+    )
+    wish = np.zeros(G.shape[1])
+    wish[kin.normal_rows] = grip
+    mu = wish + np.linalg.pinv(G) @ (-load - G @ wish)
+    actuators = np.zeros((9, 3))
+    for i in range(3):
+        actuators[3 * i : 3 * i + 3, i] = [1.0, 0.7, 0.5]
+    lam = np.array([-0.1, -0.05, -0.08])
+    eq = BalanceEquations(
+        object_matrix=G,
+        object_load=-load,
+        hand_matrix=J.T,
+        actuator_matrix=actuators,
+        hand_load=-(J.T @ mu + actuators @ lam),
+        cones=cones,
+        moment_rows=np.array([False] * 3 + [True] * 3),
+        tendon=np.array([True, False, False]),
+        spin_columns=tuple(at for at, row in enumerate(kin.rows) if row % 6 >= 3),
+    )
+    eq = dataclasses.replace(eq, **changes)
+    eq.__dict__["truth"] = (mu, lam)
+    return eq
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.01])
+@pytest.mark.parametrize("friction", ["cuts", "cone", "pyramid_inner", "pyramid_outer"])
+def test_forces_of_an_equilibrium_are_found_exactly(friction, gamma):
+    eq = equations(friction=3.0, gamma=gamma)
+    mu, lam = eq.__dict__["truth"]
+    solution = contact_forces(eq, ForceOptions(friction=friction))
+    assert solution.status is ForceStatus.SOLVED
+    assert np.linalg.norm(solution.mu - mu) < 1e-4 * np.linalg.norm(mu)
+    assert np.linalg.norm(solution.lam - lam) < 1e-4 * np.linalg.norm(lam)
+    assert np.abs(solution.residual).max() < 1e-5
+    assert solution.violation < 1e-9
+
+
+def test_cutting_planes_and_the_cone_program_give_the_same_forces_on_the_cone():
+    eq = equations(friction=0.45, grip=1.0)
+    cuts = contact_forces(eq, ForceOptions(friction="cuts"))
+    cone = contact_forces(eq, ForceOptions(friction="cone"))
+    assert cuts.solves > 2  # friction is active: otherwise this test shows nothing
+    for solution in (cuts, cone):
+        slack, relative = margins(eq.cones, solution.mu)
+        assert slack.min() > -1e-6
+        assert abs(relative).min() < 1e-4
+    assert np.linalg.norm(cuts.mu - cone.mu) < 1e-3 * np.linalg.norm(cone.mu)
+
+
+def test_pyramids_enclose_the_cone_from_both_sides():
+    eq = equations(friction=0.45, grip=1.0)
+
+    def cost(friction: str, faces: int) -> float:
+        options = ForceOptions(friction=friction, faces=faces)
+        problem, scale = force_problem(eq, options, polyhedral=False)
+        solution = contact_forces(eq, options)
+        x = np.concatenate([solution.mu, solution.lam]) / scale
+        return 0.5 * x @ problem.P @ x + problem.q @ x
+
+    exact = cost("cone", 16)
+    inner, outer = cost("pyramid_inner", 16), cost("pyramid_outer", 16)
+    assert outer < exact < inner
+    assert abs(cost("pyramid_inner", 64) - exact) < 0.2 * abs(inner - exact)
+
+
+@pytest.mark.parametrize(("dim", "faces"), [(2, 4), (2, 16), (2, 33), (3, 8), (3, 16)])
+def test_the_inscribed_polyhedron_lies_inside_the_ball(dim, faces):
+    d, cosine = directions(dim, faces)
+    generator = np.random.default_rng(0)
+    u = generator.normal(size=(20_000, dim))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    support = (u @ d.T).max(1)
+    assert support.min() >= cosine - 1e-12  # {d.u <= cosine} has no point outside the unit ball
+    assert support.min() < cosine + 0.02
+
+
+def test_without_enough_friction_the_grasp_is_said_to_be_impossible():
+    eq = equations(friction=0.02)
+    for friction in ("cuts", "cone", "pyramid_outer"):
+        solution = contact_forces(eq, ForceOptions(friction=friction))
+        assert solution.status is ForceStatus.NOT_GRASPABLE
+        assert np.isnan(solution.mu).all()
+        assert solution.violation > 0.1  # of 2.45 N
+
+
+def test_measured_normal_forces_are_respected():
+    # 9 motors: the internal forces are not determined by the joint balance
+    eq = equations(friction=1.0, actuator_matrix=np.eye(9), tendon=np.zeros(9, bool))
+    wished = np.array([4.0, 2.5, np.nan])
+    starts = [cone.start for cone in eq.cones]
+    free = contact_forces(eq).mu[starts]
+    told = contact_forces(dataclasses.replace(eq, measured_normal=wished, normal_std=0.01)).mu[starts]
+    assert np.abs(told[:2] - wished[:2]).max() < 0.1
+    assert np.abs(free[:2] - wished[:2]).max() > 0.5
+
+
+def test_a_tendon_never_pushes_and_bounds_hold():
+    eq = equations(friction=3.0)
+    mu, lam = eq.__dict__["truth"]
+    lam = np.array([0.1, -0.05, -0.08])  # the first tendon would have to push
+    load = -(eq.hand_matrix @ mu + eq.actuator_matrix @ lam)
+    solution = contact_forces(dataclasses.replace(eq, hand_load=load))
+    assert solution.status is ForceStatus.SOLVED
+    assert solution.lam[0] <= 1e-9
+    assert np.abs(solution.residual).max() > 1e-3  # what it could not explain is reported
+    bounded = contact_forces(eq, ForceOptions(max_actuator=0.06))
+    assert np.abs(bounded.lam).max() <= 0.06 + 1e-9
+
+
+def test_stop_torques_are_one_sided():
+    eq = equations(friction=3.0)
+    torque = np.zeros(9)
+    torque[4] = 0.05
+    column = -np.eye(9)[:, [4]]
+    loaded = dataclasses.replace(
+        eq,
+        hand_load=eq.hand_load + torque,
+        bound_matrix=column,
+        bound_lower=np.zeros(1),
+        bound_upper=np.array([np.inf]),
+    )
+    held_by_stop = contact_forces(loaded)
+    assert held_by_stop.bound[0] == pytest.approx(0.05, rel=2e-2)
+    away = contact_forces(dataclasses.replace(loaded, hand_load=eq.hand_load - torque))
+    assert away.bound[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_paper_form_is_infeasible_off_equilibrium_and_exact_on_it():
+    eq = equations(friction=3.0)
+    mu, _ = eq.__dict__["truth"]
+    options = ForceOptions(balance="equality")
+    assert np.linalg.norm(contact_forces(eq, options).mu - mu) < 1e-6
+    noisy = dataclasses.replace(eq, hand_load=eq.hand_load + 1e-3)
+    assert contact_forces(noisy, options).status is ForceStatus.NOT_GRASPABLE
+    assert contact_forces(noisy).status is ForceStatus.SOLVED
+
+
+@pytest.mark.parametrize(
+    "bad", [{"friction": "pyramid"}, {"balance": "hard"}, {"faces": 3}, {"torque_std": 0.0}, {"length": -1.0}]
+)
+def test_bad_options_are_refused(bad):
+    with pytest.raises(ParameterError, match=next(iter(bad))):
+        ForceOptions(**bad)
+
+
+def test_soft_finger_bears_spin_up_to_its_coefficient():
+    # a torque about the line between two opposite soft fingers, and a strong grip
+    kin = held([[1.0, 0, 0], [-1.0, 0, 0]], gamma=0.005, friction=0.5)
+    G = grasp_matrix(kin).numpy()
+    cones = friction_cones(kin.models, [0.5] * 2, [0.005] * 2)
+
+    def solve(moment: float, f_max: float):
+        eq = BalanceEquations(
+            object_matrix=G,
+            object_load=np.array([0.0, 0, 0, moment, 0, 0]),
+            hand_matrix=hand_jacobian(kin).numpy().T,
+            actuator_matrix=np.zeros((6, 0)),
+            hand_load=np.zeros(6),
+            cones=cones,
+            moment_rows=np.array([False] * 3 + [True] * 3),
+            tendon=np.zeros(0, bool),
+            spin_columns=(3, 7),
+        )
+        return contact_forces(eq, ForceOptions(max_force=f_max))
+
+    # two contacts of 4 N and 5 mm: at most 0.04 N m
+    assert solve(0.039, 4.0).status is ForceStatus.SOLVED
+    assert solve(0.041, 4.0).status is ForceStatus.NOT_GRASPABLE
+    assert torch.tensor(solve(0.039, 4.0).mu, dtype=F64)[[0, 4]].max() <= 4.0 + 1e-9

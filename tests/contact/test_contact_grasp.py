@@ -1,0 +1,177 @@
+"""Grasp matrices, ranks and quality against figures known from the theory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from contact_samples import F64, RADIUS, THREE, ball_contacts, held
+
+from torch_ekm.contact.contact_kinematics import (
+    constraint_matrix,
+    contact_frames,
+    full_grasp_matrix,
+    full_hand_jacobian,
+    grasp_matrix,
+    hand_jacobian,
+    rolling_mobility,
+)
+from torch_ekm.contact.contact_model import ContactModel, normal_rows, selection_matrix
+from torch_ekm.contact.grasp import (
+    analyse,
+    ferrari_canny,
+    has_force_closure,
+    null_space,
+    scaled_grasp_matrix,
+)
+from torch_ekm.exceptions import ParameterError
+from torch_ekm.kinematics.se3 import exp, hat
+
+
+def test_contact_frames_are_rotations_with_the_inward_normal_first():
+    n = torch.randn(500, 3, dtype=F64, generator=torch.Generator().manual_seed(1))
+    n[0], n[1] = torch.tensor([0.0, 0, 1]), torch.tensor([0.0, 0, -1])
+    n = n / n.norm(dim=-1, keepdim=True)
+    C = contact_frames(n)
+    assert (C.mT @ C - torch.eye(3, dtype=F64)).abs().max() < 1e-14
+    assert (torch.linalg.det(C) - 1).abs().max() < 1e-13
+    assert torch.equal(C[..., 0], -n)
+
+
+def test_grasp_matrix_maps_forces_to_the_wrench_about_the_object_point():
+    kin = held(THREE, gamma=0.003)
+    G = grasp_matrix(kin)
+    mu = torch.randn(G.shape[1], dtype=F64, generator=torch.Generator().manual_seed(2))
+    wrench = torch.zeros(6, dtype=F64)
+    for i in range(3):
+        C, f = kin.frame[i], mu[4 * i : 4 * i + 3]
+        wrench[:3] += C @ f
+        wrench[3:] += torch.linalg.cross(kin.lever[i], C @ f) + C[:, 0] * mu[4 * i + 3]
+    assert torch.allclose(G @ mu, wrench, atol=1e-15)
+
+
+def test_grasp_matrix_equals_the_adjoint_form_of_murray_li_sastry():
+    # G_i = Ad^T of the inverse contact pose, in object axes; here the object's axes are the hand's
+    kin = held(THREE)
+    G = full_grasp_matrix(kin)
+    for i in range(3):
+        R, p = kin.frame[i], kin.lever[i]
+        adjoint = torch.zeros(6, 6, dtype=F64)  # twist order (v; w) of g_oc^-1
+        adjoint[:3, :3], adjoint[3:, 3:] = R.mT, R.mT
+        adjoint[:3, 3:] = -R.mT @ hat(p)
+        assert torch.allclose(G[:, 6 * i : 6 * i + 6], adjoint.mT, atol=1e-15)
+
+
+def test_constraint_rows_are_the_velocities_of_the_contact_points():
+    # move the joints and the object by a small step and difference the positions of the material points
+    kin = held(THREE, joints_per_finger=1)
+    A, n_q, h = constraint_matrix(kin), 3, 1e-6
+    generator = torch.Generator().manual_seed(3)
+    dq, dp = torch.randn(n_q, dtype=F64, generator=generator), torch.randn(6, dtype=F64, generator=generator)
+    x = kin.contacts.point
+    axis = kin.axis
+    for i in range(3):
+        v_joint = kin.point_jacobian[i, :, i] * dq[i]
+        # the finger turns about the axis through x - r where z x r = v; rebuild r from the Jacobian itself
+        r = torch.linalg.cross(kin.point_jacobian[i, :, i], axis[i])
+        finger = [exp(s * h * dq[i] * axis[i]) @ r - r for s in (1.0, -1.0)]
+        object_ = [s * h * dp[:3] + exp(s * h * dp[3:]) @ x[i] - x[i] for s in (1.0, -1.0)]
+        relative = ((finger[0] - object_[0]) - (finger[1] - object_[1])) / (2 * h)
+        assert torch.allclose((finger[0] - finger[1]) / (2 * h), v_joint, atol=1e-9)
+        ds = torch.cat([dq, dp])
+        assert torch.allclose(A[3 * i : 3 * i + 3] @ ds, kin.frame[i].mT @ relative, atol=1e-9)
+
+
+def test_selection_of_contact_models():
+    models = [ContactModel.FRICTIONLESS, ContactModel.HARD_FINGER, ContactModel.SOFT_FINGER]
+    kin = held(THREE, models=models)
+    H = selection_matrix(models)
+    assert H.shape == (8, 18)
+    assert normal_rows(models) == [0, 1, 4]
+    assert torch.equal(hand_jacobian(kin), H @ full_hand_jacobian(kin))
+    assert torch.equal(grasp_matrix(kin), full_grasp_matrix(kin) @ H.mT)
+
+
+def test_rolling_mobility_of_ball_on_ball_cylinder_and_pin():
+    n = torch.tensor([[0.0, 0.6, 0.8]], dtype=F64)
+    contacts = ball_contacts(n.tolist())
+    C = contact_frames(contacts.normal)
+    eye = torch.eye(3, dtype=F64)
+    tangent = eye - torch.outer(n[0], n[0])
+    rho = 0.006
+    expected = rho * RADIUS / (rho + RADIUS) * tangent  # sphere on sphere
+    assert torch.allclose(rolling_mobility(contacts, C)[0], expected, atol=1e-15)
+    # a cylinder on a plane rolls about its axis only
+    t = C[0, :, 1]
+    K = (tangent - torch.outer(t, t)) / rho
+    cylinder = contacts.replace(finger_curvature=K[None], object_curvature=torch.zeros(1, 3, 3, dtype=F64))
+    expected = rho * (tangent - torch.outer(t, t))
+    assert torch.allclose(rolling_mobility(cylinder, C)[0], expected, atol=1e-15)
+    flat = cylinder.replace(finger_curvature=torch.zeros(1, 3, 3, dtype=F64))
+    assert rolling_mobility(flat, C).abs().max() == 0
+    assert rolling_mobility(contacts.replace(pinned=(True,)), C).abs().max() == 0
+
+
+@pytest.mark.parametrize(("gamma", "rank"), [(0.0, 5), (0.004, 6)])
+def test_two_hard_fingers_cannot_turn_the_object_about_their_line_but_soft_ones_can(gamma, rank):
+    kin = held([[1.0, 0, 0], [-1.0, 0, 0]], gamma=gamma)
+    G = scaled_grasp_matrix(kin)
+    assert int(torch.linalg.matrix_rank(G, rtol=1e-10)) == rank
+    analysis = analyse(kin, torch.eye(2, 6, dtype=F64))
+    assert analysis.indeterminate is (rank == 5)
+    assert has_force_closure(kin) is (rank == 6)
+
+
+def test_ranks_of_a_three_finger_grasp():
+    kin = held(THREE)  # 9 joints + 6 object freedoms, 9 contact rows
+    analysis = analyse(kin, torch.eye(3, 9, dtype=F64))
+    assert analysis.mobility == 6
+    assert analysis.internal_forces == 3
+    assert analysis.undetermined_forces == 0
+    assert analysis.graspable
+    assert not analysis.indeterminate
+    assert not analysis.redundant
+    assert not analysis.defective
+    # all 9 joints driven: 9 + 9 unknown forces against 15 equations
+    assert analyse(kin, torch.eye(9, dtype=F64)).undetermined_forces == 3
+
+
+def test_null_space_is_complete_and_its_rank_decision_does_not_depend_on_units():
+    A = constraint_matrix(held(THREE))
+    R = null_space(A, 9)
+    assert R.shape == (15, 6)
+    assert (A @ R).abs().max() < 1e-14
+    doubled = torch.cat([A, A[:2] * 1e-5])  # redundant rows in other units
+    assert null_space(doubled, 9).shape == (15, 6)
+    with pytest.raises(ParameterError, match="length"):
+        null_space(A, 9, length=0.0)
+
+
+def test_ferrari_canny_of_four_points_on_a_circle_is_known():
+    # planar, moments vanish for normals through the centre: no closure against a moment
+    four = [[1.0, 0, 0], [0.0, 1, 0], [-1.0, 0, 0], [0.0, -1, 0]]
+    kin = held(four, friction=0.0, plane=(0.0, 0.0, 1.0), models=[ContactModel.FRICTIONLESS] * 4)
+    assert ferrari_canny(kin, planar=True) == 0.0
+    # with friction mu on a circle of radius L each cone edge is (n + mu t, mu): the weakest direction
+    # is the pure moment, resisted by mu
+    mu = 0.3
+    kin = held(four, friction=mu, plane=(0.0, 0.0, 1.0))
+    epsilon = ferrari_canny(kin, length=RADIUS, planar=True)
+    points = np.array(
+        [
+            [-np.cos(a) - s * mu * -np.sin(a), -np.sin(a) - s * mu * np.cos(a), -s * mu]
+            for a in np.arange(4) * np.pi / 2
+            for s in (1.0, -1.0)
+        ]
+    )
+    directions = np.random.default_rng(0).normal(size=(200_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    support = (directions @ points.T).max(1).min()  # sampled: an upper bound that comes close
+    assert epsilon == pytest.approx(mu, rel=1e-12)
+    assert epsilon <= support < 1.02 * epsilon
+
+
+def test_quality_falls_as_the_fingers_move_together():
+    spread = [ferrari_canny(held([[1, 0, 0], [-1, s, 0.05], [-1, -s, -0.05]])) for s in (1.5, 0.8, 0.3)]
+    assert spread[0] > spread[1] > spread[2] > 0
+    assert not has_force_closure(held([[1.0, 0, 0], [1.0, 0.1, 0], [1.0, 0, 0.1]]))
