@@ -41,7 +41,7 @@ class ControllerOptions:
     """How much off-axis error is corrected in one step: [rad], [m]."""
     grip_force: float | None = 5.0
     """Wanted normal force of the opposing finger (the one that presses most) [N]; None: not regulated."""
-    grip_weight: float = 2.0
+    grip_weight: float = 4.0
     """Weight of grip force errors, per N^2."""
     grip_step: float = 0.7
     """At most this much of a grip force error is corrected in one step [N]."""

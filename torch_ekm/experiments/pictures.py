@@ -5,6 +5,8 @@ Both are drawn from the collision shapes of the descriptions, so that what one s
 
 from __future__ import annotations
 
+import contextlib
+import io
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -116,7 +118,7 @@ def _camera(scene_down: Array, points: Array) -> tuple[Array, Array, Array]:
     up = -scene_down
     side = np.array([0.35, -1.0, 0.45])  # radial side (index finger), a little from the front and palm
     side -= 0.5 * (side @ up) * up
-    return focus + 0.30 * side / np.linalg.norm(side), focus, up
+    return focus + 0.34 * side / np.linalg.norm(side), focus, up
 
 
 def _save_meshes(path: Path, meshes: list[Any], colours: list[tuple[float, float, float]]) -> None:
@@ -131,7 +133,9 @@ def _draw_saved(arrays: str, shapes: str, path: str, size: str) -> None:
     pyvista = require("pyvista")
     data, solid = np.load(arrays), np.load(shapes)
     n, width = len(data["transforms"]), int(size)
-    plotter = pyvista.Plotter(off_screen=True, shape=(1, n), border=False, window_size=(width * n, width))
+    plotter = pyvista.Plotter(
+        off_screen=True, shape=(1, n), border=False, window_size=(width * n, width * 3 // 4)
+    )
     for k in range(n):
         plotter.subplot(0, k)
         plotter.set_background("white")
@@ -177,7 +181,8 @@ def _draw_matplotlib(meshes: list[Any], scene: Scene, frames: list[int], path: P
 def save_animation(scene: Scene, path: Path, frame_seconds: float = 0.25) -> Path:
     """Write the frames as one stand-alone HTML page that can be turned and zoomed (viser)."""
     viser = require("viser")
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    with contextlib.redirect_stdout(io.StringIO()):  # it announces an address that nobody shall open
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
         serializer = server.get_scene_serializer()
         server.scene.set_up_direction(tuple(-scene.down))
@@ -206,5 +211,6 @@ def save_animation(scene: Scene, path: Path, frame_seconds: float = 0.25) -> Pat
             serializer.insert_sleep(frame_seconds)
         path.write_text(serializer.as_html(), encoding="utf-8")
     finally:
-        server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
     return path

@@ -62,6 +62,7 @@ def plot_prediction_error(ekm_deg: Array, km_deg: Array, xlabel: str = "trial") 
             axis.fill_between(k, low, high, color=COLOURS[name], alpha=0.2, linewidth=0)
         axis.plot(k, middle, color=COLOURS[name], marker=_MARKERS[name], markersize=3.5, label=name)
     axis.set(xlabel=xlabel, ylabel="prediction error [deg]", ylim=(0, None))
+    axis.xaxis.get_major_locator().set_params(integer=True)
     axis.set_title(
         "One-step prediction error" + (" (median, quartiles)" if len(ekm_deg) > 1 else ""), loc="left"
     )
@@ -115,7 +116,7 @@ def plot_static_error(errors_deg: dict[str, dict[str, Array]], ylabel: str = "st
             spread = np.linspace(-0.3, 0.3, len(values)) * width if len(values) > 1 else np.zeros(1)
             axis.plot(x + spread, values, _MARKERS.get(name, "o"), color=colour, markersize=3)
     axis.set_xticks(range(len(targets)), targets)
-    axis.set(ylabel=ylabel, ylim=(0, None))
+    axis.set(xlabel="target [deg]", ylabel=ylabel, ylim=(0, None))
     axis.set_title("Static error: each run, and the mean", loc="left")
     axis.legend(frameon=False)
     return figure
