@@ -1,0 +1,176 @@
+"""Wrong files: each error is typed, names the file and the place, and says what would be right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from torch_ekm.description import load_hand, load_object
+from torch_ekm.exceptions import DescriptionError, JointMismatchError, UnknownNameError
+
+HAND, BOX = load_hand("planar_two_finger"), load_object("box")
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path]:
+    urdf, transmission = tmp_path / "my.urdf", tmp_path / "my.transmission.toml"
+    urdf.write_text(HAND.urdf_path.read_text())
+    transmission.write_text(HAND.transmission_path.read_text())
+    return urdf, transmission
+
+
+def change(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+URDF_FAULTS = {
+    "malformed": ('<robot name="planar_two_finger">', "<robot", "not well-formed XML"),
+    "not a robot": ("robot", "world", "root element must be <robot>, found <world>"),
+    "limits": ('lower="-0.5" upper="1.5"', 'lower="1.5" upper="-0.5"', "joint 'left_0'.*limits reversed"),
+    "nan": (
+        'lower="-0.5"',
+        'lower="nan"',
+        "joint 'left_0', limit: 'lower' must be a finite number, got 'nan'",
+    ),
+    "word": ('lower="-0.5"', 'lower="low"', "finite number, got 'low'"),
+    "two numbers": ('xyz="-0.03 0 0"', 'xyz="-0.03 0"', "must be three numbers, got '-0.03 0'"),
+    "no limit": ("<limit ", "<bounds ", "joint 'left_0': <joint> needs a <limit>"),
+    "type": ('type="revolute"', 'type="prismatic"', "type 'prismatic' is not supported; supported: revolute"),
+    "mimic": ('<axis xyz="0 0 -1"/>', '<mimic joint="right_0"/>', "mimic.*couplings"),
+    "zero axis": ('<axis xyz="0 0 -1"/>', '<axis xyz="0 0 0"/>', "axis must not be zero"),
+    "mass": (
+        'mass value="0.1"',
+        'mass value="-0.1"',
+        "link 'hand': mass and principal inertias must be positive",
+    ),
+    "size": ('<cylinder radius="0.006"', '<cylinder radius="0"', "size of a cylinder must be positive"),
+    "unknown parent": (
+        '<parent link="hand"/>',
+        '<parent link="wrist"/>',
+        "unknown link 'wrist'; links are: hand",
+    ),
+    "loop": ('<parent link="hand"/>', '<parent link="left_tip"/>', "one tree"),
+    "twice": ('<link name="left_tip"/>', '<link name="hand"/>', "repeated: hand"),
+}
+EVERYWHERE = ("not a robot", "size")  # replaced at each place, not only at the first
+
+
+@pytest.mark.parametrize("fault", list(URDF_FAULTS))
+def test_urdf_faults(fault: str, files: tuple[Path, Path]) -> None:
+    old, new, message = URDF_FAULTS[fault]
+    urdf, _ = files
+    text = urdf.read_text()
+    assert old in text
+    urdf.write_text(text.replace(old, new, -1 if fault in EVERYWHERE else 1))
+    with pytest.raises(DescriptionError, match=message) as caught:
+        load_hand(urdf)
+    assert str(urdf) in str(caught.value)
+
+
+TRANSMISSION_FAULTS = {
+    "malformed": ("[hand]", "[hand", "not well-formed TOML"),
+    "unknown key": (
+        "tendon = true",
+        "tendons = true",
+        r"\[\[actuators\]\] 'left': unknown key 'tendons'; valid keys",
+    ),
+    "unknown table": ("[hand]", "[hands]", "unknown key 'hands'"),
+    "not a bool": ("tendon = true", "tendon = 1", "'tendon' must be true or false, got 1"),
+    "nan": ("stiffness = 10.0", "stiffness = nan", "'stiffness' must be a finite number, got nan"),
+    "text": ("stiffness = 10.0", 'stiffness = "stiff"', "finite number, got 'stiff'"),
+    "negative": ("stiffness = 10.0", "stiffness = -1.0", "'stiffness' must be positive"),
+    "negative spring": ("spring = 0.2", "spring = -0.2", "joints.* left_0: 'spring' must be at least 0"),
+    "reversed": ("range_deg = [0.0, 150.0]", "range_deg = [150.0, 0.0]", "range reversed"),
+    "both units": ("range_deg = [0.0, 150.0]", "range_deg = [0.0, 150.0]\nrange = [0.0, 1.0]", "not both"),
+    "three": ("range_deg = [0.0, 150.0]", "range_deg = [0.0, 1.0, 2.0]", "list of 2 numbers"),
+    "no range": ("range_deg = [0.0, 150.0]", "", "the key 'range' is missing"),
+    "no arms": ("moment_arms = { left_0 = 1.0, left_1 = 0.8 }", "", "'moment_arms' is missing"),
+    "rank": (
+        "moment_arms = { left_0 = 1.0, left_1 = 0.8 }",
+        "moment_arms = { right_0 = 2.0, right_1 = 1.6 }",
+        "independent",
+    ),
+    "pad link": ('link = "left_1"', 'link = "left_9"', "unknown link 'left_9'; the URDF's links are: hand"),
+    "pad radius": ("radius = 0.006", "radius = 0.0", "'radius' must be positive"),
+    "pad twice": ('name = "right"\nlink', 'name = "left"\nlink', "pad names must be unique"),
+    "base": ('base_link = "hand"', 'base_link = "left_1"', "moves with joint 'left_1'"),
+    "no base": ('base_link = "hand"', 'base_link = "palm"', "unknown base_link 'palm'"),
+    "name": ('name = "planar_two_finger"', 'name = ""', "non-empty string"),
+}
+
+
+@pytest.mark.parametrize("fault", list(TRANSMISSION_FAULTS))
+def test_transmission_faults(fault: str, files: tuple[Path, Path]) -> None:
+    old, new, message = TRANSMISSION_FAULTS[fault]
+    urdf, transmission = files
+    change(transmission, old, new)
+    with pytest.raises(DescriptionError, match=message) as caught:
+        load_hand(urdf)
+    assert str(transmission) in str(caught.value)
+
+
+def test_joints_that_do_not_match(files: tuple[Path, Path]) -> None:
+    urdf, transmission = files
+    change(transmission, "left_1 = { spring", "left_7 = { spring")
+    with pytest.raises(JointMismatchError, match="left_0, left_1, right_0, right_1") as caught:
+        load_hand(urdf)
+    assert caught.value.missing == ("left_1",)
+    assert caught.value.unexpected == ("left_7",)
+    change(transmission, "left_7 = { spring", "left_1 = { spring")
+    change(transmission, "{ left_0 = 1.0, left_1 = 0.8 }", "{ left_0 = 1.0, left_2 = 0.8 }")
+    with pytest.raises(JointMismatchError, match="does not have: left_2"):
+        load_hand(urdf)
+
+
+def test_a_joint_that_nothing_holds(files: tuple[Path, Path]) -> None:
+    urdf, transmission = files
+    for spring in ("0.2", "0.1"):
+        change(transmission, f"spring = {spring}", "spring = 0.0")
+    with pytest.raises(DescriptionError, match=r"holds the joints left_0, left_1.*positive 'spring'"):
+        load_hand(urdf)
+
+
+def test_missing_files(files: tuple[Path, Path]) -> None:
+    urdf, transmission = files
+    transmission.unlink()
+    with pytest.raises(DescriptionError, match=r"my.transmission.toml: no such transmission file"):
+        load_hand(urdf)
+    urdf.unlink()
+    with pytest.raises(DescriptionError, match=r"my.urdf: no such URDF file"):
+        load_hand(str(urdf))
+
+
+OBJECT_FAULTS = {
+    "no friction": (".object.toml", "friction = 0.9", "", "the key 'friction' is missing"),
+    "negative friction": (".object.toml", "friction = 0.9", "friction = -0.9", "must be at least 0"),
+    "no width": (".object.toml", "grasp_width = 0.03", "grasp_width = 0.0", "'grasp_width' must be positive"),
+    "no axis": (".object.toml", "grasp_axis = [0.0, 1.0, 0.0]", "grasp_axis = [0, 0, 0]", "must not be zero"),
+    "key": (".object.toml", "[marker]", "[markers]", "unknown key 'markers'"),
+    "mesh": (".urdf", '<collision><origin xyz="0 0 0"/><geometry><box size="0.09 0.03 0.04"/>',
+             '<collision><geometry><mesh filename="a.stl"/>', "box, cylinder, sphere or capsule only"),
+    "massless": (".urdf", "inertial>", "nothing>", "needs an <inertial>"),
+    "two links": (".urdf", "</robot>", '<link name="b"/><joint name="j" type="fixed"><parent link="box"/>'
+                  '<child link="b"/></joint></robot>', "single link, found box, b"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", list(OBJECT_FAULTS))
+def test_object_faults(fault: str, tmp_path: Path) -> None:
+    suffix, old, new, message = OBJECT_FAULTS[fault]
+    urdf, side = tmp_path / "thing.urdf", tmp_path / "thing.object.toml"
+    urdf.write_text(BOX.urdf_path.read_text())
+    side.write_text(BOX.urdf_path.with_suffix(".object.toml").read_text())
+    path = tmp_path / f"thing{suffix}"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new) if fault == "massless" else text.replace(old, new, 1))
+    with pytest.raises(DescriptionError, match=message):
+        load_object(urdf)
+
+
+def test_unknown_object() -> None:
+    with pytest.raises(UnknownNameError, match="toothpaste, applier, box, weighted_box, bottle, can"):
+        load_object("banana")

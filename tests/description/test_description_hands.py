@@ -1,0 +1,175 @@
+"""The hands that come with the package: counts, figures, consistency of URDF and transmission."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torch_ekm.description import data_folder, list_hands, load_hand, read_urdf, registry
+from torch_ekm.exceptions import DescriptionError, EKMError, UnknownNameError
+
+FINGERS = ("thumb", "index", "middle", "ring", "little")
+
+
+@pytest.mark.parametrize("name", list_hands())
+def test_every_hand_loads_and_is_consistent(name: str) -> None:
+    hand = load_hand(name)
+    assert hand.name == name
+    assert load_hand(hand.urdf_path).joint_names == hand.joint_names  # by path, as a user's own
+    assert hand.actuation_jacobian.shape == (hand.n_a, hand.n_q)
+    assert np.linalg.matrix_rank(np.vstack([hand.actuation_jacobian, hand.coupling])) == hand.n_a + len(
+        hand.coupling
+    )
+    assert (hand.joint_lower <= hand.joint_upper).all()
+    assert (hand.actuator_lower < hand.actuator_upper).all()
+    assert {pad.link for pad in hand.pads} <= set(hand.link_names)
+    # rest is a posture the couplings allow, and springs hold every joint
+    np.testing.assert_allclose(hand.coupling @ hand.spring_rest, 0.0, atol=1e-12)
+    assert (hand.spring_stiffness > 0).all()
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_icub_is_the_hand_of_the_paper(side: str) -> None:
+    hand = load_hand(f"icub_{side}")
+    assert hand.joint_names == tuple(f"{finger}_{k}" for finger in FINGERS for k in range(4))
+    assert hand.n_q == 20
+    assert hand.n_a == 9
+    assert set(hand.link_names) == {"hand", *hand.joint_names, *(f"{finger}_tip" for finger in FINGERS)}
+    limits_deg = {"thumb_0": (10, 90), "index_0": (0, 20), "middle_0": (0, 0), "middle_1": (0, 90)}
+    for joint, (lower, upper) in limits_deg.items():
+        k = hand.joint_names.index(joint)
+        assert math.degrees(hand.joint_lower[k]) == pytest.approx(lower, abs=1e-9)
+        assert math.degrees(hand.joint_upper[k]) == pytest.approx(upper, abs=1e-9)
+
+
+def test_icub_actuation_row_by_row() -> None:
+    """da = J_a dq and C dq = 0, written out once more."""
+    hand = load_hand("icub_right")
+    column = hand.joint_names.index
+
+    def row(**weights: float) -> np.ndarray:
+        out = np.zeros(20)
+        for joint, weight in weights.items():
+            out[column(joint)] = weight
+        return out
+
+    halves = {f"{finger}_{k}": 0.5 for finger in ("ring", "little") for k in (1, 2, 3)}
+    J_a = {
+        "hand_finger": row(index_0=-1, ring_0=-1, little_0=-1),
+        "thumb_oppose": row(thumb_0=1),
+        "thumb_proximal": row(thumb_1=1),
+        "thumb_distal": row(thumb_2=1, thumb_3=1),
+        "index_proximal": row(index_1=1),
+        "index_distal": row(index_2=1, index_3=1),
+        "middle_proximal": row(middle_1=1),
+        "middle_distal": row(middle_2=1, middle_3=1),
+        "pinky": row(**halves),
+    }
+    assert hand.actuator_names == tuple(J_a)
+    np.testing.assert_array_equal(hand.actuation_jacobian, np.stack(list(J_a.values())))
+    signs = {joint: 1.0 if joint.startswith("ring") else -1.0 for joint in halves}
+    C = [row(middle_0=1), row(index_0=1, ring_0=-1), row(ring_0=1, little_0=-1), row(**signs)]
+    np.testing.assert_array_equal(hand.coupling, np.stack(C))
+    np.testing.assert_allclose(np.degrees(hand.actuator_upper), [60, 90, 90, 180, 90, 180, 90, 180, 270])
+    np.testing.assert_allclose(np.degrees(hand.actuator_offset), [60, 0, 0, 0, 0, 0, 0, 0, 0])
+    tendons = [actuator.name for actuator in hand.actuators if actuator.tendon]
+    assert tendons == ["thumb_distal", "index_distal", "middle_distal", "pinky"]
+
+
+def test_icub_hall_sensors() -> None:
+    hand = load_hand("icub_right")
+    expected = [f"{finger}_{k}" for finger in FINGERS for k in (1, 2, 3)]
+    assert [(sensor.joint, sensor.channel) for sensor in hand.hall_sensors] == [
+        (j, k) for k, j in enumerate(expected)
+    ]
+    assert all((sensor.open, sensor.closed) == (255.0, 0.0) for sensor in hand.hall_sensors)
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_icub_weighs_what_its_cad_says(side: str) -> None:
+    """0.2483 kg, centre of mass (9.1, -6.9, -11.2) mm with straight fingers.
+
+    Source: icub-models, iCubGenova02, link r_hand. The shares of palm and fingers were derived from it, so 10 mm is what they can be asked for.
+    """
+    torch = pytest.importorskip("torch")
+    from torch_ekm.kinematics import HandKinematics
+
+    hand = load_hand(f"icub_{side}")
+    assert hand.urdf is not None
+    poses = HandKinematics(hand)(torch.zeros(20, dtype=torch.float64))
+    mass = sum(link.mass for link in hand.urdf.links)
+    com = sum(link.mass * (poses.of(link.name).numpy() @ [*link.com, 1.0])[:3] for link in hand.urdf.links)
+    assert mass == pytest.approx(0.2483, abs=1e-3)
+    mirror = 1.0 if side == "right" else -1.0
+    np.testing.assert_allclose(com / mass, [0.0091, -0.0069 * mirror, -0.0112], atol=0.010)
+    for link in hand.urdf.links:
+        if link.mass > 0:  # a rigid body's principal inertias obey the triangle inequality
+            a, b, c = np.linalg.eigvalsh(link.inertia)
+            assert a + b > c > 0
+
+
+@pytest.mark.parametrize("name", list_hands())
+def test_pads_lie_on_collision_shapes(name: str) -> None:
+    """The detector (pads) and a simulator (URDF collisions) must see the same surface."""
+    hand = load_hand(name)
+    assert hand.urdf is not None
+    for pad in hand.pads:
+        (capsule,) = hand.urdf.link(pad.link).collisions
+        assert capsule.kind == "capsule"
+        radius, length = capsule.size
+        assert radius == pad.radius
+        half = capsule.transform[:3, 2] * length / 2
+        ends = [capsule.transform[:3, 3] - half, capsule.transform[:3, 3] + half]
+        np.testing.assert_allclose(ends[1], pad.end, atol=1e-9)
+        if pad.start != pad.end:
+            np.testing.assert_allclose(ends[0], pad.start, atol=1e-9)
+
+
+def test_planar_hand_says_so() -> None:
+    hand = load_hand("planar_two_finger")
+    assert hand.planar_normal == (0.0, 0.0, 1.0)
+    np.testing.assert_array_equal(hand.actuation_jacobian, [[1, 0.8, 0, 0], [0, 0, 1, 0.8]])
+
+
+def test_unknown_names_list_the_right_ones() -> None:
+    with pytest.raises(UnknownNameError, match=r"icub_right, icub_left, planar_two_finger.*\.urdf") as caught:
+        load_hand("shadow")
+    assert caught.value.name == "shadow"
+    with pytest.raises(EKMError, match="no such URDF file"):
+        load_hand("somewhere/else.urdf")
+
+
+def test_files_are_what_the_generator_writes() -> None:
+    """Nobody edits the written files by hand; the figures live in one place."""
+    script = data_folder() / "generate.py"
+    done = subprocess.run(
+        [sys.executable, str(script), "--check"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_data_of_an_installed_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a wheel the files lie in torch_ekm/_urdf; without any, the error says what is wrong."""
+    package = tmp_path / "torch_ekm" / "description"
+    (package.parent / "_urdf" / "objects").mkdir(parents=True)
+    monkeypatch.setattr(registry, "__file__", str(package / "registry.py"))
+    assert data_folder() == package.parent / "_urdf"
+    (package.parent / "_urdf" / "objects").rmdir()
+    with pytest.raises(DescriptionError, match="not installed"):
+        data_folder()
+
+
+def test_urdf_is_read_alike_by_others() -> None:
+    yourdfpy = pytest.importorskip("yourdfpy")
+    for name in list_hands():
+        hand = load_hand(name)
+        robot = yourdfpy.URDF.load(str(hand.urdf_path), load_meshes=False, build_scene_graph=False)
+        assert tuple(robot.actuated_joint_names) == hand.joint_names
+        ours = {joint.name: joint for joint in read_urdf(hand.urdf_path).joints}
+        for theirs in robot.robot.joints:
+            np.testing.assert_allclose(theirs.origin, ours[theirs.name].transform, atol=1e-12)
