@@ -17,8 +17,13 @@ from ._table import Table, read_toml
 from .hand import Actuator, ContactPad, HallSensor, HandDescription
 from .urdf import UrdfModel
 
-_ACTUATOR = ("name", "range", "range_deg", "offset", "offset_deg", "moment_arms", "tendon", "stiffness")
-_PAD = ("name", "link", "start", "end", "radius", "direction", "torsional_friction")
+TABLES = ("hand", "joints", "actuators", "couplings", "pads", "hall_sensors", "notes")
+HAND = ("name", "base_link", "planar_normal")
+JOINT = ("spring", "rest", "rest_deg", "friction")
+ACTUATOR = ("name", "range", "range_deg", "offset", "offset_deg", "moment_arms", "tendon", "stiffness")
+COUPLING = ("name", "joints")
+PAD = ("name", "link", "start", "end", "radius", "direction", "torsional_friction")
+HALL = ("joint", "channel", "open", "closed")
 T = TypeVar("T")
 
 
@@ -31,23 +36,18 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
             coupling holds.
         JointMismatchError: the file names joints that the URDF lacks, or leaves some out.
     """
-    top = Table(
-        path,
-        "top level",
-        read_toml(path, "transmission file"),
-        ("hand", "joints", "actuators", "couplings", "pads", "hall_sensors", "notes"),
-    )
+    top = Table(path, "top level", read_toml(path, "transmission file"), TABLES)
     joints = urdf.moving_joints
     names = tuple(joint.name for joint in joints)
     if not names:
         raise DescriptionError(urdf.path, "there is no revolute or continuous joint")
-    hand = Table(path, "[hand]", top.data.get("hand"), ("name", "base_link", "planar_normal"))
+    hand = Table(path, "[hand]", top.data.get("hand"), HAND)
     base = hand.text("base_link", urdf.root)
     _check_base(path, base, urdf)
 
     springs = _joint_table(path, top.data.get("joints", {}), names)
     actuators = _each(top, "actuators", lambda place, data: _actuator(path, place, data), minimum=1)
-    couplings = _each(top, "couplings", lambda place, data: Table(path, place, data, ("name", "joints")))
+    couplings = _each(top, "couplings", lambda place, data: Table(path, place, data, COUPLING))
     J_a = _rows(path, names, [(f"actuator '{a.name}'", arms) for a, arms in actuators])
     C = _rows(path, names, [(table.place, table.weights("joints")) for table in couplings])
     K_s = springs[:, 0]
@@ -91,7 +91,7 @@ def _each(top: Table, key: str, read: Callable[[str, Any], T], minimum: int = 0)
 
 
 def _actuator(path: Path, place: str, data: Any) -> tuple[Actuator, dict[str, float]]:
-    table = Table(path, place, data, _ACTUATOR)
+    table = Table(path, place, data, ACTUATOR)
     lower, upper = table.angles("range", 2)
     if lower >= upper:
         raise table.error(f"range reversed or empty: {lower:g} to {upper:g} rad")
@@ -107,7 +107,7 @@ def _actuator(path: Path, place: str, data: Any) -> tuple[Actuator, dict[str, fl
 
 
 def _pad(path: Path, place: str, data: Any, urdf: UrdfModel) -> ContactPad:
-    table = Table(path, place, data, _PAD)
+    table = Table(path, place, data, PAD)
     link, links = table.text("link"), [link.name for link in urdf.links]
     if link not in links:
         raise table.error(f"unknown link '{link}'; the URDF's links are: {', '.join(links)}")
@@ -129,7 +129,7 @@ def _pad(path: Path, place: str, data: Any, urdf: UrdfModel) -> ContactPad:
 
 
 def _hall(path: Path, place: str, data: Any, names: tuple[str, ...]) -> HallSensor:
-    table = Table(path, place, data, ("joint", "channel", "open", "closed"))
+    table = Table(path, place, data, HALL)
     joint = table.text("joint")
     if joint not in names:
         raise JointMismatchError(path, (), (joint,), names)
@@ -148,7 +148,7 @@ def _joint_table(path: Path, data: Any, names: tuple[str, ...]) -> np.ndarray:
         raise JointMismatchError(path, missing, unexpected, names)
     rows = []
     for name in names:
-        table = Table(path, f"[joints] {name}", given[name], ("spring", "rest", "rest_deg", "friction"))
+        table = Table(path, f"[joints] {name}", given[name], JOINT)
         spring, friction = (table.number(key, 0.0, minimum=0.0) for key in ("spring", "friction"))
         rows.append((spring, table.angle("rest", 0.0), friction))
     return np.array(rows)
