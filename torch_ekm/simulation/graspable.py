@@ -68,7 +68,7 @@ def object_axes(obj: ObjectDescription) -> Array:
         reach = [_half_extent(shape, axis) for shape in obj.shapes]
         extents[max(reach)] = axis
     long_axis = extents[max(extents)]
-    return np.stack([long_axis, grasp, np.cross(long_axis, grasp)], axis=1)
+    return np.asarray(np.stack([long_axis, grasp, np.cross(long_axis, grasp)], axis=1), dtype=np.float64)
 
 
 def _half_extent(shape: Shape, axis: Array) -> float:

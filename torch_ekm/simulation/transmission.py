@@ -25,6 +25,11 @@ class Transmission:
 
         tau = -K_s (q - q0) + J_a^T k_a (m - a0 - J_a q) - C^T k_c C q - tau_f
 
+    A rigid coupling (index, ring and little spread alike) is a spring ``k_c`` from the joints that follow
+    to those that lead, and the actuators act on the joints that lead alone: ``J_a`` above stands for
+    ``J_a S`` with ``S q`` the posture whose followers obey the couplings. So a coupled joint that leads
+    is as stiff as if the coupling were rigid, whatever ``k_c`` is.
+
     PhysX integrates a joint drive implicitly and an external torque explicitly, which is unstable
     for tendons as stiff as these. So each joint gets one drive, whose stiffness is the diagonal of
     the matrix above, and whose target is recomputed at every step from the other joints of its
@@ -64,10 +69,14 @@ class Transmission:
         self.offset = hand.actuator_offset.copy()
         """a0, which grows as a tendon lengthens ``(n_a,)`` [rad]."""
         self.creep = creep
-        self._M = np.vstack([self.J_a, hand.coupling.reshape(-1, hand.n_q)])
-        self._k = np.concatenate([stiffness, np.full(hand.coupling.shape[0], coupling_stiffness)])
+        coupling = hand.coupling.reshape(-1, hand.n_q)
+        S = coupled_posture(coupling)
+        away = np.eye(hand.n_q) - S  # how far each follower is from where it should be
+        self._lead = self.J_a @ S
+        self._M = np.vstack([self._lead, away[np.abs(away).max(axis=1) > 0]])
+        self._k = np.concatenate([stiffness, np.full(len(coupling), coupling_stiffness)])
         self._pulls_only = np.concatenate(
-            [[actuator.tendon for actuator in hand.actuators], np.zeros(hand.coupling.shape[0], bool)]
+            [[actuator.tendon for actuator in hand.actuators], np.zeros(len(coupling), bool)]
         ).astype(bool)
         self._any_tendon = bool(self._pulls_only.any())
         self.spring_stiffness = np.array(spring_stiffness, dtype=np.float64)
@@ -93,7 +102,7 @@ class Transmission:
 
     def stretch(self, q: Array, motor: Array) -> Array:
         """``m - a0 - J_a q``: elastic stretch of each transmission [rad]; negative: a tendon is slack."""
-        return motor - self.offset - self.J_a @ q
+        return motor - self.offset - self._lead @ q
 
     def actuator_torque(self, q: Array, motor: Array) -> Array:
         """``-lam``: torque of each actuator along ``+a`` [N m]; never negative for a tendon."""
@@ -146,7 +155,7 @@ class Transmission:
 
     def take_over(self, other: Transmission, q: Array) -> None:
         """Go on from another transmission without a jolt: the same stretch at ``q``."""
-        self.offset = other.offset + (other.J_a - self.J_a) @ q
+        self.offset = other.offset + (other._lead - self._lead) @ q
         self._anchor = other._anchor.copy()
 
     def snapshot(self) -> TransmissionState:
@@ -154,3 +163,22 @@ class Transmission:
 
     def restore(self, state: TransmissionState) -> None:
         self._anchor, self.offset = state.anchor.copy(), state.offset.copy()
+
+
+def coupled_posture(coupling: Array) -> Array:
+    """``S`` with ``C S = 0``: the last joint of each coupling follows, the others lead ``(n_q, n_q)``."""
+    n_k, n_q = coupling.shape
+    rows = np.array(coupling, dtype=np.float64)
+    posture = np.eye(n_q)
+    following: list[tuple[int, int]] = []
+    for k in range(n_k):
+        joint = int(np.flatnonzero(np.abs(rows[k]) > 1e-12)[-1])
+        rows[k] /= rows[k, joint]
+        for other in range(n_k):
+            if other != k:
+                rows[other] -= rows[other, joint] * rows[k]
+        following.append((k, joint))
+    for k, joint in following:
+        posture[joint] = -rows[k]
+        posture[joint, joint] = 0.0
+    return posture
