@@ -31,6 +31,8 @@ from .marker import TrackerOptions as TrackerOptions
 from .scene import ConvexBody as ConvexBody
 from .scene import PlacedCard as PlacedCard
 from .scene import Scene as Scene
+from .sensed_plant import ICUB_PALM_MOUNT as ICUB_PALM_MOUNT
+from .sensed_plant import SensedPlant as SensedPlant
 from .simulated_camera import ImageQuality as ImageQuality
 from .simulated_camera import SimulatedCamera as SimulatedCamera
 from .simulated_video import SimulatedVideo as SimulatedVideo
@@ -50,6 +52,7 @@ __all__ = [
     "HallEstimate",
     "HallQuality",
     "HallSensors",
+    "ICUB_PALM_MOUNT",
     "ImageFolder",
     "ImageQuality",
     "ImageSource",
@@ -60,6 +63,7 @@ __all__ = [
     "PinholeCamera",
     "PlacedCard",
     "Scene",
+    "SensedPlant",
     "SimulatedCamera",
     "SimulatedVideo",
     "StreamOptions",

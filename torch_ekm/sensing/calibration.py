@@ -22,7 +22,9 @@ class CameraCalibration:
     rms: float
     """Root mean square distance of corners from where the camera puts them [px]."""
     std: dict[str, float]
-    """Standard deviations of fx, fy, cx, cy [px] and k1, k2, p1, p2, k3."""
+    """Standard deviations of fx, fy, cx, cy [px] and k1, k2, p1, p2, k3, were all corners independent.
+
+    They are not quite: with a dozen views, count on twice as much."""
     view_rms: tuple[float, ...]
     """Of each picture that was used [px]."""
     used: tuple[int, ...]

@@ -40,16 +40,19 @@ class StreamOptions:
     """Time between exposure and use [s]."""
     dropped: float = 0.0
     """Probability that a frame never arrives."""
+    hidden: float = 0.0
+    """Probability that something passes between the camera and one of the cards."""
     seed: int = 0
-    """Of the dropped frames and of the pixel noise."""
+    """Of the dropped and hidden frames and of the pixel noise."""
 
     def __post_init__(self) -> None:
         if not self.rate > 0:
             raise ParameterError("StreamOptions.rate", self.rate, "positive [Hz]")
         if not self.latency >= 0:
             raise ParameterError("StreamOptions.latency", self.latency, "zero or positive [s]")
-        if not 0 <= self.dropped < 1:
-            raise ParameterError("StreamOptions.dropped", self.dropped, "within [0, 1)")
+        for name in ("dropped", "hidden"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ParameterError(f"StreamOptions.{name}", getattr(self, name), "within [0, 1)")
 
     def generator(self, index: int) -> np.random.Generator:
         """Randomness of one frame: the same whatever frames were looked at before."""

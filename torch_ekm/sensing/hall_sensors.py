@@ -125,6 +125,19 @@ class HallSensors:
         u = (u - low) / (1 - low - high)
         return self._open + (self._closed - self._open) * u
 
+    def sweep(
+        self, n: int, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "n n_channels"], Float[Tensor, "n n_channels"]]:
+        """Readings and true angles [rad] while each joint goes from its lower to its upper stop.
+
+        What :meth:`HallCalibration.fit` takes.
+        """
+        share = torch.linspace(0, 1, n, dtype=torch.float64)[:, None]
+        angles = self._lower + (self._upper - self._lower) * share
+        q = torch.zeros(n, self._n_q, dtype=torch.float64)
+        q[:, self._index] = angles
+        return self.read(q, generator), angles
+
     def saturated(self, q: Float[Tensor, "*batch n_q"]) -> Bool[Tensor, "*batch n_channels"]:
         """Truth: the channel is at an end of its scale."""
         field = self.field(q)

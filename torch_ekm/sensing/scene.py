@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -146,6 +146,13 @@ class Scene:
 
     cards: tuple[PlacedCard, ...] = ()
     bodies: tuple[ConvexBody, ...] = ()
+
+    def obstructed(self, card: int, shade: int = 70) -> Scene:
+        """The scene with a ball half way between the camera and a card, which hides all of it."""
+        outline = self.cards[card].outline / 2
+        centre = outline.mean(axis=0)
+        radius = 1.2 * np.linalg.norm(outline - centre, axis=1).max()
+        return replace(self, bodies=(*self.bodies, ConvexBody(centre[None], np.array([radius]), shade)))
 
 
 def _convex_hull(points: Array) -> Array:

@@ -1,4 +1,4 @@
-"""A stream of simulated images, with latency and dropped frames."""
+"""A stream of simulated images, with latency, dropped and hidden frames."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class SimulatedVideo:
     Args:
         camera: draws the images.
         scene_at: the scene at a time [s].
-        options: rate, latency, dropped frames, seed.
+        options: rate, latency, dropped and hidden frames, seed.
         n_frames: length of the stream when iterated over; None: endless.
     """
 
@@ -45,7 +45,10 @@ class SimulatedVideo:
         time = index / options.rate
         image = None
         if generator.random() >= options.dropped:
-            image = self.camera.render(self.scene_at(time), generator)
+            scene = self.scene_at(time)
+            if scene.cards and generator.random() < options.hidden:
+                scene = scene.obstructed(int(generator.integers(len(scene.cards))), shade=70)
+            image = self.camera.render(scene, generator)
         return Frame(index, time, time + options.latency, image)
 
     def latest(self, time: float) -> Frame | None:

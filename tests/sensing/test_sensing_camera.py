@@ -1,0 +1,98 @@
+"""The lens: projection, its inverse, its calibration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from torch_ekm.exceptions import CalibrationError, DescriptionError, ParameterError
+from torch_ekm.sensing import (
+    CharucoTarget,
+    PinholeCamera,
+    PlacedCard,
+    Scene,
+    SimulatedCamera,
+    calibrate_camera,
+)
+
+cv2 = pytest.importorskip("cv2")
+
+LENS = PinholeCamera(fx=612.0, fy=607.0, cx=331.0, cy=233.0, distortion=(-0.12, 0.08, 1e-3, -7e-4, 0.0))
+
+
+def test_projection_is_opencvs(rng):
+    points = rng.uniform([-0.15, -0.1, 0.3], [0.15, 0.1, 0.5], (50, 3))
+    lens = replace(LENS, distortion=(*LENS.distortion[:4], 0.05))
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.matrix, lens.distortion_array)
+    np.testing.assert_allclose(lens.project(points), expected[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (5,), (2, 3)])
+@pytest.mark.parametrize("camera", [PinholeCamera(), LENS])
+def test_rays_invert_projection(camera, batch, rng):
+    pixels = rng.uniform([0, 0], [640, 480], (*batch, 2))
+    rays = camera.rays(pixels)
+    assert rays.shape == (*batch, 2)
+    points = np.concatenate([rays, np.ones((*batch, 1))], axis=-1)
+    np.testing.assert_allclose(camera.project(points), pixels, atol=1e-6)
+
+
+def test_saved_camera_is_the_same(tmp_path):
+    LENS.save(tmp_path / "lens.json")
+    assert PinholeCamera.load(tmp_path / "lens.json") == LENS
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"fx": 1, "distortion": [0,0,0,0,0], "zoom": 3}'])
+def test_a_file_that_is_no_camera_is_refused(tmp_path, text):
+    (tmp_path / "lens.json").write_text(text)
+    with pytest.raises(DescriptionError, match=r"lens\.json"):
+        PinholeCamera.load(tmp_path / "lens.json")
+
+
+def test_impossible_lenses_are_refused():
+    with pytest.raises(ParameterError, match="fx"):
+        PinholeCamera(fx=0.0)
+    with pytest.raises(ParameterError, match="distortion"):
+        PinholeCamera(distortion=(0.1, 0.0))
+
+
+@pytest.fixture(scope="module")
+def target_views(pose_of):
+    camera, target, rng = SimulatedCamera(LENS), CharucoTarget(), np.random.default_rng(1)
+    views = []
+    for _ in range(12):
+        pose = pose_of(
+            *rng.uniform([-0.06, -0.05, 0.30], [0.06, 0.05, 0.40]),
+            tilt_deg=rng.uniform(5, 45),
+            azimuth_deg=rng.uniform(0, 360),
+            spin_deg=rng.uniform(-30, 30),
+        )
+        views.append(camera.render(Scene((PlacedCard(target, pose),)), rng))
+    return views
+
+
+def test_calibration_recovers_the_lens(target_views):
+    blank = np.full_like(target_views[0], 128)
+    result = calibrate_camera([*target_views, None, blank])
+    assert result.used == tuple(range(12))  # the blank one is left out
+    assert result.rms < 0.12  # px
+    found = result.camera
+    for name, tolerance in (("fx", 2.5), ("fy", 2.5), ("cx", 2.0), ("cy", 2.0)):
+        error = abs(getattr(found, name) - getattr(LENS, name))
+        assert error < tolerance  # px
+        assert error < 5 * result.std[name]  # corners of one view share errors: std is a little small
+    # what counts: where points appear, over the whole image
+    grid = np.stack(np.meshgrid(np.linspace(20, 620, 7), np.linspace(20, 460, 7)), axis=-1)
+    rays = np.concatenate([LENS.rays(grid), np.ones((7, 7, 1))], axis=-1)
+    assert (
+        np.abs(found.project(rays) - grid)[1:-1, 1:-1].max() < 2.5
+    )  # px, the principal point's error included
+
+
+def test_calibration_says_what_is_missing(target_views):
+    with pytest.raises(CalibrationError, match="at least 8"):
+        calibrate_camera(target_views[:5])
+    with pytest.raises(CalibrationError, match="those before"):
+        calibrate_camera([target_views[0], target_views[1][:400]])

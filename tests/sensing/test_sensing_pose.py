@@ -1,0 +1,172 @@
+"""Pose of one board: exact where it should be, robust, with the right covariance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm.kinematics.se3 import exp, log
+from torch_ekm.sensing import (
+    BoardPose,
+    ConvexBody,
+    ImageQuality,
+    MarkerBoard,
+    PinholeCamera,
+    PlacedCard,
+    Scene,
+    SimulatedCamera,
+    estimate_board_pose,
+    refine_on_edges,
+)
+from torch_ekm.sensing.board_pose import projection_jacobian
+from torch_ekm.sensing.static_pose import StaticPose
+
+LENSES = [PinholeCamera(), PinholeCamera(fx=580, cx=300, distortion=(-0.15, 0.1, 1e-3, -5e-4, 0.0))]
+
+
+def corners(board, pose, camera):
+    X = board.corners.reshape(-1, 3)
+    return X, camera.project(X @ pose[:3, :3].T + pose[:3, 3])
+
+
+def twist(estimate, pose):
+    turn = log(torch.from_numpy(estimate.rotation @ pose[:3, :3].T)).numpy()
+    return np.concatenate([estimate.position - pose[:3, 3], turn])
+
+
+@pytest.mark.parametrize("camera", LENSES)
+@pytest.mark.parametrize("tilt", [0.0, 20.0, 50.0])
+def test_exact_corners_give_the_exact_pose(pose_of, camera, tilt):
+    pose = pose_of(0.04, -0.05, 0.42, tilt_deg=tilt)
+    found = estimate_board_pose(camera, *corners(MarkerBoard(), pose, camera))
+    assert found.n_rejected == 0
+    assert np.abs(twist(found, pose)).max() < 1e-6
+    assert found.rms < 1e-5
+
+
+@pytest.mark.parametrize("camera", LENSES)
+def test_jacobian_is_the_derivative_of_the_projection(pose_of, camera):
+    pose, X = pose_of(0.05, 0.03), MarkerBoard().corners.reshape(-1, 3)
+    R, t, h = pose[:3, :3], pose[:3, 3], 1e-6
+
+    def pixels(step):
+        turned = exp(torch.from_numpy(step[3:])).numpy() @ R
+        return camera.project(X @ turned.T + t + step[:3]).ravel()
+
+    columns = [(pixels(h * e) - pixels(-h * e)) / (2 * h) for e in np.eye(6)]
+    J = projection_jacobian(camera, X, R, t)
+    np.testing.assert_allclose(J, np.stack(columns, axis=-1), atol=1e-4 * np.abs(J).max())
+
+
+def test_covariance_is_that_of_the_errors(pose_of, rng):
+    camera, board, pose = PinholeCamera(), MarkerBoard(), pose_of(tilt_deg=35)
+    X, u = corners(board, pose, camera)
+    errors, chi2 = [], []
+    for _ in range(300):
+        found = estimate_board_pose(camera, X, u + 0.15 * rng.standard_normal(u.shape), corner_std=0.15)
+        errors.append(twist(found, pose))
+        chi2.append(errors[-1] @ np.linalg.solve(found.covariance, errors[-1]))
+    assert np.mean(chi2) == pytest.approx(6.0, rel=0.2)
+    stated = np.sqrt(np.diag(found.covariance))
+    np.testing.assert_allclose(np.std(errors, axis=0), stated, rtol=0.35)
+
+
+def test_wrong_corners_are_left_out(pose_of, rng):
+    camera, board, pose = PinholeCamera(), MarkerBoard(), pose_of()
+    X, u = corners(board, pose, camera)
+    u = u + 0.05 * rng.standard_normal(u.shape)
+    spoilt = u.copy()
+    spoilt[3] += [4.0, -3.0]
+    spoilt[9] += [-2.5, 2.0]
+    found = estimate_board_pose(camera, X, spoilt)
+    assert found.n_rejected == 2
+    without = np.delete(np.arange(16), [3, 9])
+    same = estimate_board_pose(camera, X[without], u[without])
+    np.testing.assert_allclose(found.position, same.position, atol=1e-9)
+
+
+def test_nothing_comes_of_nonsense(rng):
+    X = MarkerBoard().corners.reshape(-1, 3)
+    assert estimate_board_pose(PinholeCamera(), X, rng.uniform(0, 400, (16, 2))) is None
+    assert estimate_board_pose(PinholeCamera(), X[:5], rng.uniform(0, 400, (5, 2))) is None
+    line = X[[0, 1, 4, 5, 0, 1]]  # one row of corners: no plane
+    u = 320 + 1500 * line[:, :2]
+    assert estimate_board_pose(PinholeCamera(), line, u) is None
+
+
+def test_prior_decides_between_mirror_images(pose_of):
+    """A small board far away: both solutions fit, the one near the prior is taken."""
+    camera, board = PinholeCamera(), MarkerBoard(columns=1, rows=1, marker_size=0.012)
+    pose = pose_of(z=0.6, tilt_deg=25)
+    X, u = corners(board, pose, camera)
+    free = estimate_board_pose(camera, X, u, corner_std=0.5, min_corners=4)
+    assert free.ambiguous
+    assert np.abs(twist(free, pose)).max() < 1e-4  # exact corners: the better one is the true one
+    mirrored = pose_of(z=0.6, tilt_deg=-25)[:3, :3]
+    other = estimate_board_pose(camera, X, u, corner_std=0.5, min_corners=4, prior=mirrored)
+    towards = log(torch.from_numpy(other.rotation @ mirrored.T)).norm()
+    assert float(towards) < np.radians(12)
+    clear = estimate_board_pose(camera, X, u, corner_std=1e-3, min_corners=4, prior=mirrored)
+    assert not clear.ambiguous
+    assert np.abs(twist(clear, pose)).max() < 1e-4
+
+
+@pytest.mark.parametrize("camera", LENSES)
+def test_edges_correct_a_rough_pose(pose_of, camera, rng):
+    board, pose = MarkerBoard(), pose_of(0.03, 0.02, tilt_deg=30)
+    quality = ImageQuality(noise=1.0, vignette=0.0)
+    image = SimulatedCamera(camera, quality).render(Scene((PlacedCard(board, pose),)), rng)
+    rough = exp(torch.tensor([0.01, -0.008, 0.005], dtype=torch.float64)).numpy() @ pose[:3, :3]
+    start = BoardPose(rough, pose[:3, 3] + [1e-4, -1e-4, 1e-3], np.eye(6), 0.0, 16, 0, False)
+    error = twist(refine_on_edges(image, camera, board, start), pose)
+    assert np.abs(error[:2]).max() < 2e-5  # m
+    assert abs(error[2]) < 3e-4
+    assert np.abs(error[3:]).max() < np.radians(0.15)
+
+
+def test_edges_of_a_half_hidden_board_still_count(pose_of, rng):
+    camera, board, pose = PinholeCamera(), MarkerBoard(), pose_of(tilt_deg=30)
+    finger = ConvexBody.capsule(np.array([-0.03, 0.012, 0.33]), np.array([0.04, 0.02, 0.33]), 0.007)
+    image = SimulatedCamera(camera).render(Scene((PlacedCard(board, pose),), (finger,)), rng)
+    start = BoardPose(pose[:3, :3], pose[:3, 3], np.eye(6), 0.0, 16, 0, False)
+    refined = refine_on_edges(image, camera, board, start)
+    assert refined is not start
+    error = twist(refined, pose)
+    assert np.abs(error[3:]).max() < np.radians(0.4)
+    assert np.abs(error[:2]).max() < 5e-5
+
+
+def test_no_edges_leave_the_pose_alone(pose_of):
+    blank = np.full((480, 640), 128, dtype=np.uint8)
+    start = BoardPose(pose_of()[:3, :3], pose_of()[:3, 3], np.eye(6), 0.0, 16, 0, False)
+    assert refine_on_edges(blank, PinholeCamera(), MarkerBoard(), start) is start
+
+
+def _look(pose, rng, std):
+    step = std * rng.standard_normal(6)
+    turned = exp(torch.from_numpy(step[3:])).numpy() @ pose[:3, :3]
+    return BoardPose(turned, pose[:3, 3] + step[:3], std**2 * np.eye(6), 0.0, 16, 0, False)
+
+
+def test_average_of_a_still_board_is_better_by_the_root(pose_of, rng):
+    pose, std, errors, single = pose_of(), 1e-3, [], []
+    for _ in range(100):
+        average = StaticPose(frames=16)
+        for _ in range(16):
+            look = _look(pose, rng, std)
+            mean = average.update(look)
+        errors.append(twist(mean, pose))
+        single.append(twist(look, pose))
+    assert np.std(errors) == pytest.approx(np.std(single) / 4, rel=0.25)
+    assert np.sqrt(mean.covariance[0, 0]) == pytest.approx(std / 4, rel=0.01)
+
+
+def test_average_starts_anew_when_the_board_moves(pose_of, rng):
+    average, first, second = StaticPose(frames=16), pose_of(), pose_of(x=0.03)
+    for _ in range(10):
+        average.update(_look(first, rng, 1e-4))
+    for expected in (first, first, second, second):
+        mean = average.update(_look(second, rng, 1e-4))
+        assert np.abs(twist(mean, expected)).max() < 1e-3
+    assert average.update(None) is mean  # bridges a missing look
