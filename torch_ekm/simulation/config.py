@@ -37,8 +37,9 @@ class PlantConfig:
     """Pad that opposes the others; None: the one whose name begins with "thumb", else the first."""
     fingers: tuple[str, ...] | None = None
     """Opposing pads; None: index and middle where there are such, else the second."""
-    along: tuple[float, float, float] = (0.0, 1.0, 0.0)
-    """Direction in the hand of the object's long axis, about which a pinch can turn it."""
+    along: tuple[float, float, float] | None = None
+    """Direction in the hand of the object's long axis, about which a pinch can turn it. None: the
+    normal of a planar hand, else y, square to the planes in which the iCub's fingers bend."""
     offset_along: float = 0.010
     """Grasp points are drawn within +-this along the object's long axis [m]."""
     offset_across: float = 0.002
@@ -59,9 +60,9 @@ class PlantConfig:
                 raise ParameterError(name, value, "finite and not negative")
         if self.time_step > 0.005:
             raise ParameterError("time_step", self.time_step, "at most 5 ms")
-        if not all(math.isfinite(value) for value in (*self.gravity, *self.along)):
-            raise ParameterError("gravity, along", (self.gravity, self.along), "finite")
-        length = math.sqrt(sum(value * value for value in self.along))
-        if length < 1e-9:
-            raise ParameterError("along", self.along, "a direction, not zero")
-        object.__setattr__(self, "along", tuple(value / length for value in self.along))
+        if len(self.gravity) != 3 or not all(math.isfinite(value) for value in self.gravity):
+            raise ParameterError("gravity", self.gravity, "three finite numbers [m/s^2]")
+        if self.along is not None:
+            length = math.sqrt(sum(value * value for value in self.along))
+            if len(self.along) != 3 or not math.isfinite(length) or length < 1e-9:
+                raise ParameterError("along", self.along, "a direction: three finite numbers, not all zero")

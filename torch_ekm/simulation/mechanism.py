@@ -70,7 +70,7 @@ def make_planner(
         config.gravity,
         thumb,
         fingers,
-        along=config.along,
+        along=turning_axis(hand, config),
         mass_factor=parameters.mass,
         com_shift=parameters.com_shift,
         friction=parameters.friction,
@@ -87,3 +87,10 @@ def opposition(hand: HandDescription, config: PlantConfig) -> tuple[str, tuple[s
         return thumb, config.fingers
     chosen = tuple(name for name in names if name.startswith(("index", "middle")))
     return thumb, chosen or tuple(name for name in names if name != thumb)[:1]
+
+
+def turning_axis(hand: HandDescription, config: PlantConfig) -> tuple[float, float, float]:
+    """Unit vector along which the object's long axis is held, hand frame."""
+    along = np.array(config.along or hand.planar_normal or (0.0, 1.0, 0.0))
+    x, y, z = (along / np.linalg.norm(along)).tolist()
+    return x, y, z

@@ -128,7 +128,7 @@ class PlantParameters:
             moment_arm=1.3,
             spring=0.8,
             servo_stiffness=0.5,
-            joint_friction=0.5,
+            joint_friction=1.0,
             link_weight=True,
             friction=0.9,
             mass=1.1,

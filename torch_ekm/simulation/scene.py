@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..description import HandDescription, ObjectDescription
+from ..exceptions import ParameterError
 from .bodies import build_hand, build_object, set_inertia
 from .engine import new_scene, sapien
 
@@ -56,7 +57,22 @@ class HandScene:
         self._hand = build_hand(self._scene, hand, self._material, link_weight)
         self._object = build_object(self._scene, obj, self._material, object_scale)
         self.set_object()
+        if hand.planar_normal is not None:
+            self._keep_in_plane(np.array(hand.planar_normal))
         self._back = np.argsort(self._hand.order)
+
+    def _keep_in_plane(self, normal: Array) -> None:
+        """A planar hand's object neither leaves the plane nor tilts out of it.
+
+        Raises:
+            ParameterError: the normal is not an axis of the hand frame, as PhysX's locks need.
+        """
+        across = np.abs(normal) / np.linalg.norm(normal) > 1 - 1e-9
+        if not across.any():
+            raise ParameterError(
+                "planar_normal", tuple(normal), "x, y or z of the hand frame, to be simulated"
+            )
+        self._object.set_locked_motion_axes([*across.tolist(), *(~across).tolist()])
 
     # -- properties that may change in mid-run ----------------------------------------------------
 

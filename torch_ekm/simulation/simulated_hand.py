@@ -14,7 +14,7 @@ from ..description import HandDescription, ObjectDescription, load_hand, load_ob
 from ..exceptions import EquilibriumError, GraspError
 from ..typing import Float, Tensor
 from .config import PlantConfig
-from .mechanism import make_planner, make_servo, make_transmission, moment_arms
+from .mechanism import make_planner, make_servo, make_transmission, moment_arms, turning_axis
 from .parameters import PlantParameters
 from .pinch import PinchPlan
 from .pinch_problem import PinchRequest
@@ -183,12 +183,12 @@ class SimulatedHand:
 
         Thumb and fingers flex in nearly parallel planes; the axis is the normal of those planes
         that the contacts show: the line through the finger contacts, made square to the line from
-        the thumb to them. With one opposing finger it is ``config.along``.
+        the thumb to them. With one opposing finger it is the direction of the object's long axis.
         """
         points = self.plan.points
         across = points[1:].mean(axis=0) - points[0]
         across /= np.linalg.norm(across)
-        along = np.array(self.config.along)
+        along = np.array(turning_axis(self.hand, self.config))
         axis = points[-1] - points[1] if len(points) > 2 else along
         axis = axis - across * (axis @ across)
         axis *= np.sign(axis @ along) / np.linalg.norm(axis)
