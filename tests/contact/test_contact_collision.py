@@ -232,6 +232,22 @@ def test_the_contact_point_moves_continuously_as_the_finger_tilts(kind: str) -> 
         assert float(points[:, 0].min()) < -0.99 * HALF
 
 
+@pytest.mark.parametrize("kind", list(SHAPES))
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(pose=poses, along=st.tuples(*[st.floats(-1, 1)] * 6))
+def test_no_jumps_anywhere_outside(kind: str, pose: tuple[float, ...], along: tuple[float, ...]) -> None:
+    """A change of the pose by 1e-7 (m, rad) moves the contact point by at most R/(0.2 rho) that."""
+    position, rotation = torch.tensor(pose[:3], dtype=F64), turned(*pose[3:])
+    detector = probe(thing(kind))
+    before = touch(detector, position, rotation)
+    assume(float(before.gap) > -0.8 * RADIUS)
+    change = 1e-7 * torch.tensor(along, dtype=F64)
+    after = touch(detector, position + change[:3], exp(change[3:]) @ rotation)
+    assert float((after.point - before.point).norm()) < 1e-4
+    assert float((after.normal - before.normal).norm()) < 1e-3
+    assert float((after.gap - before.gap).abs()) < 1e-6
+
+
 def test_twice_the_same() -> None:
     detector = probe(load_object("can"))
     first, _, second = (

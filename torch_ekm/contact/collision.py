@@ -96,7 +96,7 @@ class ContactDetector:
         else:
             _check("q", q, (self.hand.n_q,))
             with torch.no_grad():
-                poses = self.kinematics(q.to(self.kinematics._axes.dtype))
+                poses = self.kinematics(q.to(self.kinematics.dtype))
         if poses.transforms.dim() != 3:
             raise ShapeError("poses", "(n_link, 4, 4)", poses.transforms.shape, "one posture at a time")
         frames = poses.transforms[self._links].detach().to("cpu", torch.float64).numpy()

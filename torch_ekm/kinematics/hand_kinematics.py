@@ -108,6 +108,11 @@ class HandKinematics(nn.Module):
     def _register(self, name: str, tensor: Tensor) -> None:
         self.register_buffer(name, tensor, persistent=False)  # made from the description, never learned
 
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the buffers, and so of the ``q`` that :meth:`forward` takes."""
+        return self._constant.dtype
+
     def link_index(self, name: str) -> int:
         """Place of a link in ``link_names``.
 
@@ -185,10 +190,9 @@ class HandKinematics(nn.Module):
         if q.dim() == 0 or q.shape[-1] != n_q:
             joints = ", ".join(self.joint_names)
             raise ShapeError("q", f"(*batch, {n_q})", q.shape, f"the joints are, in order: {joints}")
-        if q.dtype != self._constant.dtype:
-            raise ParameterError(
-                "q.dtype", q.dtype, f"{self._constant.dtype}, the dtype of this module (change it with .to())"
-            )
+        if q.dtype != self.dtype:
+            valid = f"{self.dtype}, the dtype of this module (change it with .to())"
+            raise ParameterError("q.dtype", q.dtype, valid)
 
     def extra_repr(self) -> str:
         return f"'{self.hand.name}', links={len(self.link_names)}, joints={len(self.joint_names)}"
