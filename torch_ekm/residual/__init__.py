@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from .action_linear import ActionLinearKernel as ActionLinearKernel
+from .adapters import GPyTorchSVGP as GPyTorchSVGP
+from .adapters import RiverResidual as RiverResidual
 from .base import ResidualLearner as ResidualLearner
 from .base import UpdateEvent as UpdateEvent
 from .base import UpdateReport as UpdateReport
+from .deep_kernel import DeepKernel as DeepKernel
 from .kernels import Kernel as Kernel
 from .kernels import LinearKernel as LinearKernel
 from .kernels import Matern32 as Matern32
@@ -13,5 +16,12 @@ from .kernels import Matern52 as Matern52
 from .kernels import ProductKernel as ProductKernel
 from .kernels import SquaredExponential as SquaredExponential
 from .kernels import SumKernel as SumKernel
+from .krls_t import KRLSTracker as KRLSTracker
+from .linear import RandomFeatureRLS as RandomFeatureRLS
+from .linear import RecursiveLeastSquares as RecursiveLeastSquares
+from .local_gps import LocalGPs as LocalGPs
+from .replay_mlp import ReplayMLP as ReplayMLP
 from .sogp import Prediction as Prediction
 from .sogp import SparseOnlineGP as SparseOnlineGP
+from .window_gp import WindowGP as WindowGP
+from .zero import ZeroResidual as ZeroResidual

@@ -102,7 +102,7 @@ class PrequentialAdaptation(nn.Module):
         right = torch.cat([u, L.mT @ (self.old_information / s2)], dim=-1)
         right = torch.linalg.solve_triangular(La, right, upper=False)
         g, b = right[..., : self.window], right[..., self.window :]
-        v = kernel.diagonal(self.window_x) - u.square().sum(-2) + g.square().sum(-2)
+        v = kernel.diagonal_of_set(self.window_x) - u.square().sum(-2) + g.square().sum(-2)
         variance = v.clamp_min(0.0).unsqueeze(-1) + noise.unsqueeze(-2)
         z2 = (self.window_y - g.mT @ b).square() / variance
         misfit = z2 if robust is None else (robust**2 + 1.0) * torch.log1p(z2 / robust**2)
@@ -151,5 +151,5 @@ class PrequentialAdaptation(nn.Module):
 def _trailing(value: Float[Tensor, "*batch"], like: Tensor) -> Tensor:
     """A per-model value against a parameter; one shared by the fleet takes the mean."""
     if like.shape[: value.dim()] == value.shape:
-        return value.reshape(*value.shape, *(1,) * (like.dim() - value.dim()))
+        return value[(..., *(None,) * (like.dim() - value.dim()))]
     return value.mean()

@@ -29,7 +29,7 @@ class Kernel(nn.Module, ABC):
 
     @abstractmethod
     def diagonal(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch"]:
-        """k(x, x)."""
+        """k(x, x) of one point per model; further axes go in front."""
 
     @abstractmethod
     def with_gradient(self, x: Float[Tensor, "*batch d"], z: Float[Tensor, "*batch m d"]):
@@ -42,6 +42,10 @@ class Kernel(nn.Module, ABC):
     def vector(self, x: Float[Tensor, "*batch d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
         """k(x, z_j) for one query per model, ``(*batch, m)``."""
         return self(x.unsqueeze(-2), z).squeeze(-2)
+
+    def diagonal_of_set(self, x: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n"]:
+        """k(x_i, x_i) of n points per model."""
+        return self.diagonal(x.movedim(-2, 0)).movedim(0, -1)
 
     def shift_invariant(self, in_features: int) -> list[bool]:
         """Columns of x whose origin does not matter; a normaliser may centre these and no others."""

@@ -233,7 +233,7 @@ def basis_gram(kernel: Kernel, basis: Tensor, active: Tensor, jitter: float) -> 
     """K(X, X) with ``jitter k**`` on the diagonal; the identity at free slots. Differentiable."""
     on = active.unsqueeze(-1)
     K = kernel(basis, basis) * (on * on.mT)
-    diagonal = torch.where(active > 0, kernel.diagonal(basis) * (1.0 + jitter), 1.0)
+    diagonal = torch.where(active > 0, kernel.diagonal_of_set(basis) * (1.0 + jitter), 1.0)
     return (0.5 * (K + K.mT)).diagonal_scatter(diagonal, dim1=-2, dim2=-1)
 
 

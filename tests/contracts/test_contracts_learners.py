@@ -1,0 +1,113 @@
+"""Every learner keeps the contract, in both precisions and all query shapes; broken ones are caught."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torch_ekm.residual import (
+    ActionLinearKernel,
+    DeepKernel,
+    KRLSTracker,
+    LocalGPs,
+    RandomFeatureRLS,
+    RecursiveLeastSquares,
+    ReplayMLP,
+    SparseOnlineGP,
+    SquaredExponential,
+    WindowGP,
+    ZeroResidual,
+)
+from torch_ekm.testing import check_residual_learner
+
+
+def deep(dtype=torch.float64, **options):
+    base = SquaredExponential(3, batch_shape=options.get("batch_shape", ()))
+    options = {"normalize": True, "adapt": True, "refresh_every": 4, **options}
+    return SparseOnlineGP(3, 2, capacity=8, kernel=DeepKernel(base, hidden=(8,)), dtype=dtype, **options)
+
+
+def sogp(**options):
+    return SparseOnlineGP(3, 2, **{"capacity": 8, **options})
+
+
+LEARNERS = {
+    "zero": lambda **o: ZeroResidual(3, 2, **o),
+    "rls": lambda **o: RecursiveLeastSquares(3, 2, forgetting=0.99, robust=3.0, **o),
+    "rff": lambda **o: RandomFeatureRLS(3, 2, n_frequencies=20, **o),
+    "window": lambda **o: WindowGP(3, 2, window=10, **o),
+    "krls_t": lambda **o: KRLSTracker(3, 2, capacity=8, forgetting=0.99, **o),
+    "local": lambda **o: LocalGPs(3, 2, experts=3, window=6, **o),
+    "mlp": lambda **o: ReplayMLP(3, 2, hidden=(8,), **o),
+    "ensemble": lambda **o: ReplayMLP(3, 2, hidden=(8,), members=3, **o),
+    "sogp": sogp,
+    "sogp_all": lambda **o: sogp(
+        normalize=True, adapt=True, forgetting=0.99, robust=3.0, refresh_every=4, projection="fitc", **o
+    ),
+    "sogp_skip": lambda **o: sogp(on_invalid="skip", **o),
+    "sogp_action": lambda **o: sogp(kernel=ActionLinearKernel(3, 1), normalize=True, **o),
+    "deep": deep,
+}
+FLEETS = ("zero", "rls", "rff", "window", "sogp", "sogp_all", "deep")
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_contract(name):
+    check_residual_learner(LEARNERS[name])
+
+
+@pytest.mark.parametrize("shape", [(1,), (5,), (2, 3)])
+@pytest.mark.parametrize("name", FLEETS)
+def test_contract_of_fleets(name, shape):
+    check_residual_learner(lambda **o: LEARNERS[name](batch_shape=shape, **o), dtypes=(torch.float64,))
+
+
+def test_contract_of_river():
+    pytest.importorskip("river")
+    from torch_ekm.residual import RiverResidual
+
+    check_residual_learner(lambda **o: RiverResidual(3, 2, **o), differentiable=False)
+
+
+def test_contract_of_gpytorch():
+    pytest.importorskip("gpytorch")
+    from torch_ekm.residual import GPyTorchSVGP
+
+    check_residual_learner(lambda **o: GPyTorchSVGP(3, 2, inducing=6, **o), vmap=False)
+
+
+class _WrongPrior(RecursiveLeastSquares):
+    def forward(self, x):
+        return super().forward(x) + 1e-12
+
+
+class _WrongSlope(RecursiveLeastSquares):
+    def linearize(self, x):
+        mean, slope = super().linearize(x)
+        return mean, slope * (1 + 1e-6)
+
+
+class _StateOutside(RecursiveLeastSquares):
+    def _absorb(self, x, y, mask):
+        self.extra = getattr(self, "extra", 0.0) + float(y.sum())
+        return super()._absorb(x, y, mask)
+
+    def forward(self, x):
+        return super().forward(x) + getattr(self, "extra", 0.0)
+
+
+class _Modal(RecursiveLeastSquares):
+    def forward(self, x):
+        return super().forward(x) * (1.0 if self.training else 0.9)
+
+
+class _Leaky(RecursiveLeastSquares):
+    def _refuse(self, x, y, mask, n_time):
+        self.target += 1e-3
+        return super()._refuse(x, y, mask, n_time)
+
+
+@pytest.mark.parametrize("broken", [_WrongPrior, _WrongSlope, _StateOutside, _Modal, _Leaky])
+def test_a_broken_learner_is_caught(broken):
+    with pytest.raises(AssertionError):
+        check_residual_learner(lambda **o: broken(3, 2, **o))

@@ -1,0 +1,241 @@
+"""The contract of a learner as one call: ``check_residual_learner(factory)``.
+
+For learners of this package and of others: needs torch alone, raises AssertionError with the broken
+clause. A factory takes ``dtype=`` and returns a fresh learner.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import pickle
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+from torch.distributions import Normal
+
+from .exceptions import EKMError, NonFiniteError, ShapeError
+from .residual.base import ResidualLearner, UpdateReport
+
+QUERY_SHAPES = ((), (1,), (5,), (2, 3))
+
+
+def check_residual_learner(
+    factory: Callable[..., ResidualLearner],
+    *,
+    dtypes: tuple[torch.dtype, ...] = (torch.float64, torch.float32),
+    n_samples: int = 24,
+    seed: int = 0,
+    differentiable: bool = True,
+    vmap: bool = True,
+    jacobian_tolerance: float | None = None,
+    device: torch.device | str | None = None,
+) -> None:
+    """Assert every clause of the learner contract, for each dtype and query shape.
+
+    Args:
+        factory: ``factory(dtype=...)`` gives a fresh learner, the same one each time.
+        dtypes: floating types to try.
+        n_samples: length of the stream that is learned.
+        seed: of the stream.
+        differentiable: whether gradients of ``forward`` reach x and equal ``linearize``.
+        vmap: whether ``torch.func.vmap(jacrev(learner))`` must work.
+        jacobian_tolerance: allowed difference of the two; by default 1e-8 (1e-3 in float32).
+        device: where to run.
+
+    Raises:
+        AssertionError: naming the clause.
+    """
+    for dtype in dtypes:
+        learner = factory(dtype=dtype)
+        if device is not None:
+            learner = learner.to(device)
+        x, y = _stream(learner, n_samples, seed)
+        _check_module(learner)
+        _check_prior(learner, x)
+        _check_bad_input(learner, x, y)
+        for t in range(n_samples // 2):
+            _check_report(learner.update(x[t], y[t]), learner)
+        _check_report(
+            learner.update(x[n_samples // 2 :], y[n_samples // 2 :]), learner, len(x) - n_samples // 2
+        )
+        _check_bad_input(learner, x, y)
+        _check_learns(learner, x, y)
+        _check_queries(learner, x)
+        if differentiable:
+            tolerance = jacobian_tolerance or (1e-8 if dtype == torch.float64 else 1e-3)
+            _check_gradients(learner, x, tolerance, vmap)
+        _check_modes(learner, x)
+        _check_persistence(learner, factory, x, y)
+        _check_mask(learner, x, y)
+        _check_batch_is_sequence(factory, learner, x, y)
+        learner.reset()
+        _check_prior(learner, x)
+
+
+def _stream(learner: ResidualLearner, n: int, seed: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    shape = (n, *learner.batch_shape)
+    x = torch.randn(*shape, learner.in_features, generator=generator, dtype=torch.float64)
+    w = torch.randn(learner.in_features, learner.out_features, generator=generator, dtype=torch.float64)
+    y = torch.sin(x @ w)
+    return x.to(learner.device, learner.dtype), y.to(learner.device, learner.dtype)
+
+
+def _check_module(learner: ResidualLearner) -> None:
+    assert isinstance(learner, nn.Module), "not an nn.Module"
+    assert isinstance(learner, ResidualLearner), "not a ResidualLearner"
+    assert str(learner.in_features) in repr(learner), "repr does not tell in_features"
+    assert not any(p.requires_grad for p in learner.parameters()), "a parameter requires grad"
+
+
+def _check_prior(learner: ResidualLearner, x: Tensor) -> None:
+    assert torch.equal(learner(x), torch.zeros_like(learner(x))), "prior mean is not exactly 0"
+    law = learner.predict(x[0])
+    assert bool((law.stddev > 0).all()), "prior deviation is not positive"
+
+
+def _check_report(report: UpdateReport, learner: ResidualLearner, n: int | None = None) -> None:
+    shape = learner.batch_shape if n is None else (n, *learner.batch_shape)
+    for name in ("event", "novelty", "surprise", "weight"):
+        assert getattr(report, name).shape == torch.Size(shape), f"report.{name} has the wrong shape"
+    assert bool(report.accepted.all()), "a good sample was not accepted"
+
+
+def _check_learns(learner: ResidualLearner, x: Tensor, y: Tensor) -> None:
+    mean, law = learner(x), learner.predict(x, observation=True)
+    assert bool(mean.isfinite().all() and law.stddev.isfinite().all()), "a prediction is not finite"
+    assert bool((law.stddev > 0).all()), "a deviation is not positive"
+    latent = learner.predict(x)
+    assert bool((latent.stddev <= law.stddev + 1e-6).all()), "noise makes a prediction more certain"
+
+
+def _check_queries(learner: ResidualLearner, x: Tensor) -> None:
+    for shape in QUERY_SHAPES:
+        query = x[0].expand(*shape, *x[0].shape).contiguous()
+        expected = (*shape, *learner.batch_shape, learner.out_features)
+        mean, law = learner(query), learner.predict(query)
+        assert isinstance(law, Normal), "predict does not return a Normal"
+        assert mean.shape == law.mean.shape == law.stddev.shape == torch.Size(expected), f"shape at {shape}"
+        assert mean.dtype == law.stddev.dtype == learner.dtype, "the prediction has another dtype"
+        value, jacobian = learner.linearize(query)
+        assert value.shape == torch.Size(expected), f"linearize: shape of the mean at {shape}"
+        assert jacobian.shape == (*expected, learner.in_features), f"linearize: shape at {shape}"
+        one = learner(x[0])
+        _close(mean, one.expand_as(mean), learner, "a batch differs from its entries")
+        _close(law.mean, mean, learner, "predict and forward differ")
+        _close(value, mean, learner, "linearize and forward differ")
+
+
+def _check_gradients(learner: ResidualLearner, x: Tensor, tolerance: float, vmap: bool) -> None:
+    query = x[0].clone().requires_grad_(True)
+    jacobian = learner.linearize(query)[1].detach()
+    value = learner(query)
+    for j in range(learner.out_features):
+        (row,) = torch.autograd.grad(value[..., j].sum(), query, retain_graph=True)
+        error = (row - jacobian[..., j, :]).abs().max()
+        assert float(error) <= tolerance, (
+            f"linearize is not the gradient of forward: off by {float(error):.1e}"
+        )
+    if vmap and not learner.batch_shape:
+        full = torch.func.vmap(torch.func.jacrev(learner))(x[:3])
+        error = (full - learner.linearize(x[:3])[1]).abs().max()
+        assert float(error) <= tolerance, "vmap of jacrev differs from linearize"
+
+
+def _check_modes(learner: ResidualLearner, x: Tensor) -> None:
+    mean = learner.train()(x)
+    assert torch.equal(mean, learner.eval()(x)), "train() and eval() predict differently"
+
+
+def _check_bad_input(learner: ResidualLearner, x: Tensor, y: Tensor) -> None:
+    before = _state(learner)
+    cases: list[tuple[str, Tensor, Tensor]] = [
+        ("width of x", x[0][..., :-1], y[0]),
+        ("width of y", x[0], torch.cat([y[0], y[0]], -1)),
+        ("empty batch", x[:0], y[:0]),
+        ("lengths", x[:3], y[:2]),
+    ]
+    for name, bad_x, bad_y in cases:
+        _raises(lambda a=bad_x, b=bad_y: learner.update(a, b), ShapeError, name)
+    if learner.on_invalid == "raise":
+        for value in (float("nan"), float("inf")):
+            for which in (0, 1):
+                pair = [x[:3].clone(), y[:3].clone()]
+                pair[which][2, ..., -1] = value  # the last of a block: the first must not stay
+                _raises(lambda p=pair: learner.update(*p), NonFiniteError, f"{value} in a sample")
+    _raises(lambda: learner(x[0][..., :-1]), ShapeError, "width of a query")
+    assert _same(before, _state(learner)), "a refused sample changed the state"
+
+
+def _check_mask(learner: ResidualLearner, x: Tensor, y: Tensor) -> None:
+    before, mask = learner(x), torch.zeros(learner.batch_shape, dtype=torch.bool, device=learner.device)
+    report = copy.deepcopy(learner).update(x[0], y[0], mask)
+    assert not bool(report.accepted.any()), "a masked sample is reported as accepted"
+    masked = copy.deepcopy(learner)
+    masked.update(torch.full_like(x[0], float("nan")), y[0], mask)
+    _close(masked(x), before, learner, "a masked sample changed predictions", factor=100)
+
+
+def _check_persistence(learner: ResidualLearner, factory: Callable, x: Tensor, y: Tensor) -> None:
+    file = io.BytesIO()
+    torch.save(learner.state_dict(), file)
+    file.seek(0)
+    fresh = factory(dtype=learner.dtype).to(learner.device)
+    fresh.load_state_dict(torch.load(file, weights_only=True))
+    copies = {
+        "state_dict": fresh,
+        "deepcopy": copy.deepcopy(learner),
+        "pickle": pickle.loads(pickle.dumps(learner)),
+    }
+    original = copy.deepcopy(learner)
+    original.update(x, y)
+    for name, other in copies.items():
+        assert torch.equal(other(x), learner(x)), f"{name}: the mean is not bit for bit the same"
+        assert torch.equal(other.predict(x).stddev, learner.predict(x).stddev), f"{name}: another deviation"
+        other.update(x, y)
+        assert torch.equal(other(x), original(x)), f"{name}: the stream does not continue identically"
+    single = copy.deepcopy(learner).to(torch.float32)
+    assert single(x.float()).dtype == torch.float32, ".to(float32) does not change predictions' dtype"
+    _close(single(x.float()).to(x), learner(x), single, ".to(float32) changed the prediction", factor=100)
+    single.update(x.float(), y.float())
+    _close(
+        single(x.float()).to(x), original(x), single, "after .to(float32) it learns differently", factor=1000
+    )
+
+
+def _check_batch_is_sequence(factory: Callable, learner: ResidualLearner, x: Tensor, y: Tensor) -> None:
+    block, single = (
+        factory(dtype=learner.dtype).to(learner.device),
+        factory(dtype=learner.dtype).to(learner.device),
+    )
+    block.update(x, y)
+    for t in range(len(x)):
+        single.update(x[t], y[t])
+    assert torch.equal(block(x), single(x)), "a block differs from its samples one by one"
+
+
+def _raises(call: Callable, error: type[EKMError], name: str) -> None:
+    try:
+        call()
+    except error:
+        return
+    raise AssertionError(f"{name}: expected a {error.__name__}")
+
+
+def _state(learner: ResidualLearner) -> dict[str, Tensor]:
+    return {k: copy.deepcopy(v) for k, v in learner.state_dict().items()}
+
+
+def _same(a: dict, b: dict) -> bool:
+    return a.keys() == b.keys() and all(
+        torch.equal(a[k], b[k]) if isinstance(a[k], Tensor) else a[k] == b[k] for k in a
+    )
+
+
+def _close(a: Tensor, b: Tensor, learner: ResidualLearner, message: str, factor: float = 1.0) -> None:
+    tolerance = factor * (1e-9 if learner.dtype == torch.float64 else 1e-5)
+    a, b = a.detach(), b.detach()
+    error = float((a - b).abs().max())
+    assert error <= tolerance * max(1.0, float(b.abs().max())), f"{message} (by {error:.1e})"
