@@ -86,9 +86,7 @@ def test_calibration_recovers_the_lens(target_views):
     # what counts: where points appear, over the whole image
     grid = np.stack(np.meshgrid(np.linspace(20, 620, 7), np.linspace(20, 460, 7)), axis=-1)
     rays = np.concatenate([LENS.rays(grid), np.ones((7, 7, 1))], axis=-1)
-    assert (
-        np.abs(found.project(rays) - grid)[1:-1, 1:-1].max() < 2.5
-    )  # px, the principal point's error included
+    assert np.abs(found.project(rays) - grid)[1:-1, 1:-1].max() < 2.5  # px
 
 
 def test_calibration_says_what_is_missing(target_views):

@@ -131,7 +131,7 @@ def _check_monotone(name: str, c: Tensor, low: float, high: float) -> None:
     """``q'(r) = c_1 + 2 c_2 r + 3 c_3 r^2`` must not change its sign between the ends."""
     r = torch.linspace(low, high, 512, dtype=torch.float64) / FULL_SCALE
     slope = c[1] + r * (2 * c[2] + 3 * r * c[3])
-    turning = torch.nonzero(torch.sign(slope) != torch.sign(slope[len(slope) // 2]))
+    turning = torch.nonzero(torch.sign(slope[1:]) != torch.sign(slope[:-1]))
     if len(turning):
         at = float(r[turning[0, 0]]) * FULL_SCALE
         raise NonMonotoneFitError(name, at, f"{low:.0f}..{high:.0f}")

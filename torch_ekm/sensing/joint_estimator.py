@@ -36,7 +36,9 @@ class JointEstimator:
     Args:
         hand: joints, actuation Jacobian and couplings; ``C q = 0`` is taken to hold, not just ``C dq = 0``.
         calibration: of its Hall channels.
-        encoder_std: s_a, standard deviation of an actuator's encoder [rad].
+        encoder_std: s_a, by how much an encoder and ``J_a q + a_0`` differ [rad]. The default is for encoders
+            at the motors of a loaded hand, behind cables that stretch by degrees in a pinch of 5 N; encoders at
+            the joints are good to half a degree.
         coupling_std: s_c, play of a rigid coupling [rad].
 
     Raises:
@@ -48,7 +50,7 @@ class JointEstimator:
         self,
         hand: HandDescription,
         calibration: HallCalibration,
-        encoder_std: float = 0.00873,  # 0.5 deg
+        encoder_std: float = 0.0436,  # 2.5 deg
         coupling_std: float = 0.0005,
     ) -> None:
         for name, value in (("encoder_std", encoder_std), ("coupling_std", coupling_std)):
