@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
+import tempfile
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from torch_ekm.description import load_hand, load_object
-from torch_ekm.exceptions import DescriptionError, JointMismatchError, UnknownNameError
+from torch_ekm.exceptions import DescriptionError, EKMError, JointMismatchError, UnknownNameError
 
 HAND, BOX = load_hand("planar_two_finger"), load_object("box")
 
@@ -95,9 +100,12 @@ TRANSMISSION_FAULTS = {
     ),
     "pad link": ('link = "left_1"', 'link = "left_9"', "unknown link 'left_9'; the URDF's links are: hand"),
     "pad radius": ("radius = 0.006", "radius = 0.0", "'radius' must be positive"),
-    "pad twice": ('name = "right"\nlink', 'name = "left"\nlink', "pad names must be unique"),
+    "pad twice": ('name = "right"\nlink', 'name = "left"\nlink', "each pad must be unique, repeated: left"),
     "base": ('base_link = "hand"', 'base_link = "left_1"', "moves with joint 'left_1'"),
     "no base": ('base_link = "hand"', 'base_link = "palm"', "unknown base_link 'palm'"),
+    "notes": ("[hand]", "notes = 3\n[hand]", "'notes' must be a table"),
+    "no joints": ("[joints]", "[notes]", "missing joints: left_0, left_1"),
+    "no hand": ("[hand]", "[notes]", r"\[hand\]: the table is missing"),
     "name": ('name = "planar_two_finger"', 'name = ""', "non-empty string"),
 }
 
@@ -169,6 +177,35 @@ def test_object_faults(fault: str, tmp_path: Path) -> None:
     path.write_text(text.replace(old, new) if fault == "massless" else text.replace(old, new, 1))
     with pytest.raises(DescriptionError, match=message):
         load_object(urdf)
+
+
+def test_a_hall_channel_is_read_once(tmp_path: Path) -> None:
+    icub = load_hand("icub_right")
+    (tmp_path / "my.urdf").write_text(icub.urdf_path.read_text())
+    text = icub.transmission_path.read_text()
+    (tmp_path / "my.transmission.toml").write_text(text.replace("channel = 1\n", "channel = 0\n"))
+    with pytest.raises(DescriptionError, match="each Hall channel must be unique, repeated: 0"):
+        load_hand(tmp_path / "my.urdf")
+
+
+JUNK = ["", "nan", "-1", "0", "1e999", "[]", "{}", '"x"', "<", "&", "true", "[[pads]]", "\x00", "é", "left_0"]
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(which=st.booleans(), at=st.floats(0, 1, exclude_max=True), junk=st.sampled_from(JUNK))
+def test_damaged_files_never_raise_anything_else(which: bool, at: float, junk: str) -> None:
+    """One word of either file replaced by junk: the hand loads, or the error is ours."""
+    with tempfile.TemporaryDirectory() as folder:
+        urdf, transmission = Path(folder, "my.urdf"), Path(folder, "my.transmission.toml")
+        texts = {urdf: HAND.urdf_path.read_text(), transmission: HAND.transmission_path.read_text()}
+        damaged = urdf if which else transmission
+        words = re.split(r"(\W)", texts[damaged])
+        words[int(at * len(words))] = junk
+        texts[damaged] = "".join(words)
+        for path, text in texts.items():
+            path.write_text(text, encoding="utf-8")
+        with contextlib.suppress(EKMError):
+            load_hand(urdf)
 
 
 def test_unknown_object() -> None:

@@ -32,6 +32,8 @@ class Table:
 
     def __init__(self, path: Path, place: str, data: Any, valid: Iterable[str]) -> None:
         self.path, self.place = path, place
+        if data is None:
+            raise self.error("the table is missing")
         if not isinstance(data, dict):
             raise self.error(f"must be a table, got {data!r}")
         self.data: dict[str, Any] = data
@@ -92,6 +94,13 @@ class Table:
         if self._in_degrees(key):
             return tuple(math.radians(value) for value in self.vector(f"{key}_deg", size))
         return self.vector(key, size, default)
+
+    def notes(self) -> dict[str, str]:
+        """The free text of the table ``[notes]``, if there is one."""
+        value = self._get("notes", {})
+        if not isinstance(value, dict):
+            raise self.error(f"'notes' must be a table, got {value!r}")
+        return {name: str(text) for name, text in value.items()}
 
     def weights(self, key: str) -> dict[str, float]:
         """A table of numbers, e.g. moment arms by joint name; not empty."""

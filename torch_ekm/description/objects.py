@@ -76,5 +76,5 @@ def read_object(path: Path, urdf: UrdfModel) -> ObjectDescription:
         marker_transform=pose(np.array(xyz), np.array(rpy)),
         grasp_axis=axis / np.linalg.norm(axis),
         grasp_width=table.number("grasp_width", positive=True),
-        notes={str(key): str(value) for key, value in top.data.get("notes", {}).items()},
+        notes=top.notes(),
     )

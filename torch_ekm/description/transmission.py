@@ -53,8 +53,10 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
     K_s = springs[:, 0]
     _check_mechanism(path, names, J_a, C, K_s)
     pads = _each(top, "pads", lambda place, data: _pad(path, place, data, urdf))
+    hall = _each(top, "hall_sensors", lambda place, data: _hall(path, place, data, names))
     _check_unique(path, "actuator", [actuator.name for actuator, _ in actuators])
     _check_unique(path, "pad", [pad.name for pad in pads])
+    _check_unique(path, "Hall channel", [str(sensor.channel) for sensor in hall])
     normal = hand.vector("planar_normal", 3) if "planar_normal" in hand.data else None
     return HandDescription(
         name=hand.text("name"),
@@ -72,9 +74,9 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
         spring_rest=springs[:, 1],
         joint_friction=springs[:, 2],
         pads=tuple(pads),
-        hall_sensors=tuple(_each(top, "hall_sensors", lambda place, data: _hall(path, place, data, names))),
+        hall_sensors=tuple(hall),
         planar_normal=None if normal is None else (normal[0], normal[1], normal[2]),
-        notes={str(key): str(value) for key, value in top.data.get("notes", {}).items()},
+        notes=top.notes(),
         urdf=urdf,
     )
 
@@ -207,4 +209,4 @@ def _check_unique(path: Path, kind: str, names: Iterable[str]) -> None:
     names = list(names)
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise DescriptionError(path, f"{kind} names must be unique, repeated: {', '.join(twice)}")
+        raise DescriptionError(path, f"each {kind} must be unique, repeated: {', '.join(twice)}")
