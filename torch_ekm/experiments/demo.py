@@ -75,10 +75,10 @@ def make_enhanced(model: KinematicModel, reference: GraspState, capacity: int) -
     hand = model.hand
     encode = GraspEncoding(reference, grasping_joints(hand, model, reference))
     n_s, n_a = encode.n_features, hand.n_a
-    state_kernel = SquaredExponential(n_s, lengthscale=3.0)
-    kernel = ActionLinearKernel(n_s + n_a, n_a, state_kernel=state_kernel, action_variance=0.5)
+    state_kernel = SquaredExponential(n_s, lengthscale=6.0)
+    kernel = ActionLinearKernel(n_s + n_a, n_a, state_kernel=state_kernel, action_variance=0.1)
     learner = SparseOnlineGP(
-        n_s + n_a, 6, capacity=capacity, kernel=kernel, noise_variance=0.05, robust=3.0, forgetting=0.995
+        n_s + n_a, 6, capacity=capacity, kernel=kernel, noise_variance=0.1, robust=3.0, forgetting=0.995
     )
     scale = torch.tensor([1 / _MM] * 3 + [1 / _DEG] * 3, dtype=torch.float64)
     rows = list(range(hand.n_q, hand.n_q + 6))

@@ -202,6 +202,7 @@ def save_animation(scene: Scene, path: Path, frame_seconds: float = 0.25) -> Pat
         server.initial_camera.position = tuple(position)
         server.initial_camera.look_at = tuple(focus)
         server.initial_camera.up = tuple(up)
+        server.initial_camera.fov = 0.6  # [rad]
         rotation = require("scipy.spatial.transform").Rotation
         for frame in scene.transforms:
             with server.atomic():
