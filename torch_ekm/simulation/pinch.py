@@ -45,7 +45,7 @@ class PinchPlanner:
         guesses: how many first guesses are tried before giving up.
     """
 
-    def __init__(self, problem: PinchProblem, guesses: int = 8) -> None:
+    def __init__(self, problem: PinchProblem, guesses: int = 4) -> None:
         self.problem, self.guesses = problem, guesses
 
     def plan(self, request: PinchRequest) -> PinchPlan:
@@ -65,7 +65,7 @@ class PinchPlanner:
                 jac=lambda x: problem.jacobian(x, request),
                 bounds=(low, high),
                 x_scale="jac",
-                max_nfev=200,
+                max_nfev=150,
                 ftol=1e-9,
                 xtol=1e-9,
                 gtol=1e-9,

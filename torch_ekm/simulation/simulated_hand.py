@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 _FORCE_WINDOW = 10  # steps over which a fingertip force is averaged
 _STILL = 2e-3  # [rad/s] and [m/s x 10]: slower than this is settled
-_ATTEMPTS = 6
+_ATTEMPTS = 5
 
 
 class PlantSnapshot(NamedTuple):
@@ -95,18 +95,18 @@ class SimulatedHand:
             GraspError: the planned pinches did not hold the object.
         """
         self._generator = np.random.default_rng(seed)
-        failure: Exception | None = None
+        unplanned = 0
         for _ in range(_ATTEMPTS):
             try:
                 plan = self._planner.plan(self._request())
-            except EquilibriumError as error:
-                failure = error
+            except EquilibriumError:
+                unplanned += 1
+                if unplanned == 2:
+                    raise
                 continue
             self._grasp(plan)
             if self.status is PlantStatus.HELD:
                 return self.observe()
-        if failure is not None:
-            raise failure
         raise GraspError(
             f"none of {_ATTEMPTS} planned pinches of '{self.object.name}' held it (seed {seed}); "
             "a higher pinch_force, friction or another gravity direction may help"

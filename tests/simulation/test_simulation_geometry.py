@@ -1,0 +1,88 @@
+"""Signed distances against coal and finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from torch_ekm.description.shape import Shape
+from torch_ekm.simulation.bodies import x_axis_to
+from torch_ekm.simulation.geometry import scaled, signed_distance
+
+coal = pytest.importorskip("coal")
+
+SIZES = {"box": (0.09, 0.03, 0.04), "cylinder": (0.02, 0.08), "sphere": (0.025,), "capsule": (0.015, 0.06)}
+
+
+def placed(kind, seed=0):
+    generator = np.random.default_rng(seed)
+    transform = x_axis_to(generator.standard_normal(3))
+    transform[:3, 3] = generator.uniform(-0.02, 0.02, 3)
+    return Shape(kind, SIZES[kind], transform)
+
+
+def coal_solid(shape):
+    if shape.kind == "box":
+        return coal.Box(*shape.size)
+    return {"cylinder": coal.Cylinder, "sphere": coal.Sphere, "capsule": coal.Capsule}[shape.kind](
+        *shape.size
+    )
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_distance_outside_agrees_with_coal(kind):
+    shape, generator = placed(kind), np.random.default_rng(1)
+    pose = coal.Transform3s(shape.transform[:3, :3], shape.transform[:3, 3])
+    checked = 0
+    for point in generator.uniform(-0.08, 0.08, (200, 3)):
+        result = coal.DistanceResult()
+        radius = 1e-4
+        ball = coal.Transform3s(np.eye(3), point)
+        expected = coal.distance(
+            coal_solid(shape), pose, coal.Sphere(radius), ball, coal.DistanceRequest(), result
+        )
+        if expected > 1e-3:
+            distance, _ = signed_distance((shape,), point)
+            assert distance == pytest.approx(expected + radius, abs=2e-6)
+            checked += 1
+    assert checked > 50
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_normal_is_the_gradient_inside_and_outside(kind):
+    shape, generator, step = placed(kind), np.random.default_rng(2), 1e-7
+    points = generator.uniform(-0.06, 0.06, (300, 3))
+    distance, normal = signed_distance((shape,), points)
+    assert (distance < 0).any()
+    assert (distance > 0).any()
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1.0, atol=1e-12)
+    gradient = np.stack(
+        [
+            (
+                signed_distance((shape,), points + step * e)[0]
+                - signed_distance((shape,), points - step * e)[0]
+            )
+            / (2 * step)
+            for e in np.eye(3)
+        ],
+        axis=-1,
+    )
+    smooth = np.abs(np.linalg.norm(gradient, axis=-1) - 1) < 1e-5  # not across an inner edge
+    assert smooth.mean() > 0.95
+    np.testing.assert_allclose(gradient[smooth], normal[smooth], atol=1e-5)
+
+
+def test_a_union_is_as_near_as_its_nearest_part():
+    shapes = (placed("box", 3), placed("sphere", 4))
+    points = np.random.default_rng(5).uniform(-0.08, 0.08, (2, 50, 3))
+    both = signed_distance(shapes, points)[0]
+    assert both.shape == (2, 50)
+    single = [signed_distance((shape,), points)[0] for shape in shapes]
+    np.testing.assert_allclose(both, np.minimum(*single))
+
+
+def test_scaling_scales_the_distance():
+    shape, points = placed("capsule"), np.random.default_rng(6).uniform(-0.08, 0.08, (20, 3))
+    np.testing.assert_allclose(
+        signed_distance((scaled(shape, 1.2),), 1.2 * points)[0], 1.2 * signed_distance((shape,), points)[0]
+    )

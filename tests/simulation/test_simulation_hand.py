@@ -1,0 +1,207 @@
+"""The simulated hand: grasp, hold, repeat, restore, lose."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+from simulation_helpers import DEG, ROLL, SQUEEZE, motion
+
+from torch_ekm.exceptions import (
+    EquilibriumError,
+    GraspError,
+    NonFiniteError,
+    ParameterError,
+    ShapeError,
+    UnknownNameError,
+)
+from torch_ekm.simulation import Plant, PlantConfig, PlantParameters, PlantStatus, SimulatedHand
+
+pytest.importorskip("sapien")
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return SimulatedHand("icub_right", "box")
+
+
+@pytest.fixture(scope="module")
+def grasped(plant):
+    """A fresh grasp to return to, so that tests don't depend on each other."""
+    plant.reset(0)
+    return plant.snapshot()
+
+
+def test_it_is_a_plant(plant):
+    assert isinstance(plant, Plant)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_it_holds_still_for_ten_seconds(plant, seed):
+    before = plant.reset(seed)
+    assert before.status is PlantStatus.HELD
+    start = time.process_time()
+    plant.wait(10.0)
+    cost = time.process_time() - start
+    moved, turned = motion(before, plant.observe())
+    assert moved.norm() < 1e-4 / 100  # the target is 0.1 mm and 0.1 deg
+    assert turned.norm() < 0.1 * DEG / 100
+    assert 10.0 / cost > 8.0  # times faster than real time, on one core
+
+
+def test_the_grasp_is_the_planned_one(plant, grasped):
+    truth = plant.restore(grasped).info["truth"]
+    plan = plant.plan
+    assert np.linalg.norm(truth["position"].numpy() - plan.position) < 1e-3
+    assert np.abs(truth["q"].numpy() - plan.q).max() < 1.0 * DEG
+    wanted = -np.einsum("ci,ci->c", plan.forces, plan.normals)
+    np.testing.assert_allclose(truth["fingertip_force"][:3], wanted, rtol=0.15)
+    assert wanted[0] == pytest.approx(plant.config.pinch_force, rel=0.01)
+
+
+def test_contact_forces_balance_the_weight(plant, grasped):
+    """PhysX reports normal forces; along the pinch line they must cancel up to weight and friction."""
+    force = plant.restore(grasped).info["truth"]["fingertip_force"]
+    assert abs(float(force[0] - force[1] - force[2])) < plant.object.mass * 9.81 + 0.2
+
+
+def test_pinch_force_is_what_was_asked(grasped):
+    for wanted in (3.0, 8.0):
+        plant = SimulatedHand("icub_right", "box", PlantConfig(pinch_force=wanted))
+        assert plant.reset(0).fingertip_force[0] == pytest.approx(wanted, rel=0.03)
+
+
+def run(plant, seed):
+    readings = [plant.reset(seed)]
+    readings += [plant.command(delta) for delta in (ROLL, SQUEEZE, -ROLL)]
+    parts = [(o.q, o.a, o.position, o.rotation.flatten(), o.fingertip_force) for o in readings]
+    return torch.cat([torch.cat(part) for part in parts])
+
+
+@pytest.mark.parametrize("parameters", [PlantParameters.exact(), PlantParameters.nominal_mismatch()])
+def test_one_seed_gives_one_run_bit_by_bit(parameters):
+    first, second = (SimulatedHand("icub_right", "box", parameters=parameters) for _ in range(2))
+    a = run(first, 3)
+    assert torch.equal(a, run(second, 3))
+    assert torch.equal(a, run(first, 3))  # and nothing is left of the run before
+    assert not torch.equal(a, run(second, 4))
+
+
+def test_a_snapshot_can_be_returned_to_bit_by_bit():
+    plant = SimulatedHand("icub_right", "box", parameters=PlantParameters.nominal_mismatch())
+    plant.reset(5)
+    plant.command(ROLL)
+    snapshot = plant.snapshot()
+
+    def go_on():
+        start = plant.restore(snapshot)
+        end = plant.command(ROLL)
+        return torch.cat([start.position, start.q, end.position, end.q, end.a, end.fingertip_force])
+
+    first = go_on()
+    plant.command(SQUEEZE)
+    assert torch.equal(first, go_on())
+
+
+def test_restored_and_unbroken_runs_differ_by_micrometres(plant, grasped):
+    plant.reset(0)
+    unbroken = plant.command(ROLL).info["truth"]["position"]
+    plant.restore(grasped)
+    restored = plant.command(ROLL).info["truth"]["position"]
+    assert (unbroken - restored).norm() < 20e-6
+
+
+def test_a_command_takes_half_a_second_or_more(plant, grasped):
+    start = plant.restore(grasped)
+    assert plant.command(ROLL).time - start.time >= 0.5
+    assert plant.command(20 * ROLL).time - start.time >= 1.0
+
+
+def test_encoders_show_where_the_motors_went(plant, grasped):
+    start = plant.restore(grasped)
+    torch.testing.assert_close(plant.command(ROLL).a, start.a + ROLL)
+
+
+def test_rolling_fingers_turn_the_object_about_the_rotation_axis(plant, grasped):
+    start = plant.restore(grasped)
+    _, turned = motion(start, plant.command(ROLL))
+    axis = plant.rotation_axis
+    assert axis.norm() == pytest.approx(1.0)
+    assert axis[1] > 0.9  # the iCub's y: square to the planes in which thumb and fingers bend
+    assert float(turned @ axis) > 1.5 * DEG
+
+
+def test_squeezing_raises_the_forces(plant, grasped):
+    start = plant.restore(grasped)
+    assert plant.command(SQUEEZE).fingertip_force[0] > start.fingertip_force[0] + 0.3
+
+
+def test_opening_the_hand_loses_the_object(plant, grasped):
+    plant.restore(grasped)
+    assert plant.command(-10 * SQUEEZE).status is PlantStatus.LOST
+
+
+def test_a_hard_tug_loses_the_object_and_a_gentle_one_does_not(plant, grasped):
+    plant.restore(grasped)
+    assert plant.tug(np.array([0.0, 0.0, 0.3]), np.zeros(3)).status is PlantStatus.HELD
+    assert plant.tug(np.array([0.0, 0.0, 100.0]), np.zeros(3), 0.1).status is PlantStatus.LOST
+
+
+@pytest.mark.parametrize("hand, gravity", [("icub_left", (0, 0, 9.81)), ("planar_two_finger", (0, -9.81, 0))])
+def test_other_hands_hold_too(hand, gravity):
+    plant = SimulatedHand(hand, "box", PlantConfig(gravity=gravity))
+    before = plant.reset(0)
+    plant.wait(2.0)
+    moved, turned = motion(before, plant.observe())
+    assert moved.norm() < 1e-5
+    assert turned.norm() < 0.01 * DEG
+
+
+def test_bad_commands_are_refused_and_move_nothing(plant, grasped):
+    before = plant.restore(grasped)
+    for bad, error in ((torch.zeros(8), ShapeError), (torch.full((9,), torch.nan), NonFiniteError)):
+        with pytest.raises(error):
+            plant.command(bad)
+    assert torch.equal(plant.observe().info["truth"]["q"], before.info["truth"]["q"])
+
+
+def test_errors_say_what_would_be_right():
+    with pytest.raises(UnknownNameError, match="box"):
+        SimulatedHand("icub_right", "bocks")
+    with pytest.raises(UnknownNameError, match="thumb"):
+        SimulatedHand("icub_right", "box", PlantConfig(thumb="toe"))
+    with pytest.raises(GraspError, match="reset"):
+        SimulatedHand("icub_right", "box").observe()
+    with pytest.raises(ParameterError, match="9"):
+        SimulatedHand("icub_right", "box", parameters=PlantParameters(moment_arm=(1.0, 2.0)))
+    with pytest.raises(EquilibriumError, match="box"):
+        SimulatedHand("icub_right", "box", parameters=PlantParameters(object_scale=4.0)).reset(0)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"spring": 0.0}, {"dead_zone": -1.0}, {"mass": float("nan")}, {"frame_loss": 2.0}, {"sprung": 1.0}],
+)
+def test_impossible_parameters_are_refused(changes):
+    with pytest.raises(ParameterError, match=next(iter(changes))):
+        PlantParameters.exact().replace(**changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"time_step": 0.0}, {"time_step": 0.1}, {"along": (0, 0, 0)}, {"gravity": (0, 0)}, {"tilt": -1}],
+)
+def test_impossible_settings_are_refused(changes):
+    with pytest.raises(ParameterError, match=next(iter(changes))):
+        PlantConfig(**changes)
+
+
+def test_importing_the_simulator_warns_of_nothing():
+    code = "from torch_ekm.simulation.engine import sapien; sapien()"
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "ulkan" not in done.stderr

@@ -1,0 +1,59 @@
+"""Two independent implementations of one hand: PhysX and the kinematic model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from simulation_helpers import DEG
+
+from torch_ekm.kinematics.se3 import log
+from torch_ekm.model import GraspState, KinematicModel, ModelOptions
+from torch_ekm.simulation import SimulatedHand
+
+pytest.importorskip("sapien")
+
+STEP = 0.1 * DEG  # small enough that no contact slips
+
+
+def state_of(truth):
+    return GraspState(truth["q"], truth["position"], truth["rotation"])
+
+
+@pytest.fixture(scope="module", params=["box", "can"])
+def grasp(request):
+    plant = SimulatedHand("icub_right", request.param)
+    truth = plant.reset(0).info["truth"]
+    model = KinematicModel(plant.hand, plant.object, ModelOptions(gravity=plant.config.gravity))
+    return plant, truth, model.linearize(state_of(truth))
+
+
+def test_detected_contacts_are_where_the_simulator_touches(grasp):
+    _, _, linear = grasp
+    assert linear.contacts.finger == ("thumb", "index", "middle")
+    assert linear.contacts.gap.abs().max() < 5e-6
+
+
+def test_forces_of_the_model_are_those_of_the_simulator(grasp):
+    _, truth, linear = grasp
+    torch.testing.assert_close(linear.forces.normal, truth["fingertip_force"][:3], rtol=0.05, atol=0.02)
+    torch.testing.assert_close(-linear.forces.lam, truth["actuator_torque"], rtol=0.05, atol=0.01)
+    assert linear.forces.residual.abs().max() < 1e-4  # [N m] of about 0.1
+
+
+def test_manipulation_jacobian_is_what_the_simulator_does(grasp):
+    plant, _, linear = grasp
+    snapshot, measured = plant.snapshot(), []
+    for k in range(plant.hand.n_a - 1):  # the pinky rests at its lower limit
+        ends = []
+        for sign in (1.0, -1.0):
+            plant.restore(snapshot)
+            delta = torch.zeros(plant.hand.n_a, dtype=torch.float64)
+            delta[k] = sign * STEP
+            ends.append(plant.command(delta).info["truth"])
+        plus, minus = ends
+        column = [plus["position"] - minus["position"], log(plus["rotation"] @ minus["rotation"].mT) * 0.03]
+        measured.append(torch.cat(column).numpy() / (2 * STEP))
+    measured = np.array(measured).T
+    predicted = linear.manipulation_jacobian[-6:, :-1].numpy() * np.array([[1.0]] * 3 + [[0.03]] * 3)
+    assert np.linalg.norm(predicted - measured) < 0.03 * np.linalg.norm(measured)

@@ -1,0 +1,157 @@
+"""Tendons, couplings, springs and friction, without a physics engine."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from torch_ekm.description import load_hand
+from torch_ekm.exceptions import ParameterError
+from torch_ekm.simulation.transmission import Transmission, coupled_posture
+
+
+def make(hand=None, friction=0.0, **changes):
+    hand = load_hand("icub_right") if hand is None else hand
+    figures = {
+        "actuation_jacobian": hand.actuation_jacobian,
+        "stiffness": np.full(hand.n_a, 4.0),
+        "spring_stiffness": hand.spring_stiffness,
+        "friction": np.full(hand.n_q, friction),
+    }
+    return hand, Transmission(hand, **{**figures, **changes})
+
+
+def torque(transmission, q, motor):
+    """What the drives of :class:`Transmission` give at ``q``."""
+    return transmission.drive_stiffness * (transmission.drive_targets(q, motor) - q)
+
+
+def flexed(hand, generator):
+    return hand.joint_lower + generator.uniform(0.2, 0.6, hand.n_q) * (hand.joint_upper - hand.joint_lower)
+
+
+def test_drives_give_the_gradient_of_the_elastic_energy():
+    hand, transmission = make()
+    generator = np.random.default_rng(0)
+    q = coupled_posture(hand.coupling) @ flexed(hand, generator)
+    motor = hand.actuator_offset + hand.actuation_jacobian @ q + 0.1  # taut everywhere
+
+    def energy(x):
+        stretch = motor - hand.actuator_offset - hand.actuation_jacobian @ coupled_posture(hand.coupling) @ x
+        away = x - coupled_posture(hand.coupling) @ x
+        spring = hand.spring_stiffness @ (x - hand.spring_rest) ** 2
+        return (spring + 4.0 * stretch @ stretch + 8.0 * away @ away) / 2
+
+    step = 1e-6
+    gradient = [(energy(q + step * e) - energy(q - step * e)) / (2 * step) for e in np.eye(hand.n_q)]
+    np.testing.assert_allclose(torque(transmission, q, motor), -np.array(gradient), atol=1e-8)
+
+
+def test_couplings_hold_for_the_joints_that_lead():
+    hand, _ = make()
+    S = coupled_posture(hand.coupling)
+    np.testing.assert_allclose(hand.coupling @ S, 0.0, atol=1e-12)
+    np.testing.assert_allclose(S @ S, S, atol=1e-12)
+    assert S[hand.joint_names.index("index_0"), hand.joint_names.index("index_0")] == 1.0
+
+
+def test_equilibrium_is_where_the_drives_rest():
+    hand, transmission = make()
+    motor = hand.actuator_offset + np.array([-0.3, 0.8, 0.4, 1.0, 0.5, 1.2, 0.3, 0.9, 0.6])
+    load = np.zeros(hand.n_q)
+    load[hand.joint_names.index("index_3")] = -0.05
+    q = transmission.equilibrium(motor, load)
+    np.testing.assert_allclose(torque(transmission, q, motor), -load, atol=1e-10)
+
+
+def test_free_joints_of_a_tendon_share_its_travel_evenly():
+    hand, transmission = make()
+    motor = hand.actuator_offset.copy()
+    motor[hand.actuator_names.index("index_distal")] = 1.0
+    q = transmission.equilibrium(motor)
+    share = q[[hand.joint_names.index("index_2"), hand.joint_names.index("index_3")]]
+    # 2 springs of 0.15 in series with 4 N m/rad on their sum: 0.15 x = 4 (1 - 2 x)
+    np.testing.assert_allclose(share, 4.0 / 8.15, atol=1e-3)
+
+
+def test_a_slack_tendon_does_not_push_and_a_looped_cable_does():
+    hand, transmission = make()
+    q = flexed(hand, np.random.default_rng(1))
+    q = coupled_posture(hand.coupling) @ q
+    motor = hand.actuator_offset + hand.actuation_jacobian @ q
+    distal, proximal = hand.actuator_names.index("index_distal"), hand.actuator_names.index("index_proximal")
+    motor[[distal, proximal]] -= 0.2
+    torques = transmission.actuator_torque(q, motor)
+    assert torques[distal] == 0.0
+    assert torques[proximal] == pytest.approx(-0.8)
+    j2 = hand.joint_names.index("index_2")
+    spring = -hand.spring_stiffness[j2] * (q[j2] - hand.spring_rest[j2])
+    assert torque(transmission, q, motor)[j2] == pytest.approx(spring)
+
+
+def test_friction_holds_up_to_its_torque_and_no_further():
+    hand, transmission = make(friction=0.02)
+    _, smooth = make()
+    joint = hand.joint_names.index("thumb_1")
+    q = coupled_posture(hand.coupling) @ flexed(hand, np.random.default_rng(2))
+    motor = hand.actuator_offset + hand.actuation_jacobian @ q + 0.05
+    transmission.relax(q)
+    for offset, expected in ((0.001, 0.003), (0.02, 0.02), (0.2, 0.02), (0.19, -0.01), (0.1, -0.02)):
+        moved = q.copy()
+        moved[joint] += offset
+        resisting = torque(smooth, moved, motor)[joint] - torque(transmission, moved, motor)[joint]
+        assert resisting == pytest.approx(expected, abs=1e-9)
+
+
+def test_lengthened_tendons_slacken_and_cables_do_not():
+    hand, transmission = make()
+    q = coupled_posture(hand.coupling) @ flexed(hand, np.random.default_rng(3))
+    motor = hand.actuator_offset + hand.actuation_jacobian @ q + 0.1
+    before = transmission.stretch(q, motor)
+    transmission.lengthen(0.03)
+    tendon = np.array([actuator.tendon for actuator in hand.actuators])
+    np.testing.assert_allclose(before - transmission.stretch(q, motor), 0.03 * tendon, atol=1e-12)
+
+
+def test_creep_follows_the_load():
+    hand, transmission = make(creep=0.01)
+    q = coupled_posture(hand.coupling) @ flexed(hand, np.random.default_rng(4))
+    motor = hand.actuator_offset + hand.actuation_jacobian @ q + 0.1
+    transmission.age(q, motor, duration=5.0)
+    tendon = np.array([actuator.tendon for actuator in hand.actuators])
+    np.testing.assert_allclose(
+        transmission.offset - hand.actuator_offset, 0.01 * 5.0 * 0.4 * tendon, atol=1e-9
+    )
+
+
+def test_a_new_tendon_takes_over_the_stretch_of_the_old():
+    hand, old = make()
+    _, new = make(actuation_jacobian=1.3 * hand.actuation_jacobian)
+    q = coupled_posture(hand.coupling) @ flexed(hand, np.random.default_rng(5))
+    motor = hand.actuator_offset + hand.actuation_jacobian @ q + 0.1
+    new.take_over(old, q)
+    np.testing.assert_allclose(new.stretch(q, motor), old.stretch(q, motor), atol=1e-12)
+
+
+def test_a_hand_without_couplings():
+    hand, transmission = make(load_hand("planar_two_finger"))
+    q = transmission.equilibrium(np.full(hand.n_a, 0.5))
+    np.testing.assert_allclose(torque(transmission, q, np.full(hand.n_a, 0.5)), 0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["stiffness", "spring_stiffness"])
+@pytest.mark.parametrize("bad", [-1.0, np.nan, np.inf])
+def test_impossible_stiffness_is_refused(name, bad):
+    hand = load_hand("planar_two_finger")
+    size = hand.n_a if name == "stiffness" else hand.n_q
+    with pytest.raises(ParameterError, match=name):
+        make(hand, **{name: np.full(size, bad)})
+
+
+def test_description_is_not_changed():
+    hand, transmission = make()
+    offset = dataclasses.replace(hand).actuator_offset.copy()
+    transmission.lengthen(0.1)
+    np.testing.assert_array_equal(hand.actuator_offset, offset)
