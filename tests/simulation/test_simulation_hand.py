@@ -151,7 +151,9 @@ def test_a_hard_tug_loses_the_object_and_a_gentle_one_does_not(plant, grasped):
     assert plant.tug(np.array([0.0, 0.0, 100.0]), np.zeros(3), 0.1).status is PlantStatus.LOST
 
 
-@pytest.mark.parametrize("hand, gravity", [("icub_left", (0, 0, 9.81)), ("planar_two_finger", (0, -9.81, 0))])
+@pytest.mark.parametrize(
+    ("hand", "gravity"), [("icub_left", (0, 0, 9.81)), ("planar_two_finger", (0, -9.81, 0))]
+)
 def test_other_hands_hold_too(hand, gravity):
     plant = SimulatedHand(hand, "box", PlantConfig(gravity=gravity))
     before = plant.reset(0)

@@ -82,7 +82,7 @@ def test_snapshot_brings_everything_back():
     np.testing.assert_allclose(servo.setpoint, [0.6, 0.7, 0.4])
 
 
-@pytest.mark.parametrize("delta, error", [([0.1, 0.1], ShapeError), ([0.1, np.nan, 0.1], NonFiniteError)])
+@pytest.mark.parametrize(("delta", "error"), [([0.1, 0.1], ShapeError), ([0.1, np.nan, 0.1], NonFiniteError)])
 def test_bad_commands_change_nothing(delta, error):
     servo = make()
     with pytest.raises(error):
