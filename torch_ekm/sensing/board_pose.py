@@ -30,7 +30,9 @@ class BoardPose:
     n_rejected: int
     """Corners that disagreed with the others and were left out."""
     ambiguous: bool
-    """Another pose explains the corners as well; ``prior`` decided, if one was given."""
+    """Another pose explains the image as well; ``prior`` decided, if one was given."""
+    mirror: tuple[Array, Array] | None = None
+    """Rotation and position of the other local minimum, unless it is clearly worse."""
 
 
 def estimate_board_pose(
@@ -46,9 +48,9 @@ def estimate_board_pose(
 
     A planar target has two local minima, mirrored about the line of sight. Both are computed in
     closed form (IPPE, Collins and Bartoli, IJCV 2014) and refined by Levenberg-Marquardt; the
-    better one counts. Where its advantage is below nine units of ``chi^2 = sum r^2 / corner_std^2``
-    and the two differ by more than 10 deg the result is ``ambiguous``, and the one nearer to
-    ``prior`` is taken.
+    better one counts, and the other is kept as ``mirror`` unless it is worse by a hundred units of
+    ``chi^2 = sum r^2 / corner_std^2``. Where it is worse by less than nine and the two differ by
+    more than 10 deg the result is ``ambiguous``, and the one nearer to ``prior`` is taken.
 
     Corners farther than ``max_residual`` from the fit, or than four robust deviations, are left
     out, the worst first (a corner half hidden by a finger is found, but at a wrong place).
@@ -112,20 +114,23 @@ def _choose(
     prior: Array | None,
     n_rejected: int,
 ) -> BoardPose:
-    chosen, ambiguous = candidates[0], False
+    chosen, ambiguous, mirror = candidates[0], False, None
     if len(candidates) > 1:
         other = candidates[1]
-        advantage = (np.sum(other[2] ** 2) - np.sum(chosen[2] ** 2)) / corner_std**2
-        ambiguous = bool(advantage < 9 and _angle(chosen[0], other[0]) > np.radians(10))
-        if ambiguous and prior is not None and _angle(other[0], prior) < _angle(chosen[0], prior):
-            chosen = other
+        worse = (np.sum(other[2] ** 2) - np.sum(chosen[2] ** 2)) / corner_std**2
+        if worse < 100 and angle_between(chosen[0], other[0]) > np.radians(2):
+            mirror = other[:2]
+        ambiguous = bool(worse < 9 and angle_between(chosen[0], other[0]) > np.radians(10))
+        if ambiguous and prior is not None:
+            nearer = angle_between(other[0], prior) < angle_between(chosen[0], prior)
+            chosen, mirror = (other, chosen[:2]) if nearer else (chosen, mirror)
     rotation, position, residual = chosen
     J = projection_jacobian(camera, X, rotation, position)
     freedom = max(2 * len(X) - 6, 1)
     variance = max(corner_std**2, float(np.sum(residual**2)) / freedom)
     covariance = np.asarray(variance * np.linalg.inv(J.T @ J), dtype=np.float64)
     rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
-    return BoardPose(rotation, position, covariance, rms, len(X), n_rejected, ambiguous)
+    return BoardPose(rotation, position, covariance, rms, len(X), n_rejected, ambiguous, mirror)
 
 
 def projection_jacobian(camera: PinholeCamera, X: Array, rotation: Array, position: Array) -> Array:
@@ -142,6 +147,6 @@ def projection_jacobian(camera: PinholeCamera, X: Array, rotation: Array, positi
     return np.concatenate([by_position, -by_position @ skew], axis=-1).reshape(-1, 6)
 
 
-def _angle(a: Array, b: Array) -> float:
+def angle_between(a: Array, b: Array) -> float:
     """Angle of ``a b^T`` [rad]."""
     return float(np.arccos(np.clip((np.trace(a @ b.T) - 1) / 2, -1, 1)))

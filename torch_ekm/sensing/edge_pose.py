@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .._extras import require
 from .board import MarkerBoard
-from .board_pose import BoardPose, projection_jacobian
+from .board_pose import BoardPose, angle_between, projection_jacobian
 from .camera import PinholeCamera
 
 Array = NDArray[np.float64]
 
+_ITERATIONS = 3
+_REACH = 2.0  # a point of the board that moves farther went to the edge of something else [px]
 _PER_SIDE = 12  # places looked at along each side of a marker
 _CORRELATED = 3.0  # samples along a side share their errors: three count as one
 _STEP = 0.25  # distance of samples across the edge [px]
+
+
+class _Fit(NamedTuple):
+    rotation: Array
+    position: Array
+    covariance: Array
+    residual: Array
+    """Distance of each side point from its edge, infinite where there is none, ``(n,)`` [px]."""
 
 
 def refine_on_edges(
@@ -25,7 +36,7 @@ def refine_on_edges(
     board: MarkerBoard,
     pose: BoardPose,
     edge_std: float = 0.03,
-    iterations: int = 3,
+    prior: Array | None = None,
 ) -> BoardPose:
     r"""``min_{R, t} sum_i (n_i . (e_i - pi(R X_i + t)))^2``: sides of markers against edges in the image.
 
@@ -34,8 +45,11 @@ def refine_on_edges(
     each side the grey level rises from black to white; the area under the profile,
     ``s = s_max - int (I - I_black) / (I_white - I_black) ds``, gives the edge along the normal
     ``n_i``. Places that do not look like an edge of the board (a finger before it, glare) are left
-    out, and so are those beyond three robust deviations. Gauss-Newton on the twist, as many
-    times as ``iterations`` says.
+    out, and so are those beyond three robust deviations. Gauss-Newton on the twist, three times.
+
+    Where the corners left a ``mirror`` image, it is refined too and the better of both is taken; the
+    result is ``ambiguous`` if they differ by more than 10 deg and by less than nine units of ``chi^2``,
+    and then ``prior`` decides.
 
     Args:
         image: grey levels, ``(height, width)``.
@@ -43,38 +57,70 @@ def refine_on_edges(
         board: the board whose pose is given.
         pose: a pose from corners, right to about a pixel.
         edge_std: standard deviation of the place of an edge [px].
-        iterations: Gauss-Newton steps.
+        prior: rotation ``(3, 3)`` of the board that is to be expected.
 
     Returns:
         The refined pose with its covariance, or ``pose`` itself where too little of the board's
         edges can be seen.
     """
+    starts = [(pose.rotation, pose.position)] + ([pose.mirror] if pose.mirror is not None else [])
+    fits = [_fit(image, camera, board, start, edge_std) for start in starts]
+    found = [fit for fit in fits if fit is not None]
+    if not found:
+        return pose
+    ambiguous = False
+    if len(found) == 2:
+        seen = [fit.residual[np.isfinite(fit.residual)] for fit in found]
+        variance = max(edge_std**2, min(float(np.median(r**2)) * 2.2 for r in seen)) * _CORRELATED
+        costs = [float(np.minimum(fit.residual**2 / variance, 9.0).sum()) for fit in found]
+        found = [found[k] for k in np.argsort(costs)]
+        apart = angle_between(found[0].rotation, found[1].rotation) > np.radians(10)
+        ambiguous = bool(apart and abs(costs[1] - costs[0]) < 9)
+        if ambiguous and prior is not None:
+            found.sort(key=lambda fit: angle_between(fit.rotation, prior))
+    best = found[0]
+    mirror = (found[1].rotation, found[1].position) if ambiguous else None
+    return replace(
+        pose,
+        rotation=best.rotation,
+        position=best.position,
+        covariance=best.covariance,
+        ambiguous=ambiguous,
+        mirror=mirror,
+    )
+
+
+def _fit(
+    image: NDArray, camera: PinholeCamera, board: MarkerBoard, start: tuple[Array, Array], edge_std: float
+) -> _Fit | None:
+    """Gauss-Newton from one start; None where there are too few edges, or those of something else."""
     X, along = _side_points(board)
-    rotation, position = pose.rotation, pose.position
-    result = pose
-    for _ in range(iterations):
+    rotation, position = start
+    half_width = _half_width(camera, board, rotation, position)
+    first = camera.project(X @ rotation.T + position)
+    fit = None
+    for _ in range(_ITERATIONS):
         J = projection_jacobian(camera, X, rotation, position).reshape(-1, 2, 6)
         # dpi/dx of the side's direction is the direction of its picture
         direction = np.einsum("nij,nj->ni", J[:, :, :3], along @ rotation.T)
         normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         pixel = camera.project(X @ rotation.T + position)
-        offset, valid = _edge_offsets(image, pixel, normal, _half_width(camera, board, pose))
+        offset, valid = _edge_offsets(image, pixel, normal, half_width)
         if valid.sum() < 4 * _PER_SIDE or np.ptp(pixel[valid], axis=0).min() < 8:
-            return pose
-        residual, rows = offset[valid], np.einsum("ni,nij->nj", normal[valid], J[valid])
-        inlier = np.abs(residual) <= 3 * max(edge_std, 1.4826 * float(np.median(np.abs(residual))))
-        residual, rows = residual[inlier], rows[inlier]
-        step, *_ = np.linalg.lstsq(rows, residual, rcond=None)
+            return None
+        limit = 3 * max(edge_std, 1.4826 * float(np.median(np.abs(offset[valid]))))
+        used = valid & (np.abs(offset) <= limit)
+        rows = np.einsum("ni,nij->nj", normal[used], J[used])
+        step, *_ = np.linalg.lstsq(rows, offset[used], rcond=None)
         rotation = require("cv2").Rodrigues(step[3:])[0] @ rotation
         position = position + step[:3]
-        remaining = residual - rows @ step
+        remaining = offset[used] - rows @ step
         variance = max(edge_std**2, float(remaining @ remaining) / max(len(remaining) - 6, 1))
-        covariance = variance * _CORRELATED * np.linalg.inv(rows.T @ rows)
-        result = replace(pose, rotation=rotation, position=position, covariance=covariance)
-    moved = camera.project(X @ rotation.T + position) - camera.project(X @ pose.rotation.T + pose.position)
-    # a step of more than a pixel or two means that the edges belong to something else
-    return result if float(np.abs(moved).max()) < 2.0 else pose
+        covariance = np.asarray(variance * _CORRELATED * np.linalg.inv(rows.T @ rows))
+        fit = _Fit(rotation, position, covariance, np.where(valid, offset, np.inf))
+    moved = camera.project(X @ rotation.T + position) - first
+    return fit if float(np.abs(moved).max()) < _REACH else None
 
 
 def _side_points(board: MarkerBoard) -> tuple[Array, Array]:
@@ -89,16 +135,16 @@ def _side_points(board: MarkerBoard) -> tuple[Array, Array]:
     return points.reshape(-1, 3), np.repeat(end - start, _PER_SIDE, axis=0)
 
 
-def _half_width(camera: PinholeCamera, board: MarkerBoard, pose: BoardPose) -> float:
+def _half_width(camera: PinholeCamera, board: MarkerBoard, rotation: Array, position: Array) -> float:
     """How far to look across an edge [px]: half of the black rim or of the gap, seen askew.
 
     Farther out, the blurred bits and neighbours would draw the edge towards themselves. Too narrow a
     look that ends on the slope is harmless: it is cut off alike on both sides.
     """
     cells = 6.0  # of a marker of 4 x 4 bits and its rim; finer dictionaries come out a little narrower
-    cosine = abs(pose.rotation[:, 2] @ pose.position) / np.linalg.norm(pose.position)
+    cosine = abs(rotation[:, 2] @ position) / np.linalg.norm(position)
     narrowest = min(board.marker_size / cells, board.gap, board.margin)
-    width = 0.5 * narrowest * camera.fx / pose.position[2] * max(float(cosine), 0.5)
+    width = 0.5 * narrowest * camera.fx / position[2] * max(float(cosine), 0.5)
     return float(np.clip(width, 1.0, 3.0))
 
 

@@ -30,7 +30,7 @@ class TrackerOptions:
 
     min_markers: int = 2
     """Markers of a board that must be seen. One alone is prone to flips."""
-    corner_std: float = 0.15
+    corner_std: float = 0.20
     """Standard deviation of one coordinate of a detected corner [px]."""
     max_residual: float = 1.0
     """A corner farther than this from the fitted board is left out [px]."""
@@ -161,7 +161,7 @@ class MarkerTracker:
         )
         if pose is None or not self.options.edges:
             return pose
-        return refine_on_edges(grey, self.camera, board, pose)
+        return refine_on_edges(grey, self.camera, board, pose, prior=self._prior.get(id(board)))
 
     def _certain(self, board: MarkerBoard, pose: BoardPose) -> bool:
         return not pose.ambiguous or id(board) in self._prior

@@ -1,0 +1,209 @@
+"""A hand with an object before the camera, and a plant that is known through its sensors only."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm.description import load_hand, load_object
+from torch_ekm.exceptions import ObjectLostError, ParameterError, ShapeError
+from torch_ekm.kinematics import HandKinematics
+from torch_ekm.kinematics.se3 import exp, log
+from torch_ekm.sensing import (
+    ICUB_PALM_MOUNT,
+    GraspView,
+    HallSensors,
+    MarkerBoard,
+    MarkerTracker,
+    SensedPlant,
+    StreamOptions,
+    TrackStatus,
+)
+from torch_ekm.simulation.plant import Observation, Plant, PlantStatus
+
+DEG = np.pi / 180
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return load_hand("icub_right")
+
+
+@pytest.fixture(scope="module")
+def obj():
+    return load_object("box")
+
+
+def grasp(hand, turn_deg=0.0):
+    """A pinch, about: thumb against index and middle, the object's long axis towards the little finger."""
+    angles = dict.fromkeys(hand.joint_names, 0.0)
+    angles |= {"thumb_0": 50.0, "thumb_1": 17.0, "thumb_2": 19.0, "thumb_3": 40.0}
+    angles |= {f"{f}_{k}": v for f in ("index", "middle") for k, v in ((1, 15.0), (2, 20.0), (3, 35.0))}
+    angles |= {f"{f}_{k}": 30.0 for f in ("ring", "little") for k in (1, 2, 3)}
+    q = torch.tensor([angles[name] for name in hand.joint_names], dtype=torch.float64) * DEG
+    R = torch.tensor([[0.0, 0.7, -0.7], [1, 0, 0], [0, -0.7, -0.7]], dtype=torch.float64)
+    U, _, Vt = torch.linalg.svd(R)
+    turned = exp(torch.tensor([0.0, turn_deg * DEG, 0.0], dtype=torch.float64)) @ U @ Vt
+    return q, torch.tensor([0.035, -0.012, 0.045], dtype=torch.float64), turned
+
+
+class Puppet:
+    """A plant that turns its object by ``delta_a[0]`` and moves nothing else."""
+
+    def __init__(self, hand):
+        self.hand, self.turn = hand, 0.0
+
+    def reset(self, seed):
+        self.turn = 0.0
+        return self.observe()
+
+    def observe(self):
+        q, position, rotation = grasp(self.hand, self.turn / DEG)
+        a = q @ torch.from_numpy(self.hand.actuation_jacobian).mT + torch.from_numpy(
+            self.hand.actuator_offset
+        )
+        truth = {"q": q, "position": position, "rotation": rotation}
+        wrong = torch.zeros_like(position)  # nobody may read the pose but from the images
+        return Observation(q, a, wrong, torch.eye(3).double(), torch.ones(3), info={"truth": truth})
+
+    def command(self, delta_a):
+        self.turn += float(delta_a[0])
+        return self.observe()
+
+    def close(self):
+        self.turn = None
+
+
+def test_scene_is_the_grasp_seen_from_the_camera(hand, obj):
+    palm, board = MarkerBoard(0, mount=ICUB_PALM_MOUNT), MarkerBoard(4, mount=obj.marker_transform)
+    q, position, rotation = grasp(hand)
+    camera_pose = GraspView.facing(palm.mount, np.eye(4) + 0.05)
+    scene = GraspView(hand, obj, palm, board, camera_pose).scene(q, position, rotation)
+    back = [camera_pose @ card.pose for card in scene.cards]
+    np.testing.assert_allclose(back[0], ICUB_PALM_MOUNT, atol=1e-12)
+    expected = np.eye(4)
+    expected[:3, :3], expected[:3, 3] = rotation, position
+    np.testing.assert_allclose(back[1], expected @ obj.marker_transform, atol=1e-12)
+    # the tip of the index finger: a ball of its last link's capsule, where kinematics puts it
+    pad = next(pad for pad in hand.pads if pad.name.startswith("index"))
+    link = HandKinematics(hand)(q).of(pad.link).numpy()
+    tip = np.linalg.inv(camera_pose) @ link @ [*pad.end, 1.0]
+    nearest = min(np.linalg.norm(body.centres - tip[:3], axis=1).min() for body in scene.bodies)
+    assert nearest < 1.5e-3
+
+
+def test_camera_faces_both_cards(obj, pose_of):
+    palm, other = ICUB_PALM_MOUNT, pose_of(0.02, 0.04, 0.06, 70, 30, 10) @ np.diag([1.0, -1, -1, 1])
+    pose = GraspView.facing(palm, other, 0.4)
+    middle = (palm[:3, 3] + other[:3, 3]) / 2
+    np.testing.assert_allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-12)
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
+    np.testing.assert_allclose(pose[:3, 3] + 0.4 * pose[:3, 2], middle, atol=1e-12)
+    assert pose[:3, 2] @ palm[:3, 2] == pytest.approx(pose[:3, 2] @ other[:3, 2])
+    assert pose[:3, 2] @ palm[:3, 2] < 0
+    away = other.copy()
+    away[:3, :3] = palm[:3, :3] @ np.diag([1.0, -1, -1])
+    with pytest.raises(ParameterError, match="160 deg"):
+        GraspView.facing(palm, away)
+    with pytest.raises(ParameterError, match="beside"):
+        GraspView.facing(palm, palm)
+
+
+def test_view_needs_a_pose(hand, obj):
+    with pytest.raises(ShapeError, match="camera_pose"):
+        GraspView(hand, obj, MarkerBoard(0), MarkerBoard(4), np.eye(3))
+
+
+def test_sensed_plant_knows_only_what_its_sensors_say(hand, obj):
+    hall = HallSensors(hand, seed=1)
+    plant = SensedPlant(Puppet(hand), hand, obj, hall=hall)
+    assert isinstance(plant, Plant)
+    observation = plant.reset(seed=7)
+    turn = torch.zeros(hand.n_a, dtype=torch.float64)
+    turn[0] = 4 * DEG
+    for _ in range(4):
+        truth = observation.info["truth"]
+        assert observation.status is PlantStatus.HELD
+        assert observation.info["track"].ok
+        assert observation.info["hall"].shape == (15,)
+        assert (observation.position - truth["position"]).norm() < 1e-3
+        assert 0 < log(observation.rotation @ truth["rotation"].mT).norm() < 0.5 * DEG
+        has_channel = [hand.joint_names.index(joint) for joint in hall.joints]
+        error = (observation.q - truth["q"])[has_channel]
+        assert 0 < error.square().mean().sqrt() < 1.0 * DEG
+        observation = plant.command(turn)
+    moved = log(observation.rotation @ grasp(hand)[2].mT)
+    torch.testing.assert_close(moved[1], torch.tensor(16 * DEG).double(), atol=0.5 * DEG, rtol=0)
+    plant.close()
+
+
+def test_same_seed_same_observations(hand, obj):
+    first, again, other = (
+        SensedPlant(Puppet(hand), hand, obj, hall=HallSensors(hand, seed=1)).reset(seed) for seed in (3, 3, 4)
+    )
+    assert torch.equal(first.position, again.position)
+    assert torch.equal(first.q, again.q)
+    assert not torch.equal(first.position, other.position)
+
+
+def test_object_not_seen_is_said(hand, obj):
+    plant = SensedPlant(Puppet(hand), hand, obj, looks=1)
+    with pytest.raises(ParameterError, match="reset"):
+        plant.observe()
+    first = plant.reset(seed=0)
+    plant._video.options = StreamOptions(hidden=0.999)
+    unseen = plant.observe()
+    assert unseen.status is PlantStatus.NOT_SEEN
+    assert unseen.info["track"].status in (TrackStatus.PALM_HIDDEN, TrackStatus.OBJECT_HIDDEN)
+    assert torch.equal(unseen.position, first.position)  # the last pose that was seen
+    blind = SensedPlant(Puppet(hand), hand, obj, stream=StreamOptions(hidden=0.999), looks=2)
+    with pytest.raises(ObjectLostError, match="2 frames"):
+        blind.reset(seed=0)
+    with pytest.raises(ParameterError, match="looks"):
+        SensedPlant(Puppet(hand), hand, obj, looks=0)
+
+
+def test_several_looks_get_over_dropped_frames(hand, obj):
+    plant = SensedPlant(Puppet(hand), hand, obj, stream=StreamOptions(dropped=0.5, seed=3), looks=8)
+    plant.reset(seed=0)
+    assert all(plant.observe().status is PlantStatus.HELD for _ in range(10))
+    assert plant._frames > 13
+
+
+@pytest.mark.parametrize("turn", [-29.0, 0.0, 29.0])
+@pytest.mark.parametrize("name", ["toothpaste", "applier", "box", "bottle", "can"])
+def test_every_object_is_seen_over_the_range_of_turns(hand, name, turn, simulated, rng):
+    """Neither fingers nor palm nor object hide the boards: the default places of board and camera work."""
+    obj = load_object(name)
+    palm, board = MarkerBoard(0, mount=ICUB_PALM_MOUNT), MarkerBoard(4, mount=obj.marker_transform)
+    q, position, rotation = grasp(hand)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, position
+    view = GraspView(hand, obj, palm, board, GraspView.facing(palm.mount, pose @ board.mount))
+    q, position, rotation = grasp(hand, turn)
+    tracker = MarkerTracker(simulated.camera, palm, board)
+    track = tracker.track(simulated.render(view.scene(q, position, rotation), rng))
+    assert track.ok
+    assert (track.position - position).norm() < 1e-3
+    assert log(track.rotation @ rotation.mT).norm() < 0.5 * DEG
+
+
+def test_a_finger_across_the_board_hides_it(hand, obj, simulated, rng):
+    """The links of the hand are drawn before the cards: a board behind the middle finger is not found."""
+    q, _, _ = grasp(hand)
+    palm = MarkerBoard(0, mount=ICUB_PALM_MOUNT)
+    pad = next(pad for pad in hand.pads if pad.name.startswith("middle"))
+    tip = HandKinematics(hand)(q).of(pad.link)
+    board = MarkerBoard(4, marker_size=0.010, gap=0.002, margin=0.002)
+    behind = np.eye(4)  # a small card just below the finger, parallel to the palm
+    behind[:3, 3] = tip[:3, 3].numpy() - np.array([0.0, 0.0, 0.012])
+    view = GraspView(hand, obj, palm, board, GraspView.facing(palm.mount, behind))
+    scene = view.scene(q, torch.from_numpy(behind[:3, 3].copy()), torch.eye(3).double())
+    fingers = dataclasses.replace(scene, bodies=scene.bodies[: -len(obj.shapes)])  # the box would hide it too
+    tracker = MarkerTracker(simulated.camera, palm, board)
+    assert tracker.track(simulated.render(dataclasses.replace(scene, bodies=()), rng)).ok
+    tracker.reset()
+    assert tracker.track(simulated.render(fingers, rng)).status is TrackStatus.OBJECT_HIDDEN
