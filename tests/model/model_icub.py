@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from torch_ekm.contact.contact_set import ContactSet
 from torch_ekm.description import load_hand
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.model import GraspState, KinematicModel, ModelOptions
+from torch_ekm.model.equilibrium import EquilibriumSolver
 
 F64 = torch.float64
 DEG = np.pi / 180
@@ -29,16 +31,19 @@ class Held:
 def pinch_posture(hand, open_deg: float = 0.0) -> torch.Tensor:
     q = torch.zeros(hand.n_q, dtype=F64)
     posture = {
-        "thumb_0": 56,
-        "thumb_1": 14 - open_deg,
-        "thumb_2": 16,
-        "thumb_3": 12,
+        "thumb_0": 47,
+        "thumb_1": 10 - open_deg,
+        "thumb_2": 10,
+        "thumb_3": 31,
+        "index_0": 7,
+        "ring_0": 7,
+        "little_0": 7,
         "index_1": 32,
-        "index_2": 22,
-        "index_3": 14,
-        "middle_1": 30,
-        "middle_2": 22,
-        "middle_3": 16,
+        "index_2": 12,
+        "index_3": 22,
+        "middle_1": 45,
+        "middle_2": 18,
+        "middle_3": 29,
         "ring_1": 2,
         "ring_2": 2,
         "ring_3": 2,
@@ -51,7 +56,7 @@ def pinch_posture(hand, open_deg: float = 0.0) -> torch.Tensor:
     return q
 
 
-def pinch(shape: str = "box", *, gamma: float = 0.0, friction: float = 1.0, open_deg: float = 0.0, **options):
+def pinch(shape: str = "box", *, gamma: float = 0.0, friction: float = 1.5, open_deg: float = 0.0, **options):
     """Model, state and contacts of a three-finger pinch; the fingertips are balls at the caps of the pads.
 
     The box is as thick as the fingertips are apart; the can's axis runs along the line from the index to
@@ -96,3 +101,25 @@ def pinch(shape: str = "box", *, gamma: float = 0.0, friction: float = 1.0, open
         hand, Held(), ModelOptions(**options), kinematics=kin, detector=lambda *_: contacts
     )
     return model, state, contacts
+
+
+@lru_cache(maxsize=4)
+def gripped(shape: str = "box", grip: float = 2.5, **options):
+    """A pinch in exact equilibrium with a thumb force of ``grip`` [N]: model, solver, equilibrium."""
+    model, state, contacts = pinch(shape, **options)
+    solver = EquilibriumSolver(model, state, contacts, max_step=0.2)
+    start = solver.find(torch.tensor([grip, grip / 2, grip / 2], dtype=F64))
+    for _ in range(25):  # Gauss-Newton: wished normal forces, small tangential ones
+        forces = solver.forces(start)
+        lin = model.linearize(start.state, start.contacts, forces=forces)
+        target = torch.zeros_like(start.mu)
+        target[list(lin.normal_rows)] = torch.tensor([grip, grip / 2, grip / 2], dtype=F64)
+        weight = torch.full_like(target, 0.3)
+        weight[list(lin.normal_rows)] = 1.0
+        matrix = weight[:, None] * lin.contact_force_sensitivity
+        da = torch.linalg.pinv(matrix, rtol=3e-3) @ (weight * (target - start.mu))
+        if float(forces.relative_margin.min()) > 0.5:
+            break
+        start = solver.move(start, start.a + da * min(1.0, 0.2 / float(da.abs().max())))
+    nan = float("nan")
+    return model, solver, solver.grip(start, torch.tensor([grip, nan, nan], dtype=F64))

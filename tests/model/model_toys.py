@@ -143,6 +143,11 @@ class Toy:
 
         return EquilibriumSolver(self.model, self.state, self.contacts, **options)
 
+    def forces(self):
+        from torch_ekm.model.force_balance import known_forces
+
+        return known_forces(self.model.contact_kinematics(self.state, self.contacts), self.mu, self.lam)
+
     def equilibrium(self):
         from torch_ekm.model.equilibrium import Equilibrium
 
@@ -325,9 +330,8 @@ def planar_two_finger(pinned=False, grip=1.5, **kw):
     )
 
 
-def finite_difference_jacobian(toy, start, step, read=None):
+def finite_difference_jacobian(solver, start, step, read=None):
     """Six-point central differences of exact equilibria: d(read)/da, by default the state increment."""
-    solver = toy.solver()
     columns = []
     read = read or (lambda e: e.state.minus(start.state))
     for k_a in range(len(start.a)):
@@ -339,3 +343,27 @@ def finite_difference_jacobian(toy, start, step, read=None):
                 total = total + sign * weight * read(solver.move(start, a))
         columns.append(total / (60 * step))
     return torch.stack(columns, dim=-1)
+
+
+def scaled(J, n_q, length=0.03):
+    """Translations in units of the object's size, so that one norm measures all rows."""
+    scale = torch.ones(J.shape[-2], 1, dtype=J.dtype)
+    scale[n_q : n_q + 3] = 1 / length
+    return scale * J
+
+
+def relative_error(J, truth, n_q):
+    return float((scaled(J, n_q) - scaled(truth, n_q)).norm() / scaled(truth, n_q).norm())
+
+
+def step_error_slope(solver, start, J, directions, sizes):
+    """Order of ``|ds - J da|`` in ``|da|``, averaged over directions."""
+    n_q = len(start.state.q)
+    slopes = []
+    for direction in directions:
+        errors = []
+        for size in sizes:
+            exact = solver.move(start, start.a + size * direction).state.minus(start.state)
+            errors.append(float(scaled((exact - J @ (size * direction))[:, None], n_q).norm()))
+        slopes.append(np.polyfit(np.log(sizes), np.log(errors), 1)[0])
+    return np.array(slopes)

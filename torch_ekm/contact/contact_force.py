@@ -38,7 +38,7 @@ class ForceOptions:
         ParameterError: a value outside its range.
     """
 
-    force_weight: float = 1e-6
+    force_weight: float = 1e-7
     """eps: weight of |mu|^2 against the squared, whitened joint residual [1/N^2]."""
     actuator_weight: float = 1.0
     """k: weight of |lam r/L|^2 relative to |mu|^2, r the norm of the actuator's moment arms."""

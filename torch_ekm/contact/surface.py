@@ -39,8 +39,8 @@ class TrackedContacts:
         q, position, rotation: that state.
 
     Raises:
-        ParameterError: a finger that is flat at the contact, two unequal curvatures, or a cylindrical finger
-            lying on a flat face (a line contact has no contact point).
+        ParameterError: a hollow surface, a finger that is flat at the contact, two unequal curvatures, or a
+            cylindrical finger lying on a flat face (a line contact has no contact point).
     """
 
     def __init__(
@@ -130,6 +130,8 @@ def _core(K: Tensor, surface_point: Tensor, outward: Tensor, name: str) -> Core:
     k = tangent.mT @ K @ tangent
     values, vectors = torch.linalg.eigh(0.5 * (k + k.mT))
     low, high = values.tolist()
+    if low < -FLAT:
+        raise ParameterError("curvature", (low, high), f"convex or flat at '{name}'")
     flat_direction = tangent @ vectors[:, 0]
     if high <= FLAT:
         return Core("plane", surface_point, outward, 0.0)

@@ -60,10 +60,12 @@ def two_stage(
             contradict each other; the direction comes along.
         UnstableGraspError: N^T D N has a negative eigenvalue: the grasp buckles.
     """
+    eps = torch.finfo(D.dtype).eps
+    rank_tolerance, stiffness_tolerance = max(rank_tolerance, 10 * eps), max(stiffness_tolerance, 10 * eps)
     pinv, N = _range_and_null(E, rank_tolerance)
     P = pinv @ R
     lost = E @ P - R
-    if lost.numel() and float(lost.abs().max()) > 1e-6:
+    if lost.numel() and float(lost.abs().max()) > 10 * eps**0.5 * float(R.abs().max()):
         _raise_contradiction(lost, P)
     load = D @ P if F is None else D @ P - F
     stability = torch.full(D.shape[:-2], torch.inf, dtype=D.dtype, device=D.device)

@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from ..description.hand import HandDescription
+from ..exceptions import SingularGraspError, UnstableGraspError
 from ..typing import Bool, Float, Tensor
 from .manipulation import Step, two_stage
 from .options import ModelOptions
@@ -104,7 +105,13 @@ class Reduction(nn.Module):
         R = D.new_zeros(E.shape[-2], n_a)
         first = n_h if stiff_contacts else 0
         R[first : first + len(rigid)] = eye[rigid] / arm
-        step = two_stage(D, E, R, F, on_unstable=self.options.on_unstable)
+        try:
+            step = two_stage(D, E, R, F, on_unstable=self.options.on_unstable)
+        except (SingularGraspError, UnstableGraspError) as error:
+            if error.direction is not None:  # into state coordinates
+                direction = S @ error.direction
+                error.direction = direction / torch.linalg.vector_norm(direction).clamp_min(1e-300)
+            raise
         dlam = D.new_zeros(*batch, n_a, n_a)
         dlam[..., rigid, :] = step.reaction[..., first : first + len(rigid), :] / arm
         if len(soft):

@@ -1,0 +1,299 @@
+"""Whatever comes in: a typed answer, never NaN."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from model_icub import gripped
+from model_toys import F64, contact_set, planar_two_finger, relative_error, three_finger, toy_hand
+from torch import nn
+
+from torch_ekm.contact.contact_force import ForceOptions, ForceStatus
+from torch_ekm.contact.contact_kinematics import constraint_matrix
+from torch_ekm.exceptions import (
+    NoContactError,
+    NonFiniteError,
+    ParameterError,
+    PenetrationError,
+    ShapeError,
+    SingularGraspError,
+    UnknownNameError,
+    UnstableGraspError,
+)
+from torch_ekm.model import GraspState, KinematicModel, ModelOptions, ModelStatus
+
+
+def rebuilt(toy, *, options=None, contacts=None, **hand):
+    model = toy.model
+    contacts = toy.contacts if contacts is None else contacts
+    return KinematicModel(
+        dataclasses.replace(model.hand, **hand),
+        model.obj,
+        options or model.options,
+        kinematics=model.kinematics,
+        detector=lambda *_: contacts,
+    )
+
+
+def test_no_contacts():
+    toy = three_finger()
+    with pytest.raises(NoContactError, match="no finger"):
+        rebuilt(toy, contacts=toy.contacts.select([])).linearize(toy.state)
+
+
+def test_one_contact_cannot_hold_but_the_answer_is_finite():
+    toy = three_finger()
+    with pytest.raises((SingularGraspError, UnstableGraspError)) as caught:  # the object topples
+        rebuilt(toy, contacts=toy.contacts.select([0])).linearize(toy.state)
+    assert caught.value.direction[-3:].norm() > 0.1
+    flag = dataclasses.replace(toy.model.options, on_unstable="flag")
+    lin = rebuilt(toy, contacts=toy.contacts.select([0]), options=flag).linearize(toy.state)
+    assert lin.status is ModelStatus.UNSTABLE
+    assert lin.forces.status == (ForceStatus.NOT_GRASPABLE,)
+    assert torch.isfinite(lin.manipulation_jacobian).all()
+
+
+def test_coincident_contacts_on_one_link_change_nothing():
+    toy = three_finger()
+    twice = toy.contacts.select([0, 1, 2, 2])
+    J = toy.model.linearize(toy.state).manipulation_jacobian
+    lin = rebuilt(toy, contacts=twice).linearize(toy.state)
+    assert torch.isfinite(lin.manipulation_jacobian).all()
+    assert relative_error(lin.manipulation_jacobian, J, 9) < 1e-6
+    assert float(lin.forces.normal[2:].sum()) == pytest.approx(
+        float(toy.model.linearize(toy.state).forces.normal[2])
+    )
+
+
+def test_an_object_that_cannot_be_held_says_so_and_the_step_leaves_out_the_forces():
+    toy = three_finger()
+    slippery = toy.contacts.replace(friction=torch.full((3,), 0.01, dtype=F64))
+    lin = rebuilt(toy, contacts=slippery).linearize(toy.state)
+    assert lin.status is ModelStatus.NO_FORCES
+    assert lin.forces.status == (ForceStatus.NOT_GRASPABLE,)
+    assert float(lin.forces.violation) > 0.05
+    assert not lin.forces.solved
+    for name in ("mu", "lam", "normal", "margin", "residual"):
+        assert torch.isfinite(getattr(lin.forces, name)).all()
+    assert torch.isfinite(lin.manipulation_jacobian).all()
+
+
+def test_forces_of_the_previous_step_are_reused_for_the_same_contacts_only():
+    toy = three_finger()
+    model = toy.model
+    good = model.linearize(toy.state)
+    slippery = toy.contacts.replace(friction=torch.full((3,), 0.01, dtype=F64))
+    again = model.linearize(toy.state, slippery)
+    assert again.status is ModelStatus.REUSED_FORCES
+    assert torch.equal(again.forces.mu, good.forces.mu)
+    assert relative_error(again.manipulation_jacobian, good.manipulation_jacobian, 9) < 1e-12
+    model.reset()
+    assert model.linearize(toy.state, slippery).status is ModelStatus.NO_FORCES
+
+
+def test_a_finger_through_the_object():
+    toy = three_finger()
+    deep = toy.contacts.replace(gap=torch.tensor([0.0, -0.02, 0.0], dtype=F64))
+    with pytest.raises(PenetrationError, match="f1_l2") as caught:
+        rebuilt(toy, contacts=deep).linearize(toy.state)
+    assert caught.value.depth == pytest.approx(0.02)
+
+
+def test_zero_springs_are_singular_unless_there_is_a_floor():
+    toy = three_finger()
+    with pytest.raises((SingularGraspError, UnstableGraspError)) as caught:
+        rebuilt(toy, spring_stiffness=np.zeros(9)).linearize(toy.state)
+    assert torch.isfinite(caught.value.direction).all()
+    # a free finger without springs: a floor does not change what the object does
+    model, solver, at = gripped("box")
+    free = [k for k, name in enumerate(model.hand.joint_names) if name.startswith(("ring", "little"))]
+    stiffness = model.hand.spring_stiffness.copy()
+    stiffness[free] = 0.0
+    hand = dataclasses.replace(model.hand, spring_stiffness=stiffness)
+    args = {"kinematics": model.kinematics, "detector": model.detector}
+    forces = solver.forces(at)
+    with pytest.raises(SingularGraspError) as caught:
+        KinematicModel(hand, model.obj, **args).linearize(at.state, at.contacts, forces=forces)
+    ring_and_little = caught.value.direction
+    assert ring_and_little is not None
+    ours = []
+    for floor in (1e-4, 2e-4):
+        options = dataclasses.replace(model.options, stiffness_floor=floor)
+        lin = KinematicModel(hand, model.obj, options, **args).linearize(at.state, at.contacts, forces=forces)
+        ours.append(lin.object_jacobian)
+    assert relative_error(ours[0], ours[1], 0) < 5e-3
+
+
+def test_more_tendons_than_mobility():
+    # planar two-finger grasp: 4 + 3 - 4 = 3 freedoms; four rigid tendons contradict each other
+    toy = planar_two_finger()
+    J_a = np.array([[0.009, 0.0, 0, 0], [0, 0.008, 0, 0], [0, 0, 0.009, 0], [0, 0, 0, 0.008]])
+    hand = toy_hand(4, J_a, toy.model.hand.spring_stiffness, toy.model.hand.spring_rest, planar=(0, 0, 1.0))
+    args = {"kinematics": toy.model.kinematics, "detector": toy.model.detector}
+    options = toy.model.options
+    with pytest.raises(SingularGraspError, match="actuator"):
+        KinematicModel(hand, toy.model.obj, options, **args).linearize(toy.state)
+    soft = toy_hand(
+        4,
+        J_a,
+        toy.model.hand.spring_stiffness,
+        toy.model.hand.spring_rest,
+        planar=(0, 0, 1.0),
+        stiffness=1e4,
+    )
+    lin = KinematicModel(soft, toy.model.obj, options, **args).linearize(toy.state)
+    assert torch.isfinite(lin.manipulation_jacobian).all()
+
+
+def test_a_grip_too_strong_buckles_and_the_model_without_geometry_does_not_see_it():
+    toy = three_finger(grip=4.0)
+    forces = toy.forces()
+    with pytest.raises(UnstableGraspError, match="buckles") as caught:
+        toy.model.linearize(toy.state, forces=forces)
+    assert caught.value.stiffness < 0
+    assert caught.value.direction.shape == (15,)
+    A = constraint_matrix(toy.model.contact_kinematics(toy.state, toy.contacts))
+    assert (A @ caught.value.direction).abs().max() < 1e-12  # the contacts allow it: state coordinates
+    blind = dataclasses.replace(
+        toy.model.options, hand_stiffness=False, object_stiffness=False, rolling=False
+    )
+    assert rebuilt(toy, options=blind).linearize(toy.state, forces=forces).status is ModelStatus.OK
+    flag = dataclasses.replace(toy.model.options, on_unstable="flag")
+    lin = rebuilt(toy, options=flag).linearize(toy.state, forces=forces)
+    assert lin.status is ModelStatus.UNSTABLE
+    assert float(lin.stability) < 0
+
+
+def test_slack_tendons_move_nothing():
+    toy = three_finger()
+    options = dataclasses.replace(toy.model.options, slack_tension=float(-toy.lam[0]) + 1e-6)
+    taut = toy.model.linearize(toy.state, forces=toy.forces()).manipulation_jacobian
+    forces = dataclasses.replace(toy.forces(), lam=toy.lam * torch.tensor([1.0, 2.0, 2.0], dtype=F64))
+    J = rebuilt(toy, options=options).linearize(toy.state, forces=forces).manipulation_jacobian
+    assert J[:, 0].abs().max() == 0
+    assert taut[:, 0].abs().max() > 0
+    assert J[:, 1].abs().max() > 0
+
+
+def test_bad_input_is_named():
+    toy = three_finger()
+    model, state = toy.model, toy.state
+    with pytest.raises(ShapeError, match="j8"):
+        model.linearize(GraspState(state.q[:5], state.position, state.rotation))
+    with pytest.raises(ShapeError, match="delta_a"):
+        model(state, torch.zeros(4, dtype=F64))
+    with pytest.raises(NonFiniteError, match=r"contacts\.point"):
+        model.linearize(state, toy.contacts.replace(point=toy.contacts.point * float("nan")))
+    with pytest.raises(UnknownNameError, match="thumb"):
+        model.linearize(state, locked=["thumb_7"])
+    with pytest.raises(UnknownNameError, match="f9"):
+        model.linearize(state, toy.contacts.replace(link=("f9", "f9", "f9")))
+    batch = GraspState(*(x.expand(2, *x.shape) for x in (state.q, state.position, state.rotation)))
+    with pytest.raises(ShapeError, match="contacts"):
+        model.linearize(batch)
+    with pytest.raises(ShapeError, match="gap"):
+        model.linearize(batch, toy.contacts)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"length": 0.0},
+        {"on_unstable": "ignore"},
+        {"stiffness_floor": -1.0},
+        {"gravity": (0.0, 0.0, float("nan"))},
+        {"contact_stiffness": -1.0},
+    ],
+)
+def test_bad_options_are_refused(bad):
+    with pytest.raises(ParameterError, match=next(iter(bad))):
+        ModelOptions(**bad)
+
+
+def test_it_is_a_module_that_moves_and_copies():
+    import copy
+
+    toy = three_finger()
+    model = copy.deepcopy(toy.model)
+    assert isinstance(model, nn.Module)
+    lin = toy.model.linearize(toy.state)
+    assert torch.equal(model.linearize(toy.state).manipulation_jacobian, lin.manipulation_jacobian)
+    assert "n_a=3" in repr(model)
+    assert lin.margins.shape == (3,)
+    assert lin.normal_rows == (0, 3, 6)
+
+
+def test_friction_options_reach_the_force_problem():
+    toy = three_finger(friction=0.6, grip=0.6, mass=0.2)
+    slopes = {}
+    for friction in ("cuts", "pyramid_inner"):
+        options = dataclasses.replace(
+            toy.model.options, forces=ForceOptions(friction=friction), on_unstable="flag"
+        )
+        slopes[friction] = rebuilt(toy, options=options).linearize(toy.state).forces.margin.min()
+    assert slopes["pyramid_inner"] != slopes["cuts"]
+
+
+def test_contact_compliance_tends_to_the_rigid_contact():
+    toy = three_finger()
+    rigid = toy.model.linearize(toy.state, forces=toy.forces())
+    errors = []
+    for k in (1e5, 1e6, 1e7):
+        options = dataclasses.replace(toy.model.options, contact_stiffness=k)
+        lin = rebuilt(toy, options=options).linearize(toy.state, forces=toy.forces())
+        errors.append(relative_error(lin.manipulation_jacobian, rigid.manipulation_jacobian, 9))
+        difference = lin.contact_force_sensitivity - rigid.contact_force_sensitivity
+        errors[-1] = max(errors[-1], float(difference.norm() / rigid.contact_force_sensitivity.norm()))
+    assert errors[0] > 5 * errors[1] > 25 * errors[2]
+    assert errors[2] < 0.02
+
+
+def test_float32():
+    toy = three_finger()
+    c = toy.contacts
+    f32 = {
+        name: getattr(c, name).float()
+        for name in ("point", "normal", "gap", "finger_curvature", "object_curvature", "friction")
+    }
+    contacts = c.replace(torsional_friction=c.torsional_friction.float(), **f32)
+
+    class Single(nn.Module):
+        def __init__(self, inner):
+            super().__init__()
+            self.inner, self.link_names = inner, inner.link_names
+            self.register_buffer("upstream", inner.upstream)
+
+        def forward(self, q):
+            poses = self.inner(q.double())
+            poses.transforms = poses.transforms.float()
+            return poses
+
+        def joint_axes(self, poses):
+            poses.transforms = poses.transforms.double()
+            axis, origin = self.inner.joint_axes(poses)
+            poses.transforms = poses.transforms.float()
+            return axis.float(), origin.float()
+
+    model = KinematicModel(
+        toy.model.hand,
+        toy.model.obj,
+        toy.model.options,
+        kinematics=Single(toy.model.kinematics),
+        detector=lambda *_: contacts,
+        dtype=torch.float32,
+    )
+    state = GraspState(toy.state.q.float(), toy.state.position.float(), toy.state.rotation.float())
+    lin = model.linearize(state)
+    assert lin.manipulation_jacobian.dtype == torch.float32
+    J = toy.model.linearize(toy.state).manipulation_jacobian
+    assert relative_error(lin.manipulation_jacobian.double(), J, 9) < 1e-3
+
+
+def test_contact_set_helper_is_what_the_tests_think():
+    c = contact_set(["a"], [[0.0, 0, 0]], [[0.0, 0, 1.0]], 100.0, 0.0)
+    assert torch.allclose(
+        torch.linalg.eigvalsh(c.finger_curvature)[0], torch.tensor([0.0, 100, 100], dtype=F64)
+    )

@@ -1,0 +1,185 @@
+"""The iCub hand itself in a three-finger pinch: 20 joints, 9 compliant actuators, box and can."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+import torch
+from model_icub import DEG, F64, gripped
+from model_toys import finite_difference_jacobian, relative_error, step_error_slope
+
+from torch_ekm.model import GraspState, KinematicModel, ModelStatus
+
+
+@functools.lru_cache(maxsize=4)
+def truth(shape, gamma=0.0):
+    _, solver, at = gripped(shape, gamma=gamma)
+    return finite_difference_jacobian(solver, at, 2e-4)
+
+
+def variant(model, **changes):
+    options = dataclasses.replace(model.options, **changes)
+    return KinematicModel(
+        model.hand, model.obj, options, kinematics=model.kinematics, detector=model.detector
+    )
+
+
+@pytest.mark.parametrize(("shape", "gamma"), [("box", 0.0), ("can", 0.0), ("box", 0.004)])
+def test_jacobian_equals_finite_differences_of_exact_equilibria(shape, gamma):
+    model, solver, at = gripped(shape, gamma=gamma)
+    J = model.linearize(at.state, at.contacts, forces=solver.forces(at)).manipulation_jacobian
+    assert J.shape == (26, 9)
+    assert relative_error(J, truth(shape, gamma), 20) < 1e-9
+
+
+@pytest.mark.parametrize("shape", ["box", "can"])
+def test_forces_are_found_from_the_state(shape):
+    model, _, at = gripped(shape)
+    lin = model.linearize(at.state, at.contacts)
+    assert lin.status is ModelStatus.OK
+    assert (lin.forces.mu - at.mu).norm() < 1e-4 * at.mu.norm()
+    assert lin.forces.residual.abs().max() < 1e-5
+    assert relative_error(lin.manipulation_jacobian, truth(shape), 20) < 1e-4
+
+
+@pytest.mark.parametrize("shape", ["box", "can"])
+def test_order_of_convergence_and_what_breaks_it(shape):
+    model, solver, at = gripped(shape)
+    forces = solver.forces(at)
+    directions = torch.randn(3, 9, dtype=F64, generator=torch.Generator().manual_seed(0))
+    directions = directions / directions.norm(dim=-1, keepdim=True)
+    sizes = [0.25e-3, 0.5e-3, 1e-3]  # [rad]
+    J = model.linearize(at.state, at.contacts, forces=forces).manipulation_jacobian
+    slopes = step_error_slope(solver, at, J, directions, sizes)
+    assert ((slopes > 1.95) & (slopes < 2.05)).all(), slopes
+    for changes in ({"hand_stiffness": False, "object_stiffness": False}, {"rolling": False}):
+        J = variant(model, **changes).linearize(at.state, at.contacts, forces=forces).manipulation_jacobian
+        assert (step_error_slope(solver, at, J, directions, sizes) < 1.2).all()
+        assert relative_error(J, truth(shape), 20) > 5e-3  # against 1e-9 of the whole
+
+
+def test_force_sensitivities_of_the_pinch():
+    model, solver, at = gripped("box")
+    lin = model.linearize(at.state, at.contacts, forces=solver.forces(at))
+
+    def read(e):
+        forces = solver.forces(e)
+        return torch.cat([e.lam, forces.normal, forces.margin])
+
+    expected = finite_difference_jacobian(solver, at, 5e-5, read)  # |f_t| bends sharply near 0
+    ours = [lin.actuator_force_sensitivity, lin.normal_force_sensitivity, lin.margin_sensitivity]
+    for part, difference in zip(ours, expected.split([9, 3, 3]), strict=True):
+        assert (part - difference).norm() < 1e-6 * difference.norm()
+
+
+def test_free_fingers_and_couplings():
+    model, solver, at = gripped("box")
+    J = model.linearize(at.state, at.contacts, forces=solver.forces(at)).joint_jacobian
+    names = model.hand.joint_names
+    C = torch.as_tensor(model.hand.coupling)
+    assert (C @ J).abs().max() < 1e-12
+    pinky = model.hand.actuator_names.index("pinky")
+    ring = [names.index(f"ring_{k}") for k in (1, 2, 3)]
+    assert (J[ring, pinky] - J[ring, pinky].mean()).abs().max() < 1e-9  # equal springs share equally
+    fingers = [k for k, name in enumerate(names) if name.startswith(("thumb", "index", "middle"))]
+    assert J[fingers, pinky].abs().max() < 1e-12
+
+
+def noisy_states(at, draws, seed):
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(draws):
+        noise = torch.randn(26, dtype=F64, generator=generator)
+        noise[:20] *= 0.5 * DEG
+        noise[20:23] *= 0.5e-3
+        noise[23:] *= 0.5 * DEG
+        yield at.state.plus(noise)
+
+
+def test_with_noise_forces_are_found_and_the_jacobian_stays_near():
+    model, solver, at = gripped("box")
+    model = variant(model, on_unstable="flag")
+    errors, solved = [], 0
+    for state in noisy_states(at, 60, 0):
+        contacts = solver.surfaces(state.q, state.position, state.rotation)
+        lin = model.linearize(state, contacts)
+        solved += lin.forces.solved
+        assert torch.isfinite(lin.manipulation_jacobian).all()
+        assert float(lin.forces.margin.min()) > -1e-6
+        errors.append(relative_error(lin.manipulation_jacobian, truth("box"), 20))
+    assert solved == 60
+    assert np.median(errors) < 0.15
+
+
+def test_a_joint_at_its_stop_is_held_and_a_pull_away_from_it_is_not():
+    model, solver, at = gripped("box")
+    forces = solver.forces(at)
+    free = model.linearize(at.state, at.contacts, forces=forces)
+    j = model.hand.joint_names.index("thumb_1")
+    lower, upper = model.hand.joint_lower.copy(), model.hand.joint_upper.copy()
+    assert not free.held_joints.any()
+    # the thumb pushes the object: the reaction drives thumb_1 open, against its lower stop
+    lower[j] = float(at.state.q[j])
+    hand = dataclasses.replace(model.hand, joint_lower=lower)
+    at_stop = KinematicModel(hand, model.obj, kinematics=model.kinematics, detector=model.detector)
+    lin = at_stop.linearize(at.state, at.contacts)
+    assert lin.held_joints.nonzero()[:, 0].tolist() == [j]
+    assert float(lin.forces.stop_torque[j]) > 1e-3
+    assert lin.joint_jacobian[j].abs().max() < 1e-12
+    assert lin.object_jacobian[:, model.hand.actuator_names.index("thumb_proximal")].abs().max() < 1e-9
+    # an upper stop at the same place cannot pull
+    upper[j] = float(at.state.q[j])
+    hand = dataclasses.replace(model.hand, joint_upper=upper)
+    lin = KinematicModel(hand, model.obj, kinematics=model.kinematics, detector=model.detector).linearize(
+        at.state, at.contacts
+    )
+    assert not lin.held_joints.any()
+    assert relative_error(lin.manipulation_jacobian, free.manipulation_jacobian, 20) < 1e-4
+
+
+@pytest.mark.parametrize("joints", [("thumb_2",), ("index_2", "middle_2")])
+def test_a_locked_joint_equals_the_exact_equilibria_with_it_held(joints):
+    from torch_ekm.model.equilibrium import EquilibriumSolver
+
+    model, _, at = gripped("box")
+    held = tuple(model.hand.joint_names.index(name) for name in joints)
+    solver = EquilibriumSolver(model, at.state, at.contacts, held=held)
+    start = dataclasses.replace(at, stop=torch.zeros(len(held), dtype=F64))
+    expected = finite_difference_jacobian(solver, start, 2e-4)
+    J = model.linearize(at.state, at.contacts, forces=solver.forces(at), locked=joints).manipulation_jacobian
+    assert relative_error(J, expected, 20) < 1e-9
+
+
+def test_batch_equals_single_states():
+    model, solver, at = gripped("box")
+    states = list(noisy_states(at, 6, 1))
+    contacts = [solver.surfaces(s.q, s.position, s.rotation) for s in states]
+    stack = GraspState(
+        torch.stack([s.q for s in states]).unflatten(0, (2, 3)),
+        torch.stack([s.position for s in states]).unflatten(0, (2, 3)),
+        torch.stack([s.rotation for s in states]).unflatten(0, (2, 3)),
+    )
+    fields = ("point", "normal", "gap", "finger_curvature", "object_curvature")
+    batch = contacts[0].replace(
+        **{name: torch.stack([getattr(c, name) for c in contacts]).unflatten(0, (2, 3)) for name in fields}
+    )
+    lin = model.linearize(stack, batch)
+    assert lin.manipulation_jacobian.shape == (2, 3, 26, 9)
+    for k, state in enumerate(states):
+        single = model.linearize(state, contacts[k])
+        i, j = divmod(k, 3)
+        for name in (
+            "manipulation_jacobian",
+            "contact_force_sensitivity",
+            "actuator_force_sensitivity",
+            "normal_force_sensitivity",
+            "margin_sensitivity",
+            "stability",
+        ):
+            ours, theirs = getattr(lin, name)[i, j], getattr(single, name)
+            assert (ours - theirs).norm() <= 1e-9 * theirs.norm() + 1e-12, name
+    da = 0.01 * torch.ones(9, dtype=F64)
+    moved = model(stack, da.expand(2, 3, 9), batch)
+    assert torch.allclose(moved[1, 2], model(states[5], da, contacts[5]), atol=1e-12)
