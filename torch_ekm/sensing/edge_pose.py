@@ -116,11 +116,26 @@ def _fit(
         rotation = require("cv2").Rodrigues(step[3:])[0] @ rotation
         position = position + step[:3]
         remaining = offset[used] - rows @ step
-        variance = max(edge_std**2, float(remaining @ remaining) / max(len(remaining) - 6, 1))
-        covariance = np.asarray(variance * _CORRELATED * np.linalg.inv(rows.T @ rows))
+        variance = _variance(remaining, np.flatnonzero(used) // _PER_SIDE, edge_std)
+        covariance = np.asarray(variance * np.linalg.inv(rows.T @ rows))
         fit = _Fit(rotation, position, covariance, np.where(valid, offset, np.inf))
     moved = camera.project(X @ rotation.T + position) - first
     return fit if float(np.abs(moved).max()) < _REACH else None
+
+
+def _variance(residual: Array, side: NDArray[np.int_], edge_std: float) -> float:
+    """Of one sample as if all were independent [px^2].
+
+    They are not: light, blur and the raster shift all edges of a side together. What counts is how the
+    means of sides scatter, ``sum_s n_s m_s^2 / (n_sides - 6)``, and never less than three times the
+    variance of single samples.
+    """
+    count = np.bincount(side)
+    mean = np.bincount(side, residual)[count > 0] / count[count > 0]
+    freedom = len(mean) - 6
+    between = float(count[count > 0] @ mean**2) / freedom if freedom > 1 else 0.0
+    single = float(residual @ residual) / max(len(residual) - 6, 1)
+    return max(_CORRELATED * max(edge_std**2, single), between)
 
 
 def _side_points(board: MarkerBoard) -> tuple[Array, Array]:

@@ -36,9 +36,9 @@ class JointEstimator:
     Args:
         hand: joints, actuation Jacobian and couplings; ``C q = 0`` is taken to hold, not just ``C dq = 0``.
         calibration: of its Hall channels.
-        encoder_std: s_a, by how much an encoder and ``J_a q + a_0`` differ [rad]. The default is for encoders
-            at the motors of a loaded hand, behind cables that stretch by degrees in a pinch of 5 N; encoders at
-            the joints are good to half a degree.
+        encoder_std: s_a, by how much an encoder and ``J_a q + a_0`` differ [rad]. The default is for
+            encoders at the motors of a loaded hand, behind cables that stretch by degrees in a pinch of
+            5 N; encoders at the joints are good to half a degree.
         coupling_std: s_c, play of a rigid coupling [rad].
 
     Raises:
