@@ -126,13 +126,14 @@ def test_creep_follows_the_load():
     )
 
 
-def test_a_new_tendon_takes_over_the_stretch_of_the_old():
+def test_a_new_tendon_takes_over_the_torque_of_the_old():
     hand, old = make()
-    _, new = make(actuation_jacobian=1.3 * hand.actuation_jacobian)
+    _, new = make(actuation_jacobian=1.3 * hand.actuation_jacobian, stiffness=np.full(hand.n_a, 2.0))
     q = coupled_posture(hand.coupling) @ flexed(hand, np.random.default_rng(5))
     motor = hand.actuator_offset + hand.actuation_jacobian @ q + 0.1
-    new.take_over(old, q)
-    np.testing.assert_allclose(new.stretch(q, motor), old.stretch(q, motor), atol=1e-12)
+    new.take_over(old, q, motor)
+    np.testing.assert_allclose(torque(new, q, motor), torque(old, q, motor), atol=1e-12)
+    assert np.abs(torque(new, q, motor + 0.1) - torque(old, q, motor + 0.1)).max() > 0.1
 
 
 def test_a_hand_without_couplings():

@@ -235,7 +235,8 @@ class SimulatedHand:
     def change(self, **changes: Any) -> None:
         """Change :class:`PlantParameters` by name, now and in mid-grasp; motors stay where they are.
 
-        A tendon with other moment arms is put on with the tension of the old one. ``object_scale``
+        A tendon with other moment arms or stiffness is put on so that the joints feel no difference
+        at that moment. ``object_scale``
         and ``link_weight`` shape the scene: they act from the next :meth:`reset`.
 
         Raises:
@@ -244,16 +245,24 @@ class SimulatedHand:
         old, new = self.parameters, self.parameters.replace(**changes)
         moment_arms(self.hand, new)  # refuses before anything is touched
         self.parameters = new
-        previous, servo = self._transmission, self._servo.snapshot()
-        self._transmission = make_transmission(self.hand, new)
-        self._servo = make_servo(self.hand, self.config, new)
-        self._servo.restore(servo)
+        self._planner = make_planner(self.hand, self.object, self.config, new)
         self._sensors.set_parameters(new)
-        self._planner = make_planner(self.hand, self.object, self.config, self.parameters)
-        if self._scene is not None:
-            self._transmission.take_over(previous, self._scene.q)
-            self._transmission.lengthen(new.tendon_elongation - old.tendon_elongation)
-            self._apply(self._scene)
+        motors = self._servo.snapshot()
+        self._servo = make_servo(self.hand, self.config, new)
+        self._servo.restore(motors)
+        if self._scene is None:
+            return
+        # What did not change is left alone: PhysX would not go on bit by bit from it.
+        if _differ(old, new, "moment_arm", "spring", "servo_stiffness", "joint_friction", "tendon_creep"):
+            previous = self._transmission
+            self._transmission = make_transmission(self.hand, new)
+            self._transmission.take_over(previous, self._scene.q, self._servo.output)
+            self._scene.set_drive_stiffness(self._transmission.drive_stiffness)
+        self._transmission.lengthen(new.tendon_elongation - old.tendon_elongation)
+        if _differ(old, new, "mass", "com_shift"):
+            self._scene.set_object(new.mass, new.com_shift)
+        if _differ(old, new, "friction"):
+            self._scene.set_friction(new.friction * self.object.friction)
 
     def tug(self, force: Array, torque: Array, duration: float = 0.05) -> Observation:
         """Pull at the object [N, at its centre of mass] and twist it [N m], hand frame, then settle."""
@@ -270,13 +279,6 @@ class SimulatedHand:
             raise GraspError("there is no grasp yet: call reset(seed) first")
         return self._scene
 
-    def _apply(self, scene: HandScene) -> None:
-        """Give the scene those parameters that are its own."""
-        p = self.parameters
-        scene.set_object(p.mass, p.com_shift)
-        scene.set_friction(p.friction * self.object.friction)
-        scene.set_drive_stiffness(self._transmission.drive_stiffness)
-
     def _request(self) -> PinchRequest:
         c = self.config
         along, across, first, second = self._generator.uniform(-1.0, 1.0, size=4).tolist()
@@ -292,7 +294,9 @@ class SimulatedHand:
         self._transmission = make_transmission(self.hand, p)
         self._transmission.lengthen(p.tendon_elongation)
         self._sensors.forget()
-        self._apply(scene)
+        scene.set_object(p.mass, p.com_shift)
+        scene.set_friction(p.friction * self.object.friction)
+        scene.set_drive_stiffness(self._transmission.drive_stiffness)
         self._plan = plan
         scene.q = plan.q
         scene.object_pose = (plan.position, plan.rotation)
@@ -342,3 +346,7 @@ class SimulatedHand:
         transmission.age(scene.q, servo.output, steps * self.config.time_step)
         self._normal = normal
         self._time += steps * self.config.time_step
+
+
+def _differ(old: PlantParameters, new: PlantParameters, *names: str) -> bool:
+    return any(getattr(old, name) != getattr(new, name) for name in names)

@@ -153,9 +153,12 @@ class Transmission:
             torque = self.actuator_torque(q, motor)
             self.offset = self.offset + self.creep * duration * torque * self._pulls_only[: self.n_a]
 
-    def take_over(self, other: Transmission, q: Array) -> None:
-        """Go on from another transmission without a jolt: the same stretch at ``q``."""
-        self.offset = other.offset + (other._lead - self._lead) @ q
+    def take_over(self, other: Transmission, q: Array, motor: Array) -> None:
+        """Go on from another transmission without a jolt: each actuator turns its joints as hard as
+        before, ``J^T k s = J_o^T k_o s_o``, which says how much the new tendon is stretched."""
+        along = np.einsum("aq,aq->a", self._lead, other._lead) / np.einsum("aq,aq->a", self._lead, self._lead)
+        stretch = other.stretch(q, motor) * along * other.stiffness / self.stiffness
+        self.offset = motor - self._lead @ q - stretch
         self._anchor = other._anchor.copy()
 
     def snapshot(self) -> TransmissionState:

@@ -1,0 +1,400 @@
+"""Each trouble changes what it should, by the right amount, and nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from simulation_helpers import DEG, ROLL, SQUEEZE, increment, motion
+
+from torch_ekm.exceptions import ParameterError, UnknownNameError
+from torch_ekm.simulation import (
+    SEVERITIES,
+    Change,
+    DisturbedPlant,
+    Plant,
+    PlantConfig,
+    PlantParameters,
+    PlantStatus,
+    SimulatedHand,
+    Tug,
+    severity,
+)
+
+pytest.importorskip("sapien")
+
+
+@pytest.fixture(scope="module")
+def plant():
+    plant = SimulatedHand("icub_right", "box")
+    plant.reset(0)
+    return plant
+
+
+@pytest.fixture(scope="module")
+def grasped(plant):
+    return plant.snapshot()
+
+
+@pytest.fixture
+def exact(plant, grasped):
+    """The plant without any trouble, freshly grasped."""
+    plant.restore(grasped)
+    yield plant
+    plant.restore(grasped)
+
+
+def turned(plant, delta):
+    """Rotation about the grasp's axis that a command brings [rad]."""
+    before = plant.observe()
+    return float(motion(before, plant.command(delta))[1] @ plant.rotation_axis)
+
+
+def truth(observation, name="q"):
+    return observation.info["truth"][name]
+
+
+# -- the mechanism ------------------------------------------------------------------------------------
+
+
+def test_larger_pulleys_turn_the_object_less(exact, grasped):
+    nominal = turned(exact, ROLL)
+    exact.restore(grasped)
+    exact.change(moment_arm=1.3)
+    assert turned(exact, ROLL) / nominal == pytest.approx(1 / 1.3, abs=0.05)
+
+
+def test_one_pulley_changes_the_effect_of_one_actuator(exact, grasped):
+    factors = [1.0] * 9
+    factors[exact.hand.actuator_names.index("thumb_distal")] = 1.3
+    moves = [increment(thumb_distal=-2.0), increment(index_distal=2.0)]
+    nominal = []
+    for delta in moves:
+        exact.restore(grasped)
+        nominal.append(turned(exact, delta))
+    ratios = []
+    for delta, reference in zip(moves, nominal, strict=True):
+        exact.restore(grasped)
+        exact.change(moment_arm=tuple(factors))
+        ratios.append(turned(exact, delta) / reference)
+    assert ratios[0] == pytest.approx(1 / 1.3, abs=0.06)
+    assert ratios[1] == pytest.approx(1.0, abs=0.08)
+
+
+def test_putting_on_other_pulleys_does_not_jolt_the_grasp(exact):
+    before = exact.observe()
+    exact.change(moment_arm=1.3)
+    exact.wait(0.5)
+    moved, angle = motion(before, exact.observe())
+    assert moved.norm() < 5e-5
+    assert angle.norm() < 0.1 * DEG
+
+
+def test_weaker_springs_let_the_fingertips_bend_back(exact):
+    """Contact torques split over a tendon's two joints by their springs: ``k (q_3 - q_2)`` carries them."""
+    joints = [exact.hand.joint_names.index(name) for name in ("thumb_2", "thumb_3")]
+    before = truth(exact.observe())[joints].diff()
+    exact.change(spring=0.8)
+    exact.wait(0.5)
+    assert truth(exact.observe())[joints].diff() - before > 2.0 * DEG
+
+
+def test_a_softer_transmission_squeezes_less_hard(exact, grasped):
+    def gain():
+        before = truth(exact.observe(), "fingertip_force")[0]
+        return float(truth(exact.command(SQUEEZE), "fingertip_force")[0] - before)
+
+    stiff = gain()
+    exact.restore(grasped)
+    before = exact.observe()
+    exact.change(servo_stiffness=0.5)
+    exact.wait(0.5)
+    assert motion(before, exact.observe())[0].norm() < 2e-5  # no jolt
+    assert 0.3 * stiff < gain() < 0.9 * stiff
+
+
+def test_joint_friction_keeps_the_way_back_apart(exact, grasped):
+    def gap():
+        start = exact.observe()
+        exact.command(ROLL)
+        return motion(start, exact.command(-ROLL))[1].norm() / DEG
+
+    smooth = gap()
+    exact.restore(grasped)
+    exact.change(joint_friction=2.0)
+    rough = gap()
+    assert smooth < 0.1
+    assert rough > 3 * smooth
+    assert 0.05 < rough < 2.0
+
+
+def test_longer_tendons_loosen_the_grip(exact):
+    before = truth(exact.observe(), "fingertip_force")[0]
+    exact.change(tendon_elongation=1.0 * DEG)
+    exact.wait(0.5)
+    assert 0.1 < before - truth(exact.command(torch.zeros(9)), "fingertip_force")[0] < 1.5
+
+
+def test_creep_loosens_the_grip_with_time_and_stops_when_switched_off(exact):
+    exact.change(tendon_creep=0.01)
+    forces = []
+    for _ in range(4):
+        exact.wait(1.0)
+        forces.append(float(truth(exact.observe(), "fingertip_force")[0]))
+    assert np.all(np.diff(forces) < -0.005)
+    exact.change(tendon_creep=0.0)
+    exact.wait(1.0)
+    still = float(truth(exact.observe(), "fingertip_force")[0])
+    exact.wait(1.0)
+    assert abs(float(truth(exact.observe(), "fingertip_force")[0]) - still) < 1e-3
+
+
+def test_finger_weight_pulls_the_joints():
+    light, heavy = (
+        SimulatedHand("icub_right", "box", parameters=PlantParameters(link_weight=weight)).reset(0)
+        for weight in (False, True)
+    )
+    difference = (truth(light) - truth(heavy)).abs().max()
+    assert 0.02 * DEG < difference < 3.0 * DEG
+
+
+# -- the object ---------------------------------------------------------------------------------------
+
+
+def test_a_slippery_object_slips_at_a_tug_that_a_rough_one_stands(exact, grasped):
+    slips = []
+    for friction in (1.0, 0.6):
+        before = exact.restore(grasped)
+        exact.change(friction=friction)
+        slips.append(motion(before, exact.tug(np.array([0.0, 0.0, 3.0]), np.zeros(3)))[1].norm() / DEG)
+    assert slips[0] < 1.0
+    assert slips[1] > 2 * slips[0]
+
+
+def test_a_heavier_object_sags_along_gravity(exact):
+    before = exact.observe()
+    exact.change(mass=3.0)
+    exact.wait(0.5)
+    moved, _ = motion(before, exact.observe())
+    assert moved[2] > 1e-5  # gravity is +z: the palm faces down
+    assert moved[2] > 0.5 * moved.norm()
+
+
+def test_an_eccentric_object_shifts_the_load_between_the_fingers(exact, grasped):
+    tilts = []
+    for shift in (-0.02, 0.02):
+        before = exact.restore(grasped)
+        exact.change(com_shift=(shift, 0.0, 0.0), mass=2.0)
+        exact.wait(0.5)
+        tilts.append(float(motion(before, exact.observe())[1][0]))
+    assert tilts[0] * tilts[1] < 0  # it tilts towards its heavy end, about the pinch line (x)
+    assert min(map(abs, tilts)) > 0.05 * DEG
+
+
+def test_a_larger_object_opens_the_fingers():
+    widths = []
+    for scale in (1.0, 1.2):
+        plant = SimulatedHand("icub_right", "box", PlantConfig(tilt=0.0), PlantParameters(object_scale=scale))
+        plant.reset(0)
+        widths.append((plant.plan.points[1:].mean(axis=0) - plant.plan.points[0]) @ plant.plan.normals[1])
+    assert widths[1] - widths[0] == pytest.approx(0.2 * 0.03, abs=3e-4)
+
+
+# -- the position controller --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "low", "high"),
+    [
+        ({"actuator_bias": 0.5 * DEG}, 0.1, 0.5),
+        ({"actuator_error": 0.5 * DEG}, 0.1, 0.5),
+        ({"dead_zone": 0.9 * DEG}, 0.9, 0.9),
+        ({"threshold": 2.5 * DEG}, 2.0, 2.0),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
+)
+def test_controller_errors_show_on_the_encoders(exact, changes, low, high):
+    before = exact.observe()
+    exact.change(**changes)
+    error = (exact.command(ROLL).a - before.a - ROLL).abs() / DEG
+    moved = ROLL != 0
+    assert low - 1e-9 <= error[moved].max() <= high + 1e-9
+
+
+def test_backlash_hides_from_the_encoders_and_swallows_motion(exact, grasped):
+    def there_and_back():
+        start = exact.observe()
+        exact.command(ROLL)
+        end = exact.command(-ROLL)
+        torch.testing.assert_close(end.a, start.a)
+        return motion(start, end)[1].norm() / DEG
+
+    tight = there_and_back()
+    exact.restore(grasped)
+    exact.change(backlash=1.0 * DEG)
+    assert there_and_back() > max(0.2, 5 * tight)
+
+
+def test_increments_on_the_setpoint_get_through_a_dead_zone():
+    ends = {}
+    for reference in ("encoder", "setpoint"):
+        config = PlantConfig(relative_to=reference)
+        plant = SimulatedHand("icub_right", "box", config, PlantParameters(dead_zone=1.0 * DEG))
+        start = plant.reset(0)
+        for _ in range(4):
+            last = plant.command(ROLL / 4)  # 0.5 to 0.75 deg: each one smaller than the dead zone
+        ends[reference] = motion(start, last)[1].norm() / DEG
+    assert ends["encoder"] < 0.05
+    assert ends["setpoint"] > 0.5
+
+
+# -- the sensors --------------------------------------------------------------------------------------
+
+SENSOR_TROUBLES = {
+    "joint_noise": 1.0 * DEG,
+    "position_noise": 1e-3,
+    "rotation_noise": 1.0 * DEG,
+    "force_noise": 0.3,
+    "force_offset": 0.5,
+    "force_hysteresis": 0.4,
+    "force_range": 15.0,
+    "latency": 0.1,
+    "frame_loss": 0.5,
+    "stuck_joints": ("index_3",),
+}
+SEEN_IN = {"joint_noise": "q", "stuck_joints": "q", "force": "fingertip_force"}
+
+
+@pytest.mark.parametrize("name", SENSOR_TROUBLES)
+def test_sensor_troubles_touch_their_own_reading_and_never_the_truth(exact, grasped, name):
+    clean = exact.command(ROLL)
+    exact.restore(grasped)
+    exact.change(**{name: SENSOR_TROUBLES[name]})
+    seen = exact.command(ROLL)
+    for key, value in clean.info["truth"].items():
+        assert torch.equal(seen.info["truth"][key], value), key
+    kind = name.split("_")[0]
+    own = {"joint": {"q"}, "stuck": {"q"}, "force": {"fingertip_force"}, "position": {"position"}}
+    own |= {"rotation": {"rotation"}, "latency": {"position", "rotation"}, "frame": {"position", "rotation"}}
+    for key in ("q", "a", "position", "rotation", "fingertip_force"):
+        if key not in own[kind]:
+            assert torch.equal(getattr(seen, key), getattr(clean, key)), key
+    if name not in ("stuck_joints", "latency", "frame_loss", "force_hysteresis"):  # see below
+        assert any(not torch.equal(getattr(seen, key), getattr(clean, key)) for key in own[kind])
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "reading"),
+    [
+        ("joint_noise", 0.5 * DEG, lambda o: o.q - o.info["truth"]["q"]),
+        ("position_noise", 2e-4, lambda o: o.position - o.info["truth"]["position"]),
+        ("force_noise", 0.1, lambda o: (o.fingertip_force - o.info["truth"]["fingertip_force"])[:3]),
+    ],
+)
+def test_noise_has_its_size_and_no_mean(exact, name, size, reading):
+    exact.change(**{name: size})
+    sample = torch.stack([reading(exact.observe()) for _ in range(400)])
+    assert float(sample.std()) == pytest.approx(size, rel=0.1)
+    assert float(sample.mean().abs()) < 5 * size / sample.numel() ** 0.5
+
+
+def test_rotation_noise_has_its_size(exact):
+    from torch_ekm.kinematics.se3 import log
+
+    exact.change(rotation_noise=0.2 * DEG)
+    seen = [exact.observe() for _ in range(300)]
+    sample = torch.stack([log(o.rotation @ o.info["truth"]["rotation"].mT) for o in seen])
+    assert float(sample.std()) == pytest.approx(0.2 * DEG, rel=0.1)
+
+
+def test_fingertips_read_in_8_bit_with_offset_and_hysteresis(exact):
+    exact.change(force_range=15.0)
+    readings = exact.command(SQUEEZE).fingertip_force / (15.0 / 255)
+    torch.testing.assert_close(readings, readings.round(), atol=1e-9, rtol=0)
+    exact.change(force_range=0.0, force_offset=0.3)
+    error = exact.observe()
+    error = error.fingertip_force - truth(error, "fingertip_force")
+    assert 0.02 < error[:3].abs().max() <= 0.3
+    exact.change(force_offset=0.0, force_hysteresis=0.4)
+    exact.command(SQUEEZE)
+    rising = exact.observe()
+    falling = exact.command(-SQUEEZE)
+    lag = [truth(o, "fingertip_force")[0] - o.fingertip_force[0] for o in (rising, falling)]
+    assert lag[0] == pytest.approx(0.2, abs=1e-6)
+    assert lag[1] == pytest.approx(-0.2, abs=1e-6)
+
+
+def test_latency_shows_an_older_pose(exact):
+    exact.change(latency=0.3)
+    exact.wait(0.5)
+    before = exact.observe()
+    torch.testing.assert_close(before.position, truth(before, "position"), atol=1e-6, rtol=0)
+    exact.tug(np.array([0.0, 0.0, 5.0]), np.zeros(3))
+    exact._run(100, lambda part: exact._servo.encoder - part * SQUEEZE.numpy())
+    moving = exact.observe()
+    assert (moving.position - truth(moving, "position")).norm() > 1e-5
+
+
+def test_lost_frames_repeat_the_last_pose_and_say_so(exact):
+    exact.change(frame_loss=0.3)
+    exact.observe()
+    seen = [exact.observe() for _ in range(300)]
+    lost = [o.status is PlantStatus.NOT_SEEN for o in seen]
+    assert np.mean(lost) == pytest.approx(0.3, abs=0.08)
+
+
+def test_a_stuck_channel_stays_where_it_was(exact):
+    joint = exact.hand.joint_names.index("index_3")
+    exact.change(stuck_joints=("index_3",))
+    first = exact.observe().q[joint]
+    later = exact.command(ROLL)
+    assert later.q[joint] == first
+    assert (truth(later)[joint] - first).abs() > 0.2 * DEG
+
+
+# -- severities and events ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SEVERITIES)
+def test_every_severity_grasps(name):
+    plant = SimulatedHand("icub_right", "box", parameters=severity(name))
+    assert plant.reset(0).status is not PlantStatus.LOST
+    assert plant.command(ROLL).status is not PlantStatus.LOST
+
+
+def test_severities_grow():
+    figures = [severity(name) for name in ("none", "nominal", "worn", "hostile")]
+    for name in ("actuator_bias", "dead_zone", "joint_friction", "backlash", "position_noise", "latency"):
+        values = [getattr(parameters, name) for parameters in figures]
+        assert values == sorted(values)
+        assert values[-1] > values[0] == 0.0
+    with pytest.raises(UnknownNameError, match="hostile"):
+        severity("nasty")
+
+
+def test_events_happen_when_they_should(exact):
+    tug = Tug(at=1, force=(0.0, 0.0, 5.0))
+    tendons = Change.new_tendons(at=2, moment_arm=1.2)
+    disturbed = DisturbedPlant(exact, (tendons, tug))
+    assert isinstance(disturbed, Plant)
+    still = torch.zeros(9)
+    turns, last = [], exact.observe()
+    for k in range(3):
+        now = disturbed.command(still)
+        turns.append(float(motion(last, now)[1].norm()) / DEG)
+        assert now.info.get("events", ()) == {1: (tug,), 2: (tendons,)}.get(k, ())
+        last = now
+    assert turns[0] < 0.05
+    assert turns[1] > 2.0  # a dislocation
+    assert turns[2] < 0.2
+    assert exact.parameters.moment_arm == 1.2
+
+
+def test_impossible_events_and_changes_are_refused(exact):
+    with pytest.raises(ParameterError, match=r"event\.at"):
+        DisturbedPlant(exact, (Tug(at=-1),))
+    before = exact.parameters
+    for changes in ({"moment_arm": (1.0, 2.0)}, {"spring": -1.0}, {"springs": 1.0}):
+        with pytest.raises(ParameterError):
+            exact.change(**changes)
+    assert exact.parameters == before
