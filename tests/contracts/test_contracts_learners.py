@@ -42,7 +42,15 @@ LEARNERS = {
     "ensemble": lambda **o: ReplayMLP(3, 2, hidden=(8,), members=3, **o),
     "sogp": sogp,
     "sogp_all": lambda **o: sogp(
-        normalize=True, adapt=True, forgetting=0.99, robust=3.0, refresh_every=4, projection="fitc", **o
+        normalize=True,
+        adapt=True,
+        forgetting=0.99,
+        robust=3.0,
+        refresh_every=4,
+        projection="fitc",
+        calibrate=True,
+        detect_changes=True,
+        **o,
     ),
     "sogp_skip": lambda **o: sogp(on_invalid="skip", **o),
     "sogp_action": lambda **o: sogp(kernel=ActionLinearKernel(3, 1), normalize=True, **o),

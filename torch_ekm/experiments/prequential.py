@@ -46,7 +46,7 @@ class Prequential:
         law = torch.distributions.Normal(self.mean[start:], self.deviation[start:], validate_args=False)
         return float(-law.log_prob(self.y[start:]).mean())
 
-    def coverage(self, start: int = 0) -> Float[Tensor, "m"]:
+    def coverage(self, start: int = 0) -> Float[Tensor, "*out"]:
         """Share of samples inside the central 90 % interval, per output."""
         return (self.error[start:].abs() <= Z90 * self.deviation[start:]).to(self.y.dtype).mean(0)
 

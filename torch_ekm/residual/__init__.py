@@ -20,8 +20,8 @@ from .krls_t import KRLSTracker as KRLSTracker
 from .linear import RandomFeatureRLS as RandomFeatureRLS
 from .linear import RecursiveLeastSquares as RecursiveLeastSquares
 from .local_gps import LocalGPs as LocalGPs
+from .prediction import Prediction as Prediction
 from .replay_mlp import ReplayMLP as ReplayMLP
-from .sogp import Prediction as Prediction
 from .sogp import SparseOnlineGP as SparseOnlineGP
 from .window_gp import WindowGP as WindowGP
 from .zero import ZeroResidual as ZeroResidual

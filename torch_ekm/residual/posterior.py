@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from ..typing import Float, Tensor
+from ..typing import Bool, Float, Tensor
 from .base import UpdateEvent, UpdateReport
 from .deletion import DELETION_SCORES
 from .kernels import Kernel
@@ -81,6 +81,11 @@ class SparsePosterior(nn.Module):
         """Omega: how often, and with which weight, each direction of f was seen."""
         return self.moments[..., 2, :, :]
 
+    @property
+    def needs_age(self) -> bool:
+        """Whether the deletion score asks for sample numbers (a compiled step is cheaper without)."""
+        return self.deletion not in ("kl", "mean", "novelty", "freeze")
+
     def reset(self) -> None:
         """Back to the prior, no basis."""
         for buffer in self.buffers(recurse=False):
@@ -95,6 +100,12 @@ class SparsePosterior(nn.Module):
         self.active[..., :n] = 1.0
         self.count.fill_(n)
         self.slot.fill_(n)
+
+    def forget(self, models: Bool[Tensor, "*batch"]) -> None:
+        """These models go back to the prior but keep their basis points."""
+        keep = (~models)[..., None, None]
+        for block in (self.covariance, self.precision, self.alpha, self.information):
+            block.mul_(keep)
 
     def gram(self, kernel: Kernel) -> Float[Tensor, "*batch slots slots"]:
         """K(X, X) with the nugget; the identity at free slots."""
@@ -118,7 +129,7 @@ class SparsePosterior(nn.Module):
         s2: Float[Tensor, "*batch"],
         mask: Float[Tensor, "*batch"] | None,
         number: int,
-    ) -> UpdateReport:
+    ) -> tuple[UpdateReport, Float[Tensor, "*batch out"], Float[Tensor, "*batch"]]:
         """One sample per model, without a branch on data (a mask multiplies every change by 0)::
 
             e = Qk, gamma = k** - k'e, v = k** + k'Ck, i = y - mean
@@ -129,6 +140,9 @@ class SparsePosterior(nn.Module):
 
         Csato & Opper 2002, eqs. 2.12-2.14 and the appendix; the projection's D is their
         ``-1/(eta r)``. A robust weight w and FITC replace s2 by ``s2/w (+ gamma if projected)``.
+
+        Returns:
+            The report, the innovation and the latent variance before the update.
         """
         here = self._slots == self.slot.unsqueeze(-1)
         k = kernel.vector(x, self.basis) * self.active
@@ -176,7 +190,7 @@ class SparsePosterior(nn.Module):
             used = (here & (mask > 0).unsqueeze(-1)).unsqueeze(-1)
             self.basis.copy_(torch.where(used, x.unsqueeze(-2), self.basis))
         self.active.scatter_(-1, where, novel.to(e.dtype).unsqueeze(-1))
-        if self.deletion not in ("kl", "mean", "novelty", "freeze"):
+        if self.needs_age:
             self.age.scatter_(-1, where, torch.full_like(unit[..., :1], number))
         excess = novel & full
         grown = novel ^ excess
@@ -187,7 +201,7 @@ class SparsePosterior(nn.Module):
         event = int(UpdateEvent.ABSORBED) + novel.to(torch.int64) + excess
         if mask is not None:
             event = event * (mask > 0)
-        return UpdateReport(event, gamma / prior, surprise, weight)
+        return UpdateReport(event, gamma / prior, surprise, weight), innovation, v
 
     def _delete(self, excess: Tensor, s2: Tensor) -> None:
         """KL projection of the lowest-scored point onto the others, in models marked ``excess``.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable
+from functools import cache
+from typing import Any, Literal
 
 import torch
 from torch.distributions import Normal
@@ -14,17 +16,10 @@ from .adaptation import PrequentialAdaptation
 from .base import ResidualLearner, UpdateReport, check_count, check_positive
 from .deletion import DELETION_SCORES
 from .kernels import Kernel, SquaredExponential, log_parameter
+from .monitor import ChangeDetector, NoiseCalibration
 from .posterior import SparsePosterior
+from .prediction import Prediction
 from .running_scale import RunningScale
-
-
-class Prediction(NamedTuple):
-    """Mean, latent variance and their derivatives with respect to x."""
-
-    mean: Float[Tensor, "*any out"]
-    variance: Float[Tensor, "*any out"]
-    mean_jacobian: Float[Tensor, "*any out in"]
-    variance_jacobian: Float[Tensor, "*any out in"]
 
 
 class SparseOnlineGP(ResidualLearner):
@@ -72,6 +67,12 @@ class SparseOnlineGP(ResidualLearner):
         adapt: learn kernel and noise online, see PrequentialAdaptation; one step per rebuild.
         adapt_rate: its step on the logarithms of the hyperparameters.
         adapt_network_rate: its step on a deep kernel's weights.
+        calibrate: scale the observation noise of each output so that 90 % intervals hold 90 % of the
+            samples, see NoiseCalibration.
+        detect_changes: start anew from the last samples when most of them were surprising, see
+            ChangeDetector. Looks at the result of every update, so on a GPU it waits for it.
+        compile_step: run the update through torch.compile: needs a C++ compiler and about a minute at
+            the first update. Compile predictions with ``torch.compile(gp.predict_with_jacobians)``.
 
     Raises:
         ParameterError: a parameter is outside its range.
@@ -99,6 +100,9 @@ class SparseOnlineGP(ResidualLearner):
         adapt: bool = False,
         adapt_rate: float = 0.03,
         adapt_network_rate: float = 0.003,
+        calibrate: bool = False,
+        detect_changes: bool = False,
+        compile_step: bool = False,
         batch_shape: tuple[int, ...] = (),
         on_invalid: Literal["raise", "skip"] = "raise",
         dtype: torch.dtype = torch.float64,
@@ -123,7 +127,7 @@ class SparseOnlineGP(ResidualLearner):
             raise ParameterError("deletion", deletion, f"one of {(*DELETION_SCORES, 'freeze')}")
         self.capacity = check_count("capacity", capacity)
         self.refresh_every = check_count("refresh_every", refresh_every)
-        self.forgetting = float(forgetting)
+        self.forgetting, self.compile_step = float(forgetting), bool(compile_step)
         factory: dict[str, Any] = {"dtype": torch.float64, "device": device}
         fleet = {"batch_shape": self.batch_shape, **factory}
         self.kernel = SquaredExponential(self.in_features, **fleet) if kernel is None else kernel.double()
@@ -146,6 +150,11 @@ class SparseOnlineGP(ResidualLearner):
             batch_shape=self.batch_shape,
             device=device,
         )
+        places = {"batch_shape": self.batch_shape, "device": device}
+        self.calibration = NoiseCalibration(self.out_features, **places) if calibrate else None
+        self.detector = None
+        if detect_changes:
+            self.detector = ChangeDetector(self.in_features, self.out_features, **places)
         self.adaptation = None
         if adapt:
             self.adaptation = PrequentialAdaptation(
@@ -239,7 +248,8 @@ class SparseOnlineGP(ResidualLearner):
     @property
     def noise_variance(self) -> Float[Tensor, "*batch out"]:
         """Observation noise variance, in the outputs' own squared units."""
-        return self.log_noise_variance.exp() * self.output_scale.scale.square()
+        noise = self.log_noise_variance.exp() * self.output_scale.scale.square()
+        return noise if self.calibration is None else noise * self.calibration.log_factor.exp()
 
     @property
     def basis_inputs(self) -> Float[Tensor, "*batch slots in"]:
@@ -259,8 +269,9 @@ class SparseOnlineGP(ResidualLearner):
         self.posterior.reset()
         self.input_scale.reset()
         self.output_scale.reset()
-        if self.adaptation is not None:
-            self.adaptation.reset()
+        for part in (self.adaptation, self.calibration, self.detector):
+            if part is not None:
+                part.reset()
         self.pending.zero_()
         self.n_refused.zero_()
         self._n_samples = 0
@@ -305,7 +316,14 @@ class SparseOnlineGP(ResidualLearner):
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         on = None if mask is None else mask.to(x.dtype)
         z, t = self._units(x), y / self.output_scale.scale if self.normalize_for else y
-        report = self.posterior.absorb(z, t, self.kernel, self._shared_noise(), on, self._n_samples)
+        s2, noise = self._shared_noise(), self.log_noise_variance.exp()
+        number = self._n_samples if self.posterior.needs_age else 0
+        step = _compiled_absorb() if self.compile_step else SparsePosterior.absorb
+        report, innovation, v = step(self.posterior, z, t, self.kernel, s2, on, number)
+        if self.calibration is not None:
+            self.calibration.observe(innovation, v, noise, on)
+        if self.detector is not None:
+            self._start_anew(self.detector.observe(x, y, report.surprise, on))
         self.pending += 1.0 if on is None else on
         if self._normalizing:
             used = torch.ones_like(report.weight) if on is None else on
@@ -322,6 +340,17 @@ class SparseOnlineGP(ResidualLearner):
         if due or (self._normalizing and n & (n - 1) == 0):
             self.refresh()
         return report
+
+    def _start_anew(self, changed: Tensor) -> None:
+        """Models that face another system forget the old one and learn the samples that showed it."""
+        if self.detector is None or not bool(changed.any()):
+            return
+        self.posterior.forget(changed)
+        self.pending.masked_fill_(changed, 0.0)
+        for x, y, used in zip(self.detector.inputs, self.detector.targets, self.detector.used, strict=True):
+            t = y / self.output_scale.scale if self.normalize_for else y
+            on = (used & changed).to(x.dtype)
+            self.posterior.absorb(self._units(x), t, self.kernel, self._shared_noise(), on, self._n_samples)
 
     # -- pieces ---------------------------------------------------------------------------------
 
@@ -391,3 +420,9 @@ class SparseOnlineGP(ResidualLearner):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """See get_extra_state."""
         self._n_samples = int(state["n_samples"])
+
+
+@cache
+def _compiled_absorb() -> Callable:
+    """One compiled step for all learners; kept here, since a compiled function cannot be copied."""
+    return torch.compile(SparsePosterior.absorb, dynamic=False)
