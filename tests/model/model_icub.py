@@ -94,7 +94,7 @@ def pinch(shape: str = "box", *, gamma: float = 0.0, friction: float = 1.5, open
         torsional_friction=torch.full((3,), gamma, dtype=F64),
     )
     centre = 0.5 * points[0] + 0.25 * (points[1] + points[2])
-    rotation = torch.stack([torch.linalg.cross(along, across), along, across], dim=-1)
+    rotation = torch.stack([along, across, torch.linalg.cross(along, across)], dim=-1)  # box: y is across
     state = GraspState(q, centre, rotation)
     options.setdefault("gravity", (0.0, 0.0, -9.81))
     model = KinematicModel(

@@ -18,7 +18,7 @@ from .manipulation import Step
 from .options import ModelOptions
 from .potential import gravity_gradient, gravity_hessian, spring_torque
 from .reduction import Reduction
-from .sensitivity import margin_sensitivity, normal_sensitivity
+from .sensitivity import force_change, margin_sensitivity, normal_motion, normal_sensitivity
 from .state import GraspState
 from .stiffness import geometric_stiffness, precedence
 
@@ -217,7 +217,8 @@ class KinematicModel(nn.Module):
         if o.on_unstable == "flag" and bool((step.stability <= 0).any()):
             status = ModelStatus.UNSTABLE
         J = step.motion
-        normal = normal_sensitivity(kin, forces, dmu, J)
+        df, dn = force_change(kin, dmu), normal_motion(kin, J)
+        normal = normal_sensitivity(kin, forces, df, dn)
         return Linearization(
             state=state,
             contacts=contacts,
@@ -226,7 +227,7 @@ class KinematicModel(nn.Module):
             contact_force_sensitivity=dmu,
             actuator_force_sensitivity=dlam,
             normal_force_sensitivity=normal,
-            margin_sensitivity=margin_sensitivity(kin, forces, dmu, J, normal),
+            margin_sensitivity=margin_sensitivity(kin, forces, dmu, df, dn, normal),
             normal_rows=tuple(kin.normal_rows),
             held_joints=held,
             stability=step.stability,

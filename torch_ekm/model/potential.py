@@ -86,6 +86,7 @@ def posture_stiffness(
         axis: ``z_a``.
         precedes: joint a is proximal to joint b or equal to it.
     """
-    turned = torch.linalg.cross(force[..., :, None, :], axis[..., None, :, :])  # f.(z x v) = (f x z).v
-    upper = torch.einsum("...iak,...ibk->...ab", turned, velocity) * precedes.to(axis.dtype)
+    # f.(z_a x v_b) = (f x z_a).v_b, summed over points and components as one product
+    turned = torch.linalg.cross(force[..., :, None, :], axis[..., None, :, :])
+    upper = turned.mT.flatten(-3, -2).mT @ velocity.mT.flatten(-3, -2) * precedes.to(axis.dtype)
     return upper + upper.mT - torch.diag_embed(upper.diagonal(dim1=-2, dim2=-1))

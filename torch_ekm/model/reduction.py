@@ -76,7 +76,7 @@ class Reduction(nn.Module):
         """
         n_q, n_a, L = self.joint_basis.shape[0], self.actuation.shape[0], self.options.length
         S = self.scaled_basis
-        D = S.mT @ D @ S
+        D = _left(S, D @ S)
         row_scale = torch.tensor(
             [1 / L if row % 6 < 3 else 1.0 for row in rows], dtype=D.dtype, device=D.device
         )
@@ -115,9 +115,14 @@ class Reduction(nn.Module):
         dlam = D.new_zeros(*batch, n_a, n_a)
         dlam[..., rigid, :] = step.reaction[..., first : first + len(rigid), :] / arm
         if len(soft):
-            dlam[..., soft, :] = self.stiffness[soft, None] * (B[soft] @ step.motion - eye[soft])
+            dlam[..., soft, :] = self.stiffness[soft, None] * (_left(B[soft].mT, step.motion) - eye[soft])
         dmu = step.reaction[..., :n_h, :] if stiff_contacts else K_c * L * L * (A @ step.motion)
-        return Step(S @ step.motion, step.reaction, step.stability), row_scale[:, None] * dmu, dlam
+        return Step(_left(S.mT, step.motion), step.reaction, step.stability), row_scale[:, None] * dmu, dlam
+
+
+def _left(S: Tensor, X: Tensor) -> Tensor:
+    """``S^T X`` as one large product: torch folds a batch only into the left factor."""
+    return (X.mT @ S).mT
 
 
 def joint_basis(hand: HandDescription) -> Float[Tensor, "n_q n_z"]:

@@ -32,23 +32,21 @@ def force_change(
 
 
 def normal_sensitivity(
-    kin: ContactKinematics, forces: GraspForces, dmu: Tensor, J: Tensor
+    kin: ContactKinematics, forces: GraspForces, df: Tensor, dn: Tensor
 ) -> Float[Tensor, "*batch n_c n_a"]:
-    """``d f_n/da = n_in . df + f . d n_in`` [N/rad]."""
-    dn_in = -normal_motion(kin, J)
-    df = force_change(kin, dmu)
-    n_in = -kin.contacts.normal
-    return (n_in[..., None, :] @ df + forces.force[..., None, :] @ dn_in)[..., 0, :]
+    """``d f_n/da = n_in . df + f . d n_in`` [N/rad]; ``dn`` from :func:`normal_motion`."""
+    normal, force = kin.contacts.normal[..., None, :], forces.force[..., None, :]
+    return -(normal @ df + force @ dn)[..., 0, :]
 
 
 def margin_sensitivity(
-    kin: ContactKinematics, forces: GraspForces, dmu: Tensor, J: Tensor, normal: Tensor
+    kin: ContactKinematics, forces: GraspForces, dmu: Tensor, df: Tensor, dn: Tensor, normal: Tensor
 ) -> Float[Tensor, "*batch n_c n_a"]:
     """``d (mu_s f_n - |u|)/da``, ``u = [f_t; m_n mu_s/gamma]`` [N/rad]; ``d|u|`` counts as 0 at u = 0."""
     mu_s, gamma = kin.contacts.friction, kin.contacts.torsional_friction
     n_in = -kin.contacts.normal
     f_t = forces.force - forces.normal[..., None] * n_in
-    df_t = force_change(kin, dmu) + forces.normal[..., None, None] * normal_motion(kin, J)
+    df_t = df + forces.normal[..., None, None] * dn
     square, product = (f_t * f_t).sum(-1), (f_t[..., None, :] @ df_t)[..., 0, :]
     soft = [i for i, model in enumerate(kin.models) if model is ContactModel.SOFT_FINGER]
     if soft:

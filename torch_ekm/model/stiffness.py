@@ -61,10 +61,15 @@ def geometric_stiffness(
     normal = kin.contacts.normal
     roll = kin.mobility @ hat(normal)  # -M (w x n): the contact point runs M (w_rel x n)
     if rolling:
-        D = D + (Omega.mT @ (f_hat @ roll) @ Omega).sum(-3)
+        D = D + _over_contacts(Omega, (f_hat @ roll) @ Omega)
     if bool((spin_moment != 0).any()):
         D = D + _spin_terms(kin, spin_moment, precedes, roll, Omega, hand=hand, rolling=rolling)
     return D
+
+
+def _over_contacts(left: Tensor, right: Tensor) -> Tensor:
+    """``sum_i left_i^T right_i`` as one product."""
+    return left.flatten(-3, -2).mT @ right.flatten(-3, -2)
 
 
 def _spin_terms(
@@ -83,11 +88,11 @@ def _spin_terms(
     inner[..., n_q + 3 :] = -hat(moment)
     if rolling:
         inner = inner + spin_moment[..., None, None] * (kin.contacts.object_curvature @ roll @ Omega)
-    D = (Omega.mT @ inner).sum(-3)
+    D = _over_contacts(Omega, inner)
     if hand:
         # (z_b x z_a) . m = z_a . (m x z_b), for b strictly proximal to a, both upstream of the contact
         J_w = kin.spin_jacobian
-        W = (J_w.mT @ hat(moment) @ J_w).sum(-3)
+        W = _over_contacts(J_w, hat(moment) @ J_w)
         strictly = (precedes & ~precedes.mT).mT.to(W.dtype)
         D[..., :n_q, :n_q] += W * strictly
     return D
