@@ -28,6 +28,7 @@ from .joint_estimator import JointEstimate as JointEstimate
 from .joint_estimator import JointEstimator as JointEstimator
 from .marker import MarkerTracker as MarkerTracker
 from .marker import TrackerOptions as TrackerOptions
+from .sapien_camera import SapienCamera as SapienCamera
 from .scene import ConvexBody as ConvexBody
 from .scene import PlacedCard as PlacedCard
 from .scene import Scene as Scene
@@ -62,6 +63,7 @@ __all__ = [
     "MarkerTracker",
     "PinholeCamera",
     "PlacedCard",
+    "SapienCamera",
     "Scene",
     "SensedPlant",
     "SimulatedCamera",
