@@ -18,6 +18,7 @@ from torch_ekm.sensing import (
     HallSensors,
     MarkerBoard,
     MarkerTracker,
+    PinholeCamera,
     SensedPlant,
     StreamOptions,
     TrackStatus,
@@ -171,6 +172,21 @@ def test_several_looks_get_over_dropped_frames(hand, obj):
     plant.reset(seed=0)
     assert all(plant.observe().status is PlantStatus.HELD for _ in range(10))
     assert plant._frames > 13
+
+
+def test_a_wrong_lens_or_mount_shows(hand, obj):
+    """What the tracker takes for granted may be wrong, and then the pose is."""
+    mount = ICUB_PALM_MOUNT.copy()
+    mount[0, 3] += 0.004
+    board = MarkerBoard(4, mount=obj.marker_transform)
+    shifted = MarkerTracker(PinholeCamera(), MarkerBoard(0, mount=mount), board)
+    longer = MarkerTracker(PinholeCamera(fx=660, fy=660), MarkerBoard(0, mount=ICUB_PALM_MOUNT), board)
+    exact, moved, stretched = (
+        SensedPlant(Puppet(hand), hand, obj, tracker=tracker).reset(0).position
+        for tracker in (None, shifted, longer)
+    )
+    torch.testing.assert_close(moved - exact, torch.tensor([0.004, 0, 0]).double(), atol=1e-9, rtol=0)
+    assert 0.0005 < (stretched - exact).norm() < 0.02
 
 
 @pytest.mark.parametrize("turn", [-29.0, 0.0, 29.0])

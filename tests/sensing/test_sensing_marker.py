@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import ObjectLostError, ParameterError, ShapeError
-from torch_ekm.kinematics.se3 import log
+from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.sensing import (
+    BoardPose,
     ConvexBody,
     MarkerBoard,
     MarkerTracker,
@@ -77,6 +78,28 @@ def test_covariance_of_the_object_pose(pose_of, mounted, rng):
         chi2.append(float(twist @ torch.linalg.solve(track.covariance, twist)))
         assert torch.linalg.eigvalsh(track.covariance).min() > 0
     assert 1.5 < np.mean(chi2) < 15  # 6 if errors of one scene were independent from image to image
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_covariance_is_carried_into_the_hand_frame(pose_of, mounted, which):
+    """One unit of variance along each direction of a board's twist, against finite differences."""
+    tracker, h = MarkerTracker(PinholeCamera(), *mounted), 1e-6
+    poses = pose_of(-0.05, tilt_deg=35), pose_of(0.05, 0.01, tilt_deg=30)
+
+    def object_in_hand(step, covariance):
+        looks = []
+        for k, pose in enumerate(poses):
+            moved = step if k == which else np.zeros(6)
+            turned = exp(torch.from_numpy(moved[3:])).numpy() @ pose[:3, :3]
+            known = covariance if k == which else np.zeros((6, 6))
+            looks.append(BoardPose(turned, pose[:3, 3] + moved[:3], known, 0.0, 16, 0, False))
+        return tracker._object_in_hand(*looks)
+
+    for direction in np.eye(6):
+        (p, R, _), (m, S, _) = (object_in_hand(sign * h * direction, np.eye(6)) for sign in (1, -1))
+        column = np.concatenate([p - m, log(torch.from_numpy(R @ S.T)).numpy()]) / (2 * h)
+        *_, covariance = object_in_hand(np.zeros(6), np.outer(direction, direction))
+        np.testing.assert_allclose(covariance, np.outer(column, column), atol=1e-6)
 
 
 def test_accuracy_at_nominal_noise():
@@ -177,16 +200,29 @@ def test_still_palm_is_averaged_and_bridged(pose_of, simulated, rng):
     assert (bridged.position - track.position).abs().max() < 5e-4
 
 
-def test_one_marker_alone_is_not_enough(pose_of, simulated, rng):
+@pytest.mark.parametrize(("wanted", "enough"), [(1, True), (2, False)])
+def test_one_marker_alone_is_not_enough(pose_of, simulated, rng, wanted, enough):
     boards = MarkerBoard(0), MarkerBoard(4, columns=2, rows=1)
     scene = scene_of(pose_of, boards=boards)
     card = scene.cards[1]
     corner = card.pose[:3, :3] @ [0.018, 0.0, 0.0] + card.pose[:3, 3]
     scene = dataclasses.replace(scene, bodies=(ConvexBody(0.8 * corner[None], np.array([0.007])),))
     image = simulated.render(scene, rng)
-    track = MarkerTracker(simulated.camera, *boards).track(image)
+    options = TrackerOptions(min_markers=wanted)
+    track = MarkerTracker(simulated.camera, *boards, options).track(image)
     assert track.n_markers == 5
-    assert track.status is TrackStatus.OBJECT_HIDDEN
+    assert (track.object is not None) == enough
+    assert (track.status is TrackStatus.OBJECT_HIDDEN) != enough
+
+
+def test_more_markers_may_be_asked_for(pose_of, simulated, rng):
+    scene = scene_of(pose_of)
+    tip = scene.cards[1].outline[0] * 0.85
+    finger = ConvexBody.capsule(tip, tip - np.array([0.0, 0.06, 0.0]), 0.006)
+    image = simulated.render(dataclasses.replace(scene, bodies=(finger,)), rng)
+    for wanted, status in ((3, TrackStatus.OK), (4, TrackStatus.OBJECT_HIDDEN)):
+        options = TrackerOptions(min_markers=wanted)
+        assert MarkerTracker(simulated.camera, PALM, OBJECT, options).track(image).status is status
 
 
 def test_boards_must_be_told_apart():

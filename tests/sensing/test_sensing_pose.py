@@ -125,9 +125,10 @@ def test_edges_correct_a_rough_pose(pose_of, camera, rng):
     assert np.abs(error[3:]).max() < np.radians(0.15)
 
 
-def test_edges_of_a_half_hidden_board_still_count(pose_of, rng):
+@pytest.mark.parametrize("shade", [40, 90, 215])
+def test_edges_of_a_half_hidden_board_still_count(pose_of, rng, shade):
     camera, board, pose = PinholeCamera(), MarkerBoard(), pose_of(tilt_deg=30)
-    finger = ConvexBody.capsule(np.array([-0.03, 0.012, 0.33]), np.array([0.04, 0.02, 0.33]), 0.007)
+    finger = ConvexBody.capsule(np.array([-0.03, 0.012, 0.33]), np.array([0.04, 0.02, 0.33]), 0.007, shade)
     image = SimulatedCamera(camera).render(Scene((PlacedCard(board, pose),), (finger,)), rng)
     start = BoardPose(pose[:3, :3], pose[:3, 3], np.eye(6), 0.0, 16, 0, False)
     refined = refine_on_edges(image, camera, board, start)

@@ -158,6 +158,7 @@ class MarkerTracker:
             self.options.corner_std,
             self.options.max_residual,
             self._prior.get(id(board)),
+            min_corners=min(6, 4 * self.options.min_markers),
         )
         if pose is None or not self.options.edges:
             return pose

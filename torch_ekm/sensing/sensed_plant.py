@@ -33,7 +33,8 @@ class SensedPlant:
     The inner plant moves; its ``info["truth"]`` (``q``, ``position``, ``rotation``) is drawn by
     a camera and read by Hall sensors, and only what :class:`MarkerTracker` and :class:`JointEstimator`
     make of that is passed on. Up to ``looks`` frames are tried until one shows both boards;
-    if none does, the last pose is repeated with the status NOT_SEEN. ``info`` also holds
+    if none does, the last pose is repeated with the status NOT_SEEN. The hand has come to rest by
+    then, so that the latency of the images does not matter here. ``info`` also holds
     "track" and "hall" (the raw counts). The same seed gives the same noise.
 
     Args:
@@ -41,8 +42,8 @@ class SensedPlant:
         hand, obj: what it consists of.
         palm_mount: pose of the palm's board in the hand frame, ``(4, 4)``.
         camera: draws the images.
-        tracker: finds the boards; by default one that knows the camera and the mounts exactly.
-            Give one with a calibrated camera to include the errors of its calibration.
+        tracker: finds the boards; by default one that knows the lens and the mounts exactly. Give one
+            with a calibrated lens, or with mounts as measured, to include the errors of both.
         hall: the Hall channels; None keeps the inner plant's joint angles.
         calibration: of these channels; None: from a sweep of 181 postures, at construction.
         distance: of the camera from the middle between the boards [m].
@@ -71,10 +72,13 @@ class SensedPlant:
             raise ParameterError("looks", looks, "1 or more")
         self.plant, self.hand, self.object, self.looks, self.distance = plant, hand, obj, looks, distance
         self.camera, self.stream = camera or SimulatedCamera(), stream or StreamOptions()
-        palm = MarkerBoard(0, mount=palm_mount)
-        board = MarkerBoard(palm.n_markers, mount=obj.marker_transform)
-        self.boards = (palm, board)
-        self.tracker = tracker or MarkerTracker(self.camera.camera, palm, board)
+        palm = MarkerBoard(0) if tracker is None else tracker.palm_board
+        board = MarkerBoard(palm.n_markers) if tracker is None else tracker.object_board
+        self.boards = (
+            dataclasses.replace(palm, mount=palm_mount),
+            dataclasses.replace(board, mount=obj.marker_transform),
+        )
+        self.tracker = tracker or MarkerTracker(self.camera.camera, *self.boards)
         self.hall, self.joints = hall, None
         if hall is not None:
             sweep = hall.sweep(181, torch.Generator().manual_seed(0))
