@@ -12,6 +12,9 @@ from .pinch_problem import PinchRequest as PinchRequest
 from .plant import Observation as Observation
 from .plant import Plant as Plant
 from .plant import PlantStatus as PlantStatus
+from .recording import Recording as Recording
+from .recording import RecordingPlant as RecordingPlant
+from .recording import ReplayedPlant as ReplayedPlant
 from .severities import SEVERITIES as SEVERITIES
 from .severities import severity as severity
 from .simulated_hand import PlantSnapshot as PlantSnapshot

@@ -1,0 +1,90 @@
+"""What was recorded comes back as it was."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torch_ekm.exceptions import DescriptionError, ParameterError
+from torch_ekm.simulation import Observation, Plant, PlantStatus, Recording, RecordingPlant, ReplayedPlant
+
+h5py = pytest.importorskip("h5py")
+
+
+class FakePlant:
+    """Any plant will do: one whose readings count the commands."""
+
+    def __init__(self):
+        self.state = torch.zeros(3, dtype=torch.float64)
+
+    def reset(self, seed):
+        self.state = torch.full((3,), float(seed), dtype=torch.float64)
+        return self.observe()
+
+    def observe(self):
+        status = PlantStatus.LOST if self.state[0] > 8 else PlantStatus.HELD
+        eye = torch.eye(3, dtype=torch.float64)
+        return Observation(
+            self.state, self.state[:2], self.state, eye, self.state[:1], float(self.state[0]), status
+        )
+
+    def command(self, delta_a):
+        self.state = self.state + delta_a
+        return self.observe()
+
+    def close(self):
+        pass
+
+
+def record():
+    plant = RecordingPlant(FakePlant())
+    plant.reset(1)
+    plant.command(torch.ones(3))  # belongs to an earlier grasp
+    plant.reset(5)
+    for k in range(3):
+        plant.command(torch.tensor([1.0, 2.0, k]))
+    return plant.recording
+
+
+def test_a_saved_recording_replays_like_the_original(tmp_path):
+    original = record()
+    replayed = ReplayedPlant(Recording.load(original.save(tmp_path / "run.h5")))
+    assert isinstance(replayed, Plant)
+    assert replayed.recording.seed == 5
+    seen = [replayed.reset(0)] + [replayed.command(torch.zeros(3)) for _ in range(3)]
+    for now, then in zip(seen, original.observations, strict=True):
+        for name in ("q", "a", "position", "rotation", "fingertip_force"):
+            assert torch.equal(getattr(now, name), getattr(then, name))
+        assert (now.time, now.status) == (then.time, then.status)
+    assert [o.status for o in seen] == [PlantStatus.HELD] * 4
+    assert torch.equal(seen[-1].info["recorded_command"], original.commands[-1])
+    with pytest.raises(ParameterError, match="ends there"):
+        replayed.command(torch.zeros(3))
+    assert torch.equal(replayed.reset(0).q, original.observations[0].q)
+
+
+def test_a_recording_without_commands(tmp_path):
+    plant = RecordingPlant(FakePlant())
+    plant.reset(9)
+    loaded = Recording.load(plant.recording.save(tmp_path / "run.h5"))
+    assert loaded.commands == []
+    assert ReplayedPlant(loaded).observe().status is PlantStatus.LOST
+
+
+def test_what_is_not_a_recording_is_refused(tmp_path):
+    with pytest.raises(DescriptionError, match="no such recording"):
+        Recording.load(tmp_path / "nothing.h5")
+    (tmp_path / "text.h5").write_text("not HDF5")
+    with pytest.raises(DescriptionError, match="damaged"):
+        Recording.load(tmp_path / "text.h5")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = 1
+    with pytest.raises(DescriptionError, match="not a recording"):
+        Recording.load(tmp_path / "other.h5")
+    path = record().save(tmp_path / "run.h5")
+    with h5py.File(path, "a") as file:
+        del file["q"]
+    with pytest.raises(DescriptionError, match="damaged"):
+        Recording.load(path)
+    with pytest.raises(ParameterError, match="at least one"):
+        ReplayedPlant(Recording())
