@@ -178,7 +178,7 @@ class SparsePosterior(nn.Module):
         grow = torch.where(novel, 1.0 / gamma, 0.0)
         left = torch.stack([s, e - unit, t], dim=-2)
         factor = torch.stack([-gain, grow, precision], dim=-1).unsqueeze(-1)
-        _add_products(self.moments, (left * factor).unsqueeze(-1), left.unsqueeze(-1))
+        scaled = left * factor
         values = torch.stack([innovation * gain.unsqueeze(-1), y * precision.unsqueeze(-1)], dim=-2)
         _add_products(self.vectors, left[..., ::2, :].unsqueeze(-1), values.unsqueeze(-1))
 
@@ -197,39 +197,48 @@ class SparsePosterior(nn.Module):
         self.count += grown
         self.slot += grown
         if self.deletion != "freeze" and _any(excess):
-            self._delete(excess, s2)
+            self._add_and_delete(scaled, left, excess, s2)
+        else:
+            _add_products(self.moments, scaled.unsqueeze(-1), left.unsqueeze(-1))
         event = int(UpdateEvent.ABSORBED) + novel.to(torch.int64) + excess
         if mask is not None:
             event = event * (mask > 0)
         return UpdateReport(event, gamma / prior, surprise, weight), innovation, v
 
-    def _delete(self, excess: Tensor, s2: Tensor) -> None:
-        """KL projection of the lowest-scored point onto the others, in models marked ``excess``.
+    def _add_and_delete(self, scaled: Tensor, added: Tensor, excess: Tensor, s2: Tensor) -> None:
+        """Add ``scaled added'`` to (C, Q, Omega), then delete the lowest-scored point where ``excess``.
 
+        The deletion is the KL projection onto the other points. Large fleets are limited by memory, so
+        addition and deletion share one pass: what the deletion needs of the sum follows from vectors.
         With a, c, q its entries in alpha, C, Q, stars its remaining columns and ``e = -Q*/q``::
 
             alpha -= (C*+Q*) a'/(c+q),  C += Q*Q*'/q - (C*+Q*)(C*+Q*)'/(c+q),  Q -= Q*Q*'/q
             Omega <- P'Omega P,  h <- P'h,  P = [I; e']
         """
         M, m, fleet = self.capacity + 1, self.out_features, self.batch_shape
-        c_diag, q_diag, w_diag = self.moments.diagonal(dim1=-2, dim2=-1).unbind(-2)
+        diagonal = self.moments.diagonal(dim1=-2, dim2=-1) + scaled * added
+        c_diag, q_diag, w_diag = diagonal.unbind(-2)
         score = DELETION_SCORES[self.deletion](
             self.alpha, c_diag, q_diag, w_diag / s2.unsqueeze(-1), self.age
         )
         i = score.where(self.active > 0, torch.inf).argmin(-1, keepdim=True)
         columns = self.moments.gather(-1, i[..., None, None].expand(*fleet, 3, M, 1)).squeeze(-1)
+        columns = columns + scaled * added.gather(-1, i.unsqueeze(-2).expand(*fleet, 3, 1))
         c, q, w = columns.gather(-1, i.unsqueeze(-2).expand(*fleet, 3, 1)).unbind(-2)
         C, Q, Om = (columns * (self._slots != i).unsqueeze(-2)).unbind(-2)
         on = excess.to(q.dtype).unsqueeze(-1)
-        # c + q >= 0 is the point's remaining uncertainty; rounding must not turn it negative.
+        q = q.where(excess.unsqueeze(-1), 1.0)  # an empty basis has nothing to divide by
         q_inv = on / q
+        # c + q >= 0 is the point's remaining uncertainty; rounding must not turn it negative.
         cq_inv = on / torch.maximum(c + q, 100 * torch.finfo(q.dtype).eps * q)
         CQ, Qq = C + Q, Q * q_inv
         e, CQc = -Qq, CQ * -cq_inv
         u = Om * on + 0.5 * w * e
-        left = torch.stack([Qq, CQc, e, torch.zeros_like(e), u, e], dim=-2)
-        right = torch.stack([Q, CQ, Q, Q, e, u], dim=-2)
-        _add_products(self.moments, left.view(*fleet, 3, 2, M).mT, right.view(*fleet, 3, 2, M).mT)
+        left = torch.stack([Qq, CQc, e, torch.zeros_like(e), u, e], dim=-2).view(*fleet, 3, 2, M)
+        right = torch.stack([Q, CQ, Q, Q, e, u], dim=-2).view(*fleet, 3, 2, M)
+        left = torch.cat([scaled.unsqueeze(-2), left], dim=-2)
+        right = torch.cat([added.unsqueeze(-2), right], dim=-2)
+        _add_products(self.moments, left.mT, right.mT)
         rows = self.vectors.gather(-2, i[..., None, None].expand(*fleet, 2, 1, m))
         _add_products(self.vectors, torch.stack([CQc, e], dim=-2).unsqueeze(-1), rows.mT)
 

@@ -96,7 +96,7 @@ class SparseOnlineGP(ResidualLearner):
         robust: float | None = None,
         normalize: bool = False,
         normalize_for: int = 1000,
-        refresh_every: int = 16,
+        refresh_every: int = 32,
         adapt: bool = False,
         adapt_rate: float = 0.03,
         adapt_network_rate: float = 0.003,

@@ -1,0 +1,330 @@
+"""Speed of the learners: ``pytest benchmarks/bench_learners.py``, or ``python benchmarks/bench_learners.py``
+for a table of everything measured in one run with its ratios.
+
+Twenty inputs, one thread, float64, a full basis with an addition and a deletion at every sample. Plain C,
+compiled on the spot, is the limit; GPyTorch, scikit-learn and river take part where they are installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import importlib.util
+import itertools
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm.residual import DeepKernel, SparseOnlineGP, SquaredExponential
+
+D = 20
+SOURCE = Path(__file__).with_name("sogp_learners_reference.c")
+
+
+def stream(n: int, m: int, shape: tuple[int, ...] = (), seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn(n, *shape, D, generator=generator, dtype=torch.float64)
+    y = torch.randn(n, *shape, m, generator=generator, dtype=torch.float64)
+    return x, y
+
+
+def filled(capacity: int, m: int, shape: tuple[int, ...] = (), **options) -> SparseOnlineGP:
+    gp = SparseOnlineGP(D, m, capacity=capacity, batch_shape=shape, **options)
+    gp.update(*stream(capacity + 3, m, shape, seed=1))
+    return gp
+
+
+class Timed:
+    """Calls in a cycle through samples, so that no call sees what the last one saw."""
+
+    def __init__(self, call: Callable, *arrays) -> None:
+        self.call, self.items = call, itertools.cycle(list(zip(*arrays, strict=True)))
+
+    def __call__(self):
+        return self.call(*next(self.items))
+
+
+def updates(gp: SparseOnlineGP, m: int, shape: tuple[int, ...] = ()) -> Timed:
+    return Timed(gp.update, *stream(64, m, shape))
+
+
+def predictions(gp: SparseOnlineGP, m: int, shape: tuple[int, ...] = ()) -> Timed:
+    def call(x):
+        with torch.no_grad():
+            return gp.predict_with_jacobians(x)
+
+    return Timed(call, stream(64, m, shape)[0])
+
+
+class PlainC:
+    """The textbook recursion in C; None if there is no compiler."""
+
+    def __init__(self, capacity: int, m: int) -> None:
+        compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+        if compiler is None:
+            pytest.skip("no C compiler")
+        library = Path(tempfile.mkdtemp()) / "reference.so"
+        flags = ["-O3", "-march=native", "-ffast-math", "-shared", "-fPIC"]
+        subprocess.run([compiler, *flags, str(SOURCE), "-o", str(library), "-lm"], check=True)
+        self.lib = ctypes.CDLL(str(library))
+        self.lib.predict.restype = ctypes.c_double
+        n, self.m, self.n = capacity + 1, m, capacity + 1
+        self.X, self.C, self.Q = np.zeros((n, D)), np.zeros((n, n)), np.zeros((n, n))
+        self.alpha, self.work = np.zeros((n, m)), np.zeros(4 * n + m)
+        self.w = np.full(D, 1.0 / D)
+        # fill it from the learner itself: the same state, so the same work and the same answers
+        gp = filled(capacity, m, refresh_every=10**9)
+        p = gp.posterior
+        self.free = int(p.slot)
+        self.X[:], self.alpha[:] = p.basis.numpy(), p.alpha.numpy()
+        self.C[:], self.Q[:] = p.covariance.numpy(), p.moments[1].numpy()
+        self.gp = gp
+        self.mean, self.jac, self.slope = np.zeros(m), np.zeros((m, D)), np.zeros(D)
+
+    @staticmethod
+    def _p(a: np.ndarray):
+        return a.ctypes.data_as(ctypes.c_void_p)
+
+    def update(self, x: np.ndarray, y: np.ndarray) -> None:
+        p = self._p
+        self.free = self.lib.update(
+            self.n, D, self.m, p(self.X), p(self.C), p(self.Q), p(self.alpha), self.free,
+            p(x), p(y), p(self.w), ctypes.c_double(0.01), p(self.work),
+        )  # fmt: skip
+
+    def predict(self, x: np.ndarray) -> float:
+        p = self._p
+        return self.lib.predict(
+            self.n, D, self.m, p(self.X), p(self.C), p(self.alpha), self.free, p(x), p(self.w),
+            p(self.mean), p(self.jac), p(self.slope), p(self.work),
+        )  # fmt: skip
+
+    def microseconds(self, which: str, repeats: int = 300) -> float:
+        """Time inside C: the pointers are made once, since ctypes costs more than the work."""
+        x, y = (np.ascontiguousarray(a.numpy()) for a in stream(1, self.m))
+        p, best = self._p, float("inf")
+        state = [p(a) for a in (self.X, self.C, self.Q, self.alpha)]
+        px, py, pw, work = p(x[0]), p(y[0]), p(self.w), p(self.work)
+        out = [p(self.mean), p(self.jac), p(self.slope)]
+        s2 = ctypes.c_double(0.01)
+        for _ in range(5):
+            begin = time.perf_counter()
+            if which == "update":
+                for _ in range(repeats):
+                    self.free = self.lib.update(self.n, D, self.m, *state, self.free, px, py, pw, s2, work)
+            else:
+                for _ in range(repeats):
+                    self.lib.predict(
+                        self.n, D, self.m, state[0], state[1], state[3], self.free, px, pw, *out, work
+                    )
+            best = min(best, (time.perf_counter() - begin) / repeats * 1e6)
+        return best
+
+
+def gpytorch_fantasy(capacity: int, m: int) -> Callable:
+    """One sample as a fantasy of an exact GP, then a prediction: GPyTorch's constant-kernel update."""
+    gpytorch = pytest.importorskip("gpytorch")
+    x, y = stream(capacity, m)
+    shape = torch.Size([m])
+
+    class Model(gpytorch.models.ExactGP):
+        def __init__(self, likelihood):
+            super().__init__(x.expand(m, -1, -1), y.mT.contiguous(), likelihood)
+            self.mean = gpytorch.means.ZeroMean(batch_shape=shape)
+            self.kernel = gpytorch.kernels.ScaleKernel(
+                gpytorch.kernels.RBFKernel(ard_num_dims=D, batch_shape=shape), batch_shape=shape
+            )
+
+        def forward(self, z):
+            return gpytorch.distributions.MultivariateNormal(self.mean(z), self.kernel(z))
+
+    likelihood = gpytorch.likelihoods.GaussianLikelihood(batch_shape=shape).double()
+    model = Model(likelihood).double().eval()
+    likelihood.eval()
+    new_x, new_y = stream(64, m, seed=2)
+    with torch.no_grad():
+        model(new_x[:1].expand(m, 1, D))
+
+    def call(a, b):
+        with torch.no_grad(), gpytorch.settings.fast_pred_var():
+            fantasy = model.get_fantasy_model(a.expand(m, 1, D), b.reshape(m, 1))
+            law = fantasy(a.expand(m, 1, D) + 0.1)
+            return law.mean, law.variance
+
+    return Timed(call, new_x, new_y)
+
+
+def gpytorch_svgp(capacity: int, m: int) -> Callable:
+    """One variational step on one sample."""
+    pytest.importorskip("gpytorch")
+    from torch_ekm.residual import GPyTorchSVGP
+
+    return Timed(GPyTorchSVGP(D, m, inducing=capacity).update, *stream(64, m))
+
+
+def sklearn_refit(capacity: int, m: int) -> Callable:
+    """scikit-learn has no update: a fit on the window, hyperparameters fixed."""
+    gp = pytest.importorskip("sklearn.gaussian_process")
+    kernel = gp.kernels.RBF(D**0.5) + gp.kernels.WhiteKernel(0.01)
+    x, y = (a.numpy() for a in stream(capacity, m))
+    model = gp.GaussianProcessRegressor(kernel, optimizer=None)
+    return lambda: model.fit(x, y).predict(x[:1], return_std=True)
+
+
+def river_forest(capacity: int, m: int) -> Callable:
+    """river's adaptive random forest, one per output."""
+    pytest.importorskip("river")
+    from torch_ekm.residual import RiverResidual
+
+    learner = RiverResidual(D, m)
+    learner.update(*stream(capacity, m))
+    return Timed(learner.update, *stream(64, m))
+
+
+PEERS = {
+    "gpytorch fantasy + predict": gpytorch_fantasy,
+    "gpytorch SVGP step": gpytorch_svgp,
+    "scikit-learn refit + predict": sklearn_refit,
+    "river ARF update": river_forest,
+}
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("m", [6, 26])
+@pytest.mark.parametrize("capacity", [30, 100, 300])
+@pytest.mark.parametrize("what", ["update", "predict"])
+def test_one_model(benchmark, what, capacity, m):
+    gp = filled(capacity, m)
+    benchmark(updates(gp, m) if what == "update" else predictions(gp, m))
+
+
+@pytest.mark.parametrize("capacity", [30, 100])
+@pytest.mark.parametrize("what", ["update", "predict"])
+def test_fleet_of_256(benchmark, what, capacity):
+    gp = filled(capacity, 6, (256,))
+    call = updates(gp, 6, (256,)) if what == "update" else predictions(gp, 6, (256,))
+    benchmark.pedantic(call, rounds=5, warmup_rounds=1)
+
+
+@pytest.mark.parametrize("peer", PEERS)
+def test_peers(benchmark, peer):
+    call = PEERS[peer](100, 6)
+    benchmark.pedantic(call, rounds=10, warmup_rounds=2)
+
+
+def test_plain_c_gives_the_same_numbers():
+    reference = PlainC(30, 6)
+    xs, ys = stream(40, 6, seed=5)
+    gp = reference.gp
+    gp.posterior.deletion = "mean"
+    for x, y in zip(xs, ys, strict=True):
+        reference.update(np.ascontiguousarray(x.numpy()), np.ascontiguousarray(y.numpy()))
+        gp.update(x, y)
+    x = xs[0] + 0.1
+    v = reference.predict(np.ascontiguousarray(x.numpy()))
+    ours = gp.predict_with_jacobians(x)
+    np.testing.assert_allclose(reference.mean, ours.mean.numpy(), atol=1e-5)
+    np.testing.assert_allclose(reference.jac, ours.mean_jacobian.numpy(), atol=1e-5)
+    assert v == pytest.approx(float(ours.variance[0]), abs=1e-5)
+
+
+# -- the table ------------------------------------------------------------------------------------
+
+
+def microseconds(call: Callable, budget: float = 0.6) -> float:
+    """Median of single calls: robust against other work on the machine."""
+    for _ in range(3):
+        call()
+    times, end = [], time.perf_counter() + budget
+    while time.perf_counter() < end or len(times) < 3:
+        begin = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - begin)
+    return float(np.median(times) * 1e6)
+
+
+def table(compiled: bool) -> list[tuple[str, float, str]]:
+    """(what, microseconds, target) of everything, in one run."""
+    rows: list[tuple[str, float, str]] = []
+    for b in (30, 100, 300):
+        rows.append((f"plain C update b={b} m=6", PlainC(b, 6).microseconds("update"), ""))
+        rows.append((f"plain C predict b={b} m=6", PlainC(b, 6).microseconds("predict"), ""))
+        gp = filled(b, 6)
+        rows.append((f"update b={b} m=6", microseconds(updates(gp, 6)), "300" if b == 100 else ""))
+        rows.append(
+            (f"predict+jacobians b={b} m=6", microseconds(predictions(gp, 6)), "120" if b == 100 else "")
+        )
+    gp = filled(100, 26)
+    rows.append(("update b=100 m=26", microseconds(updates(gp, 26)), "1.2 x m=6"))
+    rows.append(("predict+jacobians b=100 m=26", microseconds(predictions(gp, 26)), "1.2 x m=6"))
+    for name, kernel in (
+        ("kernel", SquaredExponential(D)),
+        ("deep kernel", DeepKernel(SquaredExponential(D))),
+    ):
+        plain, adaptive = (
+            SparseOnlineGP(D, 6, kernel=kernel),
+            SparseOnlineGP(D, 6, kernel=kernel, adapt=True),
+        )
+        for gp in (plain, adaptive):
+            gp.update(*stream(110, 6, seed=1))
+        block, cost = stream(64, 6), []
+        for gp in (plain, adaptive):
+            call = lambda gp=gp: gp.update(*block)  # noqa: E731
+            cost.append(microseconds(call, 2.0) / 64)
+        rows.append((f"adaptation of the {name}, per sample", cost[1] - cost[0], "300"))
+    for b in (30, 100):
+        gp, shape = filled(b, 6, (256,)), (256,)
+        target = "10" if b == 30 else "40"
+        rows.append(
+            (f"update b={b}, 256 models, per model", microseconds(updates(gp, 6, shape)) / 256, target)
+        )
+        rows.append(
+            (f"predict b={b}, 256 models, per model", microseconds(predictions(gp, 6, shape)) / 256, "")
+        )
+    if compiled:
+        gp = filled(100, 6, compile_step=True)
+        rows.append(("update b=100 m=6 compiled", microseconds(updates(gp, 6), 2.0), "150"))
+        compiled_call = torch.compile(gp.predict_with_jacobians)
+        timed = Timed(torch.no_grad()(compiled_call), stream(64, 6)[0])
+        rows.append(("predict+jacobians b=100 m=6 compiled", microseconds(timed), "60"))
+    for name, make in PEERS.items():
+        module = name.split()[0].replace("scikit-learn", "sklearn")
+        if importlib.util.find_spec(module) is not None:
+            rows.append((name + " b=100 m=6", microseconds(make(100, 6), 2.0), ""))
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--compiled", action="store_true", help="torch.compile too (minutes)")
+    parser.add_argument("--output", type=Path, help="write the table as Markdown here")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = table(options.compiled)
+    values = {name: value for name, value, _ in rows}
+    update, limit = values["update b=100 m=6"], values["plain C update b=100 m=6"]
+    lines = ["| what | us | target | of our update | of plain C |", "|---|---|---|---|---|"]
+    for name, value, target in rows:
+        lines.append(f"| {name} | {value:.1f} | {target} | {value / update:.2f} | {value / limit:.1f} |")
+    text = "\n".join(lines)
+    print(text)
+    if options.output:
+        options.output.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()
