@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import functools
 import importlib.util
 import itertools
 import shutil
@@ -283,8 +284,7 @@ def table(compiled: bool) -> list[tuple[str, float, str]]:
             gp.update(*stream(110, 6, seed=1))
         block, cost = stream(64, 6), []
         for gp in (plain, adaptive):
-            call = lambda gp=gp: gp.update(*block)  # noqa: E731
-            cost.append(microseconds(call, 2.0) / 64)
+            cost.append(microseconds(functools.partial(gp.update, *block), 2.0) / 64)
         rows.append((f"adaptation of the {name}, per sample", cost[1] - cost[0], "300"))
     for b in (30, 100):
         gp, shape = filled(b, 6, (256,)), (256,)
