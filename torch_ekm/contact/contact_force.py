@@ -3,135 +3,20 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .._extras import require
-from ..exceptions import ParameterError
+from .balance import BalanceEquations as BalanceEquations
+from .balance import ForceSolution as ForceSolution
+from .balance import ForceStatus as ForceStatus
+from .force_options import ForceOptions as ForceOptions
 from .friction import FrictionCone, cutting_planes, directions
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-FRICTION = ("cuts", "cone", "pyramid_inner", "pyramid_outer")
-BALANCE = ("relaxed", "equality")
-
-
-class ForceStatus(Enum):
-    """What became of the force problem."""
-
-    SOLVED = "solved"
-    NOT_GRASPABLE = "not_graspable"
-    """No forces inside the cones and bounds balance the object."""
-    FAILED = "failed"
-    """The solver gave up; nothing is known."""
-
-
-@dataclass(frozen=True)
-class ForceOptions:
-    """Weights and forms of the force problem.
-
-    Raises:
-        ParameterError: a value outside its range.
-    """
-
-    force_weight: float = 1e-7
-    """eps: weight of |mu|^2 against the squared, whitened joint residual [1/N^2]."""
-    actuator_weight: float = 1.0
-    """k: weight of |lam r/L|^2 relative to |mu|^2, r the norm of the actuator's moment arms."""
-    torque_std: float = 0.02
-    """Standard deviation of unmodelled joint torque, Sigma_tau^(1/2) [N m]."""
-    length: float = 0.03
-    """L: moments are divided by it [m]."""
-    min_normal: float = 0.0
-    """Lower bound of every normal force [N]."""
-    max_force: float = 1e3
-    """Upper bound of every normal force [N]."""
-    max_actuator: float = math.inf
-    """Bound of every actuator force [N or N m]."""
-    friction: str = "cuts"
-    """"cuts": exact, cutting planes on QPs; "cone": exact, one conic program (Clarabel); "pyramid_inner",
-    "pyramid_outer": polyhedra with ``faces`` faces."""
-    faces: int = 16
-    balance: str = "relaxed"
-    """"relaxed": joint balance soft; "equality": both balances hard (the paper's form)."""
-    tolerance: float = 2e-7
-    """Largest friction violation left by cutting planes [N]."""
-    max_cuts: int = 30
-    solver: str = "piqp"
-    """QP solver, one of qpsolvers' names."""
-
-    def __post_init__(self) -> None:
-        if self.friction not in FRICTION:
-            raise ParameterError("friction", self.friction, f"one of {', '.join(FRICTION)}")
-        if self.balance not in BALANCE:
-            raise ParameterError("balance", self.balance, f"one of {', '.join(BALANCE)}")
-        for name in ("force_weight", "torque_std", "length", "tolerance"):
-            if not getattr(self, name) > 0:
-                raise ParameterError(name, getattr(self, name), "positive")
-        if self.faces < 4:
-            raise ParameterError("faces", self.faces, "at least 4 (16 or more advised)")
-
-
-@dataclass(frozen=True)
-class BalanceEquations:
-    """Equilibrium at one state, reduced to the permitted motions (rigid couplings taken out).
-
-    ```
-    object_matrix mu = object_load                         G mu = V_p
-    hand_matrix mu + actuator_matrix lam + bound_matrix tau - r = -hand_load
-    ```
-    """
-
-    object_matrix: Array
-    """G, ``(n_w, n_h)``."""
-    object_load: Array
-    """V_p, ``(n_w,)``."""
-    hand_matrix: Array
-    """(J_h Z)^T, ``(n_z, n_h)``."""
-    actuator_matrix: Array
-    """(J_a Z)^T, ``(n_z, n_a)``."""
-    hand_load: Array
-    """Z^T V_q, ``(n_z,)``."""
-    cones: tuple[FrictionCone, ...]
-    moment_rows: Mask
-    """Rows of ``object_load`` that are moments, bool ``(n_w,)``."""
-    tendon: Mask
-    """Actuators that only pull, bool ``(n_a,)``."""
-    spin_columns: tuple[int, ...] = ()
-    """Components of ``mu`` that are moments."""
-    bound_matrix: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    """Z^T of unit joint torques with bounds of their own (stops, dry friction), ``(n_z, n_t)``."""
-    bound_lower: Array = field(default_factory=lambda: np.zeros(0))
-    bound_upper: Array = field(default_factory=lambda: np.zeros(0))
-    weight: Array | None = None
-    """(Z^T Z)^-1: whitens r where the permitted motions are not orthonormal."""
-    measured_normal: Array | None = None
-    """Measured normal forces [N], NaN where there is none."""
-    normal_std: float = 0.3
-    """Their standard deviation [N]."""
-
-
-@dataclass(frozen=True)
-class ForceSolution:
-    """Forces in the order of the problem's unknowns; NaN unless solved."""
-
-    status: ForceStatus
-    mu: Array
-    """[N], moment rows [N m]."""
-    lam: Array
-    """Minus the actuator forces along +a [N or N m]."""
-    bound: Array
-    """Torques of stops and dry friction [N m]."""
-    residual: Array
-    """r: unexplained generalised torque, ``(n_z,)`` [N m]. Large: wrong spring or rest angle, slipping."""
-    violation: float
-    """Smallest norm of the unbalanced object wrench (moments divided by L) [N]; about 0 when solved."""
-    solves: int
-    """Number of QPs."""
 
 
 def force_problem(
@@ -272,9 +157,15 @@ def solve_qp(problem, solver: str):
     if solver == "piqp":
         settings = {"eps_abs": 1e-10, "eps_rel": 1e-11, "iterative_refinement_always_enabled": True}
     solution = qpsolvers.solve_problem(problem, solver, **settings)
-    if not solution.found and solver != "clarabel":
-        solution = qpsolvers.solve_problem(_sparse(problem), "clarabel")
+    if not solution.found and solver == "piqp" and not _certified_infeasible(solution):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # qpsolvers warns when Clarabel finds the problem infeasible
+            solution = qpsolvers.solve_problem(_sparse(problem), "clarabel")
     return solution
+
+
+def _certified_infeasible(solution) -> bool:
+    return "PRIMAL_INFEASIBLE" in str(getattr(solution.extras.get("info"), "status", ""))
 
 
 def _sparse(problem):

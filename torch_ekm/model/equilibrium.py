@@ -14,7 +14,6 @@ from ..typing import Float, Tensor
 from .force_balance import known_forces
 from .kinematic_model import KinematicModel
 from .linearization import GraspForces
-from .potential import gravity_gradient, gravity_hessian, spring_torque
 from .state import GraspState
 from .stiffness import geometric_stiffness
 
@@ -211,25 +210,19 @@ class EquilibriumSolver:
         model = self.model
         _, kin = self._geometry(self.start)
         A = constraint_matrix(kin)
-        V_q, V_p = self._potential(self.start)
+        V_q, V_p = model.potential(self.start)[0].split([model.hand.n_q, 6])
         return model.balance(self.start.q, kin, A, V_q, V_p, self.held, wish, None, std)
 
     def _geometry(self, state: GraspState) -> tuple[ContactSet, ContactKinematics]:
         contacts = self.surfaces(state.q, state.position, state.rotation)
         return contacts, self.model.contact_kinematics(state, contacts, rolling=True)
 
-    def _potential(self, state: GraspState) -> tuple[Tensor, Tensor]:
-        model = self.model
-        V_q = spring_torque(state.q, model.spring_stiffness, model.spring_rest)  # type: ignore[arg-type]
-        V_p = gravity_gradient(model.weight, state.rotation @ model.com)  # type: ignore[arg-type, operator]
-        return V_q, V_p
-
     def _balance(
         self, state: GraspState, kin: ContactKinematics, mu: Tensor, lam: Tensor, stop: Tensor
     ) -> Tensor:
         A = constraint_matrix(kin) @ self.Z
         n_q = self.model.hand.n_q
-        F = self.Z.mT @ torch.cat(self._potential(state)) + A.mT @ mu + self.B.mT @ lam
+        F = self.Z.mT @ self.model.potential(state)[0] + A.mT @ mu + self.B.mT @ lam
         return F - self.Z[:n_q][self.held].mT @ stop
 
     def _newton(
@@ -268,9 +261,7 @@ class EquilibriumSolver:
                 break
             forces = known_forces(kin, mu, lam)
             D = geometric_stiffness(kin, forces.force, forces.spin_moment, model.precedes)  # type: ignore[arg-type]
-            joints = torch.arange(n_q)
-            D[joints, joints] += model.spring_stiffness  # type: ignore[operator]
-            D[n_q:, n_q:] += gravity_hessian(model.weight, state.rotation @ model.com)  # type: ignore[arg-type, operator]
+            D = D + model.potential(state)[1]
             A = row_scale[:, None] * (A_s @ Z)
             E = torch.cat([A, self.B, E_h])
             corner = torch.diag(torch.cat([A.new_zeros(len(A)), self.compliance, A.new_zeros(len(E_h))]))

@@ -49,6 +49,18 @@ class ForceBalance:
         )
         return ((q <= lower + tolerance) | (q >= upper - tolerance)) & movable
 
+    def held_by_stops(
+        self, q: Float[Tensor, "*batch n_q"], torque: Float[Tensor, "*batch n_q"]
+    ) -> Bool[Tensor, "*batch n_q"]:
+        """Joints near a stop that bears more than the threshold (and than the joint's dry friction)."""
+        options = self.options
+        if not options.joint_stops:
+            return torch.zeros_like(q, dtype=torch.bool)
+        threshold = torch.full_like(q, options.stop_torque)
+        if options.joint_friction:
+            threshold = threshold + torch.as_tensor(self.friction).to(q)
+        return (torque.abs() > threshold) & self.near_stop(q)
+
     def __call__(
         self,
         q: Tensor,

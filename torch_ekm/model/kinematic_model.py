@@ -14,6 +14,7 @@ from ..exceptions import NoContactError, NonFiniteError, PenetrationError, Shape
 from ..typing import Float, Tensor
 from .force_balance import ForceBalance
 from .linearization import GraspForces, Linearization, ModelStatus
+from .link_weights import LinkWeights
 from .manipulation import Step
 from .options import ModelOptions
 from .potential import gravity_gradient, gravity_hessian, spring_torque
@@ -87,6 +88,9 @@ class KinematicModel(nn.Module):
         )
         upstream: Tensor = kinematics.upstream  # type: ignore[assignment]
         self.register_buffer("precedes", precedence(upstream), persistent=False)
+        self.link_weights: LinkWeights | None = None
+        if self.options.link_weights:
+            self.link_weights = LinkWeights(hand, kinematics, self.options.gravity, dtype)
         self._last: tuple[tuple[str, ...], Tensor, Tensor] | None = None
 
     def extra_repr(self) -> str:
@@ -177,9 +181,8 @@ class KinematicModel(nn.Module):
         kin = self.contact_kinematics(state, contacts, poses=poses)
         n_q = self.hand.n_q
         A = constraint_matrix(kin)
-        V_q = spring_torque(state.q, self.spring_stiffness, self.spring_rest)  # type: ignore[arg-type]
-        com_lever = (state.rotation @ self.com[:, None])[..., 0]  # type: ignore[index]
-        V_p = gravity_gradient(self.weight, com_lever)  # type: ignore[arg-type]
+        V_s, V_ss = self.potential(state, poses)
+        V_q, V_p = V_s[..., :n_q], V_s[..., n_q:]
         lock = [self._joint(name) for name in locked]
         status = ModelStatus.OK
         if forces is None:
@@ -203,12 +206,12 @@ class KinematicModel(nn.Module):
             obj=o.object_stiffness,
             rolling=o.rolling,
         )
-        joints = torch.arange(n_q, device=D.device)
-        D[..., joints, joints] += self.spring_stiffness + o.stiffness_floor  # type: ignore[operator]
-        D[..., n_q:, n_q:] += gravity_hessian(self.weight, com_lever)  # type: ignore[arg-type]
+        D = D + V_ss
+        if o.stiffness_floor:
+            joints = torch.arange(n_q, device=D.device)
+            D[..., joints, joints] += o.stiffness_floor
 
-        held = forces.stop_torque.abs() > o.stop_torque if o.joint_stops else torch.zeros_like(state.q).bool()
-        held = held & self.balance.near_stop(state.q)
+        held = self.balance.held_by_stops(state.q, forces.stop_torque)
         held[..., lock] = True
         slack = torch.zeros_like(forces.lam).bool()
         if o.slack_tension is not None:
@@ -233,6 +236,24 @@ class KinematicModel(nn.Module):
             stability=step.stability,
             status=status,
         )
+
+    def potential(
+        self, state: GraspState, poses: object | None = None
+    ) -> tuple[Float[Tensor, "*batch n_s"], Float[Tensor, "*batch n_s n_s"]]:
+        """``V_s`` [N m, N] and ``V_ss`` of springs, the object's weight and (as an option) the links'."""
+        n_q = self.hand.n_q
+        com_lever = (state.rotation @ self.com[:, None])[..., 0]  # type: ignore[index]
+        V_q = spring_torque(state.q, self.spring_stiffness, self.spring_rest)  # type: ignore[arg-type]
+        V_ss = state.q.new_zeros(*state.q.shape[:-1], n_q + 6, n_q + 6)
+        V_ss[..., :n_q, :n_q] = torch.diag(self.spring_stiffness)  # type: ignore[arg-type]
+        V_ss[..., n_q:, n_q:] = gravity_hessian(self.weight, com_lever)  # type: ignore[arg-type]
+        if self.link_weights is not None:
+            poses = self.kinematics(state.q) if poses is None else poses
+            gradient, hessian = self.link_weights(poses)
+            V_q = V_q + gradient
+            V_ss[..., :n_q, :n_q] += hessian
+        V_p = gravity_gradient(self.weight, com_lever)  # type: ignore[arg-type]
+        return torch.cat([V_q, V_p], dim=-1), V_ss
 
     def _step(
         self, D: Tensor, A: Tensor, kin: ContactKinematics, held: Tensor, slack: Tensor

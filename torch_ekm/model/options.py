@@ -20,6 +20,8 @@ class ModelOptions:
 
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     """g in the **hand frame** [m/s^2], constant while the hand's pose is static."""
+    link_weights: bool = False
+    """Count the weight of the hand's own links (masses of its URDF)."""
     length: float = 0.03
     """L, size of the object: translations are divided by it before ranks are decided [m]."""
     contact_model: ContactModel | None = None
