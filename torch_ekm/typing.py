@@ -1,8 +1,7 @@
 """Shape annotations, in one place.
 
-``Float[Tensor, "*batch n_q"]`` documents a shape everywhere; jaxtyping and beartype
-check it at run time in the tests only. Without jaxtyping (the core needs torch and
-numpy alone) the annotations are inert.
+``Float[Tensor, "*batch n_q"]`` documents a shape everywhere. The annotations are never
+evaluated in use; without jaxtyping (the core needs torch and numpy alone) they are inert.
 """
 
 from __future__ import annotations

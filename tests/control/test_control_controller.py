@@ -44,7 +44,7 @@ def controller(grasp, options: ControllerOptions | None = None, enhanced: bool =
 
 
 def test_zero_error_gives_almost_no_command(grasp) -> None:
-    plant, _, seen, state = grasp
+    _, _, seen, state = grasp
     here = PoseTarget(state.position, state.rotation)
     decision = controller(grasp, ControllerOptions(grip_force=None)).decide(state, seen.a, here)
     assert decision.status is StopReason.RUNNING
@@ -74,7 +74,7 @@ def test_limits_are_kept_and_told(grasp) -> None:
 
 
 def test_grip_rows_ask_for_the_missing_force(grasp) -> None:
-    plant, _, seen, state = grasp
+    _, _, seen, state = grasp
     here = PoseTarget(state.position, state.rotation)
     weak = seen.fingertip_force * 0.5
     decision = controller(grasp).decide(state, seen.a, here, weak)
@@ -93,7 +93,7 @@ def test_limiting_function_keeps_direction() -> None:
 
 
 def test_grasp_that_is_gone_is_a_status(grasp) -> None:
-    plant, _, seen, state = grasp
+    _, _, seen, state = grasp
     away = GraspState(state.q, state.position + 0.5, state.rotation)
     target = PoseTarget(state.position, state.rotation)
     decision = controller(grasp).decide(away, seen.a, target, seen.fingertip_force)
@@ -103,7 +103,7 @@ def test_grasp_that_is_gone_is_a_status(grasp) -> None:
 
 
 def test_bad_observations_are_refused(grasp) -> None:
-    plant, _, seen, state = grasp
+    _, _, seen, state = grasp
     target = PoseTarget(state.position, state.rotation)
     loop = controller(grasp)
     with pytest.raises(NonFiniteError, match="a must be finite"):

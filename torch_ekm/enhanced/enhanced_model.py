@@ -10,6 +10,7 @@ from torch import nn
 from torch.func import jacrev
 
 from ..exceptions import NonFiniteError, ShapeError
+from ..residual.base import ResidualLearner, UpdateReport
 from ..typing import Float, Tensor
 
 
@@ -45,10 +46,12 @@ class EnhancedModel(nn.Module):
     hides the dead zone, which is much of what there is to learn.
     """
 
+    output_scale: Tensor
+
     def __init__(
         self,
         model: Callable[[Any, Tensor], Tensor],
-        learner: nn.Module,
+        learner: ResidualLearner,
         *,
         encode: Callable[[Any], Tensor] | None = None,
         outputs: list[int] | None = None,
@@ -56,8 +59,8 @@ class EnhancedModel(nn.Module):
         output_scale: float | Float[Tensor, " n_out"] = 1.0,
     ) -> None:
         super().__init__()
-        self.model = model
-        self.learner = learner
+        self.model: Any = model  # a Module is registered, any other callable is kept as it is
+        self.learner: ResidualLearner = learner
         self.encode = encode if encode is not None else _identity
         self.outputs = outputs
         self.action_scale = action_scale
@@ -88,7 +91,7 @@ class EnhancedModel(nn.Module):
         action: Float[Tensor, "*batch n_a"],
         increment: Float[Tensor, "*batch n_s"],
         nominal: Float[Tensor, "*batch n_s"] | None = None,
-    ) -> Any:
+    ) -> UpdateReport:
         """Train on one motion: ``y = ds - f(s, da)`` (eq. 9).
 
         Args:
@@ -104,8 +107,7 @@ class EnhancedModel(nn.Module):
             NonFiniteError: an entry is NaN or infinite; nothing was changed.
             ShapeError: the increment has not the shape of the model's prediction.
         """
-        if nominal is None:
-            nominal = self.model(state, action)
+        nominal = self.model(state, action) if nominal is None else nominal
         if increment.shape != nominal.shape:
             raise ShapeError("increment", f"{tuple(nominal.shape)}, that of the prediction", increment.shape)
         for name, value in (("action", action), ("increment", increment), ("prediction", nominal)):
@@ -132,8 +134,9 @@ class EnhancedModel(nn.Module):
         if J is not None:
             nominal = J @ action
         else:
-            nominal = self.model(state, action)
-            J = jacrev(lambda a: self.model(state, a))(action)
+            f: Any = self.model
+            nominal = f(state, action)
+            J = jacrev(lambda a: f(state, a))(action)
         mean, dmean = self.learner.linearize(self.features(state, action))
         n_a = action.shape[-1]
         value = nominal + self._scatter(mean / self.output_scale, nominal)

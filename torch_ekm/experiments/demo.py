@@ -90,7 +90,7 @@ def make_enhanced(model: KinematicModel, reference: GraspState, capacity: int) -
 def grasping_joints(hand: HandDescription, model: KinematicModel, state: GraspState) -> list[int]:
     """Joints that can move a finger which touches the object."""
     contacts = model.contacts(state)
-    upstream = model.kinematics.upstream
+    upstream = model.kinematics.get_buffer("upstream")
     moved = torch.zeros(hand.n_q, dtype=torch.bool)
     for link in contacts.link:
         moved |= upstream[model.link_names.index(link)]

@@ -90,7 +90,8 @@ def compare_errors(ours: Array, theirs: Array, confidence: float = 0.95) -> Comp
     spread = difference.std(ddof=1)
     if spread == 0:  # a t-test of a constant is undefined; say what it means
         same = difference[0] == 0
-        return Comparison(1.0 if same else 0.0, 1.0 if same else 0.0, *(float(difference[0]),) * 3, 0.0)
+        p, d = (1.0 if same else 0.0), float(difference[0])
+        return Comparison(p, p, d, d, d, 0.0)
     paired = stats.ttest_rel(ours, theirs)
     interval = paired.confidence_interval(confidence)
     welch = stats.ttest_ind(ours, theirs, equal_var=False)
