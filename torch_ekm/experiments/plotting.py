@@ -137,3 +137,30 @@ def plot_convergence(histories_deg: dict[str, list[Array]], target: str = "") ->
     axis.set_title(f"Error on the way{' to ' + target if target else ''}", loc="left")
     axis.legend(frameon=False)
     return figure
+
+
+def plot_bank(records: list[dict]) -> Figure:
+    """Which model of an object memory each turn went to, and how sure it was.
+
+    Args:
+        records: turns in order, with "object", "model" (or None) and "posterior".
+    """
+    objects = list(dict.fromkeys(record["object"] for record in records))
+    figure, (axis,) = _figure(8.0, 3.2)
+    palette = list(COLOURS.values())
+    for k, record in enumerate(records):
+        if record["model"] is None:
+            continue
+        colour = palette[record["model"] % len(palette)]
+        marker = "osD^v*PX"[record["model"] % 8]
+        sure = max(record["posterior"])
+        axis.plot(k + 1, objects.index(record["object"]), marker, color=colour, alpha=0.25 + 0.75 * sure)
+    used = sorted({record["model"] for record in records if record["model"] is not None})
+    for model in used:
+        axis.plot([], [], "osD^v*PX"[model % 8], color=palette[model % len(palette)], label=f"model {model}")
+    axis.set_yticks(range(len(objects)), objects)
+    axis.set(xlabel="turn")
+    axis.set_title("Which model took the turn (pale: unsure)", loc="left")
+    if used:
+        axis.legend(frameon=False, ncols=len(used), loc="lower right", bbox_to_anchor=(1, 1))
+    return figure

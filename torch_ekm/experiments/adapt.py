@@ -1,0 +1,186 @@
+"""Familiar objects and new ones: a bank of models against labelled, single and fresh models."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch.distributions import Normal
+
+from ..description import list_objects
+from ..enhanced import GraspEncoding, ModelBank
+from ..exceptions import ParameterError
+from ..residual import ResidualLearner, UpdateReport
+from ..typing import Tensor
+from .bench import Bench, Record
+from .demo import TABLE_I
+from .learners import make_learner
+from .protocols import OTHER_ANGLES, object_name
+from .setting import Setting, digest
+
+#: How the knowledge of several objects may be kept.
+MEMORIES = ("bank", "labelled", "one model", "fresh")
+
+
+@dataclass(frozen=True)
+class AdaptConfig:
+    """A random sequence of objects, one grasp and one turn each; nobody tells which object it is.
+
+    Raises:
+        ParameterError: no object, or fewer than one turn each.
+    """
+
+    setting: Setting = field(default_factory=lambda: Setting())
+    objects: tuple[str, ...] = field(default_factory=list_objects)
+    turns_each: int = 8
+    models: int = 8
+    """Largest number of models that the bank may keep."""
+    bank: dict[str, float] = field(default_factory=dict)
+    """Changes of :class:`ModelBank`'s figures."""
+
+    def __post_init__(self) -> None:
+        if not self.objects or self.turns_each < 1:
+            raise ParameterError("objects", self.objects, "at least one object and one turn each")
+
+
+class Memories(ResidualLearner):
+    """The bank drives; the other memories see the same motions, each predicting before it learns.
+
+    To :class:`~torch_ekm.enhanced.EnhancedModel` it is the bank. Labels go to "labelled" only.
+    """
+
+    def __init__(self, bank: ModelBank) -> None:
+        super().__init__(bank.in_features, bank.out_features)
+        self.bank = bank
+        self.empty = copy.deepcopy(bank.common)
+        self.one: ResidualLearner = copy.deepcopy(self.empty)
+        self.fresh: ResidualLearner = copy.deepcopy(self.empty)
+        self.labelled: dict[str, ResidualLearner] = {}
+        self.label = ""
+        self.axis = torch.zeros(3, dtype=torch.float64)
+        self.errors: dict[str, list[float]] = {}
+
+    def begin(self, label: str) -> int | None:
+        """A new grasp; returns where the bank put the last one."""
+        kept = self.bank.begin()
+        self.label = label
+        self.labelled.setdefault(label, copy.deepcopy(self.empty))
+        self.fresh.reset()
+        self.errors = {name: [] for name in (*MEMORIES, "none")}
+        return kept
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The bank's."""
+        return self.bank(x)
+
+    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+        """The bank's."""
+        return self.bank.predict(x, observation=observation)
+
+    def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The bank's."""
+        return self.bank.linearize(x)
+
+    def reset(self) -> None:
+        """Forget everything."""
+        for learner in (self.bank, self.one, self.fresh, *self.labelled.values()):
+            learner.reset()
+
+    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        """One motion: note every memory's one-step error about the axis [deg], then train all."""
+        learners = {"labelled": self.labelled[self.label], "one model": self.one, "fresh": self.fresh}
+        self.errors["none"].append(abs(float(self.axis @ y[3:6])))
+        for name, learner in (("bank", self.bank), *learners.items()):
+            self.errors[name].append(abs(float(self.axis @ (y - learner(x))[3:6])))
+        for learner in learners.values():
+            learner.update(x, y, mask)
+        return self.bank.update(x, y, mask)
+
+
+def adapt_session(config: AdaptConfig, seed: int) -> list[Record]:
+    """All turns of one seed; each record says which model the bank chose, and everybody's errors."""
+    generator = np.random.default_rng(seed)
+    sequence = generator.permutation(np.repeat(np.arange(len(config.objects)), config.turns_each))
+    benches: dict[str, Bench] = {}
+    memories: Memories | None = None
+    encoding: GraspEncoding | None = None
+    records: list[Record] = []
+    for trial, index in enumerate(sequence.tolist()):
+        item = config.objects[index]
+        if item not in benches:
+            benches[item] = Bench(config.setting, item, "E-KM", memories, encoding)
+        bench = benches[item]
+        if memories is None or encoding is None:  # the first grasp decides what is seen of a state
+            if bench.grasp(seed, trial) is None or bench.encoding is None:
+                del benches[item]
+                continue
+            encoding = bench.encoding
+            memories = Memories(_make_bank(config, encoding.n_features, bench.model.hand.n_a))
+            bench.adopt(memories, encoding)
+        slot = memories.begin(item)
+        if records:
+            records[-1]["model"] = slot
+        # the axis is known once the object is grasped, before the first motion
+        bench.on_grasp = lambda axis, memories=memories: memories.axis.copy_(axis)
+        angles = TABLE_I.get(item, OTHER_ANGLES)
+        angle = float(generator.uniform(0.4, 1.0) * max(angles))
+        record = bench.trial(seed, trial, angle)
+        record |= {"object": object_name(item), "kind": "turn", "model": None}
+        record["posterior"] = memories.bank.posterior.tolist()
+        record["n_models"] = memories.bank.n_models
+        record["memory_errors_deg"] = {name: list(errors) for name, errors in memories.errors.items()}
+        records.append(record)
+    if memories is not None and records:
+        records[-1]["model"] = memories.begin("")
+        records[-1]["n_models"] = memories.bank.n_models
+    for bench in benches.values():
+        bench.close()
+    return records
+
+
+def adapt_jobs(config: AdaptConfig, seeds: tuple[int, ...]) -> dict[str, tuple[Any, ...]]:
+    """One job for each seed."""
+    return {f"adapt_{digest(config)}_{seed}": (config, seed) for seed in seeds}
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """How well a bank told objects apart, over one sequence."""
+
+    right: int
+    """Turns, after the first three of their object, that went to the model that is their object's."""
+    judged: int
+    n_models: int
+
+
+def judge_assignment(records: list[Record], learning_turns: int = 3) -> Assignment:
+    """A model belongs to the object that most of its turns were of; each object owns one model at most."""
+    placed = [(r["object"], r["model"]) for r in records if r.get("model") is not None]
+    counts: dict[tuple[str, int], int] = {}
+    for pair in placed:
+        counts[pair] = counts.get(pair, 0) + 1
+    owner: dict[int, str] = {}
+    home: dict[str, int] = {}
+    for (item, model), _ in sorted(counts.items(), key=lambda entry: -entry[1]):
+        if model not in owner and item not in home:  # most turns first
+            owner[model], home[item] = item, model
+    seen: dict[str, int] = {}
+    right = judged = 0
+    for item, model in placed:
+        seen[item] = seen.get(item, 0) + 1
+        if seen[item] > learning_turns:
+            judged += 1
+            right += home.get(item) == model
+    return Assignment(right, judged, len({model for _, model in placed}))
+
+
+def _make_bank(config: AdaptConfig, n_s: int, n_a: int) -> ModelBank:
+    setting = config.setting
+
+    def factory() -> ResidualLearner:
+        return make_learner(setting.learner, n_s, n_a, setting.capacity, **setting.learner_options)
+
+    return ModelBank(factory, config.models, **config.bank)  # type: ignore[arg-type]
