@@ -178,18 +178,6 @@ class UnstableGraspError(GraspError):
         super().__init__(message)
 
 
-class NotGraspableError(GraspError):
-    """No contact forces inside the friction cones balance the object.
-
-    Attributes:
-        violation: smallest possible norm of the object's unbalanced wrench.
-    """
-
-    def __init__(self, message: str, violation: float | None = None) -> None:
-        self.violation = violation
-        super().__init__(message)
-
-
 class ObjectLostError(GraspError):
     """The object has left the hand (dropped, thrown, or not seen any more)."""
 
@@ -212,10 +200,6 @@ class SolverError(EKMError):
 
 class EquilibriumError(SolverError):
     """No quasi-static equilibrium was found (see ``status`` for how far the solver came)."""
-
-
-class UnreachableTargetError(EKMError):
-    """A target lies outside what the object's workspace or the actuators allow."""
 
 
 # -- sensors ----------------------------------------------------------------------------------

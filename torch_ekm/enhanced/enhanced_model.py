@@ -107,14 +107,16 @@ class EnhancedModel(nn.Module):
             NonFiniteError: an entry is NaN or infinite; nothing was changed.
             ShapeError: the increment has not the shape of the model's prediction.
         """
-        nominal = self.model(state, action) if nominal is None else nominal
-        if increment.shape != nominal.shape:
-            raise ShapeError("increment", f"{tuple(nominal.shape)}, that of the prediction", increment.shape)
-        for name, value in (("action", action), ("increment", increment), ("prediction", nominal)):
+        predicted: Tensor = self.model(state, action) if nominal is None else nominal
+        if increment.shape != predicted.shape:
+            raise ShapeError(
+                "increment", f"{tuple(predicted.shape)}, that of the prediction", increment.shape
+            )
+        for name, value in (("action", action), ("increment", increment), ("prediction", predicted)):
             finite = torch.isfinite(value)
             if not bool(finite.all()):
                 raise NonFiniteError(name, torch.nonzero(~finite)[:3].tolist())
-        residual = self._gather(increment - nominal) * self.output_scale
+        residual = self._gather(increment - predicted) * self.output_scale
         return self.learner.update(self.features(state, action), residual)
 
     def linearize(
