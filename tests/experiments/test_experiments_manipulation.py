@@ -107,5 +107,5 @@ def test_object_out_of_reach_of_the_fingers_is_lost(held) -> None:
 
 
 def test_observation_that_is_not_finite_is_refused(held) -> None:
-    with pytest.raises(NonFiniteError, match="Observation.position"):
+    with pytest.raises(NonFiniteError, match=r"Observation\.position"):
         drive(held, lambda seen: dataclasses.replace(seen, position=seen.position * math.nan))
