@@ -330,7 +330,8 @@ def test_latency_shows_an_older_pose(exact):
     before = exact.observe()
     torch.testing.assert_close(before.position, truth(before, "position"), atol=1e-6, rtol=0)
     exact.tug(np.array([0.0, 0.0, 5.0]), np.zeros(3))
-    exact._run(100, lambda part: exact._servo.encoder - part * SQUEEZE.numpy())
+    motor = exact._rig.servo.encoder
+    exact._rig.run(100, lambda part: motor - part * SQUEEZE.numpy())
     moving = exact.observe()
     assert (moving.position - truth(moving, "position")).norm() > 1e-5
 

@@ -46,6 +46,9 @@ class PlantConfig:
     """... and within +-this across it [m]."""
     tilt: float = 5 * _DEG
     """The object's long axis is drawn within +-this of ``along`` [rad]."""
+    gravity_tilt: float = 0.0
+    """At each reset gravity is turned by up to this out of its direction [rad]: another orientation of
+    the hand, which the model must be told (``SimulatedHand.gravity``)."""
     relative_to: str = "encoder"
     """Commands are increments of the "encoder" or of the "setpoint"."""
 
@@ -54,7 +57,7 @@ class PlantConfig:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ParameterError(name, value, "finite and greater than 0")
-        for name in ("offset_along", "offset_across", "tilt"):
+        for name in ("offset_along", "offset_across", "tilt", "gravity_tilt"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise ParameterError(name, value, "finite and not negative")

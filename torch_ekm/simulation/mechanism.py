@@ -31,9 +31,9 @@ def moment_arms(hand: HandDescription, parameters: PlantParameters) -> NDArray[n
 
 
 def make_transmission(hand: HandDescription, parameters: PlantParameters) -> Transmission:
-    """Tendons, springs and joint friction as they are, not yet lengthened."""
+    """Tendons, springs and joint friction as they are at the start of a grasp."""
     stiffness = np.array([actuator.stiffness for actuator in hand.actuators])
-    return Transmission(
+    transmission = Transmission(
         hand,
         moment_arms(hand, parameters),
         parameters.servo_stiffness * np.where(np.isfinite(stiffness), stiffness, _RIGID),
@@ -41,6 +41,8 @@ def make_transmission(hand: HandDescription, parameters: PlantParameters) -> Tra
         parameters.joint_friction * hand.joint_friction,
         creep=parameters.tendon_creep,
     )
+    transmission.lengthen(parameters.tendon_elongation)
+    return transmission
 
 
 def make_servo(hand: HandDescription, config: PlantConfig, parameters: PlantParameters) -> Servo:
@@ -67,7 +69,6 @@ def make_planner(
         hand,
         obj,
         make_transmission(hand, parameters),
-        config.gravity,
         thumb,
         fingers,
         along=turning_axis(hand, config),

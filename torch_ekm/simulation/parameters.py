@@ -34,7 +34,7 @@ class PlantParameters:
     tendon_elongation: float = 0.0
     """Permanent lengthening of every tendon, at its actuator [rad]."""
     tendon_creep: float = 0.0
-    """Further lengthening per torque and time [rad/(N m s)]."""
+    """Further lengthening per torque and time [rad/(N m s)]; each grasp starts without it."""
     link_weight: bool = False
     """Gravity pulls at the fingers too (the kinematic model leaves their weight out)."""
 

@@ -28,6 +28,8 @@ _FINGER_BENT = (0.4, 0.13, 0.12, 0.3)
 class PinchRequest:
     """What is wanted of a pinch. Lengths [m], angles [rad], in the object frame."""
 
+    gravity: tuple[float, float, float] = (0.0, 0.0, 9.81)
+    """In the hand frame [m/s^2]."""
     force: float = 5.0
     """Normal force of the thumb [N]; the fingers share its reaction."""
     along: float = 0.0
@@ -80,7 +82,6 @@ class PinchProblem:
     Args:
         hand, obj: the bodies.
         transmission: moment arms, springs and stiffness of the plant that will hold the object.
-        gravity: in the hand frame [m/s^2].
         thumb, fingers: names of the pads that oppose each other.
         along: wanted direction of the object's long axis, in the hand frame.
         mass_factor, com_shift, friction, object_scale: see :class:`PlantParameters`.
@@ -94,7 +95,6 @@ class PinchProblem:
         hand: HandDescription,
         obj: ObjectDescription,
         transmission: Transmission,
-        gravity: tuple[float, float, float],
         thumb: str,
         fingers: tuple[str, ...],
         along: tuple[float, float, float] = (0.0, 1.0, 0.0),
@@ -124,7 +124,7 @@ class PinchProblem:
         self._radius = np.array([pad.radius for pad in self.pads])
         links, self._ball, self._ball_radius = obstacles(hand, self.pads)
         self._ball_link = [self.kinematics.link_index(name) for name in links]
-        self._weight = mass_factor * obj.mass * np.array(gravity)
+        self._mass = mass_factor * obj.mass
         self._com = obj.com + np.array(com_shift)
         self._mu = friction * obj.friction
         self._shapes = tuple(scaled(shape, object_scale) for shape in obj.shapes)
@@ -224,9 +224,10 @@ class PinchProblem:
     def equations(self, x: Array, request: PinchRequest, g: PinchGeometry | None = None) -> Array:
         """What must vanish, in units of its tolerance."""
         g = self.geometry(x) if g is None else g
-        force = g.force.sum(axis=1) + self._weight
+        weight = self._mass * np.array(request.gravity)
+        force = g.force.sum(axis=1) + weight
         centre = g.rotation @ self._com
-        moment = np.cross(g.point - g.position[:, None], g.force).sum(axis=1) + np.cross(centre, self._weight)
+        moment = np.cross(g.point - g.position[:, None], g.force).sum(axis=1) + np.cross(centre, weight)
         spring = self.transmission.spring_stiffness * (g.q - self.transmission.spring_rest)
         passive = (spring + g.torque)[:, self.moving] @ self._passive
         press = -np.einsum("bi,bi->b", g.force[:, 0], g.normal[:, 0]) - request.force
