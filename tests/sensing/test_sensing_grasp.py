@@ -142,12 +142,14 @@ def test_sensed_plant_knows_only_what_its_sensors_say(hand, obj):
 
 
 def test_same_seed_same_observations(hand, obj):
-    first, again, other = (
-        SensedPlant(Puppet(hand), hand, obj, hall=HallSensors(hand, seed=1)).reset(seed) for seed in (3, 3, 4)
-    )
-    assert torch.equal(first.position, again.position)
-    assert torch.equal(first.q, again.q)
+    plant, twin = (SensedPlant(Puppet(hand), hand, obj, hall=HallSensors(hand, seed=1)) for _ in range(2))
+    first, other, again, elsewhere = plant.reset(3), plant.reset(4), plant.reset(3), twin.reset(3)
+    for same in (again, elsewhere):
+        assert torch.equal(first.position, same.position)
+        assert torch.equal(first.info["hall"], same.info["hall"])
+        assert torch.equal(first.q, same.q)
     assert not torch.equal(first.position, other.position)
+    assert not torch.equal(first.info["hall"], other.info["hall"])
 
 
 def test_object_not_seen_is_said(hand, obj):

@@ -158,6 +158,37 @@ def test_the_fit_is_the_least_squares_cubic():
     assert "knuckle: rms 0.00 deg" in repr(calibration)
 
 
+def test_what_the_cubic_misses_is_told_from_noise(generator):
+    """A ripple that no cubic follows is the same at all slopes; noise grows with the slope."""
+    n = torch.linspace(10, 245, 600, dtype=torch.float64)
+    r = n / 255
+    q = 0.2 * r + 1.2 * r**3
+    rippled = HallCalibration.fit(n[:, None], (q + 0.01 * torch.sin(60 * r))[:, None], ["knuckle"]).channels[
+        0
+    ]
+    assert rippled.misfit == pytest.approx(0.01 / 2**0.5, rel=0.1)
+    assert rippled.noise < 1.0
+    shaken = n + 4.0 * torch.randn(600, generator=generator, dtype=torch.float64)
+    noisy = HallCalibration.fit(shaken.clamp(1, 254)[:, None], q[:, None], ["knuckle"]).channels[0]
+    assert noisy.noise == pytest.approx(4.0, rel=0.25)
+    assert noisy.misfit < 0.7 * noisy.residual_rms
+
+
+@pytest.mark.parametrize("rising", [False, True])
+def test_pinned_readings_leave_the_right_end_open(rising):
+    """Saturated at either end of the scale: the estimate lies past the last angle that can be told."""
+    q = torch.linspace(0.0, 1.5, 300, dtype=torch.float64)
+    counts = (-30 + 310 * q / 1.5).clamp(0, 255).round()
+    counts = counts if rising else 255 - counts
+    calibration = HallCalibration.fit(counts[:, None], q[:, None], ["knuckle"])
+    zero, full = (calibration.estimate(torch.tensor([value])) for value in (0.0, 255.0))
+    closed, opened = (full, zero) if rising else (zero, full)
+    assert float(opened.q) == pytest.approx(0.145 / 2, abs=0.01)  # saturated for 30 of 310 counts
+    assert float(closed.q) == pytest.approx(1.5 - 0.121 / 2, abs=0.01)
+    assert float(opened.std) == pytest.approx(0.145 / 12**0.5, abs=0.005)
+    assert not bool(opened.valid.any() | closed.valid.any())
+
+
 def test_a_curve_that_turns_back_is_refused():
     n = torch.linspace(1, 254, 200, dtype=torch.float64)
     q = 1.0 - ((n - 120) / 130) ** 2
@@ -186,7 +217,9 @@ def test_stuck_channels(hand, generator, failure):
     assert found.tolist() == [k == 4 for k in range(15)]
     marked = calibrated(sensors)  # when calibrated
     assert [channel.stuck for channel in marked.channels] == [k == 4 for k in range(15)]
-    estimate = marked.estimate(readings)
+    sound_again = readings.clone()
+    sound_again[:, 4] = 100.0  # it was stuck when calibrated: nothing that it says is believed
+    estimate = marked.estimate(sound_again)
     assert not bool(estimate.valid[:, 4].any())
     assert bool(estimate.std[:, 4].gt(20 * DEG).all())
     with pytest.raises(CalibrationError, match=r"index_2.*stuck"):
