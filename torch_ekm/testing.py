@@ -229,9 +229,12 @@ def _state(learner: ResidualLearner) -> dict[str, Tensor]:
 
 
 def _same(a: dict, b: dict) -> bool:
-    return a.keys() == b.keys() and all(
-        torch.equal(a[k], b[k]) if isinstance(a[k], Tensor) else a[k] == b[k] for k in a
-    )
+    def equal(u: object, v: object) -> bool:
+        if isinstance(u, Tensor) and isinstance(v, Tensor):
+            return torch.equal(u, v)
+        return _same(u, v) if isinstance(u, dict) and isinstance(v, dict) else u == v
+
+    return a.keys() == b.keys() and all(equal(a[k], b[k]) for k in a)
 
 
 def _close(a: Tensor, b: Tensor, learner: ResidualLearner, message: str, factor: float = 1.0) -> None:

@@ -84,6 +84,14 @@ def test_contract_of_gpytorch():
     check_residual_learner(lambda **o: GPyTorchSVGP(3, 2, inducing=6, **o), vmap=False)
 
 
+def test_contract_of_gpytorch_window():
+    pytest.importorskip("gpytorch")
+    from torch_ekm.residual import GPyTorchWindow
+
+    options = {"window": 10, "refit_every": 8, "steps": 2, "noise_variance": 0.05}
+    check_residual_learner(lambda **o: GPyTorchWindow(3, 2, **options, **o), vmap=False)
+
+
 class _WrongPrior(RecursiveLeastSquares):
     def forward(self, x):
         return super().forward(x) + 1e-12

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from .action_linear import ActionLinearKernel as ActionLinearKernel
-from .adapters import GPyTorchSVGP as GPyTorchSVGP
-from .adapters import RiverResidual as RiverResidual
 from .base import ResidualLearner as ResidualLearner
 from .base import UpdateEvent as UpdateEvent
 from .base import UpdateReport as UpdateReport
 from .deep_kernel import DeepKernel as DeepKernel
+from .gpytorch_svgp import GPyTorchSVGP as GPyTorchSVGP
+from .gpytorch_window import GPyTorchWindow as GPyTorchWindow
 from .kernels import Kernel as Kernel
 from .kernels import LinearKernel as LinearKernel
 from .kernels import Matern32 as Matern32
@@ -22,6 +22,7 @@ from .linear import RecursiveLeastSquares as RecursiveLeastSquares
 from .local_gps import LocalGPs as LocalGPs
 from .prediction import Prediction as Prediction
 from .replay_mlp import ReplayMLP as ReplayMLP
+from .river_residual import RiverResidual as RiverResidual
 from .sogp import SparseOnlineGP as SparseOnlineGP
 from .window_gp import WindowGP as WindowGP
 from .zero import ZeroResidual as ZeroResidual

@@ -78,6 +78,7 @@ class ResidualLearner(nn.Module, ABC):
     """
 
     n_refused: Tensor
+    _like: Tensor
 
     def __init__(
         self,

@@ -32,7 +32,9 @@ class Kernel(nn.Module, ABC):
         """k(x, x) of one point per model; further axes go in front."""
 
     @abstractmethod
-    def with_gradient(self, x: Float[Tensor, "*batch d"], z: Float[Tensor, "*batch m d"]):
+    def with_gradient(
+        self, x: Float[Tensor, "*batch d"], z: Float[Tensor, "*batch m d"]
+    ) -> tuple[Tensor, Tensor]:
         """``(k(x, z_j), d k(x, z_j)/dx)``: shapes ``(*batch, m)`` and ``(*batch, m, d)``."""
 
     @abstractmethod
@@ -66,14 +68,14 @@ def log_parameter(
     Raises:
         ParameterError: a value is not positive and finite, or does not broadcast.
     """
-    value = torch.as_tensor(value, **factory)
-    if not bool(((value > 0) & value.isfinite()).all()):
-        raise ParameterError(name, value.tolist(), "positive and finite")
+    values = torch.as_tensor(value, **factory)
+    if not bool(((values > 0) & values.isfinite()).all()):
+        raise ParameterError(name, values.tolist(), "positive and finite")
     try:
-        value = value.expand(shape)
+        values = values.expand(shape)
     except RuntimeError:
-        raise ParameterError(name, value.tolist(), f"one number or of shape {tuple(shape)}") from None
-    return nn.Parameter(value.log().contiguous(), requires_grad=False)
+        raise ParameterError(name, values.tolist(), f"one number or of shape {tuple(shape)}") from None
+    return nn.Parameter(values.log().contiguous(), requires_grad=False)
 
 
 class StationaryKernel(Kernel):

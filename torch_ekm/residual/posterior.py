@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+
 import torch
 from torch import nn
 
+from ..exceptions import ParameterError
 from ..typing import Bool, Float, Tensor
 from .base import UpdateEvent, UpdateReport
 from .deletion import DELETION_SCORES
@@ -28,6 +32,7 @@ class SparsePosterior(nn.Module):
     slot: Tensor
     moments: Tensor
     vectors: Tensor
+    _slots: Tensor
 
     def __init__(
         self,
@@ -44,6 +49,13 @@ class SparsePosterior(nn.Module):
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__()
+        for name, value in (("novelty_tolerance", novelty_tolerance), ("jitter", jitter)):
+            if not 0 <= value < 1:
+                raise ParameterError(name, value, "in [0, 1)")
+        if projection not in ("kl", "fitc"):
+            raise ParameterError("projection", projection, "'kl' or 'fitc'")
+        if deletion not in (*DELETION_SCORES, "freeze"):
+            raise ParameterError("deletion", deletion, f"one of {(*DELETION_SCORES, 'freeze')}")
         self.capacity, self.batch_shape, self.out_features = capacity, batch_shape, out_features
         self.novelty_tolerance, self.jitter = novelty_tolerance, jitter
         self.projection, self.deletion, self.robust = projection, deletion, robust
@@ -144,7 +156,7 @@ class SparsePosterior(nn.Module):
         Returns:
             The report, the innovation and the latent variance before the update.
         """
-        here = self._slots == self.slot.unsqueeze(-1)
+        here = self._slots.eq(self.slot.unsqueeze(-1))
         k = kernel.vector(x, self.basis) * self.active
         prior = kernel.diagonal(x) * (1.0 + self.jitter)
         column = k.unsqueeze(-1)
@@ -225,7 +237,7 @@ class SparsePosterior(nn.Module):
         columns = self.moments.gather(-1, i[..., None, None].expand(*fleet, 3, M, 1)).squeeze(-1)
         columns = columns + scaled * added.gather(-1, i.unsqueeze(-2).expand(*fleet, 3, 1))
         c, q, w = columns.gather(-1, i.unsqueeze(-2).expand(*fleet, 3, 1)).unbind(-2)
-        C, Q, Om = (columns * (self._slots != i).unsqueeze(-2)).unbind(-2)
+        C, Q, Om = (columns * self._slots.ne(i).unsqueeze(-2)).unbind(-2)
         on = excess.to(q.dtype).unsqueeze(-1)
         q = q.where(excess.unsqueeze(-1), 1.0)  # an empty basis has nothing to divide by
         q_inv = on / q
@@ -269,3 +281,9 @@ def _add_products(target: Tensor, left: Tensor, right: Tensor) -> None:
 def _any(flag: Tensor) -> bool:
     """Skip work that no model needs where looking is free: on the CPU, outside a compiled graph."""
     return flag.is_cuda or torch.compiler.is_compiling() or bool(flag.any())
+
+
+@cache
+def compiled_absorb() -> Callable:
+    """One compiled step for all learners; kept here, since a compiled function cannot be copied."""
+    return torch.compile(SparsePosterior.absorb, dynamic=False)

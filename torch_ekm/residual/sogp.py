@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
 from typing import Any, Literal
 
 import torch
@@ -14,10 +12,9 @@ from ..typing import Float, Tensor
 from .action_linear import ActionLinearKernel
 from .adaptation import PrequentialAdaptation
 from .base import ResidualLearner, UpdateReport, check_count, check_positive
-from .deletion import DELETION_SCORES
 from .kernels import Kernel, SquaredExponential, log_parameter
 from .monitor import ChangeDetector, NoiseCalibration
-from .posterior import SparsePosterior
+from .posterior import SparsePosterior, compiled_absorb
 from .prediction import Prediction
 from .running_scale import RunningScale
 
@@ -116,15 +113,8 @@ class SparseOnlineGP(ResidualLearner):
             dtype=dtype,
             device=device,
         )
-        for name, value in (("novelty_tolerance", novelty_tolerance), ("jitter", jitter)):
-            if not 0 <= value < 1:
-                raise ParameterError(name, value, "in [0, 1)")
         if not 0 < forgetting <= 1:
             raise ParameterError("forgetting", forgetting, "in (0, 1]")
-        if projection not in ("kl", "fitc"):
-            raise ParameterError("projection", projection, "'kl' or 'fitc'")
-        if deletion not in (*DELETION_SCORES, "freeze"):
-            raise ParameterError("deletion", deletion, f"one of {(*DELETION_SCORES, 'freeze')}")
         self.capacity = check_count("capacity", capacity)
         self.refresh_every = check_count("refresh_every", refresh_every)
         self.forgetting, self.compile_step = float(forgetting), bool(compile_step)
@@ -318,7 +308,7 @@ class SparseOnlineGP(ResidualLearner):
         z, t = self._units(x), y / self.output_scale.scale if self.normalize_for else y
         s2, noise = self._shared_noise(), self.log_noise_variance.exp()
         number = self._n_samples if self.posterior.needs_age else 0
-        step = _compiled_absorb() if self.compile_step else SparsePosterior.absorb
+        step = compiled_absorb() if self.compile_step else SparsePosterior.absorb
         report, innovation, v = step(self.posterior, z, t, self.kernel, s2, on, number)
         if self.calibration is not None:
             self.calibration.observe(innovation, v, noise, on)
@@ -420,9 +410,3 @@ class SparseOnlineGP(ResidualLearner):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """See get_extra_state."""
         self._n_samples = int(state["n_samples"])
-
-
-@cache
-def _compiled_absorb() -> Callable:
-    """One compiled step for all learners; kept here, since a compiled function cannot be copied."""
-    return torch.compile(SparsePosterior.absorb, dynamic=False)
