@@ -151,6 +151,35 @@ def test_a_hard_tug_loses_the_object_and_a_gentle_one_does_not(plant, grasped):
     assert plant.tug(np.array([0.0, 0.0, 100.0]), np.zeros(3), 0.1).status is PlantStatus.LOST
 
 
+def test_the_hand_can_be_oriented_anew_at_each_grasp():
+    plant = SimulatedHand("icub_right", "box", PlantConfig(gravity_tilt=40 * DEG))
+    down = np.array(plant.config.gravity) / 9.81
+    angles = []
+    for seed in range(3):
+        before = plant.reset(seed)
+        gravity = np.array(plant.gravity)
+        assert np.linalg.norm(gravity) == pytest.approx(9.81)
+        angles.append(np.arccos(down @ gravity / 9.81) / DEG)
+        plant.wait(1.0)
+        assert motion(before, plant.observe())[0].norm() < 1e-6
+    assert max(angles) <= 40.0
+    assert max(angles) - min(angles) > 3.0
+
+
+def test_a_snapshot_outlives_the_scene_it_was_taken_in():
+    plant = SimulatedHand("icub_right", "box", PlantConfig(gravity_tilt=40 * DEG))
+    before, snapshot = plant.reset(0), plant.snapshot()
+    gravity = plant.gravity
+    plant.change(object_scale=1.1)
+    plant.reset(1)
+    after = plant.restore(snapshot)
+    assert plant.gravity == gravity
+    assert plant.parameters.object_scale == 1.0
+    torch.testing.assert_close(after.info["truth"], before.info["truth"])
+    plant.wait(1.0)
+    assert motion(before, plant.observe())[0].norm() < 1e-5
+
+
 @pytest.mark.parametrize(
     ("hand", "gravity"), [("icub_left", (0, 0, 9.81)), ("planar_two_finger", (0, -9.81, 0))]
 )

@@ -9,7 +9,7 @@ from simulation_helpers import DEG
 
 from torch_ekm.kinematics.se3 import log
 from torch_ekm.model import GraspState, KinematicModel, ModelOptions
-from torch_ekm.simulation import SimulatedHand
+from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
 
 pytest.importorskip("sapien")
 
@@ -20,11 +20,27 @@ def state_of(truth):
     return GraspState(truth["q"], truth["position"], truth["rotation"])
 
 
-@pytest.fixture(scope="module", params=["box", "can"])
+OTHER = PlantParameters(
+    moment_arm=(1.0, 1.2, 0.9, 1.3, 1.1, 1.2, 1.0, 1.3, 1.0),
+    spring=0.8,
+    servo_stiffness=0.5,
+    mass=1.5,
+    com_shift=(0.005, 0.002, -0.003),
+    object_scale=1.05,
+)
+
+
+@pytest.fixture(
+    scope="module", params=[("box", PlantParameters()), ("can", PlantParameters()), ("box", OTHER)]
+)
 def grasp(request):
-    plant = SimulatedHand("icub_right", request.param)
+    """The model is told what the plant is, be it as described or not."""
+    name, parameters = request.param
+    config = PlantConfig(gravity_tilt=0.5)
+    plant = SimulatedHand("icub_right", name, config, parameters)
     truth = plant.reset(0).info["truth"]
-    model = KinematicModel(plant.hand, plant.object, ModelOptions(gravity=plant.config.gravity))
+    hand, obj = plant.true_descriptions()
+    model = KinematicModel(hand, obj, ModelOptions(gravity=plant.gravity))
     return plant, truth, model.linearize(state_of(truth))
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..description import HandDescription, ObjectDescription
 from ..exceptions import ParameterError
 from .config import PlantConfig
+from .geometry import scaled
 from .parameters import PlantParameters
 from .pinch import PinchPlanner
 from .pinch_problem import PinchProblem
@@ -78,6 +81,36 @@ def make_planner(
         object_scale=parameters.object_scale,
     )
     return PinchPlanner(problem)
+
+
+def true_descriptions(
+    hand: HandDescription, obj: ObjectDescription, parameters: PlantParameters
+) -> tuple[HandDescription, ObjectDescription]:
+    """Descriptions that say what the plant really is: the model that knows all but the servos' errors.
+
+    The offsets of the actuators stay nominal: a model of increments needs none.
+    """
+    transmission = make_transmission(hand, parameters)
+    actuators = tuple(
+        dataclasses.replace(actuator, stiffness=float(stiffness))
+        for actuator, stiffness in zip(hand.actuators, transmission.stiffness, strict=True)
+    )
+    true_hand = dataclasses.replace(
+        hand,
+        actuators=actuators,
+        actuation_jacobian=transmission.J_a,
+        spring_stiffness=transmission.spring_stiffness,
+        joint_friction=transmission.friction,
+    )
+    true_object = dataclasses.replace(
+        obj,
+        mass=parameters.mass * obj.mass,
+        com=obj.com + np.array(parameters.com_shift),
+        inertia=parameters.mass * obj.inertia,
+        friction=parameters.friction * obj.friction,
+        shapes=tuple(scaled(shape, parameters.object_scale) for shape in obj.shapes),
+    )
+    return true_hand, true_object
 
 
 def opposition(hand: HandDescription, config: PlantConfig) -> tuple[str, tuple[str, ...]]:

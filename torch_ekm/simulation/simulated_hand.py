@@ -12,7 +12,7 @@ from ..description import HandDescription, ObjectDescription, load_hand, load_ob
 from ..exceptions import EquilibriumError, GraspError
 from ..typing import Float, Tensor
 from .config import PlantConfig
-from .mechanism import make_planner, moment_arms, turning_axis
+from .mechanism import make_planner, moment_arms, true_descriptions, turning_axis
 from .parameters import PlantParameters
 from .pinch import PinchPlan
 from .pinch_problem import PinchRequest
@@ -184,6 +184,10 @@ class SimulatedHand:
         axis = axis - across * (axis @ across)
         axis *= np.sign(axis @ along) / np.linalg.norm(axis)
         return torch.from_numpy(axis)
+
+    def true_descriptions(self) -> tuple[HandDescription, ObjectDescription]:
+        """Hand and object as they really are, for a model without mismatch (an upper bound in reports)."""
+        return true_descriptions(self.hand, self.object, self.parameters)
 
     def hand_state(self) -> tuple[Array, Array, Array]:
         """True joint angles [rad], object position [m] and rotation, for pictures."""
