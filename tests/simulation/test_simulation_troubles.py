@@ -344,6 +344,14 @@ def test_lost_frames_repeat_the_last_pose_and_say_so(exact):
     assert np.mean(lost) == pytest.approx(0.3, abs=0.08)
 
 
+def test_the_first_frame_of_a_grasp_is_never_lost():
+    plant = SimulatedHand("planar_two_finger", "box", parameters=PlantParameters(frame_loss=1.0))
+    first = plant.reset(0)
+    assert first.status is PlantStatus.HELD
+    assert torch.equal(first.position, truth(first, "position"))
+    assert plant.observe().status is PlantStatus.NOT_SEEN
+
+
 def test_a_stuck_channel_stays_where_it_was(exact):
     joint = exact.hand.joint_names.index("index_3")
     exact.change(stuck_joints=("index_3",))

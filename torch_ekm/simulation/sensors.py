@@ -19,7 +19,7 @@ class SensorState(NamedTuple):
     """All that :class:`Sensors` remembers between readings."""
 
     frames: tuple[tuple[float, Array, Array], ...]
-    seen: tuple[Array, Array]
+    seen: tuple[Array, Array] | None
     felt: Array
     stuck_at: Array | None
 
@@ -53,7 +53,7 @@ class Sensors:
     def forget(self) -> None:
         """A new grasp: no old frames, no hysteresis."""
         self._frames: deque[tuple[float, Array, Array]] = deque()
-        self._seen = (np.zeros(3), np.eye(3))
+        self._seen: tuple[Array, Array] | None = None
         self._felt = np.zeros(self.n_pads)
         self._stuck_at: Array | None = None
 
@@ -81,7 +81,7 @@ class Sensors:
         """Estimated object pose in the hand frame [m], and whether the camera saw it this time."""
         p = self._p
         noise, turn, luck = generator.standard_normal(3), generator.standard_normal(3), generator.random()
-        if luck < p.frame_loss:
+        if self._seen is not None and luck < p.frame_loss:  # the first frame of a grasp is waited for
             return self._seen[0], self._seen[1], False
         if self.wants_history and self._frames:
             _, position, rotation = self._frames[0]
