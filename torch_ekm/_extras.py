@@ -23,6 +23,8 @@ _EXTRA_OF = {
     "viser": "experiments",
     "typer": "experiments",
     "rich": "experiments",
+    "IPython": "notebooks",
+    "pyarrow": "notebooks",
     "gpytorch": "peers",
     "river": "peers",
     "sklearn": "peers",

@@ -102,6 +102,104 @@ def demo(
 
 
 @app.command()
+def reproduce(
+    experiment: Annotated[str, Argument(help="online, generalize, ablation or adapt.")] = "generalize",
+    seeds: Annotated[str, Option(help="FIRST:END; each seed is an independent run.")] = "1000:1020",
+    jobs: Annotated[int, Option(min=1, help="Processes at once.")] = 2,
+    out: Annotated[Path | None, Option(help="Folder for the report [reproduce_<experiment>].")] = None,
+    quick: Annotated[bool, Option(help="Two seeds, small turns: to see that it works.")] = False,
+    objects: Annotated[
+        Path | None, Option(help="Folder with URDF files of your own objects (generalize, adapt).")
+    ] = None,
+    hand: Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")] = "icub_right",
+    severity: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
+    learner: Annotated[str, Option(help="action-linear, rbf, paper, deep, rls, rff, ...")] = "action-linear",
+    sensing: Annotated[bool, Option(help="Camera images and Hall counts, not truth and noise.")] = False,
+) -> None:
+    """Repeat the paper's experiments, and more, with every controller on the same seeds and grasps.
+
+    Interrupted, it goes on where it stopped, and ends with the same report.
+    """
+    from .experiments.reproduce import plan
+    from .experiments.reproduce import reproduce as run
+    from .experiments.setting import Setting
+
+    setting = Setting(hand=hand, severity=severity, learner=learner, sensing=sensing)
+    planned = plan(experiment, parse_seeds(seeds), setting=setting, objects=objects, quick=quick)
+    folder = out if out is not None else Path(f"reproduce_{experiment}")
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task(experiment, total=len(planned.jobs))
+        report = run(planned, folder, jobs, on_done=lambda _: progress.advance(task))
+    for table in report.tables:
+        shown = RichTable(*table.header, title=table.caption)
+        for row in table.rows:
+            shown.add_row(*row)
+        console.print(shown)
+    console.print(report.summary)
+    console.print(f"Report:    {(folder / 'index.html').resolve()}", soft_wrap=True)
+
+
+@app.command()
+def compare(
+    data: Annotated[
+        list[str], Option(help="A .csv or .parquet file, or the name of a recording; repeatable.")
+    ],
+    learners: Annotated[str, Option(help="Names, separated by commas; all without peers by default.")] = "",
+    targets: Annotated[str, Option(help="Columns to predict; y, y1, y2, ... or the last by default.")] = "",
+    out: Annotated[Path, Option(help="Folder for tables and figures.")] = Path("compare_output"),
+    limit: Annotated[int, Option(min=0, help="Samples of a recording that are used; 0: all.")] = 1500,
+    jobs: Annotated[int, Option(min=1, help="Processes at once.")] = 2,
+) -> None:
+    """Compare residual learners on streams: predict, score, update, in the order of time.
+
+    Recordings: simulated_hand; in the folder that TORCH_EKM_DATA names: t42 (Sintov et al., GitHub
+    avishais/t42_autonomous_system), icub_grasp (Soh et al., clear-nus/icub_grasp_dataset), sarcos
+    (Kaixhin/SARCOS), kin40k and powerplant (treforevans/uci_datasets), mimo, lorenz, mackey_glass and
+    santafe (steven2358/kafbox).
+    """
+    from .experiments.compare_report import compare_data
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("comparing", total=None)
+        report = compare_data(
+            data,
+            _names(learners),
+            _names(targets),
+            out,
+            limit or None,
+            jobs,
+            on_total=lambda total: progress.update(task, total=total),
+            on_done=lambda _: progress.advance(task),
+        )
+    for table in report.tables:
+        shown = RichTable(*table.header, title=table.caption, caption=table.note)
+        for row in table.rows:
+            shown.add_row(*row)
+        console.print(shown)
+    console.print(report.summary)
+    console.print(f"Report:    {(out / 'index.html').resolve()}", soft_wrap=True)
+
+
+@app.command()
+def notebooks(
+    copy: Annotated[Path | None, Option(help="Copy them into this folder.")] = None,
+    overwrite: Annotated[bool, Option(help="Also over files that are there.")] = False,
+) -> None:
+    """List the notebooks that come with the package, or copy them to where you can run them."""
+    from .experiments.notebook_tools import copy_notebooks, notebook_folder
+
+    found = sorted(notebook_folder().glob("[0-9]*.ipynb"))
+    for path in found if copy is None else copy_notebooks(copy, overwrite=overwrite):
+        console.print(str(path), soft_wrap=True, highlight=False)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+@app.command()
 def version() -> None:
     """Print the version, and those of the packages that decide the numbers."""
     from .experiments.report import versions

@@ -1,0 +1,319 @@
+"""Comparing learners: the protocol is honest, the statistics are right, and broken files are told clearly."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from torch_ekm.cli import app
+from torch_ekm.exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
+from torch_ekm.experiments import compare as module
+from torch_ekm.experiments.compare import Comparison, bootstrap_ratio, compare, verdicts
+from torch_ekm.experiments.compare_report import overview_table, score_table
+from torch_ekm.experiments.contenders import CONTENDERS, DEFAULT, PEERS, contender
+from torch_ekm.experiments.recordings import Recording, in_own_units, load_recording, load_table
+from torch_ekm.experiments.table_file import read_table
+
+WEIGHTS = torch.tensor([[1.0, -0.5], [0.3, 0.8], [0.0, 0.4]], dtype=torch.float64)
+
+
+def linear(n: int = 120, seed: int = 0, name: str = "linear") -> Recording:
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn(n, 3, generator=generator, dtype=torch.float64)
+    y = x @ WEIGHTS + 0.1 * torch.randn(n, 2, generator=generator, dtype=torch.float64)
+    return Recording(name, x, y, warm_up=20)
+
+
+@pytest.fixture(scope="module")
+def compared() -> Comparison:
+    return compare([linear(), linear(seed=1, name="other")], ("model alone", "linear RLS", "SOGP plain"))
+
+
+def test_model_alone_is_the_unit(compared: Comparison) -> None:
+    estimate = compared.scores["linear", "model alone"].rms
+    assert (estimate.mean, estimate.low, estimate.high) == pytest.approx((1.0, 1.0, 1.0), abs=1e-5)
+
+
+def test_errors_are_those_of_predictions_made_before_learning(compared: Comparison) -> None:
+    recording, learner = linear(), contender("linear RLS")(3, 2)
+    squared = []
+    for x, y in zip(recording.x, recording.y, strict=True):
+        squared.append(float((y - learner(x)).square().mean()))
+        learner.update(x, y)
+    np.testing.assert_allclose(compared.errors["linear", "linear RLS"], squared[20:], rtol=1e-5)
+    expected = math.sqrt(np.mean(squared[20:]) / float(recording.y[20:].square().mean()))
+    assert compared.scores["linear", "linear RLS"].rms.mean == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_linear_stream_is_won_by_the_linear_learner_and_we_say_so(compared: Comparison) -> None:
+    assert compared.best("linear").learner == "linear RLS"
+    sentence = verdicts(compared)[0]
+    assert "linear RLS is best" in sentence
+    assert "Our SOGP plain loses to linear RLS" in sentence
+    assert compared.ratio("linear", "SOGP plain", "linear RLS").low > 1
+
+
+def test_tables_hold_the_scores(compared: Comparison) -> None:
+    table = score_table(compared, "linear")
+    row = next(row for row in table.rows if row[0].startswith("linear RLS"))
+    assert row[0].endswith("*")
+    assert float(row[1]) == pytest.approx(compared.scores["linear", "linear RLS"].rms.mean, abs=5e-4)
+    assert [row[0] for row in overview_table(compared).rows] == ["linear RLS", "SOGP plain", "model alone"]
+
+
+def test_ranks_share_ties(compared: Comparison) -> None:
+    assert compared.ranks().sum(1) == pytest.approx([6.0, 6.0])
+    twice = Comparison(compared.recordings[:1], ("a", "b"), {}, {})
+    score = compared.scores["linear", "linear RLS"]
+    twice.scores.update({("linear", "a"): score, ("linear", "b"): score})
+    assert twice.ranks().tolist() == [[1.5, 1.5]]
+
+
+def test_critical_difference_is_demsars() -> None:
+    # Demsar (2006), section 3.2.2: four classifiers on 14 data sets, q = 2.569, CD = 1.25
+    fourteen = tuple(linear(40, name=str(k)) for k in range(14))
+    comparison = Comparison(fourteen, ("a", "b", "c", "d"), {}, {})
+    assert comparison.critical_difference() == pytest.approx(2.569 * math.sqrt(4 * 5 / (6 * 14)), abs=1e-3)
+
+
+def test_bootstrap_of_equals_is_one() -> None:
+    errors = np.random.default_rng(0).random(100)
+    estimate = bootstrap_ratio(errors, errors, np.arange(100) // 5)
+    assert (estimate.mean, estimate.low, estimate.high) == pytest.approx((1.0, 1.0, 1.0))
+
+
+def test_samples_that_go_together_widen_the_interval() -> None:
+    draw = np.random.default_rng(0)
+    ours = np.repeat(draw.exponential(size=20), 50)  # whole blocks are good or bad
+    theirs = np.ones(1000)
+    blocks = bootstrap_ratio(ours, theirs, np.arange(1000) // 50)
+    single = bootstrap_ratio(ours, theirs, np.arange(1000))
+    assert blocks.high - blocks.low > 4 * (single.high - single.low)
+
+
+def test_block_bootstrap_covers() -> None:
+    draw, hits = np.random.default_rng(1), 0
+    for k in range(100):
+        ours = np.repeat(draw.exponential(size=40), 5) * 4.0  # true ratio 2
+        estimate = bootstrap_ratio(ours, np.ones(200), np.arange(200) // 5, seed=k, resamples=300)
+        hits += estimate.low <= 2.0 <= estimate.high
+    assert 84 <= hits <= 99
+
+
+def test_what_is_finished_is_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = compare([linear(60)], ("linear RLS",), folder=tmp_path)
+    monkeypatch.setattr(module, "run_one", lambda *_: pytest.fail("ran again"))
+    again = compare([linear(60)], ("linear RLS",), folder=tmp_path)
+    assert again.scores == first.scores
+    with pytest.raises(pytest.fail.Exception):  # other data: not the same job
+        compare([linear(60, seed=5)], ("linear RLS",), folder=tmp_path)
+
+
+def test_what_cannot_be_compared() -> None:
+    with pytest.raises(UnknownNameError, match="linear RLS"):
+        compare([linear(60)], ("best of all",))
+    with pytest.raises(ParameterError, match="different names"):
+        compare([linear(60), linear(60)], ("linear RLS",))
+    with pytest.raises(ParameterError, match="at least one"):
+        compare([], ("linear RLS",))
+    with pytest.raises(ShapeError, match="too short"):
+        linear(30)
+
+
+@pytest.mark.parametrize("name", DEFAULT)
+def test_every_contender_runs(name: str) -> None:
+    result = module.run_one(linear(44), name)
+    assert len(result["squared"]) == 24
+    assert np.isfinite(result["squared"]).all()
+    assert 0 <= result["coverage"] <= 1
+
+
+def test_every_learner_of_the_package_contends() -> None:
+    import torch_ekm.residual as residual
+
+    kinds = {type(make(2, 1)).__name__ for name, make in CONTENDERS.items() if name not in PEERS}
+    peers = {"GPyTorchSVGP", "GPyTorchWindow", "RiverResidual"}
+    exported = {
+        name
+        for name in dir(residual)
+        if isinstance(cls := getattr(residual, name), type)
+        and issubclass(cls, residual.ResidualLearner)
+        and name != "ResidualLearner"
+    }
+    assert exported == kinds | peers
+    assert len(PEERS) == len(peers)
+
+
+# -- files ----------------------------------------------------------------------------------------
+
+
+def table(n: int = 60) -> np.ndarray:
+    return np.random.default_rng(0).normal(size=(n, 4))
+
+
+def write(path: Path, values: np.ndarray, names: str = "a,b,c,load") -> Path:
+    np.savetxt(path, values, delimiter=",", header=names, comments="")
+    return path
+
+
+GOOD = "1,2,3\n" * 50
+BROKEN = {
+    "text": ("a,b,y\n1,2,3\n4,wood,6\n", r"line 3, column 'b': 'wood' is no number"),
+    "missing": ("a,b,y\n1,2,3\n4,,6\n", r"line 3, column 'b' is empty"),
+    "nan": ("a,b,y\n1,2,3\n4,nan,6\n", r"line 3, column 'b': 'nan' is not finite"),
+    "one row": ("a,b,y\n1,2,3\n", r"it has 1 samples; at least 40"),
+    "header only": ("a,b,y\n", r"it has 0 samples"),
+    "no header": ("1,2,3\n4,5,6\n", r"line 1 holds numbers only; the first line must name"),
+    "ragged": ("a,b,y\n1,2,3\n1,2\n", r"line 3 has 2 fields, but the header names 3"),
+    "empty": ("\n \n", r"the file is empty"),
+    "twice": ("a,a,y\n" + GOOD, r"two columns are called 'a'"),
+    "nameless": ("a,,y\n" + GOOD, r"column 2 has no name"),
+    "targets only": ("y1,y2,y3\n" + GOOD, r"all columns are targets"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_file_is_told_by_line_and_column(case: str, tmp_path: Path) -> None:
+    text, message = BROKEN[case]
+    path = tmp_path / "broken.csv"
+    path.write_text(text)
+    with pytest.raises(DescriptionError, match=message):
+        load_table(path)
+
+
+def test_other_files(tmp_path: Path) -> None:
+    with pytest.raises(DescriptionError, match="no such file"):
+        load_table(tmp_path / "nothing.csv")
+    (tmp_path / "a.xlsx").write_text("x")
+    with pytest.raises(DescriptionError, match=r"'\.xlsx' are not read"):
+        load_table(tmp_path / "a.xlsx")
+    (tmp_path / "latin.csv").write_bytes("größe,y\n1,2\n".encode("latin-1"))
+    with pytest.raises(DescriptionError, match="UTF-8"):
+        load_table(tmp_path / "latin.csv")
+    with pytest.raises(UnknownNameError, match="t42"):
+        load_recording("t43")
+    with pytest.raises(UnknownNameError, match="load"):
+        load_table(write(tmp_path / "good.csv", table()), ["torque"])
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_csv_is_read_as_it_was_written(delimiter: str, tmp_path: Path) -> None:
+    values = table()
+    path = tmp_path / "good.csv"
+    np.savetxt(path, values, delimiter=delimiter, header=delimiter.join("abcd"), comments="", fmt="%.17g")
+    names, read = read_table(path)
+    assert names == ("a", "b", "c", "d")
+    np.testing.assert_array_equal(read, values)
+
+
+def test_parquet_is_csv(tmp_path: Path) -> None:
+    pyarrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    values = table()
+    columns = dict(zip("abcd", values.T, strict=True))
+    parquet.write_table(pyarrow.table(columns), tmp_path / "good.parquet")
+    names, read = read_table(tmp_path / "good.parquet")
+    assert names == ("a", "b", "c", "d")
+    np.testing.assert_array_equal(read, values)
+    holes = pyarrow.table({"a": [1.0, None], "y": [1.0, 2.0]})
+    parquet.write_table(holes, tmp_path / "holes.parquet")
+    with pytest.raises(DescriptionError, match="row 2, column 'a'"):
+        read_table(tmp_path / "holes.parquet")
+    parquet.write_table(pyarrow.table({"a": ["wood"], "y": [1.0]}), tmp_path / "text.parquet")
+    with pytest.raises(DescriptionError, match="column 'a' holds string"):
+        read_table(tmp_path / "text.parquet")
+    (tmp_path / "fake.parquet").write_text("no")
+    with pytest.raises(DescriptionError, match="no Parquet file"):
+        read_table(tmp_path / "fake.parquet")
+
+
+def test_targets_are_named_or_found(tmp_path: Path) -> None:
+    values = table()
+    path = write(tmp_path / "a.csv", values)
+    assert load_table(path).y.shape == (60, 1)  # the last column
+    assert load_table(path, ["a", "c"]).y.shape == (60, 2)
+    assert load_table(write(tmp_path / "b.csv", values, "y1,a,y2,b")).y.shape == (60, 2)
+
+
+def test_units_come_from_the_warm_up_alone() -> None:
+    values = table(300)
+    changed = values.copy()
+    changed[100:] *= 50.0
+    one, two = (in_own_units("a", v[:, :3], v[:, 3:]) for v in (values, changed))
+    assert one.warm_up == 30
+    torch.testing.assert_close(one.x[:100], two.x[:100], rtol=0, atol=0)
+    torch.testing.assert_close(one.y[:100], two.y[:100], rtol=0, atol=0)
+    assert float(one.x[:30].std(0, correction=0).sub(1).abs().max()) < 1e-12
+    uncentred = in_own_units("a", values[:, :3], values[:, 3:] + 5.0, centre=False)
+    assert float(uncentred.y[:30].square().mean()) == pytest.approx(1.0)
+    assert float(uncentred.y.mean()) > 0.9
+
+
+def test_a_recording_survives_its_file(tmp_path: Path) -> None:
+    recording = linear()
+    names, values = read_table(recording.save(tmp_path / "a.csv"))
+    assert names == ("x1", "x2", "x3", "y1", "y2")
+    np.testing.assert_array_equal(values, torch.cat([recording.x, recording.y], 1).numpy())
+
+
+def test_data_folder_must_be_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("TORCH_EKM_DATA", raising=False)
+    with pytest.raises(DescriptionError, match="TORCH_EKM_DATA"):
+        load_recording("t42")
+    with pytest.raises(DescriptionError, match="not there"):
+        load_recording("t42", tmp_path)
+
+
+def test_icub_grasp_reader(tmp_path: Path) -> None:
+    folder = tmp_path / "icub_grasp" / "iCubGraspDataset"
+    folder.mkdir(parents=True)
+    for trial in (2, 1, 10):
+        slices = []
+        for t in range(20):
+            slices += [" ".join([str(10.0 * t + trial)] * 9)]
+            slices += [" ".join(["5.0"] * 5)] + [" ".join(["240"] * 12)] * 5
+        (folder / f"book_{trial}.txt").write_text("-10000\n" + "\n".join(slices) + "\n")
+    recording = load_recording("icub_grasp", tmp_path, limit=None)
+    assert recording.segments == (18, 18, 18)
+    assert recording.x.shape == (54, 23)
+    torch.testing.assert_close(recording.y, torch.ones(54, 9, dtype=torch.float64))  # 10 deg a step, unit 10
+    assert float(recording.x[0, 0]) == pytest.approx(11.0 / 30.0)  # trial 1 comes first
+
+
+def test_command_prints_and_writes_what_the_function_returns(tmp_path: Path) -> None:
+    path, out = write(tmp_path / "mine.csv", table(80)), tmp_path / "out"
+    arguments = ["compare", "--data", str(path), "--learners", "linear RLS,SOGP plain", "--out", str(out)]
+    result = CliRunner().invoke(app, [*arguments, "--jobs", "1"])
+    assert result.exit_code == 0, result.output
+    for name in ("index.html", "scores.svg", "scores_mine.csv", "curve_mine.png", "configuration.json"):
+        assert (out / name).stat().st_size > 100, name
+    direct = compare([load_table(path)], ("linear RLS", "SOGP plain"))
+    written = (out / "scores_mine.csv").read_text().splitlines()[1:]
+    for line, score in zip(written, direct.row("mine"), strict=True):
+        assert line.split(",")[1] == f"{score.rms.mean:.3f}"
+
+
+def test_command_refuses_clearly(tmp_path: Path) -> None:
+    path = write(tmp_path / "mine.csv", table(80))
+    result = CliRunner().invoke(app, ["compare", "--data", str(path), "--learners", "magic"])
+    assert isinstance(result.exception, UnknownNameError)
+    assert not Path("compare_output").exists()
+
+
+def test_simulated_hand_repeats_bit_by_bit() -> None:
+    pytest.importorskip("sapien")
+    from torch_ekm.experiments.simulated_stream import record_simulated_hand
+
+    one = record_simulated_hand(40, seed=3)
+    assert one.x.shape == (40, 26)
+    assert one.y.shape == (40, 6)
+    assert sum(one.segments) == 40
+    same = record_simulated_hand(40, seed=3, new_moment_arm=None)
+    assert torch.equal(one.x[:20], same.x[:20])  # until the tendons are replaced
+    assert torch.equal(one.y[:20], same.y[:20])
+    assert not torch.equal(one.y[20:], same.y[20:])
