@@ -1,0 +1,100 @@
+"""Streams, scores and the real hand's recordings, where they are at hand (``TORCH_EKM_DATA``)."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm.exceptions import DescriptionError, UnknownNameError
+from torch_ekm.experiments.prequential import Prequential, compare_learners, run_prequential, score_objects
+from torch_ekm.experiments.streams import ResidualRecording, Stream, load_stream, load_t42
+from torch_ekm.residual import RecursiveLeastSquares, SparseOnlineGP, ZeroResidual
+
+DATA = os.environ.get("TORCH_EKM_DATA", "")
+needs_data = pytest.mark.skipif(
+    not Path(DATA).is_dir() or not DATA, reason="TORCH_EKM_DATA names no folder with the recordings"
+)
+
+
+def test_missing_folder_and_wrong_name_are_told(monkeypatch):
+    monkeypatch.delenv("TORCH_EKM_DATA", raising=False)
+    with pytest.raises(DescriptionError, match="TORCH_EKM_DATA"):
+        load_t42()
+    with pytest.raises(UnknownNameError, match="kin40k"):
+        load_stream("boston", 0)
+
+
+def test_scores_by_hand():
+    y = torch.tensor([[1.0], [-2.0], [3.0], [4.0]], dtype=torch.float64)
+    run = Prequential(0.5 * y, torch.ones_like(y), y, 0.0)
+    assert run.rms_ratio() == pytest.approx(0.5)
+    assert run.median_ratio(2) == pytest.approx(0.5)
+    assert float(run.coverage()) == pytest.approx(0.75)  # |error| is .5, 1, 1.5, 2
+    expected = 0.5 * np.log(2 * np.pi) + 0.125 * float(y.square().mean())
+    assert run.nll() == pytest.approx(expected)
+
+
+def test_prediction_comes_before_learning():
+    x = torch.ones(2, 1, dtype=torch.float64)
+    y = torch.full((2, 1), 3.0, dtype=torch.float64)
+    run = run_prequential(RecursiveLeastSquares(1, 1), x, y)
+    assert float(run.mean[0]) == 0.0
+    assert float(run.mean[1]) > 2.5
+
+
+def test_kept_and_fresh_differ_only_from_the_second_object_on():
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(60, 3, generator=generator, dtype=torch.float64)
+    objects = [ResidualRecording(n, x, torch.sin(x[:, :2])) for n in ("a", "b")]
+    kept = score_objects(lambda: SparseOnlineGP(3, 2), objects, kept=True)
+    fresh = score_objects(lambda: SparseOnlineGP(3, 2), objects, kept=False)
+    assert kept[0] == fresh[0] == dataclasses.replace(fresh[1], name="a")
+    assert kept[1].rms < 0.5 * fresh[1].rms
+
+
+def test_compare_learners_ranks():
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(200, 3, generator=generator, dtype=torch.float64)
+    stream = Stream("line", x[:150], x[:150, :1] * 2, x[150:], x[150:, :1] * 2)
+    scores = compare_learners({"zero": ZeroResidual, "rls": RecursiveLeastSquares}, [stream])
+    assert [s.learner for s in scores] == ["zero", "rls"]
+    assert scores[1].rmse < 0.05 < scores[0].rmse
+
+
+@needs_data
+def test_public_streams_have_their_known_sizes():
+    for name, (n, d, m) in {
+        "sarcos": (4449, 21, 7),
+        "kin40k": (8000, 8, 1),
+        "powerplant": (8000, 4, 1),
+    }.items():
+        s = load_stream(name, 0)
+        assert len(s.x) + len(s.x_test) == n
+        assert (s.x.shape[1], s.y.shape[1]) == (d, m)
+        torch.testing.assert_close(s.y.var(0, correction=0), torch.ones(m, dtype=torch.float64))
+
+
+@needs_data
+def test_nominal_model_of_the_real_hand_leaves_unit_residuals():
+    recordings = load_t42()
+    assert len(recordings) == 17
+    assert all(bool(r.x.isfinite().all() and r.y.isfinite().all()) for r in recordings)
+    assert recordings[0].x.shape[1:] == (15,)
+    assert 0.5 < float(np.median([float(r.y[:, 0].std()) for r in recordings])) < 2.0
+
+
+@needs_data
+def test_the_learner_helps_on_a_real_hand():
+    recordings = load_t42()[7:9]
+
+    def make():
+        return SparseOnlineGP(15, 3, noise_variance=0.3, forgetting=0.99, robust=3.0, calibrate=True)
+
+    scores = score_objects(make, recordings, kept=True)
+    assert all(s.rms < 1.0 for s in scores)
+    assert all(0.85 < c < 0.95 for s in scores for c in s.coverage)
