@@ -1,0 +1,58 @@
+"""Does the learner survive a long smooth trajectory? ``python benchmarks/soak_learners.py --samples 1000000``
+
+A 100 Hz trajectory that stands still at times, so samples repeat exactly. Reports, over the whole run: whether
+all was finite, the smallest variance, the largest difference between the carried state and one rebuilt from
+the natural form, the condition of the basis, and the process' memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import resource
+import time
+
+import torch
+
+from torch_ekm.residual import SparseOnlineGP, SquaredExponential
+
+
+def trajectory(start: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Samples ``start`` to ``start + n`` of the trajectory."""
+    t = torch.arange(start, start + n, dtype=torch.float64) / 100.0
+    t = torch.where((t % 10) < 1, t - t % 10, t)
+    parts = [torch.sin(0.3 * t), torch.sin(0.41 * t + 1), torch.cos(0.17 * t), torch.sin(0.07 * t)]
+    x = torch.stack(parts, -1)
+    return x, torch.stack([torch.sin(2 * x[:, 0] + x[:, 1]), x[:, 2] * x[:, 3]], -1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--samples", type=int, default=100_000)
+    parser.add_argument("--capacity", type=int, default=30)
+    parser.add_argument("--float32", action="store_true")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    dtype = torch.float32 if options.float32 else torch.float64
+    kernel = SquaredExponential(4, lengthscale=1.0)
+    gp = SparseOnlineGP(4, 2, capacity=options.capacity, kernel=kernel, noise_variance=1e-4, dtype=dtype)
+    drift, smallest, begin, block = 0.0, float("inf"), time.perf_counter(), 5_003
+    for start in range(0, options.samples, block):
+        x, y = (a.to(dtype) for a in trajectory(start, min(block, options.samples - start)))
+        gp.update(x, y)
+        rebuilt = copy.deepcopy(gp)
+        rebuilt.refresh()
+        query = x[::53]
+        assert bool(gp(query).isfinite().all()), f"not finite after {start} samples"
+        drift = max(drift, float((gp(query) - rebuilt(query)).abs().max()))
+        smallest = min(smallest, float(gp.variance(query).min()))
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(
+        f"{options.samples} samples, {dtype}, {options.capacity} points: finite, smallest variance {smallest:.2e}, "
+        f"largest drift {drift:.1e}, condition {float(gp.condition_number):.1e}, {memory:.0f} MB, "
+        f"{(time.perf_counter() - begin) / options.samples * 1e6:.0f} us per sample"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,45 @@
+"""On a GPU: the same numbers, and no update or prediction waits for the device."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torch_ekm.residual import DeepKernel, RecursiveLeastSquares, SparseOnlineGP, SquaredExponential
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+
+
+def make(name: str, device: str):
+    options = {"batch_shape": (16,), "on_invalid": "skip", "device": device}
+    if name == "rls":
+        return RecursiveLeastSquares(4, 2, forgetting=0.99, robust=3.0, refresh_every=8, **options)
+    options |= {"capacity": 12, "refresh_every": 8, "robust": 3.0, "forgetting": 0.99}
+    if name == "plain":
+        return SparseOnlineGP(4, 2, **options)
+    kernel = SquaredExponential(4, batch_shape=(16,), device=device)
+    kernel = DeepKernel(kernel, hidden=(8,)) if name == "deep" else kernel
+    return SparseOnlineGP(4, 2, kernel=kernel, adapt=True, calibrate=True, normalize=True, **options)
+
+
+@pytest.mark.parametrize("name", ["rls", "plain", "adaptive", "deep"])
+def test_no_host_synchronisation_and_the_same_numbers(name):
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(60, 16, 4, generator=generator, dtype=torch.float64)
+    y = torch.randn(60, 16, 2, generator=generator, dtype=torch.float64)
+    mask = torch.rand(60, 16, generator=generator) < 0.8
+    host, device = make(name, "cpu"), make(name, "cuda")
+    host.update(x, y, mask)
+    xd, yd, md = x.cuda(), y.cuda(), mask.cuda()
+    device.update(xd[:10], yd[:10], md[:10])  # libraries initialise themselves
+    device.predict(xd[0])
+    torch.cuda.synchronize()
+    try:
+        torch.cuda.set_sync_debug_mode("error")
+        for t in range(10, 60):
+            device.update(xd[t], yd[t], md[t])
+            device.predict(xd[t])
+            device.linearize(xd[t])
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    torch.testing.assert_close(device(xd[:5]).cpu(), host(x[:5]), atol=1e-7, rtol=1e-7)
