@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from ..description import HandDescription, ObjectDescription
 from ..description.shape import Shape
-from ..description.urdf import UrdfJoint, UrdfLink, UrdfModel, read_urdf
+from ..description.urdf import UrdfJoint, UrdfLink, UrdfModel
 from ..exceptions import DescriptionError
 from .engine import sapien
 from .geometry import scaled
+from .graspable import urdf_of
 
 Array = NDArray[np.float64]
 
@@ -37,7 +38,7 @@ def build_hand(scene: Any, hand: HandDescription, material: Any, link_weight: bo
     Links on fixed joints become part of the link that carries them.
     """
     physx, pose = sapien().physx, sapien().Pose
-    urdf = hand.urdf if hand.urdf is not None else read_urdf(hand.urdf_path)
+    urdf = urdf_of(hand)
     components: dict[str, Any] = {}
     entities: list[Any] = []
 

@@ -7,14 +7,19 @@ from numpy.typing import NDArray
 
 from ..description import ContactPad, HandDescription, ObjectDescription
 from ..description.shape import Shape
-from ..description.urdf import read_urdf
+from ..description.urdf import UrdfModel, read_urdf
 
 Array = NDArray[np.float64]
 
 
+def urdf_of(hand: HandDescription) -> UrdfModel:
+    """The URDF that came with the description, or the file it names."""
+    return hand.urdf if hand.urdf is not None else read_urdf(hand.urdf_path)
+
+
 def chain(hand: HandDescription, link: str) -> list[int]:
     """Joints that move a link, the nearest first."""
-    urdf = hand.urdf if hand.urdf is not None else read_urdf(hand.urdf_path)
+    urdf = urdf_of(hand)
     above = {joint.child: joint for joint in urdf.joints}
     chain = []
     while link in above:
@@ -29,7 +34,7 @@ def obstacles(hand: HandDescription, pads: tuple[ContactPad, ...]) -> tuple[list
 
     Returns the link of each ball, its centre in that link ``(n, 3)`` [m] and its radius ``(n,)`` [m].
     """
-    urdf = hand.urdf if hand.urdf is not None else read_urdf(hand.urdf_path)
+    urdf = urdf_of(hand)
     links, centres, radii = [], [], []
 
     def add(link: str, centre: Array, radius: float) -> None:

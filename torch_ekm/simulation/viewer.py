@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from .._extras import require
 from ..description import HandDescription, ObjectDescription
 from ..description.shape import Shape
-from ..description.urdf import read_urdf
 from ..kinematics import HandKinematics
+from .graspable import urdf_of
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ class GraspViewer:
         self._kinematics = HandKinematics(hand)
         self._plotter: Any = self._pyvista.Plotter(off_screen=True, window_size=list(size))
         self._plotter.set_background("white")
-        urdf = hand.urdf if hand.urdf is not None else read_urdf(hand.urdf_path)
+        urdf = urdf_of(hand)
         pads = {pad.link for pad in hand.pads}
         self._of_link = [
             (self._kinematics.link_index(link.name), self._add(shape, _PAD if link.name in pads else _HAND))

@@ -1,0 +1,87 @@
+"""Planned pinches against an independent account of contacts, forces and torques."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from simulation_helpers import DEG
+
+from torch_ekm.contact.collision import ContactDetector
+from torch_ekm.description import list_objects, load_hand, load_object
+from torch_ekm.kinematics import HandKinematics
+from torch_ekm.simulation import PinchRequest, PlantConfig, PlantParameters
+from torch_ekm.simulation.mechanism import make_planner, make_transmission
+
+G = 9.81
+
+
+def plan_for(name, request=None, **changes):
+    hand, obj = load_hand("icub_right"), load_object(name)
+    parameters = PlantParameters.exact().replace(**changes)
+    plan = make_planner(hand, obj, PlantConfig(), parameters).plan(request or PinchRequest())
+    return hand, obj, plan, make_transmission(hand, parameters)
+
+
+def contacts_of(hand, obj, plan):
+    parts = (torch.from_numpy(part) for part in (plan.q, plan.position, plan.rotation))
+    return ContactDetector(hand, obj)(*parts)
+
+
+@pytest.mark.parametrize("name", list_objects())
+def test_a_plan_is_an_equilibrium(name):
+    hand, obj, plan, transmission = plan_for(name)
+    seen = contacts_of(hand, obj, plan)
+    assert seen.finger == plan.pads == ("thumb", "index", "middle")
+    assert seen.gap.abs().max() < 2e-5
+    np.testing.assert_allclose(seen.point.numpy(), plan.points, atol=1e-4)
+    np.testing.assert_allclose(seen.normal.numpy(), plan.normals, atol=1e-3)
+
+    weight = obj.mass * np.array([0.0, 0.0, G])
+    np.testing.assert_allclose(plan.forces.sum(axis=0) + weight, 0.0, atol=0.01)
+    moments = np.cross(plan.points, plan.forces).sum(axis=0)
+    centre = plan.position + plan.rotation @ obj.com
+    np.testing.assert_allclose(moments + np.cross(centre, weight), 0.0, atol=3e-4)
+
+    q, kinematics = torch.from_numpy(plan.q), HandKinematics(hand)
+    load = np.zeros(hand.n_q)  # virtual work of the reactions, through the link's own Jacobian
+    for link, point, force in zip(seen.link, plan.points, plan.forces, strict=True):
+        pose = kinematics(q).of(link)
+        local = pose[:3, :3].T @ (torch.from_numpy(point) - pose[:3, 3])
+        load -= kinematics.jacobian(q, link, local)[:3].numpy().T @ force
+    balance = load + transmission.drive_stiffness * (transmission.drive_targets(plan.q, plan.motor) - plan.q)
+    loaded = [hand.joint_names.index(f"{finger}_{k}") for finger in plan.pads for k in (1, 2, 3)]
+    np.testing.assert_allclose(balance[loaded], 0.0, atol=2e-3)
+
+
+@pytest.mark.parametrize("name", list_objects())
+def test_a_plan_keeps_well_inside_cones_and_stops(name):
+    hand, obj, plan, _ = plan_for(name)
+    normal = -np.einsum("ci,ci->c", plan.forces, plan.normals)
+    tangential = np.linalg.norm(plan.forces + normal[:, None] * plan.normals, axis=1)
+    assert (tangential < 0.6 * obj.friction * normal).all()
+    assert normal[0] == pytest.approx(5.0, abs=0.1)
+    spare = np.minimum(plan.q - hand.joint_lower, hand.joint_upper - plan.q)
+    bent = [j for j, name in enumerate(hand.joint_names) if name[:-2] in plan.pads and name != "middle_0"]
+    assert spare[bent].min() > 3.0 * DEG
+    assert (plan.motor >= hand.actuator_lower - 1e-6).all()
+    assert (plan.motor <= hand.actuator_upper).all()
+
+
+def test_requests_are_met():
+    request = PinchRequest(force=3.0, along=0.008, across=0.002, tilt=(0.05, -0.05))
+    _, _, plan, _ = plan_for("box", request)
+    assert -plan.forces[0] @ plan.normals[0] == pytest.approx(3.0, abs=0.05)
+    local = (plan.points - plan.position) @ plan.rotation
+    assert local[0, 0] == pytest.approx(0.008, abs=1e-3)
+    assert local[1:, 0].mean() == pytest.approx(0.008, abs=1e-3)
+    straight = plan_for("box")[2].rotation[:, 0]
+    between = np.arccos(np.clip(straight @ plan.rotation[:, 0], -1, 1))
+    assert between == pytest.approx(np.hypot(0.05, 0.05), abs=0.03)
+
+
+def test_weaker_springs_bend_the_fingertips_back():
+    stiff, weak = (plan_for("box", spring=spring)[2].q for spring in (1.0, 0.6))
+    hand = load_hand("icub_right")
+    j2, j3 = (hand.joint_names.index(f"thumb_{k}") for k in (2, 3))
+    assert weak[j3] - weak[j2] > stiff[j3] - stiff[j2] + 3 * DEG
