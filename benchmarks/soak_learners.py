@@ -1,4 +1,4 @@
-"""Does the learner survive a long smooth trajectory? ``python benchmarks/soak_learners.py --samples 1000000``
+"""Does the learner survive a long smooth trajectory? ``benchmarks/soak_learners.py --samples 1000000``
 
 A 100 Hz trajectory that stands still at times, so samples repeat exactly. Reports, over the whole run: whether
 all was finite, the smallest variance, the largest difference between the carried state and one rebuilt from
@@ -48,7 +48,8 @@ def main() -> None:
         smallest = min(smallest, float(gp.variance(query).min()))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
-        f"{options.samples} samples, {dtype}, {options.capacity} points: finite, smallest variance {smallest:.2e}, "
+        f"{options.samples} samples, {dtype}, {options.capacity} points: finite, "
+        f"smallest variance {smallest:.2e}, "
         f"largest drift {drift:.1e}, condition {float(gp.condition_number):.1e}, {memory:.0f} MB, "
         f"{(time.perf_counter() - begin) / options.samples * 1e6:.0f} us per sample"
     )
