@@ -1,8 +1,8 @@
 """Does the learner survive a long smooth trajectory? ``benchmarks/soak_learners.py --samples 1000000``
 
-A 100 Hz trajectory that stands still at times, so samples repeat exactly. Reports, over the whole run: whether
-all was finite, the smallest variance, the largest difference between the carried state and one rebuilt from
-the natural form, the condition of the basis, and the process' memory.
+A 100 Hz trajectory that stands still at times, so samples repeat exactly. Reports, over the whole run:
+whether all was finite, the smallest variance, the largest difference between the carried state and one
+rebuilt from the natural form, the condition of the basis, and the process' memory.
 """
 
 from __future__ import annotations
