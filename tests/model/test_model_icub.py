@@ -11,6 +11,7 @@ import torch
 from model_icub import DEG, F64, gripped
 from model_toys import finite_difference_jacobian, relative_error, step_error_slope
 
+from torch_ekm.exceptions import ShapeError
 from torch_ekm.model import GraspState, KinematicModel, ModelStatus
 
 
@@ -164,6 +165,46 @@ def test_a_joint_at_its_stop_is_held_and_a_pull_away_from_it_is_not():
     )
     assert not lin.held_joints.any()
     assert relative_error(lin.manipulation_jacobian, free.manipulation_jacobian, 20) < 1e-4
+
+
+def test_how_much_a_stop_bears_is_told_by_the_fingertips():
+    from torch_ekm.model.equilibrium import EquilibriumSolver
+
+    model, _, at = gripped("box", friction=6.0)  # pulling hard leaves the usual cones
+    names = model.hand.joint_names
+    j = names.index("thumb_2")
+
+    def with_stop(lower):
+        limits = model.hand.joint_lower.copy()
+        limits[j] = lower
+        hand = dataclasses.replace(model.hand, joint_lower=limits)
+        return KinematicModel(hand, model.obj, kinematics=model.kinematics, detector=model.detector)
+
+    # 0.3 deg away from a stop it plays no part
+    near = with_stop(float(at.state.q[j]) - 0.3 * DEG).linearize(at.state, at.contacts)
+    assert not near.held_joints.any()
+    assert (near.forces.mu - at.mu).norm() < 1e-4 * at.mu.norm()
+    # pressed against it: hold the joint and pull; the other joint closes, this one would open
+    solver = EquilibriumSolver(model, at.state, at.contacts, held=(j,))
+    start = dataclasses.replace(at, stop=torch.zeros(1, dtype=F64))
+    a = at.a.clone()
+    a[model.hand.actuator_names.index("thumb_distal")] += 25 * DEG
+    pressed = solver.move(start, a)
+    assert float(pressed.stop[0]) > 0.02  # the stop pushes inwards
+    # the toy contacts are named after links; name them after the pads
+    pads = {pad.link: pad.name for pad in model.hand.pads}
+    contacts = pressed.contacts.replace(finger=tuple(pads[link] for link in pressed.contacts.link))
+    felt = torch.full((len(model.hand.pads),), float("nan"), dtype=F64)
+    order = [pad.name for pad in model.hand.pads]
+    felt[[order.index(name) for name in contacts.finger]] = solver.forces(pressed).normal
+    lin = with_stop(float(at.state.q[j])).linearize(pressed.state, contacts, fingertip_force=felt)
+    assert lin.held_joints.nonzero()[:, 0].tolist() == [j]
+    assert float(lin.forces.stop_torque[j]) == pytest.approx(float(pressed.stop[0]), rel=2e-2)
+    assert (lin.forces.mu - pressed.mu).norm() < 1e-2 * pressed.mu.norm()
+    expected = finite_difference_jacobian(solver, pressed, 2e-4)
+    assert relative_error(lin.manipulation_jacobian, expected, 20) < 1e-3
+    with pytest.raises(ShapeError, match="fingertip_force"):
+        model.linearize(at.state, contacts, fingertip_force=felt[:2])
 
 
 @pytest.mark.parametrize("joints", [("thumb_2",), ("index_2", "middle_2")])

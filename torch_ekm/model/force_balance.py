@@ -43,11 +43,15 @@ class ForceBalance:
 
     def near_stop(self, q: Float[Tensor, "*batch n_q"]) -> Bool[Tensor, "*batch n_q"]:
         """Joints within the tolerance of a limit (or beyond it)."""
-        tolerance = self.options.stop_tolerance
-        lower, upper, movable = (
-            torch.as_tensor(v, device=q.device) for v in (self.lower, self.upper, self.movable)
+        low, high, movable = (
+            torch.as_tensor(v, device=q.device)
+            for v in (
+                self.lower + self.options.stop_tolerance,
+                self.upper - self.options.stop_tolerance,
+                self.movable,
+            )
         )
-        return ((q <= lower + tolerance) | (q >= upper - tolerance)) & movable
+        return ((q <= low) | (q >= high)) & movable
 
     def held_by_stops(
         self, q: Float[Tensor, "*batch n_q"], torque: Float[Tensor, "*batch n_q"]

@@ -155,7 +155,7 @@ class KinematicModel(nn.Module):
         contacts: ContactSet | None = None,
         *,
         forces: GraspForces | None = None,
-        measured_normal: Float[Tensor, "*batch n_c"] | None = None,
+        fingertip_force: Float[Tensor, "*batch n_pads"] | None = None,
         locked: Sequence[str] = (),
     ) -> Linearization:
         """Contacts, forces, ``J_m`` and the force sensitivities at a state.
@@ -164,7 +164,8 @@ class KinematicModel(nn.Module):
             state: one state, or a batch together with batched ``contacts``.
             contacts: by default from the detector (single state).
             forces: known forces; by default from the relaxed minimal-force problem.
-            measured_normal: fingertip forces [N] to be respected in that problem, NaN where unknown.
+            fingertip_force: measured normal forces [N] in the order of ``hand.pads``, NaN where unknown, to
+                be respected in that problem. Worth giving where joints are at their stops.
             locked: joints that stick, by name.
 
         Raises:
@@ -187,8 +188,9 @@ class KinematicModel(nn.Module):
         status = ModelStatus.OK
         if forces is None:
             last = self._last if self._last is not None and self._last[0] == contacts.finger else None
+            measured = None if fingertip_force is None else self._of_contacts(contacts, fingertip_force)
             forces = self.balance(
-                state.q, kin, A, V_q, V_p, lock, measured_normal, None if last is None else last[1:]
+                state.q, kin, A, V_q, V_p, lock, measured, None if last is None else last[1:]
             )
             if forces.solved:
                 if state.q.dim() == 1:
@@ -300,6 +302,17 @@ class KinematicModel(nn.Module):
         if deepest < -self.options.max_overlap:
             which = contacts.finger[int(contacts.gap.reshape(-1, contacts.n_c).amin(0).argmin())]
             raise PenetrationError(which, -deepest, self.options.max_overlap)
+
+    def _of_contacts(self, contacts: ContactSet, fingertip_force: Tensor) -> Tensor:
+        pads = [pad.name for pad in self.hand.pads]
+        if fingertip_force.shape[-1] != len(pads):
+            raise ShapeError(
+                "fingertip_force", f"(*batch, {len(pads)})", fingertip_force.shape, f"pads: {', '.join(pads)}"
+            )
+        for name in contacts.finger:
+            if name not in pads:
+                raise UnknownNameError("pad", name, pads)
+        return fingertip_force[..., [pads.index(name) for name in contacts.finger]]
 
     def _joint(self, name: str) -> int:
         if name not in self.hand.joint_names:

@@ -42,9 +42,10 @@ class ModelOptions:
     """Deepest penetration of finger and object that is still modelled [m]."""
     joint_stops: bool = True
     """A joint that its stop holds does not move."""
-    stop_tolerance: float = math.radians(0.5)
-    """How near to a limit a joint counts as touching its stop [rad]."""
-    stop_torque: float = 1e-4
+    stop_tolerance: float = math.radians(0.1)
+    """How near to a limit a joint counts as touching its stop [rad]. Joint angles alone cannot tell how
+    much torque a stop takes from the contact forces: fingertip sensors can, so give them if there are any."""
+    stop_torque: float = 0.01
     """Torque above which a stop holds its joint [N m]; below, the joint may leave."""
     slack_tension: float | None = None
     """Tendons with at most this tension [N m] are slack and move nothing. None: servos keep all taut."""
