@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -33,14 +33,15 @@ class ModelBank(ResidualLearner):
     its model for the episode; the best one predicts. Then the best one goes on alone, and when the
     episode ends it replaces the model it began as, or becomes a new one.
 
-    "New" starts from what is common: a learner of all objects whose information is multiplied by
-    ``common_weight``. It predicts the same and is less sure of it: for a familiar object it loses to
-    the model that was sure and right, for an unfamiliar one it wins against all that are sure and
-    wrong. No threshold decides, only the evidence.
+    "New" starts from what is common: a learner of all objects whose information is multiplied by a
+    weight. It predicts the same and is less sure of it: for a familiar object it loses to the model
+    that was sure and right, for an unfamiliar one it wins against all that are sure and wrong. How much
+    objects have in common nobody knows beforehand, so each of ``common_weights`` is a hypothesis, down
+    to 0, the empty learner. No threshold decides, only the evidence.
 
     To a controller it is a learner like any other. Residuals have heavier tails than a Gaussian, and
     a learner's noise is rarely right: densities are Student's (4 degrees of freedom), with a scale
-    per output that is learned from the leading model's innovations.
+    per output that is learned from the chosen model's innovations.
 
     Args:
         factory: makes an empty learner; all hypotheses are copies of what it returns.
@@ -48,7 +49,7 @@ class ModelBank(ResidualLearner):
         window: samples in which an object is recognised.
         new_prior: nu, the weight of "new" in episodes.
         temperature: tau in (0, 1]; below 1 since the samples of one grasp are not independent.
-        common_weight: share of the common learner's information that a new model starts with.
+        common_weights: shares of the common learner's information that a new model may start with.
         soften: multiplies a learner's information by a share in place; :func:`discount` by default.
 
     Raises:
@@ -70,7 +71,7 @@ class ModelBank(ResidualLearner):
         window: int = 16,
         new_prior: float = 0.3,
         temperature: float = 0.5,
-        common_weight: float = 0.1,
+        common_weights: Sequence[float] = (0.1, 0.01, 0.0),
         soften: Callable[[ResidualLearner, float], None] | None = None,
     ) -> None:
         first = factory()
@@ -80,21 +81,23 @@ class ModelBank(ResidualLearner):
         for name, value in (("models", models), ("window", window)):
             if value < 1:
                 raise ParameterError(name, value, "at least 1")
-        for name, value in (("temperature", temperature), ("common_weight", common_weight)):
-            if not 0 < value <= 1:
-                raise ParameterError(name, value, "in (0, 1]")
+        if not 0 < temperature <= 1:
+            raise ParameterError("temperature", temperature, "in (0, 1]")
+        if not common_weights or not all(0 <= weight <= 1 for weight in common_weights):
+            raise ParameterError("common_weights", common_weights, "one or more shares in [0, 1]")
         if not new_prior > 0:
             raise ParameterError("new_prior", new_prior, "positive")
         self.models, self.window, self.new_prior = models, window, new_prior
-        self.temperature, self.common_weight = temperature, common_weight
+        self.temperature, self.common_weights = temperature, tuple(common_weights)
         self._soften = discount if soften is None else soften
         self.common = first
         self.kept = nn.ModuleList(copy.deepcopy(first) for _ in range(models))
-        self.trial = nn.ModuleList(copy.deepcopy(first) for _ in range(models + 1))  # the last: "new"
+        hypotheses = models + len(self.common_weights)  # the last ones: "new"
+        self.trial = nn.ModuleList(copy.deepcopy(first) for _ in range(hypotheses))
         device = self.device
         self.register_buffer("episodes", torch.zeros(models, dtype=torch.int64, device=device))
         for name in ("log_prior", "log_evidence"):
-            self.register_buffer(name, torch.zeros(models + 1, dtype=torch.float64, device=device))
+            self.register_buffer(name, torch.zeros(hypotheses, dtype=torch.float64, device=device))
         for name in ("seen", "leader"):
             self.register_buffer(name, torch.zeros((), dtype=torch.int64, device=device))
         self.register_buffer("scale", self._like.new_ones(self.out_features))
@@ -110,7 +113,8 @@ class ModelBank(ResidualLearner):
     @property
     def posterior(self) -> Float[Tensor, " models_and_new"]:
         """Probability of each known model, and last that of a new one."""
-        return (self.log_prior + self.log_evidence).softmax(0)
+        p = (self.log_prior + self.log_evidence).softmax(0)
+        return torch.cat([p[: self.models], p[self.models :].sum(0, keepdim=True)])
 
     @torch.no_grad()
     def begin(self) -> int | None:
@@ -132,20 +136,24 @@ class ModelBank(ResidualLearner):
         if n:
             self.log_prior[:new][known] = math.log((1 - share) / n)
         if share:
-            self.log_prior[new] = math.log(share)
+            self.log_prior[new:] = math.log(share / len(self.common_weights))
         self.log_evidence.zero_()
         self.seen.zero_()
         for i in torch.nonzero(known).flatten().tolist():
             _copy(self.kept[i], self.trial[i])
-        _copy(self.common, self.trial[new])
-        self._soften(self._trial(new), self.common_weight)
+        for i, weight in enumerate(self.common_weights, start=new):
+            if weight > 0:
+                _copy(self.common, self.trial[i])
+                self._soften(self._trial(i), weight)
+            else:
+                self._trial(i).reset()
         self.leader.copy_(self.log_prior.argmax())
 
     def _keep(self) -> int | None:
         if self.seen < _LEAST:
             return None
         best = slot = int(self.leader)
-        if best == self.models:
+        if best >= self.models:
             slot = int(torch.nonzero(self.episodes == 0)[0])  # "new" has no prior when none is free
         _copy(self.trial[best], self.kept[slot])
         self.episodes[slot] += 1
@@ -194,7 +202,7 @@ class ModelBank(ResidualLearner):
             if choosing:
                 density = StudentT(4.0, law.mean, law.stddev * self.scale).log_prob(y).sum(-1)
                 self.log_evidence[i] += self.temperature * density.double()
-            if i == leader:
+            else:  # only of a model that was chosen: the errors of a wrong one say nothing of noise
                 z2 = ((y - law.mean) / law.stddev).square().clamp_max(25.0)  # one slip must not widen it
                 self.scale.copy_((self.scale.square().lerp(z2, _SCALE_RATE)).sqrt())
             reports[i] = hypothesis.update(x, y)
