@@ -67,7 +67,7 @@ def learning_table(
         "(the paper: 16; last upper boundary -0.57 deg). Recovered: trials after the event until the "
         "E-KM's error is below half of the KM's; trials with an event are left out of the ratio."
     )
-    name, what = ("learning_true", "the plant's truth") if against_truth else ("learning", "measurements")
+    name, what = ("learning_true", "the truth") if against_truth else ("learning", "measurements")
     return Table(name, f"How fast the E-KM learns: errors against {what}", header, rows, note)
 
 

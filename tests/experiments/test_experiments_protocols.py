@@ -1,0 +1,231 @@
+"""The paper's experiments, small: paired grasps, events, probes, settings, learners by name."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm.control import Decision, PoseTarget, StopReason
+from torch_ekm.exceptions import ParameterError, UnknownNameError
+from torch_ekm.experiments.ablation import TROUBLES, AblationConfig, ablation_jobs, variants
+from torch_ekm.experiments.adapt import AdaptConfig, adapt_session
+from torch_ekm.experiments.bench import Bench
+from torch_ekm.experiments.camera_off import CameraOff
+from torch_ekm.experiments.learners import LEARNERS, make_learner
+from torch_ekm.experiments.protocols import (
+    GeneralizeConfig,
+    OnlineConfig,
+    generalize_jobs,
+    generalize_session,
+    online_session,
+)
+from torch_ekm.experiments.setting import CONTROLLERS, Setting, digest
+from torch_ekm.kinematics.se3 import exp
+from torch_ekm.model import GraspState
+from torch_ekm.simulation import Observation, PlantParameters, PlantStatus
+
+ONLINE = OnlineConfig(trials=2, angles_deg=(4.0, 5.0), dislocations=(2,), tendons_replaced=2)
+
+
+# -- without a simulation ----------------------------------------------------------------------------
+
+
+def test_controllers_differ_in_the_reference_of_their_increments() -> None:
+    setting = Setting()
+    assert {c: setting.plant_config(c).relative_to for c in CONTROLLERS} == {
+        "KM": "encoder", "KM+I": "setpoint", "E-KM": "encoder", "E-KM+I": "setpoint",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "match"),
+    [
+        ({"hand": "claw"}, UnknownNameError, "icub_left"),
+        ({"learner": "oracle"}, UnknownNameError, "action-linear"),
+        ({"severity": "mild"}, UnknownNameError, "nominal"),
+        ({"capacity": 0}, ParameterError, "capacity"),
+        ({"plant": {"springs": 2.0}}, ParameterError, "spring"),
+        ({"model": {"rolls": False}}, ParameterError, "rolling"),
+        ({"grasp": {"force": 1.0}}, ParameterError, "pinch_force"),
+    ],
+)
+def test_wrong_settings_say_what_would_be_right(changes: dict, error: type, match: str) -> None:
+    with pytest.raises(error, match=match):
+        Setting(**changes)
+
+
+def test_results_are_kept_under_all_that_decides_them() -> None:
+    base = GeneralizeConfig()
+    assert digest(base) == digest(GeneralizeConfig())
+    assert digest(base) != digest(dataclasses.replace(base, setting=Setting(capacity=59)))
+    one, both = (
+        generalize_jobs(dataclasses.replace(base, objects=o), (0,)) for o in (("box",), ("box", "can"))
+    )
+    assert set(one) < set(both)  # more objects: what is there is used again
+    assert len(both) == 2 * len(CONTROLLERS)
+
+
+def test_every_learner_of_the_ablation_starts_at_zero_and_learns() -> None:
+    generator = torch.Generator().manual_seed(0)
+    slope = torch.randn(4, 6, generator=generator, dtype=torch.float64)
+    for name in LEARNERS:
+        learner = make_learner(name, 5, 4, 30)
+        x = torch.randn(120, 9, generator=generator, dtype=torch.float64)
+        y = x[:, 5:] @ slope
+        assert torch.equal(learner(x), torch.zeros(120, 6, dtype=torch.float64)), name
+        learner.update(x, y)
+        better = float((learner(x) - y).square().mean() / y.square().mean())
+        assert better == 1.0 if name == "none" else better < 0.7, (name, better)
+    with pytest.raises(UnknownNameError, match="deep"):
+        make_learner("forest", 5, 4, 30)
+
+
+def test_ablation_covers_every_trouble_of_the_nominal_plant() -> None:
+    nominal, exact = PlantParameters.nominal_mismatch(), PlantParameters.exact()
+    troubled = {
+        f.name for f in dataclasses.fields(nominal) if getattr(nominal, f.name) != getattr(exact, f.name)
+    }
+    assert troubled == {name for names in TROUBLES.values() for name in names}
+    config = AblationConfig()
+    for variant in variants(config):
+        changed = config.setting.replace(**variant.changes)
+        if variant.group == "trouble":
+            different = [
+                name for name in troubled if getattr(changed.parameters(), name) != getattr(exact, name)
+            ]
+            assert set(different) == set(TROUBLES[variant.name]), variant.name
+    jobs = ablation_jobs(config, (0,))
+    assert len(jobs) < sum(len(v.controllers) for v in variants(config))  # alike variants share their jobs
+
+
+class Stage:
+    """A plant that turns about z by what it is told, and is seen exactly."""
+
+    def __init__(self) -> None:
+        self.angle = 0.0
+
+    def reset(self, seed: int) -> Observation:
+        self.angle = 0.0
+        return self.observe()
+
+    def observe(self) -> Observation:
+        z = torch.tensor([0.0, 0.0, self.angle], dtype=torch.float64)
+        zeros = torch.zeros(3, dtype=torch.float64)
+        return Observation(zeros[:1], zeros[:1], zeros, exp(z), zeros[:1])
+
+    def command(self, delta_a: torch.Tensor) -> Observation:
+        self.angle += float(delta_a[0])
+        return self.observe()
+
+    def close(self) -> None: ...
+
+
+def test_without_the_camera_the_prediction_is_all_there_is() -> None:
+    stage = Stage()
+    start = GraspState(
+        torch.zeros(1, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), torch.eye(3).double()
+    )
+    target = PoseTarget.turned(start, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 0.5)
+    plant = CameraOff(stage, target, switch_off=0.25)
+    plant.reset(0)
+    predicted = torch.zeros(7, dtype=torch.float64)
+    predicted[-1] = 0.1
+    step = torch.tensor([0.2], dtype=torch.float64)
+    decision = Decision(step, StopReason.RUNNING, step, predicted, predicted)
+
+    def angle(seen: Observation) -> float:
+        return float(torch.atan2(seen.rotation[1, 0], seen.rotation[0, 0]))
+
+    plant.expect(decision)
+    assert angle(plant.command(step)) == pytest.approx(0.2)  # seen: 0.3 rad to go
+    plant.expect(decision)
+    assert angle(plant.command(step)) == pytest.approx(0.4)  # seen, and then the camera goes dark
+    assert plant.dark
+    plant.expect(decision)
+    assert angle(plant.command(step)) == pytest.approx(0.5)  # believed; really 0.6
+    assert stage.angle == pytest.approx(0.6)
+    assert plant.observe().status is PlantStatus.HELD
+
+
+def test_impossible_protocols_are_refused() -> None:
+    with pytest.raises(ParameterError, match="angles_deg"):
+        OnlineConfig(angles_deg=(10.0, 5.0))
+    with pytest.raises(ParameterError, match="objects"):
+        GeneralizeConfig(objects=())
+    with pytest.raises(ParameterError, match="angles_deg"):
+        GeneralizeConfig(angles_deg=(0.0,))
+    with pytest.raises(ParameterError, match="turn"):
+        AdaptConfig(turns_each=0)
+    with pytest.raises(UnknownNameError, match="KM\\+I"):
+        online_session(ONLINE, "PID", 0)
+
+
+# -- with the simulation -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def online() -> dict[str, list[dict]]:
+    return {name: online_session(ONLINE, name, 0) for name in ("KM+I", "E-KM")}
+
+
+def test_every_controller_gets_the_same_grasps_and_targets(online: dict[str, list[dict]]) -> None:
+    for ours, theirs in zip(online["E-KM"], online["KM+I"], strict=True):
+        assert ours["angle_deg"] == theirs["angle_deg"]
+        assert ours["errors_deg"][0] == theirs["errors_deg"][0]  # measured before the first motion
+
+
+def test_learner_starts_empty_and_is_trained(online: dict[str, list[dict]]) -> None:
+    first, second = online["E-KM"]
+    assert first["prediction_ekm_deg"][0] == first["prediction_km_deg"][0]
+    assert second["prediction_ekm_deg"][0] != second["prediction_km_deg"][0]
+    assert online["KM+I"][0]["prediction_ekm_deg"][0] is None
+    assert len(first["true_prediction_ekm_deg"]) == first["steps"]
+
+
+def test_knock_is_felt_in_its_trial_only(online: dict[str, list[dict]]) -> None:
+    calm, knocked = online["KM+I"]
+    assert max(calm["true_prediction_km_deg"]) < 2.0
+    assert knocked["true_prediction_km_deg"][3] > 2.0  # after the third motion
+
+
+def test_same_seed_same_session() -> None:
+    config = GeneralizeConfig(
+        objects=("box",), angles_deg=(4.0,), warm_up=1, long_step_deg=3.0, blind_deg=2.0
+    )
+    runs = [generalize_session(config, "box", "E-KM", 1) for _ in range(2)]
+    for ours, theirs in zip(*runs, strict=True):
+        assert {k: v for k, v in ours.items() if k != "seconds"} == {
+            k: v for k, v in theirs.items() if k != "seconds"
+        }
+    kinds = [record["kind"] for record in runs[0]]
+    assert kinds == ["warm-up", "turn", "long step", "long step", "camera off"]
+    assert runs[0][2]["error_deg"] < 3.0
+    assert runs[0][1]["true_error_deg"] < 1.0
+
+
+def test_what_cannot_be_grasped_is_recorded_not_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    from torch_ekm.exceptions import GraspError
+
+    bench = Bench(Setting(), "box", "KM")
+
+    def fail(seed: int) -> None:
+        raise GraspError("too wide")
+
+    monkeypatch.setattr(bench.plant, "reset", fail)
+    assert bench.trial(0, 0, 5.0)["reason"] == "not grasped"
+    assert bench.long_step(0, 0)["grasped"] is False
+
+
+def test_object_memory_runs_and_all_memories_see_the_same_motions() -> None:
+    config = AdaptConfig(objects=("box", "can"), turns_each=1)
+    records = adapt_session(config, 0)
+    assert len(records) == 2
+    for record in records:
+        assert {len(errors) for errors in record["memory_errors_deg"].values()} == {record["steps"]}
+    assert records[0]["model"] == 0
+    np.testing.assert_allclose(sum(records[0]["posterior"]), 1.0)
+    # nothing is known at first: every memory predicts what the KM does
+    assert len({errors[0] for errors in records[0]["memory_errors_deg"].values()}) == 1

@@ -1,0 +1,152 @@
+"""reproduce: plans, reports, resume after a kill, and the command line."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from torch_ekm.cli import app
+from torch_ekm.exceptions import ParameterError, UnknownNameError
+from torch_ekm.experiments.reproduce import EXPERIMENTS, Experiment, plan, reproduce
+
+
+def turn(controller: str, seed: int, trial: int, angle: float, item: str) -> dict[str, Any]:
+    """A made-up turn, decided by its arguments: reports are tested here, not the hand."""
+    draw = np.random.default_rng([seed, trial, len(controller), len(item)])
+    n = int(draw.integers(3, 9))
+    learns = controller.startswith("E-KM")
+    km = draw.uniform(0.3, 0.7, n).tolist()
+    ekm = draw.uniform(0.1, 0.3, n).tolist() if learns else [None] * n
+    return {
+        "controller": controller, "seed": seed, "trial": trial, "angle_deg": angle, "object": item,
+        "kind": "turn",
+        "grasped": True, "reason": "reached", "message": "", "lost": False, "steps": n,
+        "true_error_deg": float(draw.uniform(0, 0.3)), "static_error_deg": 0.1,
+        "errors_deg": np.linspace(angle, 0.1, n + 1).tolist(), "first_step_deg": float(draw.uniform(0.1, 1)),
+        "step_error_deg": 0.3, "prediction_km_deg": km, "prediction_ekm_deg": ekm,
+        "true_prediction_km_deg": km, "true_prediction_ekm_deg": ekm if learns else [],
+        "off_rotation_deg": float(draw.uniform(0, 2)), "seconds": [0.01] * n,
+    }  # fmt: skip
+
+
+def made_up_online(config: Any, controller: str, seed: int) -> list[dict[str, Any]]:
+    return [turn(controller, seed, trial, 8.0, "toothpaste") for trial in range(1, config.trials + 1)]
+
+
+def made_up_generalize(config: Any, item: str, controller: str, seed: int) -> list[dict[str, Any]]:
+    records = [turn(controller, seed, k, angle, item) for k, angle in enumerate(config.angles_of(item))]
+    draw = np.random.default_rng([seed, len(controller)])
+    probe = {"kind": "long step", "error_deg": float(draw.uniform(0.2, 2.0)), "angle_deg": 5.0}
+    dark = {**turn(controller, seed, 99, 12.0, item), "kind": "camera off"}
+    return [*records, {**records[0], **probe}, dark]
+
+
+def made_up_adapt(config: Any, seed: int) -> list[dict[str, Any]]:
+    names = ("none", "bank", "labelled", "one model", "fresh")
+    records = []
+    for k in range(8):
+        record = turn("E-KM", seed, k, 10.0, config.objects[k % 2])
+        errors = {name: [0.1 * (i + 1)] * record["steps"] for i, name in enumerate(names)}
+        posterior = [0.9, 0.1] + [0.0] * 7
+        records.append({**record, "model": k % 2, "posterior": posterior, "memory_errors_deg": errors})
+    return records
+
+
+SESSIONS = {
+    "online": made_up_online,
+    "generalize": made_up_generalize,
+    "ablation": made_up_generalize,
+    "adapt": made_up_adapt,
+}
+
+
+def made_up(name: str, **options: Any) -> Experiment:
+    return dataclasses.replace(plan(name, (0, 1, 2), **options), session=SESSIONS[name])
+
+
+def read(folder: Path) -> dict[str, bytes]:
+    names = [path for path in folder.iterdir() if path.suffix in (".csv", ".html", ".json")]
+    return {path.name: path.read_bytes() for path in names}
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_report_is_complete(name: str, tmp_path: Path) -> None:
+    report = reproduce(made_up(name), tmp_path)
+    page = (tmp_path / "index.html").read_text()
+    for table in report.tables:
+        with (tmp_path / f"{table.name}.csv").open() as stream:
+            rows = list(csv.reader(stream))
+        assert rows[0] == list(table.header)
+        assert len(rows) == len(table.rows) + 1 > 1, table.name
+        assert all(len(row) == len(rows[0]) for row in rows), table.name
+        assert table.caption in page
+    assert not any("nan" in cell for table in report.tables for row in table.rows for cell in row)
+    for figure in report.figures:
+        assert (tmp_path / figure.path).stat().st_size > 1000
+        assert (tmp_path / figure.path).with_suffix(".png").exists()
+    configuration = json.loads((tmp_path / "configuration.json").read_text())
+    assert configuration["seeds"] == [0, 1, 2]
+    assert configuration["versions"]["torch"]
+    assert configuration["plant"]["dead_zone"] > 0
+    assert "Development seeds" in report.summary
+    assert "no basis for a claim" in report.summary
+
+
+def test_killed_run_resumes_to_the_same_report(tmp_path: Path) -> None:
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    experiment = made_up("generalize")
+    reproduce(experiment, whole)
+    done: list[str] = []
+
+    def kill(name: str) -> None:
+        done.append(name)
+        if len(done) == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reproduce(experiment, broken, on_done=kill)
+    half = {path.name: path.stat().st_mtime_ns for path in (broken / "runs").glob("*.json")}
+    assert len(half) == 7
+    assert not (broken / "index.html").exists()
+    reproduce(experiment, broken)
+    after = {path.name: path.stat().st_mtime_ns for path in (broken / "runs").glob("*.json")}
+    assert {name: after[name] for name in half} == half  # nothing was run twice
+    assert read(broken) == read(whole)
+
+
+def test_objects_of_a_user(tmp_path: Path) -> None:
+    (tmp_path / "mug.urdf").write_text("<robot name='mug'/>")
+    (tmp_path / "pen.urdf").write_text("<robot name='pen'/>")
+    experiment = plan("generalize", (0,), objects=tmp_path)
+    assert [Path(item).name for item in experiment.config.objects] == ["mug.urdf", "pen.urdf"]
+    assert any("_mug_E-KM_0" in name for name in experiment.jobs)
+    with pytest.raises(ParameterError, match=r"\.urdf"):
+        plan("generalize", (0,), objects=tmp_path / "nothing")
+    with pytest.raises(ParameterError, match="generalize"):
+        plan("online", (0,), objects=tmp_path)
+
+
+def test_plans_are_checked() -> None:
+    with pytest.raises(UnknownNameError, match="online"):
+        plan("offline")
+    with pytest.raises(ParameterError, match="seeds"):
+        plan("online", ())
+    for name in EXPERIMENTS:
+        assert len(plan(name, quick=True).jobs) < len(plan(name).jobs)
+
+
+def test_command_line() -> None:
+    runner = CliRunner()
+    result = runner.invoke(app, ["reproduce", "--help"])
+    assert result.exit_code == 0, result.output
+    result = runner.invoke(app, ["reproduce", "offline"])
+    assert isinstance(result.exception, UnknownNameError)
+    result = runner.invoke(app, ["reproduce", "online", "--severity", "mild"])
+    assert isinstance(result.exception, UnknownNameError)
