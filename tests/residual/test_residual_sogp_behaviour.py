@@ -187,14 +187,14 @@ def test_each_output_finds_its_own_noise():
 
 
 def test_calibration_covers_whatever_the_noise():
-    x, y = system(6, 1500, noise=0.0)
+    x, y = system(6, 900, noise=0.0)
     rng = np.random.default_rng(0)
     y = y + 0.1 * torch.from_numpy(rng.standard_t(2, size=y.shape))  # infinite variance
     y[:, 1] *= 5.0
     covered = []
     for calibrate in (False, True):
         gp = SparseOnlineGP(4, 2, capacity=40, noise_variance=0.01, robust=2.0, calibrate=calibrate)
-        covered.append(run_prequential(gp, x, y).coverage(300))
+        covered.append(run_prequential(gp, x, y).coverage(200))
     assert float((covered[0] - 0.9).abs().max()) > 0.1
     assert float((covered[1] - 0.9).abs().max()) < 0.03
 
@@ -217,7 +217,7 @@ def test_change_is_noticed_and_outliers_are_not():
             recovery_after_change(
                 lambda d=detect: make(d), system(i, 300, 0), system(i + 10, 60, 1), system(i + 20, 200, 1)
             )
-            for i in range(3)
+            for i in range(3 if detect else 1)
         ]
         for detect in (True, False)
     )
