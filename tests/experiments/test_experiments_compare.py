@@ -282,7 +282,8 @@ def test_icub_grasp_reader(tmp_path: Path) -> None:
     assert recording.segments == (18, 18, 18)
     assert recording.x.shape == (54, 23)
     torch.testing.assert_close(recording.y, torch.ones(54, 9, dtype=torch.float64))  # 10 deg a step, unit 10
-    assert float(recording.x[0, 0]) == pytest.approx(11.0 / 30.0)  # trial 1 comes first
+    firsts = recording.x[::18, 0] * 30.0
+    assert firsts.tolist() == pytest.approx([11.0, 12.0, 20.0])  # trials 1, 2, 10 in this order
 
 
 def test_command_prints_and_writes_what_the_function_returns(tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ def plot_scores(comparison: Comparison) -> Figure:
         axis.grid(axis="x", color="0.9", linewidth=0.8)
     for axis in axes[:, 0]:
         axis.set_yticks(y, comparison.learners, fontsize=8)
-        axis.invert_yaxis()
+    axes[0, 0].invert_yaxis()  # shared by all panels
     for axis in list(axes.flat)[n:]:
         axis.set_visible(False)
     figure.supxlabel("rms error / that of the model alone (95 % interval); filled: best", fontsize=9)
@@ -103,16 +103,31 @@ def plot_ranks(comparison: Comparison) -> Figure:
 
 
 def plot_cost(comparison: Comparison) -> Figure:
-    """Time for one sample against the geometric mean of the error ratios."""
-    figure, ((axis,),) = _figure((6.5, 3.6), 1, 1)
+    """Time for one sample against the geometric mean of the error ratios; the model alone is 1."""
+    figure, ((axis,),) = _figure((7.5, 3.8), 1, 1)
+    points = []
     for name in comparison.learners:
         scores = [comparison.scores[r.name, name] for r in comparison.recordings]
         time = float(np.median([score.microseconds for score in scores]))
         ratio = float(np.exp(np.mean([np.log(max(score.rms.mean, 1e-6)) for score in scores])))
-        axis.plot(time, ratio, "o", color=colour_of(name))
-        axis.annotate(name, (time, ratio), xytext=(5, 3), textcoords="offset points", fontsize=8)
+        if name != "model alone":
+            points.append((ratio, time, name))
+    for place, (ratio, time, name) in enumerate(sorted(points)):  # names in a column: they would overlap
+        colour = colour_of(name)
+        height = (place + 0.5) / len(points)
+        axis.annotate(
+            name,
+            (time, ratio),
+            xytext=(1.03, height),
+            textcoords="axes fraction",
+            fontsize=8,
+            va="center",
+            color=colour,
+            arrowprops={"arrowstyle": "-", "color": colour, "alpha": 0.35, "linewidth": 0.7},
+        )
+        axis.plot(time, ratio, "o", color=colour)
     axis.set_xscale("log")
-    axis.margins(x=0.15)
+    axis.margins(x=0.1, y=0.08)
     axis.set(xlabel="one prediction and one update [µs]", ylabel="rms error / model alone (geometric mean)")
     return figure
 
