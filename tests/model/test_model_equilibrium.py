@@ -84,9 +84,9 @@ def test_planar_motion_can_be_undone_and_spatial_rolling_depends_on_the_path():
             at = solver.move(at, at.a + step)
         return float((at.state.minus(toy.state)).abs().max())
 
-    assert loop(planar_two_finger(), 1e-4) < 1e-8
-    assert loop(planar_two_finger(pinned=True), 1e-4) < 1e-8
-    assert loop(soft_two_finger(), 2.5e-4) > 1e-7
+    assert loop(planar_two_finger(), 6e-5) < 1e-8
+    assert loop(planar_two_finger(pinned=True), 6e-5) < 1e-8
+    assert loop(soft_two_finger(), 1e-4) > 1e-5
 
 
 def test_midpoint_steps_converge_with_second_order():
@@ -94,7 +94,7 @@ def test_midpoint_steps_converge_with_second_order():
     start = toy.equilibrium()
     a = start.a + torch.tensor([3e-4, -1e-4, 2e-4], dtype=F64)
     ends = []
-    for step in (1.5e-4, 0.75e-4, 2e-5):
+    for step in (1.5e-4, 0.75e-4, 2.5e-5):
         ends.append(toy.solver(max_step=step).move(start, a).state)
     errors = [float(e.minus(ends[-1]).abs().max()) for e in ends[:-1]]
     assert 3.5 < errors[0] / errors[1] < 4.6

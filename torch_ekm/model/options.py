@@ -38,6 +38,8 @@ class ModelOptions:
     """K_c of every force row of a contact [N/m]; infinite: rigid contacts."""
     stiffness_floor: float = 0.0
     """Added to every joint's stiffness [N m/rad]: a floor for springless free joints, e.g. 1e-4."""
+    contact_margin: float = 0.002
+    """Gap up to which the detector takes a pad for touching [m]; more for noisy poses."""
     max_overlap: float = 0.005
     """Deepest penetration of finger and object that is still modelled [m]."""
     joint_stops: bool = True
@@ -61,7 +63,7 @@ class ModelOptions:
         for name in ("length", "contact_stiffness", "max_overlap"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
-        for name in ("stiffness_floor", "stop_tolerance", "stop_torque"):
+        for name in ("stiffness_floor", "stop_tolerance", "stop_torque", "contact_margin"):
             if not getattr(self, name) >= 0:
                 raise ParameterError(name, getattr(self, name), "not negative")
         if len(self.gravity) != 3 or not all(math.isfinite(g) for g in self.gravity):
