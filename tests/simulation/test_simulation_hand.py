@@ -53,6 +53,16 @@ def test_it_holds_still_for_ten_seconds(plant, seed):
     assert 10.0 / cost > 8.0  # times faster than real time, on one core
 
 
+@pytest.mark.parametrize("time_step", [0.002, 0.004])
+def test_longer_time_steps_hold_the_same_grasp(plant, grasped, time_step):
+    fine = plant.restore(grasped).info["truth"]
+    coarse = SimulatedHand("icub_right", "box", PlantConfig(time_step=time_step))
+    before = coarse.reset(0)
+    coarse.wait(2.0)
+    assert motion(before, coarse.observe())[0].norm() < 1e-6
+    assert (before.info["truth"]["q"] - fine["q"]).abs().max() < 0.3 * DEG
+
+
 def test_the_grasp_is_the_planned_one(plant, grasped):
     truth = plant.restore(grasped).info["truth"]
     plan = plant.plan

@@ -62,9 +62,7 @@ class PlantConfig:
             if not (math.isfinite(value) and value >= 0):
                 raise ParameterError(name, value, "finite and not negative")
         if self.time_step > 0.004:
-            raise ParameterError(
-                "time_step", self.time_step, "at most 0.004 s: beyond, the tendons are unstable"
-            )
+            raise ParameterError("time_step", self.time_step, "at most 0.004 s: the tendons need it")
         if len(self.gravity) != 3 or not all(math.isfinite(value) for value in self.gravity):
             raise ParameterError("gravity", self.gravity, "three finite numbers [m/s^2]")
         if self.along is not None:
