@@ -8,6 +8,7 @@ import torch
 from torch_ekm.residual import (
     ActionLinearKernel,
     DeepKernel,
+    DeepKernelSOGP,
     KRLSTracker,
     LocalGPs,
     RandomFeatureRLS,
@@ -55,6 +56,7 @@ LEARNERS = {
     "sogp_skip": lambda **o: sogp(on_invalid="skip", **o),
     "sogp_action": lambda **o: sogp(kernel=ActionLinearKernel(3, 1), normalize=True, **o),
     "deep": deep,
+    "deep_sogp": lambda **o: DeepKernelSOGP(3, 2, capacity=8, hidden=(8,), refresh_every=4, **o),
 }
 FLEETS = ("zero", "rls", "rff", "window", "sogp", "sogp_all", "deep")
 

@@ -249,6 +249,17 @@ def test_forgetting_is_a_weighted_gp_and_returns_to_the_prior():
     np.testing.assert_allclose(gp.variance(xs)[:, 0].numpy(), variance, atol=1e-8)
 
 
+def test_forgetting_between_rebuilds_counts_every_sample():
+    """With a rebuild every 4 samples, sample t of 40 has been forgotten 4 (10 - t // 4) times."""
+    x, y, xs = data()
+    gp = learner(forgetting=0.9, refresh_every=4)
+    gp.update(x, y)
+    weight = 0.9 ** (4 * (10 - np.arange(N) // 4))
+    X, Y, T = x.numpy(), y.numpy(), xs.numpy()
+    A = se(X, X) + np.diag(S2 / weight)
+    np.testing.assert_allclose(gp(xs).numpy(), se(T, X) @ np.linalg.solve(A, Y), atol=1e-8)
+
+
 def test_robust_weight_is_altamirano_centred_on_the_prediction():
     x, y, _ = data()
     gp = learner(robust=2.0)

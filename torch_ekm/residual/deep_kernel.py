@@ -11,7 +11,7 @@ from torch import nn
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import check_count
-from .kernels import Kernel, SquaredExponential, StationaryKernel
+from .kernels import Kernel, StationaryKernel
 
 
 class DeepKernel(Kernel):
@@ -111,9 +111,3 @@ class DeepKernel(Kernel):
     def shift_invariant(self, in_features: int) -> list[bool]:
         # not invariant, but the network learns any shift: centred inputs keep tanh in its range
         return [True] * in_features
-
-
-def deep_squared_exponential(in_features: int, **options) -> DeepKernel:
-    """A DeepKernel on a default squared exponential."""
-    fleet = {name: options.pop(name) for name in ("batch_shape", "device") if name in options}
-    return DeepKernel(SquaredExponential(in_features, **fleet), **options)

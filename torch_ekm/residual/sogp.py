@@ -25,10 +25,9 @@ class SparseOnlineGP(ResidualLearner):
         mean(x) = alpha' k(X, x),   var(x) = k(x, x) + k(X, x)' C k(X, x)
 
     One sample costs O(b^2 + b m), a prediction O(b m) for the mean and O(b^2) for the variance
-    (b basis points, m outputs). A sample whose novelty ``gamma = k** - k'Qk`` reaches the tolerance
-    becomes a basis point, another is projected onto the basis with the smallest loss in KL
-    divergence; beyond the capacity the point with the lowest score is deleted, again by KL
-    projection (Csato & Opper, Neural Computation 14, 2002).
+    (b basis points, m outputs). A sample with novelty ``gamma = k** - k'Qk`` above the tolerance becomes
+    a basis point, another is projected onto the basis by KL divergence; beyond the capacity the point
+    with the lowest score is deleted, the same way (Csato & Opper, Neural Computation 14, 2002).
 
     The state is kept in natural form and the caches that predict are rebuilt from it by Cholesky every
     ``refresh_every`` samples (:class:`~torch_ekm.residual.posterior.SparsePosterior`): the textbook
@@ -46,16 +45,13 @@ class SparseOnlineGP(ResidualLearner):
         noise_variance: s2 in the (normalised) output's squared units, one number or one per output.
         novelty_tolerance: smallest ``gamma / k**`` of a new basis point.
         jitter: nugget on k(x, x) at basis points, relative to k**.
-        projection: ``"kl"``, or ``"fitc"``, which counts a projected sample's novelty as noise and so
-            is less confident.
-        deletion: score by which a basis point goes, a name in ``DELETION_SCORES``: ``"kl"`` exact
-            loss, ``"mean"`` its first term, ``"novelty"`` the point best explained by the others,
-            ``"oldest"``, or ``"freeze"``: once full, the basis stays.
-        forgetting: factor on all earlier information per sample, in (0, 1]; without new samples the
-            posterior returns to the prior. Applied when the caches are rebuilt.
+        projection: ``"kl"``, or ``"fitc"``: novelty of a projected sample counts as noise.
+        deletion: score by which a point goes: ``"kl"`` exact loss, ``"mean"`` its first term,
+            ``"novelty"`` best explained by the others, ``"oldest"``; ``"freeze"``: a full basis stays.
+        forgetting: factor on all earlier information per sample, in (0, 1], back to the prior in the
+            end. Applied when the caches are rebuilt.
         robust: c of the weight ``1 / (1 + z2/c^2)`` of a sample with mean squared standardised
-            innovation z2; None trusts all samples (Altamirano et al., ICML 2024, centred on the
-            prediction).
+            innovation z2 (Altamirano et al., ICML 2024, centred on the prediction); None: weight 1.
         normalize: learn the units of inputs and outputs from the first ``normalize_for`` samples.
             Inputs are centred where the kernel is shift invariant; outputs are only scaled, so the
             prior mean stays 0.
@@ -64,12 +60,10 @@ class SparseOnlineGP(ResidualLearner):
         adapt: learn kernel and noise online, see PrequentialAdaptation; one step per rebuild.
         adapt_rate: its step on the logarithms of the hyperparameters.
         adapt_network_rate: its step on a deep kernel's weights.
-        calibrate: scale the observation noise of each output so that 90 % intervals hold 90 % of the
-            samples, see NoiseCalibration.
-        detect_changes: start anew from the last samples when most of them were surprising, see
-            ChangeDetector. Looks at the result of every update, so on a GPU it waits for it.
-        compile_step: run the update through torch.compile: needs a C++ compiler and about a minute at
-            the first update. Compile predictions with ``torch.compile(gp.predict_with_jacobians)``.
+        calibrate: make 90 % intervals hold 90 % of the samples of each output, see NoiseCalibration.
+        detect_changes: start anew when most of the last samples were surprising, see ChangeDetector.
+            Looks at the result of every update, so on a GPU it waits for it.
+        compile_step: updates through torch.compile: needs a C++ compiler and a minute at the first one.
 
     Raises:
         ParameterError: a parameter is outside its range.
