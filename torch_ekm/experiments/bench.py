@@ -22,6 +22,7 @@ from .camera_off import CameraOff
 from .learners import enhance, make_encoding, make_learner
 from .manipulation import Manipulation, run_manipulation, state_of
 from .setting import Setting
+from .touch import TouchAligned
 
 Record = dict[str, Any]
 _DEG = math.pi / 180
@@ -177,7 +178,8 @@ def _sensed(plant: DisturbedPlant, simulated: SimulatedHand) -> Plant:
 
     hand = simulated.hand
     hall = HallSensors(hand) if hand.hall_sensors else None
-    return SensedPlant(plant, hand, simulated.object, hall=hall)
+    sensed = SensedPlant(plant, hand, simulated.object, hall=hall)
+    return sensed if hall is None else TouchAligned(sensed, hand, simulated.object)
 
 
 def _true_state(observation: Observation) -> GraspState:
