@@ -99,14 +99,8 @@ class SparseOnlineGP(ResidualLearner):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
-        super().__init__(
-            in_features,
-            out_features,
-            batch_shape=batch_shape,
-            on_invalid=on_invalid,
-            dtype=dtype,
-            device=device,
-        )
+        options: dict[str, Any] = {"batch_shape": batch_shape, "on_invalid": on_invalid}
+        super().__init__(in_features, out_features, dtype=dtype, device=device, **options)
         if not 0 < forgetting <= 1:
             raise ParameterError("forgetting", forgetting, "in (0, 1]")
         self.capacity = check_count("capacity", capacity)
