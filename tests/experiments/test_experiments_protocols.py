@@ -128,8 +128,11 @@ def test_without_the_camera_the_prediction_is_all_there_is() -> None:
     start = GraspState(
         torch.zeros(1, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), torch.eye(3).double()
     )
-    target = PoseTarget.turned(start, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 0.5)
-    plant = CameraOff(stage, target, switch_off=0.25)
+    axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    target = PoseTarget.turned(start, axis, 0.5)
+    tilt = exp(torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64))  # off the axis: no help for it
+    target = PoseTarget(target.position, tilt @ target.rotation)
+    plant = CameraOff(stage, target, axis, switch_off=0.25)
     plant.reset(0)
     predicted = torch.zeros(7, dtype=torch.float64)
     predicted[-1] = 0.1
@@ -141,6 +144,7 @@ def test_without_the_camera_the_prediction_is_all_there_is() -> None:
 
     plant.expect(decision)
     assert angle(plant.command(step)) == pytest.approx(0.2)  # seen: 0.3 rad to go
+    assert not plant.dark
     plant.expect(decision)
     assert angle(plant.command(step)) == pytest.approx(0.4)  # seen, and then the camera goes dark
     assert plant.dark

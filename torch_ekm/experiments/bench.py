@@ -115,7 +115,7 @@ class Bench:
         axis = self.hand.rotation_axis
         target = PoseTarget.turned(start, axis, angle_deg * _DEG)
         loop = self._controller(axis)
-        plant = CameraOff(self.plant, target, blind_deg * _DEG) if blind_deg else self.plant
+        plant = CameraOff(self.plant, target, axis, blind_deg * _DEG) if blind_deg else self.plant
         notes: list[tuple[GraspState, Decision]] = []
 
         def note(seen: Observation, decision: Decision) -> None:

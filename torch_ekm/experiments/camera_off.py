@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import torch
-
 from ..control import Decision, PoseTarget
 from ..model.state import GraspState
 from ..simulation import Observation, Plant, PlantStatus
@@ -21,11 +19,15 @@ class CameraOff:
     Args:
         plant: sees until then.
         target: where the object is being taken.
-        switch_off: rotation error below which the camera is off [rad].
+        axis: unit vector about which it turns there, hand frame. Rotation off this axis does not keep
+            the camera on: a model that tilts the object is not to be helped for it.
+        switch_off: error about the axis below which the camera is off [rad].
     """
 
-    def __init__(self, plant: Plant, target: PoseTarget, switch_off: float) -> None:
-        self.plant, self.target, self.switch_off = plant, target, switch_off
+    def __init__(
+        self, plant: Plant, target: PoseTarget, axis: Float[Tensor, " 3"], switch_off: float
+    ) -> None:
+        self.plant, self.target, self.axis, self.switch_off = plant, target, axis, switch_off
         self.dark = False
         self._pose: tuple[Tensor, Tensor] | None = None
         self._predicted: Tensor | None = None
@@ -60,7 +62,7 @@ class CameraOff:
         if not self.dark:
             self._pose = observation.position, observation.rotation
             error = self.target.error(GraspState(observation.q, *self._pose))
-            self.dark = bool(torch.linalg.vector_norm(error[3:]) <= self.switch_off)
+            self.dark = abs(float(self.axis @ error[3:])) <= self.switch_off
             return observation
         assert self._pose is not None
         # a dark camera cannot say that it does not see the object
