@@ -70,7 +70,7 @@ def demo(
     object: Annotated[str, Argument(help="An object (see 'torch-ekm objects') or a path to a URDF.")] = "box",
     out: Annotated[Path, Option(help="Folder for the report.")] = Path("demo_output"),
     hand: Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")] = "icub_right",
-    seeds: Annotated[str, Option(help="FIRST:END, e.g. 1000:1006; each seed is one grasp.")] = "1000:1006",
+    seeds: Annotated[str, Option(help="FIRST:END, e.g. 1000:1008; each seed is one grasp.")] = "1000:1008",
     jobs: Annotated[int, Option(min=1, help="Processes at once.")] = 2,
     quick: Annotated[bool, Option(help="Two grasps, two angles: to see that it works.")] = False,
 ) -> None:
@@ -114,7 +114,7 @@ def reproduce(
     hand: Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")] = "icub_right",
     severity: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
     learner: Annotated[str, Option(help="action-linear, rbf, paper, deep, rls, rff, ...")] = "action-linear",
-    sensing: Annotated[bool, Option(help="Camera images and Hall counts, not truth and noise.")] = False,
+    sensing: Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")] = True,
 ) -> None:
     """Repeat the paper's experiments, and more, with every controller on the same seeds and grasps.
 

@@ -1,0 +1,68 @@
+"""Vision and Hall sensors in the loop: joints without a sensor are found by touch."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from torch_ekm.experiments.bench import Bench
+from torch_ekm.experiments.setting import Setting
+from torch_ekm.experiments.touch import TouchAligned
+from torch_ekm.simulation import Observation, SimulatedHand
+
+
+class Blurred:
+    """A simulated hand whose encoder-known joint is read wrong."""
+
+    def __init__(self, plant: SimulatedHand, joint: int, error: float, numb: bool = False) -> None:
+        self.plant, self.joint, self.error, self.numb = plant, joint, error, numb
+
+    def reset(self, seed: int) -> Observation:
+        self.plant.reset(seed)
+        return self.observe()
+
+    def observe(self) -> Observation:
+        seen = self.plant.observe()
+        q = seen.q.clone()
+        q[self.joint] += self.error
+        force = torch.zeros_like(seen.fingertip_force) if self.numb else seen.fingertip_force
+        return dataclasses.replace(seen, q=q, fingertip_force=force)
+
+    def command(self, delta_a: torch.Tensor) -> Observation:
+        self.plant.command(delta_a)
+        return self.observe()
+
+    def close(self) -> None: ...
+
+
+@pytest.fixture(scope="module")
+def hand() -> SimulatedHand:
+    return SimulatedHand("icub_right", "box")
+
+
+@pytest.mark.parametrize("error_deg", [-9.0, 4.0, 11.0])
+def test_touch_corrects_the_joint_that_no_sensor_reads(hand: SimulatedHand, error_deg: float) -> None:
+    thumb = hand.hand.joint_names.index("thumb_0")
+    plant = TouchAligned(Blurred(hand, thumb, math.radians(error_deg)), hand.hand, hand.object)
+    seen = plant.reset(0)
+    off = torch.rad2deg(seen.q - seen.info["truth"]["q"]).abs()
+    assert float(off[thumb]) < 1.0
+    assert float(off[[i for i in range(len(off)) if i != thumb]].max()) < 0.5  # the others are let alone
+
+
+def test_finger_that_feels_nothing_says_nothing(hand: SimulatedHand) -> None:
+    thumb = hand.hand.joint_names.index("thumb_0")
+    plant = TouchAligned(Blurred(hand, thumb, 0.1, numb=True), hand.hand, hand.object)
+    seen = plant.reset(0)
+    assert float(seen.q[thumb] - seen.info["truth"]["q"][thumb]) == pytest.approx(0.1, abs=1e-9)
+
+
+def test_object_is_turned_with_camera_and_hall_sensors() -> None:
+    pytest.importorskip("cv2")
+    bench = Bench(Setting(sensing=True), "box", "E-KM")
+    record = bench.trial(0, 0, 6.0)
+    assert record["reason"] == "reached", record["message"]
+    assert record["true_error_deg"] < 0.5  # truth is only looked at afterwards
