@@ -92,6 +92,9 @@ def test_bootstrap_ratio_covers_the_truth() -> None:
         found = bootstrap_ratio(ours, theirs, seed=trial, resamples=500)
         hits += found.low <= 0.4 <= found.high
     assert hits >= 51  # 95 % of 60 is 57; fewer than 51 has a chance of 1 %
+    theirs = generator.uniform(1, 3, size=25)
+    paired = bootstrap_ratio(0.4 * theirs, theirs)  # pairs stay together: nothing is left to chance
+    assert paired.high - paired.low < 1e-9
     with pytest.raises(ShapeError):
         bootstrap_ratio(np.ones(3), np.ones(4))
     with pytest.raises(ParameterError):
