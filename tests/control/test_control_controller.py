@@ -85,10 +85,10 @@ def test_grip_rows_ask_for_the_missing_force(grasp) -> None:
 
 def test_limiting_function_keeps_direction() -> None:
     loop = LookAndMoveController.__new__(LookAndMoveController)
-    loop.options = ControllerOptions(focus_step=1.0)
+    loop.options = ControllerOptions(focus_step=1.0, focus_gain=0.5)
     error = torch.tensor([3.0, -4.0])
     torch.testing.assert_close(loop.limit(error), error / 5)
-    torch.testing.assert_close(loop.limit(error / 10), error / 10)
+    torch.testing.assert_close(loop.limit(error / 10), error / 20)
     torch.testing.assert_close(loop.limit(error * 0), error * 0)
 
 

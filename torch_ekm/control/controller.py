@@ -28,6 +28,9 @@ class ControllerOptions:
 
     focus_step: float = 1.5 * _DEGREE
     """Limiting function: at most this much of the focused error is asked for in one step."""
+    focus_gain: float = 0.6
+    """Share of a small focused error that one step asks for. A model that is right meets all of it,
+    camera noise included; below 1 the loop averages the noise over some steps."""
     actuator_step: float = 4 * _DEGREE
     """|da| of one actuator in one step."""
     effort_weight: float = 1e-2
@@ -192,9 +195,9 @@ class LookAndMoveController:
         )
 
     def limit(self, error: Float[Tensor, " n_x"]) -> Float[Tensor, " n_x"]:
-        """Limiting function ``dx_d = e min(1, 1/|S^-1 e|)``: keeps the direction, identity near the goal."""
+        """Limiting function ``dx_d = e min(gain, 1/|S^-1 e|)``: keeps the direction, linear near the goal."""
         size = float(torch.linalg.vector_norm(error)) / self.options.focus_step
-        return error * min(1.0, 1.0 / size) if size > 0 else error
+        return error * min(self.options.focus_gain, 1.0 / size) if size > 0 else error
 
     def _problem(
         self,

@@ -159,23 +159,25 @@ def _draw_saved(arrays: str, shapes: str, path: str, size: str) -> None:
 
 
 def _draw_matplotlib(meshes: list[Any], scene: Scene, frames: list[int], path: Path, size: int) -> None:
-    require("matplotlib").use("Agg")
-    plt = require("matplotlib.pyplot")
     collection = require("mpl_toolkits.mplot3d.art3d").Poly3DCollection
-    figure = plt.figure(figsize=(size / 100 * len(frames), size / 100))
-    centre = scene.transforms[:, :, :3, 3].reshape(-1, 3).mean(axis=0)
+    figure = require("matplotlib.figure").Figure(figsize=(size / 100 * len(frames), size / 100))
+    up = -scene.down  # matplotlib's z is up in the picture: turn everything there
+    forward = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    forward /= np.linalg.norm(forward)
+    turn = np.stack([forward, np.cross(up, forward), up])
+    centre = turn @ scene.transforms[:, :, :3, 3].reshape(-1, 3).mean(axis=0)
     for k, frame in enumerate(frames):
         axis = figure.add_subplot(1, len(frames), k + 1, projection="3d")
         for i, (mesh, (_, colour)) in enumerate(zip(meshes, scene.shapes, strict=True)):
             T = scene.transforms[frame, i]
-            vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
+            vertices = (mesh.vertices @ T[:3, :3].T + T[:3, 3]) @ turn.T
             axis.add_collection3d(collection(vertices[mesh.faces], facecolors=colour, shade=True))
         for name, middle in zip("xyz", centre, strict=True):
-            getattr(axis, f"set_{name}lim")(middle - 0.07, middle + 0.07)
+            getattr(axis, f"set_{name}lim")(middle - 0.06, middle + 0.06)
         axis.set_axis_off()
-        axis.view_init(elev=20, azim=-70)
+        axis.set_box_aspect((1, 1, 1), zoom=1.4)
+        axis.view_init(elev=15, azim=70)
     figure.savefig(path, dpi=100)
-    plt.close(figure)
 
 
 def save_animation(scene: Scene, path: Path, frame_seconds: float = 0.25) -> Path:

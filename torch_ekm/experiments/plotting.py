@@ -23,9 +23,9 @@ _MARKERS = {"KM": "s", "KM+I": "D", "E-KM": "o", "E-KM+I": "^"}
 
 
 def _figure(width: float, height: float, columns: int = 1):
-    require("matplotlib").use("Agg")
-    plt = require("matplotlib.pyplot")
-    figure, axes = plt.subplots(1, columns, figsize=(width, height), layout="constrained", squeeze=False)
+    # a Figure of its own: pyplot would keep it alive and touch the caller's backend
+    figure = require("matplotlib.figure").Figure(figsize=(width, height), layout="constrained")
+    axes = figure.subplots(1, columns, squeeze=False)
     for axis in axes[0]:
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(axis="y", color="0.9", linewidth=0.8)
@@ -34,12 +34,10 @@ def _figure(width: float, height: float, columns: int = 1):
 
 
 def save_figure(figure: Figure, folder: Path, name: str) -> tuple[Path, Path]:
-    """Write ``name.svg`` and ``name.png`` and close the figure."""
-    plt = require("matplotlib.pyplot")
+    """Write ``name.svg`` and ``name.png``."""
     paths = folder / f"{name}.svg", folder / f"{name}.png"
     figure.savefig(paths[0], metadata={"Date": None})  # the same figure gives the same file
     figure.savefig(paths[1], dpi=150)
-    plt.close(figure)
     return paths
 
 
@@ -118,7 +116,7 @@ def plot_static_error(errors_deg: dict[str, dict[str, Array]], ylabel: str = "st
     axis.set_xticks(range(len(targets)), targets)
     axis.set(xlabel="target [deg]", ylabel=ylabel, ylim=(0, None))
     axis.set_title("Static error: each run, and the mean", loc="left")
-    axis.legend(frameon=False)
+    axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
 
 
