@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import pickle
 import pkgutil
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import sys
 import pytest
 
 import torch_ekm
+from torch_ekm import exceptions
 from torch_ekm._extras import require
 from torch_ekm.exceptions import EKMError, MissingExtraError
 
@@ -45,6 +47,22 @@ def test_missing_extra_is_named() -> None:
     assert isinstance(info.value, EKMError)
     assert isinstance(info.value, ImportError)
     assert info.value.module == "surely_not_installed"
+
+
+def test_errors_cross_process_boundaries_whole() -> None:
+    errors = [
+        exceptions.UnknownNameError("hand", "foo", ["icub_right"]),
+        exceptions.JointMismatchError("file.toml", ["a"], ["b"], ["a", "c"]),
+        exceptions.ShapeError("q", "(20,)", (3,)),
+        exceptions.UnstableGraspError("buckles", -0.1, [1.0]),
+        exceptions.SolverError("piqp", "failed", "a hint"),
+        MissingExtraError("coal", "robot"),
+    ]
+    for error in errors:
+        copy = pickle.loads(pickle.dumps(error))
+        assert type(copy) is type(error)
+        assert str(copy) == str(error)
+        assert vars(copy) == vars(error)
 
 
 def test_every_exported_name_exists() -> None:

@@ -16,6 +16,7 @@ except MissingExtraError as error:
     raise SystemExit(f"torch-ekm: {error}") from None
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 from typer import Argument, Option
@@ -34,7 +35,7 @@ def main() -> None:
     try:
         app()
     except EKMError as error:
-        Console(stderr=True).print(f"[bold red]torch-ekm:[/] {error}", highlight=False)
+        Console(stderr=True).print(f"[bold red]torch-ekm:[/] {escape(str(error))}", highlight=False)
         sys.exit(1)
 
 

@@ -12,7 +12,18 @@ from typing import Any
 
 
 class EKMError(Exception):
-    """Root of all errors raised by torch_ekm."""
+    """Root of all errors raised by torch_ekm. They survive pickling, to cross process boundaries whole."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restore, (type(self), self.args, self.__dict__)
+
+
+def _restore(kind: type[EKMError], args: tuple[Any, ...], attributes: dict[str, Any]) -> EKMError:
+    """Rebuild an error without its constructor, whose arguments are not kept."""
+    error = kind.__new__(kind)
+    error.args = args
+    error.__dict__.update(attributes)
+    return error
 
 
 # -- what the user asked for does not exist -----------------------------------------------

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from ..control import ControllerOptions, FocusedPose, LookAndMoveController, PoseTarget, StoppingRule
-from ..description import HandDescription, list_hands, list_objects
+from ..description import HandDescription, load_hand, load_object
 from ..enhanced import EnhancedModel, GraspEncoding
 from ..exceptions import ParameterError, UnknownNameError
 from ..model import GraspState, KinematicModel, ModelOptions
@@ -38,6 +37,7 @@ class DemoConfig:
 
     Raises:
         UnknownNameError: no such hand or object; the message lists them.
+        DescriptionError: a file of theirs is missing or wrong.
         ParameterError: nothing to do, or an angle that is no rotation.
     """
 
@@ -50,9 +50,8 @@ class DemoConfig:
     max_steps: int = 40
 
     def __post_init__(self) -> None:
-        for kind, name, valid in (("hand", self.hand, list_hands()), ("object", self.object, list_objects())):
-            if name not in valid and not Path(name).exists():
-                raise UnknownNameError(kind, name, valid)
+        load_hand(self.hand)
+        load_object(self.object)
         if not self.seeds:
             raise ParameterError("seeds", self.seeds, "at least one seed")
         if not self.angles_deg or not all(0 < abs(angle) < 180 for angle in self.angles_deg):

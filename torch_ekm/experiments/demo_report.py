@@ -48,7 +48,7 @@ def run_demo(
     if pictures:
         figures = _pictures(records, config, folder) + figures
     report = Report(
-        title=f"Turning the {config.object} with the {config.hand.replace('_', ' ')} hand: KM and E-KM",
+        title=f"Turning the {_spoken(config.object)} with the hand {_spoken(config.hand)}: KM and E-KM",
         summary=verdict(records),
         tables=[overall, by_angle],
         figures=figures,
@@ -93,13 +93,14 @@ def verdict(records: list[Record]) -> str:
     """One sentence with the figures."""
     km, ekm = prediction_estimates(records)
     seeds = sorted({record["seed"] for record in records})
-    tuned = (
-        "none of them used for tuning"
-        if seeds[0] >= REPORTED
-        else "development seeds: figures were tuned on them"
+    tuned = "not used for tuning" if seeds[0] >= REPORTED else "development seeds: figures were tuned on them"
+    grasps = (
+        f"{len(seeds)} grasps (seeds {seeds[0]} to {seeds[-1]}"
+        if len(seeds) > 1
+        else f"one grasp (seed {seeds[0]}"
     )
     return (
-        f"On {len(seeds)} grasps (seeds {seeds[0]} to {seeds[-1]}, {tuned}) the "
+        f"On {grasps}, {tuned}) the "
         f"one-step prediction error of the E-KM was {ekm.mean:.2f} deg, {100 * ekm.mean / km.mean:.0f} % of "
         f"the KM's {km.mean:.2f} deg on the same motions."
     )
@@ -238,13 +239,16 @@ def _pictures(records: list[Record], config: DemoConfig, folder: Path) -> list[F
     scene = make_scene(hand, obj, q, position, rotation, np.array(PlantConfig().gravity))
     save_picture(scene, folder / "hand.png", frames=(0, -1))
     save_animation(scene, folder / "animation.html")
-    caption = (
-        f"The {config.object} before and after a turn of {turn['angle_deg']:g} deg (seed {turn['seed']})."
-    )
+    caption = f"The {_spoken(config.object)} before and after a turn of {turn['angle_deg']:g} deg (seed {turn['seed']})."
     return [
         FigureFile("hand.png", caption),
         FigureFile("animation.html", "The same turn, motion by motion: drag to look around."),
     ]
+
+
+def _spoken(name: str) -> str:
+    """A name, or the stem of a path, as words."""
+    return Path(name).stem.replace("_", " ")
 
 
 def _running_mean(values: np.ndarray, window: int = 5) -> np.ndarray:
