@@ -239,7 +239,8 @@ def _pictures(records: list[Record], config: DemoConfig, folder: Path) -> list[F
     scene = make_scene(hand, obj, q, position, rotation, np.array(PlantConfig().gravity))
     save_picture(scene, folder / "hand.png", frames=(0, -1))
     save_animation(scene, folder / "animation.html")
-    caption = f"The {_spoken(config.object)} before and after a turn of {turn['angle_deg']:g} deg (seed {turn['seed']})."
+    what = f"a turn of {turn['angle_deg']:g} deg (seed {turn['seed']})"
+    caption = f"The {_spoken(config.object)} before and after {what}."
     return [
         FigureFile("hand.png", caption),
         FigureFile("animation.html", "The same turn, motion by motion: drag to look around."),
