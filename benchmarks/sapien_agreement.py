@@ -2,10 +2,10 @@
 
     python benchmarks/sapien_agreement.py --object box --seeds 1000:1020
 
-How exact is it, until when, and is the end announced? A least-squares controller that ignores friction cones and
-joint stops turns the object in steps of 1.5 deg. Per grasp: rms error of a predicted step about the axis until the
-first contact reaches its friction cone, the first step that is wrong by more than 0.3 deg, and whether a margin of
-at most 10 % was reported at that step or before it.
+How exact is it, until when, and is the end announced? A least-squares controller that ignores friction
+cones and joint stops turns the object in steps of 1.5 deg. Per grasp: rms error of a predicted step
+about the axis until the first contact reaches its friction cone, the first step that is wrong by more
+than 0.3 deg, and whether a margin of at most 10 % was reported at that step or before it.
 """
 
 from __future__ import annotations
