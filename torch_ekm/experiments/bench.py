@@ -22,7 +22,6 @@ from .camera_off import CameraOff
 from .learners import enhance, make_encoding, make_learner
 from .manipulation import Manipulation, run_manipulation, state_of
 from .setting import Setting
-from .touch import TouchAligned
 
 Record = dict[str, Any]
 _DEG = math.pi / 180
@@ -174,7 +173,7 @@ class Bench:
 
 
 def _sensed(plant: DisturbedPlant, simulated: SimulatedHand) -> Plant:
-    from ..sensing import HallSensors, SensedPlant  # OpenCV is needed only here
+    from ..sensing import HallSensors, SensedPlant, TouchAligned  # OpenCV is needed only here
 
     hand = simulated.hand
     hall = HallSensors(hand) if hand.hall_sensors else None

@@ -2,7 +2,8 @@
 
 Vision: an image source gives frames, :class:`MarkerTracker` turns them into the object's pose in the hand
 frame. Hall sensors: :class:`HallCalibration` turns counts into angles, :class:`JointEstimator` joins them
-with the encoders. The same code serves simulated and real readings.
+with the encoders, :class:`TouchAligned` corrects the joints that no sensor reads. The same code serves
+simulated and real readings.
 """
 
 from .board import MarkerBoard as MarkerBoard
@@ -37,6 +38,7 @@ from .sensed_plant import SensedPlant as SensedPlant
 from .simulated_camera import ImageQuality as ImageQuality
 from .simulated_camera import SimulatedCamera as SimulatedCamera
 from .simulated_video import SimulatedVideo as SimulatedVideo
+from .touch import TouchAligned as TouchAligned
 from .track import Track as Track
 from .track import TrackStatus as TrackStatus
 from .video_capture import VideoCapture as VideoCapture
@@ -70,6 +72,7 @@ __all__ = [
     "SimulatedVideo",
     "StreamOptions",
     "Stuck",
+    "TouchAligned",
     "Track",
     "TrackStatus",
     "TrackerOptions",

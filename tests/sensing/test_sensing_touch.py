@@ -1,4 +1,4 @@
-"""Vision and Hall sensors in the loop: joints without a sensor are found by touch."""
+"""Joints without a sensor are found by touch."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ import math
 import pytest
 import torch
 
-from torch_ekm.experiments.bench import Bench
-from torch_ekm.experiments.setting import Setting
-from torch_ekm.experiments.touch import TouchAligned
+from torch_ekm.sensing import TouchAligned
 from torch_ekm.simulation import Observation, SimulatedHand
 
 
@@ -58,11 +56,3 @@ def test_finger_that_feels_nothing_says_nothing(hand: SimulatedHand) -> None:
     plant = TouchAligned(Blurred(hand, thumb, 0.1, numb=True), hand.hand, hand.object)
     seen = plant.reset(0)
     assert float(seen.q[thumb] - seen.info["truth"]["q"][thumb]) == pytest.approx(0.1, abs=1e-9)
-
-
-def test_object_is_turned_with_camera_and_hall_sensors() -> None:
-    pytest.importorskip("cv2")
-    bench = Bench(Setting(sensing=True), "box", "E-KM")
-    record = bench.trial(0, 0, 6.0)
-    assert record["reason"] == "reached", record["message"]
-    assert record["true_error_deg"] < 0.5  # truth is only looked at afterwards
