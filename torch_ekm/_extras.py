@@ -31,6 +31,8 @@ _EXTRA_OF = {
     "gpytorch": "peers",
     "river": "peers",
     "sklearn": "peers",
+    "distributed": "cluster",
+    "ray": "cluster",
 }
 
 

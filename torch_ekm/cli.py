@@ -116,6 +116,9 @@ def reproduce(
     severity: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
     learner: Annotated[str, Option(help="action-linear, rbf, paper, deep, rls, rff, ...")] = "action-linear",
     sensing: Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")] = True,
+    address: Annotated[
+        str | None, Option(help="A cluster instead of processes here: dask://HOST:PORT or ray://HOST:PORT.")
+    ] = None,
 ) -> None:
     """Repeat the paper's experiments, and more, with every controller on the same seeds and grasps.
 
@@ -131,7 +134,7 @@ def reproduce(
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as progress:
         task = progress.add_task(experiment, total=len(planned.jobs))
-        report = run(planned, folder, jobs, on_done=lambda _: progress.advance(task))
+        report = run(planned, folder, jobs, lambda _: progress.advance(task), address)
     for table in report.tables:
         shown = RichTable(*table.header, title=table.caption)
         for row in table.rows:

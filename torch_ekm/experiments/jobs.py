@@ -1,4 +1,4 @@
-"""Run independent jobs in processes, with progress, and resume what was interrupted."""
+"""Run independent jobs in processes or on a cluster, with progress, and resume what was interrupted."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from .clusters import cluster_outcomes
+
 
 def run_jobs(
     function: Callable[..., Any],
@@ -17,6 +19,7 @@ def run_jobs(
     folder: Path,
     processes: int = 1,
     on_done: Callable[[str], None] | None = None,
+    address: str | None = None,
 ) -> dict[str, Any]:
     """``{name: function(*arguments)}`` for all jobs, each result kept in ``folder/name.json``.
 
@@ -28,13 +31,15 @@ def run_jobs(
         jobs: name -> arguments.
         processes: 1 runs in this process. PhysX steps hold the interpreter's lock: threads do not help.
         on_done: called with the name of each job that is done, those of an earlier run first.
+        address: of a cluster that does the work instead of processes here, see
+            :func:`~torch_ekm.experiments.clusters.cluster_outcomes`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     results = {name: read for name in jobs if (read := _read(folder / f"{name}.json")) is not None}
     for name in results:
         _tell(on_done, name)
     waiting = [name for name in jobs if name not in results]
-    for name, result in _outcomes(function, jobs, waiting, processes):
+    for name, result in _outcomes(function, jobs, waiting, processes, address):
         _write(folder / f"{name}.json", result)
         results[name] = json.loads(json.dumps(result))  # the same types as after a resume
         _tell(on_done, name)
@@ -42,8 +47,15 @@ def run_jobs(
 
 
 def _outcomes(
-    function: Callable[..., Any], jobs: dict[str, tuple[Any, ...]], waiting: list[str], processes: int
+    function: Callable[..., Any],
+    jobs: dict[str, tuple[Any, ...]],
+    waiting: list[str],
+    processes: int,
+    address: str | None,
 ) -> Iterable[tuple[str, Any]]:
+    if address is not None:
+        yield from cluster_outcomes(address, function, {name: jobs[name] for name in waiting})
+        return
     if processes <= 1 or len(waiting) <= 1:
         for name in waiting:
             yield name, function(*jobs[name])

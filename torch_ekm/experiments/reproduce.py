@@ -117,6 +117,7 @@ def reproduce(
     folder: Path,
     processes: int = 1,
     on_done: Callable[[str], None] | None = None,
+    address: str | None = None,
 ) -> Report:
     """Run what has not been run yet, and write the report into ``folder``.
 
@@ -126,8 +127,10 @@ def reproduce(
     Args:
         processes: how many at once.
         on_done: called with each finished job's name.
+        address: of a Dask or Ray cluster that does the work (``dask://HOST:PORT``, ``ray://HOST:PORT``).
     """
-    results = run_jobs(experiment.session, dict(experiment.jobs), folder / "runs", processes, on_done)
+    jobs = dict(experiment.jobs)
+    results = run_jobs(experiment.session, jobs, folder / "runs", processes, on_done, address)
     report = experiment.build(results, folder)
     config = experiment.config
     hand = config.setting.hand
