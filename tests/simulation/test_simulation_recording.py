@@ -6,7 +6,15 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import DescriptionError, ParameterError
-from torch_ekm.simulation import Observation, Plant, PlantStatus, Recording, RecordingPlant, ReplayedPlant
+from torch_ekm.simulation import (
+    Observation,
+    Plant,
+    PlantStatus,
+    Recording,
+    RecordingPlant,
+    ReplayedPlant,
+    Tug,
+)
 
 h5py = pytest.importorskip("h5py")
 
@@ -24,8 +32,15 @@ class FakePlant:
     def observe(self):
         status = PlantStatus.LOST if self.state[0] > 8 else PlantStatus.HELD
         eye = torch.eye(3, dtype=torch.float64)
+        info = {
+            "truth": {"q": self.state + 0.5},
+            "raw": {"hall": self.state.to(torch.uint8), "corners": torch.full((2, 4, 2), torch.nan)},
+            "track": object(),  # not kept
+        }
+        if self.state[0] == 7:
+            info["events"] = (Tug(at=1, force=(0.0, 0.0, 5.0)),)
         return Observation(
-            self.state, self.state[:2], self.state, eye, self.state[:1], float(self.state[0]), status
+            self.state, self.state[:2], self.state, eye, self.state[:1], float(self.state[0]), status, info
         )
 
     def command(self, delta_a):
@@ -56,6 +71,10 @@ def test_a_saved_recording_replays_like_the_original(tmp_path):
         for name in ("q", "a", "position", "rotation", "fingertip_force"):
             assert torch.equal(getattr(now, name), getattr(then, name))
         assert (now.time, now.status) == (then.time, then.status)
+        assert torch.equal(now.info["truth"]["q"], then.info["truth"]["q"])
+        torch.testing.assert_close(now.info["raw"], then.info["raw"], rtol=0, atol=0, equal_nan=True)
+        assert now.info["raw"]["hall"].dtype == torch.uint8
+    assert [o.info.get("events", ()) for o in seen] == [(), (), (str(Tug(at=1, force=(0.0, 0.0, 5.0))),), ()]
     assert [o.status for o in seen] == [PlantStatus.HELD] * 4
     assert torch.equal(seen[-1].info["recorded_command"], original.commands[-1])
     with pytest.raises(ParameterError, match="ends there"):
@@ -86,5 +105,34 @@ def test_what_is_not_a_recording_is_refused(tmp_path):
         del file["q"]
     with pytest.raises(DescriptionError, match="damaged"):
         Recording.load(path)
+    for about, match in (({"x": object()}, "about"), ({"x": {1, 2}}, "about")):
+        with pytest.raises(ParameterError, match=match):
+            Recording(about=about).save(tmp_path / "never.h5")
+    ragged = record()
+    ragged.observations[1].info["raw"] = {"hall": torch.zeros(5)}
+    with pytest.raises(ParameterError, match="raw/"):
+        ragged.save(tmp_path / "never.h5")
+    assert not list(tmp_path.glob("never*"))
     with pytest.raises(ParameterError, match="at least one"):
         ReplayedPlant(Recording())
+
+
+def test_any_flipped_byte_of_the_data_is_noticed(tmp_path):
+    """All that can be read is as it was written, or an error says that it is not."""
+    original = record()
+    path = original.save(tmp_path / "run.h5")
+    whole = path.read_bytes()
+    unnoticed = 0
+    for place in range(0, len(whole), 97):
+        damaged = bytearray(whole)
+        damaged[place] ^= 0x55
+        path.write_bytes(damaged)
+        try:
+            read = Recording.load(path)
+        except DescriptionError:
+            continue
+        unnoticed += 1  # unused space
+        for now, then in zip(read.observations, original.observations, strict=True):
+            assert torch.equal(now.q, then.q)
+            assert torch.equal(now.info["truth"]["q"], then.info["truth"]["q"])
+    assert unnoticed < 0.9 * len(range(0, len(whole), 97))

@@ -13,9 +13,11 @@ from .plant import Observation as Observation
 from .plant import Plant as Plant
 from .plant import PlantStatus as PlantStatus
 from .recording import Recording as Recording
-from .recording import RecordingPlant as RecordingPlant
-from .recording import ReplayedPlant as ReplayedPlant
+from .recording_plant import RecordingPlant as RecordingPlant
+from .replayed_plant import ReplayedPlant as ReplayedPlant
 from .severities import SEVERITIES as SEVERITIES
 from .severities import severity as severity
 from .simulated_hand import PlantSnapshot as PlantSnapshot
 from .simulated_hand import SimulatedHand as SimulatedHand
+from .trial_log import TrialEntry as TrialEntry
+from .trial_log import TrialLog as TrialLog

@@ -1,41 +1,64 @@
-"""A plant that replays what another one did: an example of a driver."""
+"""One trial as it was: commands, readings, estimates, truth; a file of its own."""
 
 from __future__ import annotations
 
+import json
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from .._extras import require
 from ..exceptions import DescriptionError, ParameterError
-from ..typing import Float, Tensor
-from .plant import Observation, Plant, PlantStatus
+from ..typing import Tensor
+from .plant import Observation, PlantStatus
 
+FORMAT = "torch_ekm trial 1"
 _FIELDS = ("q", "a", "position", "rotation", "fingertip_force")
+_GROUPS = ("truth", "raw", "estimate")  # what is kept of Observation.info, and "events"
 
 
 @dataclass
 class Recording:
-    """Commands and observations of one grasp: ``n`` commands, ``n + 1`` observations."""
+    """Commands and observations of one grasp: ``n`` commands, ``n + 1`` observations.
+
+    Of ``Observation.info`` it keeps the named arrays in "truth", "raw" (readings: Hall counts, marker
+    corners, perhaps images) and "estimate" (what else was estimated, such as covariances), and what
+    is in "events", as text.
+    """
 
     seed: int = 0
     commands: list[Tensor] = field(default_factory=list)
     observations: list[Observation] = field(default_factory=list)
+    about: dict[str, Any] = field(default_factory=dict)
+    """Anything else that JSON can hold: configuration, versions, outcome. No times of day: equal runs
+    are to give equal files."""
 
     def save(self, path: str | Path) -> Path:
-        """Write an HDF5 file: ``commands (n, n_a)`` and one dataset for each sensor [SI]."""
+        """Write an HDF5 file, whole or not at all; equal recordings give equal files, byte by byte.
+
+        ``commands (n, n_a)`` [rad], each sensor ``(n + 1, ...)`` [SI], groups ``truth``, ``raw`` and
+        ``estimate``, checksums on all of it.
+
+        Raises:
+            ParameterError: ``about`` is nothing that JSON can hold, or an array of ``info`` changes
+                its shape or comes and goes; nothing is written.
+        """
         path = Path(path)
-        with require("h5py").File(path, "w") as file:
-            file.attrs["format"] = "torch_ekm recording 1"
-            file.attrs["seed"] = self.seed
-            if self.commands:
-                file["commands"] = torch.stack(self.commands).numpy()
-            for name in _FIELDS:
-                file[name] = torch.stack([getattr(o, name) for o in self.observations]).numpy()
-            file["time"] = np.array([o.time for o in self.observations])
-            file["status"] = [o.status.value for o in self.observations]
+        about = _json(self.about)
+        arrays = self._arrays()
+        part = path.with_name(path.name + ".part")
+        # version 1.10 of the format has checksums on its own records too
+        with require("h5py").File(part, "w", libver=("v110", "v110")) as file:
+            file.attrs["format"], file.attrs["seed"], file.attrs["about"] = FORMAT, self.seed, about
+            for name, value in arrays.items():
+                large = {"fletcher32": True, "compression": "gzip"} if value.size else {}
+                file.create_dataset(name, data=value, track_times=False, **large)
+        _publish(part, path)
         return path
 
     @classmethod
@@ -48,90 +71,104 @@ class Recording:
         path = Path(path)
         if not path.is_file():
             raise DescriptionError(path, "no such recording")
+        h5py = require("h5py")
         try:
-            with require("h5py").File(path, "r") as file:
-                if file.attrs.get("format") != "torch_ekm recording 1":
+            with h5py.File(path, "r") as file:
+                if file.attrs.get("format") != FORMAT:
                     raise DescriptionError(path, "this HDF5 file is not a recording of torch_ekm")
+                seed, about = int(file.attrs["seed"]), json.loads(file.attrs["about"])
                 data = {name: torch.from_numpy(file[name][()]) for name in _FIELDS}
-                times, status = file["time"][()], [PlantStatus(word.decode()) for word in file["status"][()]]
-                commands = list(torch.from_numpy(file["commands"][()])) if "commands" in file else []
-                seed = int(file.attrs["seed"])
-        except (OSError, KeyError, ValueError) as error:
-            if isinstance(error, DescriptionError):
-                raise
+                times = file["time"][()].tolist()
+                status = [PlantStatus(word.decode()) for word in file["status"][()]]
+                events = [json.loads(word) for word in file["events"][()]]
+                commands = list(torch.from_numpy(file["commands"][()]))
+                info = {
+                    group: {name: torch.from_numpy(item[()]) for name, item in file[group].items()}
+                    for group in _GROUPS
+                    if group in file
+                }
+            observations = []
+            for k, time in enumerate(times):
+                more: dict[str, Any] = {
+                    group: {name: value[k] for name, value in values.items()}
+                    for group, values in info.items()
+                }
+                more |= {"events": tuple(events[k])} if events[k] else {}
+                sensors = (data[name][k] for name in _FIELDS)
+                observations.append(Observation(*sensors, time=time, status=status[k], info=more))
+        except DescriptionError:
+            raise
+        except Exception as error:  # a damaged file fails in any way that HDF5 can think of
             raise DescriptionError(path, f"damaged recording: {error}") from None
-        observations = [
-            Observation(*(data[name][k] for name in _FIELDS), time=float(times[k]), status=status[k])
-            for k in range(len(times))
-        ]
-        return cls(seed, commands, observations)
+        return cls(seed, commands, observations, about)
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """Everything that is written, by its place in the file."""
+        seen = self.observations
+        arrays = {
+            "commands": _stack("commands", self.commands),
+            "time": np.array([o.time for o in seen], dtype=np.float64),
+            "status": np.array([o.status.value for o in seen], dtype="S8"),
+            "events": np.array(
+                [json.dumps([str(event) for event in o.info.get("events", ())]).encode() for o in seen],
+                dtype=bytes,
+            ),
+        }
+        arrays |= {name: _stack(name, [getattr(o, name) for o in seen]) for name in _FIELDS}
+        for group in _GROUPS:
+            named = [o.info.get(group, {}) for o in seen]
+            for name in sorted({name for values in named for name in values}):
+                place = f"{group}/{name}"
+                if not all(name in values for values in named):
+                    raise ParameterError(place, "missing in some observations", "there in all, or in none")
+                arrays[place] = _stack(place, [values[name] for values in named])
+        return arrays
 
 
-class RecordingPlant:
-    """Passes everything on to a plant and remembers it in ``recording``; implements :class:`Plant`."""
-
-    def __init__(self, plant: Plant) -> None:
-        self.plant = plant
-        self.recording = Recording()
-
-    def reset(self, seed: int) -> Observation:
-        """Grasp anew, and start a new recording."""
-        observation = self.plant.reset(seed)
-        self.recording = Recording(seed, [], [observation])
-        return observation
-
-    def observe(self) -> Observation:
-        """Read the sensors; not recorded."""
-        return self.plant.observe()
-
-    def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
-        """Pass the command on."""
-        observation = self.plant.command(delta_a)
-        self.recording.commands.append(torch.as_tensor(delta_a).detach().cpu().double().clone())
-        self.recording.observations.append(observation)
-        return observation
-
-    def close(self) -> None:
-        """Close the plant; the recording stays."""
-        self.plant.close()
+def _stack(name: str, values: list[Any]) -> np.ndarray:
+    """``(len(values), ...)``"""
+    arrays = [np.asarray(torch.as_tensor(value).detach().cpu()) for value in values]
+    shapes = {array.shape for array in arrays}
+    if len(shapes) > 1:
+        raise ParameterError(name, sorted(shapes), "of one shape in all observations of a trial")
+    return np.stack(arrays) if arrays else np.zeros(0)
 
 
-class ReplayedPlant:
-    """Gives the recorded observations one by one, whatever is commanded; implements :class:`Plant`.
+def plain(value: Any) -> Any:
+    """``value`` as it comes back from JSON, mappings in the order of their keys.
 
-    ``info["recorded_command"]`` says what was commanded then. A driver of a real hand has the same
-    five lines: send the increment, wait until it is done, read the sensors.
+    Raises:
+        ParameterError: JSON cannot hold it.
     """
+    return json.loads(_json(value))
 
-    def __init__(self, recording: Recording) -> None:
-        if not recording.observations:
-            raise ParameterError("recording", "empty", "one with at least one observation")
-        self.recording = recording
-        self._place = 0
 
-    def reset(self, seed: int = 0) -> Observation:
-        """Back to the first observation; the seed plays no part."""
-        self._place = 0
-        return self.observe()
+def _json(value: Any) -> str:
+    try:
+        return json.dumps(value, sort_keys=True, default=_as_plain)
+    except TypeError as error:
+        raise ParameterError("about", error, "figures, texts, lists and mappings of those") from None
 
-    def observe(self) -> Observation:
-        """The observation of this moment."""
-        return self.recording.observations[self._place]
 
-    def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
-        """The next observation.
+def _as_plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"a {type(value).__name__}")
 
-        Raises:
-            ParameterError: the recording ends here.
-        """
-        if self._place >= len(self.recording.commands):
-            raise ParameterError(
-                "command", self._place, f"at most {len(self.recording.commands)}: it ends there"
-            )
-        observation = self.recording.observations[self._place + 1]
-        observation.info["recorded_command"] = self.recording.commands[self._place]
-        self._place += 1
-        return observation
 
-    def close(self) -> None:
-        """Nothing to give back."""
+def _publish(part: Path, path: Path) -> None:
+    """Give a finished file its name, once it is safe on the disk."""
+    sync(part)
+    os.replace(part, path)
+    sync(path.parent)
+
+
+def sync(path: Path) -> None:
+    """Wait until a file, or a folder's list of names, is on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

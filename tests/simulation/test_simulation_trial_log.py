@@ -1,0 +1,184 @@
+"""A log loses at most the trial that was being run, and says what is wrong with it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from torch_ekm.exceptions import DescriptionError, GraspError, ParameterError
+from torch_ekm.simulation import (
+    PlantParameters,
+    Recording,
+    RecordingPlant,
+    SimulatedHand,
+    TrialEntry,
+    TrialLog,
+)
+
+pytest.importorskip("h5py")
+pytest.importorskip("sapien")
+
+CONFIGURATION = {"hand": "planar_two_finger", "noise": 0.001}
+
+
+def digests(folder):
+    """Of all files, by name."""
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
+
+
+def run(folder, trials, plant=None):
+    """Short trials: a grasp and two commands, decided by the number of the trial alone."""
+    log = TrialLog(folder, CONFIGURATION)
+    parameters = PlantParameters(joint_noise=CONFIGURATION["noise"])
+    plant = plant or RecordingPlant(SimulatedHand(CONFIGURATION["hand"], "box", parameters=parameters))
+    for trial in log.missing(range(trials)):
+        plant.reset(trial)
+        for sign in (1, -1):
+            plant.command(sign * torch.tensor([0.02, 0.01]))
+        log.write(trial, plant.recording, {"reason": "done"})
+    return log
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("log")
+    run(folder, 4)
+    return folder
+
+
+def test_a_trial_says_all_about_itself(unbroken):
+    log = TrialLog.open(unbroken)
+    assert log.trials == (0, 1, 2, 3)
+    assert 3 in log
+    assert 4 not in log
+    recording = log.read(2)
+    assert (recording.seed, len(recording.commands), len(recording.observations)) == (2, 2, 3)
+    assert recording.about["configuration"] == CONFIGURATION == log.configuration
+    assert recording.about["outcome"] == {"reason": "done"}
+    assert recording.about["trial"] == 2
+    assert {"python", "torch", "sapien"} <= set(recording.about["versions"])
+    assert recording.observations[-1].info["truth"]["q"].shape == (4,)
+    entry = log.index[2]
+    last = recording.observations[-1]
+    assert entry == TrialEntry(2, 2, 2, round(last.time, 6), "held", "done")
+
+
+def test_one_configuration_gives_one_log_byte_by_byte(unbroken, tmp_path):
+    run(tmp_path, 4)
+    assert digests(tmp_path) == digests(unbroken)
+    assert len(set(digests(unbroken).values())) == 5  # and the trials differ
+
+
+def test_a_run_in_pieces_gives_the_same_log(unbroken, tmp_path):
+    run(tmp_path, 2)
+    (tmp_path / "trial_000002.h5.part").write_bytes(b"killed while this was written")
+    run(tmp_path, 4)
+    assert digests(tmp_path) == digests(unbroken)
+
+
+@pytest.mark.parametrize("index", [None, b"", b"trial,se", "half", "reversed", "one more"])
+def test_the_index_is_made_from_the_files(unbroken, tmp_path, index):
+    for path in unbroken.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    place = tmp_path / "index.csv"
+    lines = place.read_bytes().splitlines(keepends=True)
+    if index is None:
+        place.unlink()
+    elif isinstance(index, bytes):
+        place.write_bytes(index)
+    else:
+        text = {
+            "half": b"".join(lines)[:-9],
+            "reversed": b"".join(lines[::-1]),
+            "one more": b"".join(lines) + b"9,9,2,0.5,held,done\n",
+        }
+        place.write_bytes(text[index])
+    assert [entry.trial for entry in TrialLog.open(tmp_path).index] == [0, 1, 2, 3]
+    assert digests(tmp_path) == digests(unbroken)
+
+
+def test_trials_of_another_process_are_seen(unbroken, tmp_path):
+    log = TrialLog(tmp_path, CONFIGURATION)
+    assert log.index == ()
+    run(tmp_path, 1)
+    assert [entry.trial for entry in log.index] == [0]
+
+
+def test_killed_while_writing_loses_the_current_trial_only(unbroken, tmp_path):
+    """A real SIGKILL at a moment of its own choosing."""
+    code = f"""
+        import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
+        from test_simulation_trial_log import run
+        run({str(tmp_path)!r}, 4)
+    """
+    process = subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)])
+    deadline = time.monotonic() + 100
+    while not (tmp_path / "trial_000001.h5").exists() and time.monotonic() < deadline:
+        time.sleep(0.002)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    there = TrialLog.open(tmp_path).trials
+    assert there[:2] == (0, 1)
+    for trial in there:
+        assert digests(tmp_path)[f"trial_{trial:06d}.h5"] == digests(unbroken)[f"trial_{trial:06d}.h5"]
+    run(tmp_path, 4)
+    assert digests(tmp_path) == digests(unbroken)
+
+
+def test_a_grasp_that_failed_is_a_trial_too(tmp_path):
+    class Clumsy(SimulatedHand):
+        def reset(self, seed):
+            raise GraspError("slippery")
+
+    plant, log = RecordingPlant(Clumsy("planar_two_finger")), TrialLog(tmp_path, {})
+    with pytest.raises(GraspError):
+        plant.reset(7)
+    log.write(0, plant.recording, {"reason": "not grasped"})
+    assert log.index == (TrialEntry(0, 7, 0, 0.0, "not grasped", "not grasped"),)
+    assert log.read(0).observations == []
+
+
+def test_what_is_no_log_of_this_run_is_refused(unbroken, tmp_path):
+    before = digests(unbroken)
+    with pytest.raises(ParameterError, match=r"configuration\['noise'\] = 0.002.*0.001 as in the log"):
+        TrialLog(unbroken, {**CONFIGURATION, "noise": 0.002})
+    with pytest.raises(ParameterError, match="about"):
+        TrialLog(tmp_path / "new", {"hand": object()})
+    with pytest.raises(DescriptionError, match="no such log"):
+        TrialLog.open(tmp_path / "nothing")
+    with pytest.raises(DescriptionError, match="trial_000000"):
+        TrialLog.open(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(DescriptionError, match="is a file"):
+        TrialLog(tmp_path / "file", {})
+    log = TrialLog.open(unbroken)
+    with pytest.raises(DescriptionError, match=r"no trial 9; there are 0, 1, 2, 3"):
+        log.read(9)
+    with pytest.raises(ParameterError, match="not in the log yet"):
+        log.write(3, Recording())
+    with pytest.raises(ParameterError, match="trial"):
+        log.write(-1, Recording())
+    assert digests(unbroken) == before
+
+
+def test_a_damaged_trial_is_named(unbroken, tmp_path):
+    for path in unbroken.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    torn = tmp_path / "trial_000001.h5"
+    torn.write_bytes(torn.read_bytes()[:2000])
+    log = TrialLog.open(tmp_path)
+    assert log.read(2).seed == 2
+    with pytest.raises(DescriptionError, match=r"trial_000001\.h5: damaged.*delete"):
+        log.read(1)
+    torn.unlink()
+    assert run(tmp_path, 4).trials == (0, 1, 2, 3)
+    assert digests(tmp_path) == digests(unbroken)
