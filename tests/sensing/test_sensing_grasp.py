@@ -129,7 +129,7 @@ def test_sensed_plant_knows_only_what_its_sensors_say(hand, obj):
         truth = observation.info["truth"]
         assert observation.status is PlantStatus.HELD
         assert observation.info["track"].ok
-        assert observation.info["hall"].shape == (15,)
+        assert observation.info["raw"]["hall"].shape == (15,)
         assert (observation.position - truth["position"]).norm() < 1e-3
         assert 0 < log(observation.rotation @ truth["rotation"].mT).norm() < 0.5 * DEG
         has_channel = [hand.joint_names.index(joint) for joint in hall.joints]
@@ -146,10 +146,10 @@ def test_same_seed_same_observations(hand, obj):
     first, other, again, elsewhere = plant.reset(3), plant.reset(4), plant.reset(3), twin.reset(3)
     for same in (again, elsewhere):
         assert torch.equal(first.position, same.position)
-        assert torch.equal(first.info["hall"], same.info["hall"])
+        assert torch.equal(first.info["raw"]["hall"], same.info["raw"]["hall"])
         assert torch.equal(first.q, same.q)
     assert not torch.equal(first.position, other.position)
-    assert not torch.equal(first.info["hall"], other.info["hall"])
+    assert not torch.equal(first.info["raw"]["hall"], other.info["raw"]["hall"])
 
 
 def test_object_not_seen_is_said(hand, obj):
@@ -167,6 +167,50 @@ def test_object_not_seen_is_said(hand, obj):
         blind.reset(seed=0)
     with pytest.raises(ParameterError, match="looks"):
         SensedPlant(Puppet(hand), hand, obj, looks=0)
+
+
+def test_what_the_inner_plant_does_not_see_is_hidden_in_the_pictures(hand, obj):
+    class Occluded(Puppet):
+        def command(self, delta_a):
+            return dataclasses.replace(super().command(delta_a), status=PlantStatus.NOT_SEEN)
+
+    plant = SensedPlant(Occluded(hand), hand, obj)
+    first = plant.reset(seed=0)
+    unseen = plant.command(torch.full((hand.n_a,), 2 * DEG))
+    assert unseen.status is PlantStatus.NOT_SEEN
+    assert unseen.info["track"].status is TrackStatus.OBJECT_HIDDEN
+    assert torch.equal(unseen.position, first.position)
+    assert unseen.info["estimate"]["pose_covariance"].isnan().all()
+
+
+def test_the_camera_shows_the_picture_that_has_arrived(hand, obj):
+    """A late picture shows the object where it was; the joint sensors are not late."""
+
+    class Late(Puppet):
+        def command(self, delta_a):
+            before = super().observe().info["truth"]
+            now = super().command(delta_a)
+            return dataclasses.replace(now, info={**now.info, "picture": before})
+
+    plant = SensedPlant(Late(hand), hand, obj, hall=HallSensors(hand, seed=1))
+    first = plant.reset(seed=0)
+    late = plant.command(torch.full((hand.n_a,), 6 * DEG))
+    assert log(late.rotation @ first.rotation.mT).norm() < 0.5 * DEG
+    assert log(late.info["truth"]["rotation"] @ first.rotation.mT).norm() > 5 * DEG
+
+
+def test_raw_readings_of_an_observation(hand, obj):
+    plant = SensedPlant(Puppet(hand), hand, obj, hall=HallSensors(hand, seed=1), keep_images=True)
+    seen = plant.reset(seed=0)
+    corners, image = seen.info["raw"]["corners"].numpy(), seen.info["raw"]["image"].numpy()
+    assert corners.shape == (8, 4, 2)
+    assert image.shape == (480, 640)
+    again = MarkerTracker(plant.camera.camera, *plant.boards).track(image)
+    assert torch.equal(again.position, seen.position)
+    np.testing.assert_array_equal(corners[5], again.markers[5])
+    plant._video.options = StreamOptions(hidden=0.999)
+    plant.looks = 1
+    assert plant.observe().info["raw"]["corners"].isnan().any()
 
 
 def test_several_looks_get_over_dropped_frames(hand, obj):

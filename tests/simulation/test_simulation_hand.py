@@ -180,6 +180,7 @@ def test_a_snapshot_outlives_the_scene_it_was_taken_in():
     plant = SimulatedHand("icub_right", "box", PlantConfig(gravity_tilt=40 * DEG))
     before, snapshot = plant.reset(0), plant.snapshot()
     gravity = plant.gravity
+    plant.close()
     plant.change(object_scale=1.1)
     plant.reset(1)
     after = plant.restore(snapshot)
@@ -188,6 +189,14 @@ def test_a_snapshot_outlives_the_scene_it_was_taken_in():
     torch.testing.assert_close(after.info["truth"], before.info["truth"])
     plant.wait(1.0)
     assert motion(before, plant.observe())[0].norm() < 1e-5
+
+
+def test_a_held_object_does_not_grow(plant, grasped):
+    plant.restore(grasped)
+    with pytest.raises(ParameterError, match=r"held; close\(\)"):
+        plant.change(object_scale=1.05, mass=2.0)
+    assert plant.parameters == PlantParameters.exact()
+    plant.change(object_scale=1.0)  # no change
 
 
 @pytest.mark.parametrize(

@@ -158,6 +158,18 @@ def test_finger_weight_pulls_the_joints():
     assert 0.02 * DEG < difference < 3.0 * DEG
 
 
+def test_finger_weight_acts_at_once(exact, grasped):
+    before = exact.restore(grasped)
+    exact.change(link_weight=True)
+    exact.wait(1.0)
+    heavy = (truth(exact.observe()) - truth(before)).abs().max()
+    exact.restore(grasped)  # takes the weight off again
+    exact.wait(1.0)
+    light = (truth(exact.observe()) - truth(before)).abs().max()
+    assert 0.02 * DEG < heavy < 3.0 * DEG
+    assert light < 0.1 * heavy
+
+
 # -- the object ---------------------------------------------------------------------------------------
 
 
@@ -334,6 +346,29 @@ def test_latency_shows_an_older_pose(exact):
     exact._rig.run(100, lambda part: motor - part * SQUEEZE.numpy())
     moving = exact.observe()
     assert (moving.position - truth(moving, "position")).norm() > 1e-5
+
+
+def test_late_pictures_of_a_second_grasp_are_its_own():
+    late = [SimulatedHand("planar_two_finger", "box", parameters=PlantParameters(latency=0.1)) for _ in "ab"]
+    late[0].reset(1)
+    late[0].wait(2.0)
+    again, fresh = (plant.reset(0) for plant in late)
+    assert torch.equal(again.position, fresh.position)
+    torch.testing.assert_close(again.position, truth(again, "position"), atol=1e-5, rtol=0)
+
+
+def test_the_picture_is_as_old_as_the_camera_is_late(exact):
+    exact.change(latency=0.1)
+    exact.wait(0.5)
+    motor = exact._rig.servo.encoder
+    exact._rig.run(100, lambda part: motor + part * ROLL.numpy())
+    now = exact.observe()
+    exact._rig.run(100, lambda part: motor + ROLL.numpy())
+    then = exact.observe().info["picture"]
+    assert float(then["time"]) == pytest.approx(now.time, abs=1e-9)
+    for name in ("q", "position", "rotation"):
+        assert torch.equal(then[name], now.info["truth"][name])
+    assert not torch.equal(now.info["picture"]["q"], now.info["truth"]["q"])
 
 
 def test_lost_frames_repeat_the_last_pose_and_say_so(exact):

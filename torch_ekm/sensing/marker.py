@@ -113,10 +113,11 @@ class MarkerTracker:
         grey = self._grey(image)
         markers = self._detect(grey)
         palm, obj = (self._board_pose(b, markers, grey) for b in (self.palm_board, self.object_board))
-        n_markers = sum(k in markers for board in (self.palm_board, self.object_board) for k in board.ids)
+        ids = (*self.palm_board.ids, *self.object_board.ids)
+        markers = {k: corners for k, corners in markers.items() if k in ids}
 
         def failed(status: TrackStatus) -> Track:
-            return Track(status, palm=palm, object=obj, n_markers=n_markers)
+            return Track(status, palm=palm, object=obj, markers=markers)
 
         seen_palm = self._palm.update(palm) if palm is None or self._certain(self.palm_board, palm) else None
         if seen_palm is None:
@@ -130,7 +131,7 @@ class MarkerTracker:
             return failed(TrackStatus.JUMP)
         self._prior = {id(self.object_board): obj.rotation, id(self.palm_board): seen_palm.rotation}
         tensors = (torch.from_numpy(array) for array in (position, rotation, covariance))
-        return Track(TrackStatus.OK, *tensors, palm=palm, object=obj, n_markers=n_markers)
+        return Track(TrackStatus.OK, *tensors, palm=palm, object=obj, markers=markers)
 
     def _grey(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         cv2, size = require("cv2"), (self.camera.height, self.camera.width)
@@ -145,7 +146,9 @@ class MarkerTracker:
         if ids is None:
             return {}
         flat = ids.ravel().tolist()
-        return {k: corners[i].reshape(4, 2) for i, k in enumerate(flat) if flat.count(k) == 1}
+        return {
+            k: corners[i].reshape(4, 2).astype(np.float64) for i, k in enumerate(flat) if flat.count(k) == 1
+        }
 
     def _board_pose(self, board: MarkerBoard, markers: dict[int, Array], grey: NDArray) -> BoardPose | None:
         seen = [k for k in board.ids if k in markers]

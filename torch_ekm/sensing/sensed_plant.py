@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ..description import HandDescription, ObjectDescription
 from ..exceptions import ObjectLostError, ParameterError
@@ -30,12 +31,16 @@ ICUB_PALM_MOUNT = np.array([[1.0, 0, 0, -0.048], [0, 1, 0, 0], [0, 0, 1, 0.004],
 class SensedPlant:
     """Observations through images and Hall counts instead of the truth; implements :class:`Plant`.
 
-    The inner plant moves; its ``info["truth"]`` (``q``, ``position``, ``rotation``) is drawn by
-    a camera and read by Hall sensors, and only what :class:`MarkerTracker` and :class:`JointEstimator`
-    make of that is passed on. Up to ``looks`` frames are tried until one shows both boards;
-    if none does, the last pose is repeated with the status NOT_SEEN. The hand has come to rest by
-    then, so that the latency of the images does not matter here. ``info`` also holds
-    "track" and "hall" (the raw counts). The same seed gives the same noise.
+    The inner plant moves; its ``info["truth"]`` (``q``, ``position``, ``rotation``) is read by Hall sensors,
+    and drawn by a camera: as it is, or as it was when the picture was taken where the inner plant tells
+    (``info["picture"]``, ``PlantParameters.latency``). Only what :class:`MarkerTracker` and
+    :class:`JointEstimator` make of that is passed on. Up to ``looks`` frames are tried until one shows
+    both boards; if none does, the last pose is repeated with the status NOT_SEEN. Where the inner plant
+    does not see its object, something hides it in the pictures.
+
+    ``info`` also holds "track", for a log "raw" (``corners (n, 4, 2)`` [px] of all markers, NaN where not
+    found, ``hall`` counts, ``image`` if asked for) and "estimate" (``pose_covariance``, NaN where not
+    seen). The same seed gives the same noise.
 
     Args:
         plant: for example a ``SimulatedHand``.
@@ -47,8 +52,9 @@ class SensedPlant:
         hall: the Hall channels; None keeps the inner plant's joint angles.
         calibration: of these channels; None: from a sweep of 181 postures, at construction.
         distance: of the camera from the middle between the boards [m].
-        stream: rate, dropped and hidden frames, seed.
+        stream: dropped and hidden frames, seed; its latency is not used.
         looks: frames tried for one observation.
+        keep_images: the last image of an observation stays in ``info["raw"]["image"]``.
 
     Raises:
         ParameterError: ``looks`` is less than 1.
@@ -67,10 +73,12 @@ class SensedPlant:
         distance: float = 0.40,
         stream: StreamOptions | None = None,
         looks: int = 5,
+        keep_images: bool = False,
     ) -> None:
         if looks < 1:
             raise ParameterError("looks", looks, "1 or more")
         self.plant, self.hand, self.object, self.looks, self.distance = plant, hand, obj, looks, distance
+        self.keep_images = keep_images
         self.camera, self.stream = camera or SimulatedCamera(), stream or StreamOptions()
         palm = MarkerBoard(0) if tracker is None else tracker.palm_board
         board = MarkerBoard(palm.n_markers) if tracker is None else tracker.object_board
@@ -125,8 +133,11 @@ class SensedPlant:
         if self._view is None:
             raise ParameterError("SensedPlant", "not started", "reset with reset(seed) first")
         truth = observation.info["truth"]
-        self._scene: Scene = self._view.scene(truth["q"], truth["position"], truth["rotation"])
-        track = self._look()
+        shown = observation.info.get("picture", truth)
+        self._scene: Scene = self._view.scene(shown["q"], shown["position"], shown["rotation"])
+        if observation.status is PlantStatus.NOT_SEEN:
+            self._scene = self._scene.obstructed(1)
+        track, image = self._look()
         status = observation.status
         if track.ok:
             self._last = track.pose()
@@ -137,22 +148,36 @@ class SensedPlant:
             )
         elif status is PlantStatus.HELD:
             status = PlantStatus.NOT_SEEN
-        q, info = observation.q, {**observation.info, "track": track}
+        q, raw = observation.q, {"corners": self._corners(track)}
+        if self.keep_images:
+            raw["image"] = torch.from_numpy(image)
         if self.hall is not None and self.joints is not None:
-            info["hall"] = self.hall.read(truth["q"], self._generator)
-            q = self.joints(info["hall"], observation.a).q
+            raw["hall"] = self.hall.read(truth["q"], self._generator)
+            q = self.joints(raw["hall"], observation.a).q
+        unknown = torch.full((6, 6), torch.nan, dtype=torch.float64)
+        estimate = {"pose_covariance": unknown if track.covariance is None else track.covariance}
         position, rotation = self._last
+        info = {**observation.info, "track": track, "raw": raw, "estimate": estimate}
         return dataclasses.replace(
             observation, q=q, position=position, rotation=rotation, status=status, info=info
         )
 
-    def _look(self) -> Track:
+    def _look(self) -> tuple[Track, NDArray[np.uint8]]:
+        """The first frame that shows both boards, or the last one tried; a dropped frame is black."""
         assert self._video is not None
-        track = None
+        track = image = None
         for _ in range(self.looks):
-            track = self.tracker.track(self._video.frame(self._frames).image)
+            image = self._video.frame(self._frames).image
+            track = self.tracker.track(image)
             self._frames += 1
             if track.ok:
                 break
         assert track is not None
-        return track
+        lens = self.camera.camera
+        return track, np.zeros((lens.height, lens.width), dtype=np.uint8) if image is None else image
+
+    def _corners(self, track: Track) -> Float[Tensor, "n 4 2"]:
+        """Of all markers of both boards [px], NaN where not found."""
+        ids = [number for board in self.boards for number in board.ids]
+        missing = np.full((4, 2), np.nan)
+        return torch.from_numpy(np.stack([track.markers.get(number, missing) for number in ids]))

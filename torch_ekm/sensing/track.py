@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..exceptions import ObjectLostError
 from ..typing import Float, Tensor
@@ -38,8 +42,13 @@ class Track:
     """The palm's board in the camera frame, where it was found in this image."""
     object: BoardPose | None = None
     """The object's board in the camera frame, where it was found."""
-    n_markers: int = 0
-    """Markers of both boards that were found."""
+    markers: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    """Corners ``(4, 2)`` [px] of each marker of both boards that was found, by its number."""
+
+    @property
+    def n_markers(self) -> int:
+        """How many markers of both boards were found."""
+        return len(self.markers)
 
     @property
     def ok(self) -> bool:

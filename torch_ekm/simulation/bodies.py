@@ -32,7 +32,7 @@ class HandBodies(NamedTuple):
     """Name of each link component."""
 
 
-def build_hand(scene: Any, hand: HandDescription, material: Any, link_weight: bool) -> HandBodies:
+def build_hand(scene: Any, hand: HandDescription, material: Any) -> HandBodies:
     """The articulation of ``hand``, its base fixed at the origin: hand frame = world frame.
 
     Links on fixed joints become part of the link that carries them.
@@ -79,7 +79,7 @@ def build_hand(scene: Any, hand: HandDescription, material: Any, link_weight: bo
         raise DescriptionError(hand.urdf_path, f"the base link '{hand.base_link}' must not move with a joint")
     entities[0].pose = pose(np.linalg.inv(base))
     for name, pieces in parts.items():
-        _fill_link(components[name], pieces, material, link_weight)
+        _fill_link(components[name], pieces, material)
     for entity in entities:
         scene.add_entity(entity)
 
@@ -141,7 +141,7 @@ def x_axis_to(axis: Array) -> Array:
     return frame
 
 
-def _fill_link(link: Any, pieces: list[tuple[Array, UrdfLink]], material: Any, link_weight: bool) -> None:
+def _fill_link(link: Any, pieces: list[tuple[Array, UrdfLink]], material: Any) -> None:
     mass, first, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
     for placed, piece in pieces:
         for shape in piece.collisions:
@@ -154,7 +154,6 @@ def _fill_link(link: Any, pieces: list[tuple[Array, UrdfLink]], material: Any, l
             inertia += rotation @ piece.inertia @ rotation.T + piece.mass * _steiner(centre)
     if mass > 0:
         set_inertia(link, mass, first / mass, inertia - mass * _steiner(first / mass))
-    link.disable_gravity = not link_weight
 
 
 def _attach(body: Any, shape: Shape, placed: Array, material: Any, group: int) -> None:

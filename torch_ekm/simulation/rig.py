@@ -60,8 +60,8 @@ class Rig:
         """Normal force of each pad, mean of the last 10 steps [N]."""
         self.fingers = 0
         """How many fingers touched the object in these steps, with any of their links."""
-        self.on_frame: Callable[[float, Array, Array], None] | None = None
-        """Called every 10 steps with the time and the object's pose."""
+        self.on_frame: Callable[[float, Array, Array, Array], None] | None = None
+        """Called every 10 steps with the time, the joint angles and the object's pose."""
         self.gravity: Gravity = config.gravity
         self._finger_of = {link: joints[-1] for link in hand.link_names if (joints := chain(hand, link))}
         self._build(config.gravity)
@@ -69,10 +69,9 @@ class Rig:
     def _build(self, gravity: Gravity) -> None:
         p = self.parameters
         self.gravity = gravity
-        self.scene = HandScene(
-            self.hand, self.obj, gravity, self.config.time_step, p.object_scale, p.link_weight
-        )
-        self._built = (gravity, p.object_scale, p.link_weight)
+        self.scene = HandScene(self.hand, self.obj, gravity, self.config.time_step, p.object_scale)
+        self.scene.set_link_weight(p.link_weight)
+        self._built = (gravity, p.object_scale)
         self.scene.set_object(p.mass, p.com_shift)
         self.scene.set_friction(p.friction * self.obj.friction)
         self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
@@ -91,6 +90,7 @@ class Rig:
         transmission.relax(plan.q)
         slack = transmission.offset + transmission.J_a @ plan.q
         self.servo.place(slack)
+        self.time = -_CLOSING  # time runs on while the object is grasped: a late camera looks back into it
         self.run(round(_CLOSING / step), lambda part: slack + part * (plan.motor - slack))
         self.servo.place(plan.motor)
         self.time = 0.0
@@ -134,7 +134,7 @@ class Rig:
                 scene.push(*push)
             scene.step(transmission.drive_targets(q, output))
             if self.on_frame is not None and k % _FORCE_WINDOW == 0:
-                self.on_frame(self.time + k * self.config.time_step, *scene.object_pose)
+                self.on_frame(self.time + k * self.config.time_step, scene.q, *scene.object_pose)
             if k > steps - window:
                 touches = scene.touches()
                 fingers |= {self._finger_of[link] for link in touches if link in self._finger_of}
@@ -167,6 +167,8 @@ class Rig:
         self.transmission.lengthen(new.tendon_elongation - old.tendon_elongation)
         if _differ(old, new, "mass", "com_shift"):
             self.scene.set_object(new.mass, new.com_shift)
+        if _differ(old, new, "link_weight"):
+            self.scene.set_link_weight(new.link_weight)
         if _differ(old, new, "friction"):
             self.scene.set_friction(new.friction * self.obj.friction)
 
@@ -185,7 +187,7 @@ class Rig:
     def restore(self, state: RigState) -> None:
         if state.parameters != self.parameters:
             self.change(state.parameters)
-        if self._built != (state.gravity, state.parameters.object_scale, state.parameters.link_weight):
+        if self._built != (state.gravity, state.parameters.object_scale):
             self._build(state.gravity)
         self.scene.restore(state.physics)
         self.transmission.restore(state.transmission)

@@ -38,7 +38,6 @@ class HandScene:
         gravity: in the hand frame [m/s^2].
         time_step: [s].
         object_scale: factor on the object's shapes.
-        link_weight: gravity pulls at the fingers too.
     """
 
     def __init__(
@@ -48,13 +47,12 @@ class HandScene:
         gravity: tuple[float, float, float],
         time_step: float = 1e-3,
         object_scale: float = 1.0,
-        link_weight: bool = False,
     ) -> None:
         self.obj, self.time_step = obj, time_step
         self._scene: Any = new_scene(gravity, time_step)
         self._system: Any = self._scene.physx_system
         self._material = sapien().physx.PhysxMaterial(obj.friction, obj.friction, 0.0)
-        self._hand = build_hand(self._scene, hand, self._material, link_weight)
+        self._hand = build_hand(self._scene, hand, self._material)
         self._object = build_object(self._scene, obj, self._material, object_scale)
         self.set_object()
         if hand.planar_normal is not None:
@@ -83,6 +81,11 @@ class HandScene:
 
     def set_friction(self, coefficient: float) -> None:
         self._material.static_friction = self._material.dynamic_friction = coefficient
+
+    def set_link_weight(self, pulls: bool) -> None:
+        """Whether gravity pulls at the links too; without, only at the object."""
+        for link in self._hand.link_of:
+            link.disable_gravity = not pulls
 
     def set_drive_stiffness(self, stiffness: Array) -> None:
         for joint, value in zip(self._hand.joints, stiffness, strict=True):

@@ -15,10 +15,23 @@ from .parameters import PlantParameters
 Array = NDArray[np.float64]
 
 
+class Frame(NamedTuple):
+    """The true state at one moment."""
+
+    time: float
+    """[s]"""
+    q: Array
+    """``(n_q,)`` [rad]"""
+    position: Array
+    """``(3,)`` [m]"""
+    rotation: Array
+    """``(3, 3)``"""
+
+
 class SensorState(NamedTuple):
     """All that :class:`Sensors` remembers between readings."""
 
-    frames: tuple[tuple[float, Array, Array], ...]
+    frames: tuple[Frame, ...]
     seen: tuple[Array, Array] | None
     felt: Array
     stuck_at: Array | None
@@ -52,7 +65,7 @@ class Sensors:
 
     def forget(self) -> None:
         """A new grasp: no old frames, no hysteresis."""
-        self._frames: deque[tuple[float, Array, Array]] = deque()
+        self._frames: deque[Frame] = deque()
         self._seen: tuple[Array, Array] | None = None
         self._felt = np.zeros(self.n_pads)
         self._stuck_at: Array | None = None
@@ -62,11 +75,15 @@ class Sensors:
         """Whether old poses matter, so that :meth:`remember` must be called."""
         return self._p.latency > 0
 
-    def remember(self, time: float, position: Array, rotation: Array) -> None:
-        """Keep a camera frame for as long as the latency asks."""
-        self._frames.append((time, position, rotation))
-        while len(self._frames) > 1 and self._frames[1][0] <= time - self._p.latency:
+    def remember(self, frame: Frame) -> None:
+        """Keep a state for as long as the latency asks."""
+        self._frames.append(frame)
+        while len(self._frames) > 1 and self._frames[1].time <= frame.time - self._p.latency + 1e-9:
             self._frames.popleft()
+
+    def pictured(self, now: Frame) -> Frame:
+        """What the camera's picture shows that is to be had now."""
+        return self._frames[0] if self.wants_history and self._frames else now
 
     def joints(self, q: Array, generator: np.random.Generator) -> Array:
         """Estimated joint angles ``(n_q,)`` [rad]."""
@@ -78,13 +95,15 @@ class Sensors:
     def pose(
         self, position: Array, rotation: Array, generator: np.random.Generator
     ) -> tuple[Array, Array, bool]:
-        """Estimated object pose in the hand frame [m], and whether the camera saw it this time."""
+        """Estimated object pose in the hand frame [m], and whether the camera saw it this time.
+
+        Args:
+            position, rotation: as :meth:`pictured`.
+        """
         p = self._p
         noise, turn, luck = generator.standard_normal(3), generator.standard_normal(3), generator.random()
         if self._seen is not None and luck < p.frame_loss:  # the first frame of a grasp is waited for
             return self._seen[0], self._seen[1], False
-        if self.wants_history and self._frames:
-            _, position, rotation = self._frames[0]
         shaken = exp(torch.from_numpy(p.rotation_noise * turn)).numpy() @ rotation
         self._seen = (position + p.position_noise * noise, shaken)
         return self._seen[0], self._seen[1], True

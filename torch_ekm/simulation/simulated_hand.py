@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..description import HandDescription, ObjectDescription, load_hand, load_object
-from ..exceptions import EquilibriumError, GraspError
+from ..exceptions import EquilibriumError, GraspError, ParameterError
 from ..typing import Float, Tensor
 from .config import PlantConfig
 from .mechanism import make_planner, moment_arms, true_descriptions, turning_axis
@@ -18,7 +19,7 @@ from .pinch import PinchPlan
 from .pinch_problem import PinchRequest
 from .plant import Observation, PlantStatus
 from .rig import Gravity, Rig, RigState
-from .sensors import Sensors, SensorState
+from .sensors import Frame, Sensors, SensorState
 
 Array = NDArray[np.float64]
 
@@ -45,7 +46,8 @@ class SimulatedHand:
         observation = plant.command(delta_a)
 
     Everything is in the hand frame, SI units. ``observation.info["truth"]`` is for reports; a
-    controller that reads it cheats. The same seed gives the same run, bit by bit.
+    controller that reads it cheats. ``info["picture"]`` is the same at the moment of the newest picture,
+    for a camera to draw. The same seed gives the same run, bit by bit.
 
     Args:
         hand: a description, or the name or path that :func:`load_hand` takes.
@@ -121,7 +123,8 @@ class SimulatedHand:
         q, (position, rotation) = rig.scene.q, rig.scene.object_pose
         status = self.status
         joints = self._sensors.joints(q, draw)
-        seen_position, seen_rotation, seen = self._sensors.pose(position, rotation, draw)
+        picture = self._sensors.pictured(Frame(rig.time, q, position, rotation))
+        seen_position, seen_rotation, seen = self._sensors.pose(picture.position, picture.rotation, draw)
         force = self._sensors.forces(rig.normal, draw)
         if not seen and status is PlantStatus.HELD:
             status = PlantStatus.NOT_SEEN
@@ -140,7 +143,7 @@ class SimulatedHand:
             fingertip_force=torch.from_numpy(force),
             time=rig.time,
             status=status,
-            info={"truth": {name: torch.from_numpy(value) for name, value in truth.items()}},
+            info={"truth": _tensors(truth), "picture": _tensors(picture._asdict())},
         )
 
     def close(self) -> None:
@@ -218,13 +221,20 @@ class SimulatedHand:
         """Change :class:`PlantParameters` by name, now and in mid-grasp; motors stay where they are.
 
         A tendon with other moment arms or stiffness is put on so that the joints feel no difference
-        at that moment. ``object_scale`` and ``link_weight`` shape the scene: they act from the next
+        at that moment. A held object cannot grow: :meth:`close` first, then change ``object_scale``, then
         :meth:`reset`.
 
         Raises:
-            ParameterError: an unknown name or a wrong figure; nothing is changed.
+            ParameterError: an unknown name, a wrong figure, or ``object_scale`` while there is a grasp;
+                nothing is changed.
         """
         new = self.parameters.replace(**changes)
+        if self._rig is not None and new.object_scale != self.parameters.object_scale:
+            raise ParameterError(
+                "object_scale",
+                new.object_scale,
+                f"{self.parameters.object_scale:g} while it is held; close(), change it, then reset(seed)",
+            )
         moment_arms(self.hand, new)  # refuses before anything is touched
         if self._rig is not None:
             self._rig.change(new)
@@ -253,7 +263,10 @@ class SimulatedHand:
     def _watch(self) -> None:
         """Let the camera keep old poses if it is late."""
         if self._rig is not None:
-            self._rig.on_frame = self._sensors.remember if self._sensors.wants_history else None
+            remember = self._sensors.remember
+            self._rig.on_frame = (
+                (lambda *state: remember(Frame(*state))) if self._sensors.wants_history else None
+            )
 
     def _request(self) -> PinchRequest:
         """Where to grasp, and which way is down."""
@@ -266,6 +279,10 @@ class SimulatedHand:
             across=across * c.offset_across,
             tilt=(first * c.tilt, second * c.tilt),
         )
+
+
+def _tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:
+    return {name: torch.from_numpy(np.asarray(value)) for name, value in arrays.items()}
 
 
 def _tilted(gravity: Gravity, angle: float, turn: float) -> Gravity:
