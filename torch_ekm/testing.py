@@ -119,6 +119,9 @@ def _check_queries(learner: ResidualLearner, x: Tensor) -> None:
         assert isinstance(law, Normal), "predict does not return a Normal"
         assert mean.shape == law.mean.shape == law.stddev.shape == torch.Size(expected), f"shape at {shape}"
         assert mean.dtype == law.stddev.dtype == learner.dtype, "the prediction has another dtype"
+        density = learner.predictive(query).log_prob(mean)
+        assert density.shape == mean.shape, f"predictive: shape of the log density at {shape}"
+        assert bool(density.isfinite().all()), "predictive: a log density is not finite"
         value, jacobian = learner.linearize(query)
         assert value.shape == torch.Size(expected), f"linearize: shape of the mean at {shape}"
         assert jacobian.shape == (*expected, learner.in_features), f"linearize: shape at {shape}"

@@ -11,6 +11,7 @@ from torch_ekm.residual import (
     DeepKernelSOGP,
     KRLSTracker,
     LocalGPs,
+    MixtureResidual,
     RandomFeatureRLS,
     RecursiveLeastSquares,
     ReplayMLP,
@@ -55,10 +56,15 @@ LEARNERS = {
     ),
     "sogp_skip": lambda **o: sogp(on_invalid="skip", **o),
     "sogp_action": lambda **o: sogp(kernel=ActionLinearKernel(3, 1), normalize=True, **o),
+    "sogp_diffusion": lambda **o: sogp(diffusion=0.01, refresh_every=4, **o),
+    "mixture": lambda **o: MixtureResidual(sogp(robust=3.0, diffusion=0.003, **o)),
+    "mixture_of_two": lambda **o: MixtureResidual(
+        [sogp(diffusion=0.01, **o), RecursiveLeastSquares(3, 2, **o)], shares=(0.0, 1.0)
+    ),
     "deep": deep,
     "deep_sogp": lambda **o: DeepKernelSOGP(3, 2, capacity=8, hidden=(8,), refresh_every=4, **o),
 }
-FLEETS = ("zero", "rls", "rff", "window", "sogp", "sogp_all", "deep")
+FLEETS = ("zero", "rls", "rff", "window", "sogp", "sogp_all", "sogp_diffusion", "mixture_of_two", "deep")
 
 
 @pytest.mark.parametrize("name", LEARNERS)

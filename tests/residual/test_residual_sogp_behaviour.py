@@ -238,6 +238,19 @@ def test_forgetting_follows_a_drift():
     assert errors[1] < 0.6 * errors[0]
 
 
+def test_diffusion_follows_a_change_that_decay_is_slow_to_forget():
+    """A linear channel that turns again and again, little noise, inputs that recur."""
+    generator = torch.Generator().manual_seed(10)
+    x = torch.randn(900, 4, generator=generator, dtype=torch.float64)
+    angle = torch.linspace(0, 3 * math.pi, 900, dtype=torch.float64)[:, None]
+    y = torch.cos(angle) * x[:, :1] + torch.sin(angle) * x[:, 1:2] + 0.02 * torch.sin(3 * x[:, 2:3])
+    errors = []
+    for options in ({"forgetting": 0.99}, {"forgetting": 0.98}, {"diffusion": 0.003}, {"diffusion": 0.01}):
+        gp = SparseOnlineGP(4, 1, capacity=60, noise_variance=0.1, robust=3.0, **options)
+        errors.append(float(run_prequential(gp, x, y).error[300:].square().mean().sqrt()))
+    assert max(errors[2:]) < 0.8 * min(errors[:2])
+
+
 def test_fitc_is_less_confident_than_kl():
     x, y = system(10, 300)
     variances = []
@@ -286,7 +299,8 @@ def test_deep_kernel_gradient_is_autograds():
     [
         {"capacity": 0}, {"capacity": 2.5}, {"noise_variance": 0.0}, {"noise_variance": -1.0},
         {"noise_variance": float("nan")}, {"novelty_tolerance": -0.1}, {"jitter": 1.0}, {"forgetting": 0.0},
-        {"forgetting": 1.1}, {"robust": 0.0}, {"deletion": "random"}, {"projection": "dtc"},
+        {"forgetting": 1.1}, {"diffusion": 1.0}, {"diffusion": -0.1}, {"robust": 0.0}, {"deletion": "random"},
+        {"projection": "dtc"},
         {"refresh_every": 0}, {"batch_shape": (0,)}, {"on_invalid": "ignore"},
         {"adapt": True, "adapt_rate": -1.0},
     ],

@@ -260,6 +260,25 @@ def test_forgetting_between_rebuilds_counts_every_sample():
     np.testing.assert_allclose(gp(xs).numpy(), se(T, X) @ np.linalg.solve(A, Y), atol=1e-8)
 
 
+@pytest.mark.parametrize("every", [1, 5])
+def test_diffusion_is_the_exact_gp_in_space_and_time(every):
+    """f wanders like an Ornstein-Uhlenbeck process, one step per rebuild: k(x, x') kept^(|t - t'|/2)."""
+    x, y, xs = data()
+    gp = learner(diffusion=0.05, refresh_every=every)
+    gp.update(x, y)
+    now = np.arange(N + 1) // every * every
+
+    def in_time(a, b, times_a, times_b):
+        return se(a, b) * 0.95 ** (np.abs(times_a[:, None] - times_b[None]) / 2)
+
+    later = np.full(len(xs), now[N])
+    K = in_time(x.numpy(), x.numpy(), now[:N], now[:N]) + S2 * np.eye(N)
+    ks = in_time(x.numpy(), xs.numpy(), now[:N], later)
+    variance = 0.8 - (ks * np.linalg.solve(K, ks)).sum(0)
+    np.testing.assert_allclose(gp(xs).numpy(), ks.T @ np.linalg.solve(K, y.numpy()), atol=1e-8)
+    np.testing.assert_allclose(gp.variance(xs)[:, 0].numpy(), variance, atol=1e-8)
+
+
 def test_robust_weight_is_altamirano_centred_on_the_prediction():
     x, y, _ = data()
     gp = learner(robust=2.0)

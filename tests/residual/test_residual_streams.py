@@ -35,6 +35,12 @@ def test_scores_by_hand():
     assert run.rms_ratio() == pytest.approx(0.5)
     assert run.median_ratio(2) == pytest.approx(0.5)
     assert float(run.coverage()) == pytest.approx(0.75)  # |error| is .5, 1, 1.5, 2
+    assert run.winsorised_ratio() == pytest.approx(0.5, rel=0.02)
+    glitch = torch.tensor([[1e3]], dtype=torch.float64)
+    many = torch.cat([y.repeat(25, 1), glitch])
+    missed = Prequential(torch.where(many > 100, 0.0, 0.5 * many), torch.ones_like(many), many, 0.0)
+    assert missed.rms_ratio() > 0.99
+    assert missed.winsorised_ratio(level=0.98) == pytest.approx(0.5, rel=0.1)
     expected = 0.5 * np.log(2 * np.pi) + 0.125 * float(y.square().mean())
     assert run.nll() == pytest.approx(expected)
 

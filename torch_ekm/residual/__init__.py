@@ -21,6 +21,7 @@ from .krls_t import KRLSTracker as KRLSTracker
 from .linear import RandomFeatureRLS as RandomFeatureRLS
 from .linear import RecursiveLeastSquares as RecursiveLeastSquares
 from .local_gps import LocalGPs as LocalGPs
+from .mixture import MixtureResidual as MixtureResidual
 from .prediction import Prediction as Prediction
 from .replay_mlp import ReplayMLP as ReplayMLP
 from .river_residual import RiverResidual as RiverResidual

@@ -10,7 +10,7 @@ from typing import Literal
 
 import torch
 from torch import nn
-from torch.distributions import Normal
+from torch.distributions import Distribution, Normal
 
 from ..exceptions import NonFiniteError, ParameterError, ShapeError
 from ..typing import Bool, Float, Int, Tensor
@@ -110,6 +110,13 @@ class ResidualLearner(nn.Module, ABC):
     @abstractmethod
     def predict(self, x: Float[Tensor, "*any in_features"], *, observation: bool = False) -> Normal:
         """N(E[g(x)], Var[g(x)]), or the law of y = g(x) + noise with ``observation=True``."""
+
+    def predictive(self, x: Float[Tensor, "*any in_features"]) -> Distribution:
+        """Law of y, for log densities: ``predict`` with noise, unless a learner knows a better one.
+
+        ``log_prob(y)`` has the shape of y. Learners of heavy-tailed noise override it.
+        """
+        return self.predict(x, observation=True)
 
     @abstractmethod
     def reset(self) -> None:

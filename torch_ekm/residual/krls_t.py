@@ -9,11 +9,12 @@ from torch.distributions import Normal
 
 from ..exceptions import ParameterError
 from ..typing import Tensor
-from .base import ResidualLearner, UpdateEvent, UpdateReport, check_count, check_positive
+from .base import UpdateEvent, UpdateReport, check_count, check_positive
+from .double_state import DoubleStateLearner
 from .kernels import Kernel, SquaredExponential
 
 
-class KRLSTracker(ResidualLearner):
+class KRLSTracker(DoubleStateLearner):
     """Posterior of f at the basis, ``N(mu, Sigma)``, forgotten back to the prior at every step::
 
         Sigma <- lam Sigma + (1 - lam) K,   mu <- sqrt(lam) mu
@@ -143,12 +144,3 @@ class KRLSTracker(ResidualLearner):
 
     def _cross(self, z: Tensor) -> Tensor:
         return self.kernel.vector(z, self.basis) * self.active
-
-    def _apply(self, fn, recurse=True):
-        """The state stays float64; a change of dtype is one of the interface only."""
-
-        def keep_double(t: Tensor) -> Tensor:
-            moved = fn(t)
-            return moved if t is self._like or not t.is_floating_point() else t.to(moved.device)
-
-        return super()._apply(keep_double, recurse)

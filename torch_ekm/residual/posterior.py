@@ -119,6 +119,26 @@ class SparsePosterior(nn.Module):
         for block in (self.covariance, self.precision, self.alpha, self.information):
             block.mul_(keep)
 
+    def diffuse(self, kernel: Kernel, s2: Float[Tensor, "*batch"], kept: Float[Tensor, "*batch"]) -> None:
+        """``f <- sqrt(kept) f + sqrt(1 - kept) f'``, f' from the prior; call :meth:`rebuild` then.
+
+        The posterior covariance S becomes ``kept S + (1 - kept) K`` (Van Vaerenbergh et al., IEEE TNNLS
+        23, 2012). With ``W = Omega/s2``, ``K = LL'`` and ``RR' = I + (1 - kept) L'WL`` the natural form
+        follows without the inverse of K::
+
+            W <- kept (W^-1 + (1 - kept) K)^-1 = kept (W - (1 - kept) G'G),   G = R^-1 L'W
+            h <- sqrt(kept) (h - (1 - kept) G' R^-1 L'h)
+        """
+        kept, s2 = kept[..., None, None], s2[..., None, None]
+        L = torch.linalg.cholesky_ex(self.gram(kernel))[0]
+        LW = L.mT @ (self.precision / s2)
+        eye = torch.eye(L.shape[-1], dtype=L.dtype, device=L.device)
+        R = torch.linalg.cholesky_ex(eye + (1.0 - kept) * (LW @ L))[0]
+        both = torch.cat([LW, L.mT @ self.information], dim=-1)
+        G, Lh = torch.linalg.solve_triangular(R, both, upper=False).tensor_split([L.shape[-1]], dim=-1)
+        self.precision.copy_(kept * (self.precision - (1.0 - kept) * s2 * (G.mT @ G)))
+        self.information.copy_(kept.sqrt() * (self.information - (1.0 - kept) * (G.mT @ Lh)))
+
     def gram(self, kernel: Kernel) -> Float[Tensor, "*batch slots slots"]:
         """K(X, X) with the nugget; the identity at free slots."""
         return basis_gram(kernel, self.basis, self.active, self.jitter)

@@ -11,7 +11,8 @@ from ..exceptions import ParameterError, ShapeError
 from ..typing import Float, Tensor
 from .action_linear import ActionLinearKernel
 from .adaptation import PrequentialAdaptation
-from .base import ResidualLearner, UpdateReport, check_count, check_positive
+from .base import UpdateReport, check_count, check_positive
+from .double_state import DoubleStateLearner
 from .kernels import Kernel, SquaredExponential, log_parameter
 from .monitor import ChangeDetector, NoiseCalibration
 from .posterior import SparsePosterior, compiled_absorb
@@ -19,7 +20,7 @@ from .prediction import Prediction
 from .running_scale import RunningScale
 
 
-class SparseOnlineGP(ResidualLearner):
+class SparseOnlineGP(DoubleStateLearner):
     """``g ~ GP(0, k)``, ``y = g(x) + noise``, on at most ``capacity`` basis points::
 
         mean(x) = alpha' k(X, x),   var(x) = k(x, x) + k(X, x)' C k(X, x)
@@ -50,6 +51,9 @@ class SparseOnlineGP(ResidualLearner):
             ``"novelty"`` best explained by the others, ``"oldest"``; ``"freeze"``: a full basis stays.
         forgetting: factor on all earlier information per sample, in (0, 1], back to the prior in the
             end. Applied when the caches are rebuilt.
+        diffusion: share of the prior variance that comes back per sample, in [0, 1): g itself wanders,
+            ``g <- sqrt(1 - d) g + sqrt(d) new``, the forgetting of KRLS-T. It bounds the certainty of
+            places visited often too, so it follows a change faster than ``forgetting`` does.
         robust: c of the weight ``1 / (1 + z2/c^2)`` of a sample with mean squared standardised
             innovation z2 (Altamirano et al., ICML 2024, centred on the prediction); None: weight 1.
         normalize: learn the units of inputs and outputs from the first ``normalize_for`` samples.
@@ -84,6 +88,7 @@ class SparseOnlineGP(ResidualLearner):
         projection: Literal["kl", "fitc"] = "kl",
         deletion: str = "kl",
         forgetting: float = 1.0,
+        diffusion: float = 0.0,
         robust: float | None = None,
         normalize: bool = False,
         normalize_for: int = 1000,
@@ -103,9 +108,12 @@ class SparseOnlineGP(ResidualLearner):
         super().__init__(in_features, out_features, dtype=dtype, device=device, **options)
         if not 0 < forgetting <= 1:
             raise ParameterError("forgetting", forgetting, "in (0, 1]")
+        if not 0 <= diffusion < 1:
+            raise ParameterError("diffusion", diffusion, "in [0, 1)")
         self.capacity = check_count("capacity", capacity)
         self.refresh_every = check_count("refresh_every", refresh_every)
-        self.forgetting, self.compile_step = float(forgetting), bool(compile_step)
+        self.forgetting, self.diffusion = float(forgetting), float(diffusion)
+        self.compile_step = bool(compile_step)
         factory: dict[str, Any] = {"dtype": torch.float64, "device": device}
         fleet = {"batch_shape": self.batch_shape, **factory}
         self.kernel = SquaredExponential(self.in_features, **fleet) if kernel is None else kernel.double()
@@ -282,6 +290,8 @@ class SparseOnlineGP(ResidualLearner):
             factor = (self.forgetting**self.pending)[..., None, None]
             posterior.precision.mul_(factor)
             posterior.information.mul_(factor)
+        if self.diffusion > 0.0:
+            posterior.diffuse(self.kernel, self._shared_noise(), (1.0 - self.diffusion) ** self.pending)
         self.pending.zero_()
         if self._normalizing:
             offset, ratio = self.input_scale.settle()
@@ -379,17 +389,6 @@ class SparseOnlineGP(ResidualLearner):
 
     def _cast(self, x: Tensor) -> Tensor:
         return torch.as_tensor(x, dtype=torch.float64, device=self.device)
-
-    def _apply(self, fn, recurse=True):
-        """Device moves take all along; a change of dtype is one of the interface only."""
-
-        def keep_double(t: Tensor) -> Tensor:
-            moved = fn(t)
-            if t is self._like or not t.is_floating_point():
-                return moved
-            return t.to(moved.device)
-
-        return super()._apply(keep_double, recurse)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Number of samples seen: the rhythm of rebuilds continues after a reload."""

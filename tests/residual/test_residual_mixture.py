@@ -1,0 +1,179 @@
+"""The mixture finds out what noise carries over, whom to trust, and how heavy the tails are."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch.distributions import StudentT
+
+from torch_ekm.exceptions import ParameterError
+from torch_ekm.experiments.prequential import run_prequential
+from torch_ekm.residual import MixtureResidual, RecursiveLeastSquares, SparseOnlineGP, ZeroResidual
+
+
+def noisy_pose(seed: int, n: int, pose: float, motion: float = 0.1):
+    """Increments of a pose measured with noise: ``y = g(x) + motion noise + e(t+1) - e(t)``."""
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn(n, 2, generator=generator, dtype=torch.float64)
+    e = pose * torch.randn(n + 1, 1, generator=generator, dtype=torch.float64)
+    q = motion * torch.randn(n, 1, generator=generator, dtype=torch.float64)
+    return x, 0.5 * x[:, :1] + q + e[1:] - e[:-1]
+
+
+def steady_kappa(pose: float, motion: float) -> float:
+    """Root of ``kappa/(1 + kappa^2) = pose^2/(2 pose^2 + motion^2)``: the MA(1) of such increments."""
+    rho = pose**2 / (2 * pose**2 + motion**2)
+    return (1 - math.sqrt(1 - 4 * rho**2)) / (2 * rho)
+
+
+def linear(**options):
+    return RecursiveLeastSquares(2, 1, noise_variance=0.1, **options)
+
+
+@pytest.mark.parametrize(("pose", "motion"), [(0.0, 0.3), (0.3, 0.3), (0.3, 0.1)])
+def test_carry_reaches_the_kalman_filters_error(pose, motion):
+    """The best error of one step is that of the moving average: ``sd(y - g) / sqrt(1 + kappa^2)``."""
+    x, y = noisy_pose(0, 1500, pose, motion)
+    mixture = MixtureResidual(linear())
+    run = run_prequential(mixture, x, y)
+    kappa = steady_kappa(pose, motion) if pose else 0.0
+    best = math.sqrt((2 * pose**2 + motion**2) / (1 + kappa**2))
+    assert float(run.error[500:].square().mean().sqrt()) < 1.05 * best
+    assert float(mixture.carry) == pytest.approx(kappa, abs=0.15)
+
+
+def test_carry_is_worth_it_and_costs_nothing_where_there_is_none():
+    for pose, limit in ((0.3, 0.85), (0.0, 1.02)):
+        x, y = noisy_pose(1, 1000, pose)
+        errors = [
+            run_prequential(learner, x, y).error[300:] for learner in (MixtureResidual(linear()), linear())
+        ]
+        ratio = float(errors[0].square().mean().sqrt() / errors[1].square().mean().sqrt())
+        assert ratio < limit
+
+
+def test_what_cannot_be_learned_costs_next_to_nothing():
+    """Pure heavy-tailed noise: a plain GP makes the model worse, the mixture steps back."""
+    generator = torch.Generator().manual_seed(2)
+    x = torch.randn(600, 3, generator=generator, dtype=torch.float64)
+    torch.manual_seed(2)
+    y = StudentT(2.5).sample((600, 1)).double()
+    ratios = []
+    for wrap in (MixtureResidual, lambda learner: learner):
+        learner = wrap(SparseOnlineGP(3, 1, capacity=40, noise_variance=0.1, diffusion=0.003))
+        ratios.append(run_prequential(learner, x, y).rms_ratio(100))
+    assert ratios[1] > 1.05
+    assert ratios[0] < 1.02
+
+
+def test_the_better_learner_of_two_is_found_per_output():
+    generator = torch.Generator().manual_seed(3)
+    x = torch.randn(500, 2, generator=generator, dtype=torch.float64)
+    noise = 0.05 * torch.randn(500, 2, generator=generator, dtype=torch.float64)
+    y = torch.cat([x[:, :1], torch.zeros(500, 1, dtype=torch.float64)], 1) + noise
+    learners = [RecursiveLeastSquares(2, 2), ZeroResidual(2, 2)]
+    mixture = MixtureResidual(learners, shares=(1.0,))
+    mixture.update(x, y)
+    assert float(mixture.weights[0, 0]) > 0.99
+    assert float((mixture(x[:50]) - y[:50]).square().mean().sqrt()) < 0.06
+
+
+def test_level_follows_an_offset():
+    """An offset that jumps: learners that forget nothing are helped by the level experts."""
+    generator = torch.Generator().manual_seed(4)
+    x = torch.randn(600, 2, generator=generator, dtype=torch.float64)
+    y = x[:, :1] + 0.05 * torch.randn(600, 1, generator=generator, dtype=torch.float64)
+    y[300:] += 0.5
+    plain, mixture = linear(bias=False), MixtureResidual(linear(bias=False))
+    errors = [
+        run_prequential(learner, x, y).error[330:].square().mean().sqrt() for learner in (plain, mixture)
+    ]
+    assert float(errors[1]) < 0.4 * float(errors[0])
+
+
+def test_predictive_law_is_better_than_normal_on_heavy_tails_and_no_worse_on_light_ones():
+    torch.manual_seed(5)
+    x = torch.randn(1500, 2, dtype=torch.float64)
+    for nu, gain in ((2.0, 0.2), (1e6, -0.03)):
+        y = 0.2 * StudentT(torch.tensor(nu, dtype=torch.float64)).sample((1500, 1))
+        mixture = MixtureResidual(ZeroResidual(2, 1))
+        run = run_prequential(mixture, x, y)
+        assert run.density is not None
+        heavy, normal = float(-run.density[300:].mean()), run.nll(300)
+        assert heavy < normal - gain
+        true = -StudentT(torch.tensor(nu, dtype=torch.float64), 0.0, 0.2).log_prob(y[300:]).mean()
+        assert heavy < float(true) + 0.06
+
+
+def test_intervals_cover():
+    torch.manual_seed(6)
+    x = torch.randn(1500, 2, dtype=torch.float64)
+    y = torch.cat([0.1 * torch.randn(1500, 1), 5.0 * torch.randn(1500, 1)], 1).double()
+    run = run_prequential(MixtureResidual(ZeroResidual(2, 2)), x, y)
+    assert float((run.coverage(200) - 0.9).abs().max()) < 0.03
+
+
+def test_new_sequence_carries_nothing_over():
+    x, y = noisy_pose(7, 300, 0.3)
+    mixture = MixtureResidual(linear(), levels=(0.0,))
+    mixture.update(x, y)
+    assert float(mixture.offset.abs()) > 0.01
+    mixture.new_sequence()
+    assert float(mixture.offset.abs()) == 0.0
+
+
+def test_a_fleet_is_so_many_single_mixtures():
+    x, y = noisy_pose(8, 120, 0.3)
+    x, y = torch.stack([x, x.flip(0), 2 * x], 1), torch.stack([y, y.flip(0), -y], 1)
+    generator = torch.Generator().manual_seed(0)
+    mask = torch.rand(120, 3, generator=generator) < 0.7
+
+    def make(**options):
+        gp = SparseOnlineGP(2, 1, capacity=10, robust=3.0, **options)
+        return MixtureResidual([gp, linear(**options)])
+
+    fleet = make(batch_shape=(3,))
+    fleet.update(x, y, mask)
+    for i in range(3):
+        single = make()
+        for t in range(120):
+            single.update(x[t, i], y[t, i], mask[t, i])
+        torch.testing.assert_close(single(x[:5, i]), fleet(x[:5])[:, i], atol=1e-10, rtol=0)
+        law, laws = single.predictive(x[:5, i]), fleet.predictive(x[:5])
+        torch.testing.assert_close(law.log_prob(y[:5, i]), laws.log_prob(y[:5])[:, i], atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "options", [{"shares": ()}, {"shares": (1.5,)}, {"carries": (2.0,)}, {"caps": (0.0,)}, {"memory": 0.0}]
+)
+def test_wrong_choices_are_named(options):
+    with pytest.raises(ParameterError, match=next(iter(options))):
+        MixtureResidual(linear(), **options)
+
+
+def test_learners_must_fit_together():
+    with pytest.raises(ParameterError, match="learners"):
+        MixtureResidual([])
+    with pytest.raises(ParameterError, match="same"):
+        MixtureResidual([ZeroResidual(2, 1), ZeroResidual(2, 2)])
+
+
+def test_at_first_a_learner_is_taken_at_its_word():
+    mixture, plain = MixtureResidual(linear()), linear()
+    x = torch.eye(2, dtype=torch.float64)
+    for learner in (mixture, plain):
+        learner.update(x, 0.5 * x[:, :1])
+    assert float(mixture.gain) > 0.75
+    assert float(mixture(x[0])) == pytest.approx(float(plain(x[0])), rel=0.3)
+
+
+def test_learners_are_trained_without_what_is_carried_over():
+    x, y = noisy_pose(9, 200, 0.3)
+    mixture, alone = MixtureResidual(linear()), linear()
+    for t in range(200):
+        offset = mixture.offset.clone()
+        mixture.update(x[t], y[t])
+        alone.update(x[t], y[t] - offset)
+    torch.testing.assert_close(mixture.members[0](x[:9]), alone(x[:9]), atol=1e-12, rtol=0)

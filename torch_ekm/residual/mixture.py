@@ -1,0 +1,269 @@
+"""Online Bayesian mixture around any learners: what to believe of them, and what noise carries over."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any, cast
+
+import torch
+from torch import nn
+from torch.distributions import Distribution, Normal
+
+from ..exceptions import ParameterError
+from ..typing import Float, Tensor
+from .base import ResidualLearner, UpdateReport
+from .tails import ScaleMixture
+
+_PRIOR = 0.8  # belief that a learner is to be taken at its word
+_FREEDOM = 10.0  # of the t law that judges the experts: an outlier must not decide alone
+_LEVEL_DECAY = 0.995
+_RATE = 0.01  # of the running variance
+
+
+class MixtureResidual(ResidualLearner):
+    """A weighted mean of experts e = (learner b, share h, carry kappa, level rho, cap c), per output::
+
+        mean_e = h m_b(x) - kappa w_e + l_e
+        i_e = y - mean_e,   w_e <- i_e / (1 + (i_e / c s)^2),   l_e <- .995 l_e + rho w_e
+        p_e ~ prior_e exp(sum_i memory^i log t_10(i_e(t-i) / s))
+
+    Differences of a noisy pose carry noise over: what one sample has too much, the next one lacks, so
+    innovations correlate by up to -1/2 and ``kappa`` (the pose's share of the noise: the moving average
+    of order one that a Kalman filter would use) takes it away. ``l`` follows a slowly wandering offset.
+    ``h`` below 1 trusts the model more than the learner, so an output on which nothing can be learned
+    costs next to nothing. Which of it holds is decided by predictive evidence alone (dynamic model
+    averaging, Raftery et al., Technometrics 52, 2010), for each output and model of a fleet. The
+    learners are trained on y without what is carried over.
+
+    It predicts the *next* sample: a constant carry is part of the mean until another sample comes.
+    Call :meth:`new_sequence` where one trajectory ends and another begins.
+
+    ``predict`` gives a Normal law whose variance is the running one; :meth:`predictive` a mixture of
+    Student t laws, which heavy tails need (see ScaleMixture).
+
+    Args:
+        learners: one or more of the same shapes; they belong to the mixture from now on.
+        shares, carries, levels, caps: values of h, kappa, rho and c to choose from.
+        memory: forgetting factor of the evidence.
+        on_invalid: see ResidualLearner.
+
+    Raises:
+        ParameterError: no learner, learners of different shapes, or an empty or impossible choice.
+    """
+
+    prior: Tensor
+    evidence: Tensor
+    innovation: Tensor
+    level: Tensor
+    gain: Tensor
+    offset: Tensor
+    inflation: Tensor
+    count: Tensor
+    _experts: Tensor
+    _owner: Tensor
+
+    def __init__(
+        self,
+        learners: ResidualLearner | Sequence[ResidualLearner],
+        *,
+        shares: Sequence[float] = (0.0, 0.5, 1.0),
+        carries: Sequence[float] = (-0.3, 0.0, 0.2, 0.4, 0.6, 0.8),
+        levels: Sequence[float] = (0.0, 0.03, 0.1),
+        caps: Sequence[float] = (3.0, 30.0),
+        memory: float = 0.99,
+        **options: Any,
+    ) -> None:
+        members = [learners] if isinstance(learners, ResidualLearner) else list(learners)
+        first = _same_shapes(members)
+        shape = {"batch_shape": tuple(first.batch_shape), "dtype": first.dtype, "device": first.device}
+        super().__init__(first.in_features, first.out_features, **{**shape, **options})
+        _check_choices(shares, carries, levels, caps, memory)
+        self.learners = nn.ModuleList(members)
+        self.memory = float(memory)
+        owner, *values = zip(
+            *itertools.product(range(len(members)), shares, carries, levels, caps), strict=True
+        )
+        factory = {"dtype": self.dtype, "device": self.device}
+        self.register_buffer("_experts", torch.tensor(values, **factory), persistent=False)
+        members_of = torch.nn.functional.one_hot(torch.tensor(owner), len(members))
+        self.register_buffer("_owner", members_of.to(self._like), persistent=False)
+        # the belief of `shares` is split over what is not a share of 1, if 1 is among them
+        plain = self._experts[0] == max(shares)
+        others = max(len(set(shares)) - 1, 1)
+        prior = torch.where(plain, _PRIOR, (1 - _PRIOR) / others).log()
+        self.register_buffer("prior", prior, persistent=False)
+        wide = (*self.batch_shape, self.out_features, len(owner))
+        for name in ("evidence", "innovation", "level"):
+            self.register_buffer(name, torch.zeros(wide, **factory))
+        # what a query needs of the weights: sum p h per learner, and sum p (l - kappa w)
+        self.register_buffer("gain", torch.zeros(*wide[:-1], len(members), **factory))
+        self.register_buffer("offset", torch.zeros(wide[:-1], **factory))
+        self.register_buffer("inflation", torch.ones(wide[:-1], **factory))
+        self.register_buffer("count", torch.zeros(self.batch_shape, **factory))
+        self.tails = ScaleMixture(
+            self.out_features, memory=self.memory, batch_shape=tuple(self.batch_shape), **factory
+        )
+        self._settle()
+
+    # -- predictions ----------------------------------------------------------------------------
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``sum_b gain_b m_b(x) + offset``."""
+        x = self._check_query(x)
+        means = torch.stack([learner(x).to(x.dtype) for learner in self.members], dim=-1)
+        return (self.gain * means).sum(-1) + self.offset
+
+    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+        """Moments of the mixture, or mean and running variance of y with ``observation=True``."""
+        x = self._check_query(x)
+        mean, deviation = self._standard(x)
+        deviation = deviation * self.inflation.sqrt()
+        if observation:
+            return Normal(mean, deviation, validate_args=False)
+        laws = [learner.predict(x) for learner in self.members]
+        means = torch.stack([law.mean for law in laws], dim=-1).to(x.dtype)
+        variances = torch.stack([law.variance for law in laws], dim=-1).to(x.dtype)
+        inside = self._experts[0].square() * (variances @ self._owner.mT)
+        between = (self._means(means) - mean.unsqueeze(-1)).square()
+        variance = (self._weights() * (inside + between)).sum(-1)
+        # y is measured: experts that disagree by more than y scatters do not know less of g than of y
+        return Normal(mean, torch.minimum(variance.sqrt(), deviation), validate_args=False)
+
+    def predictive(self, x: Tensor) -> Distribution:
+        """Mixture of Student t laws about the mean: what log densities should be taken of."""
+        mean, deviation = self._standard(self._check_query(x))
+        return self.tails.law(mean, deviation)
+
+    def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The learners' slopes, weighted; what is carried over does not depend on x."""
+        x = self._check_query(x)
+        pairs = [learner.linearize(x) for learner in self.members]
+        means = torch.stack([mean for mean, _ in pairs], dim=-1).to(x.dtype)
+        slopes = torch.stack([slope for _, slope in pairs], dim=-1).to(x.dtype)
+        return (self.gain * means).sum(-1) + self.offset, (self.gain.unsqueeze(-2) * slopes).sum(-1)
+
+    @property
+    def members(self) -> list[ResidualLearner]:
+        """The learners, in their order."""
+        return cast("list[ResidualLearner]", list(self.learners))
+
+    @property
+    def weights(self) -> Float[Tensor, "*batch out learners"]:
+        """Posterior probability of each learner, at whatever share."""
+        return self._weights() @ self._owner
+
+    @property
+    def carry(self) -> Float[Tensor, "*batch out"]:
+        """Expected kappa: which part of an innovation comes back with the opposite sign."""
+        return (self._weights() * self._experts[1]).sum(-1)
+
+    # -- learning -------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Everything back to the prior."""
+        for learner in self.members:
+            learner.reset()
+        for buffer in (self.evidence, self.innovation, self.level, self.count, self.n_refused):
+            buffer.zero_()
+        self.inflation.fill_(1.0)
+        self.tails.reset()
+        self._settle()
+
+    @torch.no_grad()
+    def new_sequence(self) -> None:
+        """The next sample does not follow on the last one: nothing is carried over."""
+        self.innovation.zero_()
+        self._settle()
+
+    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        laws = [learner.predict(x, observation=True) for learner in self.members]
+        means = torch.stack([law.mean for law in laws], dim=-1).to(x.dtype)
+        deviation = self._deviation(laws, x)
+        mean = (self.gain * means).sum(-1) + self.offset
+        scale = (deviation * self.tails.typical()).unsqueeze(-1)
+        target = y - self.offset
+
+        innovation = y.unsqueeze(-1) - self._means(means)
+        r = (innovation / scale).square()
+        evidence = self.memory * self.evidence - 0.5 * (_FREEDOM + 1.0) * torch.log1p(r / _FREEDOM)
+        evidence = evidence - evidence.amax(-1, keepdim=True)
+        innovation = innovation / (1.0 + r / self._experts[3].square())
+        level = _LEVEL_DECAY * self.level + self._experts[2] * innovation
+        z = (y - mean) / deviation
+        rate = (1.0 / (self.count + 2.0)).clamp_min(_RATE).unsqueeze(-1)
+        inflation = (self.inflation + rate * (z.square() - self.inflation)).clamp_min(1e-12)
+        news = {
+            "evidence": evidence, "innovation": innovation, "level": level, "inflation": inflation
+        }  # fmt: skip
+        for name, value in news.items():
+            buffer = self.get_buffer(name)
+            if mask is not None:
+                value = torch.where(_trailing(mask, value), value, buffer)
+            buffer.copy_(value)
+        surprise = (z.square() / self.inflation).mean(-1)
+        self.tails.observe(z, self.count, mask)
+        self.count += 1.0 if mask is None else mask.to(self.count.dtype)
+        reports = [learner.update(x, target, mask) for learner in self.members]
+        report = reports[0]
+        self._settle()
+        return UpdateReport(report.event, report.novelty, surprise, report.weight)
+
+    # -- pieces ---------------------------------------------------------------------------------
+
+    def _weights(self) -> Tensor:
+        return (self.prior + self.evidence).softmax(-1)
+
+    def _carried(self) -> Tensor:
+        return self.level - self._experts[1] * self.innovation
+
+    def _means(self, means: Float[Tensor, "*any out learners"]) -> Float[Tensor, "*any out experts"]:
+        return self._experts[0] * (means @ self._owner.mT) + self._carried()
+
+    def _settle(self) -> None:
+        """Gain and offset from the weights."""
+        p = self._weights()
+        self.gain.copy_((p * self._experts[0]) @ self._owner)
+        self.offset.copy_((p * self._carried()).sum(-1))
+
+    def _deviation(self, laws: list[Normal], x: Tensor) -> Tensor:
+        variances = torch.stack([law.variance for law in laws], dim=-1).to(x.dtype)
+        return (self.weights * variances).sum(-1).sqrt()
+
+    def _standard(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean, and the deviation by which innovations are standardised: the learners' own."""
+        laws = [learner.predict(x, observation=True) for learner in self.members]
+        means = torch.stack([law.mean for law in laws], dim=-1).to(x.dtype)
+        return (self.gain * means).sum(-1) + self.offset, self._deviation(laws, x)
+
+
+def _same_shapes(members: list[ResidualLearner]) -> ResidualLearner:
+    if not members:
+        raise ParameterError("learners", members, "at least one learner")
+    shapes = [(m.in_features, m.out_features, tuple(m.batch_shape)) for m in members]
+    if len(set(shapes)) > 1:
+        raise ParameterError("learners", shapes, "of the same (in_features, out_features, batch_shape)")
+    return members[0]
+
+
+def _check_choices(
+    shares: Sequence[float],
+    carries: Sequence[float],
+    levels: Sequence[float],
+    caps: Sequence[float],
+    memory: float,
+) -> None:
+    limits = {
+        "shares": (shares, 0.0, 1.0, "in [0, 1]"),
+        "carries": (carries, -1.0, 1.0, "in [-1, 1]"),
+        "levels": (levels, 0.0, 1.0, "in [0, 1]"),
+        "caps": (caps, 1e-3, 1e6, "positive"),
+        "memory": ((memory,), 1e-6, 1.0, "in (0, 1]"),
+    }
+    for name, (values, low, high, meaning) in limits.items():
+        if not values or not all(low <= value <= high for value in values):
+            raise ParameterError(name, values, f"one or more numbers {meaning}")
+
+
+def _trailing(mask: Tensor, like: Tensor) -> Tensor:
+    return mask[(..., *(None,) * (like.dim() - mask.dim()))]
