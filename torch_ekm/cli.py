@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from ._extras import require
 from .exceptions import EKMError, MissingExtraError
@@ -20,6 +20,9 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 from typer import Argument, Option
+
+if TYPE_CHECKING:
+    from .experiments.show import Show
 
 app = typer.Typer(
     help="Kinematic models of underactuated hands, corrected by online learners.",
@@ -187,6 +190,85 @@ def compare(
 
 
 @app.command()
+def record(
+    log: Annotated[Path, Argument(help="Folder of the log; one that is there goes on.")],
+    object: Annotated[str, Option(help="An object (see 'torch-ekm objects') or a path to a URDF.")] = "box",
+    hand: Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")] = "icub_right",
+    angles: Annotated[str, Option(help="Rotations [deg], separated by commas.")] = "10,20",
+    seeds: Annotated[str, Option(help="FIRST:END; each angle is turned once for each seed.")] = "0:3",
+    controller: Annotated[str, Option(help="KM, KM+I, E-KM or E-KM+I.")] = "KM",
+    severity: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
+    sensing: Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")] = True,
+    images: Annotated[bool, Option(help="Keep the camera's images too.")] = False,
+) -> None:
+    """Turn an object in the simulated hand and log all of it, one HDF5 file for each turn.
+
+    Interrupted or killed, it goes on where it stopped, and ends with the same files.
+    """
+    from .experiments.record import RecordConfig
+    from .experiments.record import record as run
+    from .experiments.setting import Setting
+
+    setting = Setting(hand=hand, severity=severity, sensing=sensing)
+    config = RecordConfig(setting, object, controller, _numbers("angles", angles), images)
+    chosen = parse_seeds(seeds)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("recording", total=len(chosen) * len(config.angles_deg))
+        made = run(config, chosen, log, on_trial=lambda _: progress.advance(task))
+    console.print(f"{len(made)} trials in {made.folder.resolve()}", soft_wrap=True)
+
+
+@app.command()
+def show(
+    what: Annotated[str, Argument(metavar="[HAND|LOG]", help="A hand, a URDF, or a log.")] = "icub_right",
+    object: Annotated[str | None, Option(help="An object for the hand to hold.")] = None,
+    seed: Annotated[int, Option(help="Which grasp of the object.")] = 0,
+    html: Annotated[Path | None, Option(help="Write a stand-alone page instead of serving.")] = None,
+    port: Annotated[int, Option(help="To serve at; the next free one if it is taken.")] = 8080,
+) -> None:
+    """Turn and zoom a hand, a grasp or a log in the browser.
+
+    A hand has a slider for each actuator, a grasp is simulated while its actuators are moved, a log is
+    played.
+    """
+    from .experiments.show import choose_show
+
+    _look(choose_show(what, object, seed), html, port)
+
+
+@app.command()
+def replay(
+    log: Annotated[Path, Argument(help="A log's folder, or the file of one trial.")],
+    trial: Annotated[int | None, Option(help="Which trial; the first one by default.")] = None,
+    estimates: Annotated[bool, Option(help="Show what was measured, not the truth.")] = False,
+    html: Annotated[Path | None, Option(help="Write a stand-alone page instead of serving.")] = None,
+    port: Annotated[int, Option(help="To serve at; the next free one if it is taken.")] = 8080,
+) -> None:
+    """List the trials of a log, and play one in the browser."""
+    from .experiments.show_log import LogShow
+    from .simulation import TrialEntry
+
+    shown = LogShow(log, trial, estimates)
+    if shown.log is not None:
+        table = RichTable(*TrialEntry._fields, title=str(log))
+        for entry in shown.log.index:
+            table.add_row(*map(str, entry))
+        console.print(table)
+    _look(shown, html, port)
+
+
+def _look(show: Show, html: Path | None, port: int) -> None:
+    """Write a page, or serve until Ctrl-C."""
+    from .experiments.show import save_page, serve
+
+    if html is not None:
+        console.print(f"Page:      {save_page(show, html).resolve()}", soft_wrap=True)
+        return
+    serve(show, port=port, on_ready=lambda address: console.print(f"Open {address} (Ctrl-C ends)"))
+
+
+@app.command()
 def notebooks(
     copy: Annotated[Path | None, Option(help="Copy them into this folder.")] = None,
     overwrite: Annotated[bool, Option(help="Also over files that are there.")] = False,
@@ -197,6 +279,15 @@ def notebooks(
     found = sorted(notebook_folder().glob("[0-9]*.ipynb"))
     for path in found if copy is None else copy_notebooks(copy, overwrite=overwrite):
         console.print(str(path), soft_wrap=True, highlight=False)
+
+
+def _numbers(name: str, text: str) -> tuple[float, ...]:
+    from .exceptions import ParameterError
+
+    try:
+        return tuple(float(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        raise ParameterError(name, text, "numbers separated by commas, e.g. 10,20") from None
 
 
 def _names(text: str) -> tuple[str, ...]:

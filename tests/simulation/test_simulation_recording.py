@@ -136,3 +136,16 @@ def test_any_flipped_byte_of_the_data_is_noticed(tmp_path):
             assert torch.equal(now.q, then.q)
             assert torch.equal(now.info["truth"]["q"], then.info["truth"]["q"])
     assert unnoticed < 0.9 * len(range(0, len(whole), 97))
+
+
+def test_the_last_reading_before_a_command_is_the_one_that_counts():
+    """What a controller acted on; what had happened stays noted."""
+    plant = RecordingPlant(FakePlant())
+    plant.observe()  # nothing is recorded before a reset
+    plant.reset(6)
+    plant.command(torch.ones(3))
+    plant.plant.state = plant.plant.state + 0.25  # another reading
+    seen = plant.observe()
+    kept = plant.recording.observations
+    assert [float(o.q[0]) for o in kept] == [6.0, 7.25]
+    assert kept[-1].info["events"] == seen.info["events"] == (Tug(at=1, force=(0.0, 0.0, 5.0)),)

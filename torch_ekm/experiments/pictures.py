@@ -39,13 +39,13 @@ class Scene:
 
 def make_scene(
     hand: HandDescription,
-    obj: ObjectDescription,
+    obj: ObjectDescription | None,
     q: Array,
-    position: Array,
-    rotation: Array,
+    position: Array | None,
+    rotation: Array | None,
     gravity: Array,
 ) -> Scene:
-    """Place the shapes of hand and object for each frame.
+    """Place the shapes of the hand, and of the object if there is one, for each frame.
 
     Args:
         q: ``(n_frames, n_q)`` [rad].
@@ -66,8 +66,9 @@ def make_scene(
             shapes.append((shape, colour))
             transforms.append(pose @ shape.transform)
     pose = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
-    pose[:, :3, :3], pose[:, :3, 3] = rotation, position
-    for shape in obj.shapes:
+    if obj is not None:
+        pose[:, :3, :3], pose[:, :3, 3] = rotation, position
+    for shape in obj.shapes if obj is not None else ():
         shapes.append((shape, _OBJECT))
         transforms.append(pose @ shape.transform)
     return Scene(shapes, np.stack(transforms, axis=1), gravity / np.linalg.norm(gravity))
@@ -182,38 +183,58 @@ def _draw_matplotlib(meshes: list[Any], scene: Scene, frames: list[int], path: P
 
 def save_animation(scene: Scene, path: Path, frame_seconds: float = 0.25) -> Path:
     """Write the frames as one stand-alone HTML page that can be turned and zoomed (viser)."""
-    viser = require("viser")
-    with contextlib.redirect_stdout(io.StringIO()):  # it announces an address that nobody shall open
-        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    server = start_server("127.0.0.1", 0)
     try:
         serializer = server.get_scene_serializer()
-        server.scene.set_up_direction(tuple(-scene.down))
-        nodes = []
-        for i, (shape, colour) in enumerate(scene.shapes):
-            mesh = shape_mesh(shape)
-            nodes.append(
-                server.scene.add_mesh_simple(
-                    f"/shape_{i}",
-                    np.asarray(mesh.vertices, dtype=np.float32),
-                    np.asarray(mesh.faces, dtype=np.uint32),
-                    color=tuple(int(255 * c) for c in colour),
-                    flat_shading=shape.kind == "box",
-                )
-            )
-        position, focus, up = _camera(scene.down, scene.transforms[:, :, :3, 3].reshape(-1, 3))
-        server.initial_camera.position = tuple(position)
-        server.initial_camera.look_at = tuple(focus)
-        server.initial_camera.up = tuple(up)
-        server.initial_camera.fov = 0.6  # [rad]
-        rotation = require("scipy.spatial.transform").Rotation
+        nodes = draw(server, scene)
         for frame in scene.transforms:
-            with server.atomic():
-                for node, T in zip(nodes, frame, strict=True):
-                    node.wxyz = rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
-                    node.position = T[:3, 3]
+            place(server, nodes, frame)
             serializer.insert_sleep(frame_seconds)
         path.write_text(serializer.as_html(), encoding="utf-8")
     finally:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
     return path
+
+
+def start_server(host: str, port: int) -> Any:
+    """A viser server that keeps quiet: what address is to be opened, if any, is the caller's to say.
+
+    Raises:
+        MissingExtraError: viser is not installed.
+    """
+    viser = require("viser")
+    with contextlib.redirect_stdout(io.StringIO()):
+        return viser.ViserServer(host=host, port=port, verbose=False)
+
+
+def draw(server: Any, scene: Scene) -> list[Any]:
+    """Add the scene to a viser server, seen from the thumb's side; returns a node for each shape."""
+    server.scene.set_up_direction(tuple(-scene.down))
+    nodes = []
+    for i, (shape, colour) in enumerate(scene.shapes):
+        mesh = shape_mesh(shape)
+        nodes.append(
+            server.scene.add_mesh_simple(
+                f"/shape_{i}",
+                np.asarray(mesh.vertices, dtype=np.float32),
+                np.asarray(mesh.faces, dtype=np.uint32),
+                color=tuple(int(255 * c) for c in colour),
+                flat_shading=shape.kind == "box",
+            )
+        )
+    position, focus, up = _camera(scene.down, scene.transforms[:, :, :3, 3].reshape(-1, 3))
+    server.initial_camera.position = tuple(position)
+    server.initial_camera.look_at = tuple(focus)
+    server.initial_camera.up = tuple(up)
+    server.initial_camera.fov = 0.6  # [rad]
+    return nodes
+
+
+def place(server: Any, nodes: list[Any], transforms: Array) -> None:
+    """Move the nodes to one frame of a scene, ``(n_shapes, 4, 4)``, all at once."""
+    rotation = require("scipy.spatial.transform").Rotation
+    with server.atomic():
+        for node, T in zip(nodes, transforms, strict=True):
+            node.wxyz = rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+            node.position = T[:3, 3]

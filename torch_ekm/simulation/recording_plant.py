@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
 
 from ..typing import Float, Tensor
@@ -33,8 +35,14 @@ class RecordingPlant:
         return observation
 
     def observe(self) -> Observation:
-        """Read the sensors; not recorded."""
-        return self.plant.observe()
+        """Read the sensors; recorded in the place of the last reading, since the hand has not moved."""
+        observation = self.plant.observe()
+        if self.recording.observations:
+            before = self.recording.observations[-1].info
+            kept = {name: before[name] for name in ("events",) if name in before}
+            observation = dataclasses.replace(observation, info={**observation.info, **kept})
+            self.recording.observations[-1] = observation
+        return observation
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Pass the command on."""

@@ -1,0 +1,75 @@
+"""Manipulations are logged whole, and alike whenever they are run."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+
+import pytest
+import torch
+
+from torch_ekm.exceptions import ParameterError, UnknownNameError
+from torch_ekm.experiments.bench import Bench
+from torch_ekm.experiments.record import RecordConfig, record
+from torch_ekm.experiments.setting import Setting
+from torch_ekm.sensing import MarkerTracker
+from torch_ekm.simulation import TrialLog
+
+pytest.importorskip("sapien")
+pytest.importorskip("h5py")
+
+LEARNS = RecordConfig(Setting(sensing=False), controller="E-KM", angles_deg=(3.0, 5.0))
+
+
+def digests(folder):
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
+
+
+def test_what_a_learner_did_is_the_same_after_an_interruption(tmp_path):
+    """Its second turn depends on its first, which is then run again though its file is there."""
+    log = record(LEARNS, (0, 1), tmp_path / "one")
+    assert log.trials == (0, 1, 2, 3)
+    seen = []
+    record(LEARNS, (0,), tmp_path / "two")
+    (tmp_path / "two" / "trial_000001.h5").unlink()
+    record(LEARNS, (0, 1), tmp_path / "two", seen.append)
+    assert seen == [0, 1, 2, 3]
+    assert digests(tmp_path / "one") == digests(tmp_path / "two")
+    fresh = dataclasses.replace(LEARNS, angles_deg=(5.0,))
+    alone = record(fresh, (0,), tmp_path / "three").read(0)
+    assert not torch.equal(alone.commands[0], log.read(1).commands[0])  # so the test above can fail
+
+
+def test_a_sensed_trial_can_be_computed_again_from_its_log(tmp_path):
+    """The pose from the image that was kept, corners from the same."""
+    config = RecordConfig(Setting(sensing=True), angles_deg=(3.0,), images=True)
+    log = record(config, (0,), tmp_path)
+    again = TrialLog.open(tmp_path).read(0)
+    assert again.about["outcome"]["reason"] == "reached"
+    assert again.about["outcome"]["steps"] == len(again.commands)
+    assert "seconds" not in again.about["outcome"]
+    assert log.configuration["parameters"]["moment_arm"] == config.setting.parameters().moment_arm
+    first = again.observations[0]
+    hall, image = first.info["raw"]["hall"], first.info["raw"]["image"]
+    assert hall.shape == (15,)
+    assert image.shape == (480, 640)
+    bench = Bench(config.setting, "box", "KM")
+    sensed = bench.plant.plant
+    tracker = MarkerTracker(sensed.camera.camera, *sensed.boards)
+    last = again.observations[-1]
+    track = tracker.track(last.info["raw"]["image"].numpy())
+    torch.testing.assert_close(track.position, last.position, atol=2e-4, rtol=0)
+    torch.testing.assert_close(
+        torch.from_numpy(track.markers[4]), last.info["raw"]["corners"][4], atol=1e-9, rtol=0
+    )
+    bench.close()
+
+
+def test_impossible_records_are_refused():
+    with pytest.raises(UnknownNameError, match=r"KM\+I"):
+        RecordConfig(controller="PID")
+    for angles in ((), (0.0,), (200.0,)):
+        with pytest.raises(ParameterError, match="angles"):
+            RecordConfig(angles_deg=angles)
+    with pytest.raises(ParameterError, match="camera"):
+        RecordConfig(Setting(sensing=False), images=True)
