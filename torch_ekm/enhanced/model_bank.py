@@ -11,13 +11,16 @@ import torch
 from torch import nn
 from torch.distributions import Normal, StudentT
 
-from ..exceptions import ParameterError
+from ..exceptions import NonFiniteError, ParameterError, ShapeError
 from ..residual import ResidualLearner, SparseOnlineGP, UpdateEvent, UpdateReport
 from ..typing import Float, Tensor
+from .episode_memory import EpisodeMemory
+from .signature_model import SignatureModel
 
 _LEAST = 3  # samples without which an episode says nothing
 _PRUNE = math.log(1e-4)  # hypotheses less probable than this are dropped for the rest of an episode
 _SCALE_RATE = 0.02
+_SAMPLES = 64  # remembered of an episode
 
 
 class ModelBank(ResidualLearner):
@@ -25,13 +28,19 @@ class ModelBank(ResidualLearner):
 
     ::
 
-        log p(m | y_1..t) = log p(m) + tau sum_i log p(y_i | x_i, y_1..i-1, m) + const
-        p(new) = nu / (nu + n_episodes),    p(m) = (1 - p(new)) / n_models
+        log p(m | z, y_1..t) = log p(m | z) + tau sum_i log p(y_i | x_i, y_1..i-1, m) + const
+        p(new) = nu / (nu + n_episodes),    p(m) = (1 - p(new)) / n_models         without a signature z
 
     An *episode* is one grasp: the hand knows that it grasps anew (:meth:`begin`), not what. Each
     hypothesis learns along during the first ``window`` samples, so its sum is the exact evidence of
     its model for the episode; the best one predicts. Then the best one goes on alone, and when the
     episode ends it replaces the model it began as, or becomes a new one.
+
+    Different objects may answer alike, and then residuals cannot tell them apart. With a *signature* z,
+    what the grasp feels like before the first motion (:class:`GraspSignature`), recognition begins with
+    ``p(m | z)`` of a mixture (:class:`SignatureModel`). The first grasps say little of how far apart objects
+    are; so the grasps of the past are remembered, and whenever an episode ends they are sorted anew in the
+    light of all of them. Models whose grasps changed are learned again from their samples.
 
     "New" starts from what is common: a learner of all objects whose information is multiplied by a
     weight. It predicts the same and is less sure of it: for a familiar object it loses to the model
@@ -51,6 +60,9 @@ class ModelBank(ResidualLearner):
         temperature: tau in (0, 1]; below 1 since the samples of one grasp are not independent.
         common_weights: shares of the common learner's information that a new model may start with.
         soften: multiplies a learner's information by a share in place; :func:`discount` by default.
+        signature_features: width of z; 0: grasps have no signature.
+        signatures: how signatures scatter; by default a :class:`SignatureModel` with its own figures.
+        remember: grasps that are remembered with their signatures and samples.
 
     Raises:
         ParameterError: a figure outside its range, or the factory's learners are a fleet.
@@ -62,6 +74,7 @@ class ModelBank(ResidualLearner):
     seen: Tensor
     leader: Tensor
     scale: Tensor
+    signed: Tensor
 
     def __init__(
         self,
@@ -73,14 +86,19 @@ class ModelBank(ResidualLearner):
         temperature: float = 0.5,
         common_weights: Sequence[float] = (0.1, 0.01, 0.0),
         soften: Callable[[ResidualLearner, float], None] | None = None,
+        signature_features: int = 0,
+        signatures: SignatureModel | None = None,
+        remember: int = 96,
     ) -> None:
         first = factory()
         if first.batch_shape:
             raise ParameterError("factory", tuple(first.batch_shape), "learners with batch_shape ()")
         super().__init__(first.in_features, first.out_features, dtype=first.dtype, device=first.device)
-        for name, value in (("models", models), ("window", window)):
+        for name, value in (("models", models), ("window", window), ("remember", remember)):
             if value < 1:
                 raise ParameterError(name, value, "at least 1")
+        if signature_features < 0:
+            raise ParameterError("signature_features", signature_features, "0 or more")
         if not 0 < temperature <= 1:
             raise ParameterError("temperature", temperature, "in (0, 1]")
         if not common_weights or not all(0 <= weight <= 1 for weight in common_weights):
@@ -101,7 +119,12 @@ class ModelBank(ResidualLearner):
         for name in ("seen", "leader"):
             self.register_buffer(name, torch.zeros((), dtype=torch.int64, device=device))
         self.register_buffer("scale", self._like.new_ones(self.out_features))
-        self._open()
+        self.signatures = SignatureModel() if signatures is None else signatures
+        self.memory: EpisodeMemory | None = None
+        if signature_features:
+            self.memory = EpisodeMemory(first, models, signature_features, remember, _SAMPLES)
+        self.register_buffer("signed", torch.zeros((), dtype=torch.bool, device=device))
+        self._open(None)
 
     # -- episodes -----------------------------------------------------------------------------------
 
@@ -117,47 +140,109 @@ class ModelBank(ResidualLearner):
         return torch.cat([p[: self.models], p[self.models :].sum(0, keepdim=True)])
 
     @torch.no_grad()
-    def begin(self) -> int | None:
+    def begin(self, signature: Float[Tensor, " d"] | None = None) -> int | None:
         """A new grasp: keep what the last episode learned, and ask anew which object this is.
+
+        Args:
+            signature: what the grasp feels like, for a bank with ``signature_features``.
 
         Returns:
             The model to which the last episode went; None if it was too short to tell.
+
+        Raises:
+            ParameterError, ShapeError, NonFiniteError: the signature is missing, not wanted, or cannot be
+                right; nothing was changed.
         """
+        self._check_signature(signature)
         kept = self._keep()
-        self._open()
+        self._open(signature)
         return kept
 
-    def _open(self) -> None:
+    @torch.no_grad()
+    def end(self) -> int | None:
+        """Keep what the last episode learned; the next one is yet to :meth:`begin`."""
+        kept = self._keep()
+        self._open(None)
+        return kept
+
+    def _check_signature(self, signature: Tensor | None) -> None:
+        if self.memory is None:
+            if signature is not None:
+                raise ParameterError("signature", "given", "None for a bank without signature_features")
+            return
+        width = self.memory.signature.shape[-1]
+        if signature is None:
+            raise ParameterError("signature", None, f"a tensor of shape ({width},) for this bank")
+        if signature.shape != (width,):
+            raise ShapeError("signature", f"({width},)", signature.shape)
+        if not bool(torch.isfinite(signature).all()):
+            raise NonFiniteError("signature", torch.nonzero(~torch.isfinite(signature))[:3].tolist())
+
+    def _open(self, signature: Tensor | None) -> None:
         new, known = self.models, self.episodes > 0
-        n = self.n_models
-        share = self.new_prior / (self.new_prior + float(self.episodes.sum()))
-        share = 1.0 if n == 0 else 0.0 if n == self.models else share
         self.log_prior.fill_(-math.inf)
-        if n:
-            self.log_prior[:new][known] = math.log((1 - share) / n)
-        if share:
-            self.log_prior[new:] = math.log(share / len(self.common_weights))
+        self.signed.fill_(signature is not None)
+        if self.memory is not None and signature is not None:
+            rows = self.memory.known
+            past, label = self.memory.signature[rows], self.memory.label[rows]
+            self.memory.open(signature)
+            p = self.signatures.log_posterior(signature.to(past), past, label, new)
+            self.log_prior[:new][known] = p[known]
+            free = p[~known].logsumexp(0) if not bool(known.all()) else p.new_tensor(-math.inf)
+            self.log_prior[new:] = free - math.log(len(self.common_weights))
+        else:
+            n = self.n_models
+            share = self.new_prior / (self.new_prior + float(self.episodes.sum()))
+            share = 1.0 if n == 0 else 0.0 if n == self.models else share
+            if n:
+                self.log_prior[:new][known] = math.log((1 - share) / n)
+            if share:
+                self.log_prior[new:] = math.log(share / len(self.common_weights))
         self.log_evidence.zero_()
         self.seen.zero_()
         for i in torch.nonzero(known).flatten().tolist():
             _copy(self.kept[i], self.trial[i])
         for i, weight in enumerate(self.common_weights, start=new):
-            if weight > 0:
-                _copy(self.common, self.trial[i])
-                self._soften(self._trial(i), weight)
-            else:
-                self._trial(i).reset()
+            self._begin_new(self._trial(i), weight)
         self.leader.copy_(self.log_prior.argmax())
 
+    def _begin_new(self, learner: ResidualLearner, weight: float) -> None:
+        if weight > 0:
+            _copy(self.common, learner)
+            self._soften(learner, weight)
+        else:
+            learner.reset()
+
     def _keep(self) -> int | None:
-        if self.seen < _LEAST:
+        if self.seen < _LEAST or (self.memory is not None and not self.signed):
             return None
         best = slot = int(self.leader)
         if best >= self.models:
             slot = int(torch.nonzero(self.episodes == 0)[0])  # "new" has no prior when none is free
         _copy(self.trial[best], self.kept[slot])
         self.episodes[slot] += 1
-        return slot
+        if self.memory is None:
+            return slot
+        evidence = self.log_evidence[: self.models].clone()
+        weights = math.log(len(self.common_weights))
+        evidence[self.episodes == 0] = self.log_evidence[self.models :].logsumexp(0) - weights
+        evidence[slot] = self.log_evidence[best]
+        row = self.memory.keep(slot, evidence)
+        self._sort_memory(self.memory)
+        return int(self.memory.label[row])
+
+    def _sort_memory(self, memory: EpisodeMemory) -> None:
+        """See all grasps in the light of the last one, and learn again what had been confused."""
+        rows = memory.known
+        before = memory.label[rows].clone()
+        after = self.signatures.sort(memory.signature[rows], before, self.models, memory.evidence[rows])
+        moved = after != before
+        memory.label[rows] = after
+        for slot in set(before[moved].tolist()) | set(after[moved].tolist()):
+            self.episodes[slot] += int((after == slot).sum() - (before == slot).sum())
+            learner = _learner(self.kept[slot])
+            self._begin_new(learner, min(self.common_weights))
+            memory.replay(slot, learner)
 
     # -- a learner like any other ---------------------------------------------------------------------
 
@@ -186,7 +271,9 @@ class ModelBank(ResidualLearner):
         self.episodes.zero_()
         self.scale.fill_(1.0)
         self.n_refused.zero_()
-        self._open()
+        if self.memory is not None:
+            self.memory.reset()
+        self._open(None)
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         if mask is not None and not bool(mask):
@@ -196,19 +283,27 @@ class ModelBank(ResidualLearner):
             )
         leader, choosing = int(self.leader), int(self.seen) < self.window
         reports: dict[int, UpdateReport] = {}
-        for i in self._candidates() if choosing else [leader]:
+        density = torch.zeros_like(self.log_evidence)
+        followed = self._candidates() if choosing else [leader]
+        for i in followed:
             hypothesis = self._trial(i)
             law = hypothesis.predict(x, observation=True)
             if choosing:
-                density = StudentT(4.0, law.mean, law.stddev * self.scale).log_prob(y).sum(-1)
-                self.log_evidence[i] += self.temperature * density.double()
+                density[i] = StudentT(4.0, law.mean, law.stddev * self.scale).log_prob(y).sum(-1)
             else:  # only of a model that was chosen: the errors of a wrong one say nothing of noise
                 z2 = ((y - law.mean) / law.stddev).square().clamp_max(25.0)  # one slip must not widen it
                 self.scale.copy_((self.scale.square().lerp(z2, _SCALE_RATE)).sqrt())
             reports[i] = hypothesis.update(x, y)
         self.common.update(x, y)
+        if self.memory is not None:
+            self.memory.note(x, y)
         self.seen += 1
         if choosing:
+            # those that are not followed keep their distance to the leader
+            gone = torch.ones_like(density, dtype=torch.bool)
+            gone[followed] = False
+            density[gone] = float(density[leader])
+            self.log_evidence += self.temperature * density
             self.leader.copy_((self.log_prior + self.log_evidence).argmax())
         return reports[leader]
 

@@ -11,7 +11,7 @@ import torch
 from torch.distributions import Normal
 
 from ..description import list_objects
-from ..enhanced import GraspEncoding, ModelBank
+from ..enhanced import GraspEncoding, GraspSignature, ModelBank
 from ..exceptions import ParameterError
 from ..residual import ResidualLearner, UpdateReport
 from ..typing import Tensor
@@ -23,6 +23,9 @@ from .setting import Setting, digest
 
 #: How the knowledge of several objects may be kept.
 MEMORIES = ("bank", "labelled", "one model", "fresh")
+#: The residuals of one grasp are far from independent, and they speak for whichever model has seen most:
+#: beside a signature they count for little.
+_TEMPERATURE = 0.1
 
 
 @dataclass(frozen=True)
@@ -38,12 +41,16 @@ class AdaptConfig:
     turns_each: int = 8
     models: int = 8
     """Largest number of models that the bank may keep."""
+    readings: int = 8
+    """Sensor readings at rest that make up a grasp's signature; 0: residuals alone tell objects apart."""
     bank: dict[str, float] = field(default_factory=dict)
     """Changes of :class:`ModelBank`'s figures."""
 
     def __post_init__(self) -> None:
         if not self.objects or self.turns_each < 1:
             raise ParameterError("objects", self.objects, "at least one object and one turn each")
+        if self.readings < 0:
+            raise ParameterError("readings", self.readings, "0 or more")
 
 
 class Memories(ResidualLearner):
@@ -63,9 +70,9 @@ class Memories(ResidualLearner):
         self.axis = torch.zeros(3, dtype=torch.float64)
         self.errors: dict[str, list[float]] = {}
 
-    def begin(self, label: str) -> int | None:
+    def begin(self, label: str, signature: Tensor | None = None) -> int | None:
         """A new grasp; returns where the bank put the last one."""
-        kept = self.bank.begin()
+        kept = self.bank.begin(signature)
         self.label = label
         self.labelled.setdefault(label, copy.deepcopy(self.empty))
         self.fresh.reset()
@@ -107,6 +114,7 @@ def adapt_session(config: AdaptConfig, seed: int) -> list[Record]:
     benches: dict[str, Bench] = {}
     memories: Memories | None = None
     encoding: GraspEncoding | None = None
+    signature: GraspSignature | None = None
     records: list[Record] = []
     for trial, index in enumerate(sequence.tolist()):
         item = config.objects[index]
@@ -118,23 +126,37 @@ def adapt_session(config: AdaptConfig, seed: int) -> list[Record]:
                 del benches[item]
                 continue
             encoding = bench.encoding
-            memories = Memories(_make_bank(config, encoding.n_features, bench.model.hand.n_a))
+            signature = _make_signature(config, bench) if config.readings else None
+            memories = Memories(_make_bank(config, encoding.n_features, bench.model.hand.n_a, signature))
             bench.adopt(memories, encoding)
-        slot = memories.begin(item)
-        if records:
-            records[-1]["model"] = slot
-        # the axis is known once the object is grasped, before the first motion
-        bench.on_grasp = lambda axis, memories=memories: memories.axis.copy_(axis)
+
+        def begin(
+            axis: Tensor,
+            item: str = item,
+            bench: Bench = bench,
+            memories: Memories = memories,
+            signature: GraspSignature | None = signature,
+        ) -> None:
+            """The object is grasped and at rest: feel it, and ask the bank what it is."""
+            felt = None if signature is None else _feel(bench, signature, config.readings)
+            slot = memories.begin(item, felt)
+            if records:
+                records[-1]["model"] = slot
+            memories.axis.copy_(axis)
+
+        bench.on_grasp = begin
         angles = TABLE_I.get(item, OTHER_ANGLES)
         angle = float(generator.uniform(0.4, 1.0) * max(angles))
         record = bench.trial(seed, trial, angle)
+        if not record["grasped"]:
+            continue
         record |= {"object": object_name(item), "kind": "turn", "model": None}
         record["posterior"] = memories.bank.posterior.tolist()
         record["n_models"] = memories.bank.n_models
         record["memory_errors_deg"] = {name: list(errors) for name, errors in memories.errors.items()}
         records.append(record)
     if memories is not None and records:
-        records[-1]["model"] = memories.begin("")
+        records[-1]["model"] = memories.bank.end()
         records[-1]["n_models"] = memories.bank.n_models
     for bench in benches.values():
         bench.close()
@@ -177,10 +199,32 @@ def judge_assignment(records: list[Record], learning_turns: int = 3) -> Assignme
     return Assignment(right, judged, len({model for _, model in placed}))
 
 
-def _make_bank(config: AdaptConfig, n_s: int, n_a: int) -> ModelBank:
+def _make_signature(config: AdaptConfig, bench: Bench) -> GraspSignature:
+    hand = bench.model.hand
+    thumb, *fingers = bench.hand.plan.pads  # the pads that the hand closes
+    blind: list[str] = []
+    if config.setting.sensing and hand.hall_sensors:
+        # what the sensed plant says of these joints was made with the shape of the labelled object
+        sensed = {sensor.joint for sensor in hand.hall_sensors}
+        movable = hand.joint_upper > hand.joint_lower
+        blind = [name for name, moves in zip(hand.joint_names, movable, strict=True) if moves]
+        blind = [name for name in blind if name not in sensed]
+    return GraspSignature(hand, thumb, fingers, from_encoders=blind)
+
+
+def _feel(bench: Bench, signature: GraspSignature, readings: int) -> Tensor:
+    """Mean signature of several readings at rest."""
+    seen = [bench.plant.observe() for _ in range(readings)]
+    return torch.stack([signature(o.q, o.a, o.fingertip_force) for o in seen]).mean(0)
+
+
+def _make_bank(config: AdaptConfig, n_s: int, n_a: int, signature: GraspSignature | None) -> ModelBank:
     setting = config.setting
 
     def factory() -> ResidualLearner:
         return make_learner(setting.learner, n_s, n_a, setting.capacity, **setting.learner_options)
 
-    return ModelBank(factory, config.models, **config.bank)  # type: ignore[arg-type]
+    options: dict[str, Any] = {}
+    if signature is not None:
+        options = {"temperature": _TEMPERATURE, "signature_features": signature.n_features}
+    return ModelBank(factory, config.models, **{**options, **config.bank})
