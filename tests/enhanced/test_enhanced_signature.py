@@ -1,4 +1,4 @@
-"""Grasps are sorted by what they feel like: the mixture against brute force, the bank, the features of a hand."""
+"""Grasps sorted by what they feel like: the mixture against brute force, the bank, a hand's features."""
 
 from __future__ import annotations
 

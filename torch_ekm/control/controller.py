@@ -50,6 +50,12 @@ class ControllerOptions:
     """At most this much of a grip force error is corrected in one step [N]."""
     grip_min: float = 0.8
     """Soft lower bound on every finger's normal force [N]."""
+    margin_min: float | None = None
+    """Soft lower bound on every contact's friction margin ``mu f_n - |f_t|``, as the model has it [N];
+    None: no such rows."""
+    uncertainty_weight: float = 0.0
+    """w_sig, weight of the learner's variance of the focused pose, per deg^2 (rotation) and per mm^2
+    (translation); 0: what the learner is unsure of costs nothing."""
     joint_margin: float = 0.5 * _DEGREE
     """Joints are kept this far from their stops."""
     fixed_actuators: tuple[str, ...] = ()
@@ -91,12 +97,16 @@ class LookAndMoveController:
     At each step it solves (section III.B of the E-KM paper, made feasible)::
 
         min_da  da^T W da + off-axis and grip-force errors, weighted + rho |sl|_1
+                + w_sig tr(M_c Sigma_g(s, da) M_c^T)                           (optional)
         s.t.    M_c E_p (f + g)(s, da) + sl = dx_d,    dx_d = e min(1, 1/|S^-1 e|)
                 a_min <= a + da <= a_max,  |da| <= da_max
                 q_min <= q + dq <= q_max,  f_n + (df_n/da) da >= f_min     (soft)
+                m + (dm/da) da >= m_min,  m = mu f_n - |f_t|               (soft, optional)
 
     With ``g`` the equality is nonlinear and is solved by a damped SQP on ``J_m + dg/da``:
     searching along the model's own direction instead turns the object off axis.
+    The variance is quadratic in da with an action-linear kernel, so the problem stays a convex QP;
+    for other learners it is the gradient with the positive semidefinite part of the curvature.
     Grip force is regulated on what the fingertips measure; only its *sensitivity* comes from the
     model, because a grip force computed from a wrong model drops the object.
 
@@ -145,6 +155,7 @@ class LookAndMoveController:
             NonFiniteError: an observation is NaN or infinite.
             ShapeError: an observation has the wrong size.
             SolverError: the QP solver failed (it cannot be infeasible: all rows have slack).
+            ParameterError: ``uncertainty_weight`` with a learner whose variance does not depend on da.
         """
         n_a, n_q = len(self._a_lower), state.q.shape[-1]
         _check("a", a, n_a)
@@ -171,6 +182,8 @@ class LookAndMoveController:
             # (f + g)(da + d) ~ value + J d  =  (value - J da) + J (da + d)
             offset = value - J @ da
             problem = self._problem(state, a, error, desired, lin, J, offset, fingertip_force)
+            if self.options.uncertainty_weight > 0 and self.enhanced is not None:
+                self._add_uncertainty(problem, self.enhanced, state, da)
             solution = solve_qp(problem, self.options.solver)
             best = torch.as_tensor(solution.u * _DEGREE, dtype=a.dtype)
             change = best - da
@@ -229,6 +242,10 @@ class LookAndMoveController:
             rows, want, low = self._grip(lin, force)
             least_squares.append((rows, want, np.full(len(want), opt.grip_weight)))
             soft.append((-rows, -low))
+        if opt.margin_min is not None:
+            # what a wrong model says is missing is not all asked for at once
+            low = np.minimum(opt.margin_min - _np(lin.margins), opt.grip_step)
+            soft.append((-_np(lin.margin_sensitivity) * _DEGREE, -low))
         q, J_q, c_q = _np(state.q), _np(J[:n_q]), _np(offset[:n_q])
         hand, moving = self.kinematic.hand, self._moving
         reach = np.abs(J_q).sum(1) * opt.actuator_step + 2 * opt.joint_margin
@@ -242,6 +259,18 @@ class LookAndMoveController:
         lower[self._fixed] = upper[self._fixed] = 0.0
         W = opt.effort_weight * np.eye(len(lower))
         return ControlProblem(W, lower, upper, (_np(E), _np(d)), least_squares, soft)
+
+    def _add_uncertainty(
+        self, problem: ControlProblem, enhanced: EnhancedModel, state: GraspState, da: Tensor
+    ) -> None:
+        """Add ``w_sig v(da)``, ``v = tr(M_c Sigma_g M_c^T)`` in deg^2 and mm^2, about the present da."""
+        translation = self.focus.matrix[:, :3].abs().sum(-1, keepdim=True) > 0
+        rows = self.focus.matrix / torch.where(translation, 1e-3, _DEGREE)
+        weight = torch.cat([rows.new_zeros(state.q.shape[-1]), rows.square().sum(0)])
+        v = enhanced.variance(state, da, self.options.uncertainty_weight * weight)
+        # v(da) + g.(u - da) + 1/2 (u - da)^T H (u - da), constants left out; u in degrees
+        problem.weight = problem.weight + 0.5 * _np(v.curvature) * _DEGREE**2
+        problem.linear = _np(v.gradient - v.curvature @ da) * _DEGREE
 
     def _grip(self, lin: Any, force: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rows ``(df_n/da) u``, the wanted change and the lowest allowed change of the normal forces [N].

@@ -19,7 +19,7 @@ class ControlProblem:
 
     ::
 
-        min_u,sl,t   u^T W u + sum_j w_j (A_j u - b_j)^2 + rho |sl|_1 + rho_t |t|_1
+        min_u,sl,t   u^T W u + c.u + sum_j w_j (A_j u - b_j)^2 + rho |sl|_1 + rho_t |t|_1
         s.t.         E u + sl = d            what must be reached, if it can be
                      C u - t <= h, t >= 0    what should hold, if it can
                      lower <= u <= upper     what always holds
@@ -39,6 +39,8 @@ class ControlProblem:
     """[(A, b, w)] with ``w`` the weight of each row."""
     soft_inequality: list[tuple[Array, Array]] = field(default_factory=list)
     """[(C, h)]"""
+    linear: Array | None = None
+    """c, ``(n_u,)``; None: zero."""
     slack_penalty: float = 1e3
     soft_penalty: float = 1e2
 
@@ -78,6 +80,8 @@ def build_qp(problem: ControlProblem):
     P = np.zeros((n, n))
     q = np.zeros(n)
     P[:n_u, :n_u] = 2 * problem.weight
+    if problem.linear is not None:
+        q[:n_u] += problem.linear
     for A, b, w in problem.least_squares:
         P[:n_u, :n_u] += 2 * A.T @ (w[:, None] * A)
         q[:n_u] -= 2 * A.T @ (w * b)

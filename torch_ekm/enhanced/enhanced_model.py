@@ -12,6 +12,7 @@ from torch.func import jacrev
 from ..exceptions import NonFiniteError, ShapeError
 from ..residual.base import ResidualLearner, UpdateReport
 from ..typing import Float, Tensor
+from .action_variance import Quadratic, action_variance
 
 
 @runtime_checkable
@@ -155,6 +156,23 @@ class EnhancedModel(nn.Module):
         nominal = self._gather(self.model(state, action))
         g = self.learner.predict(self.features(state, action))
         return torch.distributions.Normal(nominal + g.mean / self.output_scale, g.stddev / self.output_scale)
+
+    def variance(self, state: Any, action: Float[Tensor, " n_a"], weight: Float[Tensor, " n_s"]) -> Quadratic:
+        """``sum_j weight_j Var[ds_j]`` about one action, as a convex quadratic in the action.
+
+        Exact with an action-linear kernel; see :func:`~torch_ekm.enhanced.action_variance.action_variance`.
+        Outputs that are not learned are certain.
+
+        Args:
+            weight: of each entry of the increment, not negative, per squared unit of the entry.
+
+        Raises:
+            ParameterError: the learner's variance does not depend on the action.
+        """
+        scale, n_a = self.action_scale, action.shape[-1]
+        weight = self._gather(weight) / self.output_scale**2
+        v = action_variance(self.learner, self.features(state, action), n_a, weight)
+        return Quadratic(v.value, v.gradient * scale, v.curvature * scale**2)
 
     def _gather(self, increment: Tensor) -> Tensor:
         return increment if self.outputs is None else increment[..., self.outputs]

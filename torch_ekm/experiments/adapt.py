@@ -83,6 +83,11 @@ class Memories(ResidualLearner):
         """The bank's."""
         return self.bank(x)
 
+    @property
+    def working(self) -> ResidualLearner:
+        """The hypothesis of the bank that predicts."""
+        return self.bank.working
+
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """The bank's."""
         return self.bank.predict(x, observation=observation)
