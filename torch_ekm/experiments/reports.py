@@ -12,6 +12,7 @@ from .ablation import AblationConfig, ablation_tables
 from .adapt import MEMORIES, AdaptConfig, judge_assignment
 from .demo_report import REPORTED
 from .learning_tables import learning_table, prediction_curves, prediction_table
+from .memory_tables import memory_comparison
 from .metrics import bootstrap_mean
 from .plotting import (
     plot_bank,
@@ -140,7 +141,12 @@ def adapt_report(config: AdaptConfig, seeds: tuple[int, ...], results: Results, 
     if sessions and sessions[0]:
         save_figure(plot_bank(sessions[0]), _made(folder), "bank")
         figures.append(FigureFile("bank.svg", f"Where the bank put each turn, seed {seeds[0]}."))
-    tables = [targets_table(adapt_targets(sessions)), memories, _assignments(sessions, seeds)]
+    tables = [
+        targets_table(adapt_targets(sessions)),
+        memories,
+        memory_comparison(sessions),
+        _assignments(sessions, seeds),
+    ]
     lost = rate(r["lost"] for s in sessions for r in s)
     summary = (
         f"{len(config.objects)} objects in random order, {config.turns_each} turns each, without labels; "

@@ -1,0 +1,92 @@
+"""Object memory: what a grasp feels like without its label, and how memories are compared."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm.exceptions import ParameterError
+from torch_ekm.experiments.adapt import AdaptConfig, Memories, _make_signature, adapt_session
+from torch_ekm.experiments.bench import Bench
+from torch_ekm.experiments.learners import make_learner
+from torch_ekm.experiments.memory_tables import memory_comparison, recognition
+from torch_ekm.experiments.setting import Setting
+
+NAMES = ("none", "bank", "labelled", "one model", "fresh")
+
+
+def made_up_session(seed: int, share: dict[str, float], wrong: int = 0) -> list[dict[str, Any]]:
+    """Two objects, eight turns each; errors are the share of a common draw."""
+    draw = np.random.default_rng(seed)
+    records = []
+    for k in range(16):
+        base = draw.uniform(0.5, 1.5, 8)
+        errors = {name: (share.get(name, 1.0) * base).tolist() for name in NAMES}
+        model = k % 2 if k < 16 - wrong else 5
+        records.append({"object": "ab"[k % 2], "model": model, "memory_errors_deg": errors})
+    return records
+
+
+def test_comparison_is_paired() -> None:
+    sessions = [made_up_session(seed, {"bank": 0.5, "labelled": 0.8}) for seed in range(6)]
+    table = memory_comparison(sessions)
+    rows = {row[0]: row for row in table.rows}
+    assert rows["bank : labelled"][1].startswith("62")  # 62.5, and no interval: the draws are common
+    assert rows["bank : fresh"][1].startswith("50")
+    assert rows["one model : labelled"][1].startswith("125")
+    assert float(rows["bank : fresh"][2]) < 1e-4
+    assert all(len(row) == len(table.header) for row in table.rows)
+
+
+def test_share_of_recognised_turns() -> None:
+    sessions = [made_up_session(0, {}), made_up_session(1, {}, wrong=2)]
+    # five judged turns of each object in each sequence, two of them wrong
+    assert recognition(sessions).startswith("18 of 20 turns, 90")
+    assert "at most 3" in recognition(sessions)
+
+
+def test_bench_feels_the_width_of_what_it_holds() -> None:
+    """Through images and Hall counts, without the label; joints that no sensor reads come from encoders."""
+    setting = Setting(sensing=True)
+    seen = {}
+    for item in ("applier", "can"):
+        bench = Bench(setting, item, "KM")
+        assert bench.grasp(0, 0) is not None
+        signature = _make_signature(AdaptConfig(setting=setting), bench)
+        o = bench.plant.observe()
+        seen[item] = signature(o.q, o.a, o.fingertip_force)
+        # the estimate of a joint without a sensor was made with the label's shape: it has no say
+        blind = bench.model.hand.joint_names.index("thumb_0")
+        other = o.q.clone()
+        other[blind] += 0.2
+        torch.testing.assert_close(signature(other, o.a, o.fingertip_force), seen[item])
+        bench.close()
+    apart = 0.3e-3 * float(seen["can"][0] - seen["applier"][0])  # in units of 0.3 mm
+    assert 8e-3 < apart < 20e-3  # 14 mm, seen through wrong pulleys
+
+
+def test_memory_passes_its_signature_on_and_answers_for_its_leader() -> None:
+    config = AdaptConfig(objects=("box",), turns_each=1)
+    records = adapt_session(config, 0)
+    assert records[0]["model"] == 0
+    silent = adapt_session(dataclasses.replace(config, readings=0), 0)
+    assert silent[0]["steps"] > 0
+    with pytest.raises(ParameterError, match="readings"):
+        AdaptConfig(readings=-1)
+
+
+def test_memories_speak_with_the_bank() -> None:
+    from torch_ekm.enhanced import ModelBank
+
+    bank = ModelBank(lambda: make_learner("action-linear", 3, 2, 10), 2)
+    memories = Memories(bank)
+    memories.begin("box")
+    x, y = torch.ones(5, dtype=torch.float64), torch.ones(6, dtype=torch.float64)
+    memories.update(x, y)
+    assert memories.working is bank.working
+    assert torch.equal(memories(x), bank(x))
+    assert set(memories.errors) == set(NAMES)
