@@ -26,12 +26,12 @@ _DEGREE = np.pi / 180
 class ControllerOptions:
     """Every figure of the controller, in SI units (angles [rad])."""
 
-    focus_step: float = 1.5 * _DEGREE
+    focus_step: float = 3.0 * _DEGREE
     """Limiting function: at most this much of the focused error is asked for in one step."""
-    focus_gain: float = 0.6
+    focus_gain: float = 0.8
     """Share of a small focused error that one step asks for. A model that is right meets all of it,
     camera noise included; below 1 the loop averages the noise over some steps."""
-    actuator_step: float = 4 * _DEGREE
+    actuator_step: float = 8 * _DEGREE
     """|da| of one actuator in one step."""
     effort_weight: float = 1e-2
     """W = effort_weight I, per deg^2 of actuator motion."""

@@ -71,6 +71,10 @@ class Setting:
         """The plant's."""
         return severity(self.severity).replace(**self.plant)
 
+    def specimen(self, seed: int) -> Setting:
+        """The same with another specimen of the hand (signs and sizes of its constant errors)."""
+        return self.replace(plant={"hardware_seed": seed, **self.plant})
+
     def plant_config(self, controller: str) -> PlantConfig:
         """The position controller as ``controller`` uses it, and the grasp."""
         if controller not in CONTROLLERS:

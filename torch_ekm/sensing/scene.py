@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from .._extras import require
 from ..description import Shape
 from ..exceptions import ShapeError
 from .camera import PinholeCamera
@@ -156,18 +157,7 @@ class Scene:
 
 
 def _convex_hull(points: Array) -> Array:
-    """Andrew's monotone chain, counter-clockwise in a right-handed (u, v) plane."""
-    points = np.unique(points, axis=0)  # sorted by u, then v
-
-    def chain(ordered: Array) -> list[Array]:
-        hull: list[Array] = []
-        for p in ordered:
-            while len(hull) > 1:
-                a, b = hull[-1] - hull[-2], p - hull[-2]
-                if a[0] * b[1] - a[1] * b[0] > 0:
-                    break
-                hull.pop()
-            hull.append(p)
-        return hull[:-1]
-
-    return np.array(chain(points) + chain(points[::-1])) if len(points) > 2 else points
+    """Corners of the convex hull of points ``(n, 2)`` [px], counter-clockwise for u to the right, v up."""
+    # found in float32, good to 1e-4 px in a picture of 640 px; returned as they were
+    corners = require("cv2").convexHull(points.astype(np.float32), returnPoints=False)
+    return points[corners.ravel()]

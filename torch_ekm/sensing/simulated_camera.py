@@ -79,14 +79,15 @@ class SimulatedCamera:
         cv2 = require("cv2")
         quality, shape = self.quality, (self.camera.height, self.camera.width)
         drawn = np.full(shape, quality.background, dtype=np.uint8)
-        for body in sorted(scene.bodies, key=lambda b: -b.centres[:, 2].mean()):
-            outline = body.outline(self.camera)
+        # an outline is needed up to three times: for its body, and for each card that it may hide
+        bodies = [(body, body.outline(self.camera)) for body in scene.bodies]
+        for body, outline in sorted(bodies, key=lambda item: -item[0].centres[:, 2].mean()):
             if outline is not None:
                 fixed = np.rint(outline * 2**_SHIFT).astype(np.int32)
                 cv2.fillConvexPoly(drawn, fixed, body.shade, cv2.LINE_AA, _SHIFT)
         image = drawn.astype(np.float32)
         for card in sorted(scene.cards, key=lambda c: -c.pose[2, 3]):
-            self._draw_card(image, card, scene.bodies)
+            self._draw_card(image, card, bodies)
         image *= self._light
         if quality.blur > 0:
             image = cv2.GaussianBlur(image, (0, 0), quality.blur)
@@ -94,7 +95,9 @@ class SimulatedCamera:
             image += quality.noise * generator.standard_normal(shape, dtype=np.float32)
         return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
-    def _draw_card(self, image: NDArray, placed: PlacedCard, bodies: tuple[ConvexBody, ...]) -> None:
+    def _draw_card(
+        self, image: NDArray, placed: PlacedCard, bodies: list[tuple[ConvexBody, NDArray | None]]
+    ) -> None:
         cv2, s = require("cv2"), self.supersample
         outline = placed.outline
         if np.any(outline[:, 2] < 1e-3):
@@ -115,9 +118,8 @@ class SimulatedCamera:
         width, height = placed.card.size
         inside = (np.abs(X) <= width / 2) & (np.abs(Y) <= height / 2)
         visible = inside.astype(np.float32)
-        for body in bodies:
-            polygon = body.outline(self.camera) if placed.hidden_by(body) else None
-            if polygon is not None:
+        for body, polygon in bodies:
+            if polygon is not None and placed.hidden_by(body):
                 fine = (polygon - [u0, v0] + 0.5) * s - 0.5  # centres of pixels and of samples
                 cv2.fillConvexPoly(
                     visible, np.rint(fine * 2**_SHIFT).astype(np.int32), 0.0, cv2.LINE_8, _SHIFT
