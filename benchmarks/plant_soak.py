@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 
 import torch
@@ -50,28 +51,28 @@ def digests(folder: Path) -> dict[str, str]:
 
 def long_run(folder: Path, trials: int, sensing: bool) -> None:
     """Memory and speed."""
-    seeds = range(trials // len(ANGLES))
     sizes: dict[int, float] = {}
-    spent = 0.0
-    began = time.process_time()
-    for seed in seeds:
-        record(config(sensing), (seed,), folder)
-        done = (seed + 1) * len(ANGLES)
-        if done >= _WARM_UP and (len(sizes) == 0 or done - max(sizes) >= _WARM_UP):
-            spent += time.process_time() - began
-            sizes[done] = memory()
-            print(f"  {done} trials, {sizes[done]:.1f} MB", flush=True)
-            began = time.process_time()
-    spent += time.process_time() - began
-    sizes[len(seeds) * len(ANGLES)] = memory()
-    log = TrialLog.open(folder)
-    simulated = sum(entry.time for entry in log.index)
-    failed = sum(entry.status != "held" for entry in log.index)
+    spent, began = 0.0, time.process_time()
+    for seed in range(trials // len(ANGLES)):
+        log = record(config(sensing), (seed,), folder)
+        done = len(log)
+        at_end = seed == trials // len(ANGLES) - 1
+        if not at_end and (done < _WARM_UP or done - max(sizes, default=0) < _WARM_UP):
+            continue
+        spent += time.process_time() - began  # without the time of this report
+        sizes[done] = memory()
+        simulated = sum(entry.time for entry in log.index)
+        print(
+            f"  {done} trials, {sizes[done]:.1f} MB; {simulated:.0f} s simulated in {spent:.0f} s of CPU: "
+            f"{simulated / spent:.1f} times real time",
+            flush=True,
+        )
+        began = time.process_time()
+    ends = Counter(entry.reason for entry in TrialLog.open(folder).index)
     first, last = min(sizes), max(sizes)
     print(
-        f"{last} trials ({failed} of them lost or not grasped): memory grew from {sizes[first]:.1f} MB after "
-        f"{first} trials by {sizes[last] - sizes[first]:+.1f} MB; {simulated:.0f} s of simulated time in "
-        f"{spent:.0f} s of CPU time: {simulated / spent:.1f} times real time"
+        f"from trial {first} to {last} memory changed by {sizes[last] - sizes[first]:+.1f} MB, at most by "
+        f"{max(sizes.values()) - sizes[first]:+.1f} MB; the trials ended: {dict(ends)}"
     )
 
 

@@ -18,7 +18,9 @@ from torch_ekm.simulation import TrialLog
 pytest.importorskip("sapien")
 pytest.importorskip("h5py")
 
-LEARNS = RecordConfig(Setting(sensing=False), controller="E-KM", angles_deg=(3.0, 5.0))
+LEARNS = RecordConfig(
+    Setting(severity="none", plant={"moment_arm": 1.3}), controller="E-KM", angles_deg=(3.0, 5.0)
+)
 
 
 def digests(folder):
@@ -27,22 +29,22 @@ def digests(folder):
 
 def test_what_a_learner_did_is_the_same_after_an_interruption(tmp_path):
     """Its second turn depends on its first, which is then run again though its file is there."""
-    log = record(LEARNS, (0, 1), tmp_path / "one")
-    assert log.trials == (0, 1, 2, 3)
+    log = record(LEARNS, (1,), tmp_path / "one")
+    assert log.trials == (2, 3)
     seen = []
-    record(LEARNS, (0,), tmp_path / "two")
-    (tmp_path / "two" / "trial_000001.h5").unlink()
-    record(LEARNS, (0, 1), tmp_path / "two", seen.append)
-    assert seen == [0, 1, 2, 3]
+    record(LEARNS, (1,), tmp_path / "two")
+    (tmp_path / "two" / "trial_000003.h5").unlink()
+    record(LEARNS, (1,), tmp_path / "two", seen.append)
+    assert seen == [2, 3]
     assert digests(tmp_path / "one") == digests(tmp_path / "two")
     fresh = dataclasses.replace(LEARNS, angles_deg=(5.0,))
-    alone = record(fresh, (0,), tmp_path / "three").read(0)
-    assert not torch.equal(alone.commands[0], log.read(1).commands[0])  # so the test above can fail
+    alone = record(fresh, (1,), tmp_path / "three").read(1)
+    assert not torch.equal(alone.commands[0], log.read(3).commands[0])  # so the test above can fail
 
 
 def test_a_sensed_trial_can_be_computed_again_from_its_log(tmp_path):
     """The pose from the image that was kept, corners from the same."""
-    config = RecordConfig(Setting(sensing=True), angles_deg=(3.0,), images=True)
+    config = RecordConfig(Setting(severity="none", sensing=True), angles_deg=(3.0,), images=True)
     log = record(config, (0,), tmp_path)
     again = TrialLog.open(tmp_path).read(0)
     assert again.about["outcome"]["reason"] == "reached"
