@@ -8,7 +8,7 @@ import hashlib
 import pytest
 import torch
 
-from torch_ekm.exceptions import ParameterError, UnknownNameError
+from torch_ekm.exceptions import ParameterError, SolverError, UnknownNameError
 from torch_ekm.experiments.bench import Bench
 from torch_ekm.experiments.record import RecordConfig, record
 from torch_ekm.experiments.setting import Setting
@@ -65,6 +65,18 @@ def test_a_sensed_trial_can_be_computed_again_from_its_log(tmp_path):
         torch.from_numpy(track.markers[4]), last.info["raw"]["corners"][4], atol=1e-9, rtol=0
     )
     bench.close()
+
+
+def test_a_trial_that_fails_is_logged_with_what_happened_until_then(tmp_path, monkeypatch):
+    def fail(self, seed, trial, angle):
+        self.plant.reset(seed)
+        raise SolverError("qp", "infeasible")
+
+    monkeypatch.setattr(Bench, "trial", fail)
+    log = record(RecordConfig(Setting(), angles_deg=(3.0, 4.0)), (0,), tmp_path)
+    assert [entry.reason for entry in log.index] == ["SolverError"] * 2
+    assert len(log.read(1).observations) == 1
+    assert "infeasible" in log.read(1).about["outcome"]["message"]
 
 
 def test_impossible_records_are_refused():

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..exceptions import ParameterError, UnknownNameError
+from ..exceptions import EKMError, ParameterError, UnknownNameError
 from ..simulation import RecordingPlant, TrialLog
 from .bench import Bench
 from .setting import CONTROLLERS, Setting
@@ -94,8 +94,11 @@ def _bench(config: RecordConfig) -> Bench:
 
 
 def _turn(bench: Bench, log: TrialLog, seed: int, trial: int, angle: float) -> None:
-    outcome = bench.trial(seed, trial, angle)
-    outcome.pop("seconds", None)  # of the wall: equal runs are to give equal logs
     assert isinstance(bench.plant, RecordingPlant)
+    try:
+        outcome = bench.trial(seed, trial, angle)
+    except EKMError as error:  # kept, or the run would stop at this trial each time
+        outcome = {"reason": type(error).__name__, "message": str(error)}
+    outcome.pop("seconds", None)  # of the wall: equal runs are to give equal logs
     if trial not in log:
         log.write(trial, bench.plant.recording, outcome)
