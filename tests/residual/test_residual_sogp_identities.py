@@ -279,15 +279,23 @@ def test_diffusion_is_the_exact_gp_in_space_and_time(every):
     np.testing.assert_allclose(gp.variance(xs)[:, 0].numpy(), variance, atol=1e-8)
 
 
-def test_robust_weight_is_altamirano_centred_on_the_prediction():
+def test_robust_weight_scales_the_gain_beyond_c():
+    """One update by hand: the mean moves by ``w k/(s2 + v) i``, w = min(1, c^2/z2), v shrinks alike."""
     x, y, _ = data()
-    gp = learner(robust=2.0)
-    gp.update(x[:20], y[:20])
-    law = gp.predict(x[20], observation=True)
-    z2 = (((y[20] + 3.0) - law.mean) / law.stddev).square().mean()
-    report = gp.update(x[20], y[20] + 3.0)
-    torch.testing.assert_close(report.surprise, z2, rtol=1e-7, atol=0)
-    torch.testing.assert_close(report.weight, 1 / (1 + z2 / 4), rtol=1e-7, atol=0)
+    for shift, outlier in ((0.05, False), (3.0, True)):
+        gp = learner(robust=2.0)
+        gp.update(x[:20], y[:20])
+        law, latent = gp.predict(x[20], observation=True), gp.variance(x[20])
+        innovation = law.mean + shift - law.mean
+        z2 = (innovation / law.stddev).square().mean()
+        report = gp.update(x[20], law.mean + shift)
+        weight = min(1.0, float(4.0 / z2))
+        assert (weight < 1.0) == outlier
+        torch.testing.assert_close(report.surprise, z2, rtol=1e-7, atol=0)
+        torch.testing.assert_close(report.weight, torch.tensor(weight).double(), rtol=1e-7, atol=0)
+        gain = weight * latent / law.variance
+        torch.testing.assert_close(gp(x[20]), law.mean + gain * innovation, atol=1e-9, rtol=0)
+        torch.testing.assert_close(gp.variance(x[20]), latent * (1 - gain), atol=1e-9, rtol=0)
 
 
 @pytest.mark.parametrize("deletion", ["kl", "mean", "novelty", "oldest", "freeze"])

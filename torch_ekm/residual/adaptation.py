@@ -22,16 +22,20 @@ class PrequentialAdaptation(nn.Module):
     copy of the basis and k samples. The streaming variational bound needs as much and is a worse
     objective: it inflates the noise.
 
+    Steps shrink like ``1 / sqrt(1 + n/30)``, to a tenth at most: the state was projected with a kernel
+    that every later move makes a little wrong, so late moves must earn more than early ones; a system
+    that changes is still followed.
+
     With a robust learner (c given) the Gaussian density becomes a Student t with ``c^2`` degrees of
-    freedom, whose influence function is the robust weight.
+    freedom, whose influence is bounded like the robust update's.
 
     Args:
         posterior: the state to watch.
         kernel: whose parameters to change.
         log_noise: log noise variances ``(*batch_shape, out)``, changed too.
         window: k.
-        rate: Adam's step on the logarithms of the hyperparameters.
-        network_rate: Adam's step on parameters that are not logarithms (a deep kernel's weights).
+        rate: Adam's first step on the logarithms of the hyperparameters.
+        network_rate: Adam's first step on parameters that are not logarithms (a deep kernel's weights).
         steps: gradient steps per window.
     """
 
@@ -130,7 +134,7 @@ class PrequentialAdaptation(nn.Module):
         self.n_steps += on
         b1, b2 = 0.9, 0.99
         t = self.n_steps.clamp_min(1.0)
-        correction = (1 - b2**t).sqrt() / (1 - b1**t)
+        correction = (1 - b2**t).sqrt() / (1 - b1**t) * _shrink(t)
         for i, (p, name, gradient) in enumerate(zip(parameters, names, gradients, strict=True)):
             if gradient is None:
                 continue
@@ -146,6 +150,11 @@ class PrequentialAdaptation(nn.Module):
             p.sub_(step.where(good, 0.0))
             if logarithm:  # far beyond what normalised data can mean
                 p.clamp_(-14.0 if name == "log_noise" else -7.0, 7.0)
+
+
+def _shrink(n: Tensor) -> Tensor:
+    """Size of the n-th step relative to the first."""
+    return (1.0 + n / 30.0).rsqrt().clamp_min(0.1)
 
 
 def _trailing(value: Float[Tensor, "*batch"], like: Tensor) -> Tensor:

@@ -8,8 +8,8 @@ from torch import nn
 from ..typing import Bool, Float, Tensor
 
 _Z90_SQUARED = 1.6448536269514722**2
-_MEMORY = 8  # samples in the alarm's memory, replayed after a change
-_ALARM, _SURPRISING, _COOL = 0.6, 5.0, -2.0
+_RATE, _MEMORY = 1 / 8, 24  # of the alarm; samples kept, of which those since the change are replayed
+_ALARM, _SURPRISING, _ONSET, _COOL = 0.6, 5.0, 0.12, -2.0
 
 
 class NoiseCalibration(nn.Module):
@@ -58,14 +58,15 @@ class ChangeDetector(nn.Module):
 
         a += ([z2 > 5] - a)/8,   alarm: a > 0.6
 
-    A tenth of gross outliers never reaches it; an abrupt change does within about eight samples, which
-    are kept, so that the learner can start anew from them. After an alarm it waits before the next.
+    A tenth of gross outliers never reaches it; an abrupt change does within eight samples or some more.
+    The samples since ``a`` last lay below what a single surprise raises it to are the new system's: the
+    learner can start anew from them. After an alarm it waits before the next.
     """
 
     level: Tensor
     inputs: Tensor
     targets: Tensor
-    used: Tensor
+    levels: Tensor
 
     def __init__(
         self,
@@ -81,7 +82,7 @@ class ChangeDetector(nn.Module):
         # newest last; shifted rather than indexed, so that masks need no pointers
         self.register_buffer("inputs", torch.zeros(_MEMORY, *batch_shape, in_features, **factory))
         self.register_buffer("targets", torch.zeros(_MEMORY, *batch_shape, out_features, **factory))
-        self.register_buffer("used", torch.zeros(_MEMORY, *batch_shape, dtype=torch.bool, device=device))
+        self.register_buffer("levels", torch.zeros(_MEMORY, *batch_shape, **factory))
 
     def observe(
         self,
@@ -91,16 +92,20 @@ class ChangeDetector(nn.Module):
         mask: Tensor | None,
     ) -> Bool[Tensor, "*batch"]:
         """Take a sample in; tells which models face another system."""
-        surprising = surprise > _SURPRISING
-        step = (surprising.to(x.dtype) - self.level) / _MEMORY
+        step = _RATE * ((surprise > _SURPRISING).to(x.dtype) - self.level)
         self.level += step if mask is None else step * mask
-        for kept, new in ((self.inputs, x), (self.targets, y), (self.used, surprising)):
+        level = self.level if mask is None else self.level.where(mask > 0, torch.inf)  # inf: no sample
+        for kept, new in ((self.inputs, x), (self.targets, y), (self.levels, level)):
             kept.copy_(torch.cat([kept[1:], new.unsqueeze(0)]))
-        if mask is not None:
-            self.used[-1] &= mask > 0
         alarm = self.level > _ALARM
         self.level.masked_fill_(alarm, _COOL)
         return alarm
+
+    @property
+    def since_change(self) -> Bool[Tensor, memory * batch]:
+        """Which of the kept samples belong to the new system, at an alarm."""
+        later = (self.levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0)
+        return (later > 0) & self.levels.isfinite()
 
     def reset(self) -> None:
         """Nothing seen."""

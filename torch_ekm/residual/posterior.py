@@ -171,7 +171,8 @@ class SparsePosterior(nn.Module):
             novel:       Q += p p'/gamma,  p = e - 1_slot
 
         Csato & Opper 2002, eqs. 2.12-2.14 and the appendix; the projection's D is their
-        ``-1/(eta r)``. A robust weight w and FITC replace s2 by ``s2/w (+ gamma if projected)``.
+        ``-1/(eta r)``. A robust weight w and FITC replace s2 by ``(s2 + v)/w - v``
+        ``(+ gamma if projected)``.
 
         Returns:
             The report, the innovation and the latent variance before the update.
@@ -191,8 +192,9 @@ class SparsePosterior(nn.Module):
         if self.robust is None:
             weight = torch.ones_like(surprise)
         else:
-            weight = 1.0 / (1.0 + surprise / self.robust**2)
-            noise = s2 / weight
+            # the gain itself is weighted, v/(noise + v): where v is large, a larger s2 alone would not help
+            weight = (self.robust**2 / surprise).clamp_max(1.0)
+            noise = (s2 + v) / weight - v
         full = self.count == self.capacity
         novel = gamma > self.novelty_tolerance * prior
         if self.deletion == "freeze":

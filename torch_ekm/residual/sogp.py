@@ -54,16 +54,16 @@ class SparseOnlineGP(DoubleStateLearner):
         diffusion: share of the prior variance that comes back per sample, in [0, 1): g itself wanders,
             ``g <- sqrt(1 - d) g + sqrt(d) new``, the forgetting of KRLS-T. It bounds the certainty of
             places visited often too, so it follows a change faster than ``forgetting`` does.
-        robust: c of the weight ``1 / (1 + z2/c^2)`` of a sample with mean squared standardised
-            innovation z2 (Altamirano et al., ICML 2024, centred on the prediction); None: weight 1.
+        robust: c of the weight ``min(1, c^2/z2)`` on a sample's gain, z2 its mean squared standardised
+            innovation (after Altamirano et al., ICML 2024, centred on the prediction); None: weight 1.
         normalize: learn the units of inputs and outputs from the first ``normalize_for`` samples.
             Inputs are centred where the kernel is shift invariant; outputs are only scaled, so the
             prior mean stays 0.
         normalize_for: samples after which the units stand still.
         refresh_every: samples between two rebuilds of the caches.
         adapt: learn kernel and noise online, see PrequentialAdaptation; one step per rebuild.
-        adapt_rate: its step on the logarithms of the hyperparameters.
-        adapt_network_rate: its step on a deep kernel's weights.
+        adapt_rate: its first step on the logarithms of the hyperparameters.
+        adapt_network_rate: its first step on a deep kernel's weights.
         calibrate: make 90 % intervals hold 90 % of the samples of each output, see NoiseCalibration.
         detect_changes: start anew when most of the last samples were surprising, see ChangeDetector.
             Looks at the result of every update, so on a GPU it waits for it.
@@ -95,7 +95,7 @@ class SparseOnlineGP(DoubleStateLearner):
         refresh_every: int = 32,
         adapt: bool = False,
         adapt_rate: float = 0.03,
-        adapt_network_rate: float = 0.003,
+        adapt_network_rate: float = 0.015,
         calibrate: bool = False,
         detect_changes: bool = False,
         compile_step: bool = False,
@@ -335,7 +335,8 @@ class SparseOnlineGP(DoubleStateLearner):
             return
         self.posterior.forget(changed)
         self.pending.masked_fill_(changed, 0.0)
-        for x, y, used in zip(self.detector.inputs, self.detector.targets, self.detector.used, strict=True):
+        kept = (self.detector.inputs, self.detector.targets, self.detector.since_change)
+        for x, y, used in zip(*kept, strict=True):
             t = y / self.output_scale.scale if self.normalize_for else y
             on = (used & changed).to(x.dtype)
             self.posterior.absorb(self._units(x), t, self.kernel, self._shared_noise(), on, self._n_samples)
