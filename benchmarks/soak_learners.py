@@ -3,6 +3,9 @@
 A 100 Hz trajectory that stands still at times, so samples repeat exactly. Reports, over the whole run:
 whether all was finite, the smallest variance, the largest difference between the carried state and one
 rebuilt from the natural form, the condition of the basis, and the process' memory.
+
+``--deep``: the same of a deep kernel that adapts all the time, with its error in the first and last
+quarter against that of the plain SOGP with adaptation: features must not collapse.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ import time
 
 import torch
 
-from torch_ekm.residual import SparseOnlineGP, SquaredExponential
+from torch_ekm.residual import DeepKernelSOGP, SparseOnlineGP, SquaredExponential
 
 
 def trajectory(start: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -26,19 +29,24 @@ def trajectory(start: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:
     return x, torch.stack([torch.sin(2 * x[:, 0] + x[:, 1]), x[:, 2] * x[:, 3]], -1)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--samples", type=int, default=100_000)
-    parser.add_argument("--capacity", type=int, default=30)
-    parser.add_argument("--float32", action="store_true")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
+def make(options: argparse.Namespace, deep: bool) -> SparseOnlineGP:
+    """The learner under test."""
     dtype = torch.float32 if options.float32 else torch.float64
+    common = {"capacity": options.capacity, "dtype": dtype}
+    if options.deep:
+        kind = DeepKernelSOGP if deep else SparseOnlineGP
+        return kind(4, 2, noise_variance=0.1, adapt=True, **common)
     kernel = SquaredExponential(4, lengthscale=1.0)
-    gp = SparseOnlineGP(4, 2, capacity=options.capacity, kernel=kernel, noise_variance=1e-4, dtype=dtype)
+    return SparseOnlineGP(4, 2, kernel=kernel, noise_variance=1e-4, **common)
+
+
+def soak(gp: SparseOnlineGP, samples: int) -> None:
+    """Run and report; raises AssertionError as soon as a prediction is not finite."""
     drift, smallest, begin, block = 0.0, float("inf"), time.perf_counter(), 5_003
-    for start in range(0, options.samples, block):
-        x, y = (a.to(dtype) for a in trajectory(start, min(block, options.samples - start)))
+    errors = []
+    for start in range(0, samples, block):
+        x, y = (a.to(gp.dtype) for a in trajectory(start, min(block, samples - start)))
+        errors.append(float((gp(x) - y).square().mean().sqrt()))
         gp.update(x, y)
         rebuilt = copy.deepcopy(gp)
         rebuilt.refresh()
@@ -47,12 +55,28 @@ def main() -> None:
         drift = max(drift, float((gp(query) - rebuilt(query)).abs().max()))
         smallest = min(smallest, float(gp.variance(query).min()))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    quarter = max(len(errors) // 4, 1)
+    first, last = (sum(part) / quarter for part in (errors[:quarter], errors[-quarter:]))
     print(
-        f"{options.samples} samples, {dtype}, {options.capacity} points: finite, "
-        f"smallest variance {smallest:.2e}, "
-        f"largest drift {drift:.1e}, condition {float(gp.condition_number):.1e}, {memory:.0f} MB, "
-        f"{(time.perf_counter() - begin) / options.samples * 1e6:.0f} us per sample"
+        f"{type(gp).__name__}, {samples} samples, {gp.dtype}, {gp.capacity} points: finite, "
+        f"smallest variance {smallest:.2e}, largest drift {drift:.1e}, "
+        f"condition {float(gp.condition_number):.1e}, {memory:.0f} MB, "
+        f"{(time.perf_counter() - begin) / samples * 1e6:.0f} us per sample, rms of the next "
+        f"{block} samples {first:.4f} in the first quarter, {last:.4f} in the last",
+        flush=True,
     )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--samples", type=int, default=100_000)
+    parser.add_argument("--capacity", type=int, default=30)
+    parser.add_argument("--float32", action="store_true")
+    parser.add_argument("--deep", action="store_true")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    for deep in (True, False) if options.deep else (False,):
+        soak(make(options, deep), options.samples)
 
 
 if __name__ == "__main__":

@@ -102,7 +102,7 @@ class ChangeDetector(nn.Module):
         return alarm
 
     @property
-    def since_change(self) -> Bool[Tensor, memory * batch]:
+    def since_change(self) -> Bool[Tensor, "*memory_and_batch"]:
         """Which of the kept samples belong to the new system, at an alarm."""
         later = (self.levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0)
         return (later > 0) & self.levels.isfinite()
