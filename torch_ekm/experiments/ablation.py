@@ -27,6 +27,7 @@ from .tables import estimate, percent, text
 
 _DEG = math.pi / 180
 _BASE = "as it is"
+_ALL = ("KM", "KM+I", "E-KM")
 
 #: Troubles of the nominal plant, each alone in a plant that is otherwise exact.
 TROUBLES: dict[str, tuple[str, ...]] = {
@@ -71,7 +72,9 @@ class AblationConfig:
     object: str = "box"
     angles_deg: tuple[float, ...] = (9.0, 19.0, 29.0)
     warm_up: int = 3
-    groups: tuple[str, ...] = ("learner", "online learning", "model", "severity", "trouble")
+    groups: tuple[str, ...] = (
+        "learner", "online learning", "model", "controller", "severity", "trouble", "dead zone",
+    )  # fmt: skip
 
 
 def variants(config: AblationConfig) -> list[Variant]:
@@ -97,15 +100,27 @@ def variants(config: AblationConfig) -> list[Variant]:
         ("rigid actuators", {"actuator_compliance": False}),
     ):
         found.append(Variant("model", name, {"model": {**base.model, **option}}))
+    found.append(Variant("controller", _BASE))
+    for name, option, who in (
+        ("gain 1 near the goal", {"focus_gain": 1.0}, _ALL),
+        ("gain 0.6 near the goal", {"focus_gain": 0.6}, _ALL),
+        ("steps of 1.5 deg", {"focus_step": 1.5 * _DEG}, _ALL),
+        ("uncertainty in the cost", {"uncertainty_weight": 10.0}, ("E-KM",)),
+        ("rows for the friction margin", {"margin_min": 0.3}, ("KM", "E-KM")),
+    ):
+        found.append(Variant("controller", name, {"control": {**base.control, **option}}, who))
     found.append(Variant("severity", f"{base.severity}: {_BASE}"))
     for severity in ("none", "nominal", "worn", "hostile"):
         if severity != base.severity:
-            found.append(Variant("severity", severity, {"severity": severity}, ("KM", "KM+I", "E-KM")))
+            found.append(Variant("severity", severity, {"severity": severity}, _ALL))
     nominal = dataclasses.asdict(PlantParameters.nominal_mismatch())
     for name, fields in TROUBLES.items():
         plant = {key: nominal[key] for key in fields}
         changes = {"severity": "none", "plant": plant}
-        found.append(Variant("trouble", name, changes, ("KM", "KM+I", "E-KM")))
+        found.append(Variant("trouble", name, changes, _ALL))
+    for size in (0.0, 0.5, 0.9, 1.3, 1.7):
+        plant = {**base.plant, "dead_zone": size * _DEG}
+        found.append(Variant("dead zone", f"{size:g} deg", {"plant": plant}, _ALL))
     return [variant for variant in found if variant.group in config.groups]
 
 
