@@ -26,7 +26,8 @@ class LinearInFeatures(ResidualLearner):
     Args:
         n_phi: number of features f.
         noise_variance, weight_variance: s2 and v.
-        forgetting, robust, refresh_every: as in SparseOnlineGP.
+        forgetting, refresh_every: as in SparseOnlineGP.
+        robust: c of the weight ``1 / (1 + z2/c^2)`` on a sample's noise; None: weight 1.
         options: see ResidualLearner.
     """
 
