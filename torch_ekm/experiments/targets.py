@@ -65,9 +65,11 @@ def generalize_targets(records: list[Record], limit: int) -> list[Row]:
         rows.append(["Welch p over all objects", "below 1e-06", f"{p:.1g}", "yes" if p < 1e-6 else "no"])
 
     def share(what: str, aim: float, value: Value) -> None:
-        ours, theirs = pair("E-KM", "KM+I", value)
-        if len(ours) and theirs.mean() > 0:
-            rows.append(goal(f"{what} E-KM : KM+I", aim, 100 * bootstrap_ratio(ours, theirs).mean, " %"))
+        for name in ("E-KM", "E-KM+I"):
+            ours, theirs = pair(name, "KM+I", value)
+            if len(ours) and theirs.mean() > 0:
+                ratio = 100 * bootstrap_ratio(ours, theirs).mean
+                rows.append(goal(f"{what} {name} : KM+I", aim, ratio, " %"))
 
     share("static error", 100, static_error)
     share("motions to settle", 60, lambda r: settle_steps(r, limit=limit))
