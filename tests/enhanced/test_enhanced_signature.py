@@ -154,8 +154,8 @@ def session(bank: ModelBank, z: torch.Tensor, truth: torch.Tensor, signed: bool 
     return [*placed, bank.end()]
 
 
-def bank(**options: Any) -> ModelBank:
-    return ModelBank(learner, 6, signature_features=D, temperature=0.1, **options)
+def bank(models: int = 6, **options: Any) -> ModelBank:
+    return ModelBank(learner, models, signature_features=D, temperature=0.1, **options)
 
 
 def test_objects_that_answer_alike_are_told_apart_by_what_they_feel_like() -> None:
@@ -204,7 +204,7 @@ def test_confused_grasps_are_learned_again_where_they_belong() -> None:
 def test_full_memory_gives_up_the_oldest_of_the_most_frequent() -> None:
     z, _ = signatures(6, seed=4)
     order = torch.tensor([3, 0, 0, 0, 0, 0, 0, 0])
-    small = bank(remember=4)
+    small = bank(models=3, remember=4)
     centre = torch.stack([z[0], z[0] + 40.0])
     session(small, torch.stack([centre[int(k == 3)] for k in order]), order)
     assert small.memory is not None
@@ -245,6 +245,8 @@ def test_wrong_signatures_are_refused_and_nothing_changes() -> None:
         assert torch.equal(signed.state_dict()[name], value), name
     with pytest.raises(ParameterError, match="signature_features"):
         ModelBank(learner, 2).begin(torch.zeros(D))
+    with pytest.raises(ParameterError, match="remember"):
+        bank(remember=6)
     with pytest.raises(ParameterError, match="spread"):
         SignatureModel(spread=0.0)
 

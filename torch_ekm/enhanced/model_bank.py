@@ -94,9 +94,11 @@ class ModelBank(ResidualLearner):
         if first.batch_shape:
             raise ParameterError("factory", tuple(first.batch_shape), "learners with batch_shape ()")
         super().__init__(first.in_features, first.out_features, dtype=first.dtype, device=first.device)
-        for name, value in (("models", models), ("window", window), ("remember", remember)):
+        for name, value in (("models", models), ("window", window)):
             if value < 1:
                 raise ParameterError(name, value, "at least 1")
+        if remember <= models:  # else a model might lose the last grasp by which it is known
+            raise ParameterError("remember", remember, f"more than models = {models}")
         if signature_features < 0:
             raise ParameterError("signature_features", signature_features, "0 or more")
         if not 0 < temperature <= 1:
