@@ -16,6 +16,7 @@ from ..residual import (
     GPyTorchWindow,
     KRLSTracker,
     LocalGPs,
+    MixtureResidual,
     RandomFeatureRLS,
     RecursiveLeastSquares,
     ReplayMLP,
@@ -34,6 +35,13 @@ _FRESH: dict[str, Any] = {"noise_variance": _NOISE, "forgetting": 0.99, "robust"
 
 def _sogp(**options: Any) -> Factory:
     return lambda d, m: SparseOnlineGP(d, m, capacity=100, **{"noise_variance": _NOISE, **options})
+
+
+def _mixture(d: int, m: int) -> ResidualLearner:
+    """One that stands still and one that wanders: evidence decides."""
+    common: dict[str, Any] = {"capacity": 100, "noise_variance": _NOISE, "robust": 3.0, "adapt": True}
+    still, wandering = SparseOnlineGP(d, m, **common), SparseOnlineGP(d, m, diffusion=0.003, **common)
+    return MixtureResidual([still, wandering])
 
 
 def _deep(d: int, m: int) -> ResidualLearner:
@@ -56,6 +64,7 @@ CONTENDERS: dict[str, Factory] = {
     "SOGP adaptive": _sogp(forgetting=0.99, robust=3.0, adapt=True, calibrate=True),
     "SOGP detecting": _sogp(robust=3.0, adapt=True, calibrate=True, detect_changes=True),
     "SOGP deep": _deep,
+    "SOGP mixture": _mixture,
     "river forest": lambda d, m: RiverResidual(d, m),
     "GPyTorch window": lambda d, m: GPyTorchWindow(d, m, window=100, noise_variance=_NOISE),
     "GPyTorch SVGP": lambda d, m: GPyTorchSVGP(d, m, inducing=100, memory=500, minibatch=20),
