@@ -105,8 +105,8 @@ def variants(config: AblationConfig) -> list[Variant]:
         ("gain 1 near the goal", {"focus_gain": 1.0}, _ALL),
         ("gain 0.6 near the goal", {"focus_gain": 0.6}, _ALL),
         ("steps of 1.5 deg", {"focus_step": 1.5 * _DEG}, _ALL),
-        ("uncertainty in the cost", {"uncertainty_weight": 10.0}, ("E-KM",)),
-        ("rows for the friction margin", {"margin_min": 0.3}, ("KM", "E-KM")),
+        ("uncertainty in the cost", {"uncertainty_weight": 1.0}, ("E-KM",)),
+        ("no rows for the friction margin", {"margin_min": None}, _ALL),
     ):
         found.append(Variant("controller", name, {"control": {**base.control, **option}}, who))
     found.append(Variant("severity", f"{base.severity}: {_BASE}"))
