@@ -50,7 +50,7 @@ class ControllerOptions:
     """At most this much of a grip force error is corrected in one step [N]."""
     grip_min: float = 0.8
     """Soft lower bound on every finger's normal force [N]."""
-    margin_min: float | None = 1.0
+    margin_min: float | None = 0.5
     """Soft lower bound on every contact's friction margin ``mu f_n - |f_t|``, as the model has it [N];
     None: no such rows."""
     uncertainty_weight: float = 0.0
