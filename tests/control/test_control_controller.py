@@ -48,7 +48,7 @@ def test_zero_error_gives_almost_no_command(grasp) -> None:
     here = PoseTarget(state.position, state.rotation)
     decision = controller(grasp, ControllerOptions(grip_force=None)).decide(state, seen.a, here)
     assert decision.status is StopReason.RUNNING
-    assert float(decision.delta_a.abs().max()) < 1e-5  # [rad]; an encoder a hair outside its range comes back
+    assert float(decision.delta_a.abs().max()) < 1e-4  # [rad]; an encoder a hair outside its range comes back
 
 
 @pytest.mark.parametrize("enhanced", [False, True])
