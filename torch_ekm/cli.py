@@ -194,7 +194,7 @@ def record(
     log: Annotated[Path, Argument(help="Folder of the log; one that is there goes on.")],
     object: Annotated[str, Option(help="An object (see 'torch-ekm objects') or a path to a URDF.")] = "box",
     hand: Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")] = "icub_right",
-    angles: Annotated[str, Option(help="Rotations [deg], separated by commas.")] = "10,20",
+    angles: Annotated[str, Option(help="Rotations in degrees, separated by commas.")] = "10,20",
     seeds: Annotated[str, Option(help="FIRST:END; each angle is turned once for each seed.")] = "0:3",
     controller: Annotated[str, Option(help="KM, KM+I, E-KM or E-KM+I.")] = "KM",
     severity: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
