@@ -26,7 +26,7 @@ _DEGREE = np.pi / 180
 class ControllerOptions:
     """Every figure of the controller, in SI units (angles [rad])."""
 
-    focus_step: float = 3.0 * _DEGREE
+    focus_step: float = 1.5 * _DEGREE
     """Limiting function: at most this much of the focused error is asked for in one step."""
     focus_gain: float = 0.8
     """Share of a small focused error that one step asks for. A model that is right meets all of it,
@@ -50,7 +50,7 @@ class ControllerOptions:
     """At most this much of a grip force error is corrected in one step [N]."""
     grip_min: float = 0.8
     """Soft lower bound on every finger's normal force [N]."""
-    margin_min: float | None = 0.5
+    margin_min: float | None = None
     """Soft lower bound on every contact's friction margin ``mu f_n - |f_t|``, as the model has it [N];
     None: no such rows."""
     uncertainty_weight: float = 0.0

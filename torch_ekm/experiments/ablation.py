@@ -104,9 +104,9 @@ def variants(config: AblationConfig) -> list[Variant]:
     for name, option, who in (
         ("gain 1 near the goal", {"focus_gain": 1.0}, _ALL),
         ("gain 0.6 near the goal", {"focus_gain": 0.6}, _ALL),
-        ("steps of 1.5 deg", {"focus_step": 1.5 * _DEG}, _ALL),
+        ("steps of 3 deg", {"focus_step": 3 * _DEG}, _ALL),
         ("uncertainty in the cost", {"uncertainty_weight": 1.0}, ("E-KM",)),
-        ("no rows for the friction margin", {"margin_min": None}, _ALL),
+        ("rows for the friction margin", {"margin_min": 0.5}, _ALL),
     ):
         found.append(Variant("controller", name, {"control": {**base.control, **option}}, who))
     found.append(Variant("severity", f"{base.severity}: {_BASE}"))

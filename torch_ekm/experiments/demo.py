@@ -47,7 +47,7 @@ class DemoConfig:
     angles_deg: tuple[float, ...] = TABLE_I["box"]
     capacity: int = 60
     tolerance_deg: float = 0.25
-    max_steps: int = 40
+    max_steps: int = 60
 
     def __post_init__(self) -> None:
         load_hand(self.hand)

@@ -53,7 +53,7 @@ class Setting:
     sensing: bool = False
     """Poses from rendered camera images and joint angles from Hall counts, not truth plus noise."""
     tolerance_deg: float = 0.25
-    max_steps: int = 40
+    max_steps: int = 60
 
     def __post_init__(self) -> None:
         if self.hand not in list_hands() and not Path(self.hand).exists():
