@@ -101,7 +101,8 @@ def test_worker_with_threads_runs_one_job_at_a_time(dask_address: str, tmp_path:
 @pytest.mark.slow
 def test_ray_cluster(tmp_path: Path) -> None:
     ray = pytest.importorskip("ray")
-    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
+    # "local": its own cluster, whatever another one has left behind on this machine
+    ray.init("local", num_cpus=1, include_dashboard=False, log_to_driver=False)
     try:
         check_cluster("ray://auto", tmp_path)
         assert ray.is_initialized()  # who found it running leaves it running
