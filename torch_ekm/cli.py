@@ -22,6 +22,7 @@ from rich.table import Table as RichTable
 from typer import Argument, Option
 
 if TYPE_CHECKING:
+    from .experiments.report import Report
     from .experiments.show import Show
 
 app = typer.Typer(
@@ -90,15 +91,10 @@ def demo(
     if quick:
         chosen, angles = chosen[:2], angles[:2]
     config = DemoConfig(hand=hand, object=object, seeds=chosen, angles_deg=angles)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console) as progress:
+    with _progress() as progress:
         task = progress.add_task("manipulating", total=len(demo_jobs(config)))
         report = run_demo(config, out, jobs, on_done=lambda _: progress.advance(task))
-    for table in report.tables:
-        shown = RichTable(*table.header, title=table.caption)
-        for row in table.rows:
-            shown.add_row(*row)
-        console.print(shown)
+    _print_tables(report)
     console.print(report.summary)
     console.print(f"Report:    {(out / 'index.html').resolve()}", soft_wrap=True)
     for figure in report.figures:
@@ -134,15 +130,10 @@ def reproduce(
     setting = Setting(hand=hand, severity=severity, learner=learner, sensing=sensing)
     planned = plan(experiment, parse_seeds(seeds), setting=setting, objects=objects, quick=quick)
     folder = out if out is not None else Path(f"reproduce_{experiment}")
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console) as progress:
+    with _progress() as progress:
         task = progress.add_task(experiment, total=len(planned.jobs))
         report = run(planned, folder, jobs, lambda _: progress.advance(task), address)
-    for table in report.tables:
-        shown = RichTable(*table.header, title=table.caption)
-        for row in table.rows:
-            shown.add_row(*row)
-        console.print(shown)
+    _print_tables(report)
     console.print(report.summary)
     console.print(f"Report:    {(folder / 'index.html').resolve()}", soft_wrap=True)
 
@@ -167,8 +158,7 @@ def compare(
     """
     from .experiments.compare_report import compare_data
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console) as progress:
+    with _progress() as progress:
         task = progress.add_task("comparing", total=None)
         report = compare_data(
             data,
@@ -180,11 +170,7 @@ def compare(
             on_total=lambda total: progress.update(task, total=total),
             on_done=lambda _: progress.advance(task),
         )
-    for table in report.tables:
-        shown = RichTable(*table.header, title=table.caption, caption=table.note)
-        for row in table.rows:
-            shown.add_row(*row)
-        console.print(shown)
+    _print_tables(report, notes=True)
     console.print(report.summary)
     console.print(f"Report:    {(out / 'index.html').resolve()}", soft_wrap=True)
 
@@ -212,8 +198,7 @@ def record(
     setting = Setting(hand=hand, severity=severity, sensing=sensing)
     config = RecordConfig(setting, object, controller, _numbers("angles", angles), images)
     chosen = parse_seeds(seeds)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console) as progress:
+    with _progress() as progress:
         task = progress.add_task("recording", total=len(chosen) * len(config.angles_deg))
         made = run(config, chosen, log, on_trial=lambda _: progress.advance(task))
     console.print(f"{len(made)} trials in {made.folder.resolve()}", soft_wrap=True)
@@ -279,6 +264,20 @@ def notebooks(
     found = sorted(notebook_folder().glob("[0-9]*.ipynb"))
     for path in found if copy is None else copy_notebooks(copy, overwrite=overwrite):
         console.print(str(path), soft_wrap=True, highlight=False)
+
+
+def _progress() -> Progress:
+    """What, a bar, how many of how many, and for how long."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=console)
+
+
+def _print_tables(report: Report, notes: bool = False) -> None:
+    for table in report.tables:
+        shown = RichTable(*table.header, title=table.caption, caption=table.note if notes else None)
+        for row in table.rows:
+            shown.add_row(*row)
+        console.print(shown)
 
 
 def _numbers(name: str, text: str) -> tuple[float, ...]:

@@ -98,7 +98,7 @@ class LookAndMoveController:
 
         min_da  da^T W da + off-axis and grip-force errors, weighted + rho |sl|_1
                 + w_sig tr(M_c Sigma_g(s, da) M_c^T)                           (optional)
-        s.t.    M_c E_p (f + g)(s, da) + sl = dx_d,    dx_d = e min(1, 1/|S^-1 e|)
+        s.t.    M_c E_p (f + g)(s, da) + sl = dx_d,    dx_d = e min(gain, 1/|S^-1 e|)
                 a_min <= a + da <= a_max,  |da| <= da_max
                 q_min <= q + dq <= q_max,  f_n + (df_n/da) da >= f_min     (soft)
                 m + (dm/da) da >= m_min,  m = mu f_n - |f_t|               (soft, optional)

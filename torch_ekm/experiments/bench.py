@@ -38,6 +38,7 @@ class Bench:
         controller: one of ``CONTROLLERS``.
         learner: used instead of a fresh one of the setting's kind (e.g. one that knows other objects).
         encoding: what the learner sees of a state; by default made at the first grasp.
+        keep_images: with sensing, the camera's last image stays in ``info["raw"]["image"]``.
     """
 
     def __init__(
@@ -47,13 +48,17 @@ class Bench:
         controller: str,
         learner: ResidualLearner | None = None,
         encoding: GraspEncoding | None = None,
+        *,
+        keep_images: bool = False,
     ) -> None:
         torch.set_num_threads(1)  # small matrices: more threads only wait for each other
         self.setting, self.controller = setting, controller
         config = setting.plant_config(controller)
         self.hand = SimulatedHand(setting.hand, object, config, setting.parameters())
         self.disturbed = DisturbedPlant(self.hand)
-        self.plant: Plant = _sensed(self.disturbed, self.hand) if setting.sensing else self.disturbed
+        self.plant: Plant = self.disturbed
+        if setting.sensing:
+            self.plant = _sensed(self.disturbed, self.hand, keep_images)
         self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model_options())
         self.learner, self.encoding = learner, encoding
         self.enhanced: EnhancedModel | None = None
@@ -172,12 +177,12 @@ class Bench:
         self.enhanced = enhance(self.model, self.learner, self.encoding)
 
 
-def _sensed(plant: DisturbedPlant, simulated: SimulatedHand) -> Plant:
+def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, keep_images: bool) -> Plant:
     from ..sensing import HallSensors, SensedPlant, TouchAligned  # OpenCV is needed only here
 
     hand = simulated.hand
     hall = HallSensors(hand) if hand.hall_sensors else None
-    sensed = SensedPlant(plant, hand, simulated.object, hall=hall)
+    sensed = SensedPlant(plant, hand, simulated.object, hall=hall, keep_images=keep_images)
     return sensed if hall is None else TouchAligned(sensed, hand, simulated.object)
 
 

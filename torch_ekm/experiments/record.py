@@ -81,14 +81,7 @@ def record(
 
 
 def _bench(config: RecordConfig) -> Bench:
-    bench = Bench(config.setting, config.object, config.controller)
-    if config.images:
-        from ..sensing import SensedPlant  # OpenCV is needed only here
-
-        plant: Any = bench.plant
-        while not isinstance(plant, SensedPlant):
-            plant = plant.plant
-        plant.keep_images = True
+    bench = Bench(config.setting, config.object, config.controller, keep_images=config.images)
     bench.plant = RecordingPlant(bench.plant)
     return bench
 

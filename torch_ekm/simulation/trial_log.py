@@ -5,13 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import os
-import platform
 import re
 from collections.abc import Iterable, Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from .._versions import versions_of
 from ..exceptions import DescriptionError, ParameterError
 from .recording import Recording, plain, sync
 
@@ -145,7 +144,7 @@ class TrialLog:
             "configuration": self.configuration,
             "outcome": dict(outcome or {}),
             "trial": trial,
-            "versions": _versions(),
+            "versions": versions_of(_PACKAGES),
         }
         kept = Recording(recording.seed, recording.commands, recording.observations, plain(about))
         path = kept.save(self.path(trial))
@@ -211,14 +210,3 @@ def _compare(there: Mapping[str, Any], wanted: Mapping[str, Any], folder: Path) 
         if there.get(name) != wanted.get(name):
             valid = f"{there.get(name)!r} as in the log at {folder}, or another folder"
             raise ParameterError(f"configuration[{name!r}]", wanted.get(name), valid)
-
-
-def _versions() -> dict[str, str]:
-    """Python and the packages that decide a trial's figures."""
-    found = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
