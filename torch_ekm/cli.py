@@ -113,7 +113,7 @@ def reproduce(
     ] = None,
     hand: Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")] = "icub_right",
     severity: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
-    learner: Annotated[str, Option(help="action-linear, rbf, paper, deep, rls, rff, ...")] = "action-linear",
+    learner: Annotated[str, Option(help="rbf, action-linear, paper, deep, rls, rff, ...")] = "rbf",
     sensing: Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")] = True,
     address: Annotated[
         str | None, Option(help="A cluster instead of processes here: dask://HOST:PORT or ray://HOST:PORT.")

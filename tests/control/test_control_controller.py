@@ -22,6 +22,7 @@ from torch_ekm.residual import ActionLinearKernel, SparseOnlineGP, ZeroResidual
 from torch_ekm.simulation import SimulatedHand
 
 DEG = math.pi / 180
+STEP = ControllerOptions().focus_step
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +58,9 @@ def test_prediction_meets_the_limited_error(grasp, enhanced: bool) -> None:
     target = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG)
     decision = controller(grasp, enhanced=enhanced).decide(state, seen.a, target, seen.fingertip_force)
     turn = float(plant.rotation_axis @ decision.predicted[-3:])
-    assert float(decision.desired) == pytest.approx(1.5 * DEG)
+    assert float(decision.desired) == pytest.approx(STEP)
     # an untrained E-KM leaves what its damped iterations leave: 0.4^6
-    assert turn == pytest.approx(1.5 * DEG, rel=5e-3 if enhanced else 1e-5)
+    assert turn == pytest.approx(STEP, rel=5e-3 if enhanced else 1e-5)
     torch.testing.assert_close(decision.predicted, decision.nominal)
 
 
@@ -167,7 +168,7 @@ def test_uncertain_actions_are_avoided_at_little_cost(grasp, taught: EnhancedMod
     assert variances[2] < 0.6 * variances[0]
     for _, decision, _ in runs:  # what was asked for is still met
         turn = float(plant.rotation_axis @ decision.predicted[-3:])
-        assert turn == pytest.approx(1.5 * DEG, rel=5e-3)
+        assert turn == pytest.approx(STEP, rel=5e-3)
 
 
 def test_decision_is_the_best_of_all(grasp, taught: EnhancedModel) -> None:
@@ -230,7 +231,7 @@ def test_margin_rows_keep_away_from_the_friction_cone(grasp) -> None:
         state, seen.a, target, seen.fingertip_force
     )
     assert float(after(kept).min()) > bound - 1e-4
-    assert float(plant.rotation_axis @ kept.predicted[-3:]) == pytest.approx(1.5 * DEG, rel=1e-4)
+    assert float(plant.rotation_axis @ kept.predicted[-3:]) == pytest.approx(STEP, rel=1e-4)
     # far more than can be had: as much as one step may ask for, and the turn is still made
     much = ControllerOptions(margin_min=50.0)
     decision = controller(grasp, much).decide(state, seen.a, target, seen.fingertip_force)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
 from torch_ekm.experiments.bench import Bench
 from torch_ekm.experiments.setting import Setting
@@ -14,3 +15,17 @@ def test_object_is_turned_with_camera_and_hall_sensors() -> None:
     record = bench.trial(0, 0, 6.0)
     assert record["reason"] == "reached", record["message"]
     assert record["true_error_deg"] < 0.5  # truth is only looked at afterwards
+
+
+def test_a_stuck_hall_channel_keeps_its_first_reading() -> None:
+    pytest.importorskip("cv2")
+    bench = Bench(Setting(sensing=True, plant={"stuck_joints": ("index_3",)}), "box", "KM")
+    assert bench.grasp(0, 0) is not None
+    names = [sensor.joint for sensor in sorted(bench.hand.hand.hall_sensors, key=lambda s: s.channel)]
+    before = bench.plant.observe().info["raw"]["hall"]
+    index = bench.hand.hand.actuator_names.index("index_distal")
+    delta = torch.zeros(bench.hand.hand.n_a, dtype=torch.float64)
+    delta[index] = -0.5  # it straightens index_2 and index_3
+    after = bench.plant.command(delta).info["raw"]["hall"]
+    assert after[names.index("index_3")] == before[names.index("index_3")]
+    assert after[names.index("index_2")] != before[names.index("index_2")]

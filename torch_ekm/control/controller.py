@@ -26,7 +26,7 @@ _DEGREE = np.pi / 180
 class ControllerOptions:
     """Every figure of the controller, in SI units (angles [rad])."""
 
-    focus_step: float = 1.5 * _DEGREE
+    focus_step: float = 2.5 * _DEGREE
     """Limiting function: at most this much of the focused error is asked for in one step."""
     focus_gain: float = 0.8
     """Share of a small focused error that one step asks for. A model that is right meets all of it,

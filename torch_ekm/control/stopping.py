@@ -37,7 +37,7 @@ class StoppingRule:
     tolerance: float
     """[unit of the focused pose: rad for a rotation]"""
     settle_steps: int = 2
-    stall_window: int = 8
+    stall_window: int = 12
     stall_progress: float = 1e-3
     """[same unit]"""
     max_steps: int = 60

@@ -104,7 +104,8 @@ def variants(config: AblationConfig) -> list[Variant]:
     for name, option, who in (
         ("gain 1 near the goal", {"focus_gain": 1.0}, _ALL),
         ("gain 0.6 near the goal", {"focus_gain": 0.6}, _ALL),
-        ("steps of 3 deg", {"focus_step": 3 * _DEG}, _ALL),
+        ("steps of 1.5 deg", {"focus_step": 1.5 * _DEG}, _ALL),
+        ("steps of 4 deg", {"focus_step": 4 * _DEG}, _ALL),
         ("uncertainty in the cost", {"uncertainty_weight": 1.0}, ("E-KM",)),
         ("rows for the friction margin", {"margin_min": 0.5}, _ALL),
     ):

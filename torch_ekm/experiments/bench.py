@@ -58,7 +58,8 @@ class Bench:
         self.disturbed = DisturbedPlant(self.hand)
         self.plant: Plant = self.disturbed
         if setting.sensing:
-            self.plant = _sensed(self.disturbed, self.hand, keep_images)
+            stuck = setting.parameters().stuck_joints
+            self.plant = _sensed(self.disturbed, self.hand, stuck, keep_images)
         self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model_options())
         self.learner, self.encoding = learner, encoding
         self.enhanced: EnhancedModel | None = None
@@ -177,12 +178,16 @@ class Bench:
         self.enhanced = enhance(self.model, self.learner, self.encoding)
 
 
-def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, keep_images: bool) -> Plant:
-    from ..sensing import HallSensors, SensedPlant, TouchAligned  # OpenCV is needed only here
+def _sensed(
+    plant: DisturbedPlant, simulated: SimulatedHand, stuck: tuple[str, ...], keep_images: bool
+) -> Plant:
+    from ..sensing import HallSensors, SensedPlant, Stuck, TouchAligned  # OpenCV is needed only here
 
     hand = simulated.hand
     hall = HallSensors(hand) if hand.hall_sensors else None
     sensed = SensedPlant(plant, hand, simulated.object, hall=hall, keep_images=keep_images)
+    if hall is not None:  # after the calibration: a channel that was dead by then would not be believed
+        hall.stuck = [Stuck.FROZEN if joint in stuck else Stuck.NO for joint in hall.joints]
     return sensed if hall is None else TouchAligned(sensed, hand, simulated.object)
 
 

@@ -12,11 +12,11 @@ import torch
 
 from ..control import ControllerOptions, FocusedPose, LookAndMoveController, PoseTarget, StoppingRule
 from ..description import HandDescription, load_hand, load_object
-from ..enhanced import EnhancedModel, GraspEncoding
+from ..enhanced import EnhancedModel
 from ..exceptions import ParameterError, UnknownNameError
-from ..model import GraspState, KinematicModel, ModelOptions
-from ..residual import ActionLinearKernel, SparseOnlineGP, SquaredExponential
+from ..model import KinematicModel, ModelOptions
 from ..simulation import PlantConfig, PlantParameters, SimulatedHand
+from .learners import make_enhanced
 from .manipulation import Manipulation, run_manipulation, state_of
 
 #: Rotations of the paper's Table I [deg].
@@ -28,7 +28,7 @@ TABLE_I: dict[str, tuple[float, ...]] = {
     "applier": (3, 8, 13, 18, 23),
 }
 CONTROLLERS = ("KM", "E-KM")
-_MM, _DEG = 1e-3, math.pi / 180
+_DEG = math.pi / 180
 
 
 @dataclass(frozen=True)
@@ -63,38 +63,6 @@ def stopping_rule(config: DemoConfig) -> StoppingRule:
     return StoppingRule(
         tolerance=config.tolerance_deg * _DEG, stall_progress=0.1 * _DEG, max_steps=config.max_steps
     )
-
-
-def make_enhanced(model: KinematicModel, reference: GraspState, capacity: int) -> EnhancedModel:
-    """E-KM of the demo: a sparse online GP on the object's six rows.
-
-    The kernel is linear in the action, so ``g(s, 0) = 0`` and the controller's problem stays a QP.
-    Units: the action in 2 deg, the residual in mm and deg.
-    """
-    hand = model.hand
-    encode = GraspEncoding(reference, grasping_joints(hand, model, reference))
-    n_s, n_a = encode.n_features, hand.n_a
-    state_kernel = SquaredExponential(n_s, lengthscale=6.0)
-    kernel = ActionLinearKernel(n_s + n_a, n_a, state_kernel=state_kernel, action_variance=0.1)
-    learner = SparseOnlineGP(
-        n_s + n_a, 6, capacity=capacity, kernel=kernel, noise_variance=0.1, robust=3.0, forgetting=0.995
-    )
-    scale = torch.tensor([1 / _MM] * 3 + [1 / _DEG] * 3, dtype=torch.float64)
-    rows = list(range(hand.n_q, hand.n_q + 6))
-    return EnhancedModel(
-        model, learner, encode=encode, outputs=rows, action_scale=1 / (2 * _DEG), output_scale=scale
-    )
-
-
-def grasping_joints(hand: HandDescription, model: KinematicModel, state: GraspState) -> list[int]:
-    """Joints that can move a finger which touches the object."""
-    contacts = model.contacts(state)
-    upstream = model.kinematics.get_buffer("upstream")
-    moved = torch.zeros(hand.n_q, dtype=torch.bool)
-    for link in contacts.link:
-        moved |= upstream[model.link_names.index(link)]
-    free = torch.from_numpy(hand.joint_upper > hand.joint_lower)
-    return torch.nonzero(moved & free).flatten().tolist()
 
 
 def run_session(

@@ -23,7 +23,6 @@ from ..residual import (
     WindowGP,
     ZeroResidual,
 )
-from .demo import grasping_joints
 
 _MM, _DEG = 1e-3, math.pi / 180
 #: Outputs: translation [mm] and rotation [deg] of the object in the hand frame.
@@ -40,13 +39,20 @@ def _action_linear(n_s: int, n_a: int, capacity: int, **options: Any) -> Residua
 
 
 def _paper(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
-    """As in the paper: squared exponential over all inputs, nothing forgotten, every sample trusted."""
+    """As in the paper: squared exponential, one lengthscale; nothing forgotten, every sample trusted."""
     chosen = {"noise_variance": NOISE_VARIANCE, **options}
     return SparseOnlineGP(n_s + n_a, N_OUT, capacity=capacity, **chosen)
 
 
 def _rbf(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
-    return _paper(n_s, n_a, capacity, **{"robust": 3.0, "forgetting": 0.995, **options})
+    """Squared exponential, smooth over 15 mm, 15 deg of the state and 8 deg of an actuator.
+
+    It takes up the dead zone, which no kernel that is linear in the action can.
+    """
+    lengthscale = torch.tensor([15.0] * n_s + [4.0] * n_a, dtype=torch.float64)
+    kernel = SquaredExponential(n_s + n_a, lengthscale=lengthscale, variance=4.0)
+    chosen = {"noise_variance": NOISE_VARIANCE, "robust": 3.0, "forgetting": 0.995, **options}
+    return SparseOnlineGP(n_s + n_a, N_OUT, capacity=capacity, kernel=kernel, **chosen)
 
 
 def _deep(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
@@ -81,8 +87,8 @@ def _none(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
 
 #: Name -> ``factory(n_s, n_a, capacity, **options)``; n_s features of the state, n_a actuators.
 LEARNERS: dict[str, Callable[..., ResidualLearner]] = {
-    "action-linear": _action_linear,
     "rbf": _rbf,
+    "action-linear": _action_linear,
     "paper": _paper,
     "deep": _deep,
     "rls": _rls,
@@ -110,9 +116,20 @@ def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -
     return LEARNERS[name](n_s, n_a, capacity, **options)
 
 
+def grasping_joints(model: KinematicModel, state: GraspState) -> list[int]:
+    """Joints that can move a finger which touches the object."""
+    hand, contacts = model.hand, model.contacts(state)
+    upstream = model.kinematics.get_buffer("upstream")
+    moved = torch.zeros(hand.n_q, dtype=torch.bool)
+    for link in contacts.link:
+        moved |= upstream[model.link_names.index(link)]
+    free = torch.from_numpy(hand.joint_upper > hand.joint_lower)
+    return torch.nonzero(moved & free).flatten().tolist()
+
+
 def make_encoding(model: KinematicModel, reference: GraspState) -> GraspEncoding:
     """Inputs of a learner: the grasping fingers' joints and the object's pose, about ``reference``."""
-    return GraspEncoding(reference, grasping_joints(model.hand, model, reference))
+    return GraspEncoding(reference, grasping_joints(model, reference))
 
 
 def enhance(model: KinematicModel, learner: ResidualLearner, encoding: GraspEncoding) -> EnhancedModel:
@@ -122,3 +139,11 @@ def enhance(model: KinematicModel, learner: ResidualLearner, encoding: GraspEnco
     return EnhancedModel(
         model, learner, encode=encoding, outputs=rows, action_scale=1 / (2 * _DEG), output_scale=scale
     )
+
+
+def make_enhanced(
+    model: KinematicModel, reference: GraspState, capacity: int, learner: str = "rbf"
+) -> EnhancedModel:
+    """An E-KM that has learned nothing yet, with a learner of :data:`LEARNERS`."""
+    encoding = make_encoding(model, reference)
+    return enhance(model, make_learner(learner, encoding.n_features, model.hand.n_a, capacity), encoding)

@@ -47,7 +47,7 @@ class Setting:
     """Changes of :class:`ModelOptions`."""
     control: Mapping[str, Any] = field(default_factory=dict)
     """Changes of :class:`ControllerOptions`."""
-    learner: str = "action-linear"
+    learner: str = "rbf"
     learner_options: Mapping[str, Any] = field(default_factory=dict)
     capacity: int = 60
     sensing: bool = False

@@ -19,7 +19,8 @@ from ..control import (
 from ..model import GraspState, KinematicModel, ModelOptions
 from ..simulation import Change, DisturbedPlant, Observation, PlantConfig, PlantParameters, SimulatedHand
 from ..typing import Tensor
-from .demo import fixed_actuators, make_enhanced
+from .demo import fixed_actuators
+from .learners import make_enhanced
 from .manipulation import run_manipulation, state_of
 from .recordings import Recording
 

@@ -1,0 +1,52 @@
+"""Learners in the units of a grasp."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torch_ekm.exceptions import UnknownNameError
+from torch_ekm.experiments.learners import LEARNERS, N_OUT, make_learner
+
+N_S, N_A, ZONE = 4, 3, 0.65  # dead zone of 1.3 deg in units of 2 deg
+
+
+def motion_left(name: str) -> float:
+    """``|J a + g(s, a)| / |J a|`` for commands inside the dead zone, where nothing moves: best is 0."""
+    generator = torch.Generator().manual_seed(0)
+    J = torch.randn(N_OUT, N_A, generator=generator, dtype=torch.float64)
+    along = torch.tensor([1.0, 0.7, -0.6], dtype=torch.float64)  # the direction of a turn
+    state = torch.zeros(N_S, dtype=torch.float64)
+    learner = make_learner(name, N_S, N_A, 60)
+
+    def residual(action: torch.Tensor) -> torch.Tensor:
+        moved = action.sign() * (action.abs() - ZONE).clamp_min(0)
+        return J @ (moved - action)
+
+    for size in (3 * torch.rand(60, generator=generator, dtype=torch.float64)).tolist():
+        learner.update(torch.cat([state, size * along]), residual(size * along))
+    inside = [0.3 * along, 0.5 * along]
+    left = [J @ a + learner(torch.cat([state, a])) for a in inside]
+    return float(torch.stack(left).norm() / torch.stack([J @ a for a in inside]).norm())
+
+
+def test_default_learner_takes_up_a_dead_zone() -> None:
+    assert motion_left("rbf") < 0.35
+    assert motion_left("action-linear") > 0.5  # a mean that is linear in the action cannot
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_every_learner_predicts_and_learns(name: str) -> None:
+    learner = make_learner(name, N_S, N_A, 20)
+    x = torch.ones(N_S + N_A, dtype=torch.float64)
+    for _ in range(5):
+        learner.update(x, torch.ones(N_OUT, dtype=torch.float64))
+    mean = learner(x)
+    assert mean.shape == (N_OUT,)
+    if name != "none":
+        assert float(mean.mean()) > 0.05
+
+
+def test_unknown_learner_is_answered_with_the_known_ones() -> None:
+    with pytest.raises(UnknownNameError, match="rbf, action-linear"):
+        make_learner("oracle", N_S, N_A, 20)
