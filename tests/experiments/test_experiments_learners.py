@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import UnknownNameError
-from torch_ekm.experiments.learners import LEARNERS, N_OUT, make_learner
+from torch_ekm.experiments.learners import N_OUT, make_learner
 
 N_S, N_A, ZONE = 4, 3, 0.65  # dead zone of 1.3 deg in units of 2 deg
 
@@ -33,18 +33,6 @@ def motion_left(name: str) -> float:
 def test_default_learner_takes_up_a_dead_zone() -> None:
     assert motion_left("rbf") < 0.35
     assert motion_left("action-linear") > 0.5  # a mean that is linear in the action cannot
-
-
-@pytest.mark.parametrize("name", LEARNERS)
-def test_every_learner_predicts_and_learns(name: str) -> None:
-    learner = make_learner(name, N_S, N_A, 20)
-    x = torch.ones(N_S + N_A, dtype=torch.float64)
-    for _ in range(5):
-        learner.update(x, torch.ones(N_OUT, dtype=torch.float64))
-    mean = learner(x)
-    assert mean.shape == (N_OUT,)
-    if name != "none":
-        assert float(mean.mean()) > 0.05
 
 
 def test_unknown_learner_is_answered_with_the_known_ones() -> None:

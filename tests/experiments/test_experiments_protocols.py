@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
 import torch
 
-from torch_ekm.control import Decision, PoseTarget, StopReason
+from torch_ekm.control import ControllerOptions, Decision, PoseTarget, StopReason
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.ablation import TROUBLES, AblationConfig, ablation_jobs, variants
 from torch_ekm.experiments.adapt import AdaptConfig, adapt_session
@@ -57,9 +58,14 @@ def test_wrong_settings_say_what_would_be_right(changes: dict, error: type, matc
         Setting(**changes)
 
 
-def test_results_are_kept_under_all_that_decides_them() -> None:
+def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.MonkeyPatch) -> None:
     base = GeneralizeConfig()
     assert digest(base) == digest(GeneralizeConfig())
+    other = functools.partial(ControllerOptions, focus_gain=0.5)  # a version with another default
+    with monkeypatch.context() as patch:
+        patch.setattr("torch_ekm.experiments.setting.ControllerOptions", other)
+        changed = digest(base)
+    assert digest(base) != changed
     assert digest(base) != digest(dataclasses.replace(base, setting=Setting(capacity=59)))
     one, both = (
         generalize_jobs(dataclasses.replace(base, objects=o), (0,)) for o in (("box",), ("box", "can"))

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..control import ControllerOptions
 from ..exceptions import ParameterError, UnknownNameError
 from . import reports
 from .ablation import AblationConfig, ablation_jobs, ablation_session
@@ -133,13 +132,10 @@ def reproduce(
     results = run_jobs(experiment.session, jobs, folder / "runs", processes, on_done, address)
     report = experiment.build(results, folder)
     config = experiment.config
-    hand = config.setting.hand
     report.configuration = {
         "experiment": dataclasses.asdict(config),
         "seeds": list(experiment.seeds),
-        "plant": dataclasses.asdict(config.setting.parameters()),
-        "plant_config": dataclasses.asdict(config.setting.plant_config("KM")),
-        "controller": {**dataclasses.asdict(ControllerOptions()), **config.setting.control, "hand": hand},
+        **config.setting.figures(),
     }
     report.write(folder)
     return report

@@ -98,14 +98,30 @@ class Setting:
             tolerance=self.tolerance_deg * _DEG, stall_progress=0.1 * _DEG, max_steps=self.max_steps
         )
 
+    def figures(self) -> dict[str, Any]:
+        """All figures of plant, model, controller and stopping rule, defaults included."""
+        parts = {
+            "plant": self.parameters(),
+            "plant_config": self.plant_config("KM"),
+            "model": self.model_options(),
+            "controller": _changed(ControllerOptions(), "control", self.control),
+            "stopping_rule": self.stopping_rule(),
+        }
+        return {name: dataclasses.asdict(part) for name, part in parts.items()}
+
     def replace(self, **changes: Any) -> Setting:
         """A copy with some figures changed."""
         return dataclasses.replace(self, **changes)
 
 
 def digest(config: Any) -> str:
-    """Ten letters that change with any figure of a configuration: results are kept under them."""
-    text = json.dumps(dataclasses.asdict(config), sort_keys=True, default=str)
+    """Ten letters that change with any figure of an experiment: results are kept under them.
+
+    The defaults of the classes that its :class:`Setting` changes count, too: a version of the package
+    with other defaults does not take up the results of this one.
+    """
+    figures = [dataclasses.asdict(config), config.setting.figures()]
+    text = json.dumps(figures, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 
