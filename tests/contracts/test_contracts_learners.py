@@ -10,6 +10,7 @@ from torch_ekm.residual import (
     DeepKernel,
     DeepKernelSOGP,
     KRLSTracker,
+    LearnerFleet,
     LocalGPs,
     MixtureResidual,
     RandomFeatureRLS,
@@ -78,11 +79,34 @@ def test_contract_of_fleets(name, shape):
     check_residual_learner(lambda **o: LEARNERS[name](batch_shape=shape, **o), dtypes=(torch.float64,))
 
 
+SINGLE = {
+    "krls_t": (KRLSTracker, {"capacity": 8, "forgetting": 0.99}),
+    "local": (LocalGPs, {"experts": 3, "window": 6}),
+    "mlp": (ReplayMLP, {"hidden": (8,)}),
+    "ensemble": (ReplayMLP, {"hidden": (8,), "members": 3}),
+    "deep_sogp": (DeepKernelSOGP, {"capacity": 8, "hidden": (8,), "refresh_every": 4}),
+}
+
+
+@pytest.mark.parametrize("shape", [(1,), (5,), (2, 3)])
+@pytest.mark.parametrize("name", SINGLE)
+def test_contract_of_fleets_of_single_learners(name, shape):
+    kind, options = SINGLE[name]
+    check_residual_learner(
+        lambda **o: LearnerFleet(kind, 3, 2, batch_shape=shape, **options, **o), n_samples=12
+    )
+
+
 def test_contract_of_river():
     pytest.importorskip("river")
     from torch_ekm.residual import RiverResidual
 
     check_residual_learner(lambda **o: RiverResidual(3, 2, **o), differentiable=False)
+    check_residual_learner(
+        lambda **o: LearnerFleet(RiverResidual, 3, 2, batch_shape=(2,), **o),
+        differentiable=False,
+        n_samples=12,
+    )
 
 
 def test_contract_of_gpytorch():
@@ -90,6 +114,9 @@ def test_contract_of_gpytorch():
     from torch_ekm.residual import GPyTorchSVGP
 
     check_residual_learner(lambda **o: GPyTorchSVGP(3, 2, inducing=6, **o), vmap=False)
+    check_residual_learner(
+        lambda **o: LearnerFleet(GPyTorchSVGP, 3, 2, batch_shape=(2,), inducing=6, **o), n_samples=8
+    )
 
 
 def test_contract_of_gpytorch_window():

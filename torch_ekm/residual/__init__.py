@@ -8,6 +8,7 @@ from .base import UpdateEvent as UpdateEvent
 from .base import UpdateReport as UpdateReport
 from .deep_kernel import DeepKernel as DeepKernel
 from .deep_sogp import DeepKernelSOGP as DeepKernelSOGP
+from .fleet import LearnerFleet as LearnerFleet
 from .gpytorch_svgp import GPyTorchSVGP as GPyTorchSVGP
 from .gpytorch_window import GPyTorchWindow as GPyTorchWindow
 from .kernels import Kernel as Kernel

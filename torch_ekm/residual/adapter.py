@@ -16,7 +16,9 @@ class Adapter(ResidualLearner):
 
     def _single(self) -> None:
         if self.batch_shape:
-            raise ParameterError("batch_shape", tuple(self.batch_shape), "() for this learner")
+            raise ParameterError(
+                "batch_shape", tuple(self.batch_shape), "() for this learner; LearnerFleet holds several"
+            )
 
     def _report(self, surprise: Tensor, mask: Tensor | None) -> UpdateReport:
         event = UpdateEvent.ABSORBED if mask is None or bool(mask) else UpdateEvent.REFUSED

@@ -29,7 +29,7 @@ class KRLSTracker(DoubleStateLearner):
         noise_variance: s2.
         forgetting: lam in (0, 1].
         jitter: nugget relative to k**, also the tolerance below which a sample is not novel.
-        options: see ResidualLearner (``batch_shape`` must be ()).
+        options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
     basis: Tensor
@@ -52,7 +52,9 @@ class KRLSTracker(DoubleStateLearner):
     ) -> None:
         super().__init__(in_features, out_features, **options)
         if self.batch_shape:
-            raise ParameterError("batch_shape", tuple(self.batch_shape), "() for this learner")
+            raise ParameterError(
+                "batch_shape", tuple(self.batch_shape), "() for this learner; LearnerFleet holds several"
+            )
         if not 0 < forgetting <= 1:
             raise ParameterError("forgetting", forgetting, "in (0, 1]")
         self.capacity = check_count("capacity", capacity)

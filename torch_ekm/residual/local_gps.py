@@ -29,7 +29,7 @@ class LocalGPs(ResidualLearner):
         neighbours: experts averaged in a prediction.
         spread: correlation with the nearest centre below which an expert is opened.
         kernel, noise_variance: of all experts.
-        options: see ResidualLearner (``batch_shape`` must be ()).
+        options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
     centres: Tensor
@@ -54,7 +54,9 @@ class LocalGPs(ResidualLearner):
     ) -> None:
         super().__init__(in_features, out_features, **options)
         if self.batch_shape:
-            raise ParameterError("batch_shape", tuple(self.batch_shape), "() for this learner")
+            raise ParameterError(
+                "batch_shape", tuple(self.batch_shape), "() for this learner; LearnerFleet holds several"
+            )
         E, n = check_count("experts", experts), check_count("window", window)
         self.experts, self.window = E, n
         self.neighbours = min(check_count("neighbours", neighbours), E)

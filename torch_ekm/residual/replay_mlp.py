@@ -30,7 +30,7 @@ class ReplayMLP(ResidualLearner):
         minibatch, steps, rate: of Adam.
         prior_variance: of g before the first sample, and start of the running noise estimate.
         seed: of weights and minibatches.
-        options: see ResidualLearner (``batch_shape`` must be ()).
+        options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
     inputs: Tensor
@@ -55,7 +55,9 @@ class ReplayMLP(ResidualLearner):
     ) -> None:
         super().__init__(in_features, out_features, **options)
         if self.batch_shape:
-            raise ParameterError("batch_shape", tuple(self.batch_shape), "() for this learner")
+            raise ParameterError(
+                "batch_shape", tuple(self.batch_shape), "() for this learner; LearnerFleet holds several"
+            )
         self.members, self.memory = check_count("members", members), check_count("memory", memory)
         self.minibatch, self.steps = check_count("minibatch", minibatch), check_count("steps", steps)
         self.rate, self.seed = check_positive("rate", rate), int(seed)

@@ -1,0 +1,137 @@
+"""Any learner as a fleet: independent ones side by side, behind one contract."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from typing import Any, ClassVar, Literal
+
+import torch
+from torch import nn
+from torch.distributions import Distribution, Normal, constraints
+
+from ..typing import Float, Tensor
+from .base import ResidualLearner, UpdateReport
+
+
+class LearnerFleet(ResidualLearner):
+    """n independent learners of a kind that is one model by itself: ``g_k(x_k)``, k over ``batch_shape``.
+
+    Each does exactly what it would do alone, one after the other: n times the time of one. Learners that
+    take ``batch_shape`` themselves (``SparseOnlineGP`` among them) update all models in one call and
+    are much faster; this is for those that do not, such as ``KRLSTracker``, ``LocalGPs``, ``ReplayMLP`` and
+    the adapters of other libraries.
+
+    Args:
+        kind: ``kind(in_features, out_features, dtype=..., device=..., **options)`` gives one learner.
+        batch_shape: shape of the fleet.
+        options: of each learner; kernels and other modules among them are copied for each.
+
+    Raises:
+        ParameterError: from ``kind``, or a size is not a positive integer.
+    """
+
+    def __init__(
+        self,
+        kind: Callable[..., ResidualLearner],
+        in_features: int,
+        out_features: int,
+        *,
+        batch_shape: tuple[int, ...],
+        on_invalid: Literal["raise", "skip"] = "raise",
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+        **options: Any,
+    ) -> None:
+        factory: dict[str, Any] = {"dtype": dtype, "device": device}
+        super().__init__(in_features, out_features, batch_shape=batch_shape, on_invalid=on_invalid, **factory)
+        self.learners = nn.ModuleList(
+            kind(in_features, out_features, **copy.deepcopy(options), **factory)
+            for _ in range(math.prod(self.batch_shape))
+        )
+
+    def __getitem__(self, index: int | tuple[int, ...]) -> ResidualLearner:
+        """The learner at this place of the fleet."""
+        places = torch.arange(len(self.learners)).reshape(self.batch_shape)
+        return self._all()[int(places[index])]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Each learner's mean."""
+        return self._stack([g(z) for g, z in self._each(self._check_query(x))], 1)
+
+    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+        """Each learner's law."""
+        laws = [g.predict(z, observation=observation) for g, z in self._each(self._check_query(x))]
+        mean, deviation = (self._stack([getattr(law, n) for law in laws], 1) for n in ("mean", "stddev"))
+        return Normal(mean, deviation, validate_args=False)
+
+    def predictive(self, x: Float[Tensor, "*any in_features"]) -> Distribution:
+        """Each learner's law of y, heavy-tailed where it is."""
+        laws = [g.predictive(z) for g, z in self._each(self._check_query(x))]
+        return _SideBySide(laws, self.batch_shape)
+
+    def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Each learner's mean and Jacobian, closed where it has a closed form."""
+        parts = [g.linearize(z) for g, z in self._each(self._check_query(x))]
+        return self._stack([p[0] for p in parts], 1), self._stack([p[1] for p in parts], 2)
+
+    def reset(self) -> None:
+        """Reset each."""
+        self.n_refused.zero_()
+        for g in self._all():
+            g.reset()
+
+    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        n = len(self.learners)
+        x, y = x.reshape(n, -1), y.reshape(n, -1)
+        who = [None] * n if mask is None else list(mask.reshape(n))
+        reports = [g._absorb(g._cast(x[k]), g._cast(y[k]), who[k]) for k, g in enumerate(self._all())]
+        stacked = UpdateReport.stack(reports)
+        return UpdateReport(*(part.reshape(self.batch_shape) for part in vars(stacked).values()))
+
+    def _all(self) -> list[ResidualLearner]:
+        return [g for g in self.learners if isinstance(g, ResidualLearner)]
+
+    def _each(self, x: Tensor) -> list[tuple[ResidualLearner, Tensor]]:
+        """Each learner with its queries, ``(*any, in)``."""
+        lead = torch.broadcast_shapes(x.shape[:-1], self.batch_shape)
+        x = x.expand(*lead, x.shape[-1])
+        x = x.reshape(*lead[: len(lead) - len(self.batch_shape)], len(self.learners), x.shape[-1])
+        return list(zip(self._all(), x.unbind(-2), strict=True))
+
+    def _stack(self, parts: list[Tensor], n_last: int) -> Tensor:
+        """``(*any, *last)`` of each learner as ``(*any, *batch_shape, *last)``."""
+        return _unfold(torch.stack(parts, -1 - n_last), self.batch_shape, n_last)
+
+
+class _SideBySide(Distribution):
+    """Independent laws of the learners of a fleet, ``(*any, *batch_shape, out)``."""
+
+    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
+
+    def __init__(self, laws: list[Distribution], batch_shape: torch.Size) -> None:
+        self._laws, self._fleet = laws, batch_shape
+        super().__init__(self.mean.shape, validate_args=False)
+
+    @property
+    def mean(self) -> Tensor:
+        return self._stack([law.mean for law in self._laws])
+
+    @property
+    def variance(self) -> Tensor:
+        return self._stack([law.variance for law in self._laws])
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        value = value.expand(torch.broadcast_shapes(value.shape, self.batch_shape))
+        fleet = value.dim() - 1 - len(self._fleet)
+        each = value.reshape(*value.shape[:fleet], len(self._laws), value.shape[-1]).unbind(-2)
+        return self._stack([law.log_prob(y) for law, y in zip(self._laws, each, strict=True)])
+
+    def _stack(self, parts: list[Tensor]) -> Tensor:
+        return _unfold(torch.stack(parts, -2), self._fleet, 1)
+
+
+def _unfold(x: Tensor, batch_shape: torch.Size, n_last: int) -> Tensor:
+    cut = x.dim() - n_last
+    return x.reshape(*x.shape[: cut - 1], *batch_shape, *x.shape[cut:])
