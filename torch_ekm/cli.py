@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -115,6 +116,9 @@ def reproduce(
     severity: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
     learner: Annotated[str, Option(help="rbf, action-linear, paper, deep, rls, rff, ...")] = "rbf",
     sensing: Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")] = True,
+    step: Annotated[
+        float | None, Option(help="Largest turn of one motion [deg]; 2.5 if left out, 1.5 for wide objects.")
+    ] = None,
     address: Annotated[
         str | None, Option(help="A cluster instead of processes here: dask://HOST:PORT or ray://HOST:PORT.")
     ] = None,
@@ -127,7 +131,8 @@ def reproduce(
     from .experiments.reproduce import reproduce as run
     from .experiments.setting import Setting
 
-    setting = Setting(hand=hand, severity=severity, learner=learner, sensing=sensing)
+    control = {} if step is None else {"focus_step": math.radians(step)}
+    setting = Setting(hand=hand, severity=severity, learner=learner, sensing=sensing, control=control)
     planned = plan(experiment, parse_seeds(seeds), setting=setting, objects=objects, quick=quick)
     folder = out if out is not None else Path(f"reproduce_{experiment}")
     with _progress() as progress:

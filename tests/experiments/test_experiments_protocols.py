@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from torch_ekm.control import ControllerOptions, Decision, PoseTarget, StopReason
+from torch_ekm.description import object_files
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.ablation import TROUBLES, AblationConfig, ablation_jobs, variants
 from torch_ekm.experiments.adapt import AdaptConfig, adapt_session
@@ -59,19 +61,43 @@ def test_wrong_settings_say_what_would_be_right(changes: dict, error: type, matc
 
 
 def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    def of(setting: Setting) -> str:
+        return digest(setting, ("box",), GeneralizeConfig(setting))
+
     base = GeneralizeConfig()
-    assert digest(base) == digest(GeneralizeConfig())
+    unchanged = of(Setting())
+    assert of(Setting()) == unchanged
     other = functools.partial(ControllerOptions, focus_gain=0.5)  # a version with another default
     with monkeypatch.context() as patch:
         patch.setattr("torch_ekm.experiments.setting.ControllerOptions", other)
-        changed = digest(base)
-    assert digest(base) != changed
-    assert digest(base) != digest(dataclasses.replace(base, setting=Setting(capacity=59)))
+        assert of(Setting()) != unchanged
+    with monkeypatch.context() as patch:  # and one whose learner has another kernel
+        patch.setitem(LEARNERS, "rbf", LEARNERS["paper"])
+        assert of(Setting()) != unchanged
+    assert of(Setting()) == unchanged
+    assert of(Setting(capacity=59)) != unchanged
+    assert digest(Setting(), ("can",), base) != unchanged
     one, both = (
         generalize_jobs(dataclasses.replace(base, objects=o), (0,)) for o in (("box",), ("box", "can"))
     )
     assert set(one) < set(both)  # more objects: what is there is used again
     assert len(both) == 2 * len(CONTROLLERS)
+
+
+def test_a_corrected_object_does_not_take_up_old_results(tmp_path: Path) -> None:
+    for source in object_files("box"):
+        (tmp_path / source.name).write_bytes(source.read_bytes())
+    own = str(tmp_path / "box.urdf")
+
+    def jobs() -> set[str]:
+        return set(generalize_jobs(GeneralizeConfig(objects=(own,)), (0,)))
+
+    before = jobs()
+    assert before.isdisjoint(generalize_jobs(GeneralizeConfig(objects=("box",)), (0,)))  # other angles
+    urdf = tmp_path / "box.urdf"
+    urdf.write_text(urdf.read_text() + "\n")
+    assert jobs().isdisjoint(before)
+    assert len(jobs()) == len(before)
 
 
 def test_every_learner_of_the_ablation_starts_at_zero_and_learns() -> None:

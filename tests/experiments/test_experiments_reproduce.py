@@ -13,7 +13,8 @@ import pytest
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
-from torch_ekm.exceptions import ParameterError, UnknownNameError
+from torch_ekm.description import object_files
+from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
 from torch_ekm.experiments.reproduce import EXPERIMENTS, Experiment, plan, reproduce
 
 
@@ -122,8 +123,9 @@ def test_killed_run_resumes_to_the_same_report(tmp_path: Path) -> None:
 
 
 def test_objects_of_a_user(tmp_path: Path) -> None:
-    (tmp_path / "mug.urdf").write_text("<robot name='mug'/>")
-    (tmp_path / "pen.urdf").write_text("<robot name='pen'/>")
+    for name, like in (("mug", "can"), ("pen", "toothpaste")):
+        for source, suffix in zip(object_files(like), (".urdf", ".object.toml"), strict=True):
+            (tmp_path / (name + suffix)).write_bytes(source.read_bytes())
     experiment = plan("generalize", (0,), objects=tmp_path)
     assert [Path(item).name for item in experiment.config.objects] == ["mug.urdf", "pen.urdf"]
     assert any("_mug_E-KM_0" in name for name in experiment.jobs)
@@ -131,6 +133,9 @@ def test_objects_of_a_user(tmp_path: Path) -> None:
         plan("generalize", (0,), objects=tmp_path / "nothing")
     with pytest.raises(ParameterError, match="generalize"):
         plan("online", (0,), objects=tmp_path)
+    (tmp_path / "pen.object.toml").unlink()
+    with pytest.raises(DescriptionError, match=r"pen\.object\.toml"):  # before anything runs
+        plan("generalize", (0,), objects=tmp_path)
 
 
 def test_plans_are_checked() -> None:

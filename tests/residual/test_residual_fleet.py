@@ -42,6 +42,7 @@ def test_fleet_equals_the_learner_that_is_one_itself() -> None:
         learner.update(x, y)
     torch.testing.assert_close(slow(x), fast(x), rtol=0, atol=1e-10)
     torch.testing.assert_close(slow(x[0, 0]), fast(x[0, 0]), rtol=0, atol=1e-10)  # one query for all
+    assert isinstance(slow.predictive(x[0]), torch.distributions.Normal)
 
 
 def test_heavy_tails_stay() -> None:
@@ -72,5 +73,10 @@ def test_wrong_sizes() -> None:
         fleet.update(torch.zeros(3, 3), torch.zeros(3, 2))
     with pytest.raises(ParameterError, match="LearnerFleet"):
         KRLSTracker(3, 2, batch_shape=(2,))
+    for index in (2, (0, 0), -3):
+        with pytest.raises(ParameterError, match="one place"):
+            fleet[index]
+    with pytest.raises(ParameterError, match="single learners of 3 inputs"):
+        LearnerFleet(lambda *_, **__: KRLSTracker(4, 2), 3, 2, batch_shape=(2,))
     with pytest.raises(ParameterError, match="capacity"):
         LearnerFleet(KRLSTracker, 3, 2, batch_shape=(2,), capacity=0)

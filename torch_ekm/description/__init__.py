@@ -6,10 +6,12 @@ from .hand import HallSensor as HallSensor
 from .hand import HandDescription as HandDescription
 from .objects import ObjectDescription as ObjectDescription
 from .registry import data_folder as data_folder
+from .registry import hand_files as hand_files
 from .registry import list_hands as list_hands
 from .registry import list_objects as list_objects
 from .registry import load_hand as load_hand
 from .registry import load_object as load_object
+from .registry import object_files as object_files
 from .shape import Shape as Shape
 from .urdf import UrdfJoint as UrdfJoint
 from .urdf import UrdfLink as UrdfLink
@@ -29,7 +31,9 @@ __all__ = [
     "data_folder",
     "list_hands",
     "list_objects",
+    "hand_files",
     "load_hand",
     "load_object",
+    "object_files",
     "read_urdf",
 ]

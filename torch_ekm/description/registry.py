@@ -45,8 +45,8 @@ def load_hand(name: str | Path) -> HandDescription:
         DescriptionError: a file is missing or wrong; the message names file and place.
         JointMismatchError: URDF and transmission file name different joints.
     """
-    path = _resolve("hand", name, {key: data_folder() / file for key, file in _HANDS.items()})
-    return read_transmission(path.with_suffix(".transmission.toml"), read_urdf(path))
+    urdf, transmission = hand_files(name)
+    return read_transmission(transmission, read_urdf(urdf))
 
 
 def load_object(name: str | Path) -> ObjectDescription:
@@ -56,9 +56,29 @@ def load_object(name: str | Path) -> ObjectDescription:
         UnknownNameError: ``name`` is neither a known object nor a path to a ``.urdf`` file.
         DescriptionError: a file is missing or wrong; the message names file and place.
     """
+    urdf, about = object_files(name)
+    return read_object(about, read_urdf(urdf))
+
+
+def hand_files(name: str | Path) -> tuple[Path, Path]:
+    """URDF and transmission file of a hand, whether they exist or not.
+
+    Raises:
+        UnknownNameError: as :func:`load_hand`.
+    """
+    path = _resolve("hand", name, {key: data_folder() / file for key, file in _HANDS.items()})
+    return path, path.with_suffix(".transmission.toml")
+
+
+def object_files(name: str | Path) -> tuple[Path, Path]:
+    """URDF and object file of an object, whether they exist or not.
+
+    Raises:
+        UnknownNameError: as :func:`load_object`.
+    """
     folder = data_folder() / "objects"
     path = _resolve("object", name, {key: folder / f"{key}.urdf" for key in _OBJECTS})
-    return read_object(path.with_suffix(".object.toml"), read_urdf(path))
+    return path, path.with_suffix(".object.toml")
 
 
 def _resolve(kind: str, name: str | Path, known: dict[str, Path]) -> Path:

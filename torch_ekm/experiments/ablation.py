@@ -181,7 +181,7 @@ def _jobs_of(config: AblationConfig, variant: Variant, seeds: tuple[int, ...]) -
         long_step_deg=0.0,
         blind_deg=0.0,
     )
-    stem = f"ablation_{digest(one)}"
+    stem = f"ablation_{digest(one.setting, one.objects, one)}"
     return {
         f"{stem}_{name}_{seed}": (one, config.object, name, seed)
         for seed in seeds

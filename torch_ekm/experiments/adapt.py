@@ -170,7 +170,8 @@ def adapt_session(config: AdaptConfig, seed: int) -> list[Record]:
 
 def adapt_jobs(config: AdaptConfig, seeds: tuple[int, ...]) -> dict[str, tuple[Any, ...]]:
     """One job for each seed."""
-    return {f"adapt_{digest(config)}_{seed}": (config, seed) for seed in seeds}
+    stem = f"adapt_{digest(config.setting, config.objects, config)}"
+    return {f"{stem}_{seed}": (config, seed) for seed in seeds}
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,8 @@ class Bench:
         self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model_options())
         self.learner, self.encoding = learner, encoding
         self.enhanced: EnhancedModel | None = None
+        self.no_grasp = ""
+        """Why the last grasp that failed did."""
         self.on_grasp: Callable[[torch.Tensor], object] | None = None
         """Hears of the axis of each new grasp."""
 
@@ -76,7 +78,8 @@ class Bench:
             drawn = int(np.random.SeedSequence([seed, trial, attempt]).generate_state(1)[0])
             try:
                 start = state_of(self.plant.reset(drawn))
-            except (EquilibriumError, GraspError):
+            except (EquilibriumError, GraspError) as error:
+                self.no_grasp = str(error)
                 continue
             self.model.reset()
             if self.learns and self.enhanced is None:
@@ -113,7 +116,13 @@ class Bench:
         about = {"controller": self.controller, "seed": seed, "trial": trial, "angle_deg": angle_deg}
         start = self.grasp(seed, trial)
         if start is None:
-            return {**about, "reason": "not grasped", "grasped": False, "lost": False}
+            return {
+                **about,
+                "reason": "not grasped",
+                "message": self.no_grasp,
+                "grasped": False,
+                "lost": False,
+            }
         self.disturbed.events = tuple(
             dataclasses.replace(event, at=event.at + self.disturbed.count) for event in events
         )

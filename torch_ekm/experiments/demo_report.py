@@ -17,6 +17,7 @@ from .metrics import Estimate, bootstrap_mean, compare_errors
 from .pictures import make_scene, save_animation, save_picture
 from .plotting import plot_convergence, plot_prediction_error, plot_static_error, save_figure
 from .report import FigureFile, Report, Table
+from .setting import Setting, digest
 
 Record = dict[str, Any]
 #: Seeds from here on are never used for tuning.
@@ -64,9 +65,14 @@ def run_demo(
 
 def demo_jobs(config: DemoConfig) -> dict[str, tuple[Any, ...]]:
     """One job for each seed and controller; the name holds all that decides its result."""
-    angles = "-".join(f"{angle:g}" for angle in config.angles_deg)
-    stem = f"{Path(config.hand).stem}_{Path(config.object).stem}_{angles}_b{config.capacity}"
-    stem += f"_t{config.tolerance_deg:g}_n{config.max_steps}"
+    setting = Setting(
+        hand=config.hand,
+        capacity=config.capacity,
+        tolerance_deg=config.tolerance_deg,
+        max_steps=config.max_steps,
+    )
+    own = digest(setting, (config.object,), dataclasses.replace(config, seeds=(0,)))
+    stem = f"{Path(config.hand).stem}_{Path(config.object).stem}_{own}"
     return {f"{stem}_{name}_{seed}": (config, name, seed) for seed in config.seeds for name in CONTROLLERS}
 
 

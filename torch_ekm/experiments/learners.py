@@ -116,6 +116,23 @@ def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -
     return LEARNERS[name](n_s, n_a, capacity, **options)
 
 
+def learner_figures(name: str, capacity: int, **options: Any) -> dict[str, Any]:
+    """Kind, kernel and switches of a learner as plain figures, by an example with one state and action."""
+    learner = make_learner(name, 1, 1, capacity, **options)
+    figures: dict[str, Any] = {"kind": type(learner).__name__}
+    for key, value in vars(learner).items():
+        if not key.startswith("_") and isinstance(value, bool | int | float | str | tuple | None):
+            figures[key] = value
+    kernel = getattr(learner, "kernel", None)
+    if kernel is not None:
+        parameters = {k: p.tolist() for k, p in kernel.named_parameters() if "log_" in k}
+        figures["kernel"] = {"kind": type(kernel).__name__, **parameters}
+    noise = getattr(learner, "noise_variance", None)
+    if noise is not None:
+        figures["noise_variance"] = torch.as_tensor(noise).tolist()
+    return figures
+
+
 def grasping_joints(model: KinematicModel, state: GraspState) -> list[int]:
     """Joints that can move a finger which touches the object."""
     hand, contacts = model.hand, model.contacts(state)

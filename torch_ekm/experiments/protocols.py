@@ -141,16 +141,17 @@ def generalize_session(config: GeneralizeConfig, object: str, controller: str, s
 
 def online_jobs(config: OnlineConfig, seeds: tuple[int, ...]) -> dict[str, tuple[Any, ...]]:
     """One job for each seed and controller; the name holds all that decides its result."""
-    stem = f"online_{digest(config)}"
+    stem = f"online_{digest(config.setting, (config.object,), config)}"
     return {f"{stem}_{name}_{seed}": (config, name, seed) for seed in seeds for name in CONTROLLERS}
 
 
 def generalize_jobs(config: GeneralizeConfig, seeds: tuple[int, ...]) -> dict[str, tuple[Any, ...]]:
     """One job for each seed, object and controller."""
     # a job does not depend on which other objects there are
-    stem = f"generalize_{digest(_without_objects(config))}"
+    alone = dataclasses.replace(config, objects=("any",))
+    own = {item: digest(config.setting, (item,), alone, config.angles_of(item)) for item in config.objects}
     return {
-        f"{stem}_{object_name(item)}_{name}_{seed}": (config, item, name, seed)
+        f"generalize_{own[item]}_{object_name(item)}_{name}_{seed}": (config, item, name, seed)
         for seed in seeds
         for item in config.objects
         for name in CONTROLLERS
@@ -160,10 +161,6 @@ def generalize_jobs(config: GeneralizeConfig, seeds: tuple[int, ...]) -> dict[st
 def object_name(object: str) -> str:
     """Short name of an object given by name or path."""
     return Path(object).stem if object.endswith(".urdf") else object
-
-
-def _without_objects(config: GeneralizeConfig) -> GeneralizeConfig:
-    return dataclasses.replace(config, objects=("any",))
 
 
 def _check(controller: str) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..description import load_object
 from ..exceptions import ParameterError, UnknownNameError
 from . import reports
 from .ablation import AblationConfig, ablation_jobs, ablation_session
@@ -146,12 +147,15 @@ def object_files(folder: Path) -> tuple[str, ...]:
 
     Raises:
         ParameterError: there are none.
+        DescriptionError: one is faulty; the message names file and place.
     """
     found = tuple(str(path) for path in sorted(folder.glob("*.urdf")))
     if not found:
         raise ParameterError(
             "objects", str(folder), "a folder with *.urdf files, each with its *.object.toml"
         )
+    for path in found:  # what is wrong with one is said before anything runs
+        load_object(path)
     return found
 
 

@@ -6,18 +6,18 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ..control import ControllerOptions, StoppingRule
-from ..description import HandDescription, list_hands
+from ..description import HandDescription, hand_files, list_hands, load_hand, object_files
 from ..exceptions import ParameterError, UnknownNameError
 from ..model import ModelOptions
 from ..simulation import PlantConfig, PlantParameters, severity
 from .demo import fixed_actuators
-from .learners import LEARNERS
+from .learners import LEARNERS, learner_figures
 
 _DEG = math.pi / 180
 
@@ -99,30 +99,43 @@ class Setting:
         )
 
     def figures(self) -> dict[str, Any]:
-        """All figures of plant, model, controller and stopping rule, defaults included."""
+        """All figures of plant, model, controller, stopping rule and learner, defaults included."""
         parts = {
             "plant": self.parameters(),
             "plant_config": self.plant_config("KM"),
             "model": self.model_options(),
-            "controller": _changed(ControllerOptions(), "control", self.control),
+            "controller": self.controller_options(load_hand(self.hand)),
             "stopping_rule": self.stopping_rule(),
         }
-        return {name: dataclasses.asdict(part) for name, part in parts.items()}
+        figures = {name: dataclasses.asdict(part) for name, part in parts.items()}
+        return {**figures, "learner": learner_figures(self.learner, self.capacity, **self.learner_options)}
 
     def replace(self, **changes: Any) -> Setting:
         """A copy with some figures changed."""
         return dataclasses.replace(self, **changes)
 
 
-def digest(config: Any) -> str:
+def digest(setting: Setting, objects: Iterable[str | Path], *more: Any) -> str:
     """Ten letters that change with any figure of an experiment: results are kept under them.
 
-    The defaults of the classes that its :class:`Setting` changes count, too: a version of the package
-    with other defaults does not take up the results of this one.
+    The defaults of the classes that the setting changes count, too, and what is in the files of the
+    hand and the objects: neither a version of the package with other defaults nor an
+    object that was corrected takes up old results.
+
+    Args:
+        setting: of the experiment.
+        objects: names or paths of those that take part.
+        more: configurations and figures that decide the results as well.
     """
-    figures = [dataclasses.asdict(config), config.setting.figures()]
-    text = json.dumps(figures, sort_keys=True, default=str)
+    files = [*hand_files(setting.hand), *(path for item in objects for path in object_files(item))]
+    contents = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
+    figures = [dataclasses.asdict(setting), setting.figures(), contents, more]
+    text = json.dumps(figures, sort_keys=True, default=_plain)
     return hashlib.sha256(text.encode()).hexdigest()[:10]
+
+
+def _plain(item: Any) -> Any:
+    return vars(item) if dataclasses.is_dataclass(item) else str(item)
 
 
 def _changed(options: Any, name: str, changes: Mapping[str, Any]) -> Any:

@@ -11,6 +11,7 @@ import torch
 from torch import nn
 from torch.distributions import Distribution, Normal, constraints
 
+from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import ResidualLearner, UpdateReport
 
@@ -18,10 +19,11 @@ from .base import ResidualLearner, UpdateReport
 class LearnerFleet(ResidualLearner):
     """n independent learners of a kind that is one model by itself: ``g_k(x_k)``, k over ``batch_shape``.
 
-    Each does exactly what it would do alone, one after the other: n times the time of one. Learners that
-    take ``batch_shape`` themselves (``SparseOnlineGP`` among them) update all models in one call and
-    are much faster; this is for those that do not, such as ``KRLSTracker``, ``LocalGPs``, ``ReplayMLP`` and
-    the adapters of other libraries.
+    Each does exactly what it would do alone, one after the other: n times the time of one; a learner that
+    draws its weights from a seed draws the same in every place. Learners that take ``batch_shape``
+    themselves (``SparseOnlineGP`` among them) update all models in one call and are much faster. This is
+    for those that do not, such as ``KRLSTracker``, ``LocalGPs``, ``ReplayMLP`` and the adapters of other
+    libraries. What is special to a kind is found on ``fleet[k]``.
 
     Args:
         kind: ``kind(in_features, out_features, dtype=..., device=..., **options)`` gives one learner.
@@ -29,7 +31,7 @@ class LearnerFleet(ResidualLearner):
         options: of each learner; kernels and other modules among them are copied for each.
 
     Raises:
-        ParameterError: from ``kind``, or a size is not a positive integer.
+        ParameterError: from ``kind``, or it gives something else than single learners of these sizes.
     """
 
     def __init__(
@@ -50,11 +52,21 @@ class LearnerFleet(ResidualLearner):
             kind(in_features, out_features, **copy.deepcopy(options), **factory)
             for _ in range(math.prod(self.batch_shape))
         )
+        for g in self.learners:
+            fits = isinstance(g, ResidualLearner) and not g.batch_shape
+            if not fits or (g.in_features, g.out_features) != (self.in_features, self.out_features):
+                wanted = f"giving single learners of {self.in_features} inputs, {self.out_features} outputs"
+                raise ParameterError("kind", repr(g), wanted)
 
     def __getitem__(self, index: int | tuple[int, ...]) -> ResidualLearner:
         """The learner at this place of the fleet."""
+        place = index if isinstance(index, tuple) else (index,)
+        inside = len(place) == len(self.batch_shape)
+        inside = inside and all(-n <= i < n for i, n in zip(place, self.batch_shape, strict=True))
+        if not inside:
+            raise ParameterError("index", index, f"one place in a fleet of shape {tuple(self.batch_shape)}")
         places = torch.arange(len(self.learners)).reshape(self.batch_shape)
-        return self._all()[int(places[index])]
+        return self._all()[int(places[place])]
 
     def forward(self, x: Tensor) -> Tensor:
         """Each learner's mean."""
@@ -67,8 +79,10 @@ class LearnerFleet(ResidualLearner):
         return Normal(mean, deviation, validate_args=False)
 
     def predictive(self, x: Float[Tensor, "*any in_features"]) -> Distribution:
-        """Each learner's law of y, heavy-tailed where it is."""
+        """Each learner's law of y: a Normal, or where one is heavy-tailed a law with mean and log_prob."""
         laws = [g.predictive(z) for g, z in self._each(self._check_query(x))]
+        if all(isinstance(law, Normal) for law in laws):
+            return self.predict(x, observation=True)
         return _SideBySide(laws, self.batch_shape)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
