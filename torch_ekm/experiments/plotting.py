@@ -93,12 +93,19 @@ def plot_learning_test(ekm_deg: Array, km_deg: Array, alpha: float = 0.05) -> Fi
     return figure
 
 
-def plot_static_error(errors_deg: dict[str, dict[str, Array]], ylabel: str = "static error [deg]") -> Figure:
+def plot_static_error(errors_deg: dict[str, dict[str, Array]], what: str = "") -> Figure:
     """Static error of each controller for each target (the paper's Fig. 6): every run and the mean.
+
+    A few lost objects, at many times the error of all others, are crosses at the upper edge; a mean
+    that they carry beyond it is written there.
 
     Args:
         errors_deg: controller -> target -> ``(n_runs,)`` absolute errors [deg].
+        what: named in the title.
     """
+    everything = np.concatenate([np.ravel(v) for t in errors_deg.values() for v in t.values()])
+    top = 1.3 * float(np.percentile(everything, 95)) if everything.size else 1.0
+    top = top if everything.size and everything.max() > 2 * top else np.inf
     targets = list(next(iter(errors_deg.values())))
     figure, (axis,) = _figure(max(4.0, 1.3 * len(targets)), 3.4)
     width = 0.8 / len(errors_deg)
@@ -112,10 +119,17 @@ def plot_static_error(errors_deg: dict[str, dict[str, Array]], ylabel: str = "st
             label = name if i == 0 else None
             axis.bar(x, values.mean(), width * 0.9, color=colour, alpha=0.45, label=label)
             spread = np.linspace(-0.3, 0.3, len(values)) * width if len(values) > 1 else np.zeros(1)
-            axis.plot(x + spread, values, _MARKERS.get(name, "o"), color=colour, markersize=3)
+            inside = values <= top
+            axis.plot(
+                (x + spread)[inside], values[inside], _MARKERS.get(name, "o"), color=colour, markersize=3
+            )
+            axis.plot((x + spread)[~inside], [0.97 * top] * int((~inside).sum()), "x", color=colour)
+            if values.mean() > top:
+                note = {"xytext": (-9, 0), "textcoords": "offset points", "fontsize": 8, "ha": "right"}
+                axis.annotate(f"mean {values.mean():.1f}", (x, 0.9 * top), **note)
     axis.set_xticks(range(len(targets)), targets)
-    axis.set(xlabel="target [deg]", ylabel=ylabel, ylim=(0, None))
-    axis.set_title("Static error: each run, and the mean", loc="left")
+    axis.set(xlabel="target [deg]", ylabel="static error [deg]", ylim=(0, top if np.isfinite(top) else None))
+    axis.set_title(f"Static error{', ' + what if what else ''}: each run, and the mean", loc="left")
     axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
 

@@ -127,6 +127,10 @@ def plot_cost(comparison: Comparison) -> Figure:
         )
         axis.plot(time, ratio, "o", color=colour)
     axis.set_xscale("log")
+    ticker = require("matplotlib.ticker")
+    axis.xaxis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.xaxis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
+    axis.xaxis.set_minor_formatter(ticker.NullFormatter())
     axis.margins(x=0.1, y=0.08)
     axis.set(xlabel="one prediction and one update [µs]", ylabel="rms error / model alone (geometric mean)")
     return figure

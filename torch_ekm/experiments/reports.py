@@ -98,8 +98,13 @@ def generalize_report(
             }
             for controller in CONTROLLERS
         }
-        save_figure(plot_static_error(errors), _made(folder), f"static_error_{name}")
-        figures.append(FigureFile(f"static_error_{name}.svg", f"Static error with the {name} (Fig. 6)."))
+        save_figure(plot_static_error(errors, name.replace("_", " ")), _made(folder), f"static_error_{name}")
+        figures.append(
+            FigureFile(
+                f"static_error_{name}.svg",
+                f"Static error with the {name} (Fig. 6). Crosses: lost objects, off the scale.",
+            )
+        )
     tables = [
         targets_table(generalize_targets(records, limit)),
         angles_table(config),

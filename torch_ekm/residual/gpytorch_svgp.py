@@ -25,7 +25,7 @@ class GPyTorchSVGP(Adapter):
         inducing: number of inducing points.
         rate, minibatch, memory, steps: of Adam and of the replay.
         seed: of the minibatches.
-        options: see ResidualLearner (``batch_shape`` must be ()).
+        options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
     inputs: Tensor

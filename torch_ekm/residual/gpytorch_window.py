@@ -24,7 +24,7 @@ class GPyTorchWindow(Adapter):
         window: samples kept.
         refit_every, steps, rate: of the fit.
         noise_variance: at the start.
-        options: see ResidualLearner (``batch_shape`` must be ()).
+        options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
     inputs: Tensor

@@ -23,7 +23,7 @@ class RiverResidual(Adapter):
     Args:
         model: a river regressor, copied; default ARFRegressor.
         prior_variance: of y before the first sample.
-        options: see ResidualLearner (``batch_shape`` must be ()).
+        options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
     noise: Tensor
