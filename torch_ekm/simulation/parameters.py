@@ -120,10 +120,10 @@ class PlantParameters:
         Tendons run on pulleys 1.3 times as large as modelled and stretch twice as much; joints rub;
         the position controller stops up to 1.3 deg short of its set-point and has a constant error,
         a fresh one and play: somewhat more than the +-1 deg of the E-KM paper (section III.C.4), since
-        with less a plain KM does not stall nearly as far off as the paper's 1 to 3 deg (here 0.8 to 1.2). The fingers have weight,
-        the object is 10 % heavier, its centre 2 mm off. Sensors: 0.3 deg per joint, 0.2 mm and
-        0.15 deg for the object (a marker board seen from 0.4 m), 0.1 N each of noise, offset and
-        hysteresis per fingertip, in 8 bit.
+        with less a plain KM does not stall nearly as far off as the paper's 1 to 3 deg (here 0.8 to 1.2).
+        The fingers have weight, the object is 10 % heavier, its centre 2 mm off. Sensors: 0.3 deg per
+        joint, 0.2 mm and 0.15 deg for the object (a marker board seen from 0.4 m), 0.1 N each of noise,
+        offset and hysteresis per fingertip, in 8 bit.
         """
         return cls(
             moment_arm=1.3,
