@@ -282,7 +282,12 @@ def _print_tables(report: Report, notes: bool = False) -> None:
         shown = RichTable(*table.header, title=table.caption, caption=table.note if notes else None)
         for row in table.rows:
             shown.add_row(*row)
-        console.print(shown)
+        for column in shown.columns:
+            column.overflow = "fold"  # figures are never cut short
+        if console.is_terminal:
+            console.print(shown)
+        else:  # a file or a pipe has no width of its own
+            Console(width=Console(width=1000).measure(shown).maximum).print(shown)
 
 
 def _numbers(name: str, text: str) -> tuple[float, ...]:
