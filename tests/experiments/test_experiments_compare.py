@@ -10,13 +10,14 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from torch_ekm.cli import app
+from torch_ekm.cli import _print_tables, app
 from torch_ekm.exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.experiments import compare as module
 from torch_ekm.experiments.compare import Comparison, bootstrap_ratio, compare, verdicts
 from torch_ekm.experiments.compare_report import overview_table, score_table
 from torch_ekm.experiments.contenders import CONTENDERS, DEFAULT, PEERS, contender
 from torch_ekm.experiments.recordings import Recording, in_own_units, load_recording, load_table
+from torch_ekm.experiments.report import Report, Table
 from torch_ekm.experiments.table_file import read_table
 
 WEIGHTS = torch.tensor([[1.0, -0.5], [0.3, 0.8], [0.0, 0.4]], dtype=torch.float64)
@@ -131,6 +132,13 @@ def test_every_contender_runs(name: str) -> None:
     assert len(result["squared"]) == 24
     assert np.isfinite(result["squared"]).all()
     assert 0 <= result["coverage"] <= 1
+
+
+def test_wide_tables_are_printed_whole_into_a_file(capsys: pytest.CaptureFixture[str]) -> None:
+    cell = "0.123 [0.100, 0.200]"
+    table = Table("wide", "Wide", [f"recording {k}" for k in range(12)], [[cell] * 12], "")
+    _print_tables(Report(title="", summary="", tables=[table], figures=[], configuration={}))
+    assert capsys.readouterr().out.count(cell) == 12
 
 
 def test_every_kind_of_learner_in_the_package_contends() -> None:
