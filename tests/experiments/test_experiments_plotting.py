@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torch_ekm.experiments.plotting import plot_static_error
+from torch_ekm.experiments.plotting import plot_bank, plot_static_error
 
 pytest.importorskip("matplotlib")
 
@@ -22,3 +22,9 @@ def test_a_lost_object_does_not_hide_the_others() -> None:
     (plain,) = plot_static_error({"KM": {"23": calm, "38": calm}}).axes
     assert plain.get_ylim()[1] > 1.2  # nothing lost: the whole range, no crosses
     assert all(len(line.get_xdata()) == 0 for line in plain.lines if line.get_marker() == "x")
+
+
+def test_a_probability_an_ulp_above_one_is_sure() -> None:
+    records = [{"object": "box", "model": 0, "posterior": [1.0 + 2.3e-16, 0.0]}]
+    (axis,) = plot_bank(records).axes
+    assert axis.lines[0].get_alpha() == 1.0

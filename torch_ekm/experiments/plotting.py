@@ -165,7 +165,7 @@ def plot_bank(records: list[dict]) -> Figure:
             continue
         colour = palette[record["model"] % len(palette)]
         marker = "osD^v*PX"[record["model"] % 8]
-        sure = max(record["posterior"])
+        sure = min(max(record["posterior"]), 1.0)  # sums of probabilities end an ulp above
         axis.plot(k + 1, objects.index(record["object"]), marker, color=colour, alpha=0.25 + 0.75 * sure)
     used = sorted({record["model"] for record in records if record["model"] is not None})
     for model in used:
