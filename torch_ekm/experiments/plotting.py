@@ -174,5 +174,5 @@ def plot_bank(records: list[dict]) -> Figure:
     axis.set(xlabel="turn")
     axis.set_title("Which model took the turn (pale: unsure)", loc="left")
     if used:
-        axis.legend(frameon=False, ncols=len(used), loc="lower right", bbox_to_anchor=(1, 1))
+        axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
