@@ -53,7 +53,7 @@ def hands() -> None:
     for name in list_hands():
         hand = load_hand(name)
         table.add_row(name, str(hand.n_q), str(hand.n_a), str(len(hand.pads)), hand.urdf_path.name)
-    console.print(table)
+    _print_table(table)
 
 
 @app.command()
@@ -68,7 +68,7 @@ def objects() -> None:
         table.add_row(
             name, f"{1e3 * obj.mass:.0f}", f"{obj.friction:g}", f"{1e3 * obj.grasp_width:.0f}", shapes
         )
-    console.print(table)
+    _print_table(table)
 
 
 @app.command()
@@ -244,7 +244,7 @@ def replay(
         table = RichTable(*TrialEntry._fields, title=str(log))
         for entry in shown.log.index:
             table.add_row(*map(str, entry))
-        console.print(table)
+        _print_table(table)
     _look(shown, html, port)
 
 
@@ -282,12 +282,16 @@ def _print_tables(report: Report, notes: bool = False) -> None:
         shown = RichTable(*table.header, title=table.caption, caption=table.note if notes else None)
         for row in table.rows:
             shown.add_row(*row)
-        for column in shown.columns:
-            column.overflow = "fold"  # figures are never cut short
-        if console.is_terminal:
-            console.print(shown)
-        else:  # a file or a pipe has no width of its own
-            Console(width=Console(width=1000).measure(shown).maximum).print(shown)
+        _print_table(shown)
+
+
+def _print_table(table: RichTable) -> None:
+    for column in table.columns:
+        column.overflow = "fold"  # figures are never cut short
+    if console.is_terminal:
+        console.print(table)
+    else:  # a file or a pipe has no width of its own
+        Console(width=Console(width=1000).measure(table).maximum).print(table)
 
 
 def _numbers(name: str, text: str) -> tuple[float, ...]:

@@ -85,6 +85,9 @@ def _none(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
     return ZeroResidual(n_s + n_a, N_OUT, noise_variance=NOISE_VARIANCE, **options)
 
 
+#: What demo and experiments take unless told otherwise.
+DEFAULT_LEARNER = "rbf"
+
 #: Name -> ``factory(n_s, n_a, capacity, **options)``; n_s features of the state, n_a actuators.
 LEARNERS: dict[str, Callable[..., ResidualLearner]] = {
     "rbf": _rbf,
@@ -159,7 +162,7 @@ def enhance(model: KinematicModel, learner: ResidualLearner, encoding: GraspEnco
 
 
 def make_enhanced(
-    model: KinematicModel, reference: GraspState, capacity: int, learner: str = "rbf"
+    model: KinematicModel, reference: GraspState, capacity: int, learner: str = DEFAULT_LEARNER
 ) -> EnhancedModel:
     """An E-KM that has learned nothing yet, with a learner of :data:`LEARNERS`."""
     encoding = make_encoding(model, reference)

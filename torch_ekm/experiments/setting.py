@@ -17,7 +17,7 @@ from ..exceptions import ParameterError, UnknownNameError
 from ..model import ModelOptions
 from ..simulation import PlantConfig, PlantParameters, severity
 from .demo import fixed_actuators
-from .learners import LEARNERS, learner_figures
+from .learners import DEFAULT_LEARNER, LEARNERS, learner_figures
 
 _DEG = math.pi / 180
 
@@ -47,7 +47,7 @@ class Setting:
     """Changes of :class:`ModelOptions`."""
     control: Mapping[str, Any] = field(default_factory=dict)
     """Changes of :class:`ControllerOptions`."""
-    learner: str = "rbf"
+    learner: str = DEFAULT_LEARNER
     learner_options: Mapping[str, Any] = field(default_factory=dict)
     capacity: int = 60
     sensing: bool = False

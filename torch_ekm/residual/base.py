@@ -187,6 +187,12 @@ class ResidualLearner(nn.Module, ABC):
         """Device of the state."""
         return self._like.device
 
+    def _check_single(self) -> None:
+        """For learners that are one model each."""
+        if self.batch_shape:
+            valid = "() for this learner; LearnerFleet holds several"
+            raise ParameterError("batch_shape", tuple(self.batch_shape), valid)
+
     def _cast(self, x: Tensor) -> Tensor:
         return torch.as_tensor(x, dtype=self._like.dtype, device=self._like.device)
 

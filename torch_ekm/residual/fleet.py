@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
-from typing import Any, ClassVar, Literal
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Literal, cast
 
 import torch
 from torch import nn
@@ -74,15 +74,14 @@ class LearnerFleet(ResidualLearner):
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """Each learner's law."""
-        laws = [g.predict(z, observation=observation) for g, z in self._each(self._check_query(x))]
-        mean, deviation = (self._stack([getattr(law, n) for law in laws], 1) for n in ("mean", "stddev"))
-        return Normal(mean, deviation, validate_args=False)
+        each = self._each(self._check_query(x))
+        return self._normal([g.predict(z, observation=observation) for g, z in each])
 
     def predictive(self, x: Float[Tensor, "*any in_features"]) -> Distribution:
         """Each learner's law of y: a Normal, or where one is heavy-tailed a law with mean and log_prob."""
         laws = [g.predictive(z) for g, z in self._each(self._check_query(x))]
         if all(isinstance(law, Normal) for law in laws):
-            return self.predict(x, observation=True)
+            return self._normal(laws)
         return _SideBySide(laws, self.batch_shape)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -104,8 +103,12 @@ class LearnerFleet(ResidualLearner):
         stacked = UpdateReport.stack(reports)
         return UpdateReport(*(part.reshape(self.batch_shape) for part in vars(stacked).values()))
 
+    def _normal(self, laws: Sequence[Distribution]) -> Normal:
+        mean, deviation = (self._stack([getattr(law, n) for law in laws], 1) for n in ("mean", "stddev"))
+        return Normal(mean, deviation, validate_args=False)
+
     def _all(self) -> list[ResidualLearner]:
-        return [g for g in self.learners if isinstance(g, ResidualLearner)]
+        return cast("list[ResidualLearner]", list(self.learners))  # checked at construction
 
     def _each(self, x: Tensor) -> list[tuple[ResidualLearner, Tensor]]:
         """Each learner with its queries, ``(*any, in)``."""

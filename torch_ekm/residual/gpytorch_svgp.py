@@ -48,7 +48,7 @@ class GPyTorchSVGP(Adapter):
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        self._single()
+        self._check_single()
         require("gpytorch")
         self.inducing, self.seed = check_count("inducing", inducing), int(seed)
         self.rate, self.steps = check_positive("rate", rate), check_count("steps", steps)

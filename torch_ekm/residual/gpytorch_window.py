@@ -45,7 +45,7 @@ class GPyTorchWindow(Adapter):
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        self._single()
+        self._check_single()
         require("gpytorch")
         self.window, self.steps = check_count("window", window), check_count("steps", steps)
         self.refit_every = check_count("refit_every", refit_every)

@@ -51,10 +51,7 @@ class KRLSTracker(DoubleStateLearner):
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        if self.batch_shape:
-            raise ParameterError(
-                "batch_shape", tuple(self.batch_shape), "() for this learner; LearnerFleet holds several"
-            )
+        self._check_single()
         if not 0 < forgetting <= 1:
             raise ParameterError("forgetting", forgetting, "in (0, 1]")
         self.capacity = check_count("capacity", capacity)

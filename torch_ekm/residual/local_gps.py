@@ -53,10 +53,7 @@ class LocalGPs(ResidualLearner):
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        if self.batch_shape:
-            raise ParameterError(
-                "batch_shape", tuple(self.batch_shape), "() for this learner; LearnerFleet holds several"
-            )
+        self._check_single()
         E, n = check_count("experts", experts), check_count("window", window)
         self.experts, self.window = E, n
         self.neighbours = min(check_count("neighbours", neighbours), E)

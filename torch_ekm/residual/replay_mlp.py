@@ -10,7 +10,6 @@ import torch
 from torch import nn
 from torch.distributions import Normal
 
-from ..exceptions import ParameterError
 from ..typing import Tensor
 from .base import ResidualLearner, UpdateEvent, UpdateReport, check_count, check_positive
 
@@ -54,10 +53,7 @@ class ReplayMLP(ResidualLearner):
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        if self.batch_shape:
-            raise ParameterError(
-                "batch_shape", tuple(self.batch_shape), "() for this learner; LearnerFleet holds several"
-            )
+        self._check_single()
         self.members, self.memory = check_count("members", members), check_count("memory", memory)
         self.minibatch, self.steps = check_count("minibatch", minibatch), check_count("steps", steps)
         self.rate, self.seed = check_positive("rate", rate), int(seed)

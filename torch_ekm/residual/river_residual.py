@@ -39,7 +39,7 @@ class RiverResidual(Adapter):
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        self._single()
+        self._check_single()
         require("river")
         if model is None:
             model = require("river.forest").ARFRegressor(seed=0)
