@@ -26,18 +26,22 @@ _DEGREE = np.pi / 180
 class ControllerOptions:
     """Every figure of the controller, in SI units (angles [rad])."""
 
-    focus_step: float = 2.5 * _DEGREE
+    focus_step: float = 3.5 * _DEGREE
     """Limiting function: at most this much of the focused error is asked for in one step."""
+    contact_step: float | None = 1.2e-3
+    """And no contact is asked to move farther than this [m]: a wide object turns in smaller steps.
+    None: no such limit."""
     focus_gain: float = 0.8
     """Share of a small focused error that one step asks for. A model that is right meets all of it,
     camera noise included; below 1 the loop averages the noise over some steps."""
-    actuator_step: float = 8 * _DEGREE
-    """|da| of one actuator in one step."""
+    actuator_step: float = 16 * _DEGREE
+    """|da| of one actuator in one step. A safety limit, not the one that sets the pace: where it cuts
+    a step short, the focused pose is served at the expense of grip and off-axis motion."""
     effort_weight: float = 1e-2
     """W = effort_weight I, per deg^2 of actuator motion."""
     off_rotation_weight: float = 0.3
     """Weight of rotation off the focused axis, per deg^2."""
-    off_translation_weight: float = 0.05
+    off_translation_weight: float = 0.2
     """Weight of translation off the focus, per mm^2."""
     off_step_rotation: float = 0.5 * _DEGREE
     off_step_translation: float = 0.5e-3
@@ -98,7 +102,7 @@ class LookAndMoveController:
 
         min_da  da^T W da + off-axis and grip-force errors, weighted + rho |sl|_1
                 + w_sig tr(M_c Sigma_g(s, da) M_c^T)                           (optional)
-        s.t.    M_c E_p (f + g)(s, da) + sl = dx_d,    dx_d = e min(gain, 1/|S^-1 e|)
+        s.t.    M_c E_p (f + g)(s, da) + sl = dx_d,    dx_d = e min(gain, 1/|S^-1 e|, c/|v(e)|)
                 a_min <= a + da <= a_max,  |da| <= da_max
                 q_min <= q + dq <= q_max,  f_n + (df_n/da) da >= f_min     (soft)
                 m + (dm/da) da >= m_min,  m = mu f_n - |f_t|               (soft, optional)
@@ -163,7 +167,8 @@ class LookAndMoveController:
             _check("fingertip_force", fingertip_force, len(self._pad_index))
         error = target.error(state)
         _check("target", error, 6)
-        desired = self.limit(self.focus.matrix @ error)
+        focused = self.focus.matrix @ error
+        desired = self.limit(focused)
         zero, still = a.new_zeros(n_a), a.new_zeros(n_q + 6)
         try:
             lin = self.kinematic.linearize(state)
@@ -172,6 +177,7 @@ class LookAndMoveController:
         except GraspError as failure:
             return Decision(zero, StopReason.UNSTABLE_GRASP, desired, still, still, message=str(failure))
 
+        desired = self.limit(focused, self._contact_travel(state, lin.contacts.point, focused))
         J_m = lin.manipulation_jacobian
         da, value, J = zero, still, J_m
         solution: ControlSolution | None = None
@@ -207,10 +213,24 @@ class LookAndMoveController:
             solution=solution,
         )
 
-    def limit(self, error: Float[Tensor, " n_x"]) -> Float[Tensor, " n_x"]:
-        """Limiting function ``dx_d = e min(gain, 1/|S^-1 e|)``: keeps the direction, linear near the goal."""
-        size = float(torch.linalg.vector_norm(error)) / self.options.focus_step
-        return error * min(self.options.focus_gain, 1.0 / size) if size > 0 else error
+    def limit(self, error: Float[Tensor, " n_x"], travel: float = 0.0) -> Float[Tensor, " n_x"]:
+        """``dx_d = e min(gain, 1/|S^-1 e|, c/|v(e)|)``: keeps the direction, linear near the goal.
+
+        Args:
+            error: e, focused error.
+            travel: ``|v(e)|``, how far the contact that moves most would be carried by all of it [m].
+        """
+        opt = self.options
+        size = float(torch.linalg.vector_norm(error)) / opt.focus_step
+        if opt.contact_step is not None:
+            size = max(size, travel / opt.contact_step)
+        return error * min(opt.focus_gain, 1.0 / size) if size > 0 else error
+
+    def _contact_travel(self, state: GraspState, point: Float[Tensor, "n_c 3"], error: Tensor) -> float:
+        """``max_i |v + w x (x_i - o)|`` of the object's twist ``(v; w) = M_c^T e`` [m]."""
+        v, w = (self.focus.matrix.mT @ error).split(3)
+        carried = v + torch.linalg.cross(w.expand_as(point), point - state.position)
+        return float(torch.linalg.vector_norm(carried, dim=-1).max())
 
     def _problem(
         self,

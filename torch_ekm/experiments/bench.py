@@ -152,7 +152,7 @@ class Bench:
         if start is None:
             return {**about, "grasped": False, "lost": False}
         axis = self.hand.rotation_axis
-        loop = self._controller(axis, focus_step=step_deg * _DEG, actuator_step=20 * _DEG)
+        loop = self._controller(axis, focus_step=step_deg * _DEG, contact_step=None, actuator_step=20 * _DEG)
         seen = self.plant.observe()
         before = _true_state(seen)
         target = PoseTarget.turned(start, axis, step_deg * _DEG)
@@ -167,7 +167,7 @@ class Bench:
         """Give back what the plant holds."""
         self.plant.close()
 
-    def _controller(self, axis: torch.Tensor, **changes: float) -> LookAndMoveController:
+    def _controller(self, axis: torch.Tensor, **changes: Any) -> LookAndMoveController:
         options = dataclasses.replace(self.setting.controller_options(self.hand.hand), **changes)
         model = self.enhanced if self.enhanced is not None else self.model
         return LookAndMoveController(model, FocusedPose.rotation_about(axis), options)
