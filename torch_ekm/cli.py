@@ -117,7 +117,8 @@ def reproduce(
     learner: Annotated[str, Option(help="rbf, action-linear, paper, deep, rls, rff, ...")] = "rbf",
     sensing: Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")] = True,
     step: Annotated[
-        float | None, Option(help="Largest turn of one motion [deg]; 2.5 if left out, 1.5 for wide objects.")
+        float | None,
+        Option(help="Largest turn of one motion [deg]; 3.5 if left out (less where a contact goes 1.2 mm)."),
     ] = None,
     address: Annotated[
         str | None, Option(help="A cluster instead of processes here: dask://HOST:PORT or ray://HOST:PORT.")

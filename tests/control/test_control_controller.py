@@ -93,6 +93,30 @@ def test_limiting_function_keeps_direction() -> None:
     torch.testing.assert_close(loop.limit(error * 0), error * 0)
 
 
+def test_no_contact_is_asked_to_travel_far(grasp) -> None:
+    plant, _, seen, state = grasp
+    target = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG)
+    options = ControllerOptions(contact_step=0.4e-3)
+    decision = controller(grasp, options).decide(state, seen.a, target, seen.fingertip_force)
+    lever = decision.linearization.contacts.point - state.position
+    lever = lever - (lever @ plant.rotation_axis)[:, None] * plant.rotation_axis
+    farthest = float(torch.linalg.vector_norm(lever, dim=-1).max())
+    assert float(decision.desired) * farthest == pytest.approx(0.4e-3)
+    assert float(decision.desired) < 0.8 * STEP
+
+
+def test_a_translation_carries_every_contact_as_far(grasp) -> None:
+    _, model, seen, state = grasp
+    focus = FocusedPose(torch.eye(6, dtype=torch.float64)[:3])
+    target = PoseTarget(state.position + torch.tensor([3e-3, 4e-3, 0.0]), state.rotation)
+    options = ControllerOptions(focus_step=1.0, contact_step=0.5e-3)
+    decision = LookAndMoveController(model, focus, options).decide(state, seen.a, target)
+    torch.testing.assert_close(decision.desired, torch.tensor([0.3e-3, 0.4e-3, 0.0], dtype=torch.float64))
+    free = ControllerOptions(focus_step=1.0, contact_step=None, focus_gain=0.8)
+    decision = LookAndMoveController(model, focus, free).decide(state, seen.a, target)
+    torch.testing.assert_close(decision.desired, 0.8 * torch.tensor([3e-3, 4e-3, 0.0], dtype=torch.float64))
+
+
 def test_grasp_that_is_gone_is_a_status(grasp) -> None:
     _, _, seen, state = grasp
     away = GraspState(state.q, state.position + 0.5, state.rotation)

@@ -105,7 +105,8 @@ def variants(config: AblationConfig) -> list[Variant]:
         ("gain 1 near the goal", {"focus_gain": 1.0}, _ALL),
         ("gain 0.6 near the goal", {"focus_gain": 0.6}, _ALL),
         ("steps of 1.5 deg", {"focus_step": 1.5 * _DEG}, _ALL),
-        ("steps of 4 deg", {"focus_step": 4 * _DEG}, _ALL),
+        ("steps of 6 deg, 2 mm", {"focus_step": 6 * _DEG, "contact_step": 2e-3}, _ALL),
+        ("actuators cut at 6 deg", {"actuator_step": 6 * _DEG}, _ALL),
         ("uncertainty in the cost", {"uncertainty_weight": 1.0}, ("E-KM",)),
         ("rows for the friction margin", {"margin_min": 0.5}, _ALL),
     ):
