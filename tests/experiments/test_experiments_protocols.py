@@ -247,12 +247,31 @@ def test_what_cannot_be_grasped_is_recorded_not_raised(monkeypatch: pytest.Monke
 
     bench = Bench(Setting(), "box", "KM")
 
+    tried = []
+
     def fail(seed: int) -> None:
+        tried.append(seed)
         raise GraspError("too wide")
 
     monkeypatch.setattr(bench.plant, "reset", fail)
     assert bench.trial(0, 0, 5.0)["reason"] == "not grasped"
     assert bench.long_step(0, 0)["grasped"] is False
+    often = len(tried)
+    again = bench.trial(0, 1, 5.0)
+    assert (again["reason"], again["message"]) == ("not grasped", "too wide")
+    assert len(tried) == often  # given up
+
+
+def test_the_report_names_what_was_never_grasped(tmp_path: Path) -> None:
+    from torch_ekm.experiments.reports import generalize_report
+
+    failed = {"seed": 0, "object": "box", "kind": "turn", "grasped": False, "lost": False, "angle_deg": 9.0,
+              "reason": "not grasped", "message": "too wide"}  # fmt: skip
+    results = {who: [{**failed, "controller": who}] for who in ("KM", "KM+I", "E-KM", "E-KM+I")}
+    report = generalize_report(GeneralizeConfig(objects=("box",)), (0,), results, tmp_path)
+    assert "box was never grasped (too wide)" in report.summary
+    report.write(tmp_path)
+    assert "never grasped" in (tmp_path / "index.html").read_text()
 
 
 def test_object_memory_runs_and_all_memories_see_the_same_motions() -> None:

@@ -204,6 +204,16 @@ def test_a_motion_without_stiffness_is_reported():
     assert abs(float(caught.value.direction[1])) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(("free", "says"), [(1, "joints .* a spring"), (5, "object .* leave it free")])
+def test_the_message_says_whose_motion_it_is(free, says):
+    """Three joints, then the object's twist."""
+    stiffness = torch.ones(9, dtype=F64)
+    stiffness[free] = 0.0
+    first = torch.eye(9, dtype=F64)[:1]
+    with pytest.raises(SingularGraspError, match=says):
+        two_stage(torch.diag(stiffness), first, torch.eye(1, dtype=F64))
+
+
 def test_a_free_hand_shares_the_motion_by_its_springs():
     # A empty: J = K^-1 J_a^T (J_a K^-1 J_a^T)^-1
     K = torch.diag(torch.tensor([0.2, 0.1, 0.3], dtype=F64))

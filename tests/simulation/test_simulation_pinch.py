@@ -9,6 +9,7 @@ from simulation_helpers import DEG
 
 from torch_ekm.contact.collision import ContactDetector
 from torch_ekm.description import list_objects, load_hand, load_object
+from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.simulation import PinchRequest, PlantConfig, PlantParameters
 from torch_ekm.simulation.mechanism import make_planner, make_transmission
@@ -85,3 +86,19 @@ def test_weaker_springs_bend_the_fingertips_back():
     hand = load_hand("icub_right")
     j2, j3 = (hand.joint_names.index(f"thumb_{k}") for k in (2, 3))
     assert weak[j3] - weak[j2] > stiff[j3] - stiff[j2] + 3 * DEG
+
+
+def test_a_pinch_across_another_axis_is_not_passed_off_as_the_wanted_one(tmp_path):
+    size = (0.12, 0.10, 0.025)  # 100 mm along the grasp axis (y), 25 mm across it
+    (tmp_path / "slab.urdf").write_text(
+        '<robot name="slab"><link name="slab"><inertial><mass value="0.05"/>'
+        '<inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial><collision>'
+        f'<geometry><box size="{size[0]} {size[1]} {size[2]}"/></geometry></collision></link></robot>'
+    )
+    settings = tmp_path / "slab.object.toml"
+    settings.write_text('[object]\nname = "slab"\nfriction = 0.8\ngrasp_width = 0.1\n')
+    with pytest.raises(EquilibriumError, match=r"grasp_axis|too wide"):
+        plan_for(str(tmp_path / "slab.urdf"))
+    settings.write_text(settings.read_text() + "grasp_axis = [0.0, 0.0, 1.0]\n")
+    _, _, plan, _ = plan_for(str(tmp_path / "slab.urdf"))
+    assert abs(plan.normals[0] @ plan.rotation[:, 2]) > 0.95

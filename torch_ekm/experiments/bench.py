@@ -26,6 +26,7 @@ from .setting import Setting
 Record = dict[str, Any]
 _DEG = math.pi / 180
 _TRIES = 4  # grasps drawn for one trial before it is given up
+_HOPELESS = 2  # trials without any grasp, after which the object is given up
 _MOVING = 0.5 * _DEG  # commands that ask for less tell nothing about the shortfall of a step
 
 
@@ -65,6 +66,7 @@ class Bench:
         self.enhanced: EnhancedModel | None = None
         self.no_grasp = ""
         """Why the last grasp that failed did."""
+        self._held, self._failed = 0, 0  # trials with a grasp, and without one
         self.on_grasp: Callable[[torch.Tensor], object] | None = None
         """Hears of the axis of each new grasp."""
 
@@ -73,7 +75,12 @@ class Bench:
         return self.controller.startswith("E-KM")
 
     def grasp(self, seed: int, trial: int) -> GraspState | None:
-        """A random grasp point, decided by ``(seed, trial)`` alone; None if no pinch holds."""
+        """A random grasp point, decided by ``(seed, trial)`` alone; None if no pinch holds.
+
+        An object that no pinch held in the first two trials is given up: planning in vain takes longest.
+        """
+        if self._held == 0 and self._failed >= _HOPELESS:
+            return None
         for attempt in range(_TRIES):
             drawn = int(np.random.SeedSequence([seed, trial, attempt]).generate_state(1)[0])
             try:
@@ -81,12 +88,14 @@ class Bench:
             except (EquilibriumError, GraspError) as error:
                 self.no_grasp = str(error)
                 continue
+            self._held += 1
             self.model.reset()
             if self.learns and self.enhanced is None:
                 self._prepare_learner(start)
             if self.on_grasp is not None:
                 self.on_grasp(self.hand.rotation_axis)
             return start
+        self._failed += 1
         return None
 
     def adopt(self, learner: ResidualLearner, encoding: GraspEncoding) -> None:

@@ -193,7 +193,16 @@ def _verdict(records: list[Record], seeds: tuple[int, ...]) -> str:
     if mine:
         ours, theirs = paired_means(mine, mine, mean_prediction("ekm"), mean_prediction("km"))
         parts.append(f"prediction error on the same motions {percent(bootstrap_ratio(ours, theirs))} %")
-    return "; ".join(parts) + f". {_which(seeds)}"
+    parts += _never_grasped(records)
+    return "; ".join(parts or ["Nothing to compare"]) + f". {_which(seeds)}"
+
+
+def _never_grasped(records: list[Record]) -> list[str]:
+    """A sentence on each object that no trial could hold, with the reason of the last try."""
+    turns = [r for r in records if r["kind"] == "turn"]
+    held = {r["object"] for r in turns if r["grasped"]}
+    why = {r["object"]: r.get("message", "") for r in turns if r["object"] not in held}
+    return [f"{name} was never grasped ({reason})" for name, reason in why.items()]
 
 
 def _which(seeds: Sequence[int]) -> str:

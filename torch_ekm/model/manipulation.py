@@ -170,9 +170,17 @@ def _judge(K: Tensor, N: Tensor, stability: Tensor, tolerance: Tensor, on_unstab
     if abs(value) <= float(tolerance.reshape(-1)[at]):
         if on_unstable == "flag" and float(torch.linalg.det(flat_K[at]).abs()) > 0:
             return
+        of_object = float(direction[-6:].square().sum()) > 0.5  # a unit vector: mostly of the object's twist
+        whose, remedy = (
+            (
+                "the object",
+                "its contacts leave it free, as before a loss: add contacts, or torsional friction",
+            )
+            if of_object
+            else ("the joints", "give them a spring, a stiffness floor, or a lock")
+        )
         raise SingularGraspError(
-            f"a motion meets neither stiffness nor constraint (eigenvalue {value:.2g}); "
-            "give its joints a spring, a stiffness floor, or a lock",
+            f"a motion of {whose} meets neither stiffness nor constraint (eigenvalue {value:.2g}); {remedy}",
             direction=direction,
         )
     if on_unstable == "raise":

@@ -14,6 +14,7 @@ from .pinch_problem import PinchProblem, PinchRequest
 
 Array = NDArray[np.float64]
 
+_FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
 _GOOD_COST = 20.0  # half a sum of squares; the wishes of a good pinch cost about 0.3
 
 
@@ -52,7 +53,7 @@ class PinchPlanner:
         """Solve for a pinch.
 
         Raises:
-            EquilibriumError: no posture was found that holds the object as wanted.
+            EquilibriumError: no posture was found that holds the object as wanted, across its grasp axis.
         """
         least_squares = require("scipy.optimize").least_squares
         problem = self.problem
@@ -83,6 +84,13 @@ class PinchPlanner:
                 f"{request.force} N at along = {request.along} m",
             )
         g = problem.geometry(best[None])
+        if np.abs(g.facing).min() < _FACING:
+            raise EquilibriumError(
+                "pinch planner",
+                "the only pinch found holds the object across another axis than its 'grasp_axis'",
+                f"'{problem.obj.name}' may be too wide along {problem.obj.grasp_axis.round(3).tolist()} "
+                "for this hand: name the axis along which it is thin",
+            )
         return PinchPlan(
             q=g.q[0],
             position=g.position[0],
