@@ -116,6 +116,9 @@ def reproduce(
     severity: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
     learner: Annotated[str, Option(help="rbf, action-linear, paper, deep, rls, rff, ...")] = "rbf",
     sensing: Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")] = True,
+    angles: Annotated[
+        str, Option(help="Turns [deg], e.g. 5,10,15; Table I if left out (generalize, ablation).")
+    ] = "",
     step: Annotated[
         float | None,
         Option(help="Largest turn of one motion [deg]; 3.5 if left out (less where a contact goes 1.2 mm)."),
@@ -134,7 +137,10 @@ def reproduce(
 
     control = {} if step is None else {"focus_step": math.radians(step)}
     setting = Setting(hand=hand, severity=severity, learner=learner, sensing=sensing, control=control)
-    planned = plan(experiment, parse_seeds(seeds), setting=setting, objects=objects, quick=quick)
+    turns = _numbers("angles", angles) if angles else None
+    planned = plan(
+        experiment, parse_seeds(seeds), setting=setting, objects=objects, angles_deg=turns, quick=quick
+    )
     folder = out if out is not None else Path(f"reproduce_{experiment}")
     with _progress() as progress:
         task = progress.add_task(experiment, total=len(planned.jobs))

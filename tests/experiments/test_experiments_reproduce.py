@@ -147,6 +147,16 @@ def test_plans_are_checked() -> None:
         assert len(plan(name, quick=True).jobs) < len(plan(name).jobs)
 
 
+def test_angles_of_a_user() -> None:
+    planned = plan("generalize", (0,), angles_deg=(4.0, 8.0))
+    assert planned.config.angles_of("box") == (4.0, 8.0)
+    assert planned.jobs.keys() != plan("generalize", (0,)).jobs.keys()  # no old results are taken up
+    with pytest.raises(ParameterError, match="left out"):
+        plan("online", (0,), angles_deg=(4.0,))
+    result = CliRunner().invoke(app, ["reproduce", "generalize", "--angles", "5:10"])
+    assert isinstance(result.exception, ParameterError)
+
+
 def test_command_line() -> None:
     runner = CliRunner()
     result = runner.invoke(app, ["reproduce", "--help"])

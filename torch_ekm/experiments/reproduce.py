@@ -47,6 +47,7 @@ def plan(
     *,
     setting: Setting | None = None,
     objects: Path | None = None,
+    angles_deg: tuple[float, ...] | None = None,
     quick: bool = False,
 ) -> Experiment:
     """The jobs of an experiment, none of them run yet.
@@ -56,11 +57,13 @@ def plan(
         seeds: each is an independent run; every controller gets the same ones.
         setting: hand, plant, learner, sensing.
         objects: a folder with URDF files to be used instead of the objects that come with the package.
+        angles_deg: turns to be made instead of the experiment's own.
         quick: two seeds and a few small turns: to see that it works, not to claim anything.
 
     Raises:
         UnknownNameError: no such experiment; the message lists them.
-        ParameterError: no seeds, no URDF file in ``objects``, or an experiment that takes no objects.
+        ParameterError: no seeds, no URDF file in ``objects``, or an experiment that takes no objects
+            or no angles.
     """
     if name not in EXPERIMENTS:
         raise UnknownNameError("experiment", name, EXPERIMENTS)
@@ -74,6 +77,12 @@ def plan(
     changes: dict[str, Any] = {"setting": setting, **(_QUICK[name] if quick else {})}
     if found is not None:
         changes["objects"] = found
+    if angles_deg is not None:
+        if name not in ("generalize", "ablation"):
+            raise ParameterError(
+                "angles_deg", angles_deg, "left out: only 'generalize' and 'ablation' take angles"
+            )
+        changes["angles_deg"] = angles_deg
     if name == "online":
         online = OnlineConfig(**changes)
         return Experiment(
