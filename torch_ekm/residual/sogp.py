@@ -304,12 +304,12 @@ class SparseOnlineGP(DoubleStateLearner):
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         on = None if mask is None else mask.to(x.dtype)
         z, t = self._units(x), y / self.output_scale.scale if self.normalize_for else y
-        s2, noise = self._shared_noise(), self.log_noise_variance.exp()
+        s2 = self._shared_noise()
         number = self._n_samples if self.posterior.needs_age else 0
-        step = compiled_absorb() if self.compile_step else SparsePosterior.absorb
+        step = compiled_absorb(x.device.type) if self.compile_step else SparsePosterior.absorb
         report, innovation, v = step(self.posterior, z, t, self.kernel, s2, on, number)
         if self.calibration is not None:
-            self.calibration.observe(innovation, v, noise, on)
+            self.calibration.observe(innovation, v, self.log_noise_variance.exp(), on)
         if self.detector is not None:
             self._start_anew(self.detector.observe(x, y, report.surprise, on))
         self.pending += 1.0 if on is None else on
