@@ -26,7 +26,7 @@ _DEGREE = np.pi / 180
 class ControllerOptions:
     """Every figure of the controller, in SI units (angles [rad])."""
 
-    focus_step: float = 3.5 * _DEGREE
+    focus_step: float = 2.5 * _DEGREE
     """Limiting function: at most this much of the focused error is asked for in one step."""
     contact_step: float | None = 1.2e-3
     """And no contact is asked to move farther than this [m]: a wide object turns in smaller steps.
@@ -41,7 +41,7 @@ class ControllerOptions:
     """W = effort_weight I, per deg^2 of actuator motion."""
     off_rotation_weight: float = 0.3
     """Weight of rotation off the focused axis, per deg^2."""
-    off_translation_weight: float = 0.2
+    off_translation_weight: float = 0.05
     """Weight of translation off the focus, per mm^2."""
     off_step_rotation: float = 0.5 * _DEGREE
     off_step_translation: float = 0.5e-3
