@@ -121,7 +121,7 @@ def reproduce(
     ] = "",
     step: Annotated[
         float | None,
-        Option(help="Largest turn of one motion [deg]; 3.5 if left out (less where a contact goes 1.2 mm)."),
+        Option(help="Largest turn of one motion [deg]; 2.5 if left out (less where a contact goes 1.2 mm)."),
     ] = None,
     address: Annotated[
         str | None, Option(help="A cluster instead of processes here: dask://HOST:PORT or ray://HOST:PORT.")
