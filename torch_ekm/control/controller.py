@@ -62,6 +62,9 @@ class ControllerOptions:
     (translation); 0: what the learner is unsure of costs nothing."""
     joint_margin: float = 0.5 * _DEGREE
     """Joints are kept this far from their stops."""
+    joint_horizon: float = 8 * _DEGREE
+    """Joints have a row where actuator motions of this size could bring them to a stop. Longer ones
+    are rare, and every row costs time."""
     fixed_actuators: tuple[str, ...] = ()
     """Actuators that must not move."""
     sqp_iterations: int = 6
@@ -268,7 +271,7 @@ class LookAndMoveController:
             soft.append((-_np(lin.margin_sensitivity) * _DEGREE, -low))
         q, J_q, c_q = _np(state.q), _np(J[:n_q]), _np(offset[:n_q])
         hand, moving = self.kinematic.hand, self._moving
-        reach = np.abs(J_q).sum(1) * opt.actuator_step + 2 * opt.joint_margin
+        reach = np.abs(J_q).sum(1) * min(opt.actuator_step, opt.joint_horizon) + 2 * opt.joint_margin
         for sign, stop in ((1.0, hand.joint_upper), (-1.0, hand.joint_lower)):
             room = sign * (stop - q) - opt.joint_margin
             near = moving[room[moving] < reach[moving]]
