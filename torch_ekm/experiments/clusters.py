@@ -68,7 +68,9 @@ def _on_ray(place: str, function: Callable[..., Any], jobs: Jobs) -> Iterator[tu
         try:
             ray.init("auto" if place == "auto" else f"ray://{place}", log_to_driver=False)
         except (ConnectionError, ValueError) as error:
-            raise _silent("ray", place, error) from error
+            # a head that wants a token lets clients without one wait until they give up
+            hint = f"{error}; a recent Ray wants RAY_AUTH_MODE=token and the head's token on both sides"
+            raise _silent("ray", place, hint) from error
     try:
         run = ray.remote(num_cpus=1, max_retries=0)(alone)
         waiting = {run.remote(function, job): name for name, job in jobs.items()}
@@ -88,5 +90,5 @@ def _on_ray(place: str, function: Callable[..., Any], jobs: Jobs) -> Iterator[tu
             ray.shutdown()
 
 
-def _silent(scheme: str, place: str, error: Exception) -> ParameterError:
-    return ParameterError("address", f"{scheme}://{place}", f"a cluster that answers ({error})")
+def _silent(scheme: str, place: str, reason: object) -> ParameterError:
+    return ParameterError("address", f"{scheme}://{place}", f"a cluster that answers ({reason})")
