@@ -50,10 +50,10 @@ def feed(target: torch.nn.Module, x: torch.Tensor, y: torch.Tensor) -> list[floa
 
 
 def run(
-    n_objects: int = 4, visits: int = 5, **options: float
+    n_objects: int = 4, visits: int = 5, spread: float = 0.5
 ) -> tuple[ModelBank, list, dict[str, list[float]]]:
     """A random sequence of objects; where each episode went, and everybody's errors after first visits."""
-    world = World(n_objects, seed=3)
+    world = World(n_objects, seed=3, spread=spread)
     order = torch.randperm(n_objects * visits, generator=world.generator) % n_objects
     bank, one = ModelBank(learner, 8), learner()
     labelled = [learner() for _ in range(n_objects)]
@@ -93,6 +93,39 @@ def test_bank_predicts_like_labelled_models_and_better_than_one() -> None:
     mean = {name: sum(values) / len(values) for name, values in errors.items()}
     assert mean["bank"] < 1.1 * mean["labelled"]
     assert mean["bank"] < 0.5 * mean["one"]
+
+
+def test_bank_is_no_worse_than_one_model_where_objects_are_alike() -> None:
+    """They feel different, so each has its model, but they answer alike: what is common knows more."""
+    world, one = World(1, seed=3), learner()
+    bank = ModelBank(learner, 8, temperature=0.1, signature_features=1)
+    ours, theirs = [], []
+    for episode in range(30):
+        place = episode % 5
+        bank.begin(torch.tensor([10.0 * place], dtype=torch.float64) + 0.1 * world._randn(1))
+        x, y = world.episode(0, n=8)
+        ours += feed(bank, x, y)
+        theirs += feed(one, x, y)
+    assert bank.n_models == 5
+    assert sum(ours) < 1.03 * sum(theirs)  # the leader alone: 1.09 times
+
+
+def test_bank_mixes_leader_and_common_learner() -> None:
+    bank, _, _ = run(n_objects=2, visits=2, spread=0.2)
+    bank.begin()
+    feed(bank, *World(2, seed=3, spread=0.2).episode(1, n=4))
+    x = torch.full((N_S + N_A,), 0.7, dtype=torch.float64)
+    p, ours, theirs = float(bank.lead.sigmoid()), bank.working, bank.common
+    assert 0.55 < p < 0.999
+    torch.testing.assert_close(bank(x), p * ours(x) + (1 - p) * theirs(x))
+    torch.testing.assert_close(bank.linearize(x)[1], torch.func.jacrev(bank)(x))
+    draws = torch.Generator().manual_seed(0)
+    which = torch.rand(200_000, 1, generator=draws) < p
+    laws = [g.predict(x) for g in (ours, theirs)]
+    y = torch.where(which, laws[0].mean, laws[1].mean) + torch.where(
+        which, laws[0].stddev, laws[1].stddev
+    ) * torch.randn(200_000, N_OUT, generator=draws, dtype=torch.float64)
+    torch.testing.assert_close(bank.predict(x).stddev, y.std(0), rtol=0.01, atol=0)
 
 
 def test_familiar_object_is_taken_up_within_two_samples() -> None:

@@ -20,6 +20,7 @@ from .signature_model import SignatureModel
 _LEAST = 3  # samples without which an episode says nothing
 _PRUNE = math.log(1e-4)  # hypotheses less probable than this are dropped for the rest of an episode
 _SCALE_RATE = 0.02
+_TRUST, _FADE = 0.1, 0.9  # what one sample says of leader and common learner, and how fast that fades
 _SAMPLES = 64  # remembered of an episode
 
 
@@ -33,8 +34,17 @@ class ModelBank(ResidualLearner):
 
     An *episode* is one grasp: the hand knows that it grasps anew (:meth:`begin`), not what. Each
     hypothesis learns along during the first ``window`` samples, so its sum is the exact evidence of
-    its model for the episode; the best one predicts. Then the best one goes on alone, and when the
+    its model for the episode; the best one leads. Then the leader goes on alone, and when the
     episode ends it replaces the model it began as, or becomes a new one.
+
+    What objects have in common is best known to the learner of all of them, what is special to the
+    leader. The bank predicts with both, weighed by how well each predicted lately::
+
+        g(x) = p g_leader(x) + (1 - p) g_common(x)
+        logit p <- 0.9 logit p + 0.1 log(p_leader(y) / p_common(y))
+
+    so where objects differ little it is no worse than one model of all, and where they differ much no
+    worse than a model of each.
 
     Different objects may answer alike, and then residuals cannot tell them apart. With a *signature* z,
     what the grasp feels like before the first motion (:class:`GraspSignature`), recognition begins with
@@ -75,6 +85,7 @@ class ModelBank(ResidualLearner):
     leader: Tensor
     scale: Tensor
     signed: Tensor
+    lead: Tensor
 
     def __init__(
         self,
@@ -121,6 +132,7 @@ class ModelBank(ResidualLearner):
         for name in ("seen", "leader"):
             self.register_buffer(name, torch.zeros((), dtype=torch.int64, device=device))
         self.register_buffer("scale", self._like.new_ones(self.out_features))
+        self.register_buffer("lead", torch.zeros((), dtype=torch.float64, device=device))  # logit p
         self.signatures = SignatureModel() if signatures is None else signatures
         self.memory: EpisodeMemory | None = None
         if signature_features:
@@ -250,20 +262,28 @@ class ModelBank(ResidualLearner):
 
     @property
     def working(self) -> ResidualLearner:
-        """The hypothesis that predicts."""
+        """The hypothesis that leads."""
         return self._trial(int(self.leader))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Mean of the leading hypothesis."""
-        return self.working(x)
+        """Mean of the leading hypothesis and the common learner."""
+        return self._mix(self.working(x), self.common(x))
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
-        """Its law."""
-        return self.working.predict(x, observation=observation)
+        """Mean and variance of the mixture of their laws."""
+        ours, theirs = (g.predict(x, observation=observation) for g in (self.working, self.common))
+        p = self.lead.sigmoid()
+        apart = (p * (1 - p) * (ours.mean - theirs.mean).square()).to(self.dtype)
+        variance = self._mix(ours.variance, theirs.variance) + apart
+        return Normal(self._mix(ours.mean, theirs.mean), variance.sqrt(), validate_args=False)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Its mean and slope."""
-        return self.working.linearize(x)
+        """Mean and slope."""
+        ours, theirs = self.working.linearize(x), self.common.linearize(x)
+        return self._mix(ours[0], theirs[0]), self._mix(ours[1], theirs[1])
+
+    def _mix(self, ours: Tensor, theirs: Tensor) -> Tensor:
+        return torch.lerp(theirs, ours, self.lead.sigmoid().to(ours.dtype))
 
     @torch.no_grad()
     def reset(self) -> None:
@@ -271,6 +291,7 @@ class ModelBank(ResidualLearner):
         for learner in (self.common, *self.kept, *self.trial):
             _learner(learner).reset()
         self.episodes.zero_()
+        self.lead.zero_()
         self.scale.fill_(1.0)
         self.n_refused.zero_()
         if self.memory is not None:
@@ -290,12 +311,15 @@ class ModelBank(ResidualLearner):
         for i in followed:
             hypothesis = self._trial(i)
             law = hypothesis.predict(x, observation=True)
-            if choosing:
-                density[i] = StudentT(4.0, law.mean, law.stddev * self.scale).log_prob(y).sum(-1)
-            else:  # only of a model that was chosen: the errors of a wrong one say nothing of noise
+            density[i] = self._log_density(law, y)
+            if (
+                not choosing
+            ):  # only of a model that was chosen: the errors of a wrong one say nothing of noise
                 z2 = ((y - law.mean) / law.stddev).square().clamp_max(25.0)  # one slip must not widen it
                 self.scale.copy_((self.scale.square().lerp(z2, _SCALE_RATE)).sqrt())
             reports[i] = hypothesis.update(x, y)
+        better = density[leader] - self._log_density(self.common.predict(x, observation=True), y)
+        self.lead.mul_(_FADE).add_(_TRUST * better)
         self.common.update(x, y)
         if self.memory is not None:
             self.memory.note(x, y)
@@ -308,6 +332,9 @@ class ModelBank(ResidualLearner):
             self.log_evidence += self.temperature * density
             self.leader.copy_((self.log_prior + self.log_evidence).argmax())
         return reports[leader]
+
+    def _log_density(self, law: Normal, y: Tensor) -> Tensor:
+        return StudentT(4.0, law.mean, law.stddev * self.scale).log_prob(y).sum(-1)
 
     def _candidates(self) -> list[int]:
         """Hypotheses worth following; one that is dropped falls behind and stays dropped."""
