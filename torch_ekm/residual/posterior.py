@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import torch
 from torch import nn
@@ -313,5 +314,5 @@ def compiled_absorb(device: str) -> Callable:
         device: type of device. On the CPU the calls between the kernels cost a tenth of the step when
             Python makes them: C++ does.
     """
-    options = {"cpp_wrapper": True} if device == "cpu" else None
+    options: dict[str, Any] | None = {"cpp_wrapper": True} if device == "cpu" else None
     return torch.compile(SparsePosterior.absorb, dynamic=False, options=options)
