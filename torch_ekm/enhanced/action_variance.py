@@ -37,7 +37,7 @@ def action_variance(
         ParameterError: the learner's variance does not depend on the action, or cannot be
             differentiated: it has nothing to say here.
     """
-    learner = getattr(learner, "working", learner)  # of a bank: the hypothesis that predicts
+    learner = getattr(learner, "working", learner)  # of a bank: the hypothesis that leads
     if (
         isinstance(learner, SparseOnlineGP)
         and isinstance(learner.kernel, ActionLinearKernel)

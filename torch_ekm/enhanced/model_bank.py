@@ -43,8 +43,8 @@ class ModelBank(ResidualLearner):
         g(x) = p g_leader(x) + (1 - p) g_common(x)
         logit p <- 0.9 logit p + 0.1 log(p_leader(y) / p_common(y))
 
-    so where objects differ little it is no worse than one model of all, and where they differ much no
-    worse than a model of each.
+    so where objects differ little it is as good as one model of all, and where they differ much about
+    as good as a model of each.
 
     Different objects may answer alike, and then residuals cannot tell them apart. With a *signature* z,
     what the grasp feels like before the first motion (:class:`GraspSignature`), recognition begins with
@@ -312,9 +312,8 @@ class ModelBank(ResidualLearner):
             hypothesis = self._trial(i)
             law = hypothesis.predict(x, observation=True)
             density[i] = self._log_density(law, y)
-            if (
-                not choosing
-            ):  # only of a model that was chosen: the errors of a wrong one say nothing of noise
+            if not choosing:
+                # only of a model that was chosen: the errors of a wrong one say nothing of noise
                 z2 = ((y - law.mean) / law.stddev).square().clamp_max(25.0)  # one slip must not widen it
                 self.scale.copy_((self.scale.square().lerp(z2, _SCALE_RATE)).sqrt())
             reports[i] = hypothesis.update(x, y)

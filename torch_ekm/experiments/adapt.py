@@ -85,7 +85,7 @@ class Memories(ResidualLearner):
 
     @property
     def working(self) -> ResidualLearner:
-        """The hypothesis of the bank that predicts."""
+        """The hypothesis of the bank that leads."""
         return self.bank.working
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:

@@ -66,7 +66,7 @@ class Bench:
         self.enhanced: EnhancedModel | None = None
         self.no_grasp = ""
         """Why the last grasp that failed did."""
-        self._held, self._failed = 0, 0  # trials with a grasp, and without one
+        self._ever_held, self._failed = False, 0  # trials without a grasp
         self.on_grasp: Callable[[torch.Tensor], object] | None = None
         """Hears of the axis of each new grasp."""
 
@@ -79,7 +79,7 @@ class Bench:
 
         An object that no pinch held in the first two trials is given up: planning in vain takes longest.
         """
-        if self._held == 0 and self._failed >= _HOPELESS:
+        if not self._ever_held and self._failed >= _HOPELESS:
             return None
         for attempt in range(_TRIES):
             drawn = int(np.random.SeedSequence([seed, trial, attempt]).generate_state(1)[0])
@@ -88,7 +88,7 @@ class Bench:
             except (EquilibriumError, GraspError) as error:
                 self.no_grasp = str(error)
                 continue
-            self._held += 1
+            self._ever_held = True
             self.model.reset()
             if self.learns and self.enhanced is None:
                 self._prepare_learner(start)

@@ -170,15 +170,10 @@ def _judge(K: Tensor, N: Tensor, stability: Tensor, tolerance: Tensor, on_unstab
     if abs(value) <= float(tolerance.reshape(-1)[at]):
         if on_unstable == "flag" and float(torch.linalg.det(flat_K[at]).abs()) > 0:
             return
-        of_object = float(direction[-6:].square().sum()) > 0.5  # a unit vector: mostly of the object's twist
-        whose, remedy = (
-            (
-                "the object",
-                "its contacts leave it free, as before a loss: add contacts, or torsional friction",
-            )
-            if of_object
-            else ("the joints", "give them a spring, a stiffness floor, or a lock")
-        )
+        whose, remedy = "the joints", "give them a spring, a stiffness floor, or a lock"
+        if float(direction[-6:].square().sum()) > 0.5:  # a unit vector: mostly of the object's twist
+            whose = "the object"
+            remedy = "its contacts leave it free, as before a loss: add contacts, or torsional friction"
         raise SingularGraspError(
             f"a motion of {whose} meets neither stiffness nor constraint (eigenvalue {value:.2g}); {remedy}",
             direction=direction,
