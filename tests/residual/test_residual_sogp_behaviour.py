@@ -14,7 +14,6 @@ from torch_ekm.experiments.prequential import outlier_cost, recovery_after_chang
 from torch_ekm.experiments.streams import Stream
 from torch_ekm.residual import (
     ActionLinearKernel,
-    DeepKernel,
     RandomFeatureRLS,
     RecursiveLeastSquares,
     SparseOnlineGP,
@@ -123,69 +122,6 @@ def test_compiled_step_gives_the_same():
     torch.testing.assert_close(gps[0](x), gps[1](x), atol=1e-9, rtol=0)
 
 
-def test_adaptation_beats_a_wrong_start():
-    x, y = system(2, 900)
-    wrong = {"capacity": 40, "kernel": SquaredExponential(4, lengthscale=0.3), "noise_variance": 0.5}
-    errors, nll = [], []
-    for adapt in (False, True):
-        gp = SparseOnlineGP(4, 2, **copy.deepcopy(wrong), adapt=adapt, refresh_every=8)
-        run = run_prequential(gp, x, y)
-        errors.append(float(run.error[600:].square().mean().sqrt()))
-        nll.append(run.nll(600))
-    assert errors[1] < 0.6 * errors[0]
-    assert nll[1] < nll[0] - 0.3
-    assert 0.003 < float(gp.noise_variance.mean()) < 0.06  # true: 0.01, plus what 40 points cannot explain
-
-
-def test_adaptation_gradient_is_that_of_the_loss():
-    x, y = system(3, 64)
-    gp = SparseOnlineGP(4, 2, capacity=20, adapt=True, refresh_every=16)
-    gp.update(x[:48], y[:48])
-    for t in range(48, 63):  # the window fills but is not used up yet
-        gp.update(x[t], y[t])
-    parameter = gp.kernel.log_lengthscale
-    a = gp.adaptation
-
-    def loss(value):
-        saved = parameter.detach().clone()
-        parameter.data.copy_(value)
-        out = float(a.loss(gp.kernel, gp.log_noise_variance, 1e-6, None))
-        parameter.data.copy_(saved)
-        return out
-
-    parameter.requires_grad_(True)
-    (gradient,) = torch.autograd.grad(a.loss(gp.kernel, gp.log_noise_variance, 1e-6, None), parameter)
-    parameter.requires_grad_(False)
-    for i in range(4):
-        step = torch.zeros(4, dtype=torch.float64)
-        step[i] = 1e-5
-        slope = (loss(parameter + step) - loss(parameter - step)) / 2e-5
-        assert float(gradient[i]) == pytest.approx(slope, rel=1e-4, abs=1e-7)
-
-
-def test_lagged_loss_is_the_density_of_the_old_state():
-    x, y = system(4, 64)
-    gp = SparseOnlineGP(4, 2, capacity=20, adapt=True, refresh_every=16)
-    gp.update(x[:48], y[:48])
-    law = gp.predict(x[48:63], observation=True)
-    expected = -law.log_prob(y[48:63]).mean(-1).mean()
-    gp.update(x[48:63], y[48:63])
-    loss = gp.adaptation.loss(gp.kernel, gp.log_noise_variance, gp.posterior.jitter, None)
-    assert float(loss) == pytest.approx(float(expected), abs=1e-6)
-
-
-def test_each_output_finds_its_own_noise():
-    x, y = system(5, 1200, noise=0.0)
-    generator = torch.Generator().manual_seed(0)
-    sd = torch.tensor([0.05, 0.4], dtype=torch.float64)
-    y = y + sd * torch.randn(y.shape, generator=generator, dtype=torch.float64)
-    gp = SparseOnlineGP(4, 2, capacity=50, adapt=True, noise_variance=0.05, refresh_every=8)
-    gp.update(x, y)
-    found = gp.noise_variance.sqrt()
-    assert 0.03 < float(found[0]) < 0.15
-    assert 0.3 < float(found[1]) < 0.5
-
-
 def test_calibration_covers_whatever_the_noise():
     x, y = system(6, 900, noise=0.0)
     rng = np.random.default_rng(0)
@@ -266,36 +202,6 @@ def test_fitc_is_less_confident_than_kl():
         gp.update(x, y)
         variances.append(gp.variance(x[:50]).mean())
     assert variances[1] > variances[0]
-
-
-def test_deep_kernel_starts_as_the_plain_one_and_does_not_collapse():
-    x, y = system(11, 600)
-    errors = []
-    for kernel in (
-        SquaredExponential(4),
-        DeepKernel(SquaredExponential(4), hidden=(16,), initial_scale=1e-6),
-        DeepKernel(SquaredExponential(4), hidden=(16,)),
-    ):
-        gp = SparseOnlineGP(4, 2, capacity=40, kernel=kernel, adapt=True)
-        gp.update(x[:31], y[:31])
-        early = gp(x[:31])
-        gp.update(x[31:], y[31:])
-        errors.append((early, float((gp(x) - torch.sin(torch.asin(y.clamp(-1, 1)))).square().mean())))
-        assert float(gp.condition_number) < 1e9
-    torch.testing.assert_close(errors[0][0], errors[1][0], atol=1e-6, rtol=0)
-    assert errors[2][1] < 1.3 * errors[0][1]
-
-
-def test_deep_kernel_gradient_is_autograds():
-    x, y = system(12, 60)
-    gp = SparseOnlineGP(4, 2, capacity=20, kernel=DeepKernel(SquaredExponential(4)), normalize=True)
-    gp.update(x, y)
-    p = gp.predict_with_jacobians(x[:5])
-    torch.testing.assert_close(
-        p.mean_jacobian, torch.func.vmap(torch.func.jacrev(gp))(x[:5]), atol=1e-10, rtol=0
-    )
-    slope = torch.func.vmap(torch.func.jacrev(gp.variance))(x[:5])
-    torch.testing.assert_close(p.variance_jacobian, slope, atol=1e-9, rtol=0)
 
 
 @pytest.mark.parametrize(

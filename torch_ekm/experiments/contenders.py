@@ -11,7 +11,7 @@ from typing import Any
 
 from ..exceptions import UnknownNameError
 from ..residual import (
-    DeepKernel,
+    DeepKernelSOGP,
     GPyTorchSVGP,
     GPyTorchWindow,
     KRLSTracker,
@@ -23,7 +23,6 @@ from ..residual import (
     ResidualLearner,
     RiverResidual,
     SparseOnlineGP,
-    SquaredExponential,
     WindowGP,
     ZeroResidual,
 )
@@ -45,8 +44,7 @@ def _mixture(d: int, m: int) -> ResidualLearner:
 
 
 def _deep(d: int, m: int) -> ResidualLearner:
-    kernel = DeepKernel(SquaredExponential(d))
-    return SparseOnlineGP(d, m, capacity=100, kernel=kernel, adapt=True, calibrate=True, **_FRESH)
+    return DeepKernelSOGP(d, m, capacity=100, calibrate=True, **_FRESH)
 
 
 #: Name -> ``factory(in_features, out_features)``.

@@ -3,13 +3,32 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
 
 import torch
 from torch import nn
 
-from ..typing import Float, Tensor
+from ..typing import Bool, Float, Tensor
 from .kernels import Kernel
-from .posterior import SparsePosterior, basis_gram
+from .natural import posterior_from_natural
+from .posterior import SparsePosterior, as_gram
+from .replay import ReplayMemory
+
+#: Inputs and outputs of sets of samples, to the learner's units.
+Units = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+_REPLAYED = 4  # samples of the memory per sample of the window, in each step
+_LARGEST_SHARE = 0.9  # of a sample in its own prediction; rounding must not make it 1
+
+
+class Queries(NamedTuple):
+    """What is predicted, in the units of the snapshot: the window, then what was seen before."""
+
+    x: Float[Tensor, "*batch n in"]
+    y: Float[Tensor, "*batch n out"]
+    weight: Float[Tensor, "*batch n"]
+    absorbed: Float[Tensor, " n"]  # 1: part of the state, to be left out of it
 
 
 class PrequentialAdaptation(nn.Module):
@@ -19,8 +38,23 @@ class PrequentialAdaptation(nn.Module):
 
     (Omega, h) of k samples ago holds neither kernel nor noise, so its prediction is an exact function
     of theta; the k samples were not seen by it, so the loss cannot be won by overfitting. Memory: one
-    copy of the basis and k samples. The streaming variational bound needs as much and is a worse
+    copy of the state and k samples. The streaming variational bound needs as much and is a worse
     objective: it inflates the noise.
+
+    With a memory, each step predicts 4 k samples of the past too, so that a network with thousands of
+    weights does not run after the last k. The state has seen these; each is left out of it in closed form.
+    With ``p = k'(Q + C)k`` the posterior variance at the basis' prediction of the sample and ``w = p/s2``
+    (Rasmussen & Williams 2006, section 5.4.2, for a sparse model)::
+
+        residual <- residual / (1 - w),   p <- p / (1 - w)
+
+    Gradients need no differentiation of a factorisation. From ``d alpha = C dK alpha``, ``dC = C dK C`` and
+    ``dQ = -Q dK Q``, with ``E = Ck``, ``F = Qk`` and the loss' derivatives ``g`` by mean, variance
+    ``v = k** + k'Ck`` and p of each query::
+
+        by K:  E (g_mean alpha' + diag(g_v + g_p) E') - F diag(g_p) F'
+        by k:  alpha g_mean' + 2 E diag(g_v + g_p) + 2 F diag(g_p)
+        by ln s2:  -sum g_mean (mean + E'K alpha) - sum (g_v + g_p) diag(k'E + E'KE)
 
     Steps shrink like ``1 / sqrt(1 + n/30)``, to a tenth at most: the state was projected with a kernel
     that every later move makes a little wrong, so late moves must earn more than early ones; a system
@@ -37,6 +71,8 @@ class PrequentialAdaptation(nn.Module):
         rate: Adam's first step on the logarithms of the hyperparameters.
         network_rate: Adam's first step on parameters that are not logarithms (a deep kernel's weights).
         steps: gradient steps per window.
+        memory: number of earlier samples to keep, 0 for none.
+        horizon: samples after which the learner has forgotten.
     """
 
     window_x: Tensor
@@ -44,8 +80,8 @@ class PrequentialAdaptation(nn.Module):
     window_on: Tensor
     old_basis: Tensor
     old_active: Tensor
-    old_precision: Tensor
-    old_information: Tensor
+    old_moments: Tensor
+    old_vectors: Tensor
     n_steps: Tensor
 
     def __init__(
@@ -58,6 +94,8 @@ class PrequentialAdaptation(nn.Module):
         rate: float,
         network_rate: float,
         steps: int,
+        memory: int = 0,
+        horizon: float = math.inf,
     ) -> None:
         super().__init__()
         self.window, self.rate, self.network_rate, self.steps = window, rate, network_rate, steps
@@ -67,69 +105,122 @@ class PrequentialAdaptation(nn.Module):
         self.register_buffer("window_on", like.new_zeros(*fleet, window))
         self.register_buffer("old_basis", torch.zeros_like(like))
         self.register_buffer("old_active", torch.zeros_like(posterior.active))
-        self.register_buffer("old_precision", torch.zeros_like(posterior.precision).contiguous())
-        self.register_buffer("old_information", torch.zeros_like(posterior.information).contiguous())
+        self.register_buffer("old_moments", torch.zeros_like(posterior.moments))
+        self.register_buffer("old_vectors", torch.zeros_like(posterior.vectors))
         self.register_buffer("n_steps", like.new_zeros(fleet))
         for i, p in enumerate([*kernel.parameters(), log_noise]):
             self.register_buffer(f"first_{i}", torch.zeros_like(p.detach()))
             self.register_buffer(f"second_{i}", torch.zeros_like(p.detach()))
+        self.memory = ReplayMemory(posterior, memory, horizon) if memory else None
 
     def reset(self) -> None:
-        """Forget window, snapshot and step sizes."""
-        for buffer in self.buffers():
+        """Forget window, snapshot, memory and step sizes."""
+        for buffer in self.buffers(recurse=False):
             buffer.zero_()
+        if self.memory is not None:
+            self.memory.reset()
 
-    def observe(self, x: Tensor, y: Tensor, mask: Tensor | None, place: int) -> None:
-        """Keep a sample (in the units of the snapshot) at a place of the window."""
+    def observe(self, x: Tensor, y: Tensor, mask: Tensor | None, weight: Tensor, place: int) -> None:
+        """Keep a sample, in its own units, at a place of the window; its weight is that in the update."""
         self.window_x[..., place, :] = x
         self.window_y[..., place, :] = y
         self.window_on[..., place] = 1.0 if mask is None else mask
+        if self.memory is not None:
+            self.memory.offer(x, y, weight if mask is None else weight * mask)
 
     def snapshot(self, posterior: SparsePosterior) -> None:
         """The present state becomes the past one; the window is empty."""
         self.old_basis.copy_(posterior.basis)
         self.old_active.copy_(posterior.active)
-        self.old_precision.copy_(posterior.precision)
-        self.old_information.copy_(posterior.information)
+        self.old_moments.copy_(posterior.moments)
+        self.old_vectors.copy_(posterior.vectors)
         self.window_on.zero_()
+        if self.memory is not None:
+            self.memory.settle()
 
-    def loss(self, kernel: Kernel, log_noise: Tensor, jitter: float, robust: float | None) -> Tensor:
-        """Lagged prequential loss of each model, ``(*batch_shape)`` [nats per sample and output]."""
-        noise = log_noise.exp()
+    def forget(self, models: Bool[Tensor, "*batch"]) -> None:
+        """These models face another system: what they kept does not count any more."""
+        self.window_on.masked_fill_(models.unsqueeze(-1), 0.0)
+        self.old_moments.masked_fill_(models[..., None, None, None], 0.0)
+        self.old_vectors.masked_fill_(models[..., None, None, None], 0.0)
+        if self.memory is not None:
+            self.memory.forget(models)
+
+    def queries(self, units: Units) -> Queries:
+        """The window, and this turn's part of the memory."""
+        x, y, weight = self.window_x, self.window_y, self.window_on
+        absorbed = x.new_zeros(self.window)
+        if self.memory is not None:
+            past = self.memory.take(_REPLAYED * self.window)
+            x, y = torch.cat([x, past[0]], dim=-2), torch.cat([y, past[1]], dim=-2)
+            weight = torch.cat([weight, past[2]], dim=-1)
+            absorbed = torch.cat([absorbed, x.new_ones(past[2].shape[-1])])
+        return Queries(*units(x, y), weight, absorbed)
+
+    def loss_and_gradients(
+        self,
+        kernel: Kernel,
+        log_noise: Tensor,
+        queries: Queries,
+        jitter: float,
+        robust: float | None,
+        *,
+        moved: bool = True,
+    ) -> tuple[Tensor, list[Tensor | None]]:
+        """Loss of each model ``(*batch_shape)`` [nats per sample and output], derivatives of their sum.
+
+        The derivatives are those by ``[*kernel.parameters(), log_noise]``.
+
+        Args:
+            moved: whether kernel or noise changed since the snapshot; else its caches serve.
+        """
+        with _differentiable(kernel) as parameters:
+            K, k, prior = outcome = self._covariances(kernel, queries.x, jitter)
+            C, Q, alpha = self._caches(K.detach(), log_noise) if moved else self._old_caches()
+            K_, k_ = K.detach(), k.detach()
+            E, F = C @ k_, Q @ k_
+            kE, mean = (k_ * E).sum(-2), k_.mT @ alpha
+            p = kE + (k_ * F).sum(-2)
+            loss, by = _density(mean, prior.detach() + kE, p, log_noise, queries, robust)
+
+            E_g, F_g = E * (by.variance + by.p).unsqueeze(-2), F * by.p.unsqueeze(-2)
+            by_K = (E @ by.mean) @ alpha.mT + E_g @ E.mT - F_g @ F.mT
+            by_k = alpha @ by.mean.mT + 2.0 * (E_g + F_g)
+            by_s2 = (by.mean * (mean + E.mT @ (K_ @ alpha))).sum((-1, -2))
+            by_s2 = by_s2 + (E_g * (k_ + K_ @ E)).sum((-1, -2))
+            by_noise = by.log_noise - by_s2.unsqueeze(-1) / log_noise.shape[-1]
+            by_kernel = torch.autograd.grad(outcome, parameters, [by_K, by_k, by.variance], allow_unused=True)
+        return loss, [*by_kernel, by_noise]
+
+    def _covariances(self, kernel: Kernel, x: Tensor, jitter: float) -> tuple[Tensor, Tensor, Tensor]:
+        """K at the old basis, k and k** of the queries, from one evaluation of the kernel."""
+        M = self.old_basis.shape[-2]
+        both = kernel(self.old_basis, torch.cat([self.old_basis, x], dim=-2))
+        K = as_gram(both[..., :M], kernel, self.old_basis, self.old_active, jitter)
+        return K, both[..., M:] * self.old_active.unsqueeze(-1), kernel.diagonal_of_set(x)
+
+    def _old_caches(self) -> tuple[Tensor, Tensor, Tensor]:
+        C, Q = self.old_moments[..., 0, :, :], self.old_moments[..., 1, :, :]
+        return C, Q, self.old_vectors[..., 0, :, :]
+
+    def _caches(self, K: Tensor, log_noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         s2 = log_noise.mean(-1).exp()[..., None, None]
-        L = torch.linalg.cholesky_ex(basis_gram(kernel, self.old_basis, self.old_active, jitter))[0]
-        LW = L.mT @ (self.old_precision / s2)
-        eye = torch.eye(L.shape[-1], dtype=L.dtype, device=L.device)
-        La = torch.linalg.cholesky_ex(eye + LW @ L)[0]
-        k = kernel(self.old_basis, self.window_x) * self.old_active.unsqueeze(-1)
-        u = torch.linalg.solve_triangular(L, k, upper=False)
-        right = torch.cat([u, L.mT @ (self.old_information / s2)], dim=-1)
-        right = torch.linalg.solve_triangular(La, right, upper=False)
-        g, b = right[..., : self.window], right[..., self.window :]
-        v = kernel.diagonal_of_set(self.window_x) - u.square().sum(-2) + g.square().sum(-2)
-        variance = v.clamp_min(0.0).unsqueeze(-1) + noise.unsqueeze(-2)
-        z2 = (self.window_y - g.mT @ b).square() / variance
-        misfit = z2 if robust is None else (robust**2 + 1.0) * torch.log1p(z2 / robust**2)
-        density = 0.5 * (misfit + variance.log() + math.log(2 * math.pi)).mean(-1)
-        return (density * self.window_on).sum(-1) / self.window_on.sum(-1).clamp_min(1.0)
+        W, h = self.old_moments[..., 2, :, :] / s2, self.old_vectors[..., 1, :, :] / s2
+        Q, C, alpha = posterior_from_natural(K, W, h)
+        return C, Q, alpha
 
-    def descend(self, kernel: Kernel, log_noise: nn.Parameter, jitter: float, robust: float | None) -> None:
+    def descend(
+        self, kernel: Kernel, log_noise: nn.Parameter, units: Units, jitter: float, robust: float | None
+    ) -> None:
         """Adam on the loss, model by model; a model without samples or finite gradient stays as it is."""
         parameters = [*kernel.parameters(), log_noise]
         names = [name for name, _ in kernel.named_parameters()] + ["log_noise"]
-        for _ in range(self.steps):
-            with torch.enable_grad():
-                for p in parameters:
-                    p.requires_grad_(True)
-                try:
-                    loss = self.loss(kernel, log_noise, jitter, robust).sum()
-                    gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
-                finally:
-                    for p in parameters:
-                        p.requires_grad_(False)
+        for step in range(self.steps):
+            queries = self.queries(units)
+            _, gradients = self.loss_and_gradients(kernel, log_noise, queries, jitter, robust, moved=step > 0)
             self._adam(parameters, names, gradients)
 
-    def _adam(self, parameters: list, names: list[str], gradients: tuple) -> None:
+    def _adam(self, parameters: list, names: list[str], gradients: list) -> None:
         on = (self.window_on.sum(-1) > 0).to(self.n_steps.dtype)
         self.n_steps += on
         b1, b2 = 0.9, 0.99
@@ -162,3 +253,42 @@ def _trailing(value: Float[Tensor, "*batch"], like: Tensor) -> Tensor:
     if like.shape[: value.dim()] == value.shape:
         return value[(..., *(None,) * (like.dim() - value.dim()))]
     return value.mean()
+
+
+class _Slopes(NamedTuple):
+    mean: Tensor
+    variance: Tensor
+    p: Tensor
+    log_noise: Tensor
+
+
+def _density(
+    mean: Tensor, v: Tensor, p: Tensor, log_noise: Tensor, queries: Queries, robust: float | None
+) -> tuple[Tensor, _Slopes]:
+    """The loss from the state's predictions, and its derivatives by them."""
+    leaves = [value.detach().requires_grad_(True) for value in (mean, v, p, log_noise)]
+    mean, v, p, log_noise = leaves
+    s2 = log_noise.mean(-1, keepdim=True).exp()
+    share = (queries.absorbed * queries.weight * p / s2).clamp_max(_LARGEST_SHARE)
+    left_out = 1.0 / (1.0 - share)
+    variance = (v + p * (left_out - 1.0)).clamp_min(0.0).unsqueeze(-1) + log_noise.exp().unsqueeze(-2)
+    z2 = ((queries.y - mean) * left_out.unsqueeze(-1)).square() / variance
+    misfit = z2 if robust is None else (robust**2 + 1.0) * torch.log1p(z2 / robust**2)
+    density = 0.5 * (misfit + variance.log() + math.log(2 * math.pi)).mean(-1)
+    on = (queries.weight > 0).to(density.dtype)
+    loss = (density * on).sum(-1) / on.sum(-1).clamp_min(1.0)
+    return loss.detach(), _Slopes(*torch.autograd.grad(loss.sum(), leaves))
+
+
+@contextmanager
+def _differentiable(kernel: Kernel) -> Iterator[list[nn.Parameter]]:
+    """Inside, the kernel's parameters carry a graph."""
+    parameters = list(kernel.parameters())
+    with torch.enable_grad():
+        try:
+            for p in parameters:
+                p.requires_grad_(True)
+            yield parameters
+        finally:
+            for p in parameters:
+                p.requires_grad_(False)

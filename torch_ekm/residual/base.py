@@ -247,10 +247,10 @@ class ResidualLearner(nn.Module, ABC):
         return f"in_features={self.in_features}, out_features={self.out_features}{fleet}"
 
 
-def check_count(name: str, value: int) -> int:
-    """``value`` as a positive int, or ParameterError."""
-    if isinstance(value, bool) or int(value) != value or value < 1:
-        raise ParameterError(name, value, "an integer of at least 1")
+def check_count(name: str, value: int, least: int = 1) -> int:
+    """``value`` as an int of at least ``least``, or ParameterError."""
+    if isinstance(value, bool) or int(value) != value or value < least:
+        raise ParameterError(name, value, f"an integer of at least {least}")
     return int(value)
 
 

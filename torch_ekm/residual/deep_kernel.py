@@ -38,8 +38,8 @@ class DeepKernel(Kernel):
         self,
         base: StationaryKernel,
         *,
-        hidden: Sequence[int] = (32, 32),
-        features: int = 6,
+        hidden: Sequence[int] = (64, 64),
+        features: int = 16,
         initial_scale: float = 0.3,
         seed: int = 0,
     ) -> None:
@@ -61,18 +61,19 @@ class DeepKernel(Kernel):
             weight = scale * torch.randn(n_in, n_out, generator=generator, dtype=torch.float64)
             weight = weight.to(like).expand(*fleet, n_in, n_out).contiguous()
             self.weights.append(nn.Parameter(weight, requires_grad=False))
-            self.biases.append(nn.Parameter(like.new_zeros(*fleet, n_out), requires_grad=False))
+            if layer < len(widths) - 2:  # a constant in the features has no effect
+                self.biases.append(nn.Parameter(like.new_zeros(*fleet, n_out), requires_grad=False))
 
     def net(self, x: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n features"]:
         """The features of x."""
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+        for weight, bias in zip(self.weights[:-1], self.biases, strict=True):
             x = torch.tanh(x @ weight + bias.unsqueeze(-2))
-        return x @ self.weights[-1]  # a constant in the features has no effect
+        return x @ self.weights[-1]
 
     def net_jacobian(self, x: Float[Tensor, "*batch d"]) -> tuple[Tensor, Tensor]:
         """``(net(x), (d net/dx)')``: shapes ``(*batch, features)`` and ``(*batch, d, features)``."""
         x, slope = x.unsqueeze(-2), None
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+        for weight, bias in zip(self.weights[:-1], self.biases, strict=True):
             x = torch.tanh(x @ weight + bias.unsqueeze(-2))
             step = weight if slope is None else slope @ weight
             slope = step * (1.0 - x * x)

@@ -9,6 +9,8 @@ from .deep_kernel import DeepKernel
 from .kernels import SquaredExponential
 from .sogp import SparseOnlineGP
 
+_ADAPTATION: dict[str, Any] = {"adapt": True, "adapt_steps": 2, "adapt_memory": 2000}
+
 
 @final
 class DeepKernelSOGP(SparseOnlineGP):
@@ -17,9 +19,13 @@ class DeepKernelSOGP(SparseOnlineGP):
     The basis is kept as inputs and embedded anew whenever the network moves; the natural form does not
     contain the kernel, so nothing else has to follow. See DeepKernel and PrequentialAdaptation.
 
+    Thousands of weights want more than the last 32 samples, which on a trajectory are one place: 2000
+    samples of the past are kept to learn them from, and each rebuild takes two steps.
+
     Args:
         hidden, features, seed: of the network.
-        options: see SparseOnlineGP (without ``kernel``; ``adapt`` is on).
+        options: see SparseOnlineGP (without ``kernel``; by default ``adapt=True``, ``adapt_steps=2``,
+            ``adapt_memory=2000``).
     """
 
     def __init__(
@@ -27,12 +33,12 @@ class DeepKernelSOGP(SparseOnlineGP):
         in_features: int,
         out_features: int,
         *,
-        hidden: Sequence[int] = (32, 32),
-        features: int = 6,
+        hidden: Sequence[int] = (64, 64),
+        features: int = 16,
         seed: int = 0,
         **options: Any,
     ) -> None:
         fleet = {name: options[name] for name in ("batch_shape", "device") if name in options}
         base = SquaredExponential(in_features, **fleet)
         kernel = DeepKernel(base, hidden=hidden, features=features, seed=seed)
-        super().__init__(in_features, out_features, kernel=kernel, **{"adapt": True, **options})
+        super().__init__(in_features, out_features, kernel=kernel, **{**_ADAPTATION, **options})

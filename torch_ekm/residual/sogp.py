@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 import torch
@@ -17,7 +18,7 @@ from .kernels import Kernel, SquaredExponential, log_parameter
 from .monitor import ChangeDetector, NoiseCalibration
 from .posterior import SparsePosterior, compiled_absorb
 from .prediction import Prediction
-from .running_scale import RunningScale
+from .units import LearnedUnits
 
 
 class SparseOnlineGP(DoubleStateLearner):
@@ -61,9 +62,11 @@ class SparseOnlineGP(DoubleStateLearner):
             prior mean stays 0.
         normalize_for: samples after which the units stand still.
         refresh_every: samples between two rebuilds of the caches.
-        adapt: learn kernel and noise online, see PrequentialAdaptation; one step per rebuild.
+        adapt: learn kernel and noise online, at every rebuild; see PrequentialAdaptation.
         adapt_rate: its first step on the logarithms of the hyperparameters.
         adapt_network_rate: its first step on a deep kernel's weights.
+        adapt_steps: steps per rebuild.
+        adapt_memory: samples of the past to learn the kernel from, too (ReplayMemory); 0: the last only.
         calibrate: make 90 % intervals hold 90 % of the samples of each output, see NoiseCalibration.
         detect_changes: start anew when most of the last samples were surprising, see ChangeDetector.
             Looks at the result of every update, so on a GPU it waits for it.
@@ -96,6 +99,8 @@ class SparseOnlineGP(DoubleStateLearner):
         adapt: bool = False,
         adapt_rate: float = 0.03,
         adapt_network_rate: float = 0.015,
+        adapt_steps: int = 1,
+        adapt_memory: int = 0,
         calibrate: bool = False,
         detect_changes: bool = False,
         compile_step: bool = False,
@@ -120,10 +125,9 @@ class SparseOnlineGP(DoubleStateLearner):
         self.log_noise_variance = log_parameter(
             "noise_variance", noise_variance, (*self.batch_shape, self.out_features), **factory
         )
-        self.normalize_for = check_count("normalize_for", normalize_for) if normalize else 0
+        learn_for = check_count("normalize_for", normalize_for) if normalize else 0
         shifted = self.kernel.shift_invariant(self.in_features) if normalize else []
-        self.input_scale = RunningScale(self.in_features, shifted, **fleet)
-        self.output_scale = RunningScale(self.out_features, **fleet)
+        self.units = LearnedUnits(self.in_features, self.out_features, learn_for, shifted, **fleet)
         self.posterior = SparsePosterior(
             self.in_features,
             self.out_features,
@@ -143,6 +147,7 @@ class SparseOnlineGP(DoubleStateLearner):
             self.detector = ChangeDetector(self.in_features, self.out_features, **places)
         self.adaptation = None
         if adapt:
+            kept = self.forgetting * (1.0 - self.diffusion)
             self.adaptation = PrequentialAdaptation(
                 self.posterior,
                 self.kernel,
@@ -150,7 +155,9 @@ class SparseOnlineGP(DoubleStateLearner):
                 window=self.refresh_every,
                 rate=check_positive("adapt_rate", adapt_rate),
                 network_rate=check_positive("adapt_network_rate", adapt_network_rate),
-                steps=1,
+                steps=check_count("adapt_steps", adapt_steps),
+                memory=check_count("adapt_memory", adapt_memory, least=0),
+                horizon=math.inf if kept == 1.0 else 1.0 / (1.0 - kept),
             )
         # samples whose forgetting is due at the next rebuild
         self.register_buffer("pending", torch.zeros(self.batch_shape, **factory))
@@ -160,12 +167,12 @@ class SparseOnlineGP(DoubleStateLearner):
 
     def forward(self, x: Tensor) -> Tensor:
         """``alpha' k(X, x)``, differentiable in x."""
-        k = self._cross(self._units(self._check_query(x)))
+        k = self._cross(self.units.inputs(self._check_query(x)))
         return self._out((k.unsqueeze(-2) @ self.posterior.alpha).squeeze(-2), 1)
 
     def variance(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any out"]:
         """Latent variance ``k** + k'Ck`` of each output, differentiable in x."""
-        z = self._units(self._check_query(x))
+        z = self.units.inputs(self._check_query(x))
         k = self._cross(z).unsqueeze(-1)
         v = self.kernel.diagonal(z) + (k.mT @ (self.posterior.covariance @ k)).squeeze(-1).squeeze(-1)
         return self._out(v.clamp_min(0.0).unsqueeze(-1), 2)
@@ -179,7 +186,7 @@ class SparseOnlineGP(DoubleStateLearner):
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """``(alpha'k, alpha' dk/dx)`` in closed form."""
-        k, dk = self._cross_with_gradient(self._units(self._check_query(x)))
+        k, dk = self._cross_with_gradient(self.units.inputs(self._check_query(x)))
         coefficients = self.posterior.alpha.mT
         mean, jacobian = (coefficients @ k.unsqueeze(-1)).squeeze(-1), coefficients @ dk
         return self._out(mean, 1), self._out_slope(jacobian, 1)
@@ -189,7 +196,7 @@ class SparseOnlineGP(DoubleStateLearner):
 
         d mean/dx = alpha' dk/dx,   d var/dx = dk(x,x)/dx + 2 (Ck)' dk/dx
         """
-        z = self._units(self._check_query(x))
+        z = self.units.inputs(self._check_query(x))
         k, dk = self._cross_with_gradient(z)
         column = k.unsqueeze(-1)
         Ck = self.posterior.covariance @ column
@@ -222,26 +229,25 @@ class SparseOnlineGP(DoubleStateLearner):
             ParameterError: the kernel is not action-linear.
         """
         kernel, B = self._action_features(s)
-        V = kernel.action_prior(self._units(s)) + B.mT @ (self.posterior.covariance @ B)
-        if not self.normalize_for:
+        V = kernel.action_prior(self.units.inputs(s)) + B.mT @ (self.posterior.covariance @ B)
+        if not self.units.learn_for:
             return V.unsqueeze(-3).expand(*V.shape[:-2], self.out_features, *V.shape[-2:]).to(self.dtype)
-        inverse = 1.0 / self.input_scale.scale[..., kernel.state_features :]
+        inverse = 1.0 / self.units.input.scale[..., kernel.state_features :]
         V = V * (inverse.unsqueeze(-1) * inverse.unsqueeze(-2))
-        return (V.unsqueeze(-3) * self.output_scale.scale.square()[..., None, None]).to(self.dtype)
+        return (V.unsqueeze(-3) * self.units.output.scale.square()[..., None, None]).to(self.dtype)
 
     # -- what is known --------------------------------------------------------------------------
 
     @property
     def noise_variance(self) -> Float[Tensor, "*batch out"]:
         """Observation noise variance, in the outputs' own squared units."""
-        noise = self.log_noise_variance.exp() * self.output_scale.scale.square()
+        noise = self.units.value(self.log_noise_variance.exp(), 2)
         return noise if self.calibration is None else noise * self.calibration.log_factor.exp()
 
     @property
     def basis_inputs(self) -> Float[Tensor, "*batch slots in"]:
         """Basis points in the inputs' own units; only slots with ``posterior.active == 1`` count."""
-        scale, shift = self.input_scale.scale.unsqueeze(-2), self.input_scale.shift.unsqueeze(-2)
-        return (self.posterior.basis * scale + shift).to(self.dtype)
+        return self.units.sets_as_given(self.posterior.basis).to(self.dtype)
 
     @property
     def condition_number(self) -> Float[Tensor, "*batch"]:
@@ -253,8 +259,7 @@ class SparseOnlineGP(DoubleStateLearner):
     def reset(self) -> None:
         """Forget all samples and units; kernel and noise stay."""
         self.posterior.reset()
-        self.input_scale.reset()
-        self.output_scale.reset()
+        self.units.reset()
         for part in (self.adaptation, self.calibration, self.detector):
             if part is not None:
                 part.reset()
@@ -293,17 +298,17 @@ class SparseOnlineGP(DoubleStateLearner):
         if self.diffusion > 0.0:
             posterior.diffuse(self.kernel, self._shared_noise(), (1.0 - self.diffusion) ** self.pending)
         self.pending.zero_()
-        if self._normalizing:
-            offset, ratio = self.input_scale.settle()
+        if self.units.learning(self._n_samples):
+            offset, ratio, ratio_t = self.units.settle()
             posterior.basis.add_(offset.unsqueeze(-2)).mul_(ratio.unsqueeze(-2))
-            posterior.information.mul_(self.output_scale.settle()[1].unsqueeze(-2))
+            posterior.information.mul_(ratio_t.unsqueeze(-2))
         posterior.rebuild(self.kernel, self._shared_noise())
         if self.adaptation is not None:
             self.adaptation.snapshot(posterior)
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         on = None if mask is None else mask.to(x.dtype)
-        z, t = self._units(x), y / self.output_scale.scale if self.normalize_for else y
+        z, t = self.units.inputs(x), self.units.targets(y)
         s2 = self._shared_noise()
         number = self._n_samples if self.posterior.needs_age else 0
         step = compiled_absorb(x.device.type) if self.compile_step else SparsePosterior.absorb
@@ -313,19 +318,19 @@ class SparseOnlineGP(DoubleStateLearner):
         if self.detector is not None:
             self._start_anew(self.detector.observe(x, y, report.surprise, on))
         self.pending += 1.0 if on is None else on
-        if self._normalizing:
+        if self.units.learning(self._n_samples):
             used = torch.ones_like(report.weight) if on is None else on
-            self.input_scale.observe(x, used)
-            self.output_scale.observe(y, report.weight * used)
+            self.units.observe(x, y, used, report.weight)
         n = self._n_samples = self._n_samples + 1
         due = n % self.refresh_every == 0
         if self.adaptation is not None:
-            self.adaptation.observe(z, t, on, (n - 1) % self.refresh_every)
+            self.adaptation.observe(x, y, on, report.weight, (n - 1) % self.refresh_every)
             if due:
                 robust, jitter = self.posterior.robust, self.posterior.jitter
-                self.adaptation.descend(self.kernel, self.log_noise_variance, jitter, robust)
+                noise = self.log_noise_variance
+                self.adaptation.descend(self.kernel, noise, self.units.of_sets, jitter, robust)
         # Units are rough in the first samples: then rebuild at 1, 2, 4, 8, ... too.
-        if due or (self._normalizing and n & (n - 1) == 0):
+        if due or (self.units.learning(n) and n & (n - 1) == 0):
             self.refresh()
         return report
 
@@ -334,42 +339,31 @@ class SparseOnlineGP(DoubleStateLearner):
         if self.detector is None or not bool(changed.any()):
             return
         self.posterior.forget(changed)
+        if self.adaptation is not None:
+            self.adaptation.forget(changed)
         self.pending.masked_fill_(changed, 0.0)
         kept = (self.detector.inputs, self.detector.targets, self.detector.since_change)
         for x, y, used in zip(*kept, strict=True):
-            t = y / self.output_scale.scale if self.normalize_for else y
+            t = self.units.targets(y)
             on = (used & changed).to(x.dtype)
-            self.posterior.absorb(self._units(x), t, self.kernel, self._shared_noise(), on, self._n_samples)
+            self.posterior.absorb(
+                self.units.inputs(x), t, self.kernel, self._shared_noise(), on, self._n_samples
+            )
 
     # -- pieces ---------------------------------------------------------------------------------
-
-    @property
-    def _normalizing(self) -> bool:
-        return self._n_samples <= self.normalize_for and self.normalize_for > 0
 
     def _shared_noise(self) -> Tensor:
         """Noise by which the gain is computed: geometric mean over the (normalised) outputs."""
         return self.log_noise_variance.mean(-1).exp()
 
-    def _units(self, x: Tensor) -> Tensor:
-        """x, or its first columns, in the learner's units."""
-        if not self.normalize_for:
-            return x
-        n = x.shape[-1]
-        return (x - self.input_scale.shift[..., :n]) / self.input_scale.scale[..., :n]
-
     def _out(self, value: Tensor, power: int) -> Tensor:
         """``(*any, out or 1)`` in output units (squared if power is 2), in the interface's dtype."""
-        if self.normalize_for:
-            value = value * (self.output_scale.scale if power == 1 else self.output_scale.scale.square())
+        value = self.units.value(value, power)
         return value.expand(*value.shape[:-1], self.out_features).to(self.dtype)
 
     def _out_slope(self, slope: Tensor, power: int) -> Tensor:
         """``(*any, out or 1, columns)``: derivative by the last columns of x."""
-        if self.normalize_for:
-            scale = self.output_scale.scale if power == 1 else self.output_scale.scale.square()
-            slope = slope * scale.unsqueeze(-1)
-            slope = slope / self.input_scale.scale[..., None, self.in_features - slope.shape[-1] :]
+        slope = self.units.slope(slope, power)
         return slope.expand(*slope.shape[:-2], self.out_features, slope.shape[-1]).to(self.dtype)
 
     def _cross(self, z: Tensor) -> Tensor:
@@ -386,7 +380,7 @@ class SparseOnlineGP(DoubleStateLearner):
         s = self._cast(s)
         if s.shape[-1:] != (kernel.state_features,):
             raise ShapeError("s", f"(*any, {kernel.state_features})", s.shape)
-        return kernel, kernel.action_features_of(self._units(s), self.posterior.basis)
+        return kernel, kernel.action_features_of(self.units.inputs(s), self.posterior.basis)
 
     def _cast(self, x: Tensor) -> Tensor:
         return torch.as_tensor(x, dtype=torch.float64, device=self.device)

@@ -1,0 +1,292 @@
+"""Kernel, noise and features learned online: the loss, its gradients, the memory, and what it all gains."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm.exceptions import ParameterError
+from torch_ekm.experiments.prequential import run_prequential
+from torch_ekm.residual import (
+    DeepKernel,
+    DeepKernelSOGP,
+    Matern52,
+    SparseOnlineGP,
+    SquaredExponential,
+)
+from torch_ekm.residual.adaptation import PrequentialAdaptation, Queries
+from torch_ekm.residual.posterior import basis_gram
+from torch_ekm.residual.replay import ReplayMemory
+
+
+def system(seed: int, n: int, noise: float = 0.1) -> tuple[torch.Tensor, torch.Tensor]:
+    rng = np.random.default_rng(seed)
+    w = np.random.default_rng(50).normal(size=(4, 2)) * 0.7
+    x = rng.normal(size=(n, 4))
+    return torch.from_numpy(x), torch.from_numpy(np.sin(x @ w) + noise * rng.normal(size=(n, 2)))
+
+
+def adaptation_of(gp: SparseOnlineGP) -> PrequentialAdaptation:
+    assert gp.adaptation is not None
+    return gp.adaptation
+
+
+def loss_by_dense_algebra(
+    a: PrequentialAdaptation, gp: SparseOnlineGP, queries: Queries, robust: float | None
+) -> torch.Tensor:
+    """The loss as its docstring states it, with inverses, for autograd to go through."""
+    log_noise, kernel = gp.log_noise_variance, gp.kernel
+    s2 = log_noise.mean(-1).exp()[..., None, None]
+    K = basis_gram(kernel, a.old_basis, a.old_active, gp.posterior.jitter)
+    k = kernel(a.old_basis, queries.x) * a.old_active.unsqueeze(-1)
+    W, h = a.old_moments[..., 2, :, :] / s2, a.old_vectors[..., 1, :, :] / s2
+    eye = torch.eye(K.shape[-1], dtype=K.dtype)
+    alpha, C = torch.linalg.solve(eye + W @ K, h), -torch.linalg.solve(eye + W @ K, W)
+    explained = (k * (torch.linalg.inv(K) @ k)).sum(-2)
+    v = kernel.diagonal_of_set(queries.x) + (k * (C @ k)).sum(-2)
+    p = explained + (k * (C @ k)).sum(-2)
+    left_out = 1.0 / (1.0 - queries.absorbed * queries.weight * p / s2.squeeze(-1)).clamp_min(0.1)
+    variance = (v + p * (left_out - 1.0)).unsqueeze(-1) + log_noise.exp().unsqueeze(-2)
+    z2 = ((queries.y - k.mT @ alpha) * left_out.unsqueeze(-1)).square() / variance
+    misfit = z2 if robust is None else (robust**2 + 1.0) * torch.log1p(z2 / robust**2)
+    density = 0.5 * (misfit + variance.log() + math.log(2 * math.pi)).mean(-1)
+    on = (queries.weight > 0).to(density.dtype)
+    return (density * on).sum(-1) / on.sum(-1)
+
+
+@pytest.mark.parametrize("fleet", [(), (3,)])
+@pytest.mark.parametrize("robust", [None, 3.0])
+@pytest.mark.parametrize("kind", [SquaredExponential, Matern52, DeepKernel])
+def test_gradients_in_closed_form_are_those_of_autograd(kind, robust, fleet):
+    kernel = SquaredExponential(4, batch_shape=fleet) if kind is DeepKernel else kind(4, batch_shape=fleet)
+    if kind is DeepKernel:
+        kernel = DeepKernel(kernel, hidden=(8, 8), features=3)
+    gp = SparseOnlineGP(
+        4, 2, capacity=20, kernel=kernel, noise_variance=0.05, robust=robust, normalize=True,
+        refresh_every=16, adapt=True, adapt_memory=50, batch_shape=fleet,
+    )  # fmt: skip
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(111, *fleet, 4, generator=generator, dtype=torch.float64)
+    y = torch.sin(2 * x[..., :2]) + 0.1 * torch.randn(x[..., :2].shape, generator=generator).double()
+    gp.update(x, y)  # the last window is full but for one sample, so not used up
+    a = adaptation_of(gp)
+    queries = a.queries(gp.units.of_sets)
+    assert queries.x.shape[-2] > 16
+    parameters = [*gp.kernel.parameters(), gp.log_noise_variance]
+    for moved in (False, True):
+        if moved:
+            for p in parameters:
+                p.mul_(0.97)
+        found = a.loss_and_gradients(
+            gp.kernel, gp.log_noise_variance, queries, gp.posterior.jitter, robust, moved=moved
+        )
+        for p in parameters:
+            p.requires_grad_(True)
+        loss = loss_by_dense_algebra(a, gp, queries, robust)
+        gradients = torch.autograd.grad(loss.sum(), parameters)
+        for p in parameters:
+            p.requires_grad_(False)
+        torch.testing.assert_close(found[0], loss.detach(), atol=1e-10, rtol=0)
+        for mine, theirs in zip(found[1], gradients, strict=True):
+            assert float(theirs.abs().max()) > 1e-6
+            torch.testing.assert_close(mine, theirs, atol=1e-9, rtol=1e-7)
+
+
+def test_lagged_loss_is_the_density_of_the_old_state():
+    x, y = system(4, 64)
+    gp = SparseOnlineGP(4, 2, capacity=20, adapt=True, refresh_every=16)
+    gp.update(x[:48], y[:48])
+    law = gp.predict(x[48:63], observation=True)
+    expected = -law.log_prob(y[48:63]).mean(-1).mean()
+    gp.update(x[48:63], y[48:63])
+    a = adaptation_of(gp)
+    loss, _ = a.loss_and_gradients(
+        gp.kernel, gp.log_noise_variance, a.queries(gp.units.of_sets), gp.posterior.jitter, None
+    )
+    assert float(loss) == pytest.approx(float(expected), abs=1e-6)
+
+
+def test_a_replayed_sample_is_predicted_by_the_exact_gp_of_all_others():
+    x, y = system(7, 24)
+    gp = SparseOnlineGP(
+        4, 2, capacity=24, adapt=True, adapt_memory=24, refresh_every=24, jitter=1e-10, noise_variance=0.3
+    )
+    gp.adaptation.steps = 0  # type: ignore[union-attr]  # the kernel stays
+    gp.update(x, y)
+    a = adaptation_of(gp)
+    s2 = gp.noise_variance
+    K = gp.kernel(x, x) + s2.mean() * torch.eye(24, dtype=torch.float64)
+    for i in (0, 11, 23):
+        others = [j for j in range(24) if j != i]
+        solved = torch.linalg.solve(K[others][:, others], torch.cat([y[others], K[others, i : i + 1]], -1))
+        mean, variance = K[i, others] @ solved[:, :2], K[i, i] - K[i, others] @ solved[:, 2]
+        expected = -torch.distributions.Normal(mean, variance.sqrt()).log_prob(y[i]).mean()
+        one = torch.ones(1, dtype=torch.float64)
+        query = Queries(x[i : i + 1], y[i : i + 1], one, one)
+        loss, _ = a.loss_and_gradients(gp.kernel, gp.log_noise_variance, query, 1e-10, None)
+        assert float(loss) == pytest.approx(float(expected), abs=1e-6)
+        seen, _ = a.loss_and_gradients(
+            gp.kernel, gp.log_noise_variance, query._replace(absorbed=0.0 * one), 1e-10, None
+        )
+        assert float(seen) < float(loss) - 1e-3  # what was seen flatters itself
+
+
+def filled_memory(n: int, capacity: int, horizon: float = math.inf) -> ReplayMemory:
+    posterior = SparseOnlineGP(1, 1, capacity=2).posterior
+    memory = ReplayMemory(posterior, capacity, horizon)
+    for i in range(n):
+        value = torch.tensor([float(i)], dtype=torch.float64)
+        memory.offer(value, -value, torch.ones((), dtype=torch.float64))
+    memory.settle()
+    return memory
+
+
+def test_memory_is_an_even_sample_of_the_past():
+    memory = filled_memory(20_000, 500)
+    kept = memory.x[:, 0]
+    assert len(kept.unique()) == 500
+    torch.testing.assert_close(memory.y[:, 0], -kept)
+    share = torch.histc(kept, bins=10, min=0, max=20_000) / 500
+    # a tenth each, standard deviation .013
+    assert float((share - 0.1).abs().max()) < 0.04
+
+
+def test_memory_of_a_learner_that_forgets_fades_as_it_does():
+    memory = filled_memory(20_000, 2_000, horizon=300.0)
+    age = 19_999 - memory.x[:, 0]
+    assert memory.capacity == 300
+    # exponential: mean 300, a share exp(-1) is older than that
+    assert 240 < float(age.mean()) < 360
+    assert 0.28 < float((age > 300).double().mean()) < 0.46
+    longer = filled_memory(20_000, 200, horizon=1000.0)
+    assert 750 < float((19_999 - longer.x[:, 0]).mean()) < 1250
+
+
+def test_turns_go_through_the_whole_memory():
+    memory = filled_memory(500, 500)
+    seen = torch.cat([memory.take(64)[0][:, 0] for _ in range(7)])
+    assert len(seen) == len(seen.unique()) == 7 * 64
+    assert len(filled_memory(10, 500).take(64)[0]) == 10
+    assert len(filled_memory(0, 500).take(64)[0]) == 0
+
+
+def test_what_is_not_yet_part_of_the_state_is_not_taken_for_seen():
+    memory = filled_memory(100, 500)
+    memory.offer(torch.ones(1).double(), torch.ones(1).double(), torch.ones(()).double())
+    weight = memory.take(500)[2]
+    assert float(weight.sum()) == 100
+    assert float(weight[100]) == 0
+    memory.settle()
+    assert float(memory.take(500)[2].sum()) == 101
+    memory.forget(torch.tensor(True))
+    assert float(memory.take(500)[2].sum()) == 0
+
+
+def test_adaptation_beats_a_wrong_start():
+    x, y = system(2, 900)
+    wrong = {"capacity": 40, "kernel": SquaredExponential(4, lengthscale=0.3), "noise_variance": 0.5}
+    errors, nll = [], []
+    for adapt in (False, True):
+        gp = SparseOnlineGP(4, 2, **copy.deepcopy(wrong), adapt=adapt, refresh_every=8)
+        run = run_prequential(gp, x, y)
+        errors.append(float(run.error[600:].square().mean().sqrt()))
+        nll.append(run.nll(600))
+    assert errors[1] < 0.6 * errors[0]
+    assert nll[1] < nll[0] - 0.3
+    assert 0.003 < float(gp.noise_variance.mean()) < 0.06  # true: 0.01, plus what 40 points cannot explain
+
+
+def test_each_output_finds_its_own_noise():
+    x, y = system(5, 1200, noise=0.0)
+    generator = torch.Generator().manual_seed(0)
+    sd = torch.tensor([0.05, 0.4], dtype=torch.float64)
+    y = y + sd * torch.randn(y.shape, generator=generator, dtype=torch.float64)
+    gp = SparseOnlineGP(4, 2, capacity=50, adapt=True, noise_variance=0.05, refresh_every=8)
+    gp.update(x, y)
+    found = gp.noise_variance.sqrt()
+    assert 0.03 < float(found[0]) < 0.15
+    assert 0.3 < float(found[1]) < 0.5
+
+
+def test_deep_kernel_starts_as_the_plain_one_and_does_not_collapse():
+    x, y = system(11, 600)
+    errors = []
+    for kernel in (
+        SquaredExponential(4),
+        DeepKernel(SquaredExponential(4), hidden=(16,), initial_scale=1e-6),
+        DeepKernel(SquaredExponential(4), hidden=(16,)),
+    ):
+        gp = SparseOnlineGP(4, 2, capacity=40, kernel=kernel, adapt=True)
+        gp.update(x[:31], y[:31])
+        early = gp(x[:31])
+        gp.update(x[31:], y[31:])
+        errors.append((early, float((gp(x) - y).square().mean())))
+        assert float(gp.condition_number) < 1e9
+    torch.testing.assert_close(errors[0][0], errors[1][0], atol=1e-6, rtol=0)
+    assert errors[2][1] < 1.3 * errors[0][1]
+
+
+def test_features_learned_from_the_past_beat_those_of_the_last_samples():
+    rng = np.random.default_rng(3)
+    x = torch.from_numpy(rng.uniform(-1, 1, (2400, 6)))
+    y = torch.sin(3.0 * x[:, :1] * x[:, 1:2]) + torch.cos(2.5 * (x[:, 2:3] + x[:, 3:4] * x[:, 4:5]))
+    errors = []
+    for memory in (0, 1000):
+        gp = DeepKernelSOGP(6, 1, capacity=40, noise_variance=0.1, adapt_memory=memory)
+        gp.update(x[:2000], y[:2000])
+        errors.append(float((gp(x[2000:]) - y[2000:]).square().mean().sqrt()))
+    assert errors[1] < 0.85 * errors[0]
+
+
+def test_deep_kernel_gradient_is_autograds():
+    x, y = system(12, 60)
+    gp = SparseOnlineGP(4, 2, capacity=20, kernel=DeepKernel(SquaredExponential(4)), normalize=True)
+    gp.update(x, y)
+    p = gp.predict_with_jacobians(x[:5])
+    torch.testing.assert_close(
+        p.mean_jacobian, torch.func.vmap(torch.func.jacrev(gp))(x[:5]), atol=1e-10, rtol=0
+    )
+    slope = torch.func.vmap(torch.func.jacrev(gp.variance))(x[:5])
+    torch.testing.assert_close(p.variance_jacobian, slope, atol=1e-9, rtol=0)
+
+
+def test_a_learner_with_a_memory_goes_on_after_a_reload_as_if_nothing_had_been():
+    x, y = system(13, 400)
+    options = {"hidden": (8,), "features": 2, "capacity": 15, "adapt_memory": 150, "normalize": True}
+    options["refresh_every"] = 8  # so that a turn is a part of the memory
+    whole, first, second = (DeepKernelSOGP(4, 2, **options) for _ in range(3))
+    whole.update(x, y)
+    first.update(x[:230], y[:230])
+    second.load_state_dict(first.state_dict())
+    for half in (second, copy.deepcopy(first)):
+        half.update(x[230:], y[230:])
+        assert torch.equal(half(x), whole(x))
+    whole.reset()
+    memory = adaptation_of(whole).memory
+    assert memory is not None
+    assert float(memory.weight.sum()) == 0
+
+
+def test_after_a_change_the_memory_holds_the_new_system_only():
+    x, y = system(14, 700, noise=0.02)
+    y = torch.cat([y[:400], -2.0 * y[400:]])
+    gp = SparseOnlineGP(
+        4, 2, capacity=40, adapt=True, adapt_memory=200, robust=3.0, detect_changes=True, noise_variance=0.01
+    )
+    gp.update(x, y)
+    memory = adaptation_of(gp).memory
+    assert memory is not None
+    kept = memory.x[memory.weight > 0]
+    numbers = [int((x == row).all(-1).nonzero()) for row in kept]
+    assert len(numbers) > 50
+    assert min(numbers) >= 400
+
+
+@pytest.mark.parametrize("options", [{"adapt_memory": -1}, {"adapt_memory": 1.5}, {"adapt_steps": 0}])
+def test_wrong_parameters_are_named(options):
+    with pytest.raises(ParameterError, match=next(iter(options))):
+        SparseOnlineGP(4, 2, adapt=True, **options)
