@@ -260,10 +260,10 @@ def test_a_learner_with_a_memory_goes_on_after_a_reload_as_if_nothing_had_been()
     options["refresh_every"] = 8  # so that a turn is a part of the memory
     whole, first, second = (DeepKernelSOGP(4, 2, **options) for _ in range(3))
     whole.update(x, y)
-    first.update(x[:230], y[:230])
+    first.update(x[:238], y[:238])
     second.load_state_dict(first.state_dict())
     for half in (second, copy.deepcopy(first)):
-        half.update(x[230:], y[230:])
+        half.update(x[238:], y[238:])
         assert torch.equal(half(x), whole(x))
     whole.reset()
     memory = adaptation_of(whole).memory
