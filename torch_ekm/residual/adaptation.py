@@ -18,7 +18,7 @@ from .replay import ReplayMemory
 
 #: Inputs and outputs of sets of samples, to the learner's units.
 Units = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-_REPLAYED = 4  # samples of the memory per sample of the window, in each step
+_REPLAYED = 4  # samples of the memory per sample of the window, in each step; at least as many as points
 _LARGEST_SHARE = 0.9  # of a sample in its own prediction; rounding must not make it 1
 
 
@@ -41,8 +41,9 @@ class PrequentialAdaptation(nn.Module):
     copy of the state and k samples. The streaming variational bound needs as much and is a worse
     objective: it inflates the noise.
 
-    With a memory, each step predicts 4 k samples of the past too, so that a network with thousands of
-    weights does not run after the last k. The state has seen these; each is left out of it in closed form.
+    With a memory, each step predicts 4 k samples of the past too (as many as basis points, if these are
+    more), so that a network with thousands of weights does not run after the last k. The state has seen
+    them; each is left out of it in closed form.
     With ``p = k'(Q + C)k`` the posterior variance at the basis' prediction of the sample and ``w = p/s2``
     (Rasmussen & Williams 2006, section 5.4.2, for a sparse model)::
 
@@ -151,7 +152,7 @@ class PrequentialAdaptation(nn.Module):
         x, y, weight = self.window_x, self.window_y, self.window_on
         absorbed = x.new_zeros(self.window)
         if self.memory is not None:
-            past = self.memory.take(_REPLAYED * self.window)
+            past = self.memory.take(max(_REPLAYED * self.window, self.old_basis.shape[-2] - 1))
             x, y = torch.cat([x, past[0]], dim=-2), torch.cat([y, past[1]], dim=-2)
             weight = torch.cat([weight, past[2]], dim=-1)
             absorbed = torch.cat([absorbed, x.new_ones(past[2].shape[-1])])
