@@ -19,6 +19,7 @@ from torch_ekm.experiments.contenders import CONTENDERS, DEFAULT, PEERS, contend
 from torch_ekm.experiments.recordings import Recording, in_own_units, load_recording, load_table
 from torch_ekm.experiments.report import Report, Table
 from torch_ekm.experiments.table_file import read_table
+from torch_ekm.residual import SparseOnlineGP
 
 WEIGHTS = torch.tensor([[1.0, -0.5], [0.3, 0.8], [0.0, 0.4]], dtype=torch.float64)
 
@@ -113,6 +114,17 @@ def test_what_is_finished_is_not_run_again(tmp_path: Path, monkeypatch: pytest.M
     assert again.scores == first.scores
     with pytest.raises(pytest.fail.Exception):  # other data: not the same job
         compare([linear(60, seed=5)], ("linear RLS",), folder=tmp_path)
+
+
+def test_a_learner_with_other_settings_is_run_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = linear(60)
+    first = compare([recording], ["SOGP plain"], folder=tmp_path)
+    for options in ({"forgetting": 0.9}, {"noise_variance": 0.4}):
+        changed = {**CONTENDERS, "SOGP plain": lambda d, m, o=options: SparseOnlineGP(d, m, **o)}
+        monkeypatch.setattr("torch_ekm.experiments.contenders.CONTENDERS", changed)
+        second = compare([recording], ["SOGP plain"], folder=tmp_path)
+        assert second.scores != first.scores
+    assert len(list(tmp_path.glob("*.json"))) == 3
 
 
 def test_what_cannot_be_compared() -> None:

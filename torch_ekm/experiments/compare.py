@@ -24,6 +24,7 @@ from .recordings import Recording
 
 Array = NDArray[np.float64]
 _BLOCKS = 20
+_PLAIN = (bool, int, float, str, tuple, type(None))
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,8 @@ def compare(
         contender(learner)  # refuse before anything runs
     for recording in recordings:
         for learner in learners:
-            jobs[f"{recording.name}_{_digest(recording)}_{learner.replace(' ', '-')}"] = (recording, learner)
+            digest = _digest(recording, learner)
+            jobs[f"{recording.name}_{digest}_{learner.replace(' ', '-')}"] = (recording, learner)
     if folder is None:
         with TemporaryDirectory() as temporary:
             results = run_jobs(run_one, jobs, Path(temporary), processes, on_done)
@@ -214,7 +216,15 @@ def _kilobytes(model: torch.nn.Module) -> float:
     return sum(value.numel() * value.element_size() for value in tensors) / 1024
 
 
-def _digest(recording: Recording) -> str:
+def _digest(recording: Recording, learner: str) -> str:
+    """Of all that decides a result: the samples, and every figure of the learner as it begins."""
     parts = [recording.x.numpy().tobytes(), recording.y.numpy().tobytes(), str(recording.warm_up).encode()]
     parts.append(str(dataclasses.asdict(recording)["segments"]).encode())
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = contender(learner)(recording.x.shape[1], recording.y.shape[1])
+    for name, module in model.named_modules():
+        plain = {key: value for key, value in vars(module).items() if isinstance(value, _PLAIN)}
+        parts.append(f"{name} {type(module).__name__} {sorted(plain.items())}".encode())
+    parts += [value.numpy().tobytes() for value in [*model.parameters(), *model.buffers()]]
     return hashlib.sha1(b"".join(parts)).hexdigest()[:8]

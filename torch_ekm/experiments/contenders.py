@@ -37,14 +37,17 @@ def _sogp(**options: Any) -> Factory:
 
 
 def _mixture(d: int, m: int) -> ResidualLearner:
-    """One that stands still and one that wanders: evidence decides."""
-    common: dict[str, Any] = {"capacity": 100, "noise_variance": _NOISE, "robust": 3.0, "adapt": True}
-    still, wandering = SparseOnlineGP(d, m, **common), SparseOnlineGP(d, m, diffusion=0.003, **common)
-    return MixtureResidual([still, wandering])
+    """One that stands still and learns features, one that wanders: evidence decides."""
+    common: dict[str, Any] = {"capacity": 100, "noise_variance": _NOISE, "robust": 3.0}
+    still = DeepKernelSOGP(d, m, **common)
+    return MixtureResidual([still, SparseOnlineGP(d, m, adapt=True, diffusion=0.003, **common)])
 
 
 def _deep(d: int, m: int) -> ResidualLearner:
-    return DeepKernelSOGP(d, m, capacity=100, calibrate=True, **_FRESH)
+    # no forgetting: what features are learned from is the past
+    return DeepKernelSOGP(
+        d, m, capacity=100, noise_variance=_NOISE, robust=3.0, calibrate=True, detect_changes=True
+    )
 
 
 #: Name -> ``factory(in_features, out_features)``.
