@@ -13,7 +13,7 @@ from ..exceptions import UnknownNameError
 from ..model import GraspState, KinematicModel
 from ..residual import (
     ActionLinearKernel,
-    DeepKernel,
+    DeepKernelSOGP,
     RandomFeatureRLS,
     RecursiveLeastSquares,
     ReplayMLP,
@@ -56,9 +56,8 @@ def _rbf(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
 
 
 def _deep(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
-    kernel = DeepKernel(SquaredExponential(n_s + n_a))
-    chosen = {"noise_variance": NOISE_VARIANCE, "robust": 3.0, "forgetting": 0.995, "adapt": True, **options}
-    return SparseOnlineGP(n_s + n_a, N_OUT, capacity=capacity, kernel=kernel, **chosen)
+    chosen = {"noise_variance": NOISE_VARIANCE, "robust": 3.0, "forgetting": 0.995, **options}
+    return DeepKernelSOGP(n_s + n_a, N_OUT, capacity=capacity, **chosen)
 
 
 def _rls(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
