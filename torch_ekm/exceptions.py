@@ -114,7 +114,7 @@ class ShapeError(EKMError, ValueError):
 
 
 class NonFiniteError(EKMError, ValueError):
-    """A value is NaN or infinite. Nothing was changed.
+    """A value is NaN or infinite, or its square is. Nothing was changed.
 
     Attributes:
         name: the argument.
@@ -124,7 +124,7 @@ class NonFiniteError(EKMError, ValueError):
     def __init__(self, name: str, where: Any = ()) -> None:
         self.name, self.where = name, where
         super().__init__(
-            f"{name} must be finite; NaN or infinity at {list(where) if where else 'some entry'}; "
+            f"{name} must be finite, and its square too; not so at {list(where) if where else 'some entry'}; "
             "the call was refused and no state was changed"
         )
 

@@ -46,10 +46,11 @@ def loss_by_dense_algebra(
     W, h = a.old_moments[..., 2, :, :] / s2, a.old_vectors[..., 1, :, :] / s2
     eye = torch.eye(K.shape[-1], dtype=K.dtype)
     alpha, C = torch.linalg.solve(eye + W @ K, h), -torch.linalg.solve(eye + W @ K, W)
-    explained = (k * (torch.linalg.inv(K) @ k)).sum(-2)
+    u = (k * (torch.linalg.inv(K) @ k)).sum(-2)
     v = kernel.diagonal_of_set(queries.x) + (k * (C @ k)).sum(-2)
-    p = explained + (k * (C @ k)).sum(-2)
-    left_out = 1.0 / (1.0 - queries.absorbed * queries.weight * p / s2.squeeze(-1)).clamp_min(0.1)
+    p = u + (k * (C @ k)).sum(-2)
+    share = queries.absorbed * queries.weight * a.forgetting**queries.age * p / s2.squeeze(-1)
+    left_out = torch.where(share < 1, torch.minimum(1.0 / (1.0 - share), u / p), 1.0)
     variance = (v + p * (left_out - 1.0)).unsqueeze(-1) + log_noise.exp().unsqueeze(-2)
     z2 = ((queries.y - k.mT @ alpha) * left_out.unsqueeze(-1)).square() / variance
     misfit = z2 if robust is None else (robust**2 + 1.0) * torch.log1p(z2 / robust**2)
@@ -60,14 +61,15 @@ def loss_by_dense_algebra(
 
 @pytest.mark.parametrize("fleet", [(), (3,)])
 @pytest.mark.parametrize("robust", [None, 3.0])
+@pytest.mark.parametrize("fading", [{}, {"forgetting": 0.98}])
 @pytest.mark.parametrize("kind", [SquaredExponential, Matern52, DeepKernel])
-def test_gradients_in_closed_form_are_those_of_autograd(kind, robust, fleet):
+def test_gradients_in_closed_form_are_those_of_autograd(kind, robust, fleet, fading):
     kernel = SquaredExponential(4, batch_shape=fleet) if kind is DeepKernel else kind(4, batch_shape=fleet)
     if kind is DeepKernel:
         kernel = DeepKernel(kernel, hidden=(8, 8), features=3)
     gp = SparseOnlineGP(
         4, 2, capacity=20, kernel=kernel, noise_variance=0.05, robust=robust, normalize=True,
-        refresh_every=16, adapt=True, adapt_memory=50, batch_shape=fleet,
+        refresh_every=16, adapt=True, adapt_memory=50, batch_shape=fleet, **fading,
     )  # fmt: skip
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(111, *fleet, 4, generator=generator, dtype=torch.float64)
@@ -113,7 +115,14 @@ def test_lagged_loss_is_the_density_of_the_old_state():
 def test_a_replayed_sample_is_predicted_by_the_exact_gp_of_all_others():
     x, y = system(7, 24)
     gp = SparseOnlineGP(
-        4, 2, capacity=24, adapt=True, adapt_memory=24, refresh_every=24, jitter=1e-10, noise_variance=0.3
+        4,
+        2,
+        capacity=24,
+        adapt=True,
+        adapt_memory=24,
+        refresh_every=24,
+        jitter=1e-10,
+        noise_variance=0.01,
     )
     gp.adaptation.steps = 0  # type: ignore[union-attr]  # the kernel stays
     gp.update(x, y)
@@ -126,7 +135,7 @@ def test_a_replayed_sample_is_predicted_by_the_exact_gp_of_all_others():
         mean, variance = K[i, others] @ solved[:, :2], K[i, i] - K[i, others] @ solved[:, 2]
         expected = -torch.distributions.Normal(mean, variance.sqrt()).log_prob(y[i]).mean()
         one = torch.ones(1, dtype=torch.float64)
-        query = Queries(x[i : i + 1], y[i : i + 1], one, one)
+        query = Queries(x[i : i + 1], y[i : i + 1], one, one, one)
         loss, _ = a.loss_and_gradients(gp.kernel, gp.log_noise_variance, query, 1e-10, None)
         assert float(loss) == pytest.approx(float(expected), abs=1e-6)
         seen, _ = a.loss_and_gradients(

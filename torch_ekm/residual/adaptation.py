@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from ..typing import Bool, Float, Tensor
-from .kernels import Kernel
+from .kernels import Kernel, is_shared
 from .natural import posterior_from_natural
 from .posterior import SparsePosterior, as_gram
 from .replay import ReplayMemory
@@ -19,7 +19,6 @@ from .replay import ReplayMemory
 #: Inputs and outputs of sets of samples, to the learner's units.
 Units = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 _REPLAYED = 4  # samples of the memory per sample of the window, in each step; at least as many as points
-_LARGEST_SHARE = 0.9  # of a sample in its own prediction; rounding must not make it 1
 
 
 class Queries(NamedTuple):
@@ -29,6 +28,7 @@ class Queries(NamedTuple):
     y: Float[Tensor, "*batch n out"]
     weight: Float[Tensor, "*batch n"]
     absorbed: Float[Tensor, " n"]  # 1: part of the state, to be left out of it
+    age: Float[Tensor, " n"]  # samples since then
 
 
 class PrequentialAdaptation(nn.Module):
@@ -44,17 +44,20 @@ class PrequentialAdaptation(nn.Module):
     With a memory, each step predicts 4 k samples of the past too (as many as basis points, if these are
     more), so that a network with thousands of weights does not run after the last k. The state has seen
     them; each is left out of it in closed form.
-    With ``p = k'(Q + C)k`` the posterior variance at the basis' prediction of the sample and ``w = p/s2``
-    (Rasmussen & Williams 2006, section 5.4.2, for a sparse model)::
+    With ``u = k'Qk`` the prior variance of the basis' prediction of the sample, p its posterior variance and
+    w what is left of its weight in the state (Rasmussen & Williams 2006, section 5.4.2, for a sparse model)::
 
-        residual <- residual / (1 - w),   p <- p / (1 - w)
+        residual <- c residual,  p <- c p,   c = 1 / (1 - w p/s2), at most u/p;   1 where w p > s2
+
+    What has more than its whole share in its own prediction was left behind when the basis changed. Where g
+    itself wanders (diffusion) the past is another g, and none is kept.
 
     Gradients need no differentiation of a factorisation. From ``d alpha = C dK alpha``, ``dC = C dK C`` and
     ``dQ = -Q dK Q``, with ``E = Ck``, ``F = Qk`` and the loss' derivatives ``g`` by mean, variance
-    ``v = k** + k'Ck`` and p of each query::
+    ``v = k** + k'Ck``, ``p = u + k'Ck`` and u of each query::
 
-        by K:  E (g_mean alpha' + diag(g_v + g_p) E') - F diag(g_p) F'
-        by k:  alpha g_mean' + 2 E diag(g_v + g_p) + 2 F diag(g_p)
+        by K:  E (g_mean alpha' + diag(g_v + g_p) E') - F diag(g_p + g_u) F'
+        by k:  alpha g_mean' + 2 E diag(g_v + g_p) + 2 F diag(g_p + g_u)
         by ln s2:  -sum g_mean (mean + E'K alpha) - sum (g_v + g_p) diag(k'E + E'KE)
 
     Steps shrink like ``1 / sqrt(1 + n/30)``, to a tenth at most: the state was projected with a kernel
@@ -73,7 +76,8 @@ class PrequentialAdaptation(nn.Module):
         network_rate: Adam's first step on parameters that are not logarithms (a deep kernel's weights).
         steps: gradient steps per window.
         memory: number of earlier samples to keep, 0 for none.
-        horizon: samples after which the learner has forgotten.
+        forgetting: factor on what the state holds, per sample.
+        expects_changes: whether :meth:`forget` will be called.
     """
 
     window_x: Tensor
@@ -96,9 +100,12 @@ class PrequentialAdaptation(nn.Module):
         network_rate: float,
         steps: int,
         memory: int = 0,
-        horizon: float = math.inf,
+        forgetting: float = 1.0,
+        expects_changes: bool = False,
     ) -> None:
         super().__init__()
+        self.forgetting = forgetting
+        self.shared_kernel = is_shared(kernel, posterior.basis.shape[-1])
         self.window, self.rate, self.network_rate, self.steps = window, rate, network_rate, steps
         fleet, like = posterior.batch_shape, posterior.basis
         self.register_buffer("window_x", like.new_zeros(*fleet, window, like.shape[-1]))
@@ -112,6 +119,9 @@ class PrequentialAdaptation(nn.Module):
         for i, p in enumerate([*kernel.parameters(), log_noise]):
             self.register_buffer(f"first_{i}", torch.zeros_like(p.detach()))
             self.register_buffer(f"second_{i}", torch.zeros_like(p.detach()))
+        horizon = math.inf if forgetting == 1.0 else 1.0 / (1.0 - forgetting)
+        if expects_changes:  # so that the new system's samples are let in at once
+            horizon = min(horizon, memory)
         self.memory = ReplayMemory(posterior, memory, horizon) if memory else None
 
     def reset(self) -> None:
@@ -150,13 +160,13 @@ class PrequentialAdaptation(nn.Module):
     def queries(self, units: Units) -> Queries:
         """The window, and this turn's part of the memory."""
         x, y, weight = self.window_x, self.window_y, self.window_on
-        absorbed = x.new_zeros(self.window)
+        absorbed = age = x.new_zeros(self.window)
         if self.memory is not None:
             past = self.memory.take(max(_REPLAYED * self.window, self.old_basis.shape[-2] - 1))
             x, y = torch.cat([x, past[0]], dim=-2), torch.cat([y, past[1]], dim=-2)
             weight = torch.cat([weight, past[2]], dim=-1)
-            absorbed = torch.cat([absorbed, x.new_ones(past[2].shape[-1])])
-        return Queries(*units(x, y), weight, absorbed)
+            absorbed, age = torch.cat([absorbed, torch.ones_like(past[3])]), torch.cat([age, past[3]])
+        return Queries(*units(x, y), weight, absorbed, age)
 
     def loss_and_gradients(
         self,
@@ -180,11 +190,10 @@ class PrequentialAdaptation(nn.Module):
             C, Q, alpha = self._caches(K.detach(), log_noise) if moved else self._old_caches()
             K_, k_ = K.detach(), k.detach()
             E, F = C @ k_, Q @ k_
-            kE, mean = (k_ * E).sum(-2), k_.mT @ alpha
-            p = kE + (k_ * F).sum(-2)
-            loss, by = _density(mean, prior.detach() + kE, p, log_noise, queries, robust)
+            kE, u, mean = (k_ * E).sum(-2), (k_ * F).sum(-2), k_.mT @ alpha
+            loss, by = self._density(mean, prior.detach() + kE, u + kE, u, log_noise, queries, robust)
 
-            E_g, F_g = E * (by.variance + by.p).unsqueeze(-2), F * by.p.unsqueeze(-2)
+            E_g, F_g = E * (by.variance + by.p).unsqueeze(-2), F * (by.p + by.u).unsqueeze(-2)
             by_K = (E @ by.mean) @ alpha.mT + E_g @ E.mT - F_g @ F.mT
             by_k = alpha @ by.mean.mT + 2.0 * (E_g + F_g)
             by_s2 = (by.mean * (mean + E.mT @ (K_ @ alpha))).sum((-1, -2))
@@ -210,6 +219,39 @@ class PrequentialAdaptation(nn.Module):
         Q, C, alpha = posterior_from_natural(K, W, h)
         return C, Q, alpha
 
+    def _density(
+        self,
+        mean: Tensor,
+        v: Tensor,
+        p: Tensor,
+        u: Tensor,
+        log_noise: Tensor,
+        queries: Queries,
+        robust: float | None,
+    ) -> tuple[Tensor, _Slopes]:
+        """The loss from the state's predictions, and its derivatives by them."""
+        leaves = [value.detach().requires_grad_(True) for value in (mean, v, p, u, log_noise)]
+        mean, v, p, u, log_noise = leaves
+        c = self._left_out(p, u, log_noise.mean(-1, keepdim=True).exp(), queries)
+        variance = (v + p * (c - 1.0)).clamp_min(0.0).unsqueeze(-1) + log_noise.exp().unsqueeze(-2)
+        z2 = ((queries.y - mean) * c.unsqueeze(-1)).square() / variance
+        misfit = z2 if robust is None else (robust**2 + 1.0) * torch.log1p(z2 / robust**2)
+        density = 0.5 * (misfit + variance.log() + math.log(2 * math.pi)).mean(-1)
+        on = (queries.weight > 0).to(density.dtype)
+        loss = (density * on).sum(-1) / on.sum(-1).clamp_min(1.0)
+        return loss.detach(), _Slopes(*torch.autograd.grad(loss.sum(), leaves, materialize_grads=True))
+
+    def _left_out(self, p: Tensor, u: Tensor, s2: Tensor, queries: Queries) -> Tensor:
+        """c: what residual and p of each query grow by once it is left out of the state."""
+        if self.memory is None:
+            return torch.ones_like(p)
+        most = (u / p.clamp_min(torch.finfo(p.dtype).tiny)).clamp_min(1.0)
+        weight = queries.absorbed * queries.weight * self.forgetting**queries.age
+        share = weight * p / s2
+        inside = (share > 0.0) & (share < 1.0)
+        # where the other branch is taken its derivative must be finite too
+        return torch.where(inside, torch.minimum(1.0 / (1.0 - share.where(inside, 0.0)), most), 1.0)
+
     def descend(
         self, kernel: Kernel, log_noise: nn.Parameter, units: Units, jitter: float, robust: float | None
     ) -> None:
@@ -232,13 +274,13 @@ class PrequentialAdaptation(nn.Module):
                 continue
             first, second = getattr(self, f"first_{i}"), getattr(self, f"second_{i}")
             logarithm = name.split(".")[-1].startswith("log_")
-            fleet = _trailing(on, p)
-            good = gradient.isfinite() & (fleet > 0)
+            shared = self.shared_kernel and name != "log_noise"
+            good = gradient.isfinite() & (_spread(on, p, shared) > 0)
             gradient = gradient.where(good, 0.0)
             first.copy_(torch.where(good, b1 * first + (1 - b1) * gradient, first))
             second.copy_(torch.where(good, b2 * second + (1 - b2) * gradient**2, second))
             rate = self.rate if logarithm else self.network_rate
-            step = rate * _trailing(correction, p) * first / (second.sqrt() + 1e-8)
+            step = rate * _spread(correction, p, shared) * first / (second.sqrt() + 1e-8)
             p.sub_(step.where(good, 0.0))
             if logarithm:  # far beyond what normalised data can mean
                 p.clamp_(-14.0 if name == "log_noise" else -7.0, 7.0)
@@ -249,36 +291,19 @@ def _shrink(n: Tensor) -> Tensor:
     return (1.0 + n / 30.0).rsqrt().clamp_min(0.1)
 
 
-def _trailing(value: Float[Tensor, "*batch"], like: Tensor) -> Tensor:
-    """A per-model value against a parameter; one shared by the fleet takes the mean."""
-    if like.shape[: value.dim()] == value.shape:
-        return value[(..., *(None,) * (like.dim() - value.dim()))]
-    return value.mean()
+def _spread(value: Float[Tensor, "*batch"], like: Tensor, shared: bool) -> Tensor:
+    """A value per model against a parameter; one shared by the fleet takes the mean."""
+    if shared or like.shape[: value.dim()] != value.shape:
+        return value.mean()
+    return value[(..., *(None,) * (like.dim() - value.dim()))]
 
 
 class _Slopes(NamedTuple):
     mean: Tensor
     variance: Tensor
     p: Tensor
+    u: Tensor
     log_noise: Tensor
-
-
-def _density(
-    mean: Tensor, v: Tensor, p: Tensor, log_noise: Tensor, queries: Queries, robust: float | None
-) -> tuple[Tensor, _Slopes]:
-    """The loss from the state's predictions, and its derivatives by them."""
-    leaves = [value.detach().requires_grad_(True) for value in (mean, v, p, log_noise)]
-    mean, v, p, log_noise = leaves
-    s2 = log_noise.mean(-1, keepdim=True).exp()
-    share = (queries.absorbed * queries.weight * p / s2).clamp_max(_LARGEST_SHARE)
-    left_out = 1.0 / (1.0 - share)
-    variance = (v + p * (left_out - 1.0)).clamp_min(0.0).unsqueeze(-1) + log_noise.exp().unsqueeze(-2)
-    z2 = ((queries.y - mean) * left_out.unsqueeze(-1)).square() / variance
-    misfit = z2 if robust is None else (robust**2 + 1.0) * torch.log1p(z2 / robust**2)
-    density = 0.5 * (misfit + variance.log() + math.log(2 * math.pi)).mean(-1)
-    on = (queries.weight > 0).to(density.dtype)
-    loss = (density * on).sum(-1) / on.sum(-1).clamp_min(1.0)
-    return loss.detach(), _Slopes(*torch.autograd.grad(loss.sum(), leaves))
 
 
 @contextmanager

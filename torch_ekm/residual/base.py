@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,7 +20,7 @@ from ..typing import Bool, Float, Int, Tensor
 class UpdateEvent(enum.IntEnum):
     """What an update did with a sample."""
 
-    REFUSED = 0  #: masked out, or not finite under ``on_invalid="skip"``: nothing changed
+    REFUSED = 0  #: masked out, or not finite under ``on_invalid="skip"``: nothing was learned
     ABSORBED = 1  #: taken in; the learner has no basis, or projected the sample onto it
     ADDED = 2  #: became a new basis point
     REPLACED = 3  #: became a basis point, and another was deleted for it
@@ -53,6 +54,12 @@ class UpdateReport:
         """Reports of successive samples as one, time first."""
         names = ("event", "novelty", "surprise", "weight")
         return UpdateReport(*(torch.stack([getattr(r, n) for r in reports]) for n in names))
+
+    @staticmethod
+    def of_nothing(like: Bool[Tensor, "*batch"], dtype: torch.dtype) -> UpdateReport:
+        """No model had a sample."""
+        zero = torch.zeros_like(like, dtype=dtype)
+        return UpdateReport(torch.zeros_like(like, dtype=torch.int64), zero, zero, zero)
 
 
 class ResidualLearner(nn.Module, ABC):
@@ -93,7 +100,9 @@ class ResidualLearner(nn.Module, ABC):
         super().__init__()
         self.in_features = check_count("in_features", in_features)
         self.out_features = check_count("out_features", out_features)
-        self.batch_shape = torch.Size(check_count("batch_shape", n) for n in batch_shape)
+        self.batch_shape = torch.Size(check_counts("batch_shape", batch_shape))
+        if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
+            raise ParameterError("dtype", dtype, "torch.float64 or torch.float32")
         if on_invalid not in ("raise", "skip"):
             raise ParameterError("on_invalid", on_invalid, "'raise' or 'skip'")
         self.on_invalid = on_invalid
@@ -154,6 +163,10 @@ class ResidualLearner(nn.Module, ABC):
     ) -> UpdateReport:
         """Take in one sample per model, or a time-ordered block of them, in place.
 
+        A step in which no model has a sample leaves no trace. In a fleet what a learner does every so many
+        samples (rebuild, forget, adapt) comes at the same step for all its models, and so for one that has
+        none at that step. (On a GPU, where looking would mean waiting, a step without samples counts too.)
+
         Args:
             x: inputs ``(*batch_shape, in)`` or ``(n, *batch_shape, in)``.
             y: targets, the same with ``out``.
@@ -161,19 +174,26 @@ class ResidualLearner(nn.Module, ABC):
 
         Raises:
             ShapeError: a shape does not fit. The state is untouched.
-            NonFiniteError: NaN or infinity in an unmasked sample, under ``on_invalid="raise"``;
-                a block is refused as a whole. The state is untouched.
+            NonFiniteError: NaN, infinity or a number whose square is infinite in an unmasked sample,
+                under ``on_invalid="raise"``; a block is refused as a whole. The state is untouched.
         """
         x, y = self._cast(x), self._cast(y)
+        if mask is not None and not isinstance(mask, Tensor):
+            mask = torch.as_tensor(mask, device=self.device)
         time = self._check_pair(x, y, mask)
         mask = self._refuse(x, y, mask, len(time))
         if mask is not None:  # a NaN times zero is a NaN: clear what must not be used
             x, y = x.where(mask[..., None], 0.0), y.where(mask[..., None], 0.0)
         if not time:
-            return self._absorb(x, y, mask)
+            return self._step(x, y, mask)
         return UpdateReport.stack(
-            [self._absorb(x[t], y[t], None if mask is None else mask[t]) for t in range(time[0])]
+            [self._step(x[t], y[t], None if mask is None else mask[t]) for t in range(time[0])]
         )
+
+    def _step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        if mask is not None and not mask.is_cuda and not bool(mask.any()):
+            return UpdateReport.of_nothing(mask, self.dtype)
+        return self._absorb(x, y, mask)
 
     # -- checks ---------------------------------------------------------------------------------
 
@@ -201,6 +221,8 @@ class ResidualLearner(nn.Module, ABC):
         n = len(self.batch_shape) + 1
         if x.shape[-1:] != (self.in_features,) or (n > 1 and not self._fits(x.shape[-n:-1])):
             raise ShapeError("x", self._expected("*any", "in"), x.shape)
+        if x.shape[-n:-1] != self.batch_shape:
+            x = x.expand(*x.shape[:-n], *self.batch_shape, self.in_features)
         return x
 
     def _fits(self, shape: torch.Size) -> bool:
@@ -216,7 +238,8 @@ class ResidualLearner(nn.Module, ABC):
             expected = ", ".join(map(str, (*x.shape[:-1], self.out_features)))
             raise ShapeError("y", f"({expected})", y.shape, "one target for each input")
         if mask is not None and (mask.shape != x.shape[:-1] or mask.dtype != torch.bool):
-            raise ShapeError("mask", f"{tuple(x.shape[:-1])} of bool", mask.shape)
+            hint = f"of {mask.dtype}"
+            raise ShapeError("mask", f"{tuple(x.shape[:-1])} of torch.bool", mask.shape, hint)
         if x.numel() == 0:
             raise ShapeError("x", self._expected("[n >= 1]", "in"), x.shape, "the batch is empty")
         return x.shape[: x.dim() - n]
@@ -227,16 +250,16 @@ class ResidualLearner(nn.Module, ABC):
 
     def _refuse(self, x: Tensor, y: Tensor, mask: Tensor | None, n_time: int) -> Tensor | None:
         if self.on_invalid == "skip":
-            finite = x.isfinite().all(-1) & y.isfinite().all(-1)
+            finite = x.square().isfinite().all(-1) & y.square().isfinite().all(-1)
             refused = ~finite if mask is None else mask & ~finite
             self.n_refused += refused.sum(0) if n_time else refused
             return finite if mask is None else mask & finite
         if mask is not None:
             x, y = x.where(mask[..., None], 0.0), y.where(mask[..., None], 0.0)
-        # A sum is cheap and finite unless an entry is not (or it overflows: then look closely).
-        if not math.isfinite(x.sum() + y.sum()):
+        # A norm is cheap and finite unless a square is not (or their sum overflows: then look closely).
+        if not math.isfinite(torch.linalg.vector_norm(x) + torch.linalg.vector_norm(y)):
             for name, value in (("x", x), ("y", y)):
-                where = (~value.isfinite()).nonzero()
+                where = (~value.square().isfinite()).nonzero()
                 if len(where):
                     raise NonFiniteError(name, [tuple(w) for w in where[:5].tolist()])
         return mask
@@ -249,13 +272,28 @@ class ResidualLearner(nn.Module, ABC):
 
 def check_count(name: str, value: int, least: int = 1) -> int:
     """``value`` as an int of at least ``least``, or ParameterError."""
-    if isinstance(value, bool) or int(value) != value or value < least:
+    try:
+        good = not isinstance(value, bool) and int(value) == value and value >= least
+    except (TypeError, ValueError, OverflowError):
+        good = False
+    if not good:
         raise ParameterError(name, value, f"an integer of at least {least}")
     return int(value)
 
 
+def check_counts(name: str, values: Iterable[int]) -> tuple[int, ...]:
+    """``values`` as positive ints, or ParameterError."""
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise ParameterError(name, values, "a tuple of positive integers")
+    return tuple(check_count(name, value) for value in values)
+
+
 def check_positive(name: str, value: float) -> float:
     """``value`` as a positive finite float, or ParameterError."""
-    if not (math.isfinite(value) and value > 0):
+    try:
+        good = math.isfinite(value) and value > 0
+    except (TypeError, ValueError):
+        good = False
+    if not good:
         raise ParameterError(name, value, "positive and finite")
     return float(value)

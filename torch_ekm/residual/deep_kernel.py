@@ -10,7 +10,7 @@ from torch import nn
 
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
-from .base import check_count
+from .base import check_count, check_counts
 from .kernels import Kernel, StationaryKernel
 
 
@@ -51,7 +51,7 @@ class DeepKernel(Kernel):
         fleet, generator = like.shape[:-1], torch.Generator().manual_seed(seed)
         widths = [
             like.shape[-1],
-            *(check_count("hidden", n) for n in hidden),
+            *check_counts("hidden", hidden),
             check_count("features", features),
         ]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
@@ -87,6 +87,8 @@ class DeepKernel(Kernel):
 
     def forward(self, x: Tensor, z: Tensor) -> Tensor:
         a, b = self.embed(x), self.embed(z)
+        centre = b[..., :1, :].detach()  # see StationaryKernel
+        a, b = a - centre, b - centre
         d2 = a.square().sum(-1).unsqueeze(-1) + b.square().sum(-1).unsqueeze(-2) - 2.0 * a @ b.mT
         return self.base.log_variance.exp()[..., None, None] * self.base.phi(d2.clamp_min(0.0))
 

@@ -68,7 +68,10 @@ def log_parameter(
     Raises:
         ParameterError: a value is not positive and finite, or does not broadcast.
     """
-    values = torch.as_tensor(value, **factory)
+    try:
+        values = torch.as_tensor(value, **factory)
+    except (TypeError, ValueError, RuntimeError):
+        raise ParameterError(name, value, "one number or numbers") from None
     if not bool(((values > 0) & values.isfinite()).all()):
         raise ParameterError(name, values.tolist(), "positive and finite")
     try:
@@ -76,6 +79,35 @@ def log_parameter(
     except RuntimeError:
         raise ParameterError(name, values.tolist(), f"one number or of shape {tuple(shape)}") from None
     return nn.Parameter(values.log().contiguous(), requires_grad=False)
+
+
+def check_kernel(kernel: Kernel, in_features: int, batch_shape: tuple[int, ...]) -> Kernel:
+    """The kernel, if it takes inputs of that width and is one for all models or one for each.
+
+    Raises:
+        ParameterError: it is none, or of another width or fleet.
+    """
+    valid = f"a Kernel of {in_features} inputs, for one model or a fleet of {tuple(batch_shape)}"
+    if not isinstance(kernel, Kernel):
+        raise ParameterError("kernel", type(kernel).__name__, valid)
+    try:
+        shape = _shape_of(kernel, in_features)
+    except RuntimeError:
+        raise ParameterError("kernel", repr(kernel), valid) from None
+    if shape not in ((), tuple(batch_shape)):
+        raise ParameterError("kernel", repr(kernel), valid)
+    return kernel
+
+
+def is_shared(kernel: Kernel, in_features: int) -> bool:
+    """Whether the kernel is one for all models of a fleet."""
+    return _shape_of(kernel, in_features) == ()
+
+
+def _shape_of(kernel: Kernel, in_features: int) -> tuple[int, ...]:
+    like = next(kernel.parameters(), torch.empty(0, dtype=torch.float64))
+    x = like.new_zeros(1, in_features)
+    return tuple(kernel(x, x).shape[:-2])
 
 
 class StationaryKernel(Kernel):
@@ -131,7 +163,9 @@ class StationaryKernel(Kernel):
         if x.shape[-2] == 1:  # differences are exact; products are faster for many queries
             d2 = ((z - x) * w).square().sum(-1).unsqueeze(-2)
         else:
-            x, z = x * w, z * w
+            # about one of the points: far from 0 the difference of large squares would be all rounding
+            centre = z[..., :1, :].detach()
+            x, z = (x - centre) * w, (z - centre) * w
             d2 = x.square().sum(-1).unsqueeze(-1) + z.square().sum(-1).unsqueeze(-2)
             d2 = (d2 - 2.0 * x @ z.mT).clamp_min(0.0)
         return self.log_variance.exp()[..., None, None] * self.phi(d2)

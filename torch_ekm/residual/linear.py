@@ -12,6 +12,7 @@ from torch.distributions import Normal
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import ResidualLearner, UpdateEvent, UpdateReport, check_count, check_positive
+from .kernels import log_parameter
 
 
 class LinearInFeatures(ResidualLearner):
@@ -125,9 +126,14 @@ class LinearInFeatures(ResidualLearner):
         self.pending.zero_()
         precision = self.information.double() / self.noise_variance
         precision.diagonal(dim1=-2, dim2=-1).add_(1.0 / self.weight_variance)
+        # with a unit diagonal, and what rounding takes from it: inputs may be far from 0 and large
+        d = precision.diagonal(dim1=-2, dim2=-1).rsqrt()
+        precision = d.unsqueeze(-1) * precision * d.unsqueeze(-2)
+        precision.diagonal(dim1=-2, dim2=-1).add_(d.shape[-1] * torch.finfo(d.dtype).eps)
         factor = torch.linalg.cholesky_ex(precision)[0]
-        self.covariance.copy_(torch.cholesky_inverse(factor))
-        self.weights.copy_(torch.cholesky_solve(self.target.double() / self.noise_variance, factor))
+        self.covariance.copy_(d.unsqueeze(-1) * torch.cholesky_inverse(factor) * d.unsqueeze(-2))
+        target = d.unsqueeze(-1) * self.target.double() / self.noise_variance
+        self.weights.copy_(d.unsqueeze(-1) * torch.cholesky_solve(target, factor))
 
     def get_extra_state(self) -> dict[str, Any]:
         """Number of samples seen: the rhythm of rebuilds continues after a reload."""
@@ -192,7 +198,8 @@ class RandomFeatureRLS(LinearInFeatures):
         generator = torch.Generator().manual_seed(seed)
         draws = torch.randn(n_frequencies, in_features, generator=generator, dtype=torch.float64)
         lengthscale = math.sqrt(in_features) if lengthscale is None else lengthscale
-        self.register_buffer("frequencies", (draws / torch.as_tensor(lengthscale)).to(self._like))
+        scale = log_parameter("lengthscale", lengthscale, (self.in_features,), dtype=torch.float64).exp()
+        self.register_buffer("frequencies", (draws / scale).to(self._like))
 
     def features(self, x: Tensor) -> Tensor:
         """The random Fourier features."""

@@ -240,6 +240,8 @@ class MixtureResidual(ResidualLearner):
 def _same_shapes(members: list[ResidualLearner]) -> ResidualLearner:
     if not members:
         raise ParameterError("learners", members, "at least one learner")
+    if len({id(member) for member in members}) < len(members):
+        raise ParameterError("learners", members, "learners of their own; the same one would learn twice")
     shapes = [(m.in_features, m.out_features, tuple(m.batch_shape)) for m in members]
     if len(set(shapes)) > 1:
         raise ParameterError("learners", shapes, "of the same (in_features, out_features, batch_shape)")

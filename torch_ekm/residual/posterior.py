@@ -240,7 +240,10 @@ class SparsePosterior(nn.Module):
         event = int(UpdateEvent.ABSORBED) + novel.to(torch.int64) + excess
         if mask is not None:
             event = event * (mask > 0)
-        return UpdateReport(event, gamma / prior, surprise, weight), innovation, v
+        # k** may be 0: no action, no effect
+        # k** may be 0: no action, no effect
+        novelty = gamma / prior.clamp_min(torch.finfo(prior.dtype).tiny)
+        return UpdateReport(event, novelty, surprise, weight), innovation, v
 
     def _add_and_delete(self, scaled: Tensor, added: Tensor, excess: Tensor, s2: Tensor) -> None:
         """Add ``scaled added'`` to (C, Q, Omega), then delete the lowest-scored point where ``excess``.

@@ -32,6 +32,7 @@ class ReplayMemory(nn.Module):
     y: Tensor
     weight: Tensor
     absorbed: Tensor
+    number: Tensor
 
     def __init__(self, posterior: SparsePosterior, capacity: int, horizon: float = math.inf) -> None:
         super().__init__()
@@ -42,6 +43,7 @@ class ReplayMemory(nn.Module):
         self.register_buffer("y", like.new_zeros(*fleet, n, posterior.out_features))
         self.register_buffer("weight", like.new_zeros(*fleet, n))
         self.register_buffer("absorbed", like.new_zeros(n))
+        self.register_buffer("number", like.new_zeros(n))
         self._n_offered = self._n_taken = 0  # on the host, as the places are
 
     def offer(
@@ -59,29 +61,30 @@ class ReplayMemory(nn.Module):
             self.y[..., place, :] = y
             self.weight[..., place] = weight
             self.absorbed[place] = 0.0
+            self.number[place] = n
 
     def settle(self) -> None:
         """All that is kept is now part of the state that is to predict it."""
         self.absorbed.fill_(1.0)
 
-    def take(self, n: int) -> tuple[Tensor, Tensor, Tensor]:
+    def take(self, n: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """n samples at most, evenly spread over the places, others at the next call.
 
         Returns:
-            ``x (*batch, n, in)``, ``y (*batch, n, out)`` and the weights ``(*batch, n)``, 0 for what is
-            not yet part of the state.
+            ``x (*batch, n, in)``, ``y (*batch, n, out)``, the weights ``(*batch, n)``, 0 for what is not
+            yet part of the state, and the ages ``(n,)`` in samples.
         """
         kept = min(self._n_offered, self.capacity)
         stride = max(kept // n, 1)
         first = self._n_taken % stride
         self._n_taken += 1
         some = slice(first, min(first + stride * n, kept), stride)
-        return self.x[..., some, :], self.y[..., some, :], self.weight[..., some] * self.absorbed[some]
+        weight, age = self.weight[..., some] * self.absorbed[some], self._n_offered - self.number[some]
+        return self.x[..., some, :], self.y[..., some, :], weight, age
 
     def forget(self, models: Bool[Tensor, "*batch"]) -> None:
         """What these models saw says nothing about what they are now."""
         self.weight.masked_fill_(models.unsqueeze(-1), 0.0)
-        self._n_offered = min(self._n_offered, self.capacity)  # so that new samples are let in soon
 
     def reset(self) -> None:
         """Nothing seen."""

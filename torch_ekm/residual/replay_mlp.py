@@ -11,7 +11,7 @@ from torch import nn
 from torch.distributions import Normal
 
 from ..typing import Tensor
-from .base import ResidualLearner, UpdateEvent, UpdateReport, check_count, check_positive
+from .base import ResidualLearner, UpdateEvent, UpdateReport, check_count, check_counts, check_positive
 
 
 class ReplayMLP(ResidualLearner):
@@ -58,7 +58,7 @@ class ReplayMLP(ResidualLearner):
         self.minibatch, self.steps = check_count("minibatch", minibatch), check_count("steps", steps)
         self.rate, self.seed = check_positive("rate", rate), int(seed)
         self.prior_variance = check_positive("prior_variance", prior_variance)
-        self.hidden = tuple(check_count("hidden", n) for n in hidden)
+        self.hidden = check_counts("hidden", hidden)
         zeros = self._like.new_zeros
         self.register_buffer("inputs", zeros(self.memory, self.in_features))
         self.register_buffer("targets", zeros(self.memory, self.out_features))

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, Literal
 
 import torch
 from torch.distributions import Normal
 
-from ..exceptions import ParameterError, ShapeError
+from ..exceptions import NonFiniteError, ParameterError, ShapeError
 from ..typing import Float, Tensor
 from .action_linear import ActionLinearKernel
 from .adaptation import PrequentialAdaptation
 from .base import UpdateReport, check_count, check_positive
 from .double_state import DoubleStateLearner
-from .kernels import Kernel, SquaredExponential, log_parameter
+from .kernels import Kernel, SquaredExponential, check_kernel, log_parameter
 from .monitor import ChangeDetector, NoiseCalibration
 from .posterior import SparsePosterior, compiled_absorb
 from .prediction import Prediction
@@ -66,7 +65,8 @@ class SparseOnlineGP(DoubleStateLearner):
         adapt_rate: its first step on the logarithms of the hyperparameters.
         adapt_network_rate: its first step on a deep kernel's weights.
         adapt_steps: steps per rebuild.
-        adapt_memory: samples of the past to learn the kernel from, too (ReplayMemory); 0: the last only.
+        adapt_memory: samples of the past to learn the kernel from, too (ReplayMemory); 0: the last only,
+            as with ``diffusion``, to which the past is another g.
         calibrate: make 90 % intervals hold 90 % of the samples of each output, see NoiseCalibration.
         detect_changes: start anew when most of the last samples were surprising, see ChangeDetector.
             Looks at the result of every update, so on a GPU it waits for it.
@@ -121,7 +121,8 @@ class SparseOnlineGP(DoubleStateLearner):
         self.compile_step = bool(compile_step)
         factory: dict[str, Any] = {"dtype": torch.float64, "device": device}
         fleet = {"batch_shape": self.batch_shape, **factory}
-        self.kernel = SquaredExponential(self.in_features, **fleet) if kernel is None else kernel.double()
+        kernel = SquaredExponential(self.in_features, **fleet) if kernel is None else kernel
+        self.kernel = check_kernel(kernel, self.in_features, self.batch_shape).to(**factory)
         self.log_noise_variance = log_parameter(
             "noise_variance", noise_variance, (*self.batch_shape, self.out_features), **factory
         )
@@ -145,20 +146,17 @@ class SparseOnlineGP(DoubleStateLearner):
         self.detector = None
         if detect_changes:
             self.detector = ChangeDetector(self.in_features, self.out_features, **places)
-        self.adaptation = None
-        if adapt:
-            kept = self.forgetting * (1.0 - self.diffusion)
-            self.adaptation = PrequentialAdaptation(
-                self.posterior,
-                self.kernel,
-                self.log_noise_variance,
-                window=self.refresh_every,
-                rate=check_positive("adapt_rate", adapt_rate),
-                network_rate=check_positive("adapt_network_rate", adapt_network_rate),
-                steps=check_count("adapt_steps", adapt_steps),
-                memory=check_count("adapt_memory", adapt_memory, least=0),
-                horizon=math.inf if kept == 1.0 else 1.0 / (1.0 - kept),
-            )
+        adaptation = {
+            "rate": check_positive("adapt_rate", adapt_rate),
+            "network_rate": check_positive("adapt_network_rate", adapt_network_rate),
+            "steps": check_count("adapt_steps", adapt_steps),
+            "memory": check_count("adapt_memory", adapt_memory, least=0) if self.diffusion == 0.0 else 0,
+            "window": self.refresh_every,
+            "forgetting": self.forgetting,
+            "expects_changes": detect_changes,
+        }
+        state = (self.posterior, self.kernel, self.log_noise_variance)
+        self.adaptation = PrequentialAdaptation(*state, **adaptation) if adapt else None
         # samples whose forgetting is due at the next rebuild
         self.register_buffer("pending", torch.zeros(self.batch_shape, **factory))
         self._n_samples = 0  # on the host, so that the rhythm of rebuilds never asks the GPU
@@ -276,8 +274,11 @@ class SparseOnlineGP(DoubleStateLearner):
 
         Raises:
             ShapeError: the shape does not fit, or there are more points than the capacity.
+            NonFiniteError: NaN or infinity; the state is untouched.
         """
         x = self._cast(x)
+        if not bool(x.isfinite().all()):
+            raise NonFiniteError("x", [tuple(place) for place in (~x.isfinite()).nonzero()[:5].tolist()])
         if x.shape[1:] != (*self.batch_shape, self.in_features) or not 1 <= len(x) <= self.capacity:
             raise ShapeError("x", self._expected(f"[n <= {self.capacity}]", "in"), x.shape)
         self.reset()
