@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -70,7 +72,8 @@ FLEETS = ("zero", "rls", "rff", "window", "sogp", "sogp_all", "sogp_diffusion", 
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_contract(name):
-    check_residual_learner(LEARNERS[name])
+    # a single network cannot tell its own error from noise
+    check_residual_learner(LEARNERS[name], separates_noise=name != "mlp")
 
 
 @pytest.mark.parametrize("shape", [(1,), (5,), (2, 3)])
@@ -93,7 +96,9 @@ SINGLE = {
 def test_contract_of_fleets_of_single_learners(name, shape):
     kind, options = SINGLE[name]
     check_residual_learner(
-        lambda **o: LearnerFleet(kind, 3, 2, batch_shape=shape, **options, **o), n_samples=12
+        lambda **o: LearnerFleet(kind, 3, 2, batch_shape=shape, **options, **o),
+        n_samples=12,
+        separates_noise=name != "mlp",
     )
 
 
@@ -101,11 +106,10 @@ def test_contract_of_river():
     pytest.importorskip("river")
     from torch_ekm.residual import RiverResidual
 
-    check_residual_learner(lambda **o: RiverResidual(3, 2, **o), differentiable=False)
+    options = {"differentiable": False, "separates_noise": False}
+    check_residual_learner(lambda **o: RiverResidual(3, 2, **o), **options)
     check_residual_learner(
-        lambda **o: LearnerFleet(RiverResidual, 3, 2, batch_shape=(2,), **o),
-        differentiable=False,
-        n_samples=12,
+        lambda **o: LearnerFleet(RiverResidual, 3, 2, batch_shape=(2,), **o), n_samples=12, **options
     )
 
 
@@ -146,6 +150,9 @@ class _StateOutside(RecursiveLeastSquares):
     def forward(self, x):
         return super().forward(x) + getattr(self, "extra", 0.0)
 
+    def predict(self, x, *, observation=False):
+        return torch.distributions.Normal(self(x), super().predict(x, observation=observation).stddev)
+
 
 class _Modal(RecursiveLeastSquares):
     def forward(self, x):
@@ -158,7 +165,68 @@ class _Leaky(RecursiveLeastSquares):
         return super()._refuse(x, y, mask, n_time)
 
 
-@pytest.mark.parametrize("broken", [_WrongPrior, _WrongSlope, _StateOutside, _Modal, _Leaky])
-def test_a_broken_learner_is_caught(broken):
-    with pytest.raises(AssertionError):
-        check_residual_learner(lambda **o: broken(3, 2, **o))
+class _LearnsWithoutSample(RecursiveLeastSquares):
+    def _absorb(self, x, y, mask):
+        return super()._absorb(x, y, None if mask is not None and bool(mask.any()) else mask)
+
+
+class _LeaksBetweenModels(RecursiveLeastSquares):
+    def _absorb(self, x, y, mask):
+        report = super()._absorb(x, y, mask)
+        self.weights.copy_(0.999 * self.weights + 0.001 * self.weights.roll(1, 0))
+        return report
+
+
+class _IgnoresObservation(RecursiveLeastSquares):
+    def predict(self, x, *, observation=False):
+        return super().predict(x)
+
+
+class _ReportsNaN(RecursiveLeastSquares):
+    def _absorb(self, x, y, mask):
+        report = super()._absorb(x, y, mask)
+        return dataclasses.replace(report, novelty=report.novelty * torch.nan)
+
+
+class _LearnsWhatItSkips(RecursiveLeastSquares):
+    def _refuse(self, x, y, mask, n_time):
+        if self.on_invalid == "skip":
+            x.nan_to_num_(0.5)
+            return mask
+        return super()._refuse(x, y, mask, n_time)
+
+
+class _OverwritesInputs(RecursiveLeastSquares):
+    def _absorb(self, x, y, mask):
+        report = super()._absorb(x, y, mask)
+        y.mul_(0.5)
+        return report
+
+
+class _RemembersDeviations(RecursiveLeastSquares):
+    def reset(self):
+        covariance = self.covariance.clone()
+        super().reset()
+        self.covariance.copy_(covariance)
+
+
+BROKEN = {
+    "prior": _WrongPrior,
+    "linearize": _WrongSlope,
+    "state_dict": _StateOutside,
+    "train": _Modal,
+    "refused": _Leaky,
+    "accepts other samples": _LearnsWithoutSample,
+    "without a sample": _LeaksBetweenModels,
+    "observation": _IgnoresObservation,
+    "report.novelty": _ReportsNaN,
+    "skipped": _LearnsWhatItSkips,
+    "caller": _OverwritesInputs,
+    "reset": _RemembersDeviations,
+}
+
+
+@pytest.mark.parametrize("clause", BROKEN)
+def test_a_broken_learner_is_caught(clause):
+    with pytest.raises(AssertionError, match=clause):
+        check_residual_learner(lambda **o: BROKEN[clause](3, 2, batch_shape=(3,), **o))

@@ -1,0 +1,208 @@
+"""What a stream of somebody else's may hold, and what somebody may ask: it works or is refused by name."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+
+from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
+from torch_ekm.residual import (
+    ActionLinearKernel,
+    DeepKernelSOGP,
+    KRLSTracker,
+    MixtureResidual,
+    RandomFeatureRLS,
+    RecursiveLeastSquares,
+    SparseOnlineGP,
+    SquaredExponential,
+    WindowGP,
+    ZeroResidual,
+)
+
+
+def stream(n: int, *shape: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn(n, *shape, 3, generator=generator, dtype=torch.float64)
+    return x, torch.sin(x[..., :2])
+
+
+@pytest.mark.parametrize("offset", [1e4, 1e6])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: SparseOnlineGP(3, 2, capacity=30),
+        lambda: WindowGP(3, 2, window=40),
+        lambda: KRLSTracker(3, 2, capacity=30),
+    ],
+)
+def test_a_stationary_kernel_does_not_care_where_the_inputs_lie(make, offset):
+    x, y = stream(150)
+    near, far = make(), make()
+    near.update(x, y)
+    far.update(x + offset, y)
+    queries = stream(40, seed=1)[0]
+    # the inputs themselves are rounded to offset * 1e-16
+    torch.testing.assert_close(far(queries + offset), near(queries), atol=1e-15 * offset * 1e3, rtol=0)
+    assert float(far.predict(queries + offset).stddev.min()) > 0.5 * float(near.predict(queries).stddev.min())
+
+
+@pytest.mark.parametrize(("offset", "bound"), [(1e6, 0.6), (1e8, 1.0)])
+def test_least_squares_far_from_the_origin(offset, bound):
+    x, _ = stream(200)
+    y = x @ torch.tensor([[1.0], [-2.0], [0.5]], dtype=torch.float64)
+    rls = RecursiveLeastSquares(3, 1)
+    rls.update(x + offset, y)
+    assert bool(rls(x + offset).isfinite().all())
+    assert float((rls(x + offset) - y).square().mean().sqrt()) < bound * float(y.std())
+
+
+@pytest.mark.parametrize("value", [1e200, -1e300, float("nan"), float("inf")])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda **o: SparseOnlineGP(3, 2, capacity=8, normalize=True, **o),
+        lambda **o: RecursiveLeastSquares(3, 2, **o),
+        lambda **o: MixtureResidual(SparseOnlineGP(3, 2, capacity=8, **o), **o),
+    ],
+)
+def test_numbers_without_a_square_are_refused(make, value):
+    x, y = stream(20)
+    g = make()
+    g.update(x, y)
+    before = copy.deepcopy(g.state_dict())
+    for k in (0, 1):
+        pair = [x[0].clone(), y[0].clone()]
+        pair[k][1] = value
+        with pytest.raises(NonFiniteError, match="square"):
+            g.update(*pair)
+    for name, now in g.state_dict().items():
+        assert torch.equal(now, before[name]) if isinstance(now, torch.Tensor) else now == before[name]
+    skipping = make(on_invalid="skip")
+    skipping.update(torch.stack([x[0], x[1]]), torch.stack([y[0], torch.full_like(y[1], value)]))
+    assert int(skipping.n_refused) == 1
+    assert bool(skipping(x).isfinite().all())
+
+
+@pytest.mark.parametrize(
+    "options", [{"adapt": True}, {"forgetting": 0.9}, {"diffusion": 0.05}, {"normalize": True}]
+)
+def test_a_step_without_a_sample_leaves_no_trace_even_when_a_rebuild_is_due(options):
+    x, y = stream(40)
+    for on_invalid in ("raise", "skip"):
+        g = SparseOnlineGP(3, 2, capacity=10, refresh_every=8, on_invalid=on_invalid, **options)
+        g.update(x[:7], y[:7])
+        other = copy.deepcopy(g)
+        if on_invalid == "raise":
+            report = g.update(x[7], y[7], torch.tensor(False))
+        else:
+            report = g.update(torch.full_like(x[7], torch.nan), y[7])
+        assert int(report.event) == 0
+        assert torch.equal(g(x), other(x))
+        for learner in (g, other):  # and the stream goes on as if it had never come
+            learner.update(x[8:], y[8:])
+        assert torch.equal(g(x), other(x))
+
+
+@pytest.mark.parametrize("shape", [(3,), (1, 3), (4, 1, 3), (4, 5, 3)])
+def test_a_query_may_ask_all_models_of_a_fleet(shape):
+    fleets = [
+        ZeroResidual(3, 2, batch_shape=(5,)),
+        RecursiveLeastSquares(3, 2, batch_shape=(5,)),
+        RandomFeatureRLS(3, 2, n_frequencies=9, batch_shape=(5,)),
+        WindowGP(3, 2, window=9, batch_shape=(5,)),
+        SparseOnlineGP(3, 2, capacity=6, batch_shape=(5,)),
+        DeepKernelSOGP(3, 2, capacity=6, hidden=(4,), features=2, batch_shape=(5,)),
+        MixtureResidual(SparseOnlineGP(3, 2, capacity=6, batch_shape=(5,))),
+    ]
+    x, y = stream(12, 5)
+    query = torch.randn(shape, dtype=torch.float64)
+    whole = query.expand(*(shape[:-2] if len(shape) > 2 else ()), 5, 3)
+    for g in fleets:
+        g.update(x, y)
+        for ask in (g, lambda q, g=g: g.predict(q).stddev, lambda q, g=g: g.linearize(q)[1]):
+            torch.testing.assert_close(ask(query), ask(whole), atol=0, rtol=0)
+
+
+def test_a_fleet_that_detects_changes_with_a_memory_is_so_many_single_models():
+    x, y = stream(400, 3)
+    y[250:, 1] *= -3.0
+    options = {
+        "capacity": 12, "adapt": True, "adapt_memory": 50, "robust": 3.0, "detect_changes": True,
+        "noise_variance": 0.01,
+    }  # fmt: skip
+    fleet = SparseOnlineGP(3, 2, batch_shape=(3,), **options)
+    fleet.update(x, y)
+    for i in range(3):
+        single = SparseOnlineGP(3, 2, **options)
+        single.update(x[:, i], y[:, i])
+        torch.testing.assert_close(fleet(x[:9])[:, i], single(x[:9, i]), atol=1e-9, rtol=0)
+
+
+def test_one_kernel_for_a_fleet_as_large_as_the_inputs_are_wide():
+    x, y = stream(64, 3)
+    gp = SparseOnlineGP(3, 2, capacity=8, batch_shape=(3,), kernel=SquaredExponential(3), adapt=True)
+    start = gp.kernel.log_lengthscale.clone()
+    gp.update(x, y, torch.tensor([True, False, False]).expand(64, 3))
+    assert bool((gp.kernel.log_lengthscale != start).all())
+
+
+def test_no_action_is_not_novel():
+    gp = SparseOnlineGP(3, 2, capacity=5, kernel=ActionLinearKernel(3, 1))
+    x, y = stream(10)
+    x[0, -1] = 0.0
+    report = gp.update(x, y)
+    assert bool(report.novelty.isfinite().all())
+    assert float(report.novelty[0]) == 0
+
+
+def test_a_basis_must_be_finite():
+    gp = SparseOnlineGP(3, 2, capacity=5)
+    x, y = stream(10)
+    gp.update(x, y)
+    before = gp(x)
+    with pytest.raises(NonFiniteError):
+        gp.set_basis(torch.full((3, 3), torch.nan))
+    assert torch.equal(gp(x), before)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        (SparseOnlineGP, {"capacity": None}),
+        (SparseOnlineGP, {"capacity": float("nan")}),
+        (SparseOnlineGP, {"batch_shape": 3}),
+        (SparseOnlineGP, {"noise_variance": None}),
+        (SparseOnlineGP, {"noise_variance": "a"}),
+        (SparseOnlineGP, {"dtype": torch.int64}),
+        (SparseOnlineGP, {"kernel": "se"}),
+        (SparseOnlineGP, {"kernel": SquaredExponential(4)}),
+        (SparseOnlineGP, {"kernel": SquaredExponential(3, batch_shape=(2,))}),
+        (SparseOnlineGP, {"adapt_rate": -1.0}),
+        (SparseOnlineGP, {"adapt_memory": "many"}),
+        (SparseOnlineGP, {"refresh_every": "often"}),
+        (DeepKernelSOGP, {"hidden": 8}),
+        (RandomFeatureRLS, {"lengthscale": 0.0}),
+        (RandomFeatureRLS, {"lengthscale": float("nan")}),
+        (RandomFeatureRLS, {"lengthscale": [1.0, 2.0]}),
+    ],
+)
+def test_parameters_that_cannot_be_are_named(kind, options):
+    with pytest.raises(ParameterError, match=next(iter(options))):
+        kind(3, 2, **options)
+
+
+def test_the_same_learner_twice_is_no_mixture():
+    gp = SparseOnlineGP(3, 2, capacity=5)
+    with pytest.raises(ParameterError, match="twice"):
+        MixtureResidual([gp, gp])
+
+
+def test_masks_may_be_lists_of_bools_only():
+    gp = SparseOnlineGP(3, 2, capacity=5, batch_shape=(2,))
+    x, y = stream(1, 2)
+    report = gp.update(x[0], y[0], [True, False])
+    assert report.accepted.tolist() == [True, False]
+    with pytest.raises(ShapeError, match="int64"):
+        gp.update(x[0], y[0], [1, 0])
