@@ -50,7 +50,7 @@ def loss_by_dense_algebra(
     v = kernel.diagonal_of_set(queries.x) + (k * (C @ k)).sum(-2)
     p = u + (k * (C @ k)).sum(-2)
     share = queries.absorbed * queries.weight * a.forgetting**queries.age * p / s2.squeeze(-1)
-    left_out = torch.where(share < 1, torch.minimum(1.0 / (1.0 - share), u / p), 1.0)
+    left_out = torch.where(share < 1, torch.minimum(1.0 / (1.0 - share), u / p), u / p)
     variance = (v + p * (left_out - 1.0)).unsqueeze(-1) + log_noise.exp().unsqueeze(-2)
     z2 = ((queries.y - k.mT @ alpha) * left_out.unsqueeze(-1)).square() / variance
     misfit = z2 if robust is None else (robust**2 + 1.0) * torch.log1p(z2 / robust**2)
@@ -293,6 +293,13 @@ def test_after_a_change_the_memory_holds_the_new_system_only():
     numbers = [int((x == row).all(-1).nonzero()) for row in kept]
     assert len(numbers) > 50
     assert min(numbers) >= 400
+
+
+def test_where_g_wanders_there_is_no_memory():
+    assert adaptation_of(DeepKernelSOGP(4, 2, diffusion=0.003)).memory is None
+    assert adaptation_of(DeepKernelSOGP(4, 2)).memory is not None
+    with pytest.raises(ParameterError, match="another g"):
+        SparseOnlineGP(4, 2, adapt=True, adapt_memory=100, diffusion=0.003)
 
 
 @pytest.mark.parametrize("options", [{"adapt_memory": -1}, {"adapt_memory": 1.5}, {"adapt_steps": 0}])

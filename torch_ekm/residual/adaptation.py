@@ -47,10 +47,10 @@ class PrequentialAdaptation(nn.Module):
     With ``u = k'Qk`` the prior variance of the basis' prediction of the sample, p its posterior variance and
     w what is left of its weight in the state (Rasmussen & Williams 2006, section 5.4.2, for a sparse model)::
 
-        residual <- c residual,  p <- c p,   c = 1 / (1 - w p/s2), at most u/p;   1 where w p > s2
+        residual <- c residual,  p <- c p,   c = 1 / (1 - w p/s2), at most u/p
 
-    What has more than its whole share in its own prediction was left behind when the basis changed. Where g
-    itself wanders (diffusion) the past is another g, and none is kept.
+    since without any sample p would be u. That is honest only where noise is fresh at each sample: where it
+    is carried from one to the next, the neighbours in time tell on the one left out.
 
     Gradients need no differentiation of a factorisation. From ``d alpha = C dK alpha``, ``dC = C dK C`` and
     ``dQ = -Q dK Q``, with ``E = Ck``, ``F = Qk`` and the loss' derivatives ``g`` by mean, variance
@@ -247,10 +247,7 @@ class PrequentialAdaptation(nn.Module):
             return torch.ones_like(p)
         most = (u / p.clamp_min(torch.finfo(p.dtype).tiny)).clamp_min(1.0)
         weight = queries.absorbed * queries.weight * self.forgetting**queries.age
-        share = weight * p / s2
-        inside = (share > 0.0) & (share < 1.0)
-        # where the other branch is taken its derivative must be finite too
-        return torch.where(inside, torch.minimum(1.0 / (1.0 - share.where(inside, 0.0)), most), 1.0)
+        return torch.minimum(1.0 / (1.0 - weight * p / s2).clamp_min(torch.finfo(p.dtype).eps), most)
 
     def descend(
         self, kernel: Kernel, log_noise: nn.Parameter, units: Units, jitter: float, robust: float | None

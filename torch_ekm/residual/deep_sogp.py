@@ -9,7 +9,7 @@ from .deep_kernel import DeepKernel
 from .kernels import SquaredExponential
 from .sogp import SparseOnlineGP
 
-_ADAPTATION: dict[str, Any] = {"adapt": True, "adapt_steps": 2, "adapt_memory": 2000}
+_FROM_THE_PAST: dict[str, Any] = {"adapt_steps": 2, "adapt_memory": 2000}
 
 
 @final
@@ -25,7 +25,7 @@ class DeepKernelSOGP(SparseOnlineGP):
     Args:
         hidden, features, seed: of the network.
         options: see SparseOnlineGP (without ``kernel``; by default ``adapt=True``, ``adapt_steps=2``,
-            ``adapt_memory=2000``).
+            ``adapt_memory=2000``; with ``diffusion``, to which the past is another g, one and 0).
     """
 
     def __init__(
@@ -41,4 +41,5 @@ class DeepKernelSOGP(SparseOnlineGP):
         fleet = {name: options[name] for name in ("batch_shape", "device") if name in options}
         base = SquaredExponential(in_features, **fleet)
         kernel = DeepKernel(base, hidden=hidden, features=features, seed=seed)
-        super().__init__(in_features, out_features, kernel=kernel, **{**_ADAPTATION, **options})
+        defaults = {"adapt": True, **({} if options.get("diffusion") else _FROM_THE_PAST)}
+        super().__init__(in_features, out_features, kernel=kernel, **{**defaults, **options})

@@ -65,8 +65,8 @@ class SparseOnlineGP(DoubleStateLearner):
         adapt_rate: its first step on the logarithms of the hyperparameters.
         adapt_network_rate: its first step on a deep kernel's weights.
         adapt_steps: steps per rebuild.
-        adapt_memory: samples of the past to learn the kernel from, too (ReplayMemory); 0: the last only,
-            as with ``diffusion``, to which the past is another g.
+        adapt_memory: samples of the past to learn the kernel from, too (ReplayMemory); 0: the last only.
+            Not with ``diffusion``: where g wanders the past is another g.
         calibrate: make 90 % intervals hold 90 % of the samples of each output, see NoiseCalibration.
         detect_changes: start anew when most of the last samples were surprising, see ChangeDetector.
             Looks at the result of every update, so on a GPU it waits for it.
@@ -141,6 +141,10 @@ class SparseOnlineGP(DoubleStateLearner):
             batch_shape=self.batch_shape,
             device=device,
         )
+        if adapt_memory and diffusion > 0.0:
+            raise ParameterError(
+                "adapt_memory", adapt_memory, "0 with diffusion: the past is that of another g"
+            )
         places = {"batch_shape": self.batch_shape, "device": device}
         self.calibration = NoiseCalibration(self.out_features, **places) if calibrate else None
         self.detector = None
@@ -150,7 +154,7 @@ class SparseOnlineGP(DoubleStateLearner):
             "rate": check_positive("adapt_rate", adapt_rate),
             "network_rate": check_positive("adapt_network_rate", adapt_network_rate),
             "steps": check_count("adapt_steps", adapt_steps),
-            "memory": check_count("adapt_memory", adapt_memory, least=0) if self.diffusion == 0.0 else 0,
+            "memory": check_count("adapt_memory", adapt_memory, least=0),
             "window": self.refresh_every,
             "forgetting": self.forgetting,
             "expects_changes": detect_changes,
