@@ -23,7 +23,8 @@ class DeepKernelSOGP(SparseOnlineGP):
     samples of the past are kept to learn them from, and each rebuild takes two steps.
 
     Args:
-        hidden, features, seed: of the network.
+        hidden, features: of the network; (64, 64) and 16, or (32, 32) and 6 without a memory.
+        seed: of its weights.
         options: see SparseOnlineGP (without ``kernel``; by default ``adapt=True``, ``adapt_steps=2``,
             ``adapt_memory=2000``; with ``diffusion``, to which the past is another g, one and 0).
     """
@@ -33,13 +34,18 @@ class DeepKernelSOGP(SparseOnlineGP):
         in_features: int,
         out_features: int,
         *,
-        hidden: Sequence[int] = (64, 64),
-        features: int = 16,
+        hidden: Sequence[int] | None = None,
+        features: int | None = None,
         seed: int = 0,
         **options: Any,
     ) -> None:
         fleet = {name: options[name] for name in ("batch_shape", "device") if name in options}
         base = SquaredExponential(in_features, **fleet)
+        options = {"adapt": True, **({} if options.get("diffusion") else _FROM_THE_PAST), **options}
+        small = not options.get("adapt_memory")
+        if hidden is None:
+            hidden = (32, 32) if small else (64, 64)
+        if features is None:
+            features = 6 if small else 16
         kernel = DeepKernel(base, hidden=hidden, features=features, seed=seed)
-        defaults = {"adapt": True, **({} if options.get("diffusion") else _FROM_THE_PAST)}
-        super().__init__(in_features, out_features, kernel=kernel, **{**defaults, **options})
+        super().__init__(in_features, out_features, kernel=kernel, **options)
