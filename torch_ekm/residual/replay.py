@@ -36,7 +36,7 @@ class ReplayMemory(nn.Module):
 
     def __init__(self, posterior: SparsePosterior, capacity: int, horizon: float = math.inf) -> None:
         super().__init__()
-        self.capacity, self.horizon = max(min(capacity, math.ceil(min(horizon, capacity))), 1), horizon
+        self.capacity, self.horizon = max(math.ceil(min(capacity, horizon)), 1), horizon
         fleet, like = posterior.batch_shape, posterior.basis
         n = self.capacity
         self.register_buffer("x", like.new_zeros(*fleet, n, like.shape[-1]))
