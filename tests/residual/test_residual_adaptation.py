@@ -41,9 +41,9 @@ def loss_by_dense_algebra(
     """The loss as its docstring states it, with inverses, for autograd to go through."""
     log_noise, kernel = gp.log_noise_variance, gp.kernel
     s2 = log_noise.mean(-1).exp()[..., None, None]
-    K = basis_gram(kernel, a.old_basis, a.old_active, gp.posterior.jitter)
-    k = kernel(a.old_basis, queries.x) * a.old_active.unsqueeze(-1)
-    W, h = a.old_moments[..., 2, :, :] / s2, a.old_vectors[..., 1, :, :] / s2
+    K = basis_gram(kernel, a.old.basis, a.old.active, gp.posterior.jitter)
+    k = kernel(a.old.basis, queries.x) * a.old.active.unsqueeze(-1)
+    W, h = a.old.precision / s2, a.old.information / s2
     eye = torch.eye(K.shape[-1], dtype=K.dtype)
     alpha, C = torch.linalg.solve(eye + W @ K, h), -torch.linalg.solve(eye + W @ K, W)
     u = (k * (torch.linalg.inv(K) @ k)).sum(-2)
@@ -83,9 +83,7 @@ def test_gradients_in_closed_form_are_those_of_autograd(kind, robust, fleet, fad
         if moved:
             for p in parameters:
                 p.mul_(0.97)
-        found = a.loss_and_gradients(
-            gp.kernel, gp.log_noise_variance, queries, gp.posterior.jitter, robust, moved=moved
-        )
+        found = a.loss_and_gradients(gp.kernel, gp.log_noise_variance, queries, moved=moved)
         for p in parameters:
             p.requires_grad_(True)
         loss = loss_by_dense_algebra(a, gp, queries, robust)
@@ -106,9 +104,7 @@ def test_lagged_loss_is_the_density_of_the_old_state():
     expected = -law.log_prob(y[48:63]).mean(-1).mean()
     gp.update(x[48:63], y[48:63])
     a = adaptation_of(gp)
-    loss, _ = a.loss_and_gradients(
-        gp.kernel, gp.log_noise_variance, a.queries(gp.units.of_sets), gp.posterior.jitter, None
-    )
+    loss, _ = a.loss_and_gradients(gp.kernel, gp.log_noise_variance, a.queries(gp.units.of_sets))
     assert float(loss) == pytest.approx(float(expected), abs=1e-6)
 
 
@@ -136,11 +132,9 @@ def test_a_replayed_sample_is_predicted_by_the_exact_gp_of_all_others():
         expected = -torch.distributions.Normal(mean, variance.sqrt()).log_prob(y[i]).mean()
         one = torch.ones(1, dtype=torch.float64)
         query = Queries(x[i : i + 1], y[i : i + 1], one, one, one)
-        loss, _ = a.loss_and_gradients(gp.kernel, gp.log_noise_variance, query, 1e-10, None)
+        loss, _ = a.loss_and_gradients(gp.kernel, gp.log_noise_variance, query)
         assert float(loss) == pytest.approx(float(expected), abs=1e-6)
-        seen, _ = a.loss_and_gradients(
-            gp.kernel, gp.log_noise_variance, query._replace(absorbed=0.0 * one), 1e-10, None
-        )
+        seen, _ = a.loss_and_gradients(gp.kernel, gp.log_noise_variance, query._replace(absorbed=0.0 * one))
         assert float(seen) < float(loss) - 1e-3  # what was seen flatters itself
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 
 import pytest
 import torch
@@ -138,6 +139,19 @@ def test_a_fleet_that_detects_changes_with_a_memory_is_so_many_single_models():
         single = SparseOnlineGP(3, 2, **options)
         single.update(x[:, i], y[:, i])
         torch.testing.assert_close(fleet(x[:9])[:, i], single(x[:9, i]), atol=1e-9, rtol=0)
+
+
+def test_units_of_a_model_with_masks_are_those_of_its_own_samples():
+    x, y = stream(60, 2, 3)
+    mask = torch.rand(60, 2, 3, generator=torch.Generator().manual_seed(1)) < 0.7
+    fleet = SparseOnlineGP(3, 2, capacity=12, batch_shape=(2, 3), normalize=True, normalize_for=100)
+    fleet.update(x, y, mask)
+    fleet.refresh()
+    for i, j in itertools.product(range(2), range(3)):
+        own_x, own_y = x[mask[:, i, j], i, j], y[mask[:, i, j], i, j]
+        torch.testing.assert_close(fleet.units.input.shift[i, j], own_x.mean(0))
+        torch.testing.assert_close(fleet.units.input.scale[i, j], own_x.std(0, correction=0))
+        torch.testing.assert_close(fleet.units.output.scale[i, j], own_y.square().mean(0).sqrt())
 
 
 def test_one_kernel_for_a_fleet_as_large_as_the_inputs_are_wide():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,7 +13,6 @@ from torch import nn
 
 from ..typing import Bool, Float, Tensor
 from .kernels import Kernel, is_shared
-from .natural import posterior_from_natural
 from .posterior import SparsePosterior, as_gram
 from .replay import ReplayMemory
 
@@ -29,6 +29,16 @@ class Queries(NamedTuple):
     weight: Float[Tensor, "*batch n"]
     absorbed: Float[Tensor, " n"]  # 1: part of the state, to be left out of it
     age: Float[Tensor, " n"]  # samples since then
+
+
+class _Slopes(NamedTuple):
+    """Derivatives of the loss, by what the state says of the queries and by the noise."""
+
+    mean: Tensor
+    variance: Tensor
+    p: Tensor
+    u: Tensor
+    log_noise: Tensor
 
 
 class PrequentialAdaptation(nn.Module):
@@ -83,10 +93,6 @@ class PrequentialAdaptation(nn.Module):
     window_x: Tensor
     window_y: Tensor
     window_on: Tensor
-    old_basis: Tensor
-    old_active: Tensor
-    old_moments: Tensor
-    old_vectors: Tensor
     n_steps: Tensor
 
     def __init__(
@@ -111,10 +117,7 @@ class PrequentialAdaptation(nn.Module):
         self.register_buffer("window_x", like.new_zeros(*fleet, window, like.shape[-1]))
         self.register_buffer("window_y", like.new_zeros(*fleet, window, posterior.out_features))
         self.register_buffer("window_on", like.new_zeros(*fleet, window))
-        self.register_buffer("old_basis", torch.zeros_like(like))
-        self.register_buffer("old_active", torch.zeros_like(posterior.active))
-        self.register_buffer("old_moments", torch.zeros_like(posterior.moments))
-        self.register_buffer("old_vectors", torch.zeros_like(posterior.vectors))
+        self.old = copy.deepcopy(posterior)
         self.register_buffer("n_steps", like.new_zeros(fleet))
         for i, p in enumerate([*kernel.parameters(), log_noise]):
             self.register_buffer(f"first_{i}", torch.zeros_like(p.detach()))
@@ -128,6 +131,7 @@ class PrequentialAdaptation(nn.Module):
         """Forget window, snapshot, memory and step sizes."""
         for buffer in self.buffers(recurse=False):
             buffer.zero_()
+        self.old.reset()
         if self.memory is not None:
             self.memory.reset()
 
@@ -141,10 +145,8 @@ class PrequentialAdaptation(nn.Module):
 
     def snapshot(self, posterior: SparsePosterior) -> None:
         """The present state becomes the past one; the window is empty."""
-        self.old_basis.copy_(posterior.basis)
-        self.old_active.copy_(posterior.active)
-        self.old_moments.copy_(posterior.moments)
-        self.old_vectors.copy_(posterior.vectors)
+        for old, new in zip(self.old.buffers(), posterior.buffers(), strict=True):
+            old.copy_(new)
         self.window_on.zero_()
         if self.memory is not None:
             self.memory.settle()
@@ -152,8 +154,7 @@ class PrequentialAdaptation(nn.Module):
     def forget(self, models: Bool[Tensor, "*batch"]) -> None:
         """These models face another system: what they kept does not count any more."""
         self.window_on.masked_fill_(models.unsqueeze(-1), 0.0)
-        self.old_moments.masked_fill_(models[..., None, None, None], 0.0)
-        self.old_vectors.masked_fill_(models[..., None, None, None], 0.0)
+        self.old.forget(models)
         if self.memory is not None:
             self.memory.forget(models)
 
@@ -162,10 +163,11 @@ class PrequentialAdaptation(nn.Module):
         x, y, weight = self.window_x, self.window_y, self.window_on
         absorbed = age = x.new_zeros(self.window)
         if self.memory is not None:
-            past = self.memory.take(max(_REPLAYED * self.window, self.old_basis.shape[-2] - 1))
-            x, y = torch.cat([x, past[0]], dim=-2), torch.cat([y, past[1]], dim=-2)
-            weight = torch.cat([weight, past[2]], dim=-1)
-            absorbed, age = torch.cat([absorbed, torch.ones_like(past[3])]), torch.cat([age, past[3]])
+            n = max(_REPLAYED * self.window, self.old.capacity)
+            x_past, y_past, weight_past, age_past = self.memory.take(n)
+            x, y = torch.cat([x, x_past], dim=-2), torch.cat([y, y_past], dim=-2)
+            weight = torch.cat([weight, weight_past], dim=-1)
+            absorbed, age = torch.cat([absorbed, torch.ones_like(age_past)]), torch.cat([age, age_past])
         return Queries(*units(x, y), weight, absorbed, age)
 
     def loss_and_gradients(
@@ -173,8 +175,6 @@ class PrequentialAdaptation(nn.Module):
         kernel: Kernel,
         log_noise: Tensor,
         queries: Queries,
-        jitter: float,
-        robust: float | None,
         *,
         moved: bool = True,
     ) -> tuple[Tensor, list[Tensor | None]]:
@@ -183,15 +183,17 @@ class PrequentialAdaptation(nn.Module):
         The derivatives are those by ``[*kernel.parameters(), log_noise]``.
 
         Args:
-            moved: whether kernel or noise changed since the snapshot; else its caches serve.
+            moved: whether kernel or noise changed since the old state's caches were made.
         """
         with _differentiable(kernel) as parameters:
-            K, k, prior = outcome = self._covariances(kernel, queries.x, jitter)
-            C, Q, alpha = self._caches(K.detach(), log_noise) if moved else self._old_caches()
+            K, k, prior = outcome = self._covariances(kernel, queries.x)
             K_, k_ = K.detach(), k.detach()
+            if moved:
+                self.old.rebuild_from(K_, log_noise.mean(-1).exp())
+            C, Q, alpha = self.old.covariance, self.old.moments[..., 1, :, :], self.old.alpha
             E, F = C @ k_, Q @ k_
             kE, u, mean = (k_ * E).sum(-2), (k_ * F).sum(-2), k_.mT @ alpha
-            loss, by = self._density(mean, prior.detach() + kE, u + kE, u, log_noise, queries, robust)
+            loss, by = self._density(mean, prior.detach() + kE, u + kE, u, log_noise, queries)
 
             E_g, F_g = E * (by.variance + by.p).unsqueeze(-2), F * (by.p + by.u).unsqueeze(-2)
             by_K = (E @ by.mean) @ alpha.mT + E_g @ E.mT - F_g @ F.mT
@@ -202,22 +204,13 @@ class PrequentialAdaptation(nn.Module):
             by_kernel = torch.autograd.grad(outcome, parameters, [by_K, by_k, by.variance], allow_unused=True)
         return loss, [*by_kernel, by_noise]
 
-    def _covariances(self, kernel: Kernel, x: Tensor, jitter: float) -> tuple[Tensor, Tensor, Tensor]:
+    def _covariances(self, kernel: Kernel, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """K at the old basis, k and k** of the queries, from one evaluation of the kernel."""
-        M = self.old_basis.shape[-2]
-        both = kernel(self.old_basis, torch.cat([self.old_basis, x], dim=-2))
-        K = as_gram(both[..., :M], kernel, self.old_basis, self.old_active, jitter)
-        return K, both[..., M:] * self.old_active.unsqueeze(-1), kernel.diagonal_of_set(x)
-
-    def _old_caches(self) -> tuple[Tensor, Tensor, Tensor]:
-        C, Q = self.old_moments[..., 0, :, :], self.old_moments[..., 1, :, :]
-        return C, Q, self.old_vectors[..., 0, :, :]
-
-    def _caches(self, K: Tensor, log_noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        s2 = log_noise.mean(-1).exp()[..., None, None]
-        W, h = self.old_moments[..., 2, :, :] / s2, self.old_vectors[..., 1, :, :] / s2
-        Q, C, alpha = posterior_from_natural(K, W, h)
-        return C, Q, alpha
+        basis, active = self.old.basis, self.old.active
+        both = kernel(basis, torch.cat([basis, x], dim=-2))
+        M = basis.shape[-2]
+        K = as_gram(both[..., :M], kernel, basis, active, self.old.jitter)
+        return K, both[..., M:] * active.unsqueeze(-1), kernel.diagonal_of_set(x)
 
     def _density(
         self,
@@ -227,7 +220,6 @@ class PrequentialAdaptation(nn.Module):
         u: Tensor,
         log_noise: Tensor,
         queries: Queries,
-        robust: float | None,
     ) -> tuple[Tensor, _Slopes]:
         """The loss from the state's predictions, and its derivatives by them."""
         leaves = [value.detach().requires_grad_(True) for value in (mean, v, p, u, log_noise)]
@@ -235,6 +227,7 @@ class PrequentialAdaptation(nn.Module):
         c = self._left_out(p, u, log_noise.mean(-1, keepdim=True).exp(), queries)
         variance = (v + p * (c - 1.0)).clamp_min(0.0).unsqueeze(-1) + log_noise.exp().unsqueeze(-2)
         z2 = ((queries.y - mean) * c.unsqueeze(-1)).square() / variance
+        robust = self.old.robust
         misfit = z2 if robust is None else (robust**2 + 1.0) * torch.log1p(z2 / robust**2)
         density = 0.5 * (misfit + variance.log() + math.log(2 * math.pi)).mean(-1)
         on = (queries.weight > 0).to(density.dtype)
@@ -249,15 +242,13 @@ class PrequentialAdaptation(nn.Module):
         weight = queries.absorbed * queries.weight * self.forgetting**queries.age
         return torch.minimum(1.0 / (1.0 - weight * p / s2).clamp_min(torch.finfo(p.dtype).eps), most)
 
-    def descend(
-        self, kernel: Kernel, log_noise: nn.Parameter, units: Units, jitter: float, robust: float | None
-    ) -> None:
+    def descend(self, kernel: Kernel, log_noise: nn.Parameter, units: Units) -> None:
         """Adam on the loss, model by model; a model without samples or finite gradient stays as it is."""
         parameters = [*kernel.parameters(), log_noise]
         names = [name for name, _ in kernel.named_parameters()] + ["log_noise"]
         for step in range(self.steps):
             queries = self.queries(units)
-            _, gradients = self.loss_and_gradients(kernel, log_noise, queries, jitter, robust, moved=step > 0)
+            _, gradients = self.loss_and_gradients(kernel, log_noise, queries, moved=step > 0)
             self._adam(parameters, names, gradients)
 
     def _adam(self, parameters: list, names: list[str], gradients: list) -> None:
@@ -293,14 +284,6 @@ def _spread(value: Float[Tensor, "*batch"], like: Tensor, shared: bool) -> Tenso
     if shared or like.shape[: value.dim()] != value.shape:
         return value.mean()
     return value[(..., *(None,) * (like.dim() - value.dim()))]
-
-
-class _Slopes(NamedTuple):
-    mean: Tensor
-    variance: Tensor
-    p: Tensor
-    u: Tensor
-    log_noise: Tensor
 
 
 @contextmanager

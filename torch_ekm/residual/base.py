@@ -258,10 +258,8 @@ class ResidualLearner(nn.Module, ABC):
             x, y = x.where(mask[..., None], 0.0), y.where(mask[..., None], 0.0)
         # A norm is cheap and finite unless a square is not (or their sum overflows: then look closely).
         if not math.isfinite(torch.linalg.vector_norm(x) + torch.linalg.vector_norm(y)):
-            for name, value in (("x", x), ("y", y)):
-                where = (~value.square().isfinite()).nonzero()
-                if len(where):
-                    raise NonFiniteError(name, [tuple(w) for w in where[:5].tolist()])
+            check_finite("x", x)
+            check_finite("y", y)
         return mask
 
     def extra_repr(self) -> str:
@@ -297,3 +295,10 @@ def check_positive(name: str, value: float) -> float:
     if not good:
         raise ParameterError(name, value, "positive and finite")
     return float(value)
+
+
+def check_finite(name: str, value: Tensor) -> None:
+    """NonFiniteError, with the first places, if a square in ``value`` is not finite."""
+    where = (~value.square().isfinite()).nonzero()
+    if len(where):
+        raise NonFiniteError(name, [tuple(place) for place in where[:5].tolist()])

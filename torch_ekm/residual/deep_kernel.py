@@ -11,7 +11,7 @@ from torch import nn
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import check_count, check_counts
-from .kernels import Kernel, StationaryKernel
+from .kernels import Kernel, StationaryKernel, squared_distances
 
 
 class DeepKernel(Kernel):
@@ -88,9 +88,8 @@ class DeepKernel(Kernel):
     def forward(self, x: Tensor, z: Tensor) -> Tensor:
         a, b = self.embed(x), self.embed(z)
         centre = b[..., :1, :].detach()  # see StationaryKernel
-        a, b = a - centre, b - centre
-        d2 = a.square().sum(-1).unsqueeze(-1) + b.square().sum(-1).unsqueeze(-2) - 2.0 * a @ b.mT
-        return self.base.log_variance.exp()[..., None, None] * self.base.phi(d2.clamp_min(0.0))
+        d2 = squared_distances(a - centre, b - centre)
+        return self.base.log_variance.exp()[..., None, None] * self.base.phi(d2)
 
     def vector(self, x: Tensor, z: Tensor) -> Tensor:
         d2 = (self.embed(z) - self.embed(x.unsqueeze(-2))).square().sum(-1)

@@ -110,6 +110,12 @@ def _shape_of(kernel: Kernel, in_features: int) -> tuple[int, ...]:
     return tuple(kernel(x, x).shape[:-2])
 
 
+def squared_distances(x: Float[Tensor, "*batch n d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
+    """``|x_i - z_j|^2`` by one product, ``(*batch, n, m)``: for points near 0, see StationaryKernel."""
+    d2 = x.square().sum(-1).unsqueeze(-1) + z.square().sum(-1).unsqueeze(-2)
+    return (d2 - 2.0 * x @ z.mT).clamp_min(0.0)
+
+
 class StationaryKernel(Kernel):
     """``k = v phi(|x - z|^2_L)``, ``dk/dx = v psi L^-2 (z - x)`` with ``psi = -2 phi'``.
 
@@ -165,9 +171,7 @@ class StationaryKernel(Kernel):
         else:
             # about one of the points: far from 0 the difference of large squares would be all rounding
             centre = z[..., :1, :].detach()
-            x, z = (x - centre) * w, (z - centre) * w
-            d2 = x.square().sum(-1).unsqueeze(-1) + z.square().sum(-1).unsqueeze(-2)
-            d2 = (d2 - 2.0 * x @ z.mT).clamp_min(0.0)
+            d2 = squared_distances((x - centre) * w, (z - centre) * w)
         return self.log_variance.exp()[..., None, None] * self.phi(d2)
 
     def vector(self, x: Tensor, z: Tensor) -> Tensor:

@@ -146,9 +146,13 @@ class SparsePosterior(nn.Module):
 
     def rebuild(self, kernel: Kernel, s2: Float[Tensor, "*batch"]) -> None:
         """alpha, C, Q from the natural form by Cholesky."""
+        self.rebuild_from(self.gram(kernel), s2)
+
+    def rebuild_from(self, K: Float[Tensor, "*batch slots slots"], s2: Float[Tensor, "*batch"]) -> None:
+        """The same, with the kernel's matrix at hand (see :meth:`gram`)."""
         s2 = s2[..., None, None]
         on = self.active.unsqueeze(-1)
-        Q, C, alpha = posterior_from_natural(self.gram(kernel), self.precision / s2, self.information / s2)
+        Q, C, alpha = posterior_from_natural(K, self.precision / s2, self.information / s2)
         # a free slot has K = 1, so Q = 1 there: it must be 0 like the rest of its row
         self.covariance.copy_(C)
         self.moments[..., 1, :, :] = Q * (on * on.mT)
@@ -240,7 +244,6 @@ class SparsePosterior(nn.Module):
         event = int(UpdateEvent.ABSORBED) + novel.to(torch.int64) + excess
         if mask is not None:
             event = event * (mask > 0)
-        # k** may be 0: no action, no effect
         # k** may be 0: no action, no effect
         novelty = gamma / prior.clamp_min(torch.finfo(prior.dtype).tiny)
         return UpdateReport(event, novelty, surprise, weight), innovation, v

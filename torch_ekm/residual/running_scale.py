@@ -49,8 +49,9 @@ class RunningScale(nn.Module):
         self.register_buffer("shifted", columns)
 
     def forward(self, x: Float[Tensor, "*batch features"]) -> Float[Tensor, "*batch features"]:
-        """x in the learner's units."""
-        return (x - self.shift) / self.scale
+        """x, or its first columns, in the learner's units."""
+        n = x.shape[-1]
+        return (x - self.shift[..., :n]) / self.scale[..., :n]
 
     def observe(self, x: Float[Tensor, "*batch features"], weight: Float[Tensor, "*batch"]) -> None:
         """Add one weighted sample per model (West's update of mean and sum of squares)."""

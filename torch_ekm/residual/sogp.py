@@ -7,11 +7,11 @@ from typing import Any, Literal
 import torch
 from torch.distributions import Normal
 
-from ..exceptions import NonFiniteError, ParameterError, ShapeError
+from ..exceptions import ParameterError, ShapeError
 from ..typing import Float, Tensor
 from .action_linear import ActionLinearKernel
 from .adaptation import PrequentialAdaptation
-from .base import UpdateReport, check_count, check_positive
+from .base import UpdateReport, check_count, check_finite, check_positive
 from .double_state import DoubleStateLearner
 from .kernels import Kernel, SquaredExponential, check_kernel, log_parameter
 from .monitor import ChangeDetector, NoiseCalibration
@@ -281,8 +281,7 @@ class SparseOnlineGP(DoubleStateLearner):
             NonFiniteError: NaN or infinity; the state is untouched.
         """
         x = self._cast(x)
-        if not bool(x.isfinite().all()):
-            raise NonFiniteError("x", [tuple(place) for place in (~x.isfinite()).nonzero()[:5].tolist()])
+        check_finite("x", x)
         if x.shape[1:] != (*self.batch_shape, self.in_features) or not 1 <= len(x) <= self.capacity:
             raise ShapeError("x", self._expected(f"[n <= {self.capacity}]", "in"), x.shape)
         self.reset()
@@ -331,9 +330,7 @@ class SparseOnlineGP(DoubleStateLearner):
         if self.adaptation is not None:
             self.adaptation.observe(x, y, on, report.weight, (n - 1) % self.refresh_every)
             if due:
-                robust, jitter = self.posterior.robust, self.posterior.jitter
-                noise = self.log_noise_variance
-                self.adaptation.descend(self.kernel, noise, self.units.of_sets, jitter, robust)
+                self.adaptation.descend(self.kernel, self.log_noise_variance, self.units.of_sets)
         # Units are rough in the first samples: then rebuild at 1, 2, 4, 8, ... too.
         if due or (self.units.learning(n) and n & (n - 1) == 0):
             self.refresh()

@@ -34,10 +34,7 @@ class LearnedUnits(nn.Module):
 
     def inputs(self, x: Float[Tensor, "*any columns"]) -> Float[Tensor, "*any columns"]:
         """x, or its first columns, in the learner's units."""
-        if not self.learn_for:
-            return x
-        n = x.shape[-1]
-        return (x - self.input.shift[..., :n]) / self.input.scale[..., :n]
+        return self.input(x) if self.learn_for else x
 
     def targets(self, y: Float[Tensor, "*any out"]) -> Float[Tensor, "*any out"]:
         """y in the learner's units."""
