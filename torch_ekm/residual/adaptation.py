@@ -183,7 +183,8 @@ class PrequentialAdaptation(nn.Module):
         The derivatives are those by ``[*kernel.parameters(), log_noise]``.
 
         Args:
-            moved: whether kernel or noise changed since the old state's caches were made.
+            moved: whether kernel or noise changed since the old state's caches were made: they are
+                made anew then.
         """
         with _differentiable(kernel) as parameters:
             K, k, prior = outcome = self._covariances(kernel, queries.x)
