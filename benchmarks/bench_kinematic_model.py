@@ -19,7 +19,8 @@ from model_icub import gripped
 
 from torch_ekm.contact import ContactDetector, constraint_matrix
 from torch_ekm.description import load_object
-from torch_ekm.model import GraspState, KinematicModel
+from torch_ekm.kinematics import GraspState
+from torch_ekm.model import KinematicModel
 from torch_ekm.model.potential import gravity_gradient, spring_torque
 from torch_ekm.model.stiffness import geometric_stiffness
 

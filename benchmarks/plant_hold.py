@@ -16,7 +16,8 @@ import torch
 from torch_ekm.description import list_objects
 from torch_ekm.exceptions import EquilibriumError, GraspError
 from torch_ekm.kinematics.se3 import log
-from torch_ekm.simulation import PlantStatus, SimulatedHand
+from torch_ekm.plant import PlantStatus
+from torch_ekm.simulation import SimulatedHand
 
 _LIMITS = 0.1, 0.1  # [mm], [deg]
 

@@ -24,9 +24,9 @@ from pathlib import Path
 
 import torch
 
-from torch_ekm.experiments.record import RecordConfig, record
-from torch_ekm.experiments.setting import Setting
-from torch_ekm.simulation import TrialLog
+from torch_ekm.experiments.config import Setting
+from torch_ekm.experiments.protocols.record import RecordConfig, record
+from torch_ekm.plant import TrialLog
 
 ANGLES = (3.0, 5.0)
 _WARM_UP = 50  # trials until all caches are filled

@@ -23,8 +23,8 @@ from test_model_sapien import true_state, turning_step
 
 from torch_ekm.exceptions import GraspError
 from torch_ekm.model import KinematicModel, ModelOptions
+from torch_ekm.plant.plant import PlantStatus
 from torch_ekm.simulation import PlantParameters, SimulatedHand
-from torch_ekm.simulation.plant import PlantStatus
 
 DEG = np.pi / 180
 

@@ -16,8 +16,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from torch_ekm.experiments.prequential import compare_learners, score_objects
-from torch_ekm.experiments.streams import ResidualRecording, Stream, load_stream, load_t42
+from torch_ekm.experiments.learner_comparison.datasets import (
+    ResidualRecording,
+    Stream,
+    load_stream,
+    load_t42,
+)
+from torch_ekm.experiments.learner_comparison.prequential import compare_learners, score_objects
 from torch_ekm.residual import (
     DeepKernelSOGP,
     GPyTorchSVGP,

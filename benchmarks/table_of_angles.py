@@ -18,10 +18,10 @@ import torch
 
 from torch_ekm.control import ControllerOptions, FocusedPose, LookAndMoveController, PoseTarget
 from torch_ekm.exceptions import EKMError
-from torch_ekm.experiments.demo import TABLE_I, fixed_actuators
+from torch_ekm.experiments.config import Setting, digest
 from torch_ekm.experiments.jobs import run_jobs
 from torch_ekm.experiments.manipulation import run_manipulation, state_of
-from torch_ekm.experiments.setting import Setting, digest
+from torch_ekm.experiments.protocols.demo import TABLE_I, fixed_actuators
 from torch_ekm.model import KinematicModel, ModelOptions
 from torch_ekm.simulation import PlantConfig, SimulatedHand, severity
 

@@ -23,8 +23,8 @@ from rich.table import Table as RichTable
 from typer import Argument, Option
 
 if TYPE_CHECKING:
-    from .experiments.report import Report
-    from .experiments.show import Show
+    from .experiments.reporting.report import Report
+    from .experiments.viewer.serve import Show
 
 app = typer.Typer(
     help="Kinematic models of underactuated hands, corrected by online learners.",
@@ -84,8 +84,8 @@ def demo(
 
     Takes about two minutes on two cores. Interrupted, it goes on where it stopped.
     """
-    from .experiments.demo import TABLE_I, DemoConfig
-    from .experiments.demo_report import demo_jobs, run_demo
+    from .experiments.protocols.demo import TABLE_I, DemoConfig
+    from .experiments.protocols.demo_report import demo_jobs, run_demo
 
     angles = TABLE_I.get(object, TABLE_I["box"])
     chosen = parse_seeds(seeds)
@@ -131,9 +131,9 @@ def reproduce(
 
     Interrupted, it goes on where it stopped, and ends with the same report.
     """
+    from .experiments.config import Setting
     from .experiments.reproduce import plan
     from .experiments.reproduce import reproduce as run
-    from .experiments.setting import Setting
 
     control = {} if step is None else {"focus_step": math.radians(step)}
     setting = Setting(hand=hand, severity=severity, learner=learner, sensing=sensing, control=control)
@@ -168,7 +168,7 @@ def compare(
     (Kaixhin/SARCOS), kin40k and powerplant (treforevans/uci_datasets), mimo, lorenz, mackey_glass and
     santafe (steven2358/kafbox).
     """
-    from .experiments.compare_report import compare_data
+    from .experiments.learner_comparison.report import compare_data
 
     with _progress() as progress:
         task = progress.add_task("comparing", total=None)
@@ -203,9 +203,9 @@ def record(
 
     Interrupted or killed, it goes on where it stopped, and ends with the same files.
     """
-    from .experiments.record import RecordConfig
-    from .experiments.record import record as run
-    from .experiments.setting import Setting
+    from .experiments.config import Setting
+    from .experiments.protocols.record import RecordConfig
+    from .experiments.protocols.record import record as run
 
     setting = Setting(hand=hand, severity=severity, sensing=sensing)
     config = RecordConfig(setting, object, controller, _numbers("angles", angles), images)
@@ -229,7 +229,7 @@ def show(
     A hand has a slider for each actuator, a grasp is simulated while its actuators are moved, a log is
     played.
     """
-    from .experiments.show import choose_show
+    from .experiments.viewer.serve import choose_show
 
     _look(choose_show(what, object, seed), html, port)
 
@@ -243,8 +243,8 @@ def replay(
     port: Annotated[int, Option(help="To serve at; the next free one if it is taken.")] = 8080,
 ) -> None:
     """List the trials of a log, and play one in the browser."""
-    from .experiments.show_log import LogShow
-    from .simulation import TrialEntry
+    from .experiments.viewer.trial import LogShow
+    from .plant import TrialEntry
 
     shown = LogShow(log, trial, estimates)
     if shown.log is not None:
@@ -257,7 +257,7 @@ def replay(
 
 def _look(show: Show, html: Path | None, port: int) -> None:
     """Write a page, or serve until Ctrl-C."""
-    from .experiments.show import save_page, serve
+    from .experiments.viewer.serve import save_page, serve
 
     if html is not None:
         console.print(f"Page:      {save_page(show, html).resolve()}", soft_wrap=True)
@@ -271,7 +271,7 @@ def notebooks(
     overwrite: Annotated[bool, Option(help="Also over files that are there.")] = False,
 ) -> None:
     """List the notebooks that come with the package, or copy them to where you can run them."""
-    from .experiments.notebook_tools import copy_notebooks, notebook_folder
+    from .experiments.reporting.notebook import copy_notebooks, notebook_folder
 
     found = sorted(notebook_folder().glob("[0-9]*.ipynb"))
     for path in found if copy is None else copy_notebooks(copy, overwrite=overwrite):
@@ -317,7 +317,7 @@ def _names(text: str) -> tuple[str, ...]:
 @app.command()
 def version() -> None:
     """Print the version, and those of the packages that decide the numbers."""
-    from .experiments.report import versions
+    from .experiments.reporting.report import versions
 
     for package, number in versions().items():
         console.print(f"{package} {number}", highlight=False)

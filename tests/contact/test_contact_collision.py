@@ -13,13 +13,20 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from torch_ekm.contact._primitives import signed_distance, surface_curvature, tangents
-from torch_ekm.description import ContactPad, ObjectDescription, Shape, list_objects, load_hand, load_object
+from torch_ekm.description import (
+    ContactPad,
+    ObjectDescription,
+    Shape,
+    list_objects,
+    load_hand,
+    load_object,
+)
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.kinematics.se3 import exp
 
 coal = pytest.importorskip("coal")
-from torch_ekm.contact.collision import ContactDetector  # noqa: E402
+from torch_ekm.contact.detector import ContactDetector  # noqa: E402
 
 F64 = torch.float64
 EYE = torch.eye(3, dtype=F64)

@@ -9,7 +9,9 @@ import pytest
 import torch
 from contact_samples import F64, THREE, held
 
-from torch_ekm.contact.contact_force import (
+from torch_ekm.contact.contact_kinematics import grasp_matrix, hand_jacobian
+from torch_ekm.contact.forces.friction import directions, friction_cones
+from torch_ekm.contact.forces.problem import (
     BalanceEquations,
     ForceOptions,
     ForceStatus,
@@ -17,8 +19,6 @@ from torch_ekm.contact.contact_force import (
     force_problem,
     margins,
 )
-from torch_ekm.contact.contact_kinematics import grasp_matrix, hand_jacobian
-from torch_ekm.contact.friction import directions, friction_cones
 from torch_ekm.exceptions import ParameterError
 
 WEIGHT = np.array([0.0, 0.0, -9.81 * 0.25, 0.0, 0.0, 0.0])

@@ -17,7 +17,7 @@ from torch_ekm.contact.contact_kinematics import (
     rolling_mobility,
 )
 from torch_ekm.contact.contact_model import ContactModel, normal_rows, selection_matrix
-from torch_ekm.contact.grasp import (
+from torch_ekm.contact.grasp_analysis import (
     analyse,
     ferrari_canny,
     has_force_closure,

@@ -17,7 +17,8 @@ from torch_ekm.control import (
 )
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
-from torch_ekm.model import GraspState, KinematicModel, ModelOptions
+from torch_ekm.kinematics import GraspState
+from torch_ekm.model import KinematicModel, ModelOptions
 from torch_ekm.residual import ActionLinearKernel, SparseOnlineGP, ZeroResidual
 from torch_ekm.simulation import SimulatedHand
 

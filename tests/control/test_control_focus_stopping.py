@@ -9,8 +9,8 @@ import torch
 
 from torch_ekm.control import FocusedPose, PoseTarget, StoppingRule, StopReason
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
+from torch_ekm.kinematics.grasp_state import GraspState
 from torch_ekm.kinematics.se3 import exp
-from torch_ekm.model.state import GraspState
 
 AXIS = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
 

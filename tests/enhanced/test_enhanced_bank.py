@@ -8,9 +8,10 @@ from typing import Any
 import pytest
 import torch
 
-from torch_ekm.enhanced import EnhancedModel, ModelBank
-from torch_ekm.enhanced.model_bank import discount
+from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import ParameterError
+from torch_ekm.object_memory import ModelBank
+from torch_ekm.object_memory.model_bank import discount
 from torch_ekm.residual import ActionLinearKernel, SparseOnlineGP, SquaredExponential, WindowGP
 from torch_ekm.testing import check_residual_learner
 

@@ -8,8 +8,8 @@ from torch.func import jacrev
 
 from torch_ekm.enhanced import EnhancedModel, GraspEncoding
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
+from torch_ekm.kinematics.grasp_state import GraspState
 from torch_ekm.kinematics.se3 import exp
-from torch_ekm.model.state import GraspState
 from torch_ekm.residual import ActionLinearKernel, SparseOnlineGP
 
 N_S, N_A = 3, 2

@@ -12,9 +12,9 @@ import torch
 from torch.distributions import MultivariateNormal, StudentT
 
 from torch_ekm.description import load_hand
-from torch_ekm.enhanced import GraspSignature, ModelBank, SignatureModel
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.kinematics import HandKinematics
+from torch_ekm.object_memory import GraspSignature, ModelBank, SignatureModel
 from torch_ekm.residual import ActionLinearKernel, SparseOnlineGP, SquaredExponential
 
 N_A, D = 2, 3

@@ -5,11 +5,18 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torch_ekm.enhanced import EnhancedModel, ModelBank
+from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.enhanced.action_variance import action_variance
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.learners import LEARNERS, make_learner
-from torch_ekm.residual import ActionLinearKernel, ReplayMLP, ResidualLearner, SparseOnlineGP, ZeroResidual
+from torch_ekm.object_memory import ModelBank
+from torch_ekm.residual import (
+    ActionLinearKernel,
+    ReplayMLP,
+    ResidualLearner,
+    SparseOnlineGP,
+    ZeroResidual,
+)
 
 N_S, N_A, N_OUT = 3, 2, 3
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torch_ekm.experiments.bench import Bench
-from torch_ekm.experiments.setting import Setting
+from torch_ekm.experiments.config import Setting
+from torch_ekm.experiments.runner import Bench
 
 
 def test_object_is_turned_with_camera_and_hall_sensors() -> None:

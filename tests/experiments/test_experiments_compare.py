@@ -12,13 +12,23 @@ from typer.testing import CliRunner
 
 from torch_ekm.cli import _print_tables, app
 from torch_ekm.exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
-from torch_ekm.experiments import compare as module
-from torch_ekm.experiments.compare import Comparison, bootstrap_ratio, compare, verdicts
-from torch_ekm.experiments.compare_report import overview_table, score_table
-from torch_ekm.experiments.contenders import CONTENDERS, DEFAULT, PEERS, contender
-from torch_ekm.experiments.recordings import Recording, in_own_units, load_recording, load_table
-from torch_ekm.experiments.report import Report, Table
-from torch_ekm.experiments.table_file import read_table
+from torch_ekm.experiments.learner_comparison import compare as module
+from torch_ekm.experiments.learner_comparison.compare import (
+    Comparison,
+    bootstrap_ratio,
+    compare,
+    verdicts,
+)
+from torch_ekm.experiments.learner_comparison.learners import CONTENDERS, DEFAULT, PEERS, contender
+from torch_ekm.experiments.learner_comparison.recording import (
+    Recording,
+    in_own_units,
+    load_recording,
+    load_table,
+)
+from torch_ekm.experiments.learner_comparison.report import overview_table, score_table
+from torch_ekm.experiments.learner_comparison.table_file import read_table
+from torch_ekm.experiments.reporting.report import Report, Table
 from torch_ekm.residual import SparseOnlineGP
 
 WEIGHTS = torch.tensor([[1.0, -0.5], [0.3, 0.8], [0.0, 0.4]], dtype=torch.float64)
@@ -121,7 +131,7 @@ def test_a_learner_with_other_settings_is_run_anew(tmp_path: Path, monkeypatch: 
     first = compare([recording], ["SOGP plain"], folder=tmp_path)
     for options in ({"forgetting": 0.9}, {"noise_variance": 0.4}):
         changed = {**CONTENDERS, "SOGP plain": lambda d, m, o=options: SparseOnlineGP(d, m, **o)}
-        monkeypatch.setattr("torch_ekm.experiments.contenders.CONTENDERS", changed)
+        monkeypatch.setattr("torch_ekm.experiments.learner_comparison.learners.CONTENDERS", changed)
         second = compare([recording], ["SOGP plain"], folder=tmp_path)
         assert second.scores != first.scores
     assert len(list(tmp_path.glob("*.json"))) == 3
@@ -325,7 +335,7 @@ def test_command_refuses_clearly(tmp_path: Path) -> None:
 
 def test_simulated_hand_repeats_bit_by_bit() -> None:
     pytest.importorskip("sapien")
-    from torch_ekm.experiments.simulated_stream import record_simulated_hand
+    from torch_ekm.experiments.learner_comparison.simulated_stream import record_simulated_hand
 
     one = record_simulated_hand(40, seed=3)
     assert one.x.shape == (40, 26)

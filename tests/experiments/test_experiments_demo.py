@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from torch_ekm.cli import app, parse_seeds
 from torch_ekm.exceptions import ParameterError, UnknownNameError
-from torch_ekm.experiments.demo import DemoConfig, run_session
-from torch_ekm.experiments.demo_report import prediction_estimates, run_demo
+from torch_ekm.experiments.protocols.demo import DemoConfig, run_session
+from torch_ekm.experiments.protocols.demo_report import prediction_estimates, run_demo
 
 CONFIG = DemoConfig(seeds=(0, 1), angles_deg=(9.0, 14.0))
 

@@ -8,14 +8,20 @@ import math
 import pytest
 import torch
 
-from torch_ekm.control import ControllerOptions, FocusedPose, LookAndMoveController, PoseTarget, StoppingRule
+from torch_ekm.control import (
+    ControllerOptions,
+    FocusedPose,
+    LookAndMoveController,
+    PoseTarget,
+    StoppingRule,
+)
 from torch_ekm.control import StopReason as Reason
 from torch_ekm.exceptions import NonFiniteError
 from torch_ekm.experiments.manipulation import run_manipulation, state_of
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel, ModelOptions
+from torch_ekm.plant.plant import Observation, Plant, PlantStatus
 from torch_ekm.simulation import SimulatedHand
-from torch_ekm.simulation.plant import Observation, Plant, PlantStatus
 
 DEG = math.pi / 180
 RULE = StoppingRule(tolerance=0.25 * DEG, stall_window=3, stall_progress=0.1 * DEG, max_steps=5)

@@ -10,11 +10,16 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import ParameterError
-from torch_ekm.experiments.adapt import AdaptConfig, Memories, _make_signature, adapt_session
-from torch_ekm.experiments.bench import Bench
+from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.learners import make_learner
-from torch_ekm.experiments.memory_tables import memory_comparison, recognition
-from torch_ekm.experiments.setting import Setting
+from torch_ekm.experiments.protocols.object_memory import (
+    AdaptConfig,
+    Memories,
+    _make_signature,
+    adapt_session,
+)
+from torch_ekm.experiments.reporting.memory_tables import memory_comparison, recognition
+from torch_ekm.experiments.runner import Bench
 
 NAMES = ("none", "bank", "labelled", "one model", "fresh")
 
@@ -80,7 +85,7 @@ def test_memory_passes_its_signature_on_and_answers_for_its_leader() -> None:
 
 
 def test_memories_speak_with_the_bank() -> None:
-    from torch_ekm.enhanced import ModelBank
+    from torch_ekm.object_memory import ModelBank
 
     bank = ModelBank(lambda: make_learner("action-linear", 3, 2, 10), 2)
     memories = Memories(bank)

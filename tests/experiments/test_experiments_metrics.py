@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
-from torch_ekm.experiments.metrics import (
+from torch_ekm.experiments.reporting.metrics import (
     bootstrap_mean,
     compare_errors,
     learning_curve,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torch_ekm.experiments.plotting import plot_bank, plot_static_error
+from torch_ekm.experiments.reporting.plots import plot_bank, plot_static_error
 
 pytest.importorskip("matplotlib")
 

@@ -13,22 +13,23 @@ import torch
 from torch_ekm.control import ControllerOptions, Decision, PoseTarget, StopReason
 from torch_ekm.description import object_files
 from torch_ekm.exceptions import ParameterError, UnknownNameError
-from torch_ekm.experiments.ablation import TROUBLES, AblationConfig, ablation_jobs, variants
-from torch_ekm.experiments.adapt import AdaptConfig, adapt_session
-from torch_ekm.experiments.bench import Bench
 from torch_ekm.experiments.camera_off import CameraOff
+from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
 from torch_ekm.experiments.learners import LEARNERS, make_learner
-from torch_ekm.experiments.protocols import (
+from torch_ekm.experiments.protocols.ablation import TROUBLES, AblationConfig, ablation_jobs, variants
+from torch_ekm.experiments.protocols.object_memory import AdaptConfig, adapt_session
+from torch_ekm.experiments.protocols.turning import (
     GeneralizeConfig,
     OnlineConfig,
     generalize_jobs,
     generalize_session,
     online_session,
 )
-from torch_ekm.experiments.setting import CONTROLLERS, Setting, digest
+from torch_ekm.experiments.runner import Bench
+from torch_ekm.kinematics import GraspState
 from torch_ekm.kinematics.se3 import exp
-from torch_ekm.model import GraspState
-from torch_ekm.simulation import Observation, PlantParameters, PlantStatus
+from torch_ekm.plant import Observation, PlantStatus
+from torch_ekm.simulation import PlantParameters
 
 ONLINE = OnlineConfig(trials=2, angles_deg=(4.0, 5.0), dislocations=(2,), tendons_replaced=2)
 
@@ -69,7 +70,7 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
     assert of(Setting()) == unchanged
     other = functools.partial(ControllerOptions, focus_gain=0.5)  # a version with another default
     with monkeypatch.context() as patch:
-        patch.setattr("torch_ekm.experiments.setting.ControllerOptions", other)
+        patch.setattr("torch_ekm.experiments.config.ControllerOptions", other)
         assert of(Setting()) != unchanged
     with monkeypatch.context() as patch:  # and one whose learner has another kernel
         patch.setitem(LEARNERS, "rbf", LEARNERS["paper"])
@@ -263,7 +264,7 @@ def test_what_cannot_be_grasped_is_recorded_not_raised(monkeypatch: pytest.Monke
 
 
 def test_the_report_names_what_was_never_grasped(tmp_path: Path) -> None:
-    from torch_ekm.experiments.reports import generalize_report
+    from torch_ekm.experiments.reporting.reports import generalize_report
 
     failed = {"seed": 0, "object": "box", "kind": "turn", "grasped": False, "lost": False, "angle_deg": 9.0,
               "reason": "not grasped", "message": "too wide"}  # fmt: skip

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import ParameterError, SolverError, UnknownNameError
-from torch_ekm.experiments.bench import Bench
-from torch_ekm.experiments.record import RecordConfig, record
-from torch_ekm.experiments.setting import Setting
+from torch_ekm.experiments.config import Setting
+from torch_ekm.experiments.protocols.record import RecordConfig, record
+from torch_ekm.experiments.runner import Bench
+from torch_ekm.plant import TrialLog
 from torch_ekm.sensing import MarkerTracker
-from torch_ekm.simulation import TrialLog
 
 pytest.importorskip("sapien")
 pytest.importorskip("h5py")

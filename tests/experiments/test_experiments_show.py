@@ -13,11 +13,12 @@ from typer.testing import CliRunner
 from torch_ekm.cli import app
 from torch_ekm.description import load_hand
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
-from torch_ekm.experiments.pictures import make_scene
-from torch_ekm.experiments.show import choose_show, save_page, serve
-from torch_ekm.experiments.show_hand import GraspShow
-from torch_ekm.experiments.show_log import LogShow
-from torch_ekm.simulation import Recording, RecordingPlant, SimulatedHand, TrialLog
+from torch_ekm.experiments.viewer.hand import GraspShow
+from torch_ekm.experiments.viewer.serve import choose_show, save_page, serve
+from torch_ekm.experiments.viewer.trial import LogShow
+from torch_ekm.plant import Recording, RecordingPlant, TrialLog
+from torch_ekm.rendering.scene import make_scene
+from torch_ekm.simulation import SimulatedHand
 
 pytest.importorskip("viser")
 pytest.importorskip("sapien")

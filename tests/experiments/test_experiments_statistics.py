@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from torch_ekm.exceptions import ParameterError, ShapeError
-from torch_ekm.experiments.adapt import judge_assignment
-from torch_ekm.experiments.learning_tables import learning_table, prediction_curves
-from torch_ekm.experiments.statistics import (
+from torch_ekm.experiments.protocols.object_memory import judge_assignment
+from torch_ekm.experiments.reporting.learning_tables import learning_table, prediction_curves
+from torch_ekm.experiments.reporting.statistics import (
     bootstrap_ratio,
     compare,
     mean_prediction,
@@ -21,8 +21,18 @@ from torch_ekm.experiments.statistics import (
     survivor_error,
     unit_means,
 )
-from torch_ekm.experiments.tables import comparison_table, controller_table, object_table, reason_table
-from torch_ekm.experiments.targets import adapt_targets, generalize_targets, goal, online_targets
+from torch_ekm.experiments.reporting.tables import (
+    comparison_table,
+    controller_table,
+    object_table,
+    reason_table,
+)
+from torch_ekm.experiments.reporting.targets import (
+    adapt_targets,
+    generalize_targets,
+    goal,
+    online_targets,
+)
 
 
 def record(controller: str = "KM", seed: int = 0, error: float = 1.0, **changes: object) -> dict:

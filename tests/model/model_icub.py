@@ -11,8 +11,8 @@ from model_toys import isotropic
 
 from torch_ekm.contact.contact_set import ContactSet
 from torch_ekm.description import load_hand
-from torch_ekm.kinematics import HandKinematics
-from torch_ekm.model import GraspState, KinematicModel, ModelOptions
+from torch_ekm.kinematics import GraspState, HandKinematics
+from torch_ekm.model import KinematicModel, ModelOptions
 from torch_ekm.model.equilibrium import EquilibriumSolver
 
 F64 = torch.float64

@@ -182,7 +182,8 @@ def build(
 ) -> Toy:
     """Fingers at q whose ball tips touch an object with the given normals; at rest with the given grip."""
     from torch_ekm.contact.contact_kinematics import constraint_matrix
-    from torch_ekm.model import GraspState, KinematicModel, ModelOptions
+    from torch_ekm.kinematics import GraspState
+    from torch_ekm.model import KinematicModel, ModelOptions
     from torch_ekm.model.potential import gravity_gradient
 
     kin = ChainKinematics(fingers)

@@ -11,8 +11,8 @@ from model_icub import gripped
 from model_toys import F64, contact_set, planar_two_finger, relative_error, three_finger, toy_hand
 from torch import nn
 
-from torch_ekm.contact.contact_force import ForceOptions, ForceStatus
 from torch_ekm.contact.contact_kinematics import constraint_matrix
+from torch_ekm.contact.forces.problem import ForceOptions, ForceStatus
 from torch_ekm.exceptions import (
     NoContactError,
     NonFiniteError,
@@ -23,7 +23,8 @@ from torch_ekm.exceptions import (
     UnknownNameError,
     UnstableGraspError,
 )
-from torch_ekm.model import GraspState, KinematicModel, ModelOptions, ModelStatus
+from torch_ekm.kinematics import GraspState
+from torch_ekm.model import KinematicModel, ModelOptions, ModelStatus
 
 
 def rebuilt(toy, *, options=None, contacts=None, **hand):

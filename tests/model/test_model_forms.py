@@ -9,7 +9,7 @@ import torch
 from model_toys import F64, planar_two_finger, relative_error, soft_two_finger, three_finger
 
 from torch_ekm.contact.contact_kinematics import constraint_matrix
-from torch_ekm.contact.grasp import null_space
+from torch_ekm.contact.grasp_analysis import null_space
 from torch_ekm.exceptions import SingularGraspError, UnstableGraspError
 from torch_ekm.model.manipulation import kkt_form, null_space_form, two_stage
 from torch_ekm.model.potential import gravity_hessian
@@ -100,8 +100,9 @@ def test_the_whole_problem_turned_in_space_gives_the_turned_answer():
     # turning hand, object, contacts and gravity must turn do and dphi and change nothing else
     from model_toys import ChainKinematics
 
+    from torch_ekm.kinematics import GraspState
     from torch_ekm.kinematics.se3 import exp
-    from torch_ekm.model import GraspState, KinematicModel, ModelOptions
+    from torch_ekm.model import KinematicModel, ModelOptions
 
     toy = three_finger()
     Q = exp(torch.tensor([0.3, -0.7, 1.1], dtype=F64))

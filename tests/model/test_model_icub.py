@@ -12,7 +12,8 @@ from model_icub import DEG, F64, gripped
 from model_toys import finite_difference_jacobian, relative_error, step_error_slope
 
 from torch_ekm.exceptions import ShapeError
-from torch_ekm.model import GraspState, KinematicModel, ModelStatus
+from torch_ekm.kinematics import GraspState
+from torch_ekm.model import KinematicModel, ModelStatus
 
 
 @functools.lru_cache(maxsize=4)

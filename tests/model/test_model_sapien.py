@@ -9,7 +9,8 @@ import torch
 pytest.importorskip("sapien")
 pytest.importorskip("coal")
 
-from torch_ekm.model import GraspState, KinematicModel, ModelOptions, ModelStatus
+from torch_ekm.kinematics import GraspState
+from torch_ekm.model import KinematicModel, ModelOptions, ModelStatus
 from torch_ekm.simulation import PlantParameters, SimulatedHand
 
 DEG = np.pi / 180

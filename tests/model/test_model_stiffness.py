@@ -8,7 +8,7 @@ from model_icub import gripped
 from model_toys import F64, planar_two_finger, soft_two_finger, three_finger
 
 from torch_ekm.contact.contact_kinematics import constraint_matrix, contact_kinematics
-from torch_ekm.contact.grasp import null_space
+from torch_ekm.contact.grasp_analysis import null_space
 from torch_ekm.kinematics.se3 import exp, hat
 from torch_ekm.model.potential import (
     gravity_gradient,

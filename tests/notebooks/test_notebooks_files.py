@@ -10,8 +10,13 @@ from typer.testing import CliRunner
 
 from torch_ekm.cli import app
 from torch_ekm.exceptions import DescriptionError
-from torch_ekm.experiments.notebook_tools import TableView, copy_notebooks, notebook_folder, smoke_mode
-from torch_ekm.experiments.report import Table
+from torch_ekm.experiments.reporting.notebook import (
+    TableView,
+    copy_notebooks,
+    notebook_folder,
+    smoke_mode,
+)
+from torch_ekm.experiments.reporting.report import Table
 
 NAMES = sorted(path.name for path in notebook_folder().glob("*.ipynb"))
 EVIDENCE = ("04_", "05_")  # their outputs are kept

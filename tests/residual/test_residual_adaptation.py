@@ -10,17 +10,11 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import ParameterError
-from torch_ekm.experiments.prequential import run_prequential
-from torch_ekm.residual import (
-    DeepKernel,
-    DeepKernelSOGP,
-    Matern52,
-    SparseOnlineGP,
-    SquaredExponential,
-)
-from torch_ekm.residual.adaptation import PrequentialAdaptation, Queries
-from torch_ekm.residual.posterior import basis_gram
-from torch_ekm.residual.replay import ReplayMemory
+from torch_ekm.experiments.learner_comparison.prequential import run_prequential
+from torch_ekm.residual import DeepKernel, DeepKernelSOGP, Matern52, SparseOnlineGP, SquaredExponential
+from torch_ekm.residual.sparse_gp.hyperparameters import PrequentialAdaptation, Queries
+from torch_ekm.residual.sparse_gp.posterior import basis_gram
+from torch_ekm.residual.sparse_gp.replay import ReplayMemory
 
 
 def system(seed: int, n: int, noise: float = 0.1) -> tuple[torch.Tensor, torch.Tensor]:

@@ -6,7 +6,13 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import ParameterError, ShapeError
-from torch_ekm.residual import KRLSTracker, LearnerFleet, MixtureResidual, SparseOnlineGP, SquaredExponential
+from torch_ekm.residual import (
+    KRLSTracker,
+    LearnerFleet,
+    MixtureResidual,
+    SparseOnlineGP,
+    SquaredExponential,
+)
 
 
 def stream(n: int, *shape: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -9,7 +9,7 @@ import torch
 from torch.distributions import StudentT
 
 from torch_ekm.exceptions import ParameterError
-from torch_ekm.experiments.prequential import run_prequential
+from torch_ekm.experiments.learner_comparison.prequential import run_prequential
 from torch_ekm.residual import MixtureResidual, RecursiveLeastSquares, SparseOnlineGP, ZeroResidual
 
 

@@ -10,8 +10,12 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import EKMError, NonFiniteError, ParameterError, ShapeError
-from torch_ekm.experiments.prequential import outlier_cost, recovery_after_change, run_prequential
-from torch_ekm.experiments.streams import Stream
+from torch_ekm.experiments.learner_comparison.datasets import Stream
+from torch_ekm.experiments.learner_comparison.prequential import (
+    outlier_cost,
+    recovery_after_change,
+    run_prequential,
+)
 from torch_ekm.residual import (
     ActionLinearKernel,
     RandomFeatureRLS,
@@ -19,8 +23,8 @@ from torch_ekm.residual import (
     SparseOnlineGP,
     SquaredExponential,
     WindowGP,
-    posterior,
 )
+from torch_ekm.residual.sparse_gp import posterior
 
 
 def smooth(n: int, rate: float = 100.0) -> tuple[torch.Tensor, torch.Tensor]:

@@ -18,7 +18,7 @@ from torch_ekm.residual import (
     SquaredExponential,
     UpdateEvent,
 )
-from torch_ekm.residual.deletion import DELETION_SCORES, kl_score
+from torch_ekm.residual.sparse_gp.pruning import DELETION_SCORES, kl_score
 
 D, M, N, S2 = 4, 3, 40, 0.05
 

@@ -11,8 +11,18 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import DescriptionError, UnknownNameError
-from torch_ekm.experiments.prequential import Prequential, compare_learners, run_prequential, score_objects
-from torch_ekm.experiments.streams import ResidualRecording, Stream, load_stream, load_t42
+from torch_ekm.experiments.learner_comparison.datasets import (
+    ResidualRecording,
+    Stream,
+    load_stream,
+    load_t42,
+)
+from torch_ekm.experiments.learner_comparison.prequential import (
+    Prequential,
+    compare_learners,
+    run_prequential,
+    score_objects,
+)
 from torch_ekm.residual import RecursiveLeastSquares, SparseOnlineGP, ZeroResidual
 
 DATA = os.environ.get("TORCH_EKM_DATA", "")

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torch_ekm.kinematics.se3 import exp
-from torch_ekm.sensing import SimulatedCamera
+from torch_ekm.simulation import SimulatedCamera
 
 cv2 = pytest.importorskip("cv2")
 cv2.setNumThreads(1)

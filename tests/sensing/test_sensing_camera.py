@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 
 from torch_ekm.exceptions import CalibrationError, DescriptionError, ParameterError
-from torch_ekm.sensing import (
-    CharucoTarget,
-    PinholeCamera,
-    PlacedCard,
-    Scene,
-    SimulatedCamera,
-    calibrate_camera,
-)
+from torch_ekm.sensing import CharucoTarget, PinholeCamera, calibrate_camera
+from torch_ekm.simulation import PlacedCard, Scene, SimulatedCamera
 
 cv2 = pytest.importorskip("cv2")
 

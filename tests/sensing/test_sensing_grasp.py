@@ -12,18 +12,9 @@ from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import ObjectLostError, ParameterError, ShapeError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.kinematics.se3 import exp, log
-from torch_ekm.sensing import (
-    ICUB_PALM_MOUNT,
-    GraspView,
-    HallSensors,
-    MarkerBoard,
-    MarkerTracker,
-    PinholeCamera,
-    SensedPlant,
-    StreamOptions,
-    TrackStatus,
-)
-from torch_ekm.simulation.plant import Observation, Plant, PlantStatus
+from torch_ekm.plant.plant import Observation, Plant, PlantStatus
+from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera, StreamOptions, TrackStatus
+from torch_ekm.simulation import ICUB_PALM_MOUNT, GraspView, HallSensors, SensedPlant
 
 DEG = np.pi / 180
 

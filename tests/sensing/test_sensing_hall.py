@@ -18,7 +18,8 @@ from torch_ekm.exceptions import (
     ParameterError,
     ShapeError,
 )
-from torch_ekm.sensing import HallCalibration, HallQuality, HallSensors, JointEstimator, Stuck
+from torch_ekm.sensing import HallCalibration, JointEstimator
+from torch_ekm.simulation import HallQuality, HallSensors, Stuck
 
 DEG = torch.pi / 180
 

@@ -7,15 +7,8 @@ import pytest
 
 from torch_ekm.description import Shape
 from torch_ekm.exceptions import ParameterError, ShapeError, UnknownNameError
-from torch_ekm.sensing import (
-    ConvexBody,
-    ImageQuality,
-    MarkerBoard,
-    PinholeCamera,
-    PlacedCard,
-    Scene,
-    SimulatedCamera,
-)
+from torch_ekm.sensing import MarkerBoard, PinholeCamera
+from torch_ekm.simulation import ConvexBody, ImageQuality, PlacedCard, Scene, SimulatedCamera
 
 cv2 = pytest.importorskip("cv2")
 

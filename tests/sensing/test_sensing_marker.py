@@ -12,18 +12,15 @@ from torch_ekm.exceptions import ObjectLostError, ParameterError, ShapeError
 from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.sensing import (
     BoardPose,
-    ConvexBody,
     MarkerBoard,
     MarkerTracker,
     PinholeCamera,
-    PlacedCard,
-    Scene,
-    SimulatedCamera,
     Track,
     TrackerOptions,
     TrackStatus,
 )
-from torch_ekm.sensing.accuracy import measure_tracking
+from torch_ekm.simulation import ConvexBody, PlacedCard, Scene, SimulatedCamera
+from torch_ekm.simulation.imaging.accuracy import measure_tracking
 
 cv2 = pytest.importorskip("cv2")
 

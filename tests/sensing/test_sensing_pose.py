@@ -7,20 +7,10 @@ import pytest
 import torch
 
 from torch_ekm.kinematics.se3 import exp, log
-from torch_ekm.sensing import (
-    BoardPose,
-    ConvexBody,
-    ImageQuality,
-    MarkerBoard,
-    PinholeCamera,
-    PlacedCard,
-    Scene,
-    SimulatedCamera,
-    estimate_board_pose,
-    refine_on_edges,
-)
-from torch_ekm.sensing.board_pose import projection_jacobian
-from torch_ekm.sensing.static_pose import StaticPose
+from torch_ekm.sensing import BoardPose, MarkerBoard, PinholeCamera, estimate_board_pose, refine_on_edges
+from torch_ekm.sensing.vision.board_pose import projection_jacobian
+from torch_ekm.sensing.vision.static_pose import StaticPose
+from torch_ekm.simulation import ConvexBody, ImageQuality, PlacedCard, Scene, SimulatedCamera
 
 LENSES = [PinholeCamera(), PinholeCamera(fx=580, cx=300, distortion=(-0.15, 0.1, 1e-3, -5e-4, 0.0))]
 

@@ -8,12 +8,10 @@ import torch
 
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.kinematics.se3 import log
-from torch_ekm.sensing import (
+from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera
+from torch_ekm.simulation import (
     ConvexBody,
     ImageQuality,
-    MarkerBoard,
-    MarkerTracker,
-    PinholeCamera,
     PlacedCard,
     SapienCamera,
     Scene,

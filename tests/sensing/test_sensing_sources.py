@@ -11,14 +11,11 @@ from torch_ekm.sensing import (
     ImageSource,
     MarkerBoard,
     MarkerTracker,
-    PlacedCard,
-    Scene,
-    SimulatedCamera,
-    SimulatedVideo,
     StreamOptions,
     TrackStatus,
     VideoCapture,
 )
+from torch_ekm.simulation import PlacedCard, Scene, SimulatedCamera, SimulatedVideo
 
 cv2 = pytest.importorskip("cv2")
 

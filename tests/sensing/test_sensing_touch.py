@@ -8,8 +8,9 @@ import math
 import pytest
 import torch
 
+from torch_ekm.plant import Observation
 from torch_ekm.sensing import TouchAligned
-from torch_ekm.simulation import Observation, SimulatedHand
+from torch_ekm.simulation import SimulatedHand
 
 
 class Blurred:

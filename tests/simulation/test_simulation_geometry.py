@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from torch_ekm.description.shape import Shape
-from torch_ekm.simulation.bodies import x_axis_to
-from torch_ekm.simulation.geometry import scaled, signed_distance
+from torch_ekm.simulation.grasp_planning.geometry import scaled, signed_distance
+from torch_ekm.simulation.physics.bodies import x_axis_to
 
 coal = pytest.importorskip("coal")
 

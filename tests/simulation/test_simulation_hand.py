@@ -19,7 +19,8 @@ from torch_ekm.exceptions import (
     ShapeError,
     UnknownNameError,
 )
-from torch_ekm.simulation import Plant, PlantConfig, PlantParameters, PlantStatus, SimulatedHand
+from torch_ekm.plant import Plant, PlantStatus
+from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
 
 pytest.importorskip("sapien")
 
@@ -251,7 +252,7 @@ def test_impossible_settings_are_refused(changes):
 
 
 def test_importing_the_simulator_warns_of_nothing():
-    code = "from torch_ekm.simulation.engine import sapien; sapien()"
+    code = "from torch_ekm.simulation.physics.engine import sapien; sapien()"
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "ulkan" not in done.stderr

@@ -7,8 +7,9 @@ import pytest
 import torch
 from simulation_helpers import DEG
 
+from torch_ekm.kinematics import GraspState
 from torch_ekm.kinematics.se3 import log
-from torch_ekm.model import GraspState, KinematicModel, ModelOptions
+from torch_ekm.model import KinematicModel, ModelOptions
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
 
 pytest.importorskip("sapien")

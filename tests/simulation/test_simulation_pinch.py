@@ -7,12 +7,12 @@ import pytest
 import torch
 from simulation_helpers import DEG
 
-from torch_ekm.contact.collision import ContactDetector
+from torch_ekm.contact.detector import ContactDetector
 from torch_ekm.description import list_objects, load_hand, load_object
 from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.simulation import PinchRequest, PlantConfig, PlantParameters
-from torch_ekm.simulation.mechanism import make_planner, make_transmission
+from torch_ekm.simulation.mechanism.assembly import make_planner, make_transmission
 
 G = 9.81
 

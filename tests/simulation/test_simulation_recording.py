@@ -6,15 +6,8 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import DescriptionError, ParameterError
-from torch_ekm.simulation import (
-    Observation,
-    Plant,
-    PlantStatus,
-    Recording,
-    RecordingPlant,
-    ReplayedPlant,
-    Tug,
-)
+from torch_ekm.plant import Observation, Plant, PlantStatus, Recording, RecordingPlant, ReplayedPlant
+from torch_ekm.simulation import Tug
 
 h5py = pytest.importorskip("h5py")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
-from torch_ekm.simulation.servo import Servo
+from torch_ekm.simulation.mechanism.servo import Servo
 
 
 def make(bias=0.0, **faults):

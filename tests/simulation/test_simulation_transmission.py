@@ -9,7 +9,7 @@ import pytest
 
 from torch_ekm.description import load_hand
 from torch_ekm.exceptions import ParameterError
-from torch_ekm.simulation.transmission import Transmission, coupled_posture
+from torch_ekm.simulation.mechanism.transmission import Transmission, coupled_posture
 
 
 def make(hand=None, friction=0.0, **changes):

@@ -15,14 +15,8 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import DescriptionError, GraspError, ParameterError
-from torch_ekm.simulation import (
-    PlantParameters,
-    Recording,
-    RecordingPlant,
-    SimulatedHand,
-    TrialEntry,
-    TrialLog,
-)
+from torch_ekm.plant import Recording, RecordingPlant, TrialEntry, TrialLog
+from torch_ekm.simulation import PlantParameters, SimulatedHand
 
 pytest.importorskip("h5py")
 pytest.importorskip("sapien")

@@ -8,14 +8,13 @@ import torch
 from simulation_helpers import DEG, ROLL, SQUEEZE, increment, motion
 
 from torch_ekm.exceptions import ParameterError, UnknownNameError
+from torch_ekm.plant import Plant, PlantStatus
 from torch_ekm.simulation import (
     SEVERITIES,
     Change,
     DisturbedPlant,
-    Plant,
     PlantConfig,
     PlantParameters,
-    PlantStatus,
     SimulatedHand,
     Tug,
     severity,

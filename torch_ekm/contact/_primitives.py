@@ -2,7 +2,7 @@
 
 Everything in the primitive's own frame (see :class:`torch_ekm.description.Shape`), in plain floats: one
 point at a time, a few microseconds each. The signed distance of a convex body is a convex function of the
-point, inside and outside; the search in :mod:`torch_ekm.contact.collision` rests on that.
+point, inside and outside; the search in :mod:`torch_ekm.contact.detector` rests on that.
 """
 
 from __future__ import annotations

@@ -1,5 +1,7 @@
 """WHICH motor increment to command."""
 
+from __future__ import annotations
+
 from .controller import ControllerOptions as ControllerOptions
 from .controller import Decision as Decision
 from .controller import LookAndMoveController as LookAndMoveController
@@ -9,8 +11,8 @@ from .qp import ControlProblem as ControlProblem
 from .qp import ControlSolution as ControlSolution
 from .qp import build_qp as build_qp
 from .qp import solve_qp as solve_qp
-from .stopping import StoppingRule as StoppingRule
-from .stopping import StopReason as StopReason
+from .termination import StoppingRule as StoppingRule
+from .termination import StopReason as StopReason
 
 __all__ = [
     "ControlProblem",

@@ -10,11 +10,11 @@ import torch
 
 from ..enhanced.enhanced_model import EnhancedModel
 from ..exceptions import GraspError, NoContactError, NonFiniteError, ShapeError
-from ..model.state import GraspState
+from ..kinematics.grasp_state import GraspState
 from ..typing import Float, Tensor
 from .focus import FocusedPose, PoseTarget
 from .qp import ControlProblem, ControlSolution, solve_qp
-from .stopping import StopReason
+from .termination import StopReason
 
 if TYPE_CHECKING:
     from ..model.kinematic_model import KinematicModel

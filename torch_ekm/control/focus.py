@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 
 from ..exceptions import NonFiniteError, ParameterError, ShapeError
+from ..kinematics.grasp_state import GraspState
 from ..kinematics.se3 import exp, log
-from ..model.state import GraspState
 from ..typing import Float, Tensor
 
 

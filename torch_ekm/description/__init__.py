@@ -1,5 +1,7 @@
 """WHAT the robot is: hands and objects as data, read from URDF and transmission files."""
 
+from __future__ import annotations
+
 from .hand import Actuator as Actuator
 from .hand import ContactPad as ContactPad
 from .hand import HallSensor as HallSensor
@@ -29,9 +31,9 @@ __all__ = [
     "UrdfLink",
     "UrdfModel",
     "data_folder",
+    "hand_files",
     "list_hands",
     "list_objects",
-    "hand_files",
     "load_hand",
     "load_object",
     "object_files",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from ..exceptions import ParameterError, UnknownNameError
-from ..model.state import GraspState
+from ..kinematics.grasp_state import GraspState
 from ..typing import Float, Tensor
 
 

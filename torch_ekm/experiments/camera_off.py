@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 from ..control import Decision, PoseTarget
-from ..model.state import GraspState
-from ..simulation import Observation, Plant, PlantStatus
+from ..kinematics.grasp_state import GraspState
+from ..plant import Observation, Plant, PlantStatus
 from ..typing import Float, Tensor
 
 

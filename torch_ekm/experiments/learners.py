@@ -10,7 +10,8 @@ import torch
 
 from ..enhanced import EnhancedModel, GraspEncoding
 from ..exceptions import UnknownNameError
-from ..model import GraspState, KinematicModel
+from ..kinematics import GraspState
+from ..model import KinematicModel
 from ..residual import (
     ActionLinearKernel,
     DeepKernelSOGP,

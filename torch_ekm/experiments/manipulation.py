@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import torch
 
 from ..control import Decision, LookAndMoveController, PoseTarget, StoppingRule, StopReason
-from ..model.state import GraspState
-from ..simulation.plant import Observation, Plant, PlantStatus
+from ..kinematics.grasp_state import GraspState
+from ..plant.plant import Observation, Plant, PlantStatus
 from ..typing import Tensor
-from .metrics import prediction_error
+from .reporting.metrics import prediction_error
 
 
 @dataclass(frozen=True)

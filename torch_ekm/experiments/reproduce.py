@@ -10,11 +10,11 @@ from typing import Any
 
 from ..description import load_object
 from ..exceptions import ParameterError, UnknownNameError
-from . import reports
-from .ablation import AblationConfig, ablation_jobs, ablation_session
-from .adapt import AdaptConfig, adapt_jobs, adapt_session
+from .config import Setting
 from .jobs import run_jobs
-from .protocols import (
+from .protocols.ablation import AblationConfig, ablation_jobs, ablation_session
+from .protocols.object_memory import AdaptConfig, adapt_jobs, adapt_session
+from .protocols.turning import (
     GeneralizeConfig,
     OnlineConfig,
     generalize_jobs,
@@ -22,8 +22,8 @@ from .protocols import (
     online_jobs,
     online_session,
 )
-from .report import Report
-from .setting import Setting
+from .reporting import reports
+from .reporting.report import Report
 
 EXPERIMENTS = ("online", "generalize", "ablation", "adapt")
 #: Seeds that nobody tuned on, at least twenty for each case.

@@ -10,11 +10,11 @@ from ..contact.contact_kinematics import ContactKinematics, constraint_matrix
 from ..contact.contact_set import ContactSet
 from ..contact.surface import TrackedContacts
 from ..exceptions import EquilibriumError
+from ..kinematics.grasp_state import GraspState
 from ..typing import Float, Tensor
 from .force_balance import known_forces
 from .kinematic_model import KinematicModel
 from .linearization import GraspForces
-from .state import GraspState
 from .stiffness import geometric_stiffness
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..contact.contact_force import BalanceEquations, ForceStatus, contact_forces, margins
 from ..contact.contact_kinematics import ContactKinematics
-from ..contact.friction import friction_cones
+from ..contact.forces.friction import friction_cones
+from ..contact.forces.problem import BalanceEquations, ForceStatus, contact_forces, margins
 from ..description.hand import HandDescription
 from ..typing import Bool, Float, Tensor
 from .linearization import GraspForces

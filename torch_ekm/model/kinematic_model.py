@@ -11,6 +11,7 @@ from ..contact.contact_kinematics import ContactKinematics, constraint_matrix, c
 from ..contact.contact_set import ContactSet
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError, NonFiniteError, PenetrationError, ShapeError, UnknownNameError
+from ..kinematics.grasp_state import GraspState
 from ..typing import Float, Tensor
 from .force_balance import ForceBalance
 from .linearization import GraspForces, Linearization, ModelStatus
@@ -20,7 +21,6 @@ from .options import ModelOptions
 from .potential import gravity_gradient, gravity_hessian, spring_torque
 from .reduction import Reduction
 from .sensitivity import force_change, margin_sensitivity, normal_motion, normal_sensitivity
-from .state import GraspState
 from .stiffness import geometric_stiffness, precedence
 
 
@@ -35,7 +35,7 @@ class KinematicModel(nn.Module):
 
     Solved in the two-stage form (:func:`~torch_ekm.model.manipulation.two_stage`). Rigid couplings are
     reduced out, joints at a stop are held, contacts come from the detector, forces from
-    :func:`~torch_ekm.contact.contact_force.contact_forces`. Derived from the Lagrange multipliers of the
+    :func:`~torch_ekm.contact.forces.problem.contact_forces`. Derived from the Lagrange multipliers of the
     quasi-static equilibrium; ``docs/kinematic_model.md`` has the whole of it.
 
     Args:
@@ -65,7 +65,7 @@ class KinematicModel(nn.Module):
 
             kinematics = HandKinematics(hand, dtype=dtype)
         if detector is None:
-            from ..contact.collision import ContactDetector
+            from ..contact.detector import ContactDetector
 
             margin = self.options.contact_margin
             detector = ContactDetector(hand, obj, margin, kinematics=kinematics)  # type: ignore[arg-type]

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from ..contact.contact_force import ForceStatus
 from ..contact.contact_set import ContactSet
+from ..contact.forces.problem import ForceStatus
 from ..exceptions import ShapeError
+from ..kinematics.grasp_state import GraspState
 from ..typing import Bool, Float, Tensor
-from .state import GraspState
 
 
 class ModelStatus(Enum):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from ..contact.contact_force import ForceOptions
 from ..contact.contact_model import ContactModel
+from ..contact.forces.problem import ForceOptions
 from ..exceptions import ParameterError
 
 

@@ -9,7 +9,7 @@ import torch
 from ..description import HandDescription
 from ..exceptions import JointMismatchError, NonFiniteError, ParameterError, ShapeError
 from ..typing import Float, Tensor
-from .hall import HallCalibration
+from .hall.calibration import HallCalibration
 
 
 class JointEstimate(NamedTuple):

@@ -1,23 +1,59 @@
 """Ground truth: a simulated hand, and the plant contract."""
 
+from __future__ import annotations
+
 from .config import PlantConfig as PlantConfig
 from .disturbances import Change as Change
 from .disturbances import DisturbedPlant as DisturbedPlant
 from .disturbances import Tug as Tug
+from .grasp_planning.pinch import PinchPlan as PinchPlan
+from .grasp_planning.pinch import PinchPlanner as PinchPlanner
+from .grasp_planning.pinch_problem import PinchProblem as PinchProblem
+from .grasp_planning.pinch_problem import PinchRequest as PinchRequest
+from .hall_sensors import HallQuality as HallQuality
+from .hall_sensors import HallSensors as HallSensors
+from .hall_sensors import Stuck as Stuck
+from .imaging.grasp_view import GraspView as GraspView
+from .imaging.sapien_camera import SapienCamera as SapienCamera
+from .imaging.scene import ConvexBody as ConvexBody
+from .imaging.scene import PlacedCard as PlacedCard
+from .imaging.scene import Scene as Scene
+from .imaging.simulated_camera import ImageQuality as ImageQuality
+from .imaging.simulated_camera import SimulatedCamera as SimulatedCamera
+from .imaging.simulated_video import SimulatedVideo as SimulatedVideo
 from .parameters import PlantParameters as PlantParameters
-from .pinch import PinchPlan as PinchPlan
-from .pinch import PinchPlanner as PinchPlanner
-from .pinch_problem import PinchProblem as PinchProblem
-from .pinch_problem import PinchRequest as PinchRequest
-from .plant import Observation as Observation
-from .plant import Plant as Plant
-from .plant import PlantStatus as PlantStatus
-from .recording import Recording as Recording
-from .recording_plant import RecordingPlant as RecordingPlant
-from .replayed_plant import ReplayedPlant as ReplayedPlant
-from .severities import SEVERITIES as SEVERITIES
-from .severities import severity as severity
+from .presets import SEVERITIES as SEVERITIES
+from .presets import severity as severity
+from .sensed_plant import ICUB_PALM_MOUNT as ICUB_PALM_MOUNT
+from .sensed_plant import SensedPlant as SensedPlant
 from .simulated_hand import PlantSnapshot as PlantSnapshot
 from .simulated_hand import SimulatedHand as SimulatedHand
-from .trial_log import TrialEntry as TrialEntry
-from .trial_log import TrialLog as TrialLog
+
+__all__ = [
+    "Change",
+    "ConvexBody",
+    "DisturbedPlant",
+    "GraspView",
+    "HallQuality",
+    "HallSensors",
+    "ICUB_PALM_MOUNT",
+    "ImageQuality",
+    "PinchPlan",
+    "PinchPlanner",
+    "PinchProblem",
+    "PinchRequest",
+    "PlacedCard",
+    "PlantConfig",
+    "PlantParameters",
+    "PlantSnapshot",
+    "SEVERITIES",
+    "SapienCamera",
+    "Scene",
+    "SensedPlant",
+    "SimulatedCamera",
+    "SimulatedHand",
+    "SimulatedVideo",
+    "Stuck",
+    "Tug",
+    "severity",
+]

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..exceptions import ParameterError
+from ..plant.plant import Observation
 from ..typing import Float, Tensor
-from .plant import Observation
 from .simulated_hand import SimulatedHand
 
 

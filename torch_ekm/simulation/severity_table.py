@@ -6,7 +6,7 @@ import dataclasses
 import math
 
 from .parameters import PlantParameters
-from .severities import SEVERITIES
+from .presets import SEVERITIES
 
 _DEG = math.pi / 180
 _ANGLES = ("tendon_elongation", "actuator_bias", "actuator_error", "dead_zone", "threshold", "backlash")

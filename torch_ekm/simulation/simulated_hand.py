@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from ..description import HandDescription, ObjectDescription, load_hand, load_object
 from ..exceptions import EquilibriumError, GraspError, ParameterError
+from ..plant.plant import Observation, PlantStatus
 from ..typing import Float, Tensor
 from .config import PlantConfig
-from .mechanism import make_planner, moment_arms, true_descriptions, turning_axis
+from .grasp_planning.pinch import PinchPlan
+from .grasp_planning.pinch_problem import PinchRequest
+from .mechanism.assembly import make_planner, moment_arms, true_descriptions, turning_axis
 from .parameters import PlantParameters
-from .pinch import PinchPlan
-from .pinch_problem import PinchRequest
-from .plant import Observation, PlantStatus
-from .rig import Gravity, Rig, RigState
+from .physics.rig import Gravity, Rig, RigState
 from .sensors import Frame, Sensors, SensorState
 
 Array = NDArray[np.float64]

@@ -1,0 +1,205 @@
+"""The simulated hand as a Gymnasium environment.
+
+Importing this module registers ``torch_ekm/InHandRotation-v0``;
+``gymnasium.make("torch_ekm.env:torch_ekm/InHandRotation-v0")`` does both at once.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ._extras import require
+from .description import HandDescription, ObjectDescription
+from .exceptions import ParameterError
+from .kinematics.se3 import log
+from .plant.plant import Observation, PlantStatus
+from .rendering.grasp_viewer import GraspViewer
+from .simulation.config import PlantConfig
+from .simulation.parameters import PlantParameters
+from .simulation.presets import severity
+from .simulation.simulated_hand import SimulatedHand
+
+if TYPE_CHECKING:
+    import gymnasium
+else:
+    gymnasium = require("gymnasium")
+
+Array = NDArray[np.float64]
+_DEG = math.pi / 180
+
+
+class InHandRotation(gymnasium.Env):
+    """Turn a pinched object about the axis of its grasp, by increments of the actuators.
+
+    **Action** ``(n_a,)``, in [-1, 1]: increment of each actuator in units of ``step_limit`` [rad].
+
+    **Observation** ``(n_q + n_a + 3 + 3 + n_pads + 2,)``, float64, as the sensors say, never the truth:
+
+    ============== ======= ==============================================================
+    entries        unit    what
+    ============== ======= ==============================================================
+    n_q            rad     joint angles
+    n_a            rad     actuator encoders
+    3              m       position of the object since the reset, hand frame
+    3              rad     its rotation vector since the reset, hand frame
+    n_pads         N       normal force of each fingertip
+    1              rad     angle turned so far, about the grasp's axis
+    1              rad     angle still to turn
+    ============== ======= ==============================================================
+
+    **Reward** per step: ``-|angle to go|`` in units of 10 deg, ``-off_axis`` times the rotation about
+    other axes in the same unit, +1 at the goal, ``-lost_penalty`` when the object is lost.
+
+    **Ends** at the goal (within ``tolerance``) or with the object lost; truncated after 40 steps by the
+    registered time limit. ``info`` has ``is_success``, ``status`` and ``truth`` (for reports).
+
+    ``reset(options={"angle": rad})`` sets the target; else it is drawn from ``angles``.
+
+    Args:
+        hand, object: names, paths or descriptions.
+        parameters: plant parameters, or the name of a severity.
+        config: time, gravity, the grasp.
+        angles: least and largest target [rad].
+        step_limit: largest increment of an actuator [rad].
+        tolerance: the goal is reached within this [rad].
+        off_axis: weight of rotation off the axis.
+        lost_penalty: what losing the object costs.
+        render_mode: None or "rgb_array" (PyVista).
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 2}
+
+    def __init__(
+        self,
+        hand: HandDescription | str = "icub_right",
+        object: ObjectDescription | str = "box",
+        parameters: PlantParameters | str = "nominal",
+        config: PlantConfig | None = None,
+        angles: tuple[float, float] = (5 * _DEG, 25 * _DEG),
+        step_limit: float = 3 * _DEG,
+        tolerance: float = 0.5 * _DEG,
+        off_axis: float = 0.1,
+        lost_penalty: float = 10.0,
+        render_mode: str | None = None,
+    ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ParameterError("render_mode", render_mode, "None or 'rgb_array'")
+        if not (0 < step_limit < math.pi and tolerance > 0 and angles[0] <= angles[1]):
+            raise ParameterError(
+                "step_limit, tolerance, angles", (step_limit, tolerance, angles), "positive and in order"
+            )
+        if isinstance(parameters, str):
+            parameters = severity(parameters)
+        self.plant = SimulatedHand(hand, object, config, parameters)
+        self.angles, self.step_limit, self.tolerance = angles, step_limit, tolerance
+        self.off_axis, self.lost_penalty = off_axis, lost_penalty
+        self.render_mode = render_mode
+        self._viewer: GraspViewer | None = None
+        description = self.plant.hand
+        n_a = description.n_a
+        high = np.concatenate(
+            [
+                np.full(description.n_q, math.pi),
+                np.full(n_a, 2 * math.pi),
+                np.full(3, 1.0),
+                np.full(3, math.pi),
+                np.full(len(description.pads), 100.0),
+                np.full(2, 2 * math.pi),
+            ]
+        )
+        self.observation_space = gymnasium.spaces.Box(-high, high, dtype=np.float64)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n_a,), dtype=np.float32)
+        self._start: Observation | None = None
+        self._axis = torch.zeros(3, dtype=torch.float64)
+        self._target = 0.0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Grasp the object anew and draw a target.
+
+        Raises:
+            ParameterError: ``options["angle"]`` is not a finite number.
+        """
+        super().reset(seed=seed)
+        angle = (options or {}).get("angle", self.np_random.uniform(*self.angles))
+        if not math.isfinite(angle):
+            raise ParameterError("options['angle']", angle, "a finite angle [rad]")
+        self._target = float(angle)
+        self._start = self.plant.reset(int(self.np_random.integers(2**31)))
+        self._axis = self.plant.rotation_axis
+        return self._observation(self._start), self._info(self._start)
+
+    def step(self, action: NDArray[Any]) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Move the actuators and let the hand settle."""
+        delta = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0) * self.step_limit
+        observation = self.plant.command(torch.from_numpy(delta))
+        turned, off = self._turned(observation)
+        to_go = self._target - turned
+        lost = observation.status is PlantStatus.LOST
+        reached = not lost and abs(to_go) < self.tolerance
+        reward = -(abs(to_go) + self.off_axis * off) / (10 * _DEG) + reached - self.lost_penalty * lost
+        return self._observation(observation), float(reward), lost or reached, False, self._info(observation)
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """A picture ``(height, width, 3)`` of the true state, or None without a render mode."""
+        if self.render_mode is None:
+            return None
+        if self._viewer is None:
+            self._viewer = GraspViewer(self.plant.hand, self.plant.object, self.plant.config.gravity)
+        return self._viewer.picture(*self.plant.hand_state())
+
+    def close(self) -> None:
+        """Give back the scene and the window."""
+        self.plant.close()
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
+
+    def _turned(self, observation: Observation) -> tuple[float, float]:
+        """Angle about the grasp's axis and rotation about all others since the reset [rad]."""
+        assert self._start is not None
+        rotation = log(observation.rotation @ self._start.rotation.mT)
+        turned = float(rotation @ self._axis)
+        return turned, float(torch.linalg.vector_norm(rotation - turned * self._axis))
+
+    def _observation(self, observation: Observation) -> Array:
+        assert self._start is not None
+        turned, _ = self._turned(observation)
+        parts = (
+            observation.q,
+            observation.a,
+            observation.position - self._start.position,
+            log(observation.rotation @ self._start.rotation.mT),
+            observation.fingertip_force,
+            torch.tensor([turned, self._target - turned], dtype=torch.float64),
+        )
+        space = self.observation_space
+        return np.clip(torch.cat(parts).numpy(), space.low, space.high)  # type: ignore[attr-defined]
+
+    def _info(self, observation: Observation) -> dict[str, Any]:
+        turned, _ = self._turned(observation)
+        held = observation.status is not PlantStatus.LOST
+        return {
+            "is_success": held and abs(self._target - turned) < self.tolerance,
+            "status": observation.status.value,
+            "truth": {name: value.numpy() for name, value in observation.info["truth"].items()},
+        }
+
+
+def register() -> None:
+    """Make ``torch_ekm/InHandRotation-v0`` known to Gymnasium (once)."""
+    if "torch_ekm/InHandRotation-v0" not in gymnasium.registry:
+        gymnasium.register(
+            "torch_ekm/InHandRotation-v0",
+            entry_point="torch_ekm.env:InHandRotation",
+            max_episode_steps=40,
+        )
+
+
+register()

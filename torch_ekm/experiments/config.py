@@ -1,0 +1,146 @@
+"""What the experiments share: hand, plant, model, learner and the rule by which all controllers stop."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..control import ControllerOptions, StoppingRule
+from ..description import HandDescription, hand_files, list_hands, load_hand, object_files
+from ..exceptions import ParameterError, UnknownNameError
+from ..model import ModelOptions
+from ..simulation import PlantConfig, PlantParameters, severity
+from .learners import DEFAULT_LEARNER, LEARNERS, learner_figures
+from .protocols.demo import fixed_actuators
+
+_DEG = math.pi / 180
+
+#: The controllers that are compared on the same seeds, grasps, limits and stopping rule. "+I": the
+#: increments accumulate on the set-point instead of the encoder, an integrator that learns nothing.
+CONTROLLERS = ("KM", "KM+I", "E-KM", "E-KM+I")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to run a manipulation; plain figures only, so that it can be written down and compared.
+
+    The mappings change single figures of the classes they are named after.
+
+    Raises:
+        UnknownNameError: no such hand, severity or learner; the message lists them.
+        ParameterError: a figure outside its range.
+    """
+
+    hand: str = "icub_right"
+    severity: str = "nominal"
+    plant: Mapping[str, Any] = field(default_factory=dict)
+    """Changes of the severity's :class:`PlantParameters`."""
+    grasp: Mapping[str, Any] = field(default_factory=dict)
+    """Changes of :class:`PlantConfig`."""
+    model: Mapping[str, Any] = field(default_factory=dict)
+    """Changes of :class:`ModelOptions`."""
+    control: Mapping[str, Any] = field(default_factory=dict)
+    """Changes of :class:`ControllerOptions`."""
+    learner: str = DEFAULT_LEARNER
+    learner_options: Mapping[str, Any] = field(default_factory=dict)
+    capacity: int = 60
+    sensing: bool = False
+    """Poses from rendered camera images and joint angles from Hall counts, not truth plus noise."""
+    tolerance_deg: float = 0.25
+    max_steps: int = 60
+
+    def __post_init__(self) -> None:
+        if self.hand not in list_hands() and not Path(self.hand).exists():
+            raise UnknownNameError("hand", self.hand, list_hands())
+        if self.learner not in LEARNERS:
+            raise UnknownNameError("learner", self.learner, LEARNERS)
+        for name in ("capacity", "tolerance_deg", "max_steps"):
+            if not getattr(self, name) > 0:
+                raise ParameterError(name, getattr(self, name), "positive")
+        self.parameters()
+        self.plant_config("KM")
+        self.model_options()
+
+    def parameters(self) -> PlantParameters:
+        """The plant's."""
+        return severity(self.severity).replace(**self.plant)
+
+    def specimen(self, seed: int) -> Setting:
+        """The same with another specimen of the hand (signs and sizes of its constant errors)."""
+        return self.replace(plant={"hardware_seed": seed, **self.plant})
+
+    def plant_config(self, controller: str) -> PlantConfig:
+        """The position controller as ``controller`` uses it, and the grasp."""
+        if controller not in CONTROLLERS:
+            raise UnknownNameError("controller", controller, CONTROLLERS)
+        relative_to = "setpoint" if controller.endswith("+I") else "encoder"
+        return _changed(PlantConfig(relative_to=relative_to), "grasp", self.grasp)
+
+    def model_options(self) -> ModelOptions:
+        """The kinematic model's."""
+        gravity = self.plant_config("KM").gravity
+        return _changed(ModelOptions(gravity=gravity), "model", self.model)
+
+    def controller_options(self, hand: HandDescription) -> ControllerOptions:
+        """The same for every controller."""
+        options = ControllerOptions(fixed_actuators=fixed_actuators(hand))
+        return _changed(options, "control", self.control)
+
+    def stopping_rule(self) -> StoppingRule:
+        """The same for every controller."""
+        return StoppingRule(
+            tolerance=self.tolerance_deg * _DEG, stall_progress=0.1 * _DEG, max_steps=self.max_steps
+        )
+
+    def figures(self) -> dict[str, Any]:
+        """All figures of plant, model, controller, stopping rule and learner, defaults included."""
+        parts = {
+            "plant": self.parameters(),
+            "plant_config": self.plant_config("KM"),
+            "model": self.model_options(),
+            "controller": self.controller_options(load_hand(self.hand)),
+            "stopping_rule": self.stopping_rule(),
+        }
+        figures = {name: dataclasses.asdict(part) for name, part in parts.items()}
+        return {**figures, "learner": learner_figures(self.learner, self.capacity, **self.learner_options)}
+
+    def replace(self, **changes: Any) -> Setting:
+        """A copy with some figures changed."""
+        return dataclasses.replace(self, **changes)
+
+
+def digest(setting: Setting, objects: Iterable[str | Path], *more: Any) -> str:
+    """Ten letters that change with any figure of an experiment: results are kept under them.
+
+    The defaults of the classes that the setting changes count, too, and what is in the files of the
+    hand and the objects: neither a version of the package with other defaults nor an
+    object that was corrected takes up old results.
+
+    Args:
+        setting: of the experiment.
+        objects: names or paths of those that take part.
+        more: configurations and figures that decide the results as well.
+    """
+    files = [*hand_files(setting.hand), *(path for item in objects for path in object_files(item))]
+    contents = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
+    figures = [dataclasses.asdict(setting), setting.figures(), contents, more]
+    text = json.dumps(figures, sort_keys=True, default=_plain)
+    return hashlib.sha256(text.encode()).hexdigest()[:10]
+
+
+def _plain(item: Any) -> Any:
+    return vars(item) if dataclasses.is_dataclass(item) else str(item)
+
+
+def _changed(options: Any, name: str, changes: Mapping[str, Any]) -> Any:
+    known = {item.name for item in dataclasses.fields(options)}
+    for key in changes:
+        if key not in known:
+            raise ParameterError(name, key, f"one of {', '.join(sorted(known))}")
+    return dataclasses.replace(options, **changes)

@@ -1,0 +1,111 @@
+"""A table of numbers from a CSV or Parquet file; whatever is wrong is named with its line and column."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..._extras import require
+from ...exceptions import DescriptionError
+
+Array = NDArray[np.float64]
+
+
+def read_table(path: Path) -> tuple[tuple[str, ...], Array]:
+    """Column names and values ``(n_rows, n_columns)``, rows in the order of time.
+
+    CSV (``.csv``, ``.tsv``, ``.txt``): UTF-8, separated by comma, semicolon or tab; the first line names the
+    columns, every other field is a number with a decimal point. Parquet (``.parquet``): every column is
+    numeric. Nothing may be missing: a learner cannot guess what a hole means.
+
+    Raises:
+        DescriptionError: the file cannot be used; the message names line (row) and column.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DescriptionError(path, "there is no such file")
+    if path.suffix.lower() in (".parquet", ".pq"):
+        names, values = _parquet(path)
+    elif path.suffix.lower() in (".csv", ".tsv", ".txt"):
+        names, values = _csv(path)
+    else:
+        raise DescriptionError(path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet")
+    for i, name in enumerate(names):
+        if not name:
+            raise DescriptionError(path, f"column {i + 1} has no name in the header")
+        if name in names[:i]:
+            raise DescriptionError(path, f"two columns are called '{name}'")
+    return names, values
+
+
+def _csv(path: Path) -> tuple[tuple[str, ...], Array]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DescriptionError(path, f"byte {error.start} is not UTF-8; save it as CSV in UTF-8") from None
+    lines = text.splitlines()
+    first = next((line for line in lines if line.strip()), None)
+    if first is None:
+        raise DescriptionError(path, "the file is empty")
+    delimiter = max(",;\t", key=first.count)
+    reader = csv.reader(lines, delimiter=delimiter)
+    rows = [(reader.line_num, [field.strip() for field in row]) for row in reader if any(row)]
+    number, names = rows[0]
+    if all(_number(field) is not None for field in names):
+        raise DescriptionError(
+            path, f"line {number} holds numbers only; the first line must name the columns"
+        )
+    return tuple(names), np.array([_row(path, line, names, row) for line, row in rows[1:]]).reshape(
+        -1, len(names)
+    )
+
+
+def _row(path: Path, line: int, names: list[str], row: list[str]) -> list[float]:
+    if len(row) != len(names):
+        raise DescriptionError(
+            path, f"line {line} has {len(row)} fields, but the header names {len(names)} columns"
+        )
+    values = []
+    for name, field in zip(names, row, strict=True):
+        value, place = _number(field), f"line {line}, column '{name}'"
+        if field == "":
+            raise DescriptionError(path, f"{place} is empty; fill it in, or leave the whole line out")
+        if value is None:
+            raise DescriptionError(
+                path, f"{place}: '{field}' is no number; leave the column out or encode it"
+            )
+        if not np.isfinite(value):
+            raise DescriptionError(path, f"{place}: '{field}' is not finite")
+        values.append(value)
+    return values
+
+
+def _number(field: str) -> float | None:
+    try:
+        return float(field)
+    except ValueError:
+        return None
+
+
+def _parquet(path: Path) -> tuple[tuple[str, ...], Array]:
+    parquet, pyarrow = require("pyarrow.parquet"), require("pyarrow")
+    try:
+        table = parquet.read_table(path)
+    except pyarrow.ArrowInvalid as error:
+        raise DescriptionError(path, f"this is no Parquet file ({error})") from None
+    columns = []
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        kind = column.type
+        if not (pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind)):
+            raise DescriptionError(
+                path, f"column '{name}' holds {kind}, not numbers; leave it out or encode it"
+            )
+        values = column.to_numpy().astype(np.float64)
+        if column.null_count or not np.isfinite(values).all():
+            row = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise DescriptionError(path, f"row {row + 1}, column '{name}' is empty or not finite")
+        columns.append(values)
+    return tuple(table.column_names), np.column_stack(columns) if columns else np.empty((0, 0))

@@ -1,0 +1,97 @@
+"""Manipulations with all that was read, estimated, commanded and true, in a log."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ...exceptions import EKMError, ParameterError, UnknownNameError
+from ...plant import RecordingPlant, TrialLog
+from ..config import CONTROLLERS, Setting
+from ..runner import Bench
+
+
+@dataclass(frozen=True)
+class RecordConfig:
+    """Turns of one object from random grasps.
+
+    Raises:
+        UnknownNameError: no such controller; the message lists them.
+        ParameterError: no angle, one that is no rotation, or images without sensing.
+    """
+
+    setting: Setting = field(default_factory=Setting)
+    object: str = "box"
+    controller: str = "KM"
+    angles_deg: tuple[float, ...] = (10.0, 20.0)
+    images: bool = False
+    """Keep the camera's images too, 0.2 MB each."""
+
+    def __post_init__(self) -> None:
+        if self.controller not in CONTROLLERS:
+            raise UnknownNameError("controller", self.controller, CONTROLLERS)
+        if not self.angles_deg or not all(0 < abs(angle) < 180 for angle in self.angles_deg):
+            raise ParameterError("angles_deg", self.angles_deg, "angles between 0 and 180 deg")
+        if self.images and not self.setting.sensing:
+            raise ParameterError("images", True, "False without sensing: there is no camera")
+
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """What decides the trials, for the log."""
+        figures = dataclasses.asdict(self)
+        plant = self.setting.plant_config(self.controller)
+        parameters = dataclasses.asdict(self.setting.parameters())
+        return {"hand": self.setting.hand, "gravity": plant.gravity, "parameters": parameters, **figures}
+
+
+def record(
+    config: RecordConfig,
+    seeds: tuple[int, ...],
+    folder: Path,
+    on_trial: Callable[[int], None] | None = None,
+) -> TrialLog:
+    """Turn the object by each angle, for each seed, and log it; what is there already is not run again.
+
+    Trial ``seed * len(angles_deg) + k`` is the turn by angle k. A learner goes on from turn to turn of
+    one seed and starts empty with each seed; a seed of which turns are missing is learned anew.
+
+    Args:
+        on_trial: called with the number of each trial that is there, earlier ones too.
+
+    Raises:
+        ParameterError, DescriptionError: ``folder`` has a log of another configuration, or none.
+    """
+    log = TrialLog(folder, config.configuration)
+    n = len(config.angles_deg)
+    for seed in seeds:
+        trials = range(seed * n, seed * n + n)
+        missing = log.missing(trials)
+        bench = _bench(config) if missing else None
+        for trial, angle in zip(trials, config.angles_deg, strict=True):
+            if bench is not None and (trial in missing or bench.learns):
+                _turn(bench, log, seed, trial, angle)
+            if on_trial is not None:
+                on_trial(trial)
+        if bench is not None:
+            bench.close()
+    return log
+
+
+def _bench(config: RecordConfig) -> Bench:
+    bench = Bench(config.setting, config.object, config.controller, keep_images=config.images)
+    bench.plant = RecordingPlant(bench.plant)
+    return bench
+
+
+def _turn(bench: Bench, log: TrialLog, seed: int, trial: int, angle: float) -> None:
+    assert isinstance(bench.plant, RecordingPlant)
+    try:
+        outcome = bench.trial(seed, trial, angle)
+    except EKMError as error:  # kept, or the run would stop at this trial each time
+        outcome = {"reason": type(error).__name__, "message": str(error)}
+    outcome.pop("seconds", None)  # of the wall: equal runs are to give equal logs
+    if trial not in log:
+        log.write(trial, bench.plant.recording, outcome)

@@ -1,0 +1,178 @@
+"""Figures: one function each, colour-blind-safe, from plain arrays; saved as SVG and PNG."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..._extras import require
+from ...exceptions import ShapeError
+from .metrics import learning_curve
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+#: Okabe and Ito's palette, safe for colour-blind readers; grey for what is compared against.
+COLOURS = {"KM": "#7f7f7f", "KM+I": "#E69F00", "E-KM": "#0072B2", "E-KM+I": "#009E73", "limit": "#D55E00"}
+_MARKERS = {"KM": "s", "KM+I": "D", "E-KM": "o", "E-KM+I": "^"}
+
+
+def _figure(width: float, height: float, columns: int = 1):
+    # a Figure of its own: pyplot would keep it alive and touch the caller's backend
+    figure = require("matplotlib.figure").Figure(figsize=(width, height), layout="constrained")
+    axes = figure.subplots(1, columns, squeeze=False)
+    for axis in axes[0]:
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(axis="y", color="0.9", linewidth=0.8)
+        axis.set_axisbelow(True)
+    return figure, axes[0]
+
+
+def save_figure(figure: Figure, folder: Path, name: str) -> tuple[Path, Path]:
+    """Write ``name.svg`` and ``name.png``."""
+    paths = folder / f"{name}.svg", folder / f"{name}.png"
+    figure.savefig(paths[0], metadata={"Date": None})  # the same figure gives the same file
+    figure.savefig(paths[1], dpi=150)
+    return paths
+
+
+def plot_prediction_error(ekm_deg: Array, km_deg: Array, xlabel: str = "trial") -> Figure:
+    """Prediction errors of E-KM and KM over the trials (the paper's Fig. 5a).
+
+    Args:
+        ekm_deg: ``(n_runs, n_trials)`` absolute errors [deg]; a single run may be ``(n_trials,)``.
+        km_deg: the same for the kinematic model on the same motions.
+    """
+    ekm_deg, km_deg = np.atleast_2d(ekm_deg), np.atleast_2d(km_deg)
+    if ekm_deg.shape != km_deg.shape:
+        raise ShapeError("km_deg", f"{ekm_deg.shape}, that of ekm_deg", km_deg.shape)
+    figure, (axis,) = _figure(7.0, 3.4)
+    k = np.arange(1, ekm_deg.shape[1] + 1)
+    for name, values in (("KM", km_deg), ("E-KM", ekm_deg)):
+        middle = np.nanmedian(values, axis=0)
+        if len(values) > 1:
+            low, high = np.nanpercentile(values, [25, 75], axis=0)
+            axis.fill_between(k, low, high, color=COLOURS[name], alpha=0.2, linewidth=0)
+        axis.plot(k, middle, color=COLOURS[name], marker=_MARKERS[name], markersize=3.5, label=name)
+    axis.set(xlabel=xlabel, ylabel="prediction error [deg]", ylim=(0, None))
+    axis.xaxis.get_major_locator().set_params(integer=True)
+    axis.set_title(
+        "One-step prediction error" + (" (median, quartiles)" if len(ekm_deg) > 1 else ""), loc="left"
+    )
+    axis.legend(frameon=False)
+    return figure
+
+
+def plot_learning_test(ekm_deg: Array, km_deg: Array, alpha: float = 0.05) -> Figure:
+    """p(k) and b(k) of the first k trials (the paper's Fig. 5b).
+
+    Args:
+        ekm_deg, km_deg: ``(n_trials,)`` absolute errors [deg].
+    """
+    curve = learning_curve(ekm_deg, km_deg, alpha)
+    k = np.arange(1, len(curve.p) + 1)
+    figure, (left, right) = _figure(8.0, 3.2, columns=2)
+    left.plot(k, curve.p, color=COLOURS["E-KM"])
+    left.axhline(alpha, color=COLOURS["limit"], linewidth=1, linestyle="--", label=f"{alpha:g}")
+    left.set_yscale("log")
+    left.set(xlabel="k", ylabel="p(k)")
+    left.set_title(f"last negative result: {curve.last_negative}", loc="left", fontsize=10)
+    left.legend(frameon=False)
+    right.plot(k, curve.upper, color=COLOURS["E-KM"])
+    right.axhline(0, color=COLOURS["limit"], linewidth=1, linestyle="--")
+    right.set(xlabel="k", ylabel="b(k) [deg]")
+    finite = curve.upper[np.isfinite(curve.upper)]
+    if finite.size > 3:  # the first intervals are enormous and hide the rest
+        right.set_ylim(1.2 * finite.min(), max(np.percentile(finite, 90), 0.1))
+    right.set_title(f"last upper boundary: {curve.last_upper:.2f} deg", loc="left", fontsize=10)
+    return figure
+
+
+def plot_static_error(errors_deg: dict[str, dict[str, Array]], what: str = "") -> Figure:
+    """Static error of each controller for each target (the paper's Fig. 6): every run and the mean.
+
+    A few lost objects, at many times the error of all others, are crosses at the upper edge; a mean
+    that they carry beyond it is written there.
+
+    Args:
+        errors_deg: controller -> target -> ``(n_runs,)`` absolute errors [deg].
+        what: named in the title.
+    """
+    everything = np.concatenate([np.ravel(v) for t in errors_deg.values() for v in t.values()])
+    top = 1.3 * float(np.percentile(everything, 95)) if everything.size else 1.0
+    top = top if everything.size and everything.max() > 2 * top else np.inf
+    targets = list(next(iter(errors_deg.values())))
+    figure, (axis,) = _figure(max(4.0, 1.3 * len(targets)), 3.4)
+    width = 0.8 / len(errors_deg)
+    for j, (name, by_target) in enumerate(errors_deg.items()):
+        colour = COLOURS.get(name, f"C{j}")
+        for i, target in enumerate(targets):
+            values = np.asarray(by_target[target], dtype=float)
+            if not values.size:
+                continue
+            x = i + (j - (len(errors_deg) - 1) / 2) * width
+            label = name if i == 0 else None
+            axis.bar(x, values.mean(), width * 0.9, color=colour, alpha=0.45, label=label)
+            spread = np.linspace(-0.3, 0.3, len(values)) * width if len(values) > 1 else np.zeros(1)
+            inside = values <= top
+            axis.plot(
+                (x + spread)[inside], values[inside], _MARKERS.get(name, "o"), color=colour, markersize=3
+            )
+            axis.plot((x + spread)[~inside], [0.97 * top] * int((~inside).sum()), "x", color=colour)
+            if values.mean() > top:
+                note = {"xytext": (-9, 0), "textcoords": "offset points", "fontsize": 8, "ha": "right"}
+                axis.annotate(f"mean {values.mean():.1f}", (x, 0.9 * top), **note)
+    axis.set_xticks(range(len(targets)), targets)
+    axis.set(xlabel="target [deg]", ylabel="static error [deg]", ylim=(0, top if np.isfinite(top) else None))
+    axis.set_title(f"Static error{', ' + what if what else ''}: each run, and the mean", loc="left")
+    axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
+    return figure
+
+
+def plot_convergence(histories_deg: dict[str, list[Array]], target: str = "") -> Figure:
+    """|e| over the steps of each manipulation.
+
+    Args:
+        histories_deg: controller -> list of ``(n_steps,)`` errors [deg].
+    """
+    figure, (axis,) = _figure(6.0, 3.4)
+    for j, (name, runs) in enumerate(histories_deg.items()):
+        colour = COLOURS.get(name, f"C{j}")
+        for i, run in enumerate(runs):
+            axis.plot(run, color=colour, alpha=0.6, linewidth=1.1, label=name if i == 0 else None)
+    axis.set(xlabel="step", ylabel="|e| [deg]", ylim=(0, None))
+    axis.set_title(f"Error on the way{' to ' + target if target else ''}", loc="left")
+    axis.legend(frameon=False)
+    return figure
+
+
+def plot_bank(records: list[dict]) -> Figure:
+    """Which model of an object memory each turn went to, and how sure it was.
+
+    Args:
+        records: turns in order, with "object", "model" (or None) and "posterior".
+    """
+    objects = list(dict.fromkeys(record["object"] for record in records))
+    figure, (axis,) = _figure(8.0, 3.2)
+    palette = list(COLOURS.values())
+    for k, record in enumerate(records):
+        if record["model"] is None:
+            continue
+        colour = palette[record["model"] % len(palette)]
+        marker = "osD^v*PX"[record["model"] % 8]
+        sure = min(max(record["posterior"]), 1.0)  # sums of probabilities end an ulp above
+        axis.plot(k + 1, objects.index(record["object"]), marker, color=colour, alpha=0.25 + 0.75 * sure)
+    used = sorted({record["model"] for record in records if record["model"] is not None})
+    for model in used:
+        axis.plot([], [], "osD^v*PX"[model % 8], color=palette[model % len(palette)], label=f"model {model}")
+    axis.set_yticks(range(len(objects)), objects)
+    axis.set(xlabel="turn")
+    axis.set_title("Which model took the turn (pale: unsure)", loc="left")
+    if used:
+        axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
+    return figure

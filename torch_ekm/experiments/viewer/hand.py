@@ -1,0 +1,160 @@
+"""A hand that opens and closes, and a grasp whose actuators are moved: what there is to look at."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...description import HandDescription, load_hand
+from ...kinematics import ActuationMap
+from ...plant import PlantStatus
+from ...rendering.scene import Scene, make_scene
+from ...simulation import PlantConfig, PlantParameters, SimulatedHand
+
+Array = NDArray[np.float64]
+
+_FRAMES = 10  # of one actuator's way through its range
+_STEP_DEG = 3.0  # most that the grasp's actuators are moved at once: the object has time to follow
+
+
+class HandShow:
+    """``q(a) = argmin 1/2 q^T K_s q  s.t.  J_a q = a - a_0,  C q = 0``: the hand that touches nothing.
+
+    Joint stops are kept. One slider for each actuator; as a page, each closes and opens in turn.
+
+    Args:
+        hand: its description.
+    """
+
+    def __init__(self, hand: HandDescription) -> None:
+        self.hand, self._map = hand, ActuationMap(hand)
+        self._lower, self._upper = (
+            np.array([getattr(actuator, end) for actuator in hand.actuators]) for end in ("lower", "upper")
+        )
+        self._a = np.clip(np.zeros(hand.n_a), self._lower, self._upper)
+        self.title = hand.name
+
+    def scene(self) -> Scene:
+        """Every actuator through its range."""
+        postures = [self._a]
+        for i in range(self.hand.n_a):
+            for part in np.r_[np.linspace(0, 1, _FRAMES), np.linspace(1, 0, _FRAMES)]:
+                a = self._a.copy()
+                a[i] += part * (self._upper[i] - a[i])
+                postures.append(a)
+        return self._scene(np.array(postures))
+
+    def add_controls(self, gui: Any) -> None:
+        """A slider for each actuator [deg]."""
+        self._sliders = [
+            gui.add_slider(
+                f"{actuator.name} [deg]",
+                min=math.degrees(low),
+                max=math.degrees(high),
+                step=0.5,
+                initial_value=math.degrees(start),
+            )
+            for actuator, low, high, start in zip(
+                self.hand.actuators, self._lower, self._upper, self._a, strict=True
+            )
+        ]
+
+    def update(self) -> Array | None:
+        """Where everything is now, ``(n_shapes, 4, 4)``; None if nothing has moved."""
+        a = np.radians([slider.value for slider in self._sliders])
+        if np.array_equal(a, self._a):
+            return None
+        self._a = a
+        return self._scene(a[None]).transforms[0]
+
+    def _scene(self, a: Array) -> Scene:
+        q = self._map.joints(torch.from_numpy(a)).numpy().clip(self.hand.joint_lower, self.hand.joint_upper)
+        return make_scene(self.hand, None, q, None, None, np.array(PlantConfig().gravity))
+
+
+class GraspShow:
+    """A pinch in the simulated hand. Served, its actuators can be moved; as a page, it is closed and held.
+
+    Args:
+        hand: name or path.
+        object: name or path.
+        seed: which grasp.
+        parameters: what the plant really is; exact by default.
+
+    Raises:
+        EquilibriumError, GraspError: the object cannot be pinched by this hand.
+    """
+
+    def __init__(
+        self, hand: str, object: str, seed: int = 0, parameters: PlantParameters | None = None
+    ) -> None:
+        normal = load_hand(hand).planar_normal
+        config = PlantConfig()
+        if normal is not None:  # in the plane of a planar hand, since nothing bears its object off it
+            x, y, z = (9.81 * _in_plane(np.array(normal))).tolist()
+            config = PlantConfig(gravity=(x, y, z))
+        self.plant = SimulatedHand(hand, object, config, parameters)
+        self._seed = seed
+        self._seen = self.plant.reset(seed)
+        self._start = self._seen.a.numpy()
+        self.title = f"{self.plant.hand.name} holds {self.plant.object.name}"
+
+    def scene(self) -> Scene:
+        """The grasp as it is now."""
+        q, position, rotation = self.plant.hand_state()
+        gravity = np.array(self.plant.gravity)
+        return make_scene(
+            self.plant.hand, self.plant.object, q[None], position[None], rotation[None], gravity
+        )
+
+    def add_controls(self, gui: Any) -> None:
+        """A slider for each actuator, increments since the grasp [deg], and a button to grasp anew."""
+        self._sliders = [
+            gui.add_slider(f"{name} [deg]", min=-30.0, max=30.0, step=0.5, initial_value=0.0)
+            for name in self.plant.hand.actuator_names
+        ]
+        self._clicked = False
+
+        def click(_: Any) -> None:  # in a thread of viser's: the simulation belongs to another
+            self._clicked = True
+
+        gui.add_button("Grasp again").on_click(click)
+        self._note = gui.add_markdown(self._words())
+
+    def update(self) -> Array | None:
+        """Move the actuators towards the sliders; where everything is now, None if nothing has moved."""
+        if self._clicked:
+            self._clicked = False
+            for slider in self._sliders:
+                slider.value = 0.0
+            self._seen = self.plant.reset(self._seed)
+            self._start = self._seen.a.numpy()
+        else:
+            wanted = self._start + np.radians([slider.value for slider in self._sliders])
+            delta = wanted - self._seen.a.numpy()
+            if np.abs(delta).max() < math.radians(0.25):
+                return None
+            limit = math.radians(_STEP_DEG)
+            before = self._seen.a
+            self._seen = self.plant.command(torch.from_numpy(delta.clip(-limit, limit)))
+            if torch.equal(before, self._seen.a):  # at the end of an actuator's range
+                return None
+        self._note.content = self._words()
+        return self.scene().transforms[0]
+
+    def _words(self) -> str:
+        forces = zip(self.plant.hand.pads, self._seen.fingertip_force.tolist(), strict=True)
+        felt = ", ".join(f"{pad.name} {force:.1f} N" for pad, force in forces if force > 0)
+        status = "lost" if self._seen.status is PlantStatus.LOST else "held"
+        return f"The object is **{status}**; fingertips: {felt or 'nothing'}."
+
+
+def _in_plane(normal: Array) -> Array:
+    """Unit vector square to ``normal``: -y, or -z where the normal is y."""
+    down = -np.eye(3)[1 if abs(normal[1]) < 0.9 * np.linalg.norm(normal) else 2]
+    down = down - normal * (normal @ down) / (normal @ normal)
+    return down / np.linalg.norm(down)

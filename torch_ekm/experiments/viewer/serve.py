@@ -1,0 +1,108 @@
+"""Look at a hand, a grasp or a log: in a browser while it is served, or as a page of its own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...description import list_hands, load_hand
+from ...exceptions import DescriptionError, ParameterError, UnknownNameError
+from ...rendering.scene import Scene, draw, place, save_animation, start_server
+from .hand import GraspShow, HandShow
+from .trial import LogShow
+
+_RATE = 30.0  # [Hz] at which controls are looked at
+
+
+class Show(Protocol):
+    """Something to look at, with controls."""
+
+    @property
+    def title(self) -> str: ...
+
+    def scene(self) -> Scene:
+        """All its frames, for a page; the first one is where serving begins."""
+        ...
+
+    def add_controls(self, gui: Any) -> None:
+        """Add sliders and buttons to viser's panel."""
+        ...
+
+    def update(self) -> NDArray[np.float64] | None:
+        """Do what the controls say; transforms ``(n_shapes, 4, 4)`` if anything moved."""
+        ...
+
+
+def choose_show(what: str, object: str | None = None, seed: int = 0, trial: int | None = None) -> Show:
+    """What there is to show under a name.
+
+    Args:
+        what: a hand's name or URDF, a log's folder, or one trial's file.
+        object: an object's name or URDF for the hand to hold.
+        seed: which grasp.
+        trial: of a log.
+
+    Raises:
+        UnknownNameError: no such hand, and no log of that name; the message lists the hands.
+        ParameterError: an object was given to a log.
+        DescriptionError: the log is damaged or has nothing to show.
+    """
+    path = Path(what)
+    if what not in list_hands() and path.suffix != ".urdf":
+        if not path.exists():
+            raise UnknownNameError("hand or log", what, (*list_hands(), "a URDF file", "a log's folder"))
+        if object is not None:
+            raise ParameterError("object", object, "left out with a log, which knows its own")
+        return LogShow(path, trial)
+    return HandShow(load_hand(what)) if object is None else GraspShow(what, object, seed)
+
+
+def save_page(show: Show, path: Path) -> Path:
+    """Write a stand-alone page that any browser shows, without a network.
+
+    Raises:
+        DescriptionError: ``path`` cannot be written.
+    """
+    if path.is_dir() or not path.resolve().parent.is_dir():
+        raise DescriptionError(path, "cannot be written: name a file in a folder that is there")
+    return save_animation(show.scene(), path)
+
+
+def serve(
+    show: Show,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    on_ready: Callable[[str], None] | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> None:
+    """Serve an interactive view until ``stop()`` or an interrupt.
+
+    Args:
+        host: only this machine by default; "0.0.0.0" for all that can reach it.
+        port: the next free one is taken if it is not.
+        on_ready: called with the address to be opened.
+        stop: asked 30 times a second.
+    """
+    server = start_server(host, port)
+    try:
+        scene = show.scene()
+        nodes = draw(server, scene)
+        place(server, nodes, scene.transforms[0])
+        server.gui.set_panel_label(show.title)
+        show.add_controls(server.gui)
+        if on_ready is not None:
+            on_ready(f"http://{host}:{server.get_port()}")
+        while not stop():
+            moved = show.update()
+            if moved is not None:
+                place(server, nodes, moved)
+            time.sleep(1 / _RATE)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        server.stop()

@@ -1,0 +1,13 @@
+"""WHICH object is it: models of familiar objects, recognised by what a grasp feels like."""
+
+from __future__ import annotations
+
+from .grasp_signature import GraspSignature as GraspSignature
+from .model_bank import ModelBank as ModelBank
+from .signature_model import SignatureModel as SignatureModel
+
+__all__ = [
+    "GraspSignature",
+    "ModelBank",
+    "SignatureModel",
+]

@@ -1,0 +1,54 @@
+"""A plant that replays what another one did: an example of a driver."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from ..exceptions import ParameterError
+from ..typing import Float, Tensor
+from .plant import Observation
+from .trajectory import Recording
+
+
+class ReplayedPlant:
+    """Gives the recorded observations one by one, whatever is commanded; implements :class:`Plant`.
+
+    ``info["recorded_command"]`` says what was commanded then. A driver of a real hand has the same
+    five lines: send the increment, wait until it is done, read the sensors.
+
+    Raises:
+        ParameterError: the recording is empty.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        if not recording.observations:
+            raise ParameterError("recording", "empty", "one with at least one observation")
+        self.recording = recording
+        self._place = 0
+
+    def reset(self, seed: int = 0) -> Observation:
+        """Back to the first observation; the seed plays no part."""
+        self._place = 0
+        return self.observe()
+
+    def observe(self) -> Observation:
+        """The observation of this moment."""
+        return self.recording.observations[self._place]
+
+    def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
+        """The next observation.
+
+        Raises:
+            ParameterError: the recording ends here.
+        """
+        if self._place >= len(self.recording.commands):
+            raise ParameterError(
+                "command", self._place, f"at most {len(self.recording.commands)}: it ends there"
+            )
+        command = self.recording.commands[self._place]
+        self._place += 1
+        observation = self.observe()
+        return dataclasses.replace(observation, info={**observation.info, "recorded_command": command})
+
+    def close(self) -> None:
+        """Nothing to give back."""

@@ -1,0 +1,98 @@
+"""Regressors of river behind the contract (extra ``peers``)."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import torch
+from torch.distributions import Normal
+
+from ..._extras import require
+from ...typing import Tensor
+from ..base import UpdateReport, check_positive
+from .adapter import Adapter
+
+
+class RiverResidual(Adapter):
+    """Any river regressor, one copy per output; the variance is that of recent innovations.
+
+    The mean is 0 before the first sample. River predicts on dictionaries of Python floats: it is not
+    differentiable (``linearize`` takes central differences).
+
+    Args:
+        model: a river regressor, copied; default ARFRegressor.
+        prior_variance: of y before the first sample.
+        options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
+    """
+
+    noise: Tensor
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        model: Any = None,
+        prior_variance: float = 1.0,
+        step: float = 1e-3,
+        **options: Any,
+    ) -> None:
+        super().__init__(in_features, out_features, **options)
+        self._check_single()
+        require("river")
+        if model is None:
+            model = require("river.forest").ARFRegressor(seed=0)
+        self._prototype = model
+        self.step = check_positive("step", step)
+        self.prior_variance = check_positive("prior_variance", prior_variance)
+        self.register_buffer("noise", self._like.new_full((self.out_features,), prior_variance))
+        self.reset()
+
+    def reset(self) -> None:
+        """Fresh copies of the regressor."""
+        self._models = [self._prototype.clone() for _ in range(self.out_features)]
+        self._count = 0
+        self.noise.fill_(self.prior_variance)
+        self.n_refused.zero_()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Predictions of the regressors; no gradient reaches x."""
+        x = self._check_query(x)
+        rows = x.detach().reshape(-1, self.in_features).tolist()
+        values = [[self._value(model, row) for model in self._models] for row in rows]
+        mean = torch.tensor(values, dtype=self.dtype, device=self.device).reshape(*x.shape[:-1], -1)
+        return mean + 0.0 * x[..., :1]
+
+    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+        """The same variance with and without noise: river does not tell them apart."""
+        mean = self(x)
+        return Normal(mean, self.noise.sqrt().expand_as(mean), validate_args=False)
+
+    def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Central differences with ``step``."""
+        x = self._check_query(x)
+        eye = self.step * torch.eye(self.in_features, dtype=x.dtype, device=x.device)
+        up, down = self(x.unsqueeze(-2) + eye), self(x.unsqueeze(-2) - eye)
+        return self(x), ((up - down) / (2 * self.step)).mT
+
+    def _value(self, model: Any, row: list[float]) -> float:
+        return float(model.predict_one(dict(enumerate(row))) or 0.0) if self._count else 0.0
+
+    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        error = (y - self(x)).square()
+        if mask is None or bool(mask):
+            row = dict(enumerate(x.tolist()))
+            for model, target in zip(self._models, y.tolist(), strict=True):
+                model.learn_one(row, target)
+            self.noise.lerp_(error, max(0.02, 1.0 / (self._count + 2)))
+            self._count += 1
+        return self._report((error / self.noise).mean(-1), mask)
+
+    def get_extra_state(self) -> Tensor:
+        """The pickled regressors."""
+        return torch.frombuffer(bytearray(pickle.dumps((self._count, self._models))), dtype=torch.uint8)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """See get_extra_state. Unpickles: load only what you trust."""
+        self._count, self._models = pickle.loads(bytes(state.tolist()))

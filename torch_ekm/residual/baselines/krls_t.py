@@ -1,0 +1,145 @@
+"""Kernel recursive least squares tracker."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch.distributions import Normal
+
+from ...exceptions import ParameterError
+from ...typing import Tensor
+from ..base import UpdateEvent, UpdateReport, check_count, check_positive
+from ..double_state import DoubleStateLearner
+from ..kernels.kernel import Kernel, SquaredExponential
+
+
+class KRLSTracker(DoubleStateLearner):
+    """Posterior of f at the basis, ``N(mu, Sigma)``, forgotten back to the prior at every step::
+
+        Sigma <- lam Sigma + (1 - lam) K,   mu <- sqrt(lam) mu
+        mean = k'Q mu,   var = k** + k'Q (Sigma - K) Q k,   Q = K^-1
+
+    Pruned by the smallest error in the mean, ``|Q mu|_i^2 / Q_ii^2`` (Van Vaerenbergh, Lazaro-Gredilla
+    & Santamaria, IEEE TNNLS 23, 2012). One model; state in float64.
+
+    Args:
+        capacity: largest number of basis points.
+        kernel: default squared exponential with lengthscale sqrt(in_features).
+        noise_variance: s2.
+        forgetting: lam in (0, 1].
+        jitter: nugget relative to k**, also the tolerance below which a sample is not novel.
+        options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
+    """
+
+    basis: Tensor
+    mu: Tensor
+    Sigma: Tensor
+    Q: Tensor
+    active: Tensor
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        capacity: int = 100,
+        kernel: Kernel | None = None,
+        noise_variance: float = 0.01,
+        forgetting: float = 1.0,
+        jitter: float = 1e-6,
+        **options: Any,
+    ) -> None:
+        super().__init__(in_features, out_features, **options)
+        self._check_single()
+        if not 0 < forgetting <= 1:
+            raise ParameterError("forgetting", forgetting, "in (0, 1]")
+        self.capacity = check_count("capacity", capacity)
+        self.noise_variance = check_positive("noise_variance", noise_variance)
+        self.forgetting, self.jitter = float(forgetting), check_positive("jitter", jitter)
+        factory = {"dtype": torch.float64, "device": self.device}
+        self.kernel = SquaredExponential(in_features, **factory) if kernel is None else kernel.double()
+        M = self.capacity + 1
+        self.register_buffer("basis", torch.zeros(M, self.in_features, **factory))
+        self.register_buffer("mu", torch.zeros(M, self.out_features, **factory))
+        self.register_buffer("Sigma", torch.zeros(M, M, **factory))
+        self.register_buffer("Q", torch.zeros(M, M, **factory))
+        self.register_buffer("active", torch.zeros(M, dtype=torch.bool, device=self.device))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``k'Q mu``."""
+        k = self._cross(self._check_query(x).double())
+        return (k @ self.Q @ self.mu).to(self.dtype)
+
+    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+        """``k** - k'Qk + (Qk)'Sigma(Qk)``, plus s2 on request."""
+        z = self._check_query(x).double()
+        k = self._cross(z)
+        e = k @ self.Q
+        v = (self.kernel.diagonal(z) - (e * k).sum(-1)).clamp_min(0.0) + ((e @ self.Sigma) * e).sum(-1)
+        v = v + self.noise_variance if observation else v.clamp_min(torch.finfo(v.dtype).eps)
+        mean = (e @ self.mu).to(self.dtype)
+        return Normal(mean, v.sqrt().unsqueeze(-1).expand_as(mean).to(self.dtype), validate_args=False)
+
+    def reset(self) -> None:
+        """Empty basis."""
+        for name, buffer in self.named_buffers(recurse=False):
+            if name != "_like":
+                buffer.zero_()
+
+    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        x, y, lam = x.double(), y.double(), self.forgetting
+        if mask is not None and not bool(mask):
+            one = torch.ones_like(y[0])
+            return UpdateReport(torch.zeros_like(mask, dtype=torch.int64), 0 * one, torch.nan * one, one)
+        if lam < 1.0:
+            on = self.active.double()
+            K = self.kernel(self.basis, self.basis) * on[:, None] * on
+            K.diagonal().mul_(1.0 + self.jitter)
+            self.Sigma.mul_(lam).add_(K, alpha=1.0 - lam)
+            self.mu.mul_(lam**0.5)
+        k = self._cross(x)
+        prior = self.kernel.diagonal(x) * (1.0 + self.jitter)
+        e = self.Q @ k
+        gamma = (prior - k @ e).clamp_min(self.jitter * prior)
+        Se = self.Sigma @ e
+        variance = gamma + e @ Se
+        innovation = y - e @ self.mu
+        D = self.noise_variance + variance
+        surprise = innovation.square().mean() / D
+
+        # always take the point in, at the free slot; then prune if it was not novel or one is too much
+        new = int((~self.active).to(torch.uint8).argmax())
+        p = e.clone()
+        p[new] = -1.0
+        column = Se.clone()
+        column[new] = variance
+        self.basis[new], self.active[new] = x, True
+        self.Q += torch.outer(p, p) / gamma
+        self.mu[new] = e @ self.mu
+        self.Sigma[new], self.Sigma[:, new] = column, column
+        self.mu += torch.outer(column, innovation) / D
+        self.Sigma -= torch.outer(column, column) / D
+        novel = bool(gamma > 10 * self.jitter * prior)
+        full = int(self.active.sum()) > self.capacity
+        if full or not novel:
+            self._prune(None if novel else new)
+        event = UpdateEvent.ABSORBED if not novel else UpdateEvent.REPLACED if full else UpdateEvent.ADDED
+        return UpdateReport(
+            torch.tensor(int(event), device=self.device), gamma / prior, surprise, torch.ones_like(gamma)
+        )
+
+    def _prune(self, i: int | None) -> None:
+        if i is None:
+            error = ((self.Q @ self.mu) / self.Q.diagonal()[:, None]).square().sum(-1)
+            i = int(torch.where(self.active, error, torch.inf).argmin())
+        q = self.Q[:, i].clone()
+        self.Q -= torch.outer(q, q) / q[i]
+        self.active[i] = False
+        for matrix in (self.Q, self.Sigma):
+            matrix[i] = 0.0
+            matrix[:, i] = 0.0
+        self.mu[i] = 0.0
+
+    def _cross(self, z: Tensor) -> Tensor:
+        return self.kernel.vector(z, self.basis) * self.active

@@ -1,0 +1,214 @@
+"""Bayesian linear regression on features, one sample at a time."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from typing import Any
+
+import torch
+from torch.distributions import Normal
+
+from ...exceptions import ParameterError
+from ...typing import Float, Tensor
+from ..base import ResidualLearner, UpdateEvent, UpdateReport, check_count, check_positive
+from ..kernels.kernel import log_parameter
+
+
+class LinearInFeatures(ResidualLearner):
+    """``g(x) = w' phi(x)``, ``w ~ N(0, v I)``, ``y = g + noise``: exact posterior, O(f^2) a sample::
+
+        P = (A/s2 + I/v)^-1,  w = P b/s2,   A = sum lam^(t-i) phi phi',  b = sum lam^(t-i) phi y'
+
+    (A, b) is the master copy, (P, w) is carried along by rank-one steps and rebuilt every
+    ``refresh_every`` samples, when forgetting is applied: unlike the classical P/lam, directions
+    without new samples go back to the prior instead of winding up.
+
+    Args:
+        n_phi: number of features f.
+        noise_variance, weight_variance: s2 and v.
+        forgetting, refresh_every: as in SparseOnlineGP.
+        robust: c of the weight ``1 / (1 + z2/c^2)`` on a sample's noise; None: weight 1.
+        options: see ResidualLearner.
+    """
+
+    information: Tensor
+    target: Tensor
+    covariance: Tensor
+    weights: Tensor
+    pending: Tensor
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        n_phi: int,
+        *,
+        noise_variance: float = 0.01,
+        weight_variance: float = 1.0,
+        forgetting: float = 1.0,
+        robust: float | None = None,
+        refresh_every: int = 16,
+        **options: Any,
+    ) -> None:
+        super().__init__(in_features, out_features, **options)
+        self.noise_variance = check_positive("noise_variance", noise_variance)
+        self.weight_variance = check_positive("weight_variance", weight_variance)
+        if not 0 < forgetting <= 1:
+            raise ParameterError("forgetting", forgetting, "in (0, 1]")
+        self.forgetting = float(forgetting)
+        self.robust = None if robust is None else check_positive("robust", robust)
+        self.refresh_every = check_count("refresh_every", refresh_every)
+        f, zeros = n_phi, self._like.new_zeros
+        self.register_buffer("information", zeros(*self.batch_shape, f, f))
+        self.register_buffer("target", zeros(*self.batch_shape, f, self.out_features))
+        prior = self.weight_variance * torch.eye(f, dtype=self.dtype, device=self.device)
+        self.register_buffer("covariance", prior.expand(*self.batch_shape, f, f).clone())
+        self.register_buffer("weights", zeros(*self.batch_shape, f, self.out_features))
+        self.register_buffer("pending", zeros(self.batch_shape))
+        self._n_samples = 0
+
+    @abstractmethod
+    def features(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any f"]:
+        """phi(x), differentiable."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``w' phi(x)``."""
+        phi = self.features(self._check_query(x))
+        return (phi.unsqueeze(-2) @ self.weights).squeeze(-2)
+
+    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+        """Variance ``phi' P phi``, plus s2 on request; the same for all outputs."""
+        phi = self.features(self._check_query(x)).unsqueeze(-2)
+        mean = (phi @ self.weights).squeeze(-2)
+        v = (phi @ self.covariance @ phi.mT).squeeze(-1).clamp_min(torch.finfo(phi.dtype).tiny)
+        v = v + self.noise_variance if observation else v
+        return Normal(mean, v.sqrt().expand_as(mean), validate_args=False)
+
+    def reset(self) -> None:
+        """Back to w ~ N(0, v I)."""
+        for buffer in (self.information, self.target, self.weights, self.pending, self.n_refused):
+            buffer.zero_()
+        self.covariance.zero_()
+        self.covariance.diagonal(dim1=-2, dim2=-1).fill_(self.weight_variance)
+        self._n_samples = 0
+
+    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        s2, column = self.noise_variance, self.features(x).unsqueeze(-1)
+        Pphi = self.covariance @ column
+        v = (column.mT @ Pphi).squeeze(-1).squeeze(-1)
+        innovation = y - (column.mT @ self.weights).squeeze(-2)
+        surprise = innovation.square().mean(-1) / (s2 + v)
+        weight = torch.ones_like(v)
+        if self.robust is not None:
+            weight = 1.0 / (1.0 + surprise / self.robust**2)
+        gain, share = 1.0 / (s2 / weight + v), weight
+        if mask is not None:
+            gain, share = gain * mask, share * mask
+        gain, share = gain[..., None, None], share[..., None, None]
+        self.covariance -= gain * (Pphi @ Pphi.mT)
+        self.weights += gain * (Pphi @ innovation.unsqueeze(-2))
+        self.information += share * (column @ column.mT)
+        self.target += share * (column @ y.unsqueeze(-2))
+        self.pending += 1.0 if mask is None else mask
+        self._n_samples += 1
+        if self._n_samples % self.refresh_every == 0:
+            self._rebuild()
+        event = torch.full_like(v, UpdateEvent.ABSORBED, dtype=torch.int64)
+        return UpdateReport(event if mask is None else event * mask, 0.0 * v, surprise, weight)
+
+    def _rebuild(self) -> None:
+        """Forget what is due; (P, w) from (A, b) by Cholesky in double precision."""
+        if self.forgetting < 1.0:
+            factor = (self.forgetting**self.pending)[..., None, None]
+            self.information.mul_(factor)
+            self.target.mul_(factor)
+        self.pending.zero_()
+        precision = self.information.double() / self.noise_variance
+        precision.diagonal(dim1=-2, dim2=-1).add_(1.0 / self.weight_variance)
+        # with a unit diagonal, and what rounding takes from it: inputs may be far from 0 and large
+        d = precision.diagonal(dim1=-2, dim2=-1).rsqrt()
+        precision = d.unsqueeze(-1) * precision * d.unsqueeze(-2)
+        precision.diagonal(dim1=-2, dim2=-1).add_(d.shape[-1] * torch.finfo(d.dtype).eps)
+        factor = torch.linalg.cholesky_ex(precision)[0]
+        self.covariance.copy_(d.unsqueeze(-1) * torch.cholesky_inverse(factor) * d.unsqueeze(-2))
+        target = d.unsqueeze(-1) * self.target.double() / self.noise_variance
+        self.weights.copy_(d.unsqueeze(-1) * torch.cholesky_solve(target, factor))
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Number of samples seen: the rhythm of rebuilds continues after a reload."""
+        return {"n_samples": self._n_samples}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """See get_extra_state."""
+        self._n_samples = int(state["n_samples"])
+
+
+class RecursiveLeastSquares(LinearInFeatures):
+    """``g(x) = W' [x, 1]``: Bayesian recursive least squares with forgetting.
+
+    Args:
+        bias: append the constant 1.
+        options: see LinearInFeatures.
+    """
+
+    def __init__(self, in_features: int, out_features: int, *, bias: bool = True, **options: Any) -> None:
+        super().__init__(in_features, out_features, in_features + bias, **options)
+        self.bias = bool(bias)
+
+    def features(self, x: Tensor) -> Tensor:
+        """``[x, 1]``."""
+        return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1) if self.bias else x
+
+    def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The slope is W itself, everywhere."""
+        x = self._check_query(x)
+        slope = self.weights.mT[..., : self.in_features]
+        return self(x), slope.expand(*x.shape[:-1], *slope.shape[-2:])
+
+
+class RandomFeatureRLS(LinearInFeatures):
+    """``phi(x) = sqrt(1/D) [cos(Omega x), sin(Omega x)]``: a squared exponential GP, approximately.
+
+    Incremental sparse-spectrum regression after Gijsberts & Metta (Neural Networks 41, 2013); the
+    frequencies Omega ~ N(0, L^-2) stay fixed.
+
+    Args:
+        n_frequencies: D; there are 2 D features.
+        lengthscale: L, one number or one per input; default sqrt(in_features).
+        seed: of the frequencies.
+        options: see LinearInFeatures.
+    """
+
+    frequencies: Tensor
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        n_frequencies: int = 100,
+        lengthscale: float | Tensor | None = None,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        super().__init__(
+            in_features, out_features, 2 * check_count("n_frequencies", n_frequencies), **options
+        )
+        generator = torch.Generator().manual_seed(seed)
+        draws = torch.randn(n_frequencies, in_features, generator=generator, dtype=torch.float64)
+        lengthscale = math.sqrt(in_features) if lengthscale is None else lengthscale
+        scale = log_parameter("lengthscale", lengthscale, (self.in_features,), dtype=torch.float64).exp()
+        self.register_buffer("frequencies", (draws / scale).to(self._like))
+
+    def features(self, x: Tensor) -> Tensor:
+        """The random Fourier features."""
+        angle = x @ self.frequencies.mT
+        return torch.cat([angle.cos(), angle.sin()], dim=-1) / math.sqrt(len(self.frequencies))
+
+    def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """``dphi/dx = sqrt(1/D) [-sin(.) Omega; cos(.) Omega]``."""
+        phi = self.features(self._check_query(x))
+        cos, sin = phi.chunk(2, dim=-1)
+        slope = torch.cat([-sin, cos], dim=-1).unsqueeze(-1) * self.frequencies.repeat(2, 1)
+        return (phi.unsqueeze(-2) @ self.weights).squeeze(-2), self.weights.mT @ slope

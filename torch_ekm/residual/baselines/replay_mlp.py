@@ -1,0 +1,153 @@
+"""Small networks trained on the stream with a replay memory; several of them give uncertainty."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import nn
+from torch.distributions import Normal
+
+from ...typing import Tensor
+from ..base import ResidualLearner, UpdateEvent, UpdateReport, check_count, check_counts, check_positive
+
+
+class ReplayMLP(ResidualLearner):
+    """``g(x) = mean_i (net_i(x; theta_i) - net_i(x; theta_i0))``: exactly 0 before the first sample.
+
+    Each sample brings ``steps`` Adam steps on itself and a minibatch from the last ``memory`` ones.
+    With ``members > 1`` the latent variance is the members' spread, each trained on minibatches of its
+    own (Lakshminarayanan et al., NeurIPS 2017, with Osband's randomised priors, NeurIPS 2018); with one
+    member it is the running mean of squared innovations. One model.
+
+    Args:
+        hidden: widths of the tanh layers.
+        members: networks in the ensemble.
+        memory: samples kept for replay (the oldest goes).
+        minibatch, steps, rate: of Adam.
+        prior_variance: of g before the first sample, and start of the running noise estimate.
+        seed: of weights and minibatches.
+        options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
+    """
+
+    inputs: Tensor
+    targets: Tensor
+    count: Tensor
+    noise: Tensor
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        hidden: Sequence[int] = (64, 64),
+        members: int = 1,
+        memory: int = 1000,
+        minibatch: int = 32,
+        steps: int = 2,
+        rate: float = 3e-3,
+        prior_variance: float = 1.0,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        super().__init__(in_features, out_features, **options)
+        self._check_single()
+        self.members, self.memory = check_count("members", members), check_count("memory", memory)
+        self.minibatch, self.steps = check_count("minibatch", minibatch), check_count("steps", steps)
+        self.rate, self.seed = check_positive("rate", rate), int(seed)
+        self.prior_variance = check_positive("prior_variance", prior_variance)
+        self.hidden = check_counts("hidden", hidden)
+        zeros = self._like.new_zeros
+        self.register_buffer("inputs", zeros(self.memory, self.in_features))
+        self.register_buffer("targets", zeros(self.memory, self.out_features))
+        self.register_buffer("count", torch.zeros((), dtype=torch.int64, device=self.device))
+        self.register_buffer("noise", zeros(self.out_features))
+        self.theta = nn.ParameterList()
+        widths = [self.in_features, *self.hidden, self.out_features]
+        for n_in, n_out in itertools.pairwise(widths):
+            self.theta.append(nn.Parameter(zeros(self.members, n_in, n_out), requires_grad=False))
+            self.theta.append(nn.Parameter(zeros(self.members, 1, n_out), requires_grad=False))
+        for i, p in enumerate(self.theta):
+            for kind in ("start", "first", "second"):
+                self.register_buffer(f"{kind}_{i}", torch.zeros_like(p))
+        self.reset()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Mean of the members."""
+        return self._members(self._check_query(x)).mean(-2)
+
+    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+        """Spread of the members, plus the running noise on request."""
+        members = self._members(self._check_query(x))
+        mean = members.mean(-2)
+        if self.members > 1:
+            # before the first sample all members are 0 and so is their spread: then it is the prior
+            v = members.var(-2).where(self.count > 0, self.prior_variance)
+            v = v.clamp_min(torch.finfo(v.dtype).eps)
+            v = v + self.noise if observation else v
+        else:
+            v = self.noise.expand_as(mean)
+        return Normal(mean, v.sqrt(), validate_args=False)
+
+    def reset(self) -> None:
+        """New weights from the seed, empty memory."""
+        for name, buffer in self.named_buffers(recurse=False):
+            if name != "_like":
+                buffer.zero_()
+        generator = torch.Generator().manual_seed(self.seed)
+        for i, p in enumerate(self.theta):
+            if i % 2 == 0:
+                draw = torch.randn(p.shape, generator=generator, dtype=torch.float64)
+                p.data.copy_(draw / p.shape[-2] ** 0.5)
+            else:
+                p.data.zero_()
+            self.get_buffer(f"start_{i}").copy_(p.data)
+        self.noise.fill_(self.prior_variance)
+
+    def _net(self, x: Tensor, theta: Sequence[Tensor]) -> Tensor:
+        """x ``(..., members or 1, n, in)`` through all members."""
+        for i in range(0, len(theta) - 2, 2):
+            x = torch.tanh(x @ theta[i] + theta[i + 1])
+        return x @ theta[-2] + theta[-1]
+
+    def _members(self, x: Tensor) -> Tensor:
+        x = x.unsqueeze(-2).unsqueeze(-2)
+        start = [self.get_buffer(f"start_{i}") for i in range(len(self.theta))]
+        return (self._net(x, list(self.theta)) - self._net(x, start)).squeeze(-2)
+
+    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        law = self.predict(x, observation=True)
+        surprise = ((y - law.mean) / law.stddev).square().mean(-1)
+        one = torch.ones_like(surprise)
+        if mask is not None and not bool(mask):
+            return UpdateReport(torch.zeros_like(mask, dtype=torch.int64), 0 * one, surprise, one)
+        n = int(self.count)
+        self.noise.lerp_((y - law.mean).square(), max(0.02, 1.0 / (n + 2)))
+        self.inputs[n % self.memory], self.targets[n % self.memory] = x, y
+        self.count += 1
+        start = [self.get_buffer(f"start_{i}") for i in range(len(self.theta))]
+        # the sample's number seeds its minibatches, so that a reloaded learner draws the same
+        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + n)
+        for step in range(self.steps):
+            size = (self.members, self.minibatch)
+            index = torch.randint(min(n + 1, self.memory), size, generator=generator)
+            index[:, 0] = n % self.memory
+            index = index.to(self.device)
+            bx, by = self.inputs[index], self.targets[index] + self._net(self.inputs[index], start)
+            with torch.enable_grad():
+                theta = [p.detach().requires_grad_(True) for p in self.theta]
+                loss = (self._net(bx, theta) - by).square().sum((0, 2)).mean()
+                gradients = torch.autograd.grad(loss, theta)
+            self._adam(gradients, n * self.steps + step + 1)
+        event = torch.tensor(int(UpdateEvent.ABSORBED), device=self.device)
+        return UpdateReport(event, 0 * one, surprise, one)
+
+    def _adam(self, gradients: Sequence[Tensor], t: int) -> None:
+        scale = self.rate * (1 - 0.999**t) ** 0.5 / (1 - 0.9**t)
+        for i, (p, g) in enumerate(zip(self.theta, gradients, strict=True)):
+            first, second = self.get_buffer(f"first_{i}"), self.get_buffer(f"second_{i}")
+            first.lerp_(g, 0.1)
+            second.mul_(0.999).addcmul_(g, g, value=0.001)
+            p.data.addcdiv_(first, second.sqrt().add_(1e-8), value=-scale)

@@ -1,0 +1,109 @@
+"""An exact GP on the last samples."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch.distributions import Normal
+
+from ...typing import Tensor
+from ..base import ResidualLearner, UpdateEvent, UpdateReport, check_count, check_positive
+from ..kernels.kernel import Kernel, SquaredExponential
+
+
+class WindowGP(ResidualLearner):
+    """``mean = k'(K + s2 I)^-1 y``, ``var = k** - k'(K + s2 I)^-1 k`` on a sliding window.
+
+    O(window^3) per sample: one Cholesky. What left the window is gone.
+
+    Args:
+        window: samples kept.
+        kernel: default squared exponential with lengthscale sqrt(in_features).
+        noise_variance: s2.
+        robust: c; a surprising sample gets the noise ``s2 (1 + z2/c^2)``.
+        options: see ResidualLearner.
+    """
+
+    inputs: Tensor
+    targets: Tensor
+    noise: Tensor
+    count: Tensor
+    solution: Tensor
+    inverse: Tensor
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        window: int = 100,
+        kernel: Kernel | None = None,
+        noise_variance: float = 0.01,
+        robust: float | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(in_features, out_features, **options)
+        self.window = check_count("window", window)
+        self.noise_variance = check_positive("noise_variance", noise_variance)
+        self.robust = None if robust is None else check_positive("robust", robust)
+        fleet = {"batch_shape": self.batch_shape, "device": self.device, "dtype": self.dtype}
+        self.kernel = SquaredExponential(in_features, **fleet) if kernel is None else kernel.to(self._like)
+        zeros, shape, n = self._like.new_zeros, self.batch_shape, self.window
+        self.register_buffer("inputs", zeros(*shape, n, self.in_features))
+        self.register_buffer("targets", zeros(*shape, n, self.out_features))
+        self.register_buffer("noise", zeros(*shape, n))  # 0 where there is no sample
+        self.register_buffer("count", torch.zeros(shape, dtype=torch.int64, device=self.device))
+        self.register_buffer("solution", zeros(*shape, n, self.out_features))
+        self.register_buffer("inverse", zeros(*shape, n, n))  # L^-1 of K + s2 I = LL'
+
+    def forward(self, x: Tensor) -> Tensor:
+        """``k'(K + s2 I)^-1 y``."""
+        k = self.kernel.vector(self._check_query(x), self.inputs)
+        return (k.unsqueeze(-2) @ self.solution).squeeze(-2)
+
+    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+        """``k** - |L^-1 k|^2``, plus s2 on request."""
+        x = self._check_query(x)
+        u = (self.inverse @ self.kernel.vector(x, self.inputs).unsqueeze(-1)).squeeze(-1)
+        v = (self.kernel.diagonal(x) - u.square().sum(-1)).clamp_min(torch.finfo(x.dtype).eps)
+        v = v + self.noise_variance if observation else v
+        mean = self(x)
+        return Normal(mean, v.sqrt().unsqueeze(-1).expand_as(mean), validate_args=False)
+
+    def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """``dk/dx'(K + s2 I)^-1 y``."""
+        k, dk = self.kernel.with_gradient(self._check_query(x), self.inputs)
+        return (k.unsqueeze(-2) @ self.solution).squeeze(-2), self.solution.mT @ dk
+
+    def reset(self) -> None:
+        """Empty the window."""
+        for name, buffer in self.named_buffers(recurse=False):
+            if name != "_like":
+                buffer.zero_()
+
+    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        law = self.predict(x, observation=True)
+        surprise = ((y - law.mean) / law.stddev).square().mean(-1)
+        weight = torch.ones_like(surprise)
+        if self.robust is not None:
+            weight = 1.0 / (1.0 + surprise / self.robust**2)
+        here = torch.arange(self.window, device=self.device) == (self.count % self.window).unsqueeze(-1)
+        if mask is not None:
+            here = here & mask.unsqueeze(-1)
+        self.inputs.copy_(torch.where(here.unsqueeze(-1), x.unsqueeze(-2), self.inputs))
+        self.targets.copy_(torch.where(here.unsqueeze(-1), y.unsqueeze(-2), self.targets))
+        self.noise.copy_(torch.where(here, (self.noise_variance / weight).unsqueeze(-1), self.noise))
+        self.count += 1 if mask is None else mask
+
+        on = (self.noise > 0).to(x.dtype).unsqueeze(-1)
+        K = (self.kernel(self.inputs, self.inputs) * (on * on.mT)).double()
+        K = K + torch.diag_embed(torch.where(self.noise > 0, self.noise, 1.0)).double()
+        L = torch.linalg.cholesky_ex(K)[0]
+        inverse = torch.linalg.solve_triangular(L, torch.eye(self.window).to(L).expand_as(L), upper=False)
+        inverse = inverse * on.mT.double()
+        self.solution.copy_(inverse.mT @ (inverse @ self.targets.double()))
+        self.inverse.copy_(inverse)
+        event = torch.full_like(self.count, UpdateEvent.ABSORBED)
+        novelty = (law.variance[..., 0] - self.noise_variance) / self.kernel.diagonal(x)
+        return UpdateReport(event if mask is None else event * mask, novelty, surprise, weight)

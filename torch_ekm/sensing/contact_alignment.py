@@ -1,0 +1,103 @@
+"""A finger that feels the object touches it: what that says about joints without a sensor."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+
+from ..contact.detector import ContactDetector
+from ..description import HandDescription, ObjectDescription
+from ..kinematics import HandKinematics
+from ..plant import Observation, Plant
+from ..typing import Float, Tensor
+
+_STEP = math.radians(2.0)
+_LIMIT = math.radians(25.0)
+_LEAST_SLOPE = 5e-3  # [m/rad]: joints that hardly change the gap are not to blame for it
+_ITERATIONS = 4
+_CLOSED = 5e-5  # [m]
+
+
+class TouchAligned:
+    """``gap_i(q + delta_u e_u) = 0`` for each pad i that feels a force, u its joint without a Hall sensor.
+
+    The angle of such a joint is known from the motor's encoder alone, through a tendon with another
+    pulley radius than the model's that stretches under load: on the iCub the thumb's opposition is
+    off by 10 deg, the thumb then seems to be millimetres away from the object that it presses, and no
+    kinematic model can be made of the grasp. But where camera and fingertip agree that there is a
+    contact, the gap is known, and with it the angle. Solved by the secant method, at every observation.
+
+    Args:
+        plant: gives estimates of joints, pose and fingertip forces.
+        hand, obj: what it consists of.
+        least_force: a pad that feels less than this [N] says nothing.
+    """
+
+    def __init__(
+        self, plant: Plant, hand: HandDescription, obj: ObjectDescription, least_force: float = 0.5
+    ) -> None:
+        self.plant, self.hand, self.least_force = plant, hand, least_force
+        self._detector = ContactDetector(hand, obj, margin=math.inf)
+        kinematics = HandKinematics(hand)
+        sensed = {sensor.joint for sensor in hand.hall_sensors}
+        self._joints: list[list[int]] = []
+        for pad in hand.pads:
+            upstream = kinematics.upstream[kinematics.link_index(pad.link)]
+            self._joints.append(
+                [
+                    j
+                    for j in torch.nonzero(upstream).flatten().tolist()
+                    if hand.joint_names[j] not in sensed and hand.joint_upper[j] > hand.joint_lower[j]
+                ]
+            )
+        self._delta = torch.zeros(hand.n_q, dtype=torch.float64)
+
+    def reset(self, seed: int) -> Observation:
+        """Grasp anew."""
+        self._delta.zero_()
+        return self._aligned(self.plant.reset(seed))
+
+    def observe(self) -> Observation:
+        """Read the sensors."""
+        return self._aligned(self.plant.observe())
+
+    def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
+        """Move the actuators by ``delta_a`` [rad], wait, read the sensors."""
+        return self._aligned(self.plant.command(delta_a))
+
+    def close(self) -> None:
+        """Give back what the plant holds."""
+        self.plant.close()
+
+    def _aligned(self, seen: Observation) -> Observation:
+        for i, pad in enumerate(self.hand.pads):
+            if float(seen.fingertip_force[i]) >= self.least_force:
+                for j in self._joints[i]:
+                    self._close_gap(seen, pad.name, j)
+        return dataclasses.replace(seen, q=seen.q + self._delta)
+
+    def _close_gap(self, seen: Observation, pad: str, joint: int) -> None:
+        """Secant steps on one joint's error, from its last known value."""
+
+        def gap(delta: float) -> float:
+            q = seen.q + self._delta
+            q[joint] = seen.q[joint] + delta
+            contacts = self._detector(q, seen.position, seen.rotation)
+            return float(contacts.gap[contacts.finger.index(pad)])
+
+        old = float(self._delta[joint])
+        new = old + _STEP
+        before, after = gap(old), gap(new)
+        for _ in range(_ITERATIONS):
+            slope = (after - before) / (new - old) if new != old else 0.0
+            if abs(slope) < _LEAST_SLOPE:
+                return
+            old, before, new = new, after, new - after / slope
+            if abs(new) > _LIMIT:
+                return
+            after = gap(new)
+            if abs(after) < _CLOSED:
+                break
+        self._delta[joint] = new

@@ -1,0 +1,167 @@
+"""Joint angles from Hall readings: a cubic per channel, fitted on a calibration sweep."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from ...exceptions import CalibrationError, DescriptionError, NonFiniteError, ParameterError, ShapeError
+from ...typing import Bool, Float, Tensor
+from .channel import FULL_SCALE, HallChannel, fit_channel
+
+
+class HallEstimate(NamedTuple):
+    """Joint angles from one set of readings."""
+
+    q: Float[Tensor, "*batch n_channels"]
+    """Angles [rad]; of a saturated channel the middle of the range that it cannot tell apart."""
+    std: Float[Tensor, "*batch n_channels"]
+    """Standard deviations [rad]; of a channel that says nothing, that of a uniform spread over its sweep."""
+    valid: Bool[Tensor, "*batch n_channels"]
+    """False where the channel is saturated or was stuck when calibrated."""
+
+
+class HallCalibration:
+    r"""``q_k = c_0 + c_1 r + c_2 r^2 + c_3 r^3``, ``r = n_k / 255``, for each channel k.
+
+    The parametric fit of section III.C of the paper, on a sweep in which angles were known. The deviation of
+    an estimate is ``sigma^2 = (q'(r) sigma_n)^2 + sigma_m^2``: noise and rounding of the reading through
+    the slope of the curve, and what a cubic misses. Both are read off the residuals of the sweep.
+
+    Build one with :meth:`fit` or :meth:`load`.
+    """
+
+    def __init__(self, channels: Sequence[HallChannel]) -> None:
+        if not channels:
+            raise ParameterError("channels", channels, "at least one channel")
+        self.channels = tuple(channels)
+
+        def column(values: Iterable[Any]) -> Tensor:
+            return torch.tensor(list(values), dtype=torch.float64)
+
+        self._c = column(c.coefficients for c in channels).T  # (4, n_channels)
+        self._low, self._high = column(c.low for c in channels), column(c.high for c in channels)
+        self._noise, self._misfit = column(c.noise for c in channels), column(c.misfit for c in channels)
+        self._stuck = torch.tensor([c.stuck for c in channels])
+        # the angles that a reading of 0, one of 255, and a stuck channel leave open
+        at_zero = [c.beyond(upper=not c.rises) for c in channels]
+        at_full = [c.beyond(upper=c.rises) for c in channels]
+        whole = [(c.angle_min, c.angle_max) for c in channels]
+        self._blind = [column(pairs) for pairs in (at_zero, at_full, whole)]
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        return tuple(channel.joint for channel in self.channels)
+
+    @property
+    def n_channels(self) -> int:
+        return len(self.channels)
+
+    def __repr__(self) -> str:
+        lines = (f"  {channel.summary()}" for channel in self.channels)
+        return "HallCalibration(\n" + "\n".join(lines) + "\n)"
+
+    @classmethod
+    def fit(
+        cls,
+        readings: Float[Tensor, "n n_channels"],
+        angles: Float[Tensor, "n n_channels"],
+        joints: Sequence[str],
+        stuck: str = "mark",
+    ) -> HallCalibration:
+        """Least squares on the samples of a sweep at which a channel is not saturated.
+
+        Args:
+            readings: 0..255.
+            angles: of the sensed joints, known from elsewhere [rad].
+            joints: name of the joint of each channel.
+            stuck: what becomes of a channel that does not answer to its joint's motion: "mark" it (its
+                estimates are never valid), or "raise".
+
+        Raises:
+            ShapeError, NonFiniteError: samples that do not fit together, or NaN.
+            ParameterError: readings outside 0..255.
+            CalibrationError: a joint was not moved, or too few samples are unsaturated.
+            NonMonotoneFitError: a fitted curve turns back within its range.
+        """
+        if stuck not in ("mark", "raise"):
+            raise ParameterError("stuck", stuck, "'mark' or 'raise'")
+        readings, angles = readings.to(torch.float64), angles.to(torch.float64)
+        if readings.ndim != 2 or readings.shape[1] != len(joints):
+            raise ShapeError("readings", f"(n, {len(joints)})", readings.shape)
+        if angles.shape != readings.shape:
+            raise ShapeError("angles", f"{tuple(readings.shape)} as the readings", angles.shape)
+        for name, value in (("readings", readings), ("angles", angles)):
+            if not bool(torch.isfinite(value).all()):
+                raise NonFiniteError(name, torch.nonzero(~torch.isfinite(value))[:3].tolist())
+        if bool((readings < 0).any() or (readings > FULL_SCALE).any()):
+            found = (float(readings.min()), float(readings.max()))
+            raise ParameterError("readings", found, "within 0..255")
+        channels = [fit_channel(name, readings[:, k], angles[:, k]) for k, name in enumerate(joints)]
+        dead = [channel.joint for channel in channels if channel.stuck]
+        if dead and stuck == "raise":
+            problem = f"stuck ({len(dead)} in all: {', '.join(dead)}); mend it, or mark it"
+            raise CalibrationError(f"Hall channel of {dead[0]}", problem)
+        return cls(channels)
+
+    def estimate(self, readings: Float[Tensor, "*batch n_channels"]) -> HallEstimate:
+        """Angles, their deviations, and which of them to believe.
+
+        Raises:
+            ShapeError: the last dimension is not the number of channels.
+            NonFiniteError: a reading is NaN.
+        """
+        if readings.ndim == 0 or readings.shape[-1] != self.n_channels:
+            raise ShapeError("readings", f"(*batch, {self.n_channels})", readings.shape)
+        if not bool(torch.isfinite(readings).all()):
+            raise NonFiniteError("readings", torch.nonzero(~torch.isfinite(readings))[:3].tolist())
+        n = readings.to(torch.float64)
+        held = n.clamp(self._low, self._high)  # noise may carry a sound reading past the range of the sweep
+        r, c = held / FULL_SCALE, self._c
+        q = c[0] + r * (c[1] + r * (c[2] + r * c[3]))
+        slope = (c[1] + r * (2 * c[2] + 3 * r * c[3])) / FULL_SCALE
+        std = ((slope * self._noise) ** 2 + self._misfit**2).sqrt()
+        blind = (n <= 0, n >= FULL_SCALE, self._stuck.expand_as(n))
+        for pinned, ends in zip(blind, self._blind, strict=True):
+            q = torch.where(pinned, ends.mean(-1).expand_as(q), q)
+            spread = (ends[:, 1] - ends[:, 0]).abs() / 12**0.5
+            # never surer than the last reading that is not saturated
+            std = torch.where(pinned, torch.maximum(std, (spread**2 + self._misfit**2).sqrt()), std)
+        return HallEstimate(q, std, ~(blind[0] | blind[1] | blind[2]))
+
+    def find_stuck(
+        self, readings: Float[Tensor, "n n_channels"], angles: Float[Tensor, "n n_channels"]
+    ) -> Bool[Tensor, " n_channels"]:
+        """Channels that stood still while their joints are known to have moved.
+
+        A channel is stuck if its readings span at most two counts, while ``angles`` (from the encoders, say)
+        would have moved a sound one by eight. Saturated ends count as no motion.
+        """
+        spans = [c.expected_span(angles[:, k].to(torch.float64)) for k, c in enumerate(self.channels)]
+        actual = readings.amax(0) - readings.amin(0)
+        return (actual <= 2) & (torch.tensor(spans) >= 8)
+
+    def save(self, path: str | Path) -> None:
+        """Write the calibration as JSON; :meth:`load` gives it back to the last bit."""
+        table = {"format": "torch_ekm.HallCalibration", "version": 1}
+        table["channels"] = [channel.to_dict() for channel in self.channels]  # type: ignore[assignment]
+        Path(path).write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: str | Path) -> HallCalibration:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            DescriptionError: the file is not such a calibration.
+        """
+        try:
+            table = json.loads(Path(path).read_text(encoding="utf-8"))
+            if table["format"] != "torch_ekm.HallCalibration" or table["version"] != 1:
+                raise DescriptionError(path, "no Hall calibration of version 1")
+            return cls([HallChannel.from_dict(channel) for channel in table["channels"]])
+        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            raise DescriptionError(path, f"no Hall calibration: {error}") from error

@@ -1,0 +1,124 @@
+"""A board of square markers, glued to a body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..._extras import require
+from ...exceptions import ParameterError, ShapeError, UnknownNameError
+
+Array = NDArray[np.float64]
+
+
+def get_dictionary(name: str):
+    """OpenCV's predefined marker dictionary of that name, e.g. ``"DICT_4X4_50"``.
+
+    Raises:
+        UnknownNameError: OpenCV has no such dictionary.
+    """
+    aruco = require("cv2").aruco
+    valid = sorted(key for key in dir(aruco) if key.startswith("DICT_"))
+    if name not in valid:
+        raise UnknownNameError("marker dictionary", name, valid)
+    return aruco.getPredefinedDictionary(getattr(aruco, name))
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerBoard:
+    """``rows x columns`` markers of edge ``marker_size`` [m], ``gap`` apart, on a white card.
+
+    Board frame: origin at the centre of the card, x to the right, y up, **z out of the printed
+    face**. Several coplanar markers determine the pose far better than one does: a single small
+    square has two nearly equal solutions, and noise flips between them (Collins and Bartoli, IJCV 2014).
+
+    Raises:
+        ParameterError: a size that is not positive, or more markers than the dictionary has.
+        ShapeError: ``mount`` is not ``(4, 4)``.
+    """
+
+    first_id: int = 0
+    """The markers are numbered ``first_id, first_id + 1, ...``, row by row from the upper left."""
+    columns: int = 2
+    rows: int = 2
+    marker_size: float = 0.020
+    gap: float = 0.004
+    margin: float = 0.004
+    """Width of the white rim around the outer markers [m]."""
+    dictionary: str = "DICT_4X4_50"
+    mount: Array = field(default_factory=lambda: np.eye(4), repr=False)
+    """Pose of the board frame in the frame of the body that carries it, ``(4, 4)``."""
+
+    def __post_init__(self) -> None:
+        for name in ("columns", "rows", "marker_size", "gap", "margin"):
+            if not getattr(self, name) > 0:
+                raise ParameterError(f"MarkerBoard.{name}", getattr(self, name), "positive")
+        object.__setattr__(self, "mount", np.array(self.mount, dtype=np.float64))
+        if self.mount.shape != (4, 4):
+            raise ShapeError("MarkerBoard.mount", "(4, 4)", self.mount.shape)
+        available = len(get_dictionary(self.dictionary).bytesList)
+        if self.first_id < 0 or self.first_id + self.n_markers > available:
+            raise ParameterError(
+                "MarkerBoard.first_id", self.first_id, f"within 0..{available - self.n_markers}"
+            )
+
+    @property
+    def n_markers(self) -> int:
+        return self.rows * self.columns
+
+    @property
+    def ids(self) -> range:
+        return range(self.first_id, self.first_id + self.n_markers)
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of the card [m]."""
+        pitch = self.marker_size + self.gap
+        extra = 2 * self.margin - self.gap
+        return self.columns * pitch + extra, self.rows * pitch + extra
+
+    @cached_property
+    def corners(self) -> Array:
+        """Corners of each marker in the board frame, ``(n_markers, 4, 3)`` [m].
+
+        In the order in which the detector reports them: upper left, upper right, lower right, lower left.
+        """
+        pitch, s = self.marker_size + self.gap, self.marker_size
+        width, height = self.size
+        square = np.array([[0, 0], [s, 0], [s, -s], [0, -s]])
+        corners = np.zeros((self.n_markers, 4, 3))
+        for k in range(self.n_markers):
+            row, column = divmod(k, self.columns)
+            upper_left = [
+                -width / 2 + self.margin + column * pitch,
+                height / 2 - self.margin - row * pitch,
+            ]
+            corners[k, :, :2] = upper_left + square
+        return corners
+
+    def texture(self, texel: float = 2.5e-4) -> NDArray[np.uint8]:
+        """The printed card: 0 black, 255 white, texels of about ``texel`` [m], upper left first.
+
+        Marker edges need not fall between texels: each marker is drawn with linear interpolation, which
+        puts the middle of the transition at the edge.
+        """
+        cv2 = require("cv2")
+        dictionary = get_dictionary(self.dictionary)
+        width, height = self.size
+        n_x, n_y = round(width / texel), round(height / texel)
+        scale = np.array([n_x / width, n_y / height])  # texels per metre
+        cells = dictionary.markerSize + 2
+        side = cells * max(1, round(self.marker_size / texel / cells))
+        card = np.full((n_y, n_x), 255, dtype=np.uint8)
+        for k, marker_id in enumerate(self.ids):
+            upper_left = (self.corners[k, 0, :2] * [1, -1] + [width / 2, height / 2]) * scale
+            ratio = self.marker_size * scale / side
+            shift = upper_left + ratio / 2 - 0.5  # continuous coordinates: texel i has its centre at i + 0.5
+            affine = np.array([[ratio[0], 0, shift[0]], [0, ratio[1], shift[1]]])
+            marker = cv2.aruco.generateImageMarker(dictionary, marker_id, side)
+            drawn = cv2.warpAffine(marker, affine, (n_x, n_y), borderValue=255)
+            np.minimum(card, drawn, out=card)
+        return card

@@ -1,0 +1,106 @@
+"""The lens from pictures of a target: intrinsic calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..._extras import require
+from ...exceptions import CalibrationError
+from .camera import PinholeCamera
+from .charuco import CharucoTarget
+
+
+@dataclass(frozen=True)
+class CameraCalibration:
+    """A camera, and how well the pictures determine it."""
+
+    camera: PinholeCamera
+    rms: float
+    """Root mean square distance of corners from where the camera puts them [px]."""
+    std: dict[str, float]
+    """Standard deviations of fx, fy, cx, cy [px] and k1, k2, p1, p2, k3, were all corners independent.
+
+    They are not quite: with a dozen views, count on twice as much."""
+    view_rms: tuple[float, ...]
+    """Of each picture that was used [px]."""
+    used: tuple[int, ...]
+    """Numbers of the pictures that were used; the others showed too little of the target, or blurred."""
+
+
+def calibrate_camera(
+    images: Iterable[NDArray[np.uint8] | None],
+    target: CharucoTarget | None = None,
+    distortion: bool = True,
+    min_views: int = 8,
+    min_corners: int = 12,
+    max_view_rms: float = 1.0,
+) -> CameraCalibration:
+    """``min sum |u_ij - pi(K, k, R_i X_j + t_i)|^2`` over intrinsics and the pose of each view.
+
+    Corners of a ChArUco target (OpenCV's detector), then Zhang's method (``cv2.calibrateCamera``).
+    Views whose own error exceeds ``max_view_rms`` are left out and the rest solved again, once.
+    The target should fill different parts of the image, at tilts up to about 45 deg: frontal views
+    alone do not tell focal length from distance.
+
+    Args:
+        images: grey or BGR pictures of one size; None (dropped frames) are skipped.
+        target: what is seen.
+        distortion: estimate k1, k2, p1, p2 (k3 stays 0); False: an ideal lens.
+        min_views: fewer usable pictures are refused.
+        min_corners: a picture with fewer is not used.
+        max_view_rms: a picture with more is not used [px].
+
+    Raises:
+        CalibrationError: too few usable views, or pictures of different sizes.
+    """
+    cv2 = require("cv2")
+    target = target or CharucoTarget()
+    detector = cv2.aruco.CharucoDetector(target.board)
+    points = target.board.getChessboardCorners()
+    views: list[tuple[int, NDArray, NDArray]] = []
+    shape = None
+    for k, image in enumerate(images):
+        if image is None:
+            continue
+        if shape is not None and image.shape[:2] != shape:
+            raise CalibrationError("camera", f"picture {k} is {image.shape[:2]}, those before are {shape}")
+        shape = image.shape[:2]
+        corners, ids, _, _ = detector.detectBoard(image)
+        if ids is not None and len(ids) >= min_corners:
+            views.append((k, points[ids.ravel()].reshape(-1, 3), corners.reshape(-1, 2)))
+    if shape is None or len(views) < min_views:
+        raise CalibrationError(
+            "camera",
+            f"only {len(views)} pictures show {min_corners} or more corners of the target, at least "
+            f"{min_views} are needed; move the target about, closer, in good light",
+        )
+    flags = cv2.CALIB_FIX_K3
+    if not distortion:
+        flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_ZERO_TANGENT_DIST
+
+    def solve(chosen: list[tuple[int, NDArray, NDArray]]):
+        start = (shape[1], shape[0])
+        return cv2.calibrateCameraExtended(
+            [view[1] for view in chosen], [view[2] for view in chosen], start, None, None, flags=flags
+        )
+
+    rms, K, k, _, _, std, _, errors = solve(views)
+    good = [view for view, error in zip(views, errors.ravel(), strict=True) if error <= max_view_rms]
+    if min_views <= len(good) < len(views):
+        views = good
+        rms, K, k, _, _, std, _, errors = solve(views)
+    fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    lens = tuple(float(c) for c in k.ravel()[:5])
+    camera = PinholeCamera(shape[1], shape[0], fx, fy, cx, cy, lens)
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    return CameraCalibration(
+        camera,
+        float(rms),
+        {name: float(s) for name, s in zip(names, std.ravel(), strict=False)},
+        tuple(float(error) for error in errors.ravel()),
+        tuple(view[0] for view in views),
+    )

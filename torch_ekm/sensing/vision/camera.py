@@ -1,0 +1,97 @@
+"""The pinhole camera: where a point of space appears in the image."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..._extras import require
+from ...exceptions import DescriptionError, ParameterError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """``u = fx x'' + cx, v = fy y'' + cy`` with ``x'', y''`` the distorted ``x/z, y/z``.
+
+    Camera frame: x right, y down, z forward [m]. Image: u right, v down [px], the *centre* of
+    the first pixel at (0, 0), as in OpenCV. Distortion ``(k1, k2, p1, p2, k3)`` (Brown-Conrady).
+    The defaults are those of a VGA camera of 56 deg horizontal field of view.
+
+    Raises:
+        ParameterError: a size or focal length is not positive, or the distortion has no 5 entries.
+    """
+
+    width: int = 640
+    height: int = 480
+    fx: float = 600.0
+    fy: float = 600.0
+    cx: float = 319.5
+    cy: float = 239.5
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height", "fx", "fy"):
+            if not getattr(self, name) > 0:
+                raise ParameterError(f"PinholeCamera.{name}", getattr(self, name), "positive [px]")
+        if len(self.distortion) != 5:
+            raise ParameterError("PinholeCamera.distortion", self.distortion, "(k1, k2, p1, p2, k3)")
+
+    @property
+    def matrix(self) -> Array:
+        """``K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` [px]."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
+
+    @property
+    def distortion_array(self) -> Array:
+        return np.asarray(self.distortion, dtype=np.float64)
+
+    @property
+    def is_ideal(self) -> bool:
+        """True where straight lines stay straight in the image."""
+        return not any(self.distortion)
+
+    def project(self, points: Array) -> Array:
+        """Pixels ``(*batch, 2)`` of points ``(*batch, 3)`` in the camera frame [m], ``z > 0``."""
+        points = np.asarray(points, dtype=np.float64)
+        x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
+        k1, k2, p1, p2, k3 = self.distortion
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        return np.stack([self.fx * xd + self.cx, self.fy * yd + self.cy], axis=-1)
+
+    def rays(self, pixels: Array) -> Array:
+        """Inverse of :meth:`project`: ``(x/z, y/z)`` of pixels, ``(*batch, 2) -> (*batch, 2)``."""
+        pixels = np.asarray(pixels, dtype=np.float64)
+        ideal = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
+        if self.is_ideal:
+            return ideal
+        cv2 = require("cv2")
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
+        flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2))
+        undistorted = cv2.undistortPoints(flat, self.matrix, self.distortion_array, criteria=criteria)
+        return undistorted.reshape(pixels.shape)
+
+    def save(self, path: str | Path) -> None:
+        """Write the parameters as JSON."""
+        Path(path).write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: str | Path) -> PinholeCamera:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            DescriptionError: the file is no JSON or names other parameters.
+        """
+        try:
+            values = json.loads(Path(path).read_text(encoding="utf-8"))
+            return cls(**{**values, "distortion": tuple(values["distortion"])})
+        except (json.JSONDecodeError, TypeError, KeyError) as error:
+            raise DescriptionError(path, f"no camera parameters: {error}") from error

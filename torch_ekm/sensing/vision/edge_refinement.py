@@ -1,0 +1,196 @@
+"""A board's pose made finer on the edges of its markers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..._extras import require
+from .board import MarkerBoard
+from .board_pose import BoardPose, angle_between, projection_jacobian
+from .camera import PinholeCamera
+
+Array = NDArray[np.float64]
+
+_ITERATIONS = 3
+_REACH = 2.0  # a point of the board that moves farther went to the edge of something else [px]
+_PER_SIDE = 12  # places looked at along each side of a marker
+_CORRELATED = 3.0  # samples along a side share their errors: three count as one
+_STEP = 0.25  # distance of samples across the edge [px]
+
+
+class _Fit(NamedTuple):
+    rotation: Array
+    position: Array
+    covariance: Array
+    residual: Array
+    """Distance of each side point from its edge, infinite where there is none, ``(n,)`` [px]."""
+
+
+def refine_on_edges(
+    image: NDArray[np.uint8],
+    camera: PinholeCamera,
+    board: MarkerBoard,
+    pose: BoardPose,
+    edge_std: float = 0.03,
+    prior: Array | None = None,
+) -> BoardPose:
+    r"""``min_{R, t} sum_i (n_i . (e_i - pi(R X_i + t)))^2``: sides of markers against edges in the image.
+
+    Four corners of a marker rest on a few pixels each, and blur draws detected corners outwards; its
+    four sides rest on a hundred pixels, and a symmetric blur leaves an edge where it is. Across
+    each side the grey level rises from black to white; the area under the profile,
+    ``s = s_max - int (I - I_black) / (I_white - I_black) ds``, gives the edge along the normal
+    ``n_i``. Places that do not look like an edge of the board (a finger before it, glare) are left
+    out, and so are those beyond three robust deviations. Gauss-Newton on the twist, three times.
+
+    Where the corners left a ``mirror`` image, it is refined too and the better of both is taken; the
+    result is ``ambiguous`` if they differ by more than 10 deg and by less than nine units of ``chi^2``,
+    and then ``prior`` decides.
+
+    Args:
+        image: grey levels, ``(height, width)``.
+        camera: the lens.
+        board: the board whose pose is given.
+        pose: a pose from corners, right to about a pixel.
+        edge_std: standard deviation of the place of an edge [px].
+        prior: rotation ``(3, 3)`` of the board that is to be expected.
+
+    Returns:
+        The refined pose with its covariance, or ``pose`` itself where too little of the board's
+        edges can be seen.
+    """
+    starts = [(pose.rotation, pose.position)] + ([pose.mirror] if pose.mirror is not None else [])
+    fits = [_fit(image, camera, board, start, edge_std) for start in starts]
+    found = [fit for fit in fits if fit is not None]
+    if not found:
+        return pose
+    ambiguous = False
+    if len(found) == 2:
+        seen = [fit.residual[np.isfinite(fit.residual)] for fit in found]
+        variance = max(edge_std**2, min(float(np.median(r**2)) * 2.2 for r in seen)) * _CORRELATED
+        costs = [float(np.minimum(fit.residual**2 / variance, 9.0).sum()) for fit in found]
+        found = [found[k] for k in np.argsort(costs)]
+        apart = angle_between(found[0].rotation, found[1].rotation) > np.radians(10)
+        ambiguous = bool(apart and abs(costs[1] - costs[0]) < 9)
+        if ambiguous and prior is not None:
+            found.sort(key=lambda fit: angle_between(fit.rotation, prior))
+    best = found[0]
+    mirror = (found[1].rotation, found[1].position) if ambiguous else None
+    return replace(
+        pose,
+        rotation=best.rotation,
+        position=best.position,
+        covariance=best.covariance,
+        ambiguous=ambiguous,
+        mirror=mirror,
+    )
+
+
+def _fit(
+    image: NDArray, camera: PinholeCamera, board: MarkerBoard, start: tuple[Array, Array], edge_std: float
+) -> _Fit | None:
+    """Gauss-Newton from one start; None where there are too few edges, or those of something else."""
+    X, along = _side_points(board)
+    rotation, position = start
+    half_width = _half_width(camera, board, rotation, position)
+    first = camera.project(X @ rotation.T + position)
+    fit = None
+    for _ in range(_ITERATIONS):
+        J = projection_jacobian(camera, X, rotation, position).reshape(-1, 2, 6)
+        # dpi/dx of the side's direction is the direction of its picture
+        direction = np.einsum("nij,nj->ni", J[:, :, :3], along @ rotation.T)
+        normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        pixel = camera.project(X @ rotation.T + position)
+        offset, valid = _edge_offsets(image, pixel, normal, half_width)
+        if valid.sum() < 4 * _PER_SIDE or np.ptp(pixel[valid], axis=0).min() < 8:
+            return None
+        limit = 3 * max(edge_std, 1.4826 * float(np.median(np.abs(offset[valid]))))
+        used = valid & (np.abs(offset) <= limit)
+        rows = np.einsum("ni,nij->nj", normal[used], J[used])
+        step, *_ = np.linalg.lstsq(rows, offset[used], rcond=None)
+        rotation = require("cv2").Rodrigues(step[3:])[0] @ rotation
+        position = position + step[:3]
+        remaining = offset[used] - rows @ step
+        variance = _variance(remaining, np.flatnonzero(used) // _PER_SIDE, edge_std)
+        covariance = np.asarray(variance * np.linalg.inv(rows.T @ rows))
+        fit = _Fit(rotation, position, covariance, np.where(valid, offset, np.inf))
+    moved = camera.project(X @ rotation.T + position) - first
+    return fit if float(np.abs(moved).max()) < _REACH else None
+
+
+def _variance(residual: Array, side: NDArray[np.int_], edge_std: float) -> float:
+    """Of one sample as if all were independent [px^2].
+
+    They are not: light, blur and the raster shift all edges of a side together. What counts is how the
+    means of sides scatter, ``sum_s n_s m_s^2 / (n_sides - 6)``, and never less than three times the
+    variance of single samples.
+    """
+    count = np.bincount(side)
+    mean = np.bincount(side, residual)[count > 0] / count[count > 0]
+    freedom = len(mean) - 6
+    between = float(count[count > 0] @ mean**2) / freedom if freedom > 1 else 0.0
+    single = float(residual @ residual) / max(len(residual) - 6, 1)
+    return max(_CORRELATED * max(edge_std**2, single), between)
+
+
+def _side_points(board: MarkerBoard) -> tuple[Array, Array]:
+    """Points on all sides and the sides' directions in the board frame, ``(n, 3)`` each.
+
+    In the order of the corners (clockwise seen from before), so that white lies to the left.
+    """
+    start = board.corners.reshape(-1, 3)
+    end = np.roll(board.corners, -1, axis=1).reshape(-1, 3)
+    fraction = np.linspace(0.12, 0.88, _PER_SIDE)[None, :, None]
+    points = start[:, None] * (1 - fraction) + end[:, None] * fraction
+    return points.reshape(-1, 3), np.repeat(end - start, _PER_SIDE, axis=0)
+
+
+def _half_width(camera: PinholeCamera, board: MarkerBoard, rotation: Array, position: Array) -> float:
+    """How far to look across an edge [px]: half of the black rim or of the gap, seen askew.
+
+    Farther out, the blurred bits and neighbours would draw the edge towards themselves. Too narrow a
+    look that ends on the slope is harmless: it is cut off alike on both sides.
+    """
+    cells = 6.0  # of a marker of 4 x 4 bits and its rim; finer dictionaries come out a little narrower
+    cosine = abs(rotation[:, 2] @ position) / np.linalg.norm(position)
+    narrowest = min(board.marker_size / cells, board.gap, board.margin)
+    width = 0.5 * narrowest * camera.fx / position[2] * max(float(cosine), 0.5)
+    return float(np.clip(width, 1.0, 3.0))
+
+
+def _edge_offsets(
+    image: NDArray[np.uint8], pixel: Array, normal: Array, half_width: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Signed distance of the edge from ``pixel`` along ``normal`` [px], and whether there is one."""
+    n_half = max(2, round(half_width / _STEP))
+    s = _STEP * np.arange(-n_half, n_half + 1)
+    where = (pixel[:, None] + s[:, None] * normal[:, None]).astype(np.float32)
+    profile = require("cv2").remap(image, where, None, 1).astype(np.float64)  # 1: bilinear
+    sides = profile.reshape(-1, _PER_SIDE, len(s))
+    # levels: of each side, so that the noise of a pixel does not move the edge
+    left = np.median(sides[:, :, -2:], axis=(1, 2)).repeat(_PER_SIDE)
+    right = np.median(sides[:, :, :2], axis=(1, 2)).repeat(_PER_SIDE)
+    contrast = left - right  # n = (-d_v, d_u)
+    white, black = np.median(left), np.median(right)
+    typical = white - black
+    safe = np.where(np.abs(contrast) > 1, contrast, 1.0)
+    share = (profile - right[:, None]) / safe[:, None]
+    offset = s[-1] - _STEP * (share.sum(axis=1) - 0.5 * (share[:, 0] + share[:, -1]))
+    height, width = image.shape
+    inside = np.all((where > 0) & (where < [width - 1, height - 1]), axis=(1, 2))
+    tolerance = 0.25 * abs(typical)
+    valid = (
+        inside
+        & (np.sign(contrast) == np.sign(typical))
+        & (np.abs(left - white) < tolerance)
+        & (np.abs(right - black) < tolerance)
+        & (np.abs(profile[:, -2:].mean(1) - left) < tolerance)
+        & (np.abs(profile[:, :2].mean(1) - right) < tolerance)
+        & (np.abs(offset) < 0.6 * s[-1])
+    )
+    return offset, valid

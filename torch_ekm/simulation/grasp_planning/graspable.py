@@ -1,0 +1,87 @@
+"""Facts about the shape of hands and objects that a grasp planner needs."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...description import ContactPad, HandDescription, ObjectDescription
+from ...description.shape import Shape
+from ...description.urdf import UrdfModel, read_urdf
+
+Array = NDArray[np.float64]
+
+
+def urdf_of(hand: HandDescription) -> UrdfModel:
+    """The URDF that came with the description, or the file it names."""
+    return hand.urdf if hand.urdf is not None else read_urdf(hand.urdf_path)
+
+
+def chain(hand: HandDescription, link: str) -> list[int]:
+    """Joints that move a link, the nearest first."""
+    urdf = urdf_of(hand)
+    above = {joint.child: joint for joint in urdf.joints}
+    chain = []
+    while link in above:
+        if above[link].name in hand.joint_names:
+            chain.append(hand.joint_names.index(above[link].name))
+        link = above[link].parent
+    return chain
+
+
+def obstacles(hand: HandDescription, pads: tuple[ContactPad, ...]) -> tuple[list[str], Array, Array]:
+    """Balls that stand for the solid parts of the hand, the pads' rounded ends left out.
+
+    Returns the link of each ball, its centre in that link ``(n, 3)`` [m] and its radius ``(n,)`` [m].
+    """
+    urdf = urdf_of(hand)
+    links, centres, radii = [], [], []
+
+    def add(link: str, centre: Array, radius: float) -> None:
+        links.append(link)
+        centres.append(centre)
+        radii.append(radius)
+
+    carrying = {pad.link: pad for pad in pads}
+    for link in urdf.links:
+        if link.name in carrying:
+            add(link.name, np.array(carrying[link.name].start), carrying[link.name].radius)
+            continue
+        for shape in link.collisions:
+            rotation, origin = shape.transform[:3, :3], shape.transform[:3, 3]
+            if shape.kind == "box":
+                half = np.array(shape.size) / 2
+                for corner in np.stack(np.meshgrid(*[np.linspace(-1, 1, 4)] * 3), axis=-1).reshape(-1, 3):
+                    if np.abs(corner).max() == 1:
+                        add(link.name, origin + rotation @ (half * corner), 0.0)
+            elif shape.kind == "sphere":
+                add(link.name, origin, shape.size[0])
+            else:
+                for part in (-0.5, 0.0, 0.5):
+                    add(link.name, origin + part * shape.size[1] * rotation[:, 2], shape.size[0])
+    return links, np.array(centres), np.array(radii)
+
+
+def object_axes(obj: ObjectDescription) -> Array:
+    """Columns: the longest direction across the grasp axis, the grasp axis, and their product."""
+    grasp = obj.grasp_axis / np.linalg.norm(obj.grasp_axis)
+    helper = np.eye(3)[np.argmin(np.abs(grasp))]
+    first = np.cross(helper, grasp)
+    first /= np.linalg.norm(first)
+    extents = {}
+    for axis in (first, np.cross(grasp, first)):
+        reach = [_half_extent(shape, axis) for shape in obj.shapes]
+        extents[max(reach)] = axis
+    long_axis = extents[max(extents)]
+    return np.asarray(np.stack([long_axis, grasp, np.cross(long_axis, grasp)], axis=1), dtype=np.float64)
+
+
+def _half_extent(shape: Shape, axis: Array) -> float:
+    local = np.abs(shape.transform[:3, :3].T @ axis)
+    centre = abs(float(shape.transform[:3, 3] @ axis))
+    if shape.kind == "box":
+        return centre + float(local @ np.array(shape.size)) / 2
+    if shape.kind == "sphere":
+        return centre + shape.size[0]
+    radius, length = shape.size
+    return centre + float(local[2]) * length / 2 + radius

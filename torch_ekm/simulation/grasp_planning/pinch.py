@@ -1,0 +1,119 @@
+"""Plan a pinch by least squares."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..._extras import require
+from ...exceptions import EquilibriumError
+from .pinch_problem import PinchProblem, PinchRequest
+
+Array = NDArray[np.float64]
+
+_FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
+_GOOD_COST = 20.0  # half a sum of squares; the wishes of a good pinch cost about 0.3
+
+
+@dataclass(frozen=True)
+class PinchPlan:
+    """An equilibrium of hand and object, in the hand frame."""
+
+    q: Array
+    position: Array
+    rotation: Array
+    motor: Array
+    """Motor positions that hold it ``(n_a,)`` [rad]."""
+    forces: Array
+    """Force of each finger on the object ``(n_pads, 3)`` [N]."""
+    points: Array
+    """Contact points ``(n_pads, 3)`` [m]."""
+    normals: Array
+    """Outward normals of the object there ``(n_pads, 3)``."""
+    pads: tuple[str, ...]
+    residual: float
+    """Largest violation: gap / 0.1 mm, force / 10 mN, moment / 0.2 mN m, joint torque / 1 mN m."""
+
+
+class PinchPlanner:
+    """``min_x |residuals(x)|^2`` within the joints' ranges, from seeded first guesses.
+
+    Args:
+        problem: the equations and wishes.
+        guesses: how many first guesses are tried before giving up.
+    """
+
+    def __init__(self, problem: PinchProblem, guesses: int = 4) -> None:
+        self.problem, self.guesses = problem, guesses
+
+    def plan(self, request: PinchRequest) -> PinchPlan:
+        """Solve for a pinch.
+
+        Raises:
+            EquilibriumError: no posture was found that holds the object as wanted, across its grasp axis.
+        """
+        least_squares = require("scipy.optimize").least_squares
+        problem = self.problem
+        low, high = problem.bounds()
+        best, violation, cost = np.zeros_like(low), np.inf, np.inf
+        for guess in self._guesses(request):
+            found = least_squares(
+                lambda x: problem.residuals(x[None], request)[0],
+                np.clip(guess, low + 1e-9, high - 1e-9),
+                jac=lambda x: problem.jacobian(x, request),
+                bounds=(low, high),
+                x_scale="jac",
+                max_nfev=150,
+                ftol=1e-9,
+                xtol=1e-9,
+                gtol=1e-9,
+            )
+            worst = float(np.abs(problem.equations(found.x[None], request)[0]).max())
+            if (worst > 1, found.cost) < (violation > 1, cost):
+                best, violation, cost = found.x, worst, found.cost
+            if violation < 0.2 and cost < _GOOD_COST:
+                break
+        if violation > 1.0:
+            raise EquilibriumError(
+                "pinch planner",
+                f"the best posture violates equilibrium by {violation:.2g} times its tolerance",
+                f"the object '{problem.obj.name}' may be too wide, or out of reach, for a force of "
+                f"{request.force} N at along = {request.along} m",
+            )
+        g = problem.geometry(best[None])
+        if np.abs(g.facing).min() < _FACING:
+            raise EquilibriumError(
+                "pinch planner",
+                "the only pinch found holds the object across another axis than its 'grasp_axis'",
+                f"'{problem.obj.name}' may be too wide along {problem.obj.grasp_axis.round(3).tolist()} "
+                "for this hand: name the axis along which it is thin",
+            )
+        return PinchPlan(
+            q=g.q[0],
+            position=g.position[0],
+            rotation=g.rotation[0],
+            motor=problem.motors(g),
+            forces=g.force[0],
+            points=g.point[0],
+            normals=g.normal[0],
+            pads=tuple(pad.name for pad in problem.pads),
+            residual=violation,
+        )
+
+    def _guesses(self, request: PinchRequest) -> Iterator[Array]:
+        """The preferred posture, then seeded variations of it; the object between the fingertips."""
+        generator = np.random.default_rng(0)
+        problem = self.problem
+        low, high = problem.joint_range
+        for trial in range(self.guesses):
+            moving = problem.preferred()
+            if trial:
+                moving = moving + generator.uniform(-0.3, 0.3, size=moving.shape) * (high - low)
+            tips = problem.tips(moving)
+            force = np.outer(np.ones(len(tips)), problem.towards) * request.force
+            force[1:] *= -1.0 / max(1, len(tips) - 1)
+            centre = (tips[0] + tips[1:].mean(axis=0)) / 2
+            yield np.concatenate([moving, centre, np.zeros(3), force.ravel()])

@@ -1,0 +1,299 @@
+"""The equations of a pinch: fingers in equilibrium with an object between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...description import HandDescription, ObjectDescription
+from ...exceptions import UnknownNameError
+from ...kinematics import HandKinematics, LinkPoses
+from ...kinematics.se3 import exp
+from ..mechanism.transmission import Transmission
+from .geometry import scaled, signed_distance
+from .graspable import chain, object_axes, obstacles
+
+Array = NDArray[np.float64]
+
+# Preferred joint angles as parts of their range, last joint first: the thumb bent and the fingers
+# nearly straight, since turning the object towards the fingers' flexion straightens the thumb.
+_THUMB_BENT = (0.65, 0.3, 0.3, 0.5)
+_FINGER_BENT = (0.4, 0.13, 0.12, 0.3)
+
+
+@dataclass(frozen=True)
+class PinchRequest:
+    """What is wanted of a pinch. Lengths [m], angles [rad], in the object frame."""
+
+    gravity: tuple[float, float, float] = (0.0, 0.0, 9.81)
+    """In the hand frame [m/s^2]."""
+    force: float = 5.0
+    """Normal force of the thumb [N]; the fingers share its reaction."""
+    along: float = 0.0
+    """Where on the object's long axis the fingers are centred [m]."""
+    across: float = 0.0
+    """Where on the object's other lateral axis [m]."""
+    tilt: tuple[float, float] = (0.0, 0.0)
+    """Turn of the long axis away from the hand's wanted direction, about the two other axes."""
+
+
+@dataclass(frozen=True)
+class PinchGeometry:
+    """A batch of candidate pinches, in the hand frame; ``b`` candidates, ``c`` contacts."""
+
+    q: Array
+    position: Array
+    rotation: Array
+    force: Array
+    """Of each finger on the object ``(b, c, 3)`` [N]."""
+    gap: Array
+    """Between pad and object ``(b, c)`` [m]."""
+    normal: Array
+    """Outward normals of the object ``(b, c, 3)``."""
+    point: Array
+    """Contact points ``(b, c, 3)`` [m]."""
+    local: Array
+    """Centres of the pads' rounded ends in the object frame ``(b, c, 3)`` [m]."""
+    facing: Array
+    """Component of the normals along the object's grasp axis ``(b, c)``."""
+    pad_axis: Array
+    pad_direction: Array
+    clearance: Array
+    """Between the object and the other parts of the hand ``(b, n)`` [m]."""
+    torque: Array
+    """``J_h^T f``: what springs and actuators must supply ``(b, n_q)`` [N m]."""
+
+
+class PinchProblem:
+    """Residuals over posture, object pose and contact forces, ``x = [q_moving; o; phi; f_1 ...]``::
+
+        distance_i(q, p) = 0                    each pad touches the object
+        G f = -w_gravity                        the object is in balance
+        N^T (K_s (q - q0) + J_h^T f) = 0        so are the joints that no actuator fixes,
+                                                N = null([J_a; C])
+        -n_thumb . f_thumb = wanted force
+
+    with soft wishes: forces well inside the friction cones, pads that meet the object with their
+    rounded ends, joints away from their stops, tendons taut, the object where it is wanted.
+
+    Args:
+        hand, obj: the bodies.
+        transmission: moment arms, springs and stiffness of the plant that will hold the object.
+        thumb, fingers: names of the pads that oppose each other.
+        along: wanted direction of the object's long axis, in the hand frame.
+        mass_factor, com_shift, friction, object_scale: see :class:`PlantParameters`.
+
+    Raises:
+        UnknownNameError: there is no such pad; the message lists all.
+    """
+
+    def __init__(
+        self,
+        hand: HandDescription,
+        obj: ObjectDescription,
+        transmission: Transmission,
+        thumb: str,
+        fingers: tuple[str, ...],
+        along: tuple[float, float, float] = (0.0, 1.0, 0.0),
+        mass_factor: float = 1.0,
+        com_shift: tuple[float, ...] = (0.0, 0.0, 0.0),
+        friction: float = 1.0,
+        object_scale: float = 1.0,
+    ) -> None:
+        by_name = {pad.name: pad for pad in hand.pads}
+        for name in (thumb, *fingers):
+            if name not in by_name:
+                raise UnknownNameError("contact pad", name, by_name)
+        self.hand, self.obj, self.transmission = hand, obj, transmission
+        self.pads = tuple(by_name[name] for name in (thumb, *fingers))
+        self.along = np.array(along, dtype=np.float64)
+        self.kinematics = HandKinematics(hand)
+        self._links = [self.kinematics.link_index(pad.link) for pad in self.pads]
+        self._upstream = self.kinematics.upstream.numpy()[self._links]  # (n_c, n_q)
+        span = hand.joint_upper - hand.joint_lower
+        self.moving = np.flatnonzero(self._upstream.any(axis=0) & (span > 1e-6))
+        self.joint_range = (hand.joint_lower[self.moving], hand.joint_upper[self.moving])
+        self._tip = np.array([pad.end for pad in self.pads])
+        axis = self._tip - np.array([pad.start for pad in self.pads])
+        length = np.linalg.norm(axis, axis=1, keepdims=True)
+        self._axis = np.divide(axis, length, out=np.zeros_like(axis), where=length > 0)
+        self._palmar = np.array([pad.direction for pad in self.pads])
+        self._radius = np.array([pad.radius for pad in self.pads])
+        links, self._ball, self._ball_radius = obstacles(hand, self.pads)
+        self._ball_link = [self.kinematics.link_index(name) for name in links]
+        self._mass = mass_factor * obj.mass
+        self._com = obj.com + np.array(com_shift)
+        self._mu = friction * obj.friction
+        self._shapes = tuple(scaled(shape, object_scale) for shape in obj.shapes)
+        self._prepare_mechanism()
+        self._axes = object_axes(obj)
+        self.towards = self._direction_of_grasp()
+
+    def _prepare_mechanism(self) -> None:
+        hand, J_a = self.hand, self.transmission.J_a
+        C = hand.coupling.reshape(-1, hand.n_q)
+        self._passive = _null_space(np.vstack([J_a, C])[:, self.moving])
+        rest = np.setdiff1d(np.arange(hand.n_q), self.moving)
+        self.follow = np.zeros((hand.n_q, len(self.moving)))  # joints that a coupling drags along
+        self.follow[self.moving] = np.eye(len(self.moving))
+        self.follow[rest] = -np.linalg.pinv(C[:, rest]) @ C[:, self.moving]
+        free = _null_space(C) if len(C) else np.eye(hand.n_q)
+        self._to_tension = np.linalg.pinv((J_a @ free).T) @ free.T
+        tendon = np.array([actuator.tendon for actuator in hand.actuators], dtype=bool)
+        self._pulling = tendon & J_a[:, self.moving].any(axis=1)
+
+    def _unpack(self, x: Array) -> tuple[Array, Array, Array, Array]:
+        n = len(self.moving)
+        q0 = self.transmission.spring_rest
+        q = q0 + (x[:, :n] - q0[self.moving]) @ self.follow.T
+        rotation = exp(torch.from_numpy(x[:, n + 3 : n + 6])).numpy() @ self.nominal_rotation()
+        return q, x[:, n : n + 3], rotation, x[:, n + 6 :].reshape(len(x), -1, 3)
+
+    def nominal_rotation(self) -> Array:
+        """Long axis along the hand's wanted direction, grasp axis from the thumb to the fingers."""
+        frame = np.column_stack([self.along, self.towards, np.cross(self.along, self.towards)])
+        return frame @ self._axes.T
+
+    def _direction_of_grasp(self) -> Array:
+        tips = self.tips(self.preferred())
+        across = tips[1:].mean(axis=0) - tips[0]
+        across -= self.along * (self.along @ across)
+        return across / np.linalg.norm(across)
+
+    def tips(self, moving: Array) -> Array:
+        """Centres of the pads' rounded ends ``(c, 3)`` [m]."""
+        poses = self.kinematics(torch.from_numpy(self.posture(moving))).transforms.numpy()[self._links]
+        return np.einsum("cij,cj->ci", poses[:, :3, :3], self._tip) + poses[:, :3, 3]
+
+    def posture(self, moving: Array) -> Array:
+        """All joints, coupled ones following, others at rest ``(n_q,)`` [rad]."""
+        q0 = self.transmission.spring_rest
+        return q0 + (moving - q0[self.moving]) @ self.follow.T
+
+    def preferred(self) -> Array:
+        """Half-bent fingers: most at the last joint, which the pinch force bends anyway."""
+        low, high = self.joint_range
+        fraction = np.full(self.hand.n_q, 0.4)
+        for pad in self.pads:
+            bent = _THUMB_BENT if pad is self.pads[0] else _FINGER_BENT
+            for place, joint in enumerate(chain(self.hand, pad.link)):
+                fraction[joint] = bent[min(place, 3)]
+        return low + fraction[self.moving] * (high - low)
+
+    def geometry(self, x: Array) -> PinchGeometry:
+        """Forward kinematics and distances of a batch of candidates ``(b, n_x)``."""
+        q, o, R, f = self._unpack(x)
+        poses = self.kinematics(torch.from_numpy(q))
+        links = poses.transforms.numpy()[:, self._links]
+        turn, origin = links[..., :3, :3], links[..., :3, 3]
+        centre = origin + np.einsum("bcij,cj->bci", turn, self._tip)
+        local = np.einsum("bji,bcj->bci", R, centre - o[:, None])
+        distance, normal = signed_distance(self._shapes, local)
+        n = np.einsum("bij,bcj->bci", R, normal)
+        every = poses.transforms.numpy()[:, self._ball_link]
+        ball = every[..., :3, 3] + np.einsum("bcij,cj->bci", every[..., :3, :3], self._ball)
+        clearance, _ = signed_distance(self._shapes, np.einsum("bji,bcj->bci", R, ball - o[:, None]))
+        point = centre - self._radius[:, None] * n
+        return PinchGeometry(
+            q=q,
+            position=o,
+            rotation=R,
+            force=f,
+            gap=distance - self._radius,
+            normal=n,
+            point=point,
+            local=local,
+            facing=normal @ self._axes[:, 1],
+            pad_axis=np.einsum("bcij,cj->bci", turn, self._axis),
+            pad_direction=np.einsum("bcij,cj->bci", turn, self._palmar),
+            clearance=clearance - self._ball_radius,
+            torque=self._contact_torque(poses, f, point),
+        )
+
+    def _contact_torque(self, poses: LinkPoses, f: Array, point: Array) -> Array:
+        """``J_h^T f``, torque that the actuators and springs must supply ``(batch, n_q)`` [N m]."""
+        axes, origins = (part.numpy() for part in self.kinematics.joint_axes(poses))
+        lever = np.cross(axes[:, None], point[:, :, None] - origins[:, None])  # (b, n_c, n_q, 3)
+        return np.einsum("bcqi,bci,cq->bq", lever, f, self._upstream)
+
+    # -- residuals --------------------------------------------------------------------------------------
+
+    def equations(self, x: Array, request: PinchRequest, g: PinchGeometry | None = None) -> Array:
+        """What must vanish, in units of its tolerance."""
+        g = self.geometry(x) if g is None else g
+        weight = self._mass * np.array(request.gravity)
+        force = g.force.sum(axis=1) + weight
+        centre = g.rotation @ self._com
+        moment = np.cross(g.point - g.position[:, None], g.force).sum(axis=1) + np.cross(centre, weight)
+        spring = self.transmission.spring_stiffness * (g.q - self.transmission.spring_rest)
+        passive = (spring + g.torque)[:, self.moving] @ self._passive
+        press = -np.einsum("bi,bi->b", g.force[:, 0], g.normal[:, 0]) - request.force
+        return np.concatenate(
+            [g.gap / 1e-4, force / 0.01, moment / 2e-4, passive / 1e-3, press[:, None] / 0.1], axis=1
+        )
+
+    def residuals(self, x: Array, request: PinchRequest) -> Array:
+        """Equations and wishes ``(b, n_r)``, to be squared and summed."""
+        g = self.geometry(x)
+        f_n = -np.einsum("bci,bci->bc", g.force, g.normal)
+        f_t = np.linalg.norm(g.force + f_n[..., None] * g.normal, axis=-1)
+        cone = np.maximum(0.0, f_t - 0.4 * self._mu * f_n) / 0.05
+        share = (f_n[:, 1:] - f_n[:, :1] / max(1, len(self.pads) - 1)) / 1.0
+        cap = np.maximum(0.0, 0.3 + np.einsum("bci,bci->bc", g.normal, g.pad_axis)) / 0.1
+        pad = np.maximum(0.0, 0.3 + np.einsum("bci,bci->bc", g.normal, g.pad_direction)) / 0.1
+        along, across = g.local @ self._axes[:, 0], g.local @ self._axes[:, 2]
+        place = [
+            (along[:, 0] - request.along) / 2e-3,
+            (along[:, 1:].mean(axis=1) - request.along) / 2e-3,
+            (across[:, 0] - request.across) / 2e-3,
+            (across[:, 1:].mean(axis=1) - request.across) / 2e-3,
+        ]
+        long_axis = g.rotation @ self._axes[:, 0]
+        wish = self._tilted(request)
+        tilt = (long_axis - wish) / 0.1
+        facing = np.concatenate([-g.facing[:, :1], g.facing[:, 1:]], axis=1)
+        opposed = np.maximum(0.0, 0.98 - facing) / 0.05
+        clear = np.maximum(0.0, 0.002 - g.clearance) / 1e-3
+        posture = (x[:, : len(self.moving)] - self.preferred()) / 0.3
+        taut = np.maximum(0.0, 0.02 - self.tension(g)[:, self._pulling]) / 0.01
+        hard = 3 * self.equations(x, request, g)
+        wishes = [cone, share, cap, pad, np.stack(place, axis=1), tilt, opposed, clear, posture, taut]
+        return np.concatenate([hard, *wishes], axis=1)
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest ``x``; joints keep off their stops."""
+        low, high = self.joint_range
+        margin = np.minimum(0.07, 0.2 * (high - low))
+        rest = np.concatenate([np.full(3, 0.3), np.full(3, 1.5), np.full(3 * len(self.pads), 50.0)])
+        return np.concatenate([low + margin, -rest]), np.concatenate([high - margin, rest])
+
+    def motors(self, g: PinchGeometry) -> Array:
+        """Motor positions that hold the first candidate ``(n_a,)`` [rad]; idle ones rest."""
+        T = self.transmission
+        in_use = (T.J_a @ self.follow).any(axis=1)
+        stretch = np.where(in_use, self.tension(g)[0] / T.stiffness, 0.0)
+        return T.offset + T.J_a @ g.q[0] + stretch
+
+    def tension(self, g: PinchGeometry) -> Array:
+        """Torque of each actuator along ``+a`` that balances the joints, ``(batch, n_a)`` [N m]."""
+        spring = self.transmission.spring_stiffness * (g.q - self.transmission.spring_rest)
+        return (spring + g.torque) @ self._to_tension.T
+
+    def _tilted(self, request: PinchRequest) -> Array:
+        third = np.cross(self.along, self.towards)
+        wish = self.along + request.tilt[0] * third + request.tilt[1] * self.towards
+        return wish / np.linalg.norm(wish)
+
+    def jacobian(self, x: Array, request: PinchRequest, step: float = 1e-6) -> Array:
+        """Central differences, all columns in one batch."""
+        shift = step * np.eye(len(x))
+        values = self.residuals(np.concatenate([x + shift, x - shift]), request)
+        return ((values[: len(x)] - values[len(x) :]) / (2 * step)).T
+
+
+def _null_space(matrix: Array, tolerance: float = 1e-9) -> Array:
+    _, singular, vt = np.linalg.svd(matrix)
+    return np.asarray(vt[int((singular > tolerance).sum()) :].T, dtype=np.float64)

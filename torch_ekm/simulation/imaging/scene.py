@@ -1,0 +1,163 @@
+"""What stands before the camera: cards with markers, and bodies that hide them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..._extras import require
+from ...description import Shape
+from ...exceptions import ShapeError
+from ...sensing.vision.camera import PinholeCamera
+
+Array = NDArray[np.float64]
+
+
+class Card(Protocol):
+    """Anything printed on a plane: a marker board, a calibration target."""
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height [m]."""
+        ...
+
+    def texture(self, texel: float = ...) -> NDArray[np.uint8]:
+        """What is printed, upper left first."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexBody:
+    """The convex hull of ``n`` balls: a capsule is two, a box eight of radius 0.
+
+    Raises:
+        ShapeError: ``centres`` is not ``(n, 3)`` or ``radii`` not ``(n,)``.
+    """
+
+    centres: Array
+    """``(n, 3)`` [m]"""
+    radii: Array
+    """``(n,)`` [m]"""
+    shade: int = 90
+    """Grey level, 0 black to 255 white."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "centres", np.array(self.centres, dtype=np.float64))
+        object.__setattr__(self, "radii", np.array(self.radii, dtype=np.float64))
+        if self.centres.ndim != 2 or self.centres.shape[1] != 3:
+            raise ShapeError("ConvexBody.centres", "(n, 3)", self.centres.shape)
+        if self.radii.shape != self.centres.shape[:1]:
+            raise ShapeError("ConvexBody.radii", f"({len(self.centres)},)", self.radii.shape)
+
+    @classmethod
+    def capsule(cls, start: Array, end: Array, radius: float, shade: int = 90) -> ConvexBody:
+        return cls(np.stack([start, end]), np.full(2, radius), shade)
+
+    @classmethod
+    def box(cls, size: tuple[float, float, float], shade: int = 140) -> ConvexBody:
+        """A box about the origin with edges ``size`` [m]."""
+        signs = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5]), axis=-1).reshape(-1, 3)
+        return cls(signs * np.asarray(size), np.zeros(8), shade)
+
+    @classmethod
+    def cylinder(cls, radius: float, length: float, shade: int = 140, sides: int = 32) -> ConvexBody:
+        """A cylinder along z about the origin."""
+        angle = 2 * np.pi * np.arange(sides) / sides
+        ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        ends = [np.c_[ring, np.full(sides, z)] for z in (-length / 2, length / 2)]
+        return cls(np.concatenate(ends), np.zeros(2 * sides), shade)
+
+    @classmethod
+    def of_shape(cls, shape: Shape, shade: int = 90) -> ConvexBody:
+        """A primitive of a hand's or object's description, in the frame of its link or object."""
+        if shape.kind == "box":
+            body = cls.box(tuple(shape.size), shade)  # type: ignore[arg-type]
+        elif shape.kind == "cylinder":
+            body = cls.cylinder(*shape.size, shade)  # type: ignore[arg-type]
+        else:
+            half = shape.size[1] / 2 if shape.kind == "capsule" else 0.0
+            end = np.array([0, 0, half])
+            body = cls.capsule(-end, end, shape.size[0], shade)
+        return body.moved(shape.transform)
+
+    def moved(self, transform: Array) -> ConvexBody:
+        """The body seen from another frame: ``x -> R x + t``."""
+        return ConvexBody(self.centres @ transform[:3, :3].T + transform[:3, 3], self.radii, self.shade)
+
+    def outline(self, camera: PinholeCamera, per_ball: int = 24) -> Array | None:
+        """Convex outline in the image, ``(m, 2)`` [px]; None where the body is not before the camera.
+
+        A ball of centre c and radius r shows its circle about ``c (1 - r^2/d^2)`` of radius
+        ``r sqrt(1 - r^2/d^2)``, normal to c, with ``d = |c|``; and the picture of a convex hull
+        is the convex hull of the pictures.
+        """
+        distance = np.linalg.norm(self.centres, axis=1)
+        if np.any(self.centres[:, 2] - self.radii <= 1e-3):
+            return None
+        points = self.centres[:, None, :]
+        if np.any(self.radii > 0):
+            shrink = 1 - (self.radii / distance) ** 2
+            axis = self.centres / distance[:, None]
+            first = np.cross(axis, np.where(np.abs(axis[:, :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0]))
+            first /= np.linalg.norm(first, axis=1, keepdims=True)
+            second = np.cross(axis, first)
+            angle = 2 * np.pi * np.arange(per_ball) / per_ball
+            circle = np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
+            radius = self.radii * np.sqrt(shrink) / np.cos(np.pi / per_ball)  # the polygon circumscribes
+            points = self.centres[:, None] * shrink[:, None, None] + radius[:, None, None] * circle
+        return _convex_hull(camera.project(points.reshape(-1, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedCard:
+    """A card and its pose in the camera frame, ``(4, 4)``."""
+
+    card: Card
+    pose: Array
+
+    @property
+    def faces_camera(self) -> bool:
+        """True where its printed side can be seen: ``n . c < 0``."""
+        return bool(self.pose[:3, 2] @ self.pose[:3, 3] < 0)
+
+    @property
+    def outline(self) -> Array:
+        """The four corners in the camera frame, ``(4, 3)`` [m], upper left first, clockwise."""
+        w, h = self.card.size
+        flat = np.array([[-w, h, 0], [w, h, 0], [w, -h, 0], [-w, -h, 0]]) / 2
+        return flat @ self.pose[:3, :3].T + self.pose[:3, 3]
+
+    def hidden_by(self, body: ConvexBody) -> bool:
+        """True where the body lies on the camera's side of the card's plane.
+
+        Bodies do not cut through cards; of one that crosses the plane beside the card, the part next to
+        the card decides.
+        """
+        normal, origin = self.pose[:3, 2], self.pose[:3, 3]
+        nearest = body.centres[np.argmin(np.linalg.norm(body.centres - origin, axis=1))]
+        return bool((nearest - origin) @ normal * (-origin @ normal) > 0)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Cards and bodies in the camera frame."""
+
+    cards: tuple[PlacedCard, ...] = ()
+    bodies: tuple[ConvexBody, ...] = ()
+
+    def obstructed(self, card: int, shade: int = 70) -> Scene:
+        """The scene with a ball half way between the camera and a card, which hides all of it."""
+        outline = self.cards[card].outline / 2
+        centre = outline.mean(axis=0)
+        radius = 1.2 * np.linalg.norm(outline - centre, axis=1).max()
+        return replace(self, bodies=(*self.bodies, ConvexBody(centre[None], np.array([radius]), shade)))
+
+
+def _convex_hull(points: Array) -> Array:
+    """Corners of the convex hull of points ``(n, 2)`` [px], counter-clockwise for u to the right, v up."""
+    # found in float32, good to 1e-4 px in a picture of 640 px; returned as they were
+    corners = require("cv2").convexHull(points.astype(np.float32), returnPoints=False)
+    return points[corners.ravel()]

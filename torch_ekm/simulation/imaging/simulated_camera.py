@@ -1,0 +1,167 @@
+"""The picture that a camera would take of cards and fingers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..._extras import require
+from ...exceptions import ParameterError
+from ...sensing.vision.camera import PinholeCamera
+from .scene import Card, ConvexBody, PlacedCard, Scene
+
+_SHIFT = 4  # fractional bits of OpenCV's polygon coordinates
+
+
+@dataclass(frozen=True)
+class ImageQuality:
+    """What spoils a picture; the defaults are the nominal ones.
+
+    Raises:
+        ParameterError: a value is out of range.
+    """
+
+    blur: float = 0.7
+    """Standard deviation of lens and focus blur [px]."""
+    noise: float = 3.0
+    """Standard deviation of the noise of each pixel [grey levels of 255]."""
+    black: float = 30.0
+    """Grey level of black print in full light."""
+    white: float = 220.0
+    """Grey level of white paper in full light."""
+    background: float = 110.0
+    vignette: float = 0.15
+    """Loss of light at the corners of the image, as a fraction."""
+
+    def __post_init__(self) -> None:
+        for name in ("blur", "noise"):
+            if not getattr(self, name) >= 0:
+                raise ParameterError(f"ImageQuality.{name}", getattr(self, name), "zero or positive")
+        if not 0 <= self.black < self.white <= 255:
+            raise ParameterError("ImageQuality.black", self.black, "below white, both within 0..255")
+
+
+class SimulatedCamera:
+    """Draws cards by their homography ``x ~ K [r1 r2 t] X``, then bodies, blur and noise.
+
+    Cards are sampled ``supersample^2`` times in each pixel and hidden by the bodies before them and
+    by nearer cards; the scene knows the true poses, the picture is all that a tracker gets.
+
+    Args:
+        camera: the lens.
+        quality: blur, noise, light.
+        supersample: samples per pixel and direction.
+    """
+
+    def __init__(
+        self,
+        camera: PinholeCamera | None = None,
+        quality: ImageQuality | None = None,
+        supersample: int = 4,
+    ) -> None:
+        if supersample < 1:
+            raise ParameterError("supersample", supersample, "a positive integer")
+        self.camera = camera or PinholeCamera()
+        self.quality = quality or ImageQuality()
+        self.supersample = supersample
+        self._textures: dict[int, tuple[Card, NDArray[np.uint8]]] = {}
+        v, u = np.mgrid[: self.camera.height, : self.camera.width].astype(np.float32)
+        self._rays = None
+        if not self.camera.is_ideal:
+            self._rays = self.camera.rays(np.stack([u, v], axis=-1)).astype(np.float32)
+        radius2 = (u - self.camera.cx) ** 2 + (v - self.camera.cy) ** 2
+        self._light = 1 - self.quality.vignette * radius2 / radius2.max()
+
+    def render(self, scene: Scene, generator: np.random.Generator) -> NDArray[np.uint8]:
+        """Picture ``(height, width)`` of the scene; the generator draws its noise."""
+        cv2 = require("cv2")
+        quality, shape = self.quality, (self.camera.height, self.camera.width)
+        drawn = np.full(shape, quality.background, dtype=np.uint8)
+        # an outline is needed up to three times: for its body, and for each card that it may hide
+        bodies = [(body, body.outline(self.camera)) for body in scene.bodies]
+        for body, outline in sorted(bodies, key=lambda item: -item[0].centres[:, 2].mean()):
+            if outline is not None:
+                fixed = np.rint(outline * 2**_SHIFT).astype(np.int32)
+                cv2.fillConvexPoly(drawn, fixed, body.shade, cv2.LINE_AA, _SHIFT)
+        image = drawn.astype(np.float32)
+        for card in sorted(scene.cards, key=lambda c: -c.pose[2, 3]):
+            self._draw_card(image, card, bodies)
+        image *= self._light
+        if quality.blur > 0:
+            image = cv2.GaussianBlur(image, (0, 0), quality.blur)
+        if quality.noise > 0:
+            image += quality.noise * generator.standard_normal(shape, dtype=np.float32)
+        return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+    def _draw_card(
+        self, image: NDArray, placed: PlacedCard, bodies: list[tuple[ConvexBody, NDArray | None]]
+    ) -> None:
+        cv2, s = require("cv2"), self.supersample
+        outline = placed.outline
+        if np.any(outline[:, 2] < 1e-3):
+            return
+        corners = self.camera.project(outline)
+        if not np.all(np.abs(corners) < 1e5):
+            return
+        u0, v0 = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 2, 0)
+        u1, v1 = np.minimum(np.ceil(corners.max(axis=0)).astype(int) + 3, image.shape[::-1])
+        if u0 >= u1 or v0 >= v1:
+            return
+        u0, v0, u1, v1 = int(u0), int(v0), int(u1), int(v1)  # numpy's would make the samples float64
+        x, y = self._sample_rays(u0, v0, u1, v1)
+        # plane of the card: (x, y, 1) ~ [r1 r2 t] (X, Y, 1)
+        to_card = np.linalg.inv(placed.pose[:3, [0, 1, 3]]).astype(np.float32)
+        X, Y, W = (row[0] * x + row[1] * y + row[2] for row in to_card)
+        X, Y = X / W, Y / W
+        width, height = placed.card.size
+        inside = (np.abs(X) <= width / 2) & (np.abs(Y) <= height / 2)
+        visible = inside.astype(np.float32)
+        for body, polygon in bodies:
+            if polygon is not None and placed.hidden_by(body):
+                fine = (polygon - [u0, v0] + 0.5) * s - 0.5  # centres of pixels and of samples
+                cv2.fillConvexPoly(
+                    visible, np.rint(fine * 2**_SHIFT).astype(np.int32), 0.0, cv2.LINE_8, _SHIFT
+                )
+        quality = self.quality
+        cosine = abs(placed.pose[:3, 2] @ placed.pose[:3, 3]) / np.linalg.norm(placed.pose[:3, 3])
+        light = 0.7 + 0.3 * cosine
+        if placed.faces_camera:
+            texture = self._texture(placed.card)
+            n_y, n_x = texture.shape
+            tx = (X / width + 0.5) * n_x - 0.5
+            ty = (0.5 - Y / height) * n_y - 0.5
+            print_ = cv2.remap(texture, tx, ty, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            value = quality.black + (quality.white - quality.black) / 255 * print_
+        else:
+            value = np.full_like(visible, 0.6 * quality.white)  # the bare back
+        size = (u1 - u0, v1 - v0)
+        alpha = cv2.resize(visible, size, interpolation=cv2.INTER_AREA)
+        colour = cv2.resize(value * (light * visible), size, interpolation=cv2.INTER_AREA)
+        patch = image[v0:v1, u0:u1]
+        patch *= 1 - alpha
+        patch += colour
+
+    def _sample_rays(self, u0: int, v0: int, u1: int, v1: int) -> tuple[NDArray, NDArray]:
+        """``x/z, y/z`` of the samples of a window, float32."""
+        cv2, s, camera = require("cv2"), self.supersample, self.camera
+        n_u, n_v = (u1 - u0) * s, (v1 - v0) * s
+        if self._rays is None:
+            u = u0 - 0.5 + (np.arange(n_u, dtype=np.float32) + 0.5) / s
+            v = v0 - 0.5 + (np.arange(n_v, dtype=np.float32) + 0.5) / s
+            return (u[None, :] - camera.cx) / camera.fx, (v[:, None] - camera.cy) / camera.fy
+        # distortion is smooth: linear in between pixels; one more pixel keeps the rim of the window exact
+        a, b = max(u0 - 1, 0), max(v0 - 1, 0)
+        crop = self._rays[b : v1 + 1, a : u1 + 1]
+        fine = cv2.resize(crop, (crop.shape[1] * s, crop.shape[0] * s), interpolation=cv2.INTER_LINEAR)
+        fine = fine[(v0 - b) * s :, (u0 - a) * s :][:n_v, :n_u]
+        return np.ascontiguousarray(fine[..., 0]), np.ascontiguousarray(fine[..., 1])
+
+    def _texture(self, card: Card) -> NDArray[np.uint8]:
+        known = self._textures.get(id(card))
+        if known is None or known[0] is not card:  # the card is kept, so that its id is not given again
+            if len(self._textures) >= 16:
+                self._textures.clear()
+            known = self._textures[id(card)] = (card, card.texture())
+        return known[1]

@@ -1,0 +1,187 @@
+"""Tendons, couplings, springs and joint friction as one implicit drive per joint."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...description.hand import HandDescription
+from ...exceptions import ParameterError
+
+Array = NDArray[np.float64]
+
+
+class TransmissionState(NamedTuple):
+    """All that a :class:`Transmission` remembers between steps."""
+
+    anchor: Array
+    offset: Array
+
+
+class Transmission:
+    """The torque on the joints of a hand whose motors stand at ``m``::
+
+        tau = -K_s (q - q0) + J_a^T k_a (m - a0 - J_a q) - C^T k_c C q - tau_f
+
+    A rigid coupling (index, ring and little spread alike) is a spring ``k_c`` from the joints that follow
+    to those that lead, and the actuators act on the joints that lead alone: ``J_a`` above stands for
+    ``J_a S`` with ``S q`` the posture whose followers obey the couplings. So a coupled joint that leads
+    is as stiff as if the coupling were rigid, whatever ``k_c`` is.
+
+    PhysX integrates a joint drive implicitly and an external torque explicitly, which is unstable
+    for tendons as stiff as these. So each joint gets one drive, whose stiffness is the diagonal of
+    the matrix above, and whose target is recomputed at every step from the other joints of its
+    tendon: the equilibrium is the exact one, and only the off-diagonal part acts one step late.
+
+    ``tau_f`` is Coulomb friction with presliding (Dahl 1968): a bristle of stiffness ``k_f`` from the
+    joint to an anchor that slips when the bristle carries the friction torque. It belongs to the
+    same drive. PhysX's own joint friction is a fraction of the momentum, not a torque: not used.
+
+    Args:
+        hand: joints, springs, couplings.
+        actuation_jacobian: J_a of **this** plant ``(n_a, n_q)``; the model's may be another.
+        stiffness: k_a, tendon and servo in series ``(n_a,)`` [N m/rad].
+        spring_stiffness: diagonal of K_s ``(n_q,)`` [N m/rad].
+        friction: Coulomb torque of each joint ``(n_q,)`` [N m].
+        coupling_stiffness: k_c of the rigid couplings [N m/rad].
+        bristle_stiffness: k_f [N m/rad].
+        creep: how fast a loaded tendon lengthens for good [rad/(N m s)].
+    """
+
+    def __init__(
+        self,
+        hand: HandDescription,
+        actuation_jacobian: Array,
+        stiffness: Array,
+        spring_stiffness: Array,
+        friction: Array,
+        coupling_stiffness: float = 8.0,
+        bristle_stiffness: float = 3.0,
+        creep: float = 0.0,
+    ) -> None:
+        for name, value in (("stiffness", stiffness), ("spring_stiffness", spring_stiffness)):
+            if not np.all(np.isfinite(value)) or np.any(value < 0):
+                raise ParameterError(name, value, "finite and not negative in every entry [N m/rad]")
+        self.n_a, self.n_q = hand.n_a, hand.n_q
+        self.J_a = np.array(actuation_jacobian, dtype=np.float64)
+        self.offset = hand.actuator_offset.copy()
+        """a0, which grows as a tendon lengthens ``(n_a,)`` [rad]."""
+        self.creep = creep
+        coupling = hand.coupling.reshape(-1, hand.n_q)
+        S = coupled_posture(coupling)
+        away = np.eye(hand.n_q) - S  # how far each follower is from where it should be
+        self._lead = self.J_a @ S
+        self._M = np.vstack([self._lead, away[np.abs(away).max(axis=1) > 0]])
+        self._k = np.concatenate([stiffness, np.full(len(coupling), coupling_stiffness)])
+        self._pulls_only = np.concatenate(
+            [[actuator.tendon for actuator in hand.actuators], np.zeros(len(coupling), bool)]
+        ).astype(bool)
+        self._any_tendon = bool(self._pulls_only.any())
+        self.spring_stiffness = np.array(spring_stiffness, dtype=np.float64)
+        self.spring_rest = np.array(hand.spring_rest, dtype=np.float64)
+        self.friction = np.array(friction, dtype=np.float64)
+        self._k_f = np.where(self.friction > 0, bristle_stiffness, 0.0)
+        self._reach = np.divide(
+            self.friction, self._k_f, out=np.zeros_like(self.friction), where=self._k_f > 0
+        )
+        self._anchor = self.spring_rest.copy()
+        self._spring_torque = self.spring_stiffness * self.spring_rest
+        self.drive_stiffness = self.spring_stiffness + self._k @ (self._M**2) + self._k_f
+        """Stiffness of each joint's drive ``(n_q,)`` [N m/rad], while all tendons are taut."""
+
+    @property
+    def stiffness(self) -> Array:
+        """k_a of each actuator [N m/rad]."""
+        return self._k[: self.n_a]
+
+    def relax(self, q: Array) -> None:
+        """Put the friction's anchors at ``q``: no friction torque now."""
+        self._anchor = np.array(q, dtype=np.float64)
+
+    def stretch(self, q: Array, motor: Array) -> Array:
+        """``m - a0 - J_a q``: elastic stretch of each transmission [rad]; negative: a tendon is slack."""
+        return motor - self.offset - self._lead @ q
+
+    def actuator_torque(self, q: Array, motor: Array) -> Array:
+        """``-lam``: torque of each actuator along ``+a`` [N m]; never negative for a tendon."""
+        torque = self.stiffness * self.stretch(q, motor)
+        return np.where(self._pulls_only[: self.n_a], np.maximum(torque, 0.0), torque)
+
+    def drive_targets(self, q: Array, motor: Array) -> Array:
+        """Targets that make the drives give the torque above at ``q`` ``(n_q,)`` [rad].
+
+        A slack tendon takes its stiffness with it: the target then undoes the drive's share.
+        """
+        slip = q - self._anchor
+        np.clip(slip, -self._reach, self._reach, out=slip)
+        self._anchor = q - slip  # the anchor follows where the bristle would carry more than friction
+        stretch = np.concatenate([motor - self.offset, np.zeros(len(self._k) - self.n_a)]) - self._M @ q
+        force = self._k * stretch
+        if self._any_tendon:
+            force[self._pulls_only & (force < 0)] = 0.0
+        torque = self._spring_torque - self.spring_stiffness * q + force @ self._M - self._k_f * slip
+        return q + torque / self.drive_stiffness
+
+    def equilibrium(self, motor: Array, external: Array | None = None) -> Array:
+        """Frictionless free posture ``K q = K_s q0 + J_a^T k_a (m - a0) + tau_ext`` ``(n_q,)`` [rad].
+
+        Slack tendons are found by repetition; joint stops are not part of it.
+        """
+        load = self._spring_torque + (0.0 if external is None else external)
+        taut = np.ones(len(self._k), bool)
+        aim = np.concatenate([motor - self.offset, np.zeros(len(self._k) - self.n_a)])
+        q = np.zeros(self.n_q)
+        for _ in range(1 + int(self._pulls_only.sum())):
+            k = self._k * taut
+            K = np.diag(self.spring_stiffness) + self._M.T @ (k[:, None] * self._M)
+            q = np.linalg.solve(K, load + self._M.T @ (k * aim))
+            slack = self._pulls_only & (aim - self._M @ q < 0)
+            if np.array_equal(~slack, taut):
+                break
+            taut = ~slack
+        return q.astype(np.float64)
+
+    def lengthen(self, amount: float) -> None:
+        """Make every tendon longer for good [rad at the actuator]; looped cables keep their length."""
+        self.offset = self.offset + amount * self._pulls_only[: self.n_a]
+
+    def age(self, q: Array, motor: Array, duration: float) -> None:
+        """Creep: ``da0/dt = creep * torque`` for every tendon."""
+        if self.creep > 0:
+            torque = self.actuator_torque(q, motor)
+            self.offset = self.offset + self.creep * duration * torque * self._pulls_only[: self.n_a]
+
+    def take_over(self, other: Transmission, q: Array, motor: Array) -> None:
+        """Go on from another transmission without a jolt: each actuator turns its joints as hard as
+        before, ``J^T k s = J_o^T k_o s_o``, which says how much the new tendon is stretched."""
+        along = np.einsum("aq,aq->a", self._lead, other._lead) / np.einsum("aq,aq->a", self._lead, self._lead)
+        stretch = other.stretch(q, motor) * along * other.stiffness / self.stiffness
+        self.offset = motor - self._lead @ q - stretch
+        self._anchor = other._anchor.copy()
+
+    def snapshot(self) -> TransmissionState:
+        return TransmissionState(self._anchor.copy(), self.offset.copy())
+
+    def restore(self, state: TransmissionState) -> None:
+        self._anchor, self.offset = state.anchor.copy(), state.offset.copy()
+
+
+def coupled_posture(coupling: Array) -> Array:
+    """``S`` with ``C S = 0``: the last joint of each coupling follows, the others lead ``(n_q, n_q)``."""
+    n_k, n_q = coupling.shape
+    rows = np.array(coupling, dtype=np.float64)
+    posture = np.eye(n_q)
+    following: list[tuple[int, int]] = []
+    for k in range(n_k):
+        joint = int(np.flatnonzero(np.abs(rows[k]) > 1e-12)[-1])
+        rows[k] /= rows[k, joint]
+        for other in range(n_k):
+            if other != k:
+                rows[other] -= rows[other, joint] * rows[k]
+        following.append((k, joint))
+    for k, joint in following:
+        posture[joint] = -rows[k]
+        posture[joint, joint] = 0.0
+    return posture

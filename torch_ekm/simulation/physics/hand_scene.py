@@ -1,0 +1,180 @@
+"""A fixed hand and one free object in a SAPIEN scene."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...description import HandDescription, ObjectDescription
+from ...exceptions import ParameterError
+from .bodies import build_hand, build_object, set_inertia
+from .engine import new_scene, sapien
+
+Array = NDArray[np.float64]
+
+_JOINT_DAMPING = 5e-3  # [N m s/rad]; the softest freedom (springs alone) settles in 0.1 s
+_TORQUE_LIMIT = 100.0  # [N m]; a limit that never acts
+
+
+class Touch(NamedTuple):
+    """What one link does to the object at one instant, in the hand frame."""
+
+    force: Array
+    """Sum of the normal forces on the object ``(3,)`` [N]."""
+    normal: float
+    """Sum of their sizes [N]."""
+    point: Array
+    """Their centre ``(3,)`` [m]."""
+
+
+class HandScene:
+    """Bodies, time and contacts: physics only, nothing of transmissions, servos or sensors.
+
+    Args:
+        hand: the hand; its URDF gives links, inertias and shapes. Hand frame = world frame.
+        obj: the object.
+        gravity: in the hand frame [m/s^2].
+        time_step: [s].
+        object_scale: factor on the object's shapes.
+    """
+
+    def __init__(
+        self,
+        hand: HandDescription,
+        obj: ObjectDescription,
+        gravity: tuple[float, float, float],
+        time_step: float = 1e-3,
+        object_scale: float = 1.0,
+    ) -> None:
+        self.obj, self.time_step = obj, time_step
+        self._scene: Any = new_scene(gravity, time_step)
+        self._system: Any = self._scene.physx_system
+        self._material = sapien().physx.PhysxMaterial(obj.friction, obj.friction, 0.0)
+        self._hand = build_hand(self._scene, hand, self._material)
+        self._object = build_object(self._scene, obj, self._material, object_scale)
+        self.set_object()
+        if hand.planar_normal is not None:
+            self._keep_in_plane(np.array(hand.planar_normal))
+        self._back = np.argsort(self._hand.order)
+
+    def _keep_in_plane(self, normal: Array) -> None:
+        """A planar hand's object neither leaves the plane nor tilts out of it.
+
+        Raises:
+            ParameterError: the normal is not an axis of the hand frame, as PhysX's locks need.
+        """
+        across = np.abs(normal) / np.linalg.norm(normal) > 1 - 1e-9
+        if not across.any():
+            raise ParameterError(
+                "planar_normal", tuple(normal), "x, y or z of the hand frame, to be simulated"
+            )
+        self._object.set_locked_motion_axes([*across.tolist(), *(~across).tolist()])
+
+    # -- properties that may change in mid-run ----------------------------------------------------
+
+    def set_object(self, mass: float = 1.0, com_shift: tuple[float, ...] = (0.0, 0.0, 0.0)) -> None:
+        """The object's mass by a factor, its centre of mass by a shift in the object frame [m]."""
+        obj = self.obj
+        set_inertia(self._object, mass * obj.mass, obj.com + np.array(com_shift), mass * obj.inertia)
+
+    def set_friction(self, coefficient: float) -> None:
+        self._material.static_friction = self._material.dynamic_friction = coefficient
+
+    def set_link_weight(self, pulls: bool) -> None:
+        """Whether gravity pulls at the links too; without, only at the object."""
+        for link in self._hand.link_of:
+            link.disable_gravity = not pulls
+
+    def set_drive_stiffness(self, stiffness: Array) -> None:
+        for joint, value in zip(self._hand.joints, stiffness, strict=True):
+            joint.set_drive_properties(float(value), _JOINT_DAMPING, _TORQUE_LIMIT, "force")
+
+    # -- state --------------------------------------------------------------------------------------
+
+    @property
+    def q(self) -> Array:
+        """Joint angles in the hand's order ``(n_q,)`` [rad]."""
+        return self._hand.articulation.qpos.astype(np.float64)[self._hand.order]
+
+    @q.setter
+    def q(self, value: Array) -> None:
+        self._hand.articulation.qpos = value[self._back].astype(np.float32)
+        self._hand.articulation.qvel = np.zeros(len(value), dtype=np.float32)
+
+    @property
+    def object_pose(self) -> tuple[Array, Array]:
+        """The object frame in the hand frame: ``(3,)`` [m] and ``(3, 3)``, orthogonal to float64."""
+        matrix = self._object.entity_pose.to_transformation_matrix().astype(np.float64)
+        u, _, vt = np.linalg.svd(matrix[:3, :3])  # it came in float32
+        return matrix[:3, 3], u @ vt
+
+    @object_pose.setter
+    def object_pose(self, pose: tuple[Array, Array]) -> None:
+        matrix = np.eye(4)
+        matrix[:3, 3], matrix[:3, :3] = pose
+        self._object.entity_pose = sapien().Pose(matrix)
+
+    @property
+    def object_speed(self) -> tuple[float, float]:
+        """Of the object: [m/s] and [rad/s]."""
+        linear, angular = self._object.linear_velocity, self._object.angular_velocity
+        return float(np.linalg.norm(linear)), float(np.linalg.norm(angular))
+
+    def hold_object(self, held: bool) -> None:
+        """Fix the object where it is, or let it go at rest."""
+        if self._object.kinematic and not held:
+            self._object.kinematic = False
+            self._object.linear_velocity = self._object.angular_velocity = np.zeros(3, np.float32)
+        elif held:
+            self._object.kinematic = True
+
+    # -- time ---------------------------------------------------------------------------------------
+
+    def step(self, drive_targets: Array) -> None:
+        """One time step with the joints' drives aimed at the targets ``(n_q,)`` [rad]."""
+        for joint, target in zip(self._hand.joints, drive_targets.tolist(), strict=True):
+            joint.set_drive_target(target)
+        self._system.step()
+
+    def push(self, force: Array, torque: Array) -> None:
+        """Push the object during the next step: [N] at its centre of mass and [N m], hand frame."""
+        self._object.add_force_torque(force.astype(np.float32), torque.astype(np.float32))
+
+    def touches(self) -> dict[str, Touch]:
+        """Which links touch the object now.
+
+        PhysX gives the normal part of each impulse; pairs within the contact offset that carry
+        nothing are listed too and left out here.
+        """
+        found: dict[str, list[tuple[Array, Array]]] = {}
+        for contact in self._system.get_contacts():
+            first, second = contact.bodies
+            if first is self._object or first == self._object:
+                link, sign = second, -1.0
+            elif second is self._object or second == self._object:
+                link, sign = first, 1.0
+            else:
+                continue
+            for point in contact.points:
+                impulse = np.asarray(point.impulse, dtype=np.float64)
+                if impulse @ impulse > 0:
+                    name = self._hand.link_of[link]
+                    force = sign * impulse / self.time_step
+                    found.setdefault(name, []).append((force, np.asarray(point.position, np.float64)))
+        touches = {}
+        for name in sorted(found):  # the order of PhysX is not defined
+            points = sorted(found[name], key=lambda pair: tuple(pair[1]))
+            sizes = np.array([np.linalg.norm(force) for force, _ in points])
+            centre = sizes @ np.array([place for _, place in points]) / sizes.sum()
+            touches[name] = Touch(np.sum([force for force, _ in points], axis=0), float(sizes.sum()), centre)
+        return touches
+
+    def snapshot(self) -> bytes:
+        """Positions and velocities. Contact caches are not in it: a run that goes on from here and
+        one that is restored to here differ by some micrometres; restored runs are all alike."""
+        return self._system.pack()
+
+    def restore(self, state: bytes) -> None:
+        self._system.unpack(state)

@@ -1,0 +1,199 @@
+"""Hand, tendons and motors, running in time: the mechanism behind the sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...description import HandDescription, ObjectDescription
+from ..config import PlantConfig
+from ..grasp_planning.graspable import chain
+from ..grasp_planning.pinch import PinchPlan
+from ..mechanism.assembly import make_servo, make_transmission, moment_arms
+from ..mechanism.servo import ServoState
+from ..mechanism.transmission import TransmissionState
+from ..parameters import PlantParameters
+from .hand_scene import HandScene
+
+Array = NDArray[np.float64]
+Gravity = tuple[float, float, float]
+
+_FORCE_WINDOW = 10  # steps over which a fingertip force is averaged
+_STILL = 2e-3  # [rad/s] and [m/s x 10]: slower than this is settled
+_CLOSING, _HOLDING, _SETTLING = 0.2, 0.3, 1.0  # [s] of a grasp, object held fixed in the first two
+
+
+class RigState(NamedTuple):
+    """A moment of a :class:`Rig`."""
+
+    physics: bytes
+    transmission: TransmissionState
+    servo: ServoState
+    parameters: PlantParameters
+    gravity: Gravity
+    normal: Array
+    fingers: int
+    time: float
+
+
+class Rig:
+    """Steps the scene with the transmission's torques while the servos move, and feels the contacts.
+
+    Args:
+        hand, obj: the bodies.
+        config: time steps and rates.
+        parameters: what they really are.
+    """
+
+    def __init__(
+        self, hand: HandDescription, obj: ObjectDescription, config: PlantConfig, parameters: PlantParameters
+    ) -> None:
+        self.hand, self.obj, self.config, self.parameters = hand, obj, config, parameters
+        self.transmission = make_transmission(hand, parameters)
+        self.servo = make_servo(hand, config, parameters)
+        self.time = 0.0
+        """[s] since the fingers closed."""
+        self.normal = np.zeros(len(hand.pads))
+        """Normal force of each pad, mean of the last 10 steps [N]."""
+        self.fingers = 0
+        """How many fingers touched the object in these steps, with any of their links."""
+        self.on_frame: Callable[[float, Array, Array, Array], None] | None = None
+        """Called every 10 steps with the time, the joint angles and the object's pose."""
+        self.gravity: Gravity = config.gravity
+        self._finger_of = {link: joints[-1] for link in hand.link_names if (joints := chain(hand, link))}
+        self._build(config.gravity)
+
+    def _build(self, gravity: Gravity) -> None:
+        p = self.parameters
+        self.gravity = gravity
+        self.scene = HandScene(self.hand, self.obj, gravity, self.config.time_step, p.object_scale)
+        self.scene.set_link_weight(p.link_weight)
+        self._built = (gravity, p.object_scale)
+        self.scene.set_object(p.mass, p.com_shift)
+        self.scene.set_friction(p.friction * self.obj.friction)
+        self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
+
+    def grasp(self, plan: PinchPlan, gravity: Gravity) -> None:
+        """Close on the object held in its planned place, release it, let it settle.
+
+        The scene is new each time, so that nothing of an earlier run is left in PhysX.
+        """
+        self.transmission = make_transmission(self.hand, self.parameters)
+        self._build(gravity)
+        scene, transmission, step = self.scene, self.transmission, self.config.time_step
+        scene.q = plan.q
+        scene.object_pose = (plan.position, plan.rotation)
+        scene.hold_object(True)
+        transmission.relax(plan.q)
+        slack = transmission.offset + transmission.J_a @ plan.q
+        self.servo.place(slack)
+        self.time = -_CLOSING  # time runs on while the object is grasped: a late camera looks back into it
+        self.run(round(_CLOSING / step), lambda part: slack + part * (plan.motor - slack))
+        self.servo.place(plan.motor)
+        self.time = 0.0
+        self.run(round(_HOLDING / step), lambda part: plan.motor)
+        scene.hold_object(False)
+        self.settle(_SETTLING)
+
+    def move(self, goal: Array) -> None:
+        """Ramp the motors to ``goal`` ``(n_a,)`` [rad] and let the hand settle."""
+        c, start = self.config, self.servo.encoder
+        ramp = max(c.ramp_time, float(np.abs(goal - start).max()) / c.rate_limit)
+        self.run(max(1, round(ramp / c.time_step)), lambda part: start + part * (goal - start))
+        self.settle(c.command_time - c.ramp_time)
+
+    def settle(self, least: float) -> None:
+        """Wait at least that long [s], and until the object is still or ``settle_limit`` is used up."""
+        c = self.config
+        self.wait(max(least, c.time_step))
+        for _ in range(round((c.settle_limit - c.command_time) / 0.05)):
+            linear, angular = self.scene.object_speed
+            if max(10 * linear, angular) < _STILL:
+                break
+            self.wait(0.05)
+
+    def wait(self, duration: float, push: tuple[Array, Array] | None = None) -> None:
+        """Let time pass [s] with the motors at rest, pushing the object by (force, torque) if asked."""
+        motor = self.servo.encoder
+        self.run(max(1, round(duration / self.config.time_step)), lambda part: motor, push)
+
+    def run(
+        self, steps: int, motor_at: Callable[[float], Array], push: tuple[Array, Array] | None = None
+    ) -> None:
+        """Advance by ``steps``; ``motor_at(part)`` says where the motors are, part from 0 to 1."""
+        scene, transmission, servo = self.scene, self.transmission, self.servo
+        normal = np.zeros(len(self.hand.pads))
+        fingers: set[int] = set()
+        window = min(_FORCE_WINDOW, steps)
+        for k in range(1, steps + 1):
+            output, q = servo.move_to(motor_at(k / steps)), scene.q
+            if push is not None:
+                scene.push(*push)
+            scene.step(transmission.drive_targets(q, output))
+            if self.on_frame is not None and k % _FORCE_WINDOW == 0:
+                self.on_frame(self.time + k * self.config.time_step, scene.q, *scene.object_pose)
+            if k > steps - window:
+                touches = scene.touches()
+                fingers |= {self._finger_of[link] for link in touches if link in self._finger_of}
+                for i, pad in enumerate(self.hand.pads):
+                    if pad.link in touches:
+                        normal[i] += touches[pad.link].normal / window
+        duration = steps * self.config.time_step
+        transmission.age(scene.q, servo.output, duration)
+        self.normal, self.fingers = normal, len(fingers)
+        self.time += duration
+
+    def change(self, new: PlantParameters) -> None:
+        """Take on other parameters in mid-run, the motors staying where they are.
+
+        What does not differ is left alone: PhysX would not go on bit by bit from being told again.
+
+        Raises:
+            ParameterError: moment arms for another number of actuators; nothing is changed.
+        """
+        old = self.parameters
+        moment_arms(self.hand, new)
+        self.parameters = new
+        motors = self.servo.snapshot()
+        self.servo = make_servo(self.hand, self.config, new)
+        self.servo.restore(motors)
+        if _differ(old, new, "moment_arm", "spring", "servo_stiffness", "joint_friction", "tendon_creep"):
+            previous, self.transmission = self.transmission, make_transmission(self.hand, new)
+            self.transmission.take_over(previous, self.scene.q, self.servo.output)
+            self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
+        self.transmission.lengthen(new.tendon_elongation - old.tendon_elongation)
+        if _differ(old, new, "mass", "com_shift"):
+            self.scene.set_object(new.mass, new.com_shift)
+        if _differ(old, new, "link_weight"):
+            self.scene.set_link_weight(new.link_weight)
+        if _differ(old, new, "friction"):
+            self.scene.set_friction(new.friction * self.obj.friction)
+
+    def snapshot(self) -> RigState:
+        return RigState(
+            self.scene.snapshot(),
+            self.transmission.snapshot(),
+            self.servo.snapshot(),
+            self.parameters,
+            self.gravity,
+            self.normal.copy(),
+            self.fingers,
+            self.time,
+        )
+
+    def restore(self, state: RigState) -> None:
+        if state.parameters != self.parameters:
+            self.change(state.parameters)
+        if self._built != (state.gravity, state.parameters.object_scale):
+            self._build(state.gravity)
+        self.scene.restore(state.physics)
+        self.transmission.restore(state.transmission)
+        self.servo.restore(state.servo)
+        self.normal, self.fingers, self.time = state.normal.copy(), state.fingers, state.time
+
+
+def _differ(old: PlantParameters, new: PlantParameters, *names: str) -> bool:
+    return any(getattr(old, name) != getattr(new, name) for name in names)
