@@ -1,6 +1,6 @@
 """Does a grasp stay where it is, and how fast is the physics? ``benchmarks/plant_hold.py --seeds 10``
 
-Each object is pinched at random at severity "none" and held for 10 s of simulated time: drift of its true
+Each object is pinched at random at preset "none" and held for 10 s of simulated time: drift of its true
 pose, and simulated time per CPU time of one core while it is held. The target is 0.1 mm and 0.1 deg for at
 least 9 of 10 grasps, at 8 times real time.
 """

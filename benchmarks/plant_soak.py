@@ -1,6 +1,6 @@
 """Does the simulated hand survive a long run, and its log a kill? ``benchmarks/plant_soak.py --trials 1000``
 
-A trial is a random pinch of the box, turned by 3 or 5 deg by the kinematic model at severity "nominal",
+A trial is a random pinch of the box, turned by 3 or 5 deg by the kinematic model at preset "nominal",
 logged. Reports the growth of the process' memory, how much faster than real time a closed-loop trial is
 (one core), whether two runs of the same seeds leave the same bytes, and what is left of a run that is
 killed (SIGKILL) at random moments. ``--sensing`` puts camera and Hall sensors into the loop. Quick:

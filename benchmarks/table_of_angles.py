@@ -1,7 +1,7 @@
 """Which angles of Table I does an exact model reach? ``benchmarks/table_of_angles.py --out DIR``
 
 The controller's model is made of the hand and object as the plant has them (an upper bound, no learner);
-what is left of severity "nominal" is the noise, friction, dead band and the error of the position
+what is left of preset "nominal" is the noise, friction, dead band and the error of the position
 controller. Increments add up on the set-points. An angle counts as reached when the object is held and
 its true error about the axis is below 1 deg. Interrupted, it goes on where it stopped.
 """
@@ -23,7 +23,7 @@ from torch_ekm.experiments.jobs import run_jobs
 from torch_ekm.experiments.manipulation import run_manipulation, state_of
 from torch_ekm.experiments.protocols.demo import TABLE_I, fixed_actuators
 from torch_ekm.model import KinematicModel, ModelOptions
-from torch_ekm.simulation import PlantConfig, SimulatedHand, severity
+from torch_ekm.simulation import PlantConfig, SimulatedHand, preset
 
 _DEG = math.pi / 180
 _REACHED = 1.0  # [deg]
@@ -33,12 +33,12 @@ def turn(object: str, seed: int, level: str) -> list[dict[str, Any]]:
     """All angles of Table I from the grasp of one seed, each from a new grasp."""
     torch.set_num_threads(1)
     config = PlantConfig(relative_to="setpoint")
-    plant = SimulatedHand("icub_right", object, config, severity(level))
+    plant = SimulatedHand("icub_right", object, config, preset(level))
     # a noisy pose may show a gap of some millimetres where there is contact
     model = KinematicModel(
         *plant.true_descriptions(), ModelOptions(gravity=config.gravity, contact_margin=0.004)
     )
-    rule = Setting(severity=level).stopping_rule()
+    rule = Setting(preset=level).stopping_rule()
     records: list[dict[str, Any]] = []
     for angle in TABLE_I[object]:
         record: dict[str, Any] = {"object": object, "seed": seed, "angle_deg": angle, "error_deg": None}
@@ -92,15 +92,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20, help="how many")
     parser.add_argument("--first", type=int, default=1000, help="the first seed; below 100: for development")
     parser.add_argument("--objects", nargs="+", default=list(TABLE_I), choices=list(TABLE_I))
-    parser.add_argument("--severity", default="nominal")
+    parser.add_argument("--preset", default="nominal")
     parser.add_argument("--jobs", type=int, default=2)
     options = parser.parse_args()
-    level = options.severity
+    level = options.preset
     # seeds outermost: an interrupted run has the same seeds of every object
     seeds = range(options.first, options.first + options.seeds)
     jobs = {f"{o}_{s}": (o, s, level) for s in seeds for o in options.objects}
     count = iter(range(1, len(jobs) + 1))
-    folder = options.out / digest(severity(level))  # other figures of the plant: other results
+    folder = options.out / digest(preset(level))  # other figures of the plant: other results
     done = run_jobs(
         turn, jobs, folder, options.jobs, lambda name: print(f"{next(count)}/{len(jobs)} {name}", flush=True)
     )

@@ -113,7 +113,7 @@ def reproduce(
         Path | None, Option(help="Folder with URDF files of your own objects (generalize, adapt).")
     ] = None,
     hand: Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")] = "icub_right",
-    severity: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
+    preset: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
     learner: Annotated[str, Option(help="rbf, action-linear, paper, deep, rls, rff, ...")] = "rbf",
     sensing: Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")] = True,
     angles: Annotated[
@@ -136,7 +136,7 @@ def reproduce(
     from .experiments.reproduce import reproduce as run
 
     control = {} if step is None else {"focus_step": math.radians(step)}
-    setting = Setting(hand=hand, severity=severity, learner=learner, sensing=sensing, control=control)
+    setting = Setting(hand=hand, preset=preset, learner=learner, sensing=sensing, control=control)
     turns = _numbers("angles", angles) if angles else None
     planned = plan(
         experiment, parse_seeds(seeds), setting=setting, objects=objects, angles_deg=turns, quick=quick
@@ -195,7 +195,7 @@ def record(
     angles: Annotated[str, Option(help="Rotations in degrees, separated by commas.")] = "10,20",
     seeds: Annotated[str, Option(help="FIRST:END; each angle is turned once for each seed.")] = "0:3",
     controller: Annotated[str, Option(help="KM, KM+I, E-KM or E-KM+I.")] = "KM",
-    severity: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
+    preset: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
     sensing: Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")] = True,
     images: Annotated[bool, Option(help="Keep the camera's images too.")] = False,
 ) -> None:
@@ -207,7 +207,7 @@ def record(
     from .experiments.protocols.record import RecordConfig
     from .experiments.protocols.record import record as run
 
-    setting = Setting(hand=hand, severity=severity, sensing=sensing)
+    setting = Setting(hand=hand, preset=preset, sensing=sensing)
     config = RecordConfig(setting, object, controller, _numbers("angles", angles), images)
     chosen = parse_seeds(seeds)
     with _progress() as progress:

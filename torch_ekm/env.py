@@ -21,7 +21,7 @@ from .plant.plant import Observation, PlantStatus
 from .rendering.grasp_viewer import GraspViewer
 from .simulation.config import PlantConfig
 from .simulation.parameters import PlantParameters
-from .simulation.presets import severity
+from .simulation.presets import preset
 from .simulation.simulated_hand import SimulatedHand
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class InHandRotation(gymnasium.Env):
 
     Args:
         hand, object: names, paths or descriptions.
-        parameters: plant parameters, or the name of a severity.
+        parameters: plant parameters, or the name of a preset.
         config: time, gravity, the grasp.
         angles: least and largest target [rad].
         step_limit: largest increment of an actuator [rad].
@@ -94,7 +94,7 @@ class InHandRotation(gymnasium.Env):
                 "step_limit, tolerance, angles", (step_limit, tolerance, angles), "positive and in order"
             )
         if isinstance(parameters, str):
-            parameters = severity(parameters)
+            parameters = preset(parameters)
         self.plant = SimulatedHand(hand, object, config, parameters)
         self.angles, self.step_limit, self.tolerance = angles, step_limit, tolerance
         self.off_axis, self.lost_penalty = off_axis, lost_penalty

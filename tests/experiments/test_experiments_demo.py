@@ -54,7 +54,7 @@ def test_report_is_complete_and_says_how_it_was_made(folder: Path) -> None:
         "summary.csv",
         "by_angle.csv",
         "prediction_error.svg",
-        "static_error.png",
+        "steady_state_error.png",
         "configuration.json",
     ):
         assert (folder / name).stat().st_size > 100, name

@@ -70,7 +70,7 @@ def drive(held, change=None, angle: float = 80.0, rule: StoppingRule = RULE):
 def test_target_that_cannot_be_reached_stalls_and_says_so(held) -> None:
     done, plant = drive(held)
     assert done.reason is Reason.STALLED
-    assert done.static_error == pytest.approx(80 * DEG)
+    assert done.steady_state_error == pytest.approx(80 * DEG)
     assert plant.commands == len(done.steps) == 3
 
 

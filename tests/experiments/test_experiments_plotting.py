@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torch_ekm.experiments.reporting.plots import plot_bank, plot_static_error
+from torch_ekm.experiments.reporting.plots import plot_bank, plot_steady_state_error
 
 pytest.importorskip("matplotlib")
 
@@ -13,13 +13,13 @@ pytest.importorskip("matplotlib")
 def test_a_lost_object_does_not_hide_the_others() -> None:
     calm = np.linspace(0.8, 1.2, 20)
     lost = np.append(calm[:19], 38.0)
-    (axis,) = plot_static_error({"KM": {"23": calm, "38": lost}}, "can").axes
+    (axis,) = plot_steady_state_error({"KM": {"23": calm, "38": lost}}, "can").axes
     assert axis.get_ylim()[1] < 2.0
     crosses = [line for line in axis.lines if line.get_marker() == "x"]
     assert sum(len(line.get_xdata()) for line in crosses) == 1
     assert [text.get_text() for text in axis.texts] == [f"mean {lost.mean():.1f}"]
     assert "can" in axis.get_title(loc="left")
-    (plain,) = plot_static_error({"KM": {"23": calm, "38": calm}}).axes
+    (plain,) = plot_steady_state_error({"KM": {"23": calm, "38": calm}}).axes
     assert plain.get_ylim()[1] > 1.2  # nothing lost: the whole range, no crosses
     assert all(len(line.get_xdata()) == 0 for line in plain.lines if line.get_marker() == "x")
 

@@ -16,7 +16,7 @@ from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.camera_off import CameraOff
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
 from torch_ekm.experiments.learners import LEARNERS, make_learner
-from torch_ekm.experiments.protocols.ablation import TROUBLES, AblationConfig, ablation_jobs, variants
+from torch_ekm.experiments.protocols.ablation import DISTURBANCES, AblationConfig, ablation_jobs, variants
 from torch_ekm.experiments.protocols.object_memory import AdaptConfig, adapt_session
 from torch_ekm.experiments.protocols.turning import (
     GeneralizeConfig,
@@ -49,7 +49,7 @@ def test_controllers_differ_in_the_reference_of_their_increments() -> None:
     [
         ({"hand": "claw"}, UnknownNameError, "icub_left"),
         ({"learner": "oracle"}, UnknownNameError, "action-linear"),
-        ({"severity": "mild"}, UnknownNameError, "nominal"),
+        ({"preset": "mild"}, UnknownNameError, "nominal"),
         ({"capacity": 0}, ParameterError, "capacity"),
         ({"plant": {"springs": 2.0}}, ParameterError, "spring"),
         ({"model": {"rolls": False}}, ParameterError, "rolling"),
@@ -116,20 +116,20 @@ def test_every_learner_of_the_ablation_starts_at_zero_and_learns() -> None:
         make_learner("forest", 5, 4, 30)
 
 
-def test_ablation_covers_every_trouble_of_the_nominal_plant() -> None:
+def test_ablation_covers_every_disturbance_of_the_nominal_plant() -> None:
     nominal, exact = PlantParameters.nominal_mismatch(), PlantParameters.exact()
-    troubled = {
+    disturbed = {
         f.name for f in dataclasses.fields(nominal) if getattr(nominal, f.name) != getattr(exact, f.name)
     }
-    assert troubled == {name for names in TROUBLES.values() for name in names}
+    assert disturbed == {name for names in DISTURBANCES.values() for name in names}
     config = AblationConfig()
     for variant in variants(config):
         changed = config.setting.replace(**variant.changes)
-        if variant.group == "trouble":
+        if variant.group == "disturbance":
             different = [
-                name for name in troubled if getattr(changed.parameters(), name) != getattr(exact, name)
+                name for name in disturbed if getattr(changed.parameters(), name) != getattr(exact, name)
             ]
-            assert set(different) == set(TROUBLES[variant.name]), variant.name
+            assert set(different) == set(DISTURBANCES[variant.name]), variant.name
     jobs = ablation_jobs(config, (0,))
     assert len(jobs) < sum(len(v.controllers) for v in variants(config))  # alike variants share their jobs
 

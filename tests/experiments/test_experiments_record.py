@@ -19,7 +19,7 @@ pytest.importorskip("sapien")
 pytest.importorskip("h5py")
 
 LEARNS = RecordConfig(
-    Setting(severity="none", plant={"moment_arm": 1.3}), controller="E-KM", angles_deg=(3.0, 5.0)
+    Setting(preset="none", plant={"moment_arm": 1.3}), controller="E-KM", angles_deg=(3.0, 5.0)
 )
 
 
@@ -44,7 +44,7 @@ def test_what_a_learner_did_is_the_same_after_an_interruption(tmp_path):
 
 def test_a_sensed_trial_can_be_computed_again_from_its_log(tmp_path):
     """The pose from the image that was kept, corners from the same."""
-    config = RecordConfig(Setting(severity="none", sensing=True), angles_deg=(3.0,), images=True)
+    config = RecordConfig(Setting(preset="none", sensing=True), angles_deg=(3.0,), images=True)
     log = record(config, (0,), tmp_path)
     again = TrialLog.open(tmp_path).read(0)
     assert again.about["outcome"]["reason"] == "reached"

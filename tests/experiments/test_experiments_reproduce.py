@@ -29,7 +29,7 @@ def turn(controller: str, seed: int, trial: int, angle: float, item: str) -> dic
         "controller": controller, "seed": seed, "trial": trial, "angle_deg": angle, "object": item,
         "kind": "turn",
         "grasped": True, "reason": "reached", "message": "", "lost": False, "steps": n,
-        "true_error_deg": float(draw.uniform(0, 0.3)), "static_error_deg": 0.1,
+        "true_error_deg": float(draw.uniform(0, 0.3)), "steady_state_error_deg": 0.1,
         "errors_deg": np.linspace(angle, 0.1, n + 1).tolist(), "first_step_deg": float(draw.uniform(0.1, 1)),
         "step_error_deg": 0.3, "prediction_km_deg": km, "prediction_ekm_deg": ekm,
         "true_prediction_km_deg": km, "true_prediction_ekm_deg": ekm if learns else [],
@@ -163,5 +163,5 @@ def test_command_line() -> None:
     assert result.exit_code == 0, result.output
     result = runner.invoke(app, ["reproduce", "offline"])
     assert isinstance(result.exception, UnknownNameError)
-    result = runner.invoke(app, ["reproduce", "online", "--severity", "mild"])
+    result = runner.invoke(app, ["reproduce", "online", "--preset", "mild"])
     assert isinstance(result.exception, UnknownNameError)

@@ -191,7 +191,7 @@ def test_command_line(folder, tmp_path):
     failed = runner.invoke(app, ["replay", str(tmp_path / "nothing")])
     assert isinstance(failed.exception, DescriptionError)
     made = tmp_path / "made"
-    arguments = ["record", str(made), "--seeds", "0:1", "--severity", "none", "--no-sensing", "--angles", "3"]
+    arguments = ["record", str(made), "--seeds", "0:1", "--preset", "none", "--no-sensing", "--angles", "3"]
     done = runner.invoke(app, arguments)
     assert done.exit_code == 0, done.output
     assert TrialLog.open(made).index[0].reason == "reached"

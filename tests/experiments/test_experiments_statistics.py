@@ -17,7 +17,7 @@ from torch_ekm.experiments.reporting.statistics import (
     recovery_trials,
     select,
     settle_steps,
-    static_error,
+    steady_state_error,
     survivor_error,
     unit_means,
 )
@@ -39,7 +39,7 @@ def record(controller: str = "KM", seed: int = 0, error: float = 1.0, **changes:
     base = {
         "controller": controller, "seed": seed, "trial": 1, "object": "box", "kind": "turn",
         "angle_deg": 20.0, "grasped": True, "reason": "reached", "lost": False, "true_error_deg": error,
-        "static_error_deg": error,
+        "steady_state_error_deg": error,
         "steps": 3, "errors_deg": [20.0, 8.0, 0.4, 0.3], "first_step_deg": 0.5, "step_error_deg": 0.4,
         "off_rotation_deg": 1.0, "seconds": [0.01] * 3, "prediction_km_deg": [0.6, 0.4],
         "prediction_ekm_deg": [0.3, 0.1], "true_prediction_km_deg": [0.5, 0.5],
@@ -50,9 +50,9 @@ def record(controller: str = "KM", seed: int = 0, error: float = 1.0, **changes:
 
 def test_lost_object_counts_with_the_whole_angle() -> None:
     lost = record(error=3.0, lost=True, reason="object lost")
-    assert static_error(lost) == 20.0
+    assert steady_state_error(lost) == 20.0
     assert survivor_error(lost) is None
-    assert static_error(record(error=3.0)) == 3.0
+    assert steady_state_error(record(error=3.0)) == 3.0
 
 
 @pytest.mark.parametrize(
@@ -70,8 +70,8 @@ def test_lost_objects_never_settle() -> None:
 def test_units_are_objects_and_seeds_and_pairs_need_both() -> None:
     ours = [record("E-KM", 0, 1.0), record("E-KM", 0, 3.0), record("E-KM", 1, 5.0), record("E-KM", 2, 7.0)]
     theirs = [record("KM", 1, 10.0), record("KM", 0, 4.0)]
-    assert unit_means(ours, static_error) == {("box", 0): 2.0, ("box", 1): 5.0, ("box", 2): 7.0}
-    a, b = paired_means(ours, theirs, static_error)
+    assert unit_means(ours, steady_state_error) == {("box", 0): 2.0, ("box", 1): 5.0, ("box", 2): 7.0}
+    a, b = paired_means(ours, theirs, steady_state_error)
     np.testing.assert_array_equal(a, [2.0, 5.0])
     np.testing.assert_array_equal(b, [4.0, 10.0])
 
@@ -182,11 +182,11 @@ def test_targets_of_each_experiment() -> None:
         records += [record("KM", seed, 2.0 + 0.1 * seed), record("KM+I", seed, 0.3 + 0.01 * seed)]
         records.append(record("E-KM", seed, 0.2 + 0.01 * seed, first_step_deg=0.2))
     rows = {row[0]: row for row in generalize_targets(records, limit=40)}
-    assert rows["static error E-KM : KM, box"][-1] == "yes"
+    assert rows["steady-state error E-KM : KM, box"][-1] == "yes"
     assert rows["error of the first motion E-KM : KM+I"][2] == "40 %"
     assert rows["motions to settle E-KM : KM+I"][-1] == "no, by 40 %"
     assert rows["objects lost, E-KM"][2] == "0 %"
-    assert rows["static error of the KM"][-1] == "yes"
+    assert rows["steady-state error of the KM"][-1] == "yes"
     turns = [record("E-KM", 0, trial=t) for t in range(1, 20)]
     assert any("after 16 trials" in row[0] for row in online_targets(turns, (10,), 19))
     memory = {name: [0.2] for name in ("bank", "labelled", "one model", "fresh")}

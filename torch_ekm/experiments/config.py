@@ -15,7 +15,7 @@ from ..control import ControllerOptions, StoppingRule
 from ..description import HandDescription, hand_files, list_hands, load_hand, object_files
 from ..exceptions import ParameterError, UnknownNameError
 from ..model import ModelOptions
-from ..simulation import PlantConfig, PlantParameters, severity
+from ..simulation import PlantConfig, PlantParameters, preset
 from .learners import DEFAULT_LEARNER, LEARNERS, learner_figures
 from .protocols.demo import fixed_actuators
 
@@ -33,14 +33,14 @@ class Setting:
     The mappings change single figures of the classes they are named after.
 
     Raises:
-        UnknownNameError: no such hand, severity or learner; the message lists them.
+        UnknownNameError: no such hand, preset or learner; the message lists them.
         ParameterError: a figure outside its range.
     """
 
     hand: str = "icub_right"
-    severity: str = "nominal"
+    preset: str = "nominal"
     plant: Mapping[str, Any] = field(default_factory=dict)
-    """Changes of the severity's :class:`PlantParameters`."""
+    """Changes of the preset's :class:`PlantParameters`."""
     grasp: Mapping[str, Any] = field(default_factory=dict)
     """Changes of :class:`PlantConfig`."""
     model: Mapping[str, Any] = field(default_factory=dict)
@@ -69,10 +69,10 @@ class Setting:
 
     def parameters(self) -> PlantParameters:
         """The plant's."""
-        return severity(self.severity).replace(**self.plant)
+        return preset(self.preset).replace(**self.plant)
 
-    def specimen(self, seed: int) -> Setting:
-        """The same with another specimen of the hand (signs and sizes of its constant errors)."""
+    def hardware_instance(self, seed: int) -> Setting:
+        """The same with another instance of the hand (signs and sizes of its constant errors)."""
         return self.replace(plant={"hardware_seed": seed, **self.plant})
 
     def plant_config(self, controller: str) -> PlantConfig:

@@ -39,7 +39,7 @@ class Manipulation:
     """A finished (or lost) manipulation."""
 
     reason: StopReason
-    static_error: float
+    steady_state_error: float
     """|e| when the controller stopped, as measured."""
     true_error: float | None
     """|e| by the plant's truth, if it tells it."""
@@ -120,7 +120,7 @@ def run_manipulation(
         )
         state, limited = after, decision.limited
         errors.append(_focus_error(focus, target, state))
-    done.static_error = errors[-1]
+    done.steady_state_error = errors[-1]
     truth = observation.info.get("truth")
     if truth is not None:
         true_state = GraspState(truth["q"], truth["position"], truth["rotation"])

@@ -221,7 +221,7 @@ def _record(
     done: Manipulation, notes: list[tuple[GraspState, Decision]], axis: torch.Tensor, learns: bool
 ) -> Record:
     steps = done.steps
-    measured = [step.error for step in steps] + [done.static_error]
+    measured = [step.error for step in steps] + [done.steady_state_error]
     asked = [float(torch.linalg.vector_norm(decision.desired)) for _, decision in notes]
     # how much of a step was missing: |e| should have fallen by what was asked for
     short = [abs(measured[k + 1] - (measured[k] - asked[k])) for k in range(len(steps))]
@@ -240,7 +240,7 @@ def _record(
         "reason": done.reason.value,
         "message": done.message,
         "lost": done.lost,
-        "static_error_deg": done.static_error / _DEG,
+        "steady_state_error_deg": done.steady_state_error / _DEG,
         "true_error_deg": None if done.true_error is None else done.true_error / _DEG,
         "steps": len(steps),
         "errors_deg": [error / _DEG for error in measured],

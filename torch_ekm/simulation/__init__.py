@@ -22,8 +22,8 @@ from .imaging.simulated_camera import ImageQuality as ImageQuality
 from .imaging.simulated_camera import SimulatedCamera as SimulatedCamera
 from .imaging.simulated_video import SimulatedVideo as SimulatedVideo
 from .parameters import PlantParameters as PlantParameters
-from .presets import SEVERITIES as SEVERITIES
-from .presets import severity as severity
+from .presets import PRESETS as PRESETS
+from .presets import preset as preset
 from .sensed_plant import ICUB_PALM_MOUNT as ICUB_PALM_MOUNT
 from .sensed_plant import SensedPlant as SensedPlant
 from .simulated_hand import PlantSnapshot as PlantSnapshot
@@ -46,7 +46,7 @@ __all__ = [
     "PlantConfig",
     "PlantParameters",
     "PlantSnapshot",
-    "SEVERITIES",
+    "PRESETS",
     "SapienCamera",
     "Scene",
     "SensedPlant",
@@ -55,5 +55,5 @@ __all__ = [
     "SimulatedVideo",
     "Stuck",
     "Tug",
-    "severity",
+    "preset",
 ]

@@ -83,7 +83,7 @@ class PlantParameters:
     """Joints whose sensor keeps its first reading."""
 
     hardware_seed: int = 0
-    """Which specimen of the hand: signs and sizes of the constant errors."""
+    """Which hardware instance: signs and sizes of the constant errors."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):

@@ -64,7 +64,7 @@ def _hostile() -> PlantParameters:
     )
 
 
-SEVERITIES: dict[str, Callable[[], PlantParameters]] = {
+PRESETS: dict[str, Callable[[], PlantParameters]] = {
     "none": PlantParameters.exact,
     "nominal": PlantParameters.nominal_mismatch,
     "worn": _worn,
@@ -72,12 +72,12 @@ SEVERITIES: dict[str, Callable[[], PlantParameters]] = {
 }
 
 
-def severity(name: str) -> PlantParameters:
+def preset(name: str) -> PlantParameters:
     """The parameters called "none", "nominal", "worn" or "hostile".
 
     Raises:
-        UnknownNameError: there is no such severity; the message lists them.
+        UnknownNameError: there is no such preset; the message lists them.
     """
-    if name not in SEVERITIES:
-        raise UnknownNameError("severity", name, SEVERITIES)
-    return SEVERITIES[name]()
+    if name not in PRESETS:
+        raise UnknownNameError("preset", name, PRESETS)
+    return PRESETS[name]()

@@ -48,7 +48,7 @@ class Sensors:
         F^ = quantise(play(F) + offset + noise)     8 bit over ``force_range``
 
     ``play`` is hysteresis: the reading follows the force only once it has moved by half the width.
-    The offset is drawn once for each specimen of the hand; a fingertip that touches nothing reads
+    The offset is drawn once for each hardware instance; a fingertip that touches nothing reads
     its offset too, if there is one.
     """
 
@@ -59,8 +59,8 @@ class Sensors:
 
     def set_parameters(self, parameters: PlantParameters) -> None:
         self._p = parameters
-        specimen = np.random.default_rng([parameters.hardware_seed, 1])
-        self._offset = parameters.force_offset * specimen.uniform(-1.0, 1.0, size=self.n_pads)
+        hardware_instance = np.random.default_rng([parameters.hardware_seed, 1])
+        self._offset = parameters.force_offset * hardware_instance.uniform(-1.0, 1.0, size=self.n_pads)
         self._stuck = np.array([name in parameters.stuck_joints for name in self._joints], dtype=bool)
 
     def forget(self) -> None:

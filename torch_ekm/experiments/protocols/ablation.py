@@ -20,7 +20,7 @@ from ..reporting.statistics import (
     paired_means,
     rate,
     select,
-    static_error,
+    steady_state_error,
 )
 from ..reporting.tables import estimate, percent, text
 from .turning import GeneralizeConfig, generalize_session, object_name
@@ -29,8 +29,8 @@ _DEG = math.pi / 180
 _BASE = "as it is"
 _ALL = ("KM", "KM+I", "E-KM")
 
-#: Troubles of the nominal plant, each alone in a plant that is otherwise exact.
-TROUBLES: dict[str, tuple[str, ...]] = {
+#: Disturbances of the nominal plant, each alone in a plant that is otherwise exact.
+DISTURBANCES: dict[str, tuple[str, ...]] = {
     "pulley radii": ("moment_arm",),
     "joint springs": ("spring",),
     "servo stiffness": ("servo_stiffness",),
@@ -73,7 +73,7 @@ class AblationConfig:
     angles_deg: tuple[float, ...] = (9.0, 19.0, 29.0)
     warm_up: int = 3
     groups: tuple[str, ...] = (
-        "learner", "online learning", "model", "controller", "severity", "trouble", "dead zone",
+        "learner", "online learning", "model", "controller", "preset", "disturbance", "dead zone",
     )  # fmt: skip
 
 
@@ -111,15 +111,15 @@ def variants(config: AblationConfig) -> list[Variant]:
         ("rows for the friction margin", {"margin_min": 0.5}, _ALL),
     ):
         found.append(Variant("controller", name, {"control": {**base.control, **option}}, who))
-    found.append(Variant("severity", f"{base.severity}: {_BASE}"))
-    for severity in ("none", "nominal", "worn", "hostile"):
-        if severity != base.severity:
-            found.append(Variant("severity", severity, {"severity": severity}, _ALL))
+    found.append(Variant("preset", f"{base.preset}: {_BASE}"))
+    for preset in ("none", "nominal", "worn", "hostile"):
+        if preset != base.preset:
+            found.append(Variant("preset", preset, {"preset": preset}, _ALL))
     nominal = dataclasses.asdict(PlantParameters.nominal_mismatch())
-    for name, fields in TROUBLES.items():
+    for name, fields in DISTURBANCES.items():
         plant = {key: nominal[key] for key in fields}
-        changes = {"severity": "none", "plant": plant}
-        found.append(Variant("trouble", name, changes, _ALL))
+        changes = {"preset": "none", "plant": plant}
+        found.append(Variant("disturbance", name, changes, _ALL))
     for size in (0.0, 0.5, 0.9, 1.3, 1.7):
         plant = {**base.plant, "dead_zone": size * _DEG}
         found.append(Variant("dead zone", f"{size:g} deg", {"plant": plant}, _ALL))
@@ -146,12 +146,12 @@ def ablation_tables(
                 names = _jobs_of(config, variant, seeds)
                 rows.append(_row(variant, [r for name in names for r in results[name]]))
         header = [
-            group, "static error KM", "KM+I", "E-KM", "prediction KM", "E-KM", "E-KM:KM [%]",
+            group, "steady-state error KM", "KM+I", "E-KM", "prediction KM", "E-KM", "E-KM:KM [%]",
             "E-KM:KM, true [%]", "lost: KM", "E-KM",
         ]  # fmt: skip
         note = (
             f"{object_name(config.object)}, {', '.join(f'{a:g}' for a in config.angles_deg)} deg, "
-            f"{len(seeds)} seeds. Static error by the simulation's truth, lost objects with the whole angle; "
+            f"{len(seeds)} seeds. Steady-state error by the truth, lost objects with the whole angle; "
             "one-step prediction error on the E-KM's own motions; both in degrees with 95 % bootstrap "
             "intervals over seeds."
         )
@@ -161,7 +161,7 @@ def ablation_tables(
 
 def _row(variant: Variant, records: list[Record]) -> list[str]:
     by = {name: select(records, controller=name, kind="turn") for name in ("KM", "KM+I", "E-KM")}
-    row = [variant.name, *(text(estimate(by[name], static_error)) for name in ("KM", "KM+I", "E-KM"))]
+    row = [variant.name, *(text(estimate(by[name], steady_state_error)) for name in ("KM", "KM+I", "E-KM"))]
     mine = [r for r in by["E-KM"] if r["prediction_ekm_deg"]]
     if mine:
         ours, theirs = paired_means(mine, mine, mean_prediction("ekm"), mean_prediction("km"))
@@ -194,7 +194,7 @@ def _jobs_of(config: AblationConfig, variant: Variant, seeds: tuple[int, ...]) -
 ablation_session = generalize_session
 
 __all__ = [
-    "TROUBLES",
+    "DISTURBANCES",
     "AblationConfig",
     "Variant",
     "ablation_jobs",

@@ -125,10 +125,10 @@ def _record(controller: str, seed: int, angle: float, done: Manipulation, frames
         "reason": done.reason.value,
         "message": done.message,
         "lost": done.lost,
-        "static_error_deg": done.static_error / _DEG,
+        "steady_state_error_deg": done.steady_state_error / _DEG,
         "true_error_deg": None if done.true_error is None else done.true_error / _DEG,
         "steps": len(steps),
-        "errors_deg": [step.error / _DEG for step in steps] + [done.static_error / _DEG],
+        "errors_deg": [step.error / _DEG for step in steps] + [done.steady_state_error / _DEG],
         "prediction_km_deg": [step.prediction_error_km / _DEG for step in steps],
         "prediction_ekm_deg": [
             None if step.prediction_error_ekm is None else step.prediction_error_ekm / _DEG for step in steps

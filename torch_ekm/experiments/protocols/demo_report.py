@@ -15,7 +15,7 @@ from ...simulation import PlantConfig, PlantParameters
 from ..config import Setting, digest
 from ..jobs import run_jobs
 from ..reporting.metrics import Estimate, bootstrap_mean, compare_errors
-from ..reporting.plots import plot_convergence, plot_prediction_error, plot_static_error, save_figure
+from ..reporting.plots import plot_convergence, plot_prediction_error, plot_steady_state_error, save_figure
 from ..reporting.report import FigureFile, Report, Table
 from .demo import CONTROLLERS, DemoConfig, run_session
 
@@ -145,7 +145,7 @@ def summary_table(records: list[Record]) -> Table:
         else None
     )
     note = (
-        "Mean and 95 % bootstrap interval over seeds; angles in degrees. Static error is by the "
+        "Mean and 95 % bootstrap interval over seeds; angles in degrees. Steady-state error is by the "
         "simulation's truth at the end of each trial, lost objects included. The prediction error of the "
         "E-KM stands beside the KM's on the same motions; the KM's own row is on its own motions."
     )
@@ -155,7 +155,7 @@ def summary_table(records: list[Record]) -> Table:
             f"[{compared.low:.2f}, {compared.high:.2f}], p = {compared.paired_p:.1g}."
         )
     header = [
-        "controller", "static error", "median", "prediction error", "steps", "off-axis rotation",
+        "controller", "steady-state error", "median", "prediction error", "steps", "off-axis rotation",
         "reached", "lost", "ms per step",
     ]  # fmt: skip
     return Table("summary", "All angles", header, rows, note)
@@ -175,7 +175,7 @@ def angle_table(records: list[Record], config: DemoConfig) -> Table:
             ]
         rows.append(row)
     header = ["target"] + [f"{name}: {what}" for name in CONTROLLERS for what in ("error", "steps", "lost")]
-    return Table("by_angle", "Static error, steps and lost objects for each target [deg]", header, rows)
+    return Table("by_angle", "Steady-state error, steps and lost objects for each target [deg]", header, rows)
 
 
 def _figures(records: list[Record], config: DemoConfig, folder: Path) -> list[FigureFile]:
@@ -215,9 +215,9 @@ def _figures(records: list[Record], config: DemoConfig, folder: Path) -> list[Fi
         for name in CONTROLLERS
     }
     add(
-        plot_static_error(errors),
-        "static_error",
-        "Static error for each target [deg] (the paper's Fig. 6).",
+        plot_steady_state_error(errors),
+        "steady_state_error",
+        "Steady-state error for each target [deg] (the paper's Fig. 6).",
     )
     last = config.angles_deg[-1]
     histories = {

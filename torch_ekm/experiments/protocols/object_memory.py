@@ -125,7 +125,7 @@ def adapt_session(config: AdaptConfig, seed: int) -> list[Record]:
     for trial, index in enumerate(sequence.tolist()):
         item = config.objects[index]
         if item not in benches:
-            benches[item] = Bench(config.setting.specimen(seed), item, "E-KM", memories, encoding)
+            benches[item] = Bench(config.setting.hardware_instance(seed), item, "E-KM", memories, encoding)
         bench = benches[item]
         if memories is None or encoding is None:  # the first grasp decides what is seen of a state
             if bench.grasp(seed, trial) is None or bench.encoding is None:

@@ -100,7 +100,7 @@ def online_session(config: OnlineConfig, controller: str, seed: int) -> list[Rec
     """All trials of one seed, in order; an E-KM starts empty and keeps what it learns."""
     _check(controller)
     angles = np.random.default_rng(seed).uniform(*config.angles_deg, size=config.trials)
-    bench = Bench(config.setting.specimen(seed), config.object, controller)
+    bench = Bench(config.setting.hardware_instance(seed), config.object, controller)
     records = []
     for trial, angle in enumerate(angles.tolist(), start=1):
         if trial == config.tendons_replaced:
@@ -115,7 +115,7 @@ def online_session(config: OnlineConfig, controller: str, seed: int) -> list[Rec
 def generalize_session(config: GeneralizeConfig, object: str, controller: str, seed: int) -> list[Record]:
     """Warm-up (E-KM only), all angles, then the probes, with one object and one seed."""
     _check(controller)
-    bench = Bench(config.setting.specimen(seed), object, controller)
+    bench = Bench(config.setting.hardware_instance(seed), object, controller)
     angles = config.angles_of(object)
     about = {"object": object_name(object)}
     records: list[Record] = []

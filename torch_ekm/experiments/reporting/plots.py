@@ -93,8 +93,8 @@ def plot_learning_test(ekm_deg: Array, km_deg: Array, alpha: float = 0.05) -> Fi
     return figure
 
 
-def plot_static_error(errors_deg: dict[str, dict[str, Array]], what: str = "") -> Figure:
-    """Static error of each controller for each target (the paper's Fig. 6): every run and the mean.
+def plot_steady_state_error(errors_deg: dict[str, dict[str, Array]], what: str = "") -> Figure:
+    """Steady-state error of each controller for each target (the paper's Fig. 6): every run and the mean.
 
     A few lost objects, at many times the error of all others, are crosses at the upper edge; a mean
     that they carry beyond it is written there.
@@ -128,8 +128,10 @@ def plot_static_error(errors_deg: dict[str, dict[str, Array]], what: str = "") -
                 note = {"xytext": (-9, 0), "textcoords": "offset points", "fontsize": 8, "ha": "right"}
                 axis.annotate(f"mean {values.mean():.1f}", (x, 0.9 * top), **note)
     axis.set_xticks(range(len(targets)), targets)
-    axis.set(xlabel="target [deg]", ylabel="static error [deg]", ylim=(0, top if np.isfinite(top) else None))
-    axis.set_title(f"Static error{', ' + what if what else ''}: each run, and the mean", loc="left")
+    axis.set(
+        xlabel="target [deg]", ylabel="steady-state error [deg]", ylim=(0, top if np.isfinite(top) else None)
+    )
+    axis.set_title(f"Steady-state error{', ' + what if what else ''}: each run, and the mean", loc="left")
     axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
 

@@ -16,7 +16,7 @@ from ..protocols.turning import GeneralizeConfig, OnlineConfig, object_name
 from .learning_tables import learning_table, prediction_curves, prediction_table
 from .memory_tables import memory_comparison
 from .metrics import bootstrap_mean
-from .plots import plot_bank, plot_learning_test, plot_prediction_error, plot_static_error, save_figure
+from .plots import plot_bank, plot_learning_test, plot_prediction_error, plot_steady_state_error, save_figure
 from .report import FigureFile, Report, Table
 from .statistics import (
     Record,
@@ -25,7 +25,7 @@ from .statistics import (
     paired_means,
     rate,
     select,
-    static_error,
+    steady_state_error,
 )
 from .tables import (
     comparison_table,
@@ -91,7 +91,7 @@ def generalize_report(
             controller: {
                 f"{angle:g}": np.array(
                     [
-                        static_error(r)
+                        steady_state_error(r)
                         for r in turns
                         if r["controller"] == controller and r["angle_deg"] == angle
                     ]
@@ -100,11 +100,15 @@ def generalize_report(
             }
             for controller in CONTROLLERS
         }
-        save_figure(plot_static_error(errors, name.replace("_", " ")), _made(folder), f"static_error_{name}")
+        save_figure(
+            plot_steady_state_error(errors, name.replace("_", " ")),
+            _made(folder),
+            f"steady_state_error_{name}",
+        )
         figures.append(
             FigureFile(
-                f"static_error_{name}.svg",
-                f"Static error with the {name} (Fig. 6). Crosses: lost objects, off the scale.",
+                f"steady_state_error_{name}.svg",
+                f"Steady-state error with the {name} (Fig. 6). Crosses: lost objects, off the scale.",
             )
         )
     tables = [
@@ -186,12 +190,12 @@ def _verdict(records: list[Record], seeds: tuple[int, ...]) -> str:
     ours, theirs = paired_means(
         select(records, controller="E-KM", kind="turn"),
         select(records, controller="KM", kind="turn"),
-        static_error,
+        steady_state_error,
     )
     mine = [r for r in select(records, controller="E-KM", kind="turn") if r["prediction_ekm_deg"]]
     parts = []
     if len(ours) and theirs.mean() > 0:
-        parts.append(f"Static error E-KM : KM {percent(bootstrap_ratio(ours, theirs))} %")
+        parts.append(f"Steady-state error E-KM : KM {percent(bootstrap_ratio(ours, theirs))} %")
     if mine:
         ours, theirs = paired_means(mine, mine, mean_prediction("ekm"), mean_prediction("km"))
         parts.append(f"prediction error on the same motions {percent(bootstrap_ratio(ours, theirs))} %")

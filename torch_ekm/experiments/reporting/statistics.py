@@ -21,7 +21,7 @@ Value = Callable[[Record], "float | None"]
 BAND_DEG = 0.5
 
 
-def static_error(record: Record) -> float:
+def steady_state_error(record: Record) -> float:
     """True error at the end [deg]; a lost object counts with the whole angle that was asked for."""
     return abs(record["angle_deg"]) if record["lost"] else record["true_error_deg"]
 

@@ -18,7 +18,7 @@ from .statistics import (
     rate,
     select,
     settle_steps,
-    static_error,
+    steady_state_error,
     survivor_error,
     unit_means,
 )
@@ -26,7 +26,7 @@ from .statistics import (
 Array = NDArray[np.float64]
 
 STATIC_NOTE = (
-    "Mean and 95 % bootstrap interval over seeds; angles in degrees, static errors by the simulation's "
+    "Mean and 95 % bootstrap interval over seeds; angles in degrees, steady-state errors by the simulation's "
     "truth. A lost object counts with the whole angle that was asked for; 'survivors' leaves it out. "
     f"Settled: the measured error stays within {BAND_DEG:g} deg; a turn that never settles counts with the "
     "step limit. Intervals of rates are Wilson's."
@@ -65,9 +65,9 @@ def controller_table(records: list[Record], limit: int) -> Table:
         rows.append(
             [
                 name,
-                text(estimate(mine, static_error)),
+                text(estimate(mine, steady_state_error)),
                 text(estimate(mine, survivor_error)),
-                f"{np.median([static_error(r) for r in mine]):.2f}",
+                f"{np.median([steady_state_error(r) for r in mine]):.2f}",
                 text(estimate(mine, lambda r: settle_steps(r, limit=limit)), 1),
                 text(estimate(mine, lambda r: r["first_step_deg"])),
                 text(estimate(mine, lambda r: r["step_error_deg"])),
@@ -76,14 +76,14 @@ def controller_table(records: list[Record], limit: int) -> Table:
             ]
         )
     header = [
-        "controller", "static error", "survivors", "median", "motions to settle", "error of the first motion",
+        "controller", "steady-state error", "survivors", "median", "motions to settle", "error of first motion",
         "of all motions", "off-axis rotation", "lost",
     ]  # fmt: skip
     return Table("controllers", "All turns of each controller", header, rows, STATIC_NOTE)
 
 
 def reason_table(records: list[Record]) -> Table:
-    """Why the controllers stopped, with the static error of each kind."""
+    """Why the controllers stopped, with the steady-state error of each kind."""
     rows = []
     for name in CONTROLLERS:
         mine = [r for r in records if r["controller"] == name and r["kind"] == "turn"]
@@ -102,7 +102,7 @@ def reason_table(records: list[Record]) -> Table:
 
 
 def object_table(records: list[Record]) -> Table:
-    """Static error of each object, paired (the paper's Table II)."""
+    """Steady-state error of each object, paired (the paper's Table II)."""
     rows = []
     objects = list(dict.fromkeys(r["object"] for r in records))
     for item in [*objects, None]:
@@ -110,12 +110,12 @@ def object_table(records: list[Record]) -> Table:
         by = {name: select(chosen, controller=name, kind="turn") for name in CONTROLLERS}
         if not by["KM"] or not by["E-KM"]:
             continue
-        ours, theirs = paired_means(by["E-KM"], by["KM"], static_error)
+        ours, theirs = paired_means(by["E-KM"], by["KM"], steady_state_error)
         tests = compare(ours, theirs)
         rows.append(
             [
                 item or "all",
-                *(text(estimate(by[name], static_error)) for name in CONTROLLERS),
+                *(text(estimate(by[name], steady_state_error)) for name in CONTROLLERS),
                 percent(bootstrap_ratio(ours, theirs)),
                 "-" if tests is None else f"{tests.welch_p:.1g} / {tests.paired_p:.1g}",
                 "-" if tests is None else f"{tests.effect_size:.1f}",
@@ -127,17 +127,17 @@ def object_table(records: list[Record]) -> Table:
         *(f"{name} lost" for name in CONTROLLERS),
     ]  # fmt: skip
     note = (
-        "Static error, lost objects with the whole angle. Ratio of means with the bootstrap over paired "
-        "seeds; the effect size is Cohen's d of the paired differences. The paper's ratios: 28.5 to 70 %, "
+        "Steady-state error, lost objects with the whole angle. Ratio of means with the bootstrap over "
+        "paired seeds; the effect size is Cohen's d of the paired differences. The paper's ratios: 28.5 to 70 %, "
         "p = 3.8e-4."
     )
-    return Table("by_object", "Static error of each object (Table II)", header, rows, note)
+    return Table("by_object", "Steady-state error of each object (Table II)", header, rows, note)
 
 
 def comparison_table(records: list[Record], limit: int) -> Table:
     """E-KM against KM and KM+I in everything that is measured."""
     values: list[tuple[str, Value]] = [
-        ("static error", static_error),
+        ("steady-state error", steady_state_error),
         ("motions to settle", lambda r: settle_steps(r, limit=limit)),
         ("error of the first motion", lambda r: r["first_step_deg"]),
         ("error of all motions", lambda r: r["step_error_deg"]),
@@ -155,10 +155,10 @@ def comparison_table(records: list[Record], limit: int) -> Table:
             )
             row.append(_ratio_cell(ours, theirs))
         rows.append(row)
-    for kind, value in (("long step", _long_step_error), ("camera off", static_error)):
+    for kind, value in (("long step", _long_step_error), ("camera off", steady_state_error)):
         if not any(r["kind"] == kind for r in records):
             continue
-        row = [{"long step": "error of one long step", "camera off": "static error, camera off"}[kind]]
+        row = [{"long step": "error of one long step", "camera off": "steady-state error, camera off"}[kind]]
         for ours_name, theirs_name in pairs:
             ours, theirs = paired_means(
                 select(records, controller=ours_name, kind=kind),
@@ -187,7 +187,7 @@ def probe_table(records: list[Record]) -> Table:
                 name,
                 text(estimate(steps, _long_step_error)),
                 str(rate(r["lost"] for r in steps)),
-                text(estimate(dark, static_error)),
+                text(estimate(dark, steady_state_error)),
                 str(rate(r["lost"] for r in dark)),
             ]
         )

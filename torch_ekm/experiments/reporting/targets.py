@@ -19,7 +19,7 @@ from .statistics import (
     recovery_trials,
     select,
     settle_steps,
-    static_error,
+    steady_state_error,
     unit_means,
 )
 
@@ -55,11 +55,11 @@ def generalize_targets(records: list[Record], limit: int) -> list[Row]:
 
     rows = []
     for item in dict.fromkeys(r["object"] for r in records):
-        ours, theirs = pair("E-KM", "KM", static_error, item)
+        ours, theirs = pair("E-KM", "KM", steady_state_error, item)
         if len(ours):
             ratio = bootstrap_ratio(ours, theirs)
-            rows.append(goal(f"static error E-KM : KM, {item}", 25, 100 * ratio.mean, " %"))
-    tests = compare(*pair("E-KM", "KM", static_error))
+            rows.append(goal(f"steady-state error E-KM : KM, {item}", 25, 100 * ratio.mean, " %"))
+    tests = compare(*pair("E-KM", "KM", steady_state_error))
     if tests is not None:
         p = tests.welch_p
         rows.append(["Welch p over all objects", "below 1e-06", f"{p:.1g}", "yes" if p < 1e-6 else "no"])
@@ -71,7 +71,7 @@ def generalize_targets(records: list[Record], limit: int) -> list[Row]:
                 ratio = 100 * bootstrap_ratio(ours, theirs).mean
                 rows.append(goal(f"{what} {name} : KM+I", aim, ratio, " %"))
 
-    share("static error", 100, static_error)
+    share("steady-state error", 100, steady_state_error)
     share("motions to settle", 60, lambda r: settle_steps(r, limit=limit))
     share("error of the first motion", 50, lambda r: r["first_step_deg"])
     lost = {
@@ -82,11 +82,13 @@ def generalize_targets(records: list[Record], limit: int) -> list[Row]:
     if len(lost) == 2:
         rows.append(goal("objects lost, E-KM minus KM+I", 0, lost["E-KM"] - lost["KM+I"], " %"))
         rows.append(goal("objects lost, E-KM", 5, lost["E-KM"], " %"))
-    km = unit_means(select(records, controller="KM", kind="turn"), static_error)
+    km = unit_means(select(records, controller="KM", kind="turn"), steady_state_error)
     if km:
         mean = float(np.mean(list(km.values())))
         inside = 1 <= mean <= 3
-        rows.append(["static error of the KM", "1 to 3 deg", f"{mean:.2f} deg", "yes" if inside else "no"])
+        rows.append(
+            ["steady-state error of the KM", "1 to 3 deg", f"{mean:.2f} deg", "yes" if inside else "no"]
+        )
     return rows
 
 

@@ -49,12 +49,12 @@ def make_transmission(hand: HandDescription, parameters: PlantParameters) -> Tra
 
 
 def make_servo(hand: HandDescription, config: PlantConfig, parameters: PlantParameters) -> Servo:
-    """The position controller of this specimen of the hand."""
-    specimen = np.random.default_rng([parameters.hardware_seed, 0])
+    """The position controller of this hardware instance."""
+    hardware_instance = np.random.default_rng([parameters.hardware_seed, 0])
     return Servo(
         hand.actuator_lower,
         hand.actuator_upper,
-        bias=parameters.actuator_bias * specimen.uniform(-1.0, 1.0, size=hand.n_a),
+        bias=parameters.actuator_bias * hardware_instance.uniform(-1.0, 1.0, size=hand.n_a),
         fresh_error=parameters.actuator_error,
         dead_zone=parameters.dead_zone,
         threshold=parameters.threshold,

@@ -1,4 +1,4 @@
-"""Each trouble changes what it should, by the right amount, and nothing else."""
+"""Each disturbance changes what it should, by the right amount, and nothing else."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from simulation_helpers import DEG, ROLL, SQUEEZE, increment, motion
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.plant import Plant, PlantStatus
 from torch_ekm.simulation import (
-    SEVERITIES,
+    PRESETS,
     Change,
     DisturbedPlant,
     PlantConfig,
     PlantParameters,
     SimulatedHand,
     Tug,
-    severity,
+    preset,
 )
 
 pytest.importorskip("sapien")
@@ -37,7 +37,7 @@ def grasped(plant):
 
 @pytest.fixture
 def exact(plant, grasped):
-    """The plant without any trouble, freshly grasped."""
+    """The plant without any disturbance, freshly grasped."""
     plant.restore(grasped)
     yield plant
     plant.restore(grasped)
@@ -261,7 +261,7 @@ def test_increments_on_the_setpoint_get_through_a_dead_zone():
 
 # -- the sensors --------------------------------------------------------------------------------------
 
-SENSOR_TROUBLES = {
+SENSOR_DISTURBANCES = {
     "joint_noise": 1.0 * DEG,
     "position_noise": 1e-3,
     "rotation_noise": 1.0 * DEG,
@@ -276,11 +276,11 @@ SENSOR_TROUBLES = {
 SEEN_IN = {"joint_noise": "q", "stuck_joints": "q", "force": "fingertip_force"}
 
 
-@pytest.mark.parametrize("name", SENSOR_TROUBLES)
-def test_sensor_troubles_touch_their_own_reading_and_never_the_truth(exact, grasped, name):
+@pytest.mark.parametrize("name", SENSOR_DISTURBANCES)
+def test_sensor_disturbances_touch_their_own_reading_and_never_the_truth(exact, grasped, name):
     clean = exact.command(ROLL)
     exact.restore(grasped)
-    exact.change(**{name: SENSOR_TROUBLES[name]})
+    exact.change(**{name: SENSOR_DISTURBANCES[name]})
     seen = exact.command(ROLL)
     for key, value in clean.info["truth"].items():
         assert torch.equal(seen.info["truth"][key], value), key
@@ -395,24 +395,24 @@ def test_a_stuck_channel_stays_where_it_was(exact):
     assert (truth(later)[joint] - first).abs() > 0.2 * DEG
 
 
-# -- severities and events ----------------------------------------------------------------------------
+# -- presets and events ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", SEVERITIES)
-def test_every_severity_grasps(name):
-    plant = SimulatedHand("icub_right", "box", parameters=severity(name))
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_grasps(name):
+    plant = SimulatedHand("icub_right", "box", parameters=preset(name))
     assert plant.reset(0).status is not PlantStatus.LOST
     assert plant.command(ROLL).status is not PlantStatus.LOST
 
 
-def test_severities_grow():
-    figures = [severity(name) for name in ("none", "nominal", "worn", "hostile")]
+def test_presets_grow():
+    figures = [preset(name) for name in ("none", "nominal", "worn", "hostile")]
     for name in ("actuator_bias", "dead_zone", "joint_friction", "backlash", "position_noise", "latency"):
         values = [getattr(parameters, name) for parameters in figures]
         assert values == sorted(values)
         assert values[-1] > values[0] == 0.0
     with pytest.raises(UnknownNameError, match="hostile"):
-        severity("nasty")
+        preset("nasty")
 
 
 def test_events_happen_when_they_should(exact):

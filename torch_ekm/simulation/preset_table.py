@@ -1,4 +1,4 @@
-"""The severities as a table: ``python -m torch_ekm.simulation.severity_table``."""
+"""The presets as a table: ``python -m torch_ekm.simulation.preset_table``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 import math
 
 from .parameters import PlantParameters
-from .presets import SEVERITIES
+from .presets import PRESETS
 
 _DEG = math.pi / 180
 _ANGLES = ("tendon_elongation", "actuator_bias", "actuator_error", "dead_zone", "threshold", "backlash")
@@ -16,10 +16,10 @@ _SHOWN_AS |= {name: (1.0, "N") for name in ("force_noise", "force_offset", "forc
 _SHOWN_AS |= {"tendon_creep": (1 / _DEG, "deg/(N m s)"), "latency": (1.0, "s")}
 
 
-def severity_table() -> str:
-    """All figures of all severities as a Markdown table, with "." for what is as in "none"."""
-    columns = [make() for make in SEVERITIES.values()]
-    lines = [f"| parameter | unit | {' | '.join(SEVERITIES)} |", "|---" * (2 + len(SEVERITIES)) + "|"]
+def preset_table() -> str:
+    """All figures of all presets as a Markdown table, with "." for what is as in "none"."""
+    columns = [make() for make in PRESETS.values()]
+    lines = [f"| parameter | unit | {' | '.join(PRESETS)} |", "|---" * (2 + len(PRESETS)) + "|"]
     for item in dataclasses.fields(PlantParameters):
         name = item.name
         factor, unit = _SHOWN_AS.get(name, (1.0, ""))
@@ -38,4 +38,4 @@ def _shown(value: object, factor: float) -> str:
 
 
 if __name__ == "__main__":
-    print(severity_table())
+    print(preset_table())
