@@ -20,9 +20,11 @@ from .learners import DEFAULT_LEARNER, LEARNERS, learner_figures
 
 _DEG = math.pi / 180
 
-#: The controllers that are compared on the same seeds, grasps, limits and stopping rule. "+I": the
-#: increments accumulate on the set-point instead of the encoder, an integrator that learns nothing.
+#: The controllers that are compared on the same seeds, grasps, limits and stopping rule. "+I" is integral
+#: action: the increments accumulate on the set-point instead of the encoder, which learns nothing.
 CONTROLLERS = ("KM", "KM+I", "E-KM", "E-KM+I")
+#: Seeds from here on are never used for tuning.
+FIRST_REPORTED = 1000
 
 
 @dataclass(frozen=True)
@@ -76,9 +78,7 @@ class Setting:
 
     def plant_config(self, controller: str) -> PlantConfig:
         """The position controller as ``controller`` uses it, and the grasp."""
-        if controller not in CONTROLLERS:
-            raise UnknownNameError("controller", controller, CONTROLLERS)
-        relative_to = "setpoint" if controller.endswith("+I") else "encoder"
+        relative_to = "setpoint" if check_controller(controller).endswith("+I") else "encoder"
         return _changed(PlantConfig(relative_to=relative_to), "grasp", self.grasp)
 
     def model_options(self) -> ModelOptions:
@@ -128,6 +128,22 @@ def digest(setting: Setting, objects: Iterable[str | Path], *more: Any) -> str:
     figures = [dataclasses.asdict(setting), setting.figures(), contents, more]
     text = json.dumps(figures, sort_keys=True, default=_plain)
     return hashlib.sha256(text.encode()).hexdigest()[:10]
+
+
+def object_name(object: str) -> str:
+    """Short name of an object given by name or path."""
+    return Path(object).stem if object.endswith(".urdf") else object
+
+
+def check_controller(name: str) -> str:
+    """``name``, if there is such a controller.
+
+    Raises:
+        UnknownNameError: there is not; the message lists them.
+    """
+    if name not in CONTROLLERS:
+        raise UnknownNameError("controller", name, CONTROLLERS)
+    return name
 
 
 def _plain(item: Any) -> Any:

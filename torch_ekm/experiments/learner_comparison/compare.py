@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..._extras import require
 from ...exceptions import ParameterError
 from ..jobs import run_jobs
-from ..reporting.metrics import Estimate
+from ..reporting.statistics import Estimate
 from .learners import DEFAULT, OURS, contender
 from .prequential import Z90, run_prequential
 from .recording import Recording
