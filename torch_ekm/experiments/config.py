@@ -77,8 +77,14 @@ class Setting:
         return self.replace(plant={"hardware_seed": seed, **self.plant})
 
     def plant_config(self, controller: str) -> PlantConfig:
-        """The position controller as ``controller`` uses it, and the grasp."""
-        relative_to = "setpoint" if check_controller(controller).endswith("+I") else "encoder"
+        """The position controller as ``controller`` uses it, and the grasp.
+
+        Raises:
+            UnknownNameError: no such controller; the message lists them.
+        """
+        if controller not in CONTROLLERS:
+            raise UnknownNameError("controller", controller, CONTROLLERS)
+        relative_to = "setpoint" if controller.endswith("+I") else "encoder"
         return _changed(PlantConfig(relative_to=relative_to), "grasp", self.grasp)
 
     def model_options(self) -> ModelOptions:
@@ -133,17 +139,6 @@ def digest(setting: Setting, objects: Iterable[str | Path], *more: Any) -> str:
 def object_name(object: str) -> str:
     """Short name of an object given by name or path."""
     return Path(object).stem if object.endswith(".urdf") else object
-
-
-def check_controller(name: str) -> str:
-    """``name``, if there is such a controller.
-
-    Raises:
-        UnknownNameError: there is not; the message lists them.
-    """
-    if name not in CONTROLLERS:
-        raise UnknownNameError("controller", name, CONTROLLERS)
-    return name
 
 
 def _plain(item: Any) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -36,8 +36,6 @@ class Bench:
         setting: hand, plant, model, learner, rule.
         object: name, path or description.
         controller: one of ``CONTROLLERS``.
-        learner: used instead of a fresh one of the setting's kind (e.g. one that knows other objects).
-        encoding: what the learner sees of a state; by default made at the first grasp.
         keep_images: with sensing, the camera's last image stays in ``info["raw"]["image"]``.
     """
 
@@ -46,8 +44,6 @@ class Bench:
         setting: Setting,
         object: str | ObjectDescription,
         controller: str,
-        learner: ResidualLearner | None = None,
-        encoding: GraspEncoding | None = None,
         *,
         keep_images: bool = False,
     ) -> None:
@@ -62,16 +58,16 @@ class Bench:
             stuck = setting.parameters().stuck_joints
             self.plant = _sensed(self.disturbed, self.hand, stuck, keep_images)
         self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model_options())
-        self.learner, self.encoding = learner, encoding
+        self.learner: ResidualLearner | None = None
+        self.encoding: GraspEncoding | None = None
         self.enhanced: EnhancedModel | None = None
         self.no_grasp = ""
         """Why the last grasp that failed did."""
         self._ever_held, self._failed = False, 0  # trials without a grasp
-        self.on_grasp: Callable[[torch.Tensor], object] | None = None
-        """Hears of the axis of each new grasp."""
 
     @property
     def learns(self) -> bool:
+        """The controller is an E-KM."""
         return self.controller.startswith("E-KM")
 
     def grasp(self, seed: int, trial: int) -> GraspState | None:
@@ -92,45 +88,53 @@ class Bench:
             self.model.reset()
             if self.learns and self.enhanced is None:
                 self._prepare_learner(start)
-            if self.on_grasp is not None:
-                self.on_grasp(self.hand.rotation_axis)
             return start
         self._failed += 1
         return None
 
     def adopt(self, learner: ResidualLearner, encoding: GraspEncoding) -> None:
-        """Use this learner from now on, with this encoding."""
+        """Learn with this learner (e.g. one that knows other objects) and what it sees of a state, instead
+        of a fresh one of the setting's kind."""
         self.learner, self.encoding, self.enhanced = learner, encoding, None
 
-    def trial(
+    def trial(self, seed: int, trial: int, angle_deg: float, kind: str = "turn", **options: Any) -> Record:
+        """Turn the object by ``angle_deg`` from a fresh grasp.
+
+        Args:
+            kind: what the record is called.
+            options: of :meth:`turn`.
+        """
+        start = self.grasp(seed, trial)
+        about = Trial(self.name, kind, self.controller, seed, trial, angle_deg)
+        if start is None:
+            return NotGrasped(**vars(about), message=self.no_grasp)
+        return self.turn(about, start, **options)
+
+    def turn(
         self,
-        seed: int,
-        trial: int,
-        angle_deg: float,
-        kind: str = "turn",
+        about: Trial,
+        start: GraspState,
         *,
         learn: bool = True,
         events: Sequence[Tug | Change] = (),
         blind_deg: float = 0.0,
         poses: bool = False,
-    ) -> Record:
-        """Turn the object by ``angle_deg`` from a fresh grasp.
+    ) -> TrialRecord:
+        """Turn the object that is held.
 
         Args:
-            kind: what the record is called.
+            about: what is to be done.
+            start: from where, as measured.
             learn: train after every motion (an E-KM only).
             events: what happens on the way; ``at`` counts this trial's commands from 0.
             blind_deg: the camera is off for this last part of the turn [deg].
             poses: keep the true poses, for pictures.
         """
-        about, start = self._begin(kind, seed, trial, angle_deg)
-        if start is None:
-            return NotGrasped(**vars(about), message=self.no_grasp)
         self.disturbed.events = tuple(
             dataclasses.replace(event, at=event.at + self.disturbed.count) for event in events
         )
         axis = self.hand.rotation_axis
-        target = PoseTarget.turned(start, axis, angle_deg * _DEG)
+        target = PoseTarget.turned(start, axis, about.angle_deg * _DEG)
         controller, plant = self._controller(axis), self.plant
         if blind_deg:
             model = self.model if self.enhanced is None else self.enhanced
@@ -144,7 +148,8 @@ class Bench:
         Feedback has no say in it. The true error is that of the rotation about the axis, from where the
         object really was; the learner stays as it is.
         """
-        about, start = self._begin("long step", seed, trial, step_deg)
+        start = self.grasp(seed, trial)
+        about = Trial(self.name, "long step", self.controller, seed, trial, step_deg)
         if start is None:
             return NotGrasped(**vars(about), message=self.no_grasp)
         axis = self.hand.rotation_axis
@@ -160,9 +165,6 @@ class Bench:
     def close(self) -> None:
         """Give back what the plant holds."""
         self.plant.close()
-
-    def _begin(self, kind: str, seed: int, trial: int, angle_deg: float) -> tuple[Trial, GraspState | None]:
-        return Trial(self.name, kind, self.controller, seed, trial, angle_deg), self.grasp(seed, trial)
 
     def _controller(self, axis: torch.Tensor, **changes: Any) -> LookAndMoveController:
         options = dataclasses.replace(self.setting.controller_options(), **changes)

@@ -36,15 +36,10 @@ DISTURBANCES: dict[str, tuple[str, ...]] = {
     "dead zone": ("dead_zone",),
     "backlash": ("backlash",),
     "noise of the sensors": (
-        "joint_noise",
-        "position_noise",
-        "rotation_noise",
-        "force_noise",
-        "force_offset",
-        "force_hysteresis",
+        "joint_noise", "position_noise", "rotation_noise", "force_noise", "force_offset", "force_hysteresis",
         "force_range",
     ),
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from typing import Self
 import numpy as np
 
 from ...exceptions import ParameterError
-from ..config import CONTROLLERS, Setting, check_controller, digest, object_name
-from ..records import Record, TrialRecord
+from ..config import CONTROLLERS, Setting, digest, object_name
+from ..records import Record
 from ..reporting.plots import plot_steady_state_error, save_figure
-from ..reporting.report import Cell, Column, FigureFile, Report, Table
+from ..reporting.report import Cell, Column, Report, Table
 from ..reporting.statistics import (
     Array,
     Value,
@@ -92,7 +92,7 @@ class Generalize(Protocol):
             if not angles or not all(0 < abs(angle) < 180 for angle in angles):
                 raise ParameterError("angles_deg", self.angles_deg, "angles between 0 and 180 deg")
         for name in self.controllers:
-            check_controller(name)
+            self.setting.plant_config(name)
 
     def angles_of(self, object: str) -> tuple[float, ...]:
         """Rotations of one object [deg]."""
@@ -178,10 +178,20 @@ class Generalize(Protocol):
         figures = []
         for item in self.objects:
             name = object_name(item)
-            caption = f"Steady-state error with the {name} (Fig. 6). Crosses: lost objects, off the scale."
-            turns = select(records, object=name, kind="turn")
-            if turns:
-                figures.append(self.figure(turns, self.angles_of(item), folder, name, caption))
+            turns = by_controller(select(records, object=name))
+            errors = {
+                controller: {
+                    f"{angle:g}": np.array([steady_state_error(r) for r in mine if r.angle_deg == angle])
+                    for angle in self.angles_of(item)
+                }
+                for controller, mine in turns.items()
+            }
+            if errors:
+                caption = (
+                    f"Steady-state error with the {name} (Fig. 6). Crosses: lost objects, off the scale."
+                )
+                plot = plot_steady_state_error(errors, name.replace("_", " "))
+                figures.append(save_figure(plot, folder, f"steady_state_error_{name}", caption))
         tables = [
             targets_table(self.targets(results)),
             self.angles_table(),
@@ -196,27 +206,6 @@ class Generalize(Protocol):
         names = ", ".join(object_name(item) for item in self.objects)
         summary = f"Objects: {names}. {verdict(records, seeds)}"
         return Report("Generalisation: other objects, other weights", summary, tables, figures)
-
-    def figure(
-        self,
-        turns: Sequence[TrialRecord],
-        angles: Sequence[float],
-        folder: Path,
-        name: str,
-        caption: str,
-    ) -> FigureFile:
-        """Fig. 6 of one object."""
-        errors = {
-            controller: {
-                f"{angle:g}": np.array(
-                    [steady_state_error(r) for r in select(turns, controller=controller, angle_deg=angle)]
-                )
-                for angle in angles
-            }
-            for controller in self.controllers
-        }
-        plot = plot_steady_state_error(errors, name.replace("_", " "))
-        return save_figure(plot, folder, f"steady_state_error_{name}", caption)
 
     def angles_table(self) -> Table:
         """The rotations that were asked for (Table I)."""

@@ -21,7 +21,7 @@ from ...residual import ResidualLearner, UpdateReport
 from ...typing import Tensor
 from ..config import Setting, digest
 from ..learners import make_learner
-from ..records import TrialRecord
+from ..records import Trial, TrialRecord
 from ..reporting.plots import plot_bank, save_figure
 from ..reporting.report import Cell, Column, Report, Table
 from ..reporting.statistics import Array, bootstrap_mean, bootstrap_ratio, rate
@@ -102,10 +102,11 @@ class ObjectMemory(Protocol):
         for trial, index in enumerate(sequence.tolist()):
             item = self.objects[index]
             if item not in benches:
-                setting = self.setting.hardware_instance(seed)
-                benches[item] = Bench(setting, item, "E-KM", memories, encoding)
+                benches[item] = Bench(self.setting.hardware_instance(seed), item, "E-KM")
+                if memories is not None and encoding is not None:
+                    benches[item].adopt(memories, encoding)
             bench = benches[item]
-            if memories is None or encoding is None:  # the first grasp decides what is seen of a state
+            if memories is None:  # the first grasp decides what is seen of a state
                 if bench.grasp(seed, trial) is None or bench.encoding is None:
                     del benches[item]
                     continue
@@ -113,33 +114,25 @@ class ObjectMemory(Protocol):
                 signature = self.make_signature(bench) if self.readings else None
                 memories = Memories(self._make_bank(encoding.n_features, bench.model.hand.n_a, signature))
                 bench.adopt(memories, encoding)
-
-            def begin(
-                axis: Tensor,
-                item: str = item,
-                bench: Bench = bench,
-                memories: Memories = memories,
-                signature: GraspSignature | None = signature,
-            ) -> None:
-                """The object is grasped and at rest: feel it, and ask the bank what it is."""
-                felt = None if signature is None else _feel(bench, signature, self.readings)
-                slot = memories.begin(item, felt)
-                if records:
-                    records[-1] = dataclasses.replace(records[-1], model=slot)
-                memories.axis.copy_(axis)
-
-            bench.on_grasp = begin
             angle = float(generator.uniform(0.4, 1.0) * max(TABLE_I.get(item, OTHER_ANGLES)))
-            record = bench.trial(seed, trial, angle)
-            if isinstance(record, TrialRecord):
-                records.append(
-                    MemoryTurn(
-                        **vars(record),
-                        posterior=tuple(memories.bank.posterior.tolist()),
-                        n_models=memories.bank.n_models,
-                        memory_errors_deg={name: tuple(errors) for name, errors in memories.errors.items()},
-                    )
+            start = bench.grasp(seed, trial)
+            if start is None:
+                continue
+            # the object is at rest: feel it, and ask the bank what it is
+            felt = None if signature is None else _feel(bench, signature, self.readings)
+            slot = memories.begin(item, felt)
+            if records:
+                records[-1] = dataclasses.replace(records[-1], model=slot)
+            memories.axis.copy_(bench.hand.rotation_axis)
+            turn = bench.turn(Trial(bench.name, "turn", "E-KM", seed, trial, angle), start)
+            records.append(
+                MemoryTurn(
+                    **vars(turn),
+                    posterior=tuple(memories.bank.posterior.tolist()),
+                    n_models=memories.bank.n_models,
+                    memory_errors_deg={name: tuple(errors) for name, errors in memories.errors.items()},
                 )
+            )
         if memories is not None and records:
             slot = memories.bank.end()
             records[-1] = dataclasses.replace(records[-1], model=slot, n_models=memories.bank.n_models)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...exceptions import ParameterError
 from ...simulation import Change, Tug
-from ..config import CONTROLLERS, Setting, check_controller, digest, object_name
+from ..config import CONTROLLERS, Setting, digest, object_name
 from ..records import Record
 from ..reporting.plots import plot_learning_test, plot_prediction_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
@@ -86,7 +86,6 @@ class Online(Protocol):
 
     def session(self, controller: str, seed: int) -> list[Record]:
         """All trials of one seed, in order."""
-        check_controller(controller)
         angles = np.random.default_rng(seed).uniform(*self.angle_range_deg, size=self.trials)
         bench = Bench(self.setting.hardware_instance(seed), self.object, controller)
         records = []

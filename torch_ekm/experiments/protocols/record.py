@@ -10,7 +10,7 @@ from typing import Any
 
 from ...exceptions import EKMError, ParameterError
 from ...plant import RecordingPlant, TrialLog
-from ..config import Setting, check_controller
+from ..config import Setting
 from ..runner import Bench
 
 
@@ -31,7 +31,7 @@ class RecordConfig:
     """Keep the camera's images too, 0.2 MB each."""
 
     def __post_init__(self) -> None:
-        check_controller(self.controller)
+        self.setting.plant_config(self.controller)
         if not self.angles_deg or not all(0 < abs(angle) < 180 for angle in self.angles_deg):
             raise ParameterError("angles_deg", self.angles_deg, "angles between 0 and 180 deg")
         if self.images and not self.setting.sensing:

@@ -15,16 +15,8 @@ from ..._versions import versions_of
 from .statistics import Estimate, Rate
 
 _PACKAGES = (
-    "torch_ekm",
-    "torch",
-    "numpy",
-    "scipy",
-    "sapien",
-    "coal",
-    "qpsolvers",
-    "piqp",
-    "pytorch-kinematics",
-)
+    "torch_ekm", "torch", "numpy", "scipy", "sapien", "coal", "qpsolvers", "piqp", "pytorch-kinematics",
+)  # fmt: skip
 T = TypeVar("T")
 #: None: there is nothing to say.
 Cell = str | bool | int | float | Estimate | Rate | None

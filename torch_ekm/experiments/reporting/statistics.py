@@ -23,9 +23,6 @@ BAND_DEG = 0.5
 ALPHA = 0.05
 
 
-# -- figures of one trial ----------------------------------------------------------------------------
-
-
 def steady_state_error(record: TrialRecord) -> float:
     """True error at the end [deg]; a lost object counts with the whole angle that was asked for."""
     return abs(record.angle_deg) if record.lost else record.true_error_deg
@@ -57,9 +54,6 @@ def mean_of(name: str) -> Value:
     return value
 
 
-# -- units and pairs ---------------------------------------------------------------------------------
-
-
 def select(records: Iterable[Record], **wanted: Any) -> list[TrialRecord]:
     """Trials of grasped objects with these entries."""
     grasped = (r for r in records if isinstance(r, TrialRecord))
@@ -86,9 +80,6 @@ def paired_means(
     a, b = unit_means(ours, ours_value), unit_means(theirs, theirs_value or ours_value)
     units = [unit for unit in a if unit in b]
     return np.array([a[unit] for unit in units]), np.array([b[unit] for unit in units])
-
-
-# -- intervals ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -179,9 +170,6 @@ def rate(events: Iterable[bool]) -> Rate:
     count = sum(outcomes)
     interval = require("scipy.stats").binomtest(count, len(outcomes)).proportion_ci(method="wilson")
     return Rate(count, len(outcomes), float(interval.low), float(interval.high))
-
-
-# -- tests -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
