@@ -14,33 +14,12 @@ import numpy as np
 from ...exceptions import ParameterError
 from ..config import CONTROLLERS, Setting, digest, object_name
 from ..records import Record
+from ..reporting import statistics as stats
+from ..reporting import tables
 from ..reporting.plots import plot_steady_state_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from ..reporting.statistics import (
-    Array,
-    Value,
-    bootstrap_ratio,
-    estimate,
-    paired_means,
-    paired_test,
-    rate,
-    select,
-    settle_steps,
-    steady_state_error,
-    unit_means,
-)
-from ..reporting.tables import (
-    Target,
-    by_controller,
-    by_object,
-    comparison_table,
-    controller_table,
-    prediction_table,
-    reason_table,
-    targets_table,
-    timing_table,
-    verdict,
-)
+from ..reporting.statistics import Array, Value, steady_state_error
+from ..reporting.tables import Target
 from ..runner import Bench
 from .protocol import Protocol, Results, records_of
 
@@ -142,33 +121,33 @@ class Generalize(Protocol):
         """Set for the four controllers, over all objects."""
         records, limit = records_of(results), self.setting.max_steps
         found = []
-        for item, mine in by_object(records).items():
+        for item, mine in tables.by_object(records).items():
             ours, theirs = _pair(mine, "E-KM", "KM", steady_state_error)
             if item != "all" and len(ours):
-                ratio = 100 * bootstrap_ratio(ours, theirs).mean
+                ratio = 100 * stats.bootstrap_ratio(ours, theirs).mean
                 found.append(Target(f"steady-state error E-KM : KM, {item} [%]", ratio, most=25))
-        tests = paired_test(*_pair(records, "E-KM", "KM", steady_state_error))
+        tests = stats.paired_test(*_pair(records, "E-KM", "KM", steady_state_error))
         if tests is not None:
             found.append(Target("Welch p over all objects", tests.welch_p, most=1e-6))
         shares: list[tuple[str, float, Value]] = [
             ("steady-state error", 100, steady_state_error),
-            ("motions to settle", 60, settle_steps(limit)),
+            ("motions to settle", 60, stats.settle_steps(limit)),
             ("error of the first motion", 50, lambda r: r.first_step_deg),
         ]
         for what, aim, value in shares:
             for name in ("E-KM", "E-KM+I"):
                 ours, theirs = _pair(records, name, "KM+I", value)
                 if len(ours) and theirs.mean() > 0:
-                    ratio = 100 * bootstrap_ratio(ours, theirs).mean
+                    ratio = 100 * stats.bootstrap_ratio(ours, theirs).mean
                     found.append(Target(f"{what} {name} : KM+I [%]", ratio, most=aim))
-        turns = by_controller(records)
+        turns = tables.by_controller(records)
         lost = {name: 100 * float(np.mean([r.lost for r in mine])) for name, mine in turns.items()}
         if "E-KM" in lost and "KM+I" in lost:
             difference = lost["E-KM"] - lost["KM+I"]
             found.append(Target("objects lost, E-KM minus KM+I [%]", difference, most=0))
             found.append(Target("objects lost, E-KM [%]", lost["E-KM"], most=5))
         if "KM" in turns:
-            mean = float(np.mean(list(unit_means(turns["KM"], steady_state_error).values())))
+            mean = float(np.mean(list(stats.unit_means(turns["KM"], steady_state_error).values())))
             found.append(Target("steady-state error of the KM [deg]", mean, least=1, most=3))
         return found
 
@@ -178,7 +157,7 @@ class Generalize(Protocol):
         figures = []
         for item in self.objects:
             name = object_name(item)
-            turns = by_controller(select(records, object=name))
+            turns = tables.by_controller(stats.select(records, object=name))
             errors = {
                 controller: {
                     f"{angle:g}": np.array([steady_state_error(r) for r in mine if r.angle_deg == angle])
@@ -192,20 +171,20 @@ class Generalize(Protocol):
                 )
                 plot = plot_steady_state_error(errors, name.replace("_", " "))
                 figures.append(save_figure(plot, folder, f"steady_state_error_{name}", caption))
-        tables = [
-            targets_table(self.targets(results)),
+        shown = [
+            tables.targets_table(self.targets(results)),
             self.angles_table(),
             object_table(records),
-            controller_table(records, limit),
-            comparison_table(records, limit),
+            tables.controller_table(records, limit),
+            tables.comparison_table(records, limit),
             probe_table(records),
-            prediction_table(records),
-            reason_table(records),
-            timing_table(records),
+            tables.prediction_table(records),
+            tables.reason_table(records),
+            tables.timing_table(records),
         ]
         names = ", ".join(object_name(item) for item in self.objects)
-        summary = f"Objects: {names}. {verdict(records, seeds)}"
-        return Report("Generalisation: other objects, other weights", summary, tables, figures)
+        summary = f"Objects: {names}. {tables.verdict(records, seeds)}"
+        return Report("Generalisation: other objects, other weights", summary, shown, figures)
 
     def angles_table(self) -> Table:
         """The rotations that were asked for (Table I)."""
@@ -220,23 +199,23 @@ class Generalize(Protocol):
 
 
 def _pair(records: Sequence[Record], ours: str, theirs: str, value: Value) -> tuple[Array, Array]:
-    turns = by_controller(records)
-    return paired_means(turns.get(ours, []), turns.get(theirs, []), value)
+    turns = tables.by_controller(records)
+    return stats.paired_means(turns.get(ours, []), turns.get(theirs, []), value)
 
 
 def object_table(records: Sequence[Record]) -> Table:
     """Steady-state error of each object, paired (the paper's Table II)."""
     rows: list[list[Cell]] = []
-    for item, chosen in by_object(records).items():
-        turns = by_controller(chosen)
+    for item, chosen in tables.by_object(records).items():
+        turns = tables.by_controller(chosen)
         by = {name: turns.get(name, []) for name in CONTROLLERS}
         if not by["KM"] or not by["E-KM"]:
             continue
-        ours, theirs = paired_means(by["E-KM"], by["KM"], steady_state_error)
-        tests = paired_test(ours, theirs)
+        ours, theirs = stats.paired_means(by["E-KM"], by["KM"], steady_state_error)
+        tests = stats.paired_test(ours, theirs)
         figures = () if tests is None else (tests.welch_p, tests.paired_p, tests.effect_size)
-        row: list[Cell] = [item, *(estimate(mine, steady_state_error) for mine in by.values())]
-        row += [bootstrap_ratio(ours, theirs), *(figures or (None,) * 3)]
+        row: list[Cell] = [item, *(stats.estimate(mine, steady_state_error) for mine in by.values())]
+        row += [stats.bootstrap_ratio(ours, theirs), *(figures or (None,) * 3)]
         rows.append(row + [sum(r.lost for r in mine) for mine in by.values()])
     columns = [
         "object", *(f"{name} [deg]" for name in CONTROLLERS), Column("E-KM:KM [%]", ".0f", percent=True),
@@ -253,12 +232,12 @@ def object_table(records: Sequence[Record]) -> Table:
 
 def probe_table(records: Sequence[Record]) -> Table:
     """What the model is worth without feedback: one long step, and turns that end in the dark."""
-    steps, dark = (by_controller(records, kind) for kind in ("long step", "camera off"))
+    steps, dark = (tables.by_controller(records, kind) for kind in ("long step", "camera off"))
     items = {name: name for name in CONTROLLERS if name in steps or name in dark}
     columns: dict[Column, Callable[[str], Cell]] = {
-        Column("one long step"): lambda name: estimate(steps.get(name, []), steady_state_error),
-        Column("lost in it"): lambda name: rate(r.lost for r in steps.get(name, [])),
-        Column("camera off at the end"): lambda name: estimate(dark.get(name, []), steady_state_error),
-        Column("lost then"): lambda name: rate(r.lost for r in dark.get(name, [])),
+        Column("one long step"): lambda name: stats.estimate(steps.get(name, []), steady_state_error),
+        Column("lost in it"): lambda name: stats.rate(r.lost for r in steps.get(name, [])),
+        Column("camera off at the end"): lambda name: stats.estimate(dark.get(name, []), steady_state_error),
+        Column("lost then"): lambda name: stats.rate(r.lost for r in dark.get(name, [])),
     }
     return Table.of("probes", "True error without feedback [deg]", "controller", items, columns)

@@ -69,8 +69,6 @@ class ObjectMemory(Protocol):
     """Largest number of models that the bank may keep."""
     readings: int = 8
     """Sensor readings at rest that make up a grasp's signature; 0: residuals alone tell objects apart."""
-    bank: Mapping[str, float] = field(default_factory=dict)
-    """Changes of :class:`ModelBank`'s figures."""
 
     record: ClassVar[type[TrialRecord]] = MemoryTurn
     quick_seeds: ClassVar[int] = 1
@@ -200,7 +198,7 @@ class ObjectMemory(Protocol):
         options: dict[str, Any] = {}
         if signature is not None:
             options = {"temperature": _TEMPERATURE, "signature_features": signature.n_features}
-        return ModelBank(factory, self.models, **{**options, **self.bank})
+        return ModelBank(factory, self.models, **options)
 
 
 class Memories(ResidualLearner):

@@ -14,19 +14,11 @@ from ...exceptions import ParameterError
 from ...simulation import Change, Tug
 from ..config import CONTROLLERS, Setting, digest, object_name
 from ..records import Record
+from ..reporting import tables
 from ..reporting.plots import plot_learning_test, plot_prediction_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
 from ..reporting.statistics import Array, learning_curve, select
-from ..reporting.tables import (
-    Target,
-    comparison_table,
-    controller_table,
-    prediction_table,
-    reason_table,
-    targets_table,
-    timing_table,
-    verdict,
-)
+from ..reporting.tables import Target
 from ..runner import Bench
 from .protocol import Protocol, Results, records_of
 
@@ -139,18 +131,18 @@ class Online(Protocol):
             caption = f"p(k) and b(k) of the first k trials, seed {min(seeds)} (Fig. 5b)."
             figure = plot_learning_test(ekm[0][both], km[0][both])
             figures.append(save_figure(figure, folder, "learning_test", caption))
-        tables = [
-            targets_table(self.targets(results)),
+        shown = [
+            tables.targets_table(self.targets(results)),
             self.learning_table(records),
             self.learning_table(records, against_truth=True),
-            prediction_table(records),
-            controller_table(records, limit),
-            comparison_table(records, limit),
-            reason_table(records),
-            timing_table(records),
+            tables.prediction_table(records),
+            tables.controller_table(records, limit),
+            tables.comparison_table(records, limit),
+            tables.reason_table(records),
+            tables.timing_table(records),
         ]
-        summary = f"{self.trials} turns of the {object_name(self.object)}. {verdict(records, seeds)}"
-        return Report("Online manipulation: learning while turning", summary, tables, figures)
+        summary = f"{self.trials} turns of the {object_name(self.object)}. {tables.verdict(records, seeds)}"
+        return Report("Online manipulation: learning while turning", summary, shown, figures)
 
     def learning_table(self, records: Sequence[Record], against_truth: bool = False) -> Table:
         """How fast the E-KM learns (the paper's Fig. 5b), for each seed and for the mean over seeds."""

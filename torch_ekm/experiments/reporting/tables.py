@@ -10,24 +10,9 @@ import numpy as np
 from ...control import StopReason
 from ..config import CONTROLLERS, FIRST_REPORTED
 from ..records import NotGrasped, Record, TrialRecord
+from . import statistics as stats
 from .report import Cell, Column, Table
-from .statistics import (
-    BAND_DEG,
-    Array,
-    Estimate,
-    Value,
-    bootstrap_mean,
-    bootstrap_ratio,
-    estimate,
-    mean_of,
-    paired_means,
-    paired_test,
-    rate,
-    select,
-    settle_steps,
-    steady_state_error,
-    survivor_error,
-)
+from .statistics import BAND_DEG, Array, Estimate, Value, bootstrap_ratio, steady_state_error
 
 Trials = Sequence[TrialRecord]
 
@@ -67,23 +52,23 @@ def targets_table(targets: Sequence[Target]) -> Table:
 
 def by_controller(records: Sequence[Record], kind: str = "turn") -> dict[str, list[TrialRecord]]:
     """Trials of one kind, of each controller that has any."""
-    found = {name: select(records, controller=name, kind=kind) for name in CONTROLLERS}
+    found = {name: stats.select(records, controller=name, kind=kind) for name in CONTROLLERS}
     return {name: mine for name, mine in found.items() if mine}
 
 
 def controller_table(records: Sequence[Record], limit: int) -> Table:
     """Every controller on the same seeds and grasps."""
     columns: dict[Column, Callable[[Trials], Cell]] = {
-        Column("steady-state error"): lambda mine: estimate(mine, steady_state_error),
-        Column("survivors"): lambda mine: estimate(mine, survivor_error),
+        Column("steady-state error"): lambda mine: stats.estimate(mine, steady_state_error),
+        Column("survivors"): lambda mine: stats.estimate(mine, stats.survivor_error),
         Column("median"): lambda mine: float(np.median([steady_state_error(r) for r in mine])),
-        Column("motions", ".1f"): lambda mine: estimate(mine, lambda r: r.steps),
-        Column("motions to settle", ".1f"): lambda mine: estimate(mine, settle_steps(limit)),
-        Column("first motion"): lambda mine: estimate(mine, lambda r: r.first_step_deg),
-        Column("of all motions"): lambda mine: estimate(mine, lambda r: r.step_error_deg),
-        Column("off-axis rotation", ".1f"): lambda mine: estimate(mine, survivors_off_axis),
-        Column("reached"): lambda mine: rate(r.reason == StopReason.REACHED.value for r in mine),
-        Column("lost"): lambda mine: rate(r.lost for r in mine),
+        Column("motions", ".1f"): lambda mine: stats.estimate(mine, lambda r: r.steps),
+        Column("motions to settle", ".1f"): lambda mine: stats.estimate(mine, stats.settle_steps(limit)),
+        Column("first motion"): lambda mine: stats.estimate(mine, lambda r: r.first_step_deg),
+        Column("of all motions"): lambda mine: stats.estimate(mine, lambda r: r.step_error_deg),
+        Column("off-axis rotation", ".1f"): lambda mine: stats.estimate(mine, survivors_off_axis),
+        Column("reached"): lambda mine: stats.rate(r.reason == StopReason.REACHED.value for r in mine),
+        Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
     }
     note = (
         "Mean and 95 % bootstrap interval over seeds; angles in degrees, steady-state errors by the "
@@ -106,7 +91,7 @@ def reason_table(records: Sequence[Record]) -> Table:
     for name in CONTROLLERS:
         for reason in [*(reason.value for reason in StopReason), NotGrasped.reason]:
             those = [r for r in records if (r.controller, r.kind, r.reason) == (name, "turn", reason)]
-            errors = [r.true_error_deg for r in select(those) if not r.lost]
+            errors = [r.true_error_deg for r in stats.select(those) if not r.lost]
             if those:
                 rows.append([name, reason, len(those), float(np.mean(errors)) if errors else None])
     columns = ["controller", "reason", "turns", "mean true error [deg]"]
@@ -117,7 +102,7 @@ def comparison_table(records: Sequence[Record], limit: int) -> Table:
     """E-KM against KM and KM+I in everything that is measured."""
     values: dict[str, tuple[str, Value]] = {
         "steady-state error": ("turn", steady_state_error),
-        "motions to settle": ("turn", settle_steps(limit)),
+        "motions to settle": ("turn", stats.settle_steps(limit)),
         "error of the first motion": ("turn", lambda r: r.first_step_deg),
         "error of all motions": ("turn", lambda r: r.step_error_deg),
         "off-axis rotation": ("turn", survivors_off_axis),
@@ -132,8 +117,8 @@ def comparison_table(records: Sequence[Record], limit: int) -> Table:
             continue
         row: list[Cell] = [what]
         for ours_name, theirs_name in pairs:
-            ours, theirs = (select(records, controller=n, kind=kind) for n in (ours_name, theirs_name))
-            row += ratio_and_p(*paired_means(ours, theirs, value))
+            ours, theirs = (stats.select(records, controller=n, kind=kind) for n in (ours_name, theirs_name))
+            row += ratio_and_p(*stats.paired_means(ours, theirs, value))
         rows.append(row)
     columns: list[Column | str] = [""]
     for ours_name, theirs_name in pairs:
@@ -151,7 +136,7 @@ def ratio_and_p(ours: Array, theirs: Array) -> tuple[Estimate | None, float | No
     """Ratio of means, and p of the paired t-test, where there are such."""
     if not len(ours) or theirs.mean() == 0:
         return None, None
-    tests = paired_test(ours, theirs)
+    tests = stats.paired_test(ours, theirs)
     return bootstrap_ratio(ours, theirs), None if tests is None else tests.paired_p
 
 
@@ -161,9 +146,9 @@ def prediction_means(records: Sequence[Record], kind: str = "") -> tuple[Array, 
     Args:
         kind: "true_" for errors against the plant's truth.
     """
-    mine = [r for r in select(records, controller="E-KM", kind="turn") if r.prediction_ekm_deg]
+    mine = [r for r in stats.select(records, controller="E-KM", kind="turn") if r.prediction_ekm_deg]
     names = (f"{kind}prediction_ekm_deg", f"{kind}prediction_km_deg")
-    return paired_means(mine, mine, *(mean_of(name) for name in names))
+    return stats.paired_means(mine, mine, *(stats.mean_of(name) for name in names))
 
 
 def prediction_cells(records: Sequence[Record], kind: str = "") -> list[Cell]:
@@ -171,7 +156,7 @@ def prediction_cells(records: Sequence[Record], kind: str = "") -> list[Cell]:
     ours, theirs = prediction_means(records, kind)
     if not len(ours):
         return [None] * 3
-    return [bootstrap_mean(theirs), bootstrap_mean(ours), bootstrap_ratio(ours, theirs)]
+    return [stats.bootstrap_mean(theirs), stats.bootstrap_mean(ours), bootstrap_ratio(ours, theirs)]
 
 
 def prediction_table(records: Sequence[Record]) -> Table:
@@ -213,7 +198,7 @@ def timing_table(records: Sequence[Record]) -> Table:
 def verdict(records: Sequence[Record], seeds: Sequence[int]) -> str:
     """What the E-KM is worth beside the KM, in one sentence."""
     turns = by_controller(records)
-    ours, theirs = paired_means(turns.get("E-KM", []), turns.get("KM", []), steady_state_error)
+    ours, theirs = stats.paired_means(turns.get("E-KM", []), turns.get("KM", []), steady_state_error)
     parts = []
     if len(ours) and theirs.mean() > 0:
         parts.append(f"Steady-state error E-KM : KM {100 * bootstrap_ratio(ours, theirs):.0f} %")
@@ -226,7 +211,7 @@ def verdict(records: Sequence[Record], seeds: Sequence[int]) -> str:
 
 def _never_grasped(records: Sequence[Record]) -> Mapping[str, str]:
     """Objects that no turn could hold, with the reason of the last try."""
-    held = {r.object for r in select(records, kind="turn")}
+    held = {r.object for r in stats.select(records, kind="turn")}
     failed = [r for r in records if isinstance(r, NotGrasped) and r.kind == "turn"]
     return {r.object: r.message for r in failed if r.object not in held}
 
