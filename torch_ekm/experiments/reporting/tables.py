@@ -124,7 +124,7 @@ def comparison_table(records: Sequence[Record], limit: int) -> Table:
     for ours_name, theirs_name in pairs:
         columns += [
             Column(f"{ours_name} : {theirs_name} [%]", ".0f", percent=True),
-            Column("paired p", ".1g"),
+            Column(f"p, {ours_name} : {theirs_name}", ".1g"),
         ]
     note = (
         "Ratio of means over the same objects and seeds, 95 % bootstrap over pairs, p of the paired t-test."
