@@ -10,6 +10,9 @@ import torch
 from ..exceptions import ShapeError
 from ..typing import Float, Tensor
 
+CHARACTERISTIC_LENGTH = 0.03
+"""L [m], size of a held object: what makes lengths comparable with angles, and moments with forces."""
+
 
 @dataclass(frozen=True)
 class ContactSet:
@@ -37,7 +40,7 @@ class ContactSet:
     friction: Float[Tensor, " n_c"]
     """Coulomb coefficient mu_s of each contact."""
     torsional_friction: Float[Tensor, " n_c"]
-    """Soft-finger coefficient gamma [m]; 0: a hard finger."""
+    """Soft-finger coefficient gamma [m]; 0: a point contact with friction."""
     pinned: tuple[bool, ...] = ()
     """Contact is a material point of both bodies (sharp tip or edge): no rolling term."""
 

@@ -183,7 +183,7 @@ class EquilibriumSolver:
             tolerance: largest miss [N].
 
         Raises:
-            EquilibriumError: not reached (three hard fingers can hold only certain combinations).
+            EquilibriumError: not reached (three point contacts can hold only certain combinations).
         """
         at, known = start, torch.isfinite(normal_force)
         for _ in range(max_rounds):

@@ -17,9 +17,9 @@ from ...control import (
     StoppingRule,
 )
 from ...kinematics import GraspState
-from ...model import KinematicModel, ModelOptions
+from ...model import KinematicModel
 from ...plant import Observation
-from ...simulation import Change, DisturbedPlant, PlantConfig, PlantParameters, SimulatedHand
+from ...simulation import Change, DisturbedPlant, PlantParameters, SimulatedHand
 from ...typing import Tensor
 from ..learners import make_enhanced
 from ..manipulation import run_manipulation, state_of
@@ -51,16 +51,15 @@ def record_simulated_hand(
     Raises:
         GraspError, EquilibriumError: the object could not be grasped.
     """
-    draw, config = np.random.default_rng(seed), PlantConfig()
-    plant = SimulatedHand(hand, object, config, PlantParameters.nominal_mismatch())
+    draw = np.random.default_rng(seed)
+    plant = SimulatedHand(hand, object, parameters=PlantParameters.nominal_mismatch())
     events = [] if new_moment_arm is None else [Change.new_tendons(n // 2, new_moment_arm)]
     disturbed = DisturbedPlant(plant, events)
-    model = KinematicModel(plant.hand, plant.object, ModelOptions(gravity=config.gravity))
+    model = KinematicModel(plant.hand, plant.object)
     rule = StoppingRule(tolerance=0.25 * _DEG, stall_progress=0.1 * _DEG, max_steps=10)
     enhanced, x, y, segments = None, [], [], []
     while len(x) < n:
         start = state_of(disturbed.reset(seed + len(segments)))
-        model.reset()
         enhanced = make_enhanced(model, start, 1) if enhanced is None else enhanced
         controller = LookAndMoveController(
             model,
