@@ -269,8 +269,8 @@ stiffness = {ACTUATOR_STIFFNESS}""")
     out += [f'\n[[couplings]]\nname = "{name}"\njoints = {inline(arms)}' for name, arms in COUPLINGS]
     out.append(f"""
 # Fingertips: capsules of {PAD_RADIUS * 1e3:g} mm, the same as the URDF's collision shapes [m, link frame].
-# direction: the palmar side. torsional_friction [m]: {PAD_TORSION:g} is a point contact with friction, as that
-# of a simulator is; a soft pad has 2 to 4 mm.""")
+# direction: the palmar side. torsional_friction [m]: {PAD_TORSION:g} is a point contact with friction, as
+# a simulator's is; a soft pad has 2 to 4 mm.""")
     for finger in FINGERS:
         out.append(f"""
 [[pads]]

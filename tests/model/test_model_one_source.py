@@ -1,4 +1,4 @@
-"""What plant and model, or two parts of the model, share is said once; and a linearization remembers nothing."""
+"""What plant and model, or two parts of the model, share is said once; linearize remembers nothing."""
 
 from __future__ import annotations
 
@@ -37,7 +37,11 @@ def test_one_length_scales_ranks_and_moments():
     def unbalanced(length):
         options = dataclasses.replace(toy.model.options, length=length)
         model = KinematicModel(
-            toy.model.hand, toy.model.obj, options, kinematics=toy.model.kinematics, detector=None or (lambda *_: slippery)
+            toy.model.hand,
+            toy.model.obj,
+            options,
+            kinematics=toy.model.kinematics,
+            detector=lambda *_: slippery,
         )
         return float(model.linearize(toy.state).forces.violation)
 

@@ -1,7 +1,7 @@
 """Signed distance to a primitive, with the surface's normal and curvature there.
 
-A box, a ball and a capsule are all points within ``radius`` of a box, which may have no extent; a cylinder is a
-box in the half plane (distance from the axis, height). The signed distance of a convex body is a convex
+A box, a ball and a capsule are all points within ``radius`` of a box, which may have no extent; a cylinder is
+a box in the half plane (distance from the axis, height). The signed distance of a convex body is a convex
 function of the point, inside and outside; the search in :mod:`torch_ekm.contact.detector` rests on that.
 
 Twice, for speed: :func:`point_distance` in plain floats, below a microsecond for one point, and
@@ -27,8 +27,8 @@ Distance = Callable[[float, float, float], tuple[float, Vec]]
 def point_distance(shape: Shape) -> Distance:
     """``d(p) = min |p - x|`` over the surface, negative inside; the gradient has unit length.
 
-    In the primitive's own frame (see :class:`torch_ekm.description.Shape`), one point at a time. On the medial
-    axis any of the possible normals is given.
+    In the primitive's own frame (see :class:`torch_ekm.description.Shape`), one point at a time. On the
+    medial axis any of the possible normals is given.
     """
     if shape.kind == "cylinder":
         return _cylinder(*shape.size)
@@ -115,15 +115,15 @@ def _rounded_box(shape: Shape) -> tuple[Vec, float]:
 def _box(hx: float, hy: float, hz: float, radius: float) -> Distance:
     def distance(x: float, y: float, z: float) -> tuple[float, Vec]:
         ex, ey, ez = abs(x) - hx, abs(y) - hy, abs(z) - hz
-        if ex <= 0 and ey <= 0 and ez <= 0:
-            if ex >= ey and ex >= ez:
-                return ex - radius, (copysign(1.0, x), 0.0, 0.0)
-            if ey >= ez:
-                return ey - radius, (0.0, copysign(1.0, y), 0.0)
-            return ez - radius, (0.0, 0.0, copysign(1.0, z))
         ox, oy, oz = max(ex, 0.0), max(ey, 0.0), max(ez, 0.0)
         d = sqrt(ox * ox + oy * oy + oz * oz)
-        return d - radius, (copysign(ox, x) / d, copysign(oy, y) / d, copysign(oz, z) / d)
+        if d > 0:
+            return d - radius, (copysign(ox, x) / d, copysign(oy, y) / d, copysign(oz, z) / d)
+        if ex >= ey and ex >= ez:
+            return ex - radius, (copysign(1.0, x), 0.0, 0.0)
+        if ey >= ez:
+            return ey - radius, (0.0, copysign(1.0, y), 0.0)
+        return ez - radius, (0.0, 0.0, copysign(1.0, z))
 
     return distance
 

@@ -187,7 +187,11 @@ class KinematicModel(nn.Module):
         status = ModelStatus.OK
         if forces is None:
             last = None
-            if previous is not None and previous.forces.solved and previous.contacts.finger == contacts.finger:
+            if (
+                previous is not None
+                and previous.forces.solved
+                and previous.contacts.finger == contacts.finger
+            ):
                 last = previous.forces
             measured = None if fingertip_force is None else at_contacts(self.hand, contacts, fingertip_force)
             forces = self.balance(state.q, kin, A, V_q, V_p, lock, measured, last)

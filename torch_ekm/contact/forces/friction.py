@@ -1,7 +1,7 @@
 """Friction cones: exact norm, polyhedra around them, cutting planes.
 
-Point contact with friction ``|f_t| <= mu_s f_n``; soft finger ``(|f_t|/mu_s)^2 + (m_n/gamma)^2 <= f_n^2``. Both read
-``|u| <= mu_s f_n`` with ``u = [f_t; m_n mu_s/gamma]``.
+Point contact with friction ``|f_t| <= mu_s f_n``; soft finger ``(|f_t|/mu_s)^2 + (m_n/gamma)^2 <= f_n^2``.
+Both read ``|u| <= mu_s f_n`` with ``u = [f_t; m_n mu_s/gamma]``.
 """
 
 from __future__ import annotations

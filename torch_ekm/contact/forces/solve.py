@@ -63,9 +63,7 @@ def _solve(problem):
     if solution.found or "PRIMAL_INFEASIBLE" in status:
         return solution
     G, A = (None if M is None else csc(M) for M in (problem.G, problem.A))
-    sparse = qpsolvers.Problem(
-        csc(problem.P), problem.q, G, problem.h, A, problem.b, problem.lb, problem.ub
-    )
+    sparse = qpsolvers.Problem(csc(problem.P), problem.q, G, problem.h, A, problem.b, problem.lb, problem.ub)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # qpsolvers warns when Clarabel finds the problem infeasible
         return qpsolvers.solve_problem(sparse, "clarabel")
