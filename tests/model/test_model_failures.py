@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from model_icub import gripped
-from model_toys import F64, contact_set, planar_two_finger, relative_error, three_finger, toy_hand
+from model_toys import F64, contact_set, planar_two_finger, relative_error, select, three_finger, toy_hand
 from torch import nn
 
 from torch_ekm.contact import ForceStatus
@@ -42,16 +42,16 @@ def rebuilt(toy, *, options=None, contacts=None, **hand):
 def test_no_contacts():
     toy = three_finger()
     with pytest.raises(NoContactError, match="no finger"):
-        rebuilt(toy, contacts=toy.contacts.select([])).linearize(toy.state)
+        rebuilt(toy, contacts=select(toy.contacts, [])).linearize(toy.state)
 
 
 def test_one_contact_cannot_hold_but_the_answer_is_finite():
     toy = three_finger()
     with pytest.raises((SingularGraspError, UnstableGraspError)) as caught:  # the object topples
-        rebuilt(toy, contacts=toy.contacts.select([0])).linearize(toy.state)
+        rebuilt(toy, contacts=select(toy.contacts, [0])).linearize(toy.state)
     assert caught.value.direction[-3:].norm() > 0.1
     flag = dataclasses.replace(toy.model.options, on_unstable="flag")
-    lin = rebuilt(toy, contacts=toy.contacts.select([0]), options=flag).linearize(toy.state)
+    lin = rebuilt(toy, contacts=select(toy.contacts, [0]), options=flag).linearize(toy.state)
     assert lin.status is ModelStatus.UNSTABLE
     assert lin.forces.status == (ForceStatus.NOT_GRASPABLE,)
     assert torch.isfinite(lin.manipulation_jacobian).all()
@@ -59,7 +59,7 @@ def test_one_contact_cannot_hold_but_the_answer_is_finite():
 
 def test_coincident_contacts_on_one_link_change_nothing():
     toy = three_finger()
-    twice = toy.contacts.select([0, 1, 2, 2])
+    twice = select(toy.contacts, [0, 1, 2, 2])
     J = toy.model.linearize(toy.state).manipulation_jacobian
     lin = rebuilt(toy, contacts=twice).linearize(toy.state)
     assert torch.isfinite(lin.manipulation_jacobian).all()

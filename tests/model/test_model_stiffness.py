@@ -13,7 +13,6 @@ from torch_ekm.kinematics.se3 import exp, hat
 from torch_ekm.model.potential import (
     gravity_gradient,
     gravity_hessian,
-    link_weight_terms,
     posture_stiffness,
     spring_torque,
 )
@@ -117,9 +116,22 @@ def test_posture_stiffness_is_the_hessian_of_the_work_of_constant_forces():
     velocity = torch.linalg.cross(axis[None] * kin.upstream[..., None].to(F64), x[:, None] - origin[None])
     S = posture_stiffness(force, velocity, axis, precedes)
     assert torch.allclose(S, torch.func.hessian(work)(q), atol=1e-12)
-    gradient, hessian = link_weight_terms(-force, x, axis, origin, kin.upstream, precedes)
-    assert torch.allclose(gradient, torch.func.grad(work)(q), atol=1e-12)
-    assert torch.allclose(hessian, S, atol=1e-14)
+
+
+def test_the_weight_of_the_links_is_the_gradient_of_their_height():
+    model, _, at = gripped("box", link_weights=True)
+    links = [link for link in model.hand.urdf.links if link.mass > 0]
+    gravity = torch.tensor(model.gravity, dtype=F64)
+
+    def potential(q):
+        poses = model.kinematics(q)
+        places = [poses.of(link.name) @ torch.tensor([*link.com, 1.0], dtype=F64) for link in links]
+        return -sum(link.mass * gravity @ x[:3] for link, x in zip(links, places, strict=True))
+
+    gradient, hessian = model.link_weights(model.kinematics(at.state.q))
+    assert torch.allclose(gradient, torch.func.grad(potential)(at.state.q), atol=1e-14)
+    assert torch.allclose(hessian, torch.func.hessian(potential)(at.state.q), atol=1e-14)
+    assert gradient.abs().max() > 1e-3
 
 
 def test_gravity_terms_are_derivatives_of_the_height():

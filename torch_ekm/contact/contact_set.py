@@ -66,18 +66,3 @@ class ContactSet:
     def replace(self, **changes: object) -> ContactSet:
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
-
-    def select(self, index: list[int]) -> ContactSet:
-        """The contacts with the given indices, in that order."""
-        return ContactSet(
-            finger=tuple(self.finger[i] for i in index),
-            link=tuple(self.link[i] for i in index),
-            point=self.point[..., index, :],
-            normal=self.normal[..., index, :],
-            gap=self.gap[..., index],
-            finger_curvature=self.finger_curvature[..., index, :, :],
-            object_curvature=self.object_curvature[..., index, :, :],
-            friction=self.friction[index],
-            torsional_friction=self.torsional_friction[index],
-            pinned=tuple(self.pinned[i] for i in index),
-        )

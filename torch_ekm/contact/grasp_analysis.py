@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import torch
 
-from ..kinematics.null_space import null_space
 from ..typing import Float, Tensor
 from .contact_kinematics import ContactKinematics, constraint_matrix
 from .contact_set import CHARACTERISTIC_LENGTH
@@ -43,7 +42,6 @@ def analyse(
     *,
     length: float = CHARACTERISTIC_LENGTH,
     tolerance: float = 1e-8,
-    planar: bool = False,
 ) -> GraspAnalysis:
     """Ranks and classes of one grasp (no batch).
 
@@ -52,22 +50,14 @@ def analyse(
         actuation: J_a.
         length: size of the object [m].
         tolerance: of the rank decisions.
-        planar: count only motions in the plane of the contacts' ``n`` and ``t1`` (translations in it and
-            the rotation about its normal), as in a planar hand.
     """
     A, n_q = constraint_matrix(kin), actuation.shape[-1]
-    pose = torch.eye(6, dtype=A.dtype, device=A.device)
-    if planar:
-        plane = torch.linalg.cross(kin.frame[0, :, 0], kin.frame[0, :, 1])
-        pose = A.new_zeros(6, 3)
-        pose[:3, :2], pose[3:, 2] = null_space(plane[None]), plane
-    pose_scaled = pose.clone()
-    pose_scaled[:3] *= length
-    basis = torch.block_diag(torch.eye(n_q, dtype=A.dtype, device=A.device), pose_scaled)
+    scale = A.new_ones(n_q + 6)
+    scale[n_q : n_q + 3] = length
     row = torch.tensor([1 / length if r % 6 < 3 else 1.0 for r in kin.rows], dtype=A.dtype, device=A.device)
-    A_s = row[:, None] * (A @ basis)
+    A_s = row[:, None] * A * scale
     arm = torch.linalg.vector_norm(actuation, dim=-1, keepdim=True).clamp_min(1e-12)
-    B_s = torch.cat([actuation / arm, actuation.new_zeros(len(actuation), pose.shape[1])], dim=-1)
+    B_s = torch.cat([actuation / arm, actuation.new_zeros(len(actuation), 6)], dim=-1)
 
     def rank(matrix: Tensor) -> int:
         return int(torch.linalg.matrix_rank(matrix, rtol=tolerance)) if matrix.numel() else 0

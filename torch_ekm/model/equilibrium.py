@@ -33,10 +33,6 @@ class Equilibrium:
     residual: float
     """Largest entry of the scaled equations that were solved."""
 
-    @property
-    def n_c(self) -> int:
-        return self.contacts.n_c
-
 
 class EquilibriumSolver:
     """Solves the nonlinear equations of rest for given actuator positions.

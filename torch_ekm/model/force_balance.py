@@ -32,8 +32,10 @@ class ForceBalance:
         self.pose_basis = reduction.pose_basis.double().numpy()
         self.actuation = (reduction.actuation.double().numpy() @ self.joint_basis).T
         self.tendon = torch.tensor([actuator.tendon for actuator in hand.actuators])
-        self.lower, self.upper = hand.joint_lower, hand.joint_upper
-        self.movable = (np.abs(self.joint_basis) > 1e-9).any(1)
+        # a joint beyond one of these touches its stop
+        stops = (np.abs(self.joint_basis) > 1e-9).any(1) & options.joint_stops
+        self.low = np.where(stops, hand.joint_lower + options.stop_tolerance, -np.inf)
+        self.high = np.where(stops, hand.joint_upper - options.stop_tolerance, np.inf)
         gram = self.joint_basis.T @ self.joint_basis
         self.weight = None if np.allclose(gram, np.eye(len(gram))) else np.linalg.inv(gram)
         # smallest joint torques that make up a generalised residual
@@ -41,25 +43,12 @@ class ForceBalance:
         # in a plane the third row of the pose basis is the rotation
         self.moment_rows: Mask = np.any(np.abs(self.pose_basis[3:]) > 1e-9, axis=0)
 
-    def near_stop(self, q: Float[Tensor, "*batch n_q"]) -> Bool[Tensor, "*batch n_q"]:
-        """Joints within the tolerance of a limit (or beyond it)."""
-        low, high, movable = (
-            torch.as_tensor(v, device=q.device)
-            for v in (
-                self.lower + self.options.stop_tolerance,
-                self.upper - self.options.stop_tolerance,
-                self.movable,
-            )
-        )
-        return ((q <= low) | (q >= high)) & movable
-
     def held_by_stops(
         self, q: Float[Tensor, "*batch n_q"], torque: Float[Tensor, "*batch n_q"]
     ) -> Bool[Tensor, "*batch n_q"]:
         """Joints near a stop that bears more than the threshold."""
-        if not self.options.joint_stops:
-            return torch.zeros_like(q, dtype=torch.bool)
-        return (torque.abs() > self.options.stop_torque) & self.near_stop(q)
+        low, high = (torch.as_tensor(stop, device=q.device) for stop in (self.low, self.high))
+        return (torque.abs() > self.options.stop_torque) & ((q <= low) | (q >= high))
 
     def __call__(
         self,
@@ -141,10 +130,7 @@ class ForceBalance:
     def _bounded(self, q: np.ndarray, locked: list[int]) -> tuple[list[int], np.ndarray, np.ndarray]:
         """Joints with a torque of their own, and its bounds: stops push inwards, locks both ways."""
         lower, upper = np.zeros(len(q)), np.zeros(len(q))
-        if self.options.joint_stops:
-            tolerance = self.options.stop_tolerance
-            upper[(q <= self.lower + tolerance) & self.movable] = np.inf
-            lower[(q >= self.upper - tolerance) & self.movable] = -np.inf
+        upper[q <= self.low], lower[q >= self.high] = np.inf, -np.inf
         lower[locked], upper[locked] = -np.inf, np.inf
         joints = [int(j) for j in np.flatnonzero((lower < 0) | (upper > 0))]
         return joints, lower[joints], upper[joints]
