@@ -33,7 +33,7 @@ class ForceBalance:
         self.actuation = (reduction.actuation.double().numpy() @ self.joint_basis).T
         self.tendon = torch.tensor([actuator.tendon for actuator in hand.actuators])
         # a joint beyond one of these touches its stop
-        stops = (np.abs(self.joint_basis) > 1e-9).any(1) & options.joint_stops
+        stops = (np.abs(self.joint_basis) > 1e-9).any(1)
         self.low = np.where(stops, hand.joint_lower + options.stop_tolerance, -np.inf)
         self.high = np.where(stops, hand.joint_upper - options.stop_tolerance, np.inf)
         gram = self.joint_basis.T @ self.joint_basis

@@ -39,8 +39,6 @@ class ModelOptions:
     """Gap up to which the detector takes a pad for touching [m]; more for noisy poses."""
     max_overlap: float = 0.005
     """Deepest penetration of finger and object that is still modelled [m]."""
-    joint_stops: bool = True
-    """A joint that its stop holds does not move."""
     stop_tolerance: float = math.radians(0.1)
     """How near to a limit a joint counts as touching its stop [rad]. Joint angles alone cannot tell how
     much torque a stop takes from the contact forces: fingertip sensors can, so give them if there are any."""
