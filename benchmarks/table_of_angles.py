@@ -34,16 +34,13 @@ def turn(object: str, seed: int, level: str) -> list[dict[str, Any]]:
     config = PlantConfig(relative_to="setpoint")
     plant = SimulatedHand("icub_right", object, config, preset(level))
     # a noisy pose may show a gap of some millimetres where there is contact
-    model = KinematicModel(
-        *plant.true_descriptions(), ModelOptions(gravity=config.gravity, contact_margin=0.004)
-    )
+    model = KinematicModel(*plant.true_descriptions(), ModelOptions(contact_margin=0.004))
     rule = Setting(preset=level).stopping_rule()
     records: list[dict[str, Any]] = []
     for angle in TABLE_I[object]:
         record: dict[str, Any] = {"object": object, "seed": seed, "angle_deg": angle, "error_deg": None}
         try:
             start = plant.reset(seed).state
-            model.reset()
             axis = plant.rotation_axis
             target = PoseTarget.turned(start, axis, degrees=angle)
             done = ClosedLoop(plant, LookAndMoveController(model, axis), rule).run(target)

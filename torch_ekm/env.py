@@ -151,7 +151,7 @@ class InHandRotation(gymnasium.Env):
         if self.render_mode is None:
             return None
         if self._viewer is None:
-            self._viewer = GraspViewer(self.plant.hand, self.plant.object, self.plant.config.gravity)
+            self._viewer = GraspViewer(self.plant.hand, self.plant.object, self.plant.hand.gravity)
         return self._viewer.picture(*self.plant.hand_state())
 
     def close(self) -> None:

@@ -234,6 +234,7 @@ def transmission_text(left: bool) -> str:
 [hand]
 name = "icub_{side}"
 base_link = "hand"
+gravity = [0.0, 0.0, 9.81]  # [m/s^2]: the palm faces down
 
 # Springs [N m/rad] and their rest angles, Coulomb friction [N m] of every joint.
 #
@@ -271,8 +272,8 @@ stiffness = {ACTUATOR_STIFFNESS}{posture}""")
     out += [f'\n[[couplings]]\nname = "{name}"\njoints = {inline(arms)}' for name, arms in COUPLINGS]
     out.append(f"""
 # Fingertips: capsules of {PAD_RADIUS * 1e3:g} mm, the same as the URDF's collision shapes [m, link frame].
-# direction: the palmar side. torsional_friction [m]: {PAD_TORSION:g} is a hard finger, as a single contact
-# point of a simulator is; a soft pad has 2 to 4 mm.""")
+# direction: the palmar side. torsional_friction [m]: {PAD_TORSION:g} is a point contact with friction, as
+# a simulator's is; a soft pad has 2 to 4 mm.""")
     for finger in FINGERS:
         out.append(f"""
 [[pads]]

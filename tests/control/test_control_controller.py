@@ -18,7 +18,7 @@ from torch_ekm.control import (
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
 from torch_ekm.kinematics import GraspState
-from torch_ekm.model import KinematicModel, ModelOptions
+from torch_ekm.model import KinematicModel
 from torch_ekm.residual import ActionLinearKernel, SparseOnlineGP, ZeroResidual
 from torch_ekm.simulation import SimulatedHand
 
@@ -31,7 +31,7 @@ def grasp():
     """A held box: plant, kinematic model, first observation and its state."""
     plant = SimulatedHand("icub_right", "box")
     seen = plant.reset(seed=3)
-    model = KinematicModel(plant.hand, plant.object, ModelOptions(gravity=plant.config.gravity))
+    model = KinematicModel(plant.hand, plant.object)
     return plant, model, seen, GraspState(seen.q, seen.position, seen.rotation)
 
 

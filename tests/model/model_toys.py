@@ -127,6 +127,24 @@ def contact_set(links, points, normals, k_f, k_o, *, friction=3.0, gamma=0.0, pi
     )
 
 
+def select(contacts: ContactSet, index: list[int]) -> ContactSet:
+    """The contacts with the given indices, in that order."""
+    names = (
+        "point",
+        "normal",
+        "gap",
+        "finger_curvature",
+        "object_curvature",
+        "friction",
+        "torsional_friction",
+    )
+    tuples = ("finger", "link", "pinned")
+    return contacts.replace(
+        **{name: getattr(contacts, name)[index] for name in names},
+        **{name: tuple(getattr(contacts, name)[i] for i in index) for name in tuples},
+    )
+
+
 @dataclass
 class Toy:
     """A toy grasp in exact equilibrium: the spring rest angles are chosen so that it is at rest."""

@@ -165,7 +165,7 @@ def test_a_hard_tug_loses_the_object_and_a_gentle_one_does_not(plant, grasped):
 
 def test_the_hand_can_be_oriented_anew_at_each_grasp():
     plant = SimulatedHand("icub_right", "box", PlantConfig(gravity_tilt=40 * DEG))
-    down = np.array(plant.config.gravity) / 9.81
+    down = np.array(plant.hand.gravity) / 9.81
     angles = []
     for seed in range(3):
         before = plant.reset(seed)

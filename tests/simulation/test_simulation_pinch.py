@@ -20,7 +20,7 @@ G = 9.81
 def plan_for(name, request=None, **changes):
     hand, obj = load_hand("icub_right"), load_object(name)
     parameters = PlantParameters.exact().replace(**changes)
-    plan = make_planner(hand, obj, PlantConfig(), parameters).plan(request or PinchRequest())
+    plan = make_planner(hand, obj, PlantConfig(), parameters).plan(request or PinchRequest(hand.gravity))
     return hand, obj, plan, make_transmission(hand, parameters)
 
 
@@ -70,7 +70,7 @@ def test_a_plan_keeps_well_inside_cones_and_stops(name):
 
 
 def test_requests_are_met():
-    request = PinchRequest(force=3.0, along=0.008, across=0.002, tilt=(0.05, -0.05))
+    request = PinchRequest((0.0, 0.0, 9.81), force=3.0, along=0.008, across=0.002, tilt=(0.05, -0.05))
     _, _, plan, _ = plan_for("box", request)
     assert -plan.forces[0] @ plan.normals[0] == pytest.approx(3.0, abs=0.05)
     local = (plan.points - plan.position) @ plan.rotation

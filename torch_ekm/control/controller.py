@@ -17,7 +17,7 @@ from .qp import ControlProblem, ControlSolution, solve_qp
 from .termination import StopReason
 
 if TYPE_CHECKING:
-    from ..model.kinematic_model import KinematicModel
+    from ..model import KinematicModel, Linearization
 
 _DEGREE = np.pi / 180
 
@@ -141,6 +141,11 @@ class LookAndMoveController:
         self._fixed = [hand.actuator_names.index(name) for name in fixed]
         self._pad_index = {pad.name: i for i, pad in enumerate(hand.pads)}
         self._moving = np.flatnonzero(hand.joint_upper > hand.joint_lower)
+        self._previous: Linearization | None = None
+
+    def reset(self) -> None:
+        """Forget the contact forces of the last grasp; call it where one controller serves several."""
+        self._previous = None
 
     def decide(
         self,
@@ -177,12 +182,14 @@ class LookAndMoveController:
         desired = self.limit(focused)
         zero, still = a.new_zeros(n_a), a.new_zeros(n_q + 6)
         try:
-            lin = self.kinematic.linearize(state)
+            lin = self.kinematic.linearize(state, previous=self._previous)
         except NoContactError as failure:
             return Decision(zero, StopReason.OBJECT_LOST, desired, still, still, message=str(failure))
         except GraspError as failure:
             return Decision(zero, StopReason.UNSTABLE_GRASP, desired, still, still, message=str(failure))
 
+        if lin.forces.solved:
+            self._previous = lin
         desired = self.limit(focused, self._contact_travel(state, lin.contacts.point, focused))
         J_m = lin.manipulation_jacobian
         da, value, J = zero, still, J_m

@@ -9,6 +9,7 @@ import torch
 
 from ..exceptions import NonFiniteError, ParameterError, ShapeError
 from ..kinematics.grasp_state import GraspState
+from ..kinematics.null_space import null_space
 from ..kinematics.se3 import exp, log
 from ..typing import Float, Tensor
 
@@ -92,9 +93,7 @@ class FocusedPose:
 
 def _complement(matrix: Tensor, block: slice) -> Tensor:
     """Rows of the 6-vector block that M_c leaves free: null space of its columns in that block."""
-    part = matrix[:, block]
-    _, singular, vh = torch.linalg.svd(part, full_matrices=True)
-    free = vh[int((singular > 1e-9).sum()) :]
+    free = null_space(matrix[:, block]).mT
     rows = torch.zeros(len(free), 6, dtype=matrix.dtype)
     rows[:, block] = free
     return rows

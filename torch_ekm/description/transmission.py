@@ -18,7 +18,7 @@ from .hand import Actuator, ContactPad, HallSensor, HandDescription
 from .urdf import UrdfModel
 
 TABLES = ("hand", "joints", "actuators", "couplings", "pads", "hall_sensors", "notes")
-HAND = ("name", "base_link", "planar_normal")
+HAND = ("name", "base_link", "planar_normal", "gravity")
 JOINT = ("spring", "rest", "rest_deg", "friction")
 ACTUATOR = (
     "name",
@@ -68,6 +68,7 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
     _check_unique(path, "pad", [pad.name for pad in pads])
     _check_unique(path, "Hall channel", [str(sensor.channel) for sensor in hall])
     normal = hand.vector("planar_normal", 3) if "planar_normal" in hand.data else None
+    gravity = hand.vector("gravity", 3, HandDescription.gravity)
     return HandDescription(
         name=hand.text("name"),
         urdf_path=urdf.path,
@@ -86,6 +87,7 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
         pads=tuple(pads),
         hall_sensors=tuple(hall),
         planar_normal=None if normal is None else (normal[0], normal[1], normal[2]),
+        gravity=(gravity[0], gravity[1], gravity[2]),
         notes=top.notes(),
         urdf=urdf,
     )

@@ -83,8 +83,7 @@ class Setting:
 
     def model_options(self) -> ModelOptions:
         """The kinematic model's."""
-        gravity = self.plant_config("KM").gravity
-        return _changed(ModelOptions(gravity=gravity), "model", self.model)
+        return _changed(ModelOptions(), "model", self.model)
 
     def controller_options(self) -> ControllerOptions:
         """The same for every controller."""

@@ -91,7 +91,6 @@ class Bench:
                 self.no_grasp = str(error)
                 continue
             self._ever_held = True
-            self.model.reset()
             if self.learns and self.enhanced is None:
                 self._prepare_learner(start)
             if self.on_grasp is not None:

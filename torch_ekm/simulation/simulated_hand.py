@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,6 +66,8 @@ class SimulatedHand:
         self.hand = load_hand(hand) if isinstance(hand, str) else hand
         self.object = load_object(object) if isinstance(object, str) else object
         self.config = PlantConfig() if config is None else config
+        if self.config.gravity is not None:
+            self.hand = dataclasses.replace(self.hand, gravity=self.config.gravity)
         self.parameters = PlantParameters.exact() if parameters is None else parameters
         self._planner = make_planner(self.hand, self.object, self.config, self.parameters)
         self._sensors = Sensors(self.parameters, self.hand.n_q, len(self.hand.pads), self.hand.joint_names)
@@ -168,7 +171,7 @@ class SimulatedHand:
 
     @property
     def gravity(self) -> Gravity:
-        """Gravity of this grasp in the hand frame [m/s^2]: ``config.gravity``, tilted as drawn."""
+        """Gravity of this grasp in the hand frame [m/s^2]: ``hand.gravity``, tilted as drawn."""
         return self._grasped().gravity
 
     @property
@@ -273,7 +276,7 @@ class SimulatedHand:
         c = self.config
         along, across, first, second, tilt, turn = self._generator.uniform(-1.0, 1.0, size=6).tolist()
         return PinchRequest(
-            gravity=_tilted(c.gravity, tilt * c.gravity_tilt, np.pi * turn),
+            gravity=_tilted(self.hand.gravity, tilt * c.gravity_tilt, np.pi * turn),
             force=c.pinch_force,
             along=along * c.offset_along,
             across=across * c.offset_across,

@@ -10,8 +10,8 @@ import torch
 
 from ...control import ClosedLoop, LookAndMoveController, PoseTarget, StoppingRule
 from ...enhanced import EnhancedModel
-from ...model import KinematicModel, ModelOptions
-from ...simulation import Change, DisturbedPlant, PlantConfig, PlantParameters, SimulatedHand
+from ...model import KinematicModel
+from ...simulation import Change, DisturbedPlant, PlantParameters, SimulatedHand
 from .recording import Recording
 
 _DEG = math.pi / 180
@@ -39,16 +39,15 @@ def record_simulated_hand(
     Raises:
         GraspError, EquilibriumError: the object could not be grasped.
     """
-    draw, config = np.random.default_rng(seed), PlantConfig()
-    plant = SimulatedHand(hand, object, config, PlantParameters.nominal_mismatch())
+    draw = np.random.default_rng(seed)
+    plant = SimulatedHand(hand, object, parameters=PlantParameters.nominal_mismatch())
     events = [] if new_moment_arm is None else [Change.new_tendons(n // 2, new_moment_arm)]
     disturbed = DisturbedPlant(plant, events)
-    model = KinematicModel(plant.hand, plant.object, ModelOptions(gravity=config.gravity))
+    model = KinematicModel(plant.hand, plant.object)
     rule = StoppingRule(max_steps=10)
     enhanced, x, y, segments = None, [], [], []
     while len(x) < n:
         start = disturbed.reset(seed + len(segments)).state
-        model.reset()
         enhanced = EnhancedModel.for_grasp(model, start) if enhanced is None else enhanced
         controller = LookAndMoveController(model, plant.rotation_axis)
         target = PoseTarget.turned(start, plant.rotation_axis, draw.uniform(5, 20) * _DEG)

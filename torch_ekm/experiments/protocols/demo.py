@@ -77,13 +77,12 @@ def run_session(
     plant_config = PlantConfig()
     plant = SimulatedHand(config.hand, config.object, plant_config, PlantParameters.nominal_mismatch())
     # a noisy pose may show a gap of some millimetres where there is contact
-    options = ModelOptions(gravity=plant_config.gravity, contact_margin=0.004)
+    options = ModelOptions(contact_margin=0.004)
     model = KinematicModel(plant.hand, plant.object, options)
     enhanced: EnhancedModel | None = None
     records = []
     for angle in config.angles_deg:
         start = plant.reset(seed).state
-        model.reset()
         if enhanced is None and controller == "E-KM":
             enhanced = EnhancedModel.for_grasp(model, start, partial(grasp_learner, capacity=config.capacity))
         axis = plant.rotation_axis

@@ -242,7 +242,7 @@ def _pictures(records: list[Record], config: DemoConfig, folder: Path) -> list[F
     turn = max(turns, key=lambda r: (r["reason"] == "reached", r["angle_deg"], -r["true_error_deg"]))
     q, position, rotation = (np.array([frame[k] for frame in turn["frames"]]) for k in range(3))
     hand, obj = load_hand(config.hand), load_object(config.object)
-    scene = make_scene(hand, obj, q, position, rotation, np.array(PlantConfig().gravity))
+    scene = make_scene(hand, obj, q, position, rotation, np.array(hand.gravity))
     save_picture(scene, folder / "hand.png", frames=(0, -1))
     save_animation(scene, folder / "animation.html")
     what = f"a turn of {turn['angle_deg']:g} deg (seed {turn['seed']})"

@@ -73,7 +73,7 @@ class HandShow:
 
     def _scene(self, a: Array) -> Scene:
         q = self._map.joints(torch.from_numpy(a)).numpy().clip(self.hand.joint_lower, self.hand.joint_upper)
-        return make_scene(self.hand, None, q, None, None, np.array(PlantConfig().gravity))
+        return make_scene(self.hand, None, q, None, None, np.array(self.hand.gravity))
 
 
 class GraspShow:

@@ -16,7 +16,6 @@ from ...exceptions import DescriptionError, EKMError
 from ...kinematics.se3 import log as rotation_vector
 from ...plant import Recording, TrialLog
 from ...rendering.scene import Scene, make_scene
-from ...simulation import PlantConfig
 
 Array = NDArray[np.float64]
 
@@ -66,7 +65,7 @@ class LogShow:
                 )
         if self._bodies is None:
             self._bodies = load_hand(configuration["hand"]), load_object(configuration["object"])
-        gravity = configuration.get("gravity", PlantConfig().gravity)
+        gravity = configuration.get("gravity", self._bodies[0].gravity)
         self.recording, self._frame = recording, 0
         self.trial = recording.about.get("trial", trial)
         self._scene = self._drawn(recording, np.array(gravity, dtype=np.float64))

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import ParameterError
 from ..config import PlantConfig
-from ..grasp_planning.geometry import scaled
 from ..grasp_planning.pinch import PinchPlanner
 from ..grasp_planning.pinch_problem import PinchProblem
 from ..parameters import PlantParameters
@@ -108,7 +107,7 @@ def true_descriptions(
         com=obj.com + np.array(parameters.com_shift),
         inertia=parameters.mass * obj.inertia,
         friction=parameters.friction * obj.friction,
-        shapes=tuple(scaled(shape, parameters.object_scale) for shape in obj.shapes),
+        shapes=tuple(shape.scaled(parameters.object_scale) for shape in obj.shapes),
     )
     return true_hand, true_object
 

@@ -11,7 +11,6 @@ from ...description import HandDescription, ObjectDescription
 from ...description.shape import Shape
 from ...description.urdf import UrdfJoint, UrdfLink, UrdfModel
 from ...exceptions import DescriptionError
-from ..grasp_planning.geometry import scaled
 from ..grasp_planning.graspable import urdf_of
 from .engine import sapien
 
@@ -113,7 +112,7 @@ def build_object(scene: Any, obj: ObjectDescription, material: Any, scale: float
     entity.name = obj.name
     body = sapien().physx.PhysxRigidDynamicComponent()
     for shape in obj.shapes:
-        sized = scaled(shape, scale)
+        sized = shape.scaled(scale)
         _attach(body, sized, sized.transform, material, group=0)
     body.linear_damping = body.angular_damping = 0.0
     entity.add_component(body)

@@ -62,9 +62,9 @@ class Rig:
         """How many fingers touched the object in these steps, with any of their links."""
         self.on_frame: Callable[[float, Array, Array, Array], None] | None = None
         """Called every 10 steps with the time, the joint angles and the object's pose."""
-        self.gravity: Gravity = config.gravity
+        self.gravity: Gravity = hand.gravity
         self._finger_of = {link: joints[-1] for link in hand.link_names if (joints := chain(hand, link))}
-        self._build(config.gravity)
+        self._build(hand.gravity)
 
     def _build(self, gravity: Gravity) -> None:
         p = self.parameters
