@@ -72,7 +72,8 @@ class HandDescription:
     """
 
     name: str
-    urdf_path: Path
+    urdf: UrdfModel = field(repr=False)
+    """The tree of links and joints as it was read, with inertias and collision shapes."""
     transmission_path: Path
     base_link: str
     """The hand frame: every pose and Jacobian in torch_ekm is expressed in it."""
@@ -96,8 +97,10 @@ class HandDescription:
     planar_normal: tuple[float, float, float] | None = None
     """Normal of the plane in which a planar hand moves (hand frame); None: a spatial hand."""
     notes: dict[str, str] = field(default_factory=dict)
-    urdf: UrdfModel | None = field(default=None, repr=False)
-    """The tree of links and joints as it was read, with inertias and collision shapes."""
+
+    @property
+    def urdf_path(self) -> Path:
+        return self.urdf.path
 
     @property
     def n_q(self) -> int:

@@ -6,7 +6,6 @@ import torch
 from torch import nn
 
 from ..description.hand import HandDescription
-from ..description.urdf import read_urdf
 from ..typing import Float, Tensor
 from .potential import link_weight_terms
 from .stiffness import precedence
@@ -32,10 +31,9 @@ class LinkWeights(nn.Module):
         dtype: torch.dtype,
     ) -> None:
         super().__init__()
-        urdf = read_urdf(hand.urdf_path)
         upstream: Tensor = kinematics.upstream  # type: ignore[assignment]
         names = list(kinematics.link_names)  # type: ignore[arg-type]
-        links = [link for link in urdf.links if link.mass > 0 and upstream[names.index(link.name)].any()]
+        links = [link for link in hand.urdf.links if link.mass > 0 and upstream[names.index(link.name)].any()]
         self.kinematics_joint_axes = kinematics.joint_axes
         self.index = [names.index(link.name) for link in links]
         mass = torch.tensor([link.mass for link in links], dtype=dtype)

@@ -12,7 +12,6 @@ from ...description.shape import Shape
 from ...description.urdf import UrdfJoint, UrdfLink, UrdfModel
 from ...exceptions import DescriptionError
 from ..grasp_planning.geometry import scaled
-from ..grasp_planning.graspable import urdf_of
 from .engine import sapien
 
 Array = NDArray[np.float64]
@@ -38,7 +37,7 @@ def build_hand(scene: Any, hand: HandDescription, material: Any) -> HandBodies:
     Links on fixed joints become part of the link that carries them.
     """
     physx, pose = sapien().physx, sapien().Pose
-    urdf = urdf_of(hand)
+    urdf = hand.urdf
     components: dict[str, Any] = {}
     entities: list[Any] = []
 
