@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_ekm.description import list_hands, load_hand, read_urdf, registry, urdf_folder
+from torch_ekm.description import list_hands, load_hand, registry, urdf_folder
 from torch_ekm.exceptions import DescriptionError, EKMError, UnknownNameError
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
@@ -161,14 +161,3 @@ def test_data_of_an_installed_package(tmp_path: Path, monkeypatch: pytest.Monkey
     (package.parent / "_urdf" / "objects").rmdir()
     with pytest.raises(DescriptionError, match="not installed"):
         urdf_folder()
-
-
-def test_urdf_is_read_alike_by_others() -> None:
-    yourdfpy = pytest.importorskip("yourdfpy")
-    for name in list_hands():
-        hand = load_hand(name)
-        robot = yourdfpy.URDF.load(str(hand.urdf_path), load_meshes=False, build_scene_graph=False)
-        assert tuple(robot.actuated_joint_names) == hand.joint_names
-        ours = {joint.name: joint for joint in read_urdf(hand.urdf_path).joints}
-        for theirs in robot.robot.joints:
-            np.testing.assert_allclose(theirs.origin, ours[theirs.name].transform, atol=1e-12)

@@ -35,9 +35,17 @@ def build_hand(scene: Any, hand: HandDescription, material: Any) -> HandBodies:
     """The articulation of ``hand``, its base fixed at the origin: hand frame = world frame.
 
     Links on fixed joints become part of the link that carries them.
+
+    Raises:
+        DescriptionError: the link of a pad has nothing but meshes to touch with, or the base link moves.
     """
     physx, pose = sapien().physx, sapien().Pose
     urdf = hand.urdf
+    for pad in hand.pads:
+        if urdf.link(pad.link).has_mesh and not urdf.link(pad.link).collisions:
+            problem = f"link '{pad.link}' carries the pad '{pad.name}', and its only <collision> is a mesh"
+            remedy = "write the pad's capsule there: contacts need box, cylinder, sphere or capsule"
+            raise DescriptionError(hand.urdf_path, f"{problem}; {remedy}")
     components: dict[str, Any] = {}
     entities: list[Any] = []
 
