@@ -166,6 +166,10 @@ OBJECT_FAULTS = {
     "key": (".object.toml", "[marker]", "[markers]", "unknown key 'markers'"),
     "mesh": (".urdf", '<collision><origin xyz="0 0 0"/><geometry><box size="0.09 0.03 0.04"/>',
              '<collision><geometry><mesh filename="a.stl"/>', "or capsule only, found a mesh"),
+    "mesh beside a box": (".urdf", "</inertial>",
+                          '</inertial><collision><geometry><mesh filename="a.stl"/></geometry></collision>',
+                          "found a mesh"),
+    "no shape": (".urdf", "collision>", "nothing>", "found no shape"),
     "massless": (".urdf", "inertial>", "nothing>", "needs an <inertial>"),
     "two links": (".urdf", "</robot>", '<link name="b"/><joint name="j" type="fixed"><parent link="box"/>'
                   '<child link="b"/></joint></robot>', "single link, found box, b"),
@@ -181,7 +185,9 @@ def test_object_faults(fault: str, tmp_path: Path) -> None:
     path = tmp_path / f"thing{suffix}"
     text = path.read_text()
     assert old in text
-    path.write_text(text.replace(old, new) if fault == "massless" else text.replace(old, new, 1))
+    path.write_text(
+        text.replace(old, new) if fault in ("massless", "no shape") else text.replace(old, new, 1)
+    )
     with pytest.raises(DescriptionError, match=message):
         load_object(urdf)
 
