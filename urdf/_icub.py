@@ -22,6 +22,7 @@ from _writer import (
     number,
     solid_inertia,
 )
+from trimesh.transformations import compose_matrix
 
 HALF_TURN = math.pi / 2
 
@@ -134,9 +135,7 @@ def _signs(link: str, left: bool) -> Vector:
 
 def _joint_frame(xyz: Vector, rpy: Vector, parent: Vector, child: Vector) -> tuple[Vector, Vector]:
     """``p' = D_parent p``, ``R' = D_parent R D_child`` with diagonal reflections D."""
-    from torch_ekm.description.urdf import pose
-
-    T = pose(np.array(xyz, dtype=float), np.array(rpy, dtype=float))
+    T = compose_matrix(translate=xyz, angles=rpy)
     R = np.array(parent)[:, None] * T[:3, :3] * np.array(child)
     p = np.array(parent) * T[:3, 3]
     turn = (math.atan2(R[2, 1], R[2, 2]), -math.asin(np.clip(R[2, 0], -1, 1)), math.atan2(R[1, 0], R[0, 0]))

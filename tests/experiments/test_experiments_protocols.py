@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from torch_ekm.control import ControllerOptions, PoseTarget
-from torch_ekm.description import object_files
+from torch_ekm.description import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.camera_off import CameraOff
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
@@ -86,7 +86,7 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
 
 
 def test_a_corrected_object_does_not_take_up_old_results(tmp_path: Path) -> None:
-    for source in object_files("box"):
+    for source in object_paths("box"):
         (tmp_path / source.name).write_bytes(source.read_bytes())
     own = str(tmp_path / "box.urdf")
 

@@ -12,7 +12,9 @@ import pytest
 import torch
 from simulation_helpers import DEG, ROLL, SQUEEZE, motion
 
+from torch_ekm.description import load_hand
 from torch_ekm.exceptions import (
+    DescriptionError,
     EquilibriumError,
     GraspError,
     NonFiniteError,
@@ -257,3 +259,18 @@ def test_importing_the_simulator_warns_of_nothing():
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "ulkan" not in done.stderr
+
+
+def test_a_pad_on_a_mesh_is_refused(tmp_path):
+    """Its finger would reach through the object."""
+    hand = load_hand("icub_right")
+    before, found, rest = hand.urdf_path.read_text().partition('<link name="index_3">')
+    link, end, after = rest.partition("</link>")
+    for shape in ("cylinder", "sphere"):
+        link = link.replace(f"<{shape} ", '<mesh filename="tip.stl" ')
+    (tmp_path / "a.urdf").write_text(before + found + link + end + after)
+    (tmp_path / "a.transmission.toml").write_text(hand.transmission_path.read_text())
+    with pytest.raises(
+        DescriptionError, match=r"link 'index_3' carries the pad .* a mesh; write the pad's capsule"
+    ):
+        SimulatedHand(load_hand(tmp_path / "a.urdf"), "box").reset(0)

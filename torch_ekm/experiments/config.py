@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..control import ControllerOptions, StoppingRule
-from ..description import hand_files, list_hands, object_files
+from ..description import hand_paths, list_hands, object_paths
 from ..exceptions import ParameterError, UnknownNameError
 from ..model import ModelOptions
 from ..simulation import PlantConfig, PlantParameters, preset
@@ -122,7 +122,7 @@ def digest(setting: Setting, objects: Iterable[str | Path], *more: Any) -> str:
         objects: names or paths of those that take part.
         more: configurations and figures that decide the results as well.
     """
-    files = [*hand_files(setting.hand), *(path for item in objects for path in object_files(item))]
+    files = [*hand_paths(setting.hand), *(path for item in objects for path in object_paths(item))]
     contents = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
     figures = [dataclasses.asdict(setting), setting.figures(), contents, more]
     text = json.dumps(figures, sort_keys=True, default=_plain)

@@ -6,7 +6,6 @@ import torch
 from torch import nn
 
 from ..description.hand import HandDescription
-from ..description.urdf import read_urdf
 from ..typing import Float, Tensor
 from .potential import posture_stiffness
 from .stiffness import precedence
@@ -39,8 +38,7 @@ class LinkWeights(nn.Module):
         super().__init__()
         upstream: Tensor = kinematics.upstream  # type: ignore[assignment]
         names = list(kinematics.link_names)  # type: ignore[arg-type]
-        urdf = read_urdf(hand.urdf_path)
-        links = [link for link in urdf.links if link.mass > 0 and upstream[names.index(link.name)].any()]
+        links = [link for link in hand.urdf.links if link.mass > 0 and upstream[names.index(link.name)].any()]
         self._joint_axes, self._index = kinematics.joint_axes, [names.index(link.name) for link in links]
         mass = torch.tensor([link.mass for link in links], dtype=dtype)
         for name, value in (

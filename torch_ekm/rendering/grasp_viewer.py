@@ -12,7 +12,6 @@ from .._extras import require
 from ..description import HandDescription, ObjectDescription
 from ..description.shape import Shape
 from ..kinematics import HandKinematics
-from ..simulation.grasp_planning.graspable import urdf_of
 
 Array = NDArray[np.float64]
 
@@ -45,11 +44,10 @@ class GraspViewer:
         self._kinematics = HandKinematics(hand)
         self._plotter: Any = self._pyvista.Plotter(off_screen=True, window_size=list(size))
         self._plotter.set_background("white")
-        urdf = urdf_of(hand)
         pads = {pad.link for pad in hand.pads}
         self._of_link = [
             (self._kinematics.link_index(link.name), self._add(shape, _PAD if link.name in pads else _HAND))
-            for link in urdf.links
+            for link in hand.urdf.links
             for shape in link.collisions
         ]
         self._of_object = [self._add(shape, _OBJECT) for shape in obj.shapes]

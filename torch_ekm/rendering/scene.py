@@ -58,7 +58,6 @@ def make_scene(
     pads = {pad.link for pad in hand.pads}
     shapes: list[tuple[Shape, tuple[float, float, float]]] = []
     transforms: list[Array] = []
-    assert hand.urdf is not None
     for link in hand.urdf.links:
         colour = _TIP if link.name in pads else _PALM if link.name == hand.base_link else _PHALANX
         pose = links.of(link.name).numpy()

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...description import HandDescription, ObjectDescription, read_urdf
+from ...description import HandDescription, ObjectDescription
 from ...exceptions import ParameterError, ShapeError
 from ...kinematics import HandKinematics
 from ...sensing.vision.board import MarkerBoard
@@ -46,10 +46,9 @@ class GraspView:
         if self.camera_pose.shape != (4, 4):
             raise ShapeError("camera_pose", "(4, 4)", self.camera_pose.shape)
         self._kinematics = HandKinematics(hand)
-        urdf = hand.urdf if hand.urdf is not None else read_urdf(hand.urdf_path)
         self._links = [
             (self._kinematics.link_index(link.name), ConvexBody.of_shape(shape))
-            for link in urdf.links
+            for link in hand.urdf.links
             for shape in link.collisions
         ]
         self._object = [ConvexBody.of_shape(shape, shade=150) for shape in obj.shapes]
