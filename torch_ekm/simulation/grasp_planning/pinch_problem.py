@@ -13,7 +13,7 @@ from ...exceptions import UnknownNameError
 from ...kinematics import HandKinematics, LinkPoses
 from ...kinematics.se3 import exp
 from ..mechanism.transmission import Transmission
-from .geometry import scaled, signed_distance
+from .geometry import signed_distance
 from .graspable import chain, object_axes, obstacles
 
 Array = NDArray[np.float64]
@@ -127,7 +127,7 @@ class PinchProblem:
         self._mass = mass_factor * obj.mass
         self._com = obj.com + np.array(com_shift)
         self._mu = friction * obj.friction
-        self._shapes = tuple(scaled(shape, object_scale) for shape in obj.shapes)
+        self._shapes = tuple(shape.scaled(object_scale) for shape in obj.shapes)
         self._prepare_mechanism()
         self._axes = object_axes(obj)
         self.towards = self._direction_of_grasp()

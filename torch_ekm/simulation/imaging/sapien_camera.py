@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..._extras import require
 from ...exceptions import ParameterError
 from ...sensing.vision.camera import PinholeCamera
-from .scene import Card, ConvexBody, PlacedCard, Scene
+from .card_scene import Card, CardScene, ConvexBody, PlacedCard
 from .simulated_camera import ImageQuality
 
 # SAPIEN's cameras look along x, with y to the left and z up
@@ -68,7 +68,7 @@ class SapienCamera:
         except RuntimeError:
             return False
 
-    def render(self, scene: Scene, generator: np.random.Generator) -> NDArray[np.uint8]:
+    def render(self, scene: CardScene, generator: np.random.Generator) -> NDArray[np.uint8]:
         """Picture ``(height, width)`` of the scene; the generator draws its noise."""
         cv2, quality = require("cv2"), self.quality
         drawn = [self._add(*self._card(card)) for card in scene.cards]

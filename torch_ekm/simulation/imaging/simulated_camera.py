@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..._extras import require
 from ...exceptions import ParameterError
 from ...sensing.vision.camera import PinholeCamera
-from .scene import Card, ConvexBody, PlacedCard, Scene
+from .card_scene import Card, CardScene, ConvexBody, PlacedCard
 
 _SHIFT = 4  # fractional bits of OpenCV's polygon coordinates
 
@@ -74,7 +74,7 @@ class SimulatedCamera:
         radius2 = (u - self.camera.cx) ** 2 + (v - self.camera.cy) ** 2
         self._light = 1 - self.quality.vignette * radius2 / radius2.max()
 
-    def render(self, scene: Scene, generator: np.random.Generator) -> NDArray[np.uint8]:
+    def render(self, scene: CardScene, generator: np.random.Generator) -> NDArray[np.uint8]:
         """Picture ``(height, width)`` of the scene; the generator draws its noise."""
         cv2 = require("cv2")
         quality, shape = self.quality, (self.camera.height, self.camera.width)

@@ -11,8 +11,6 @@ from ...description import HandDescription, ObjectDescription
 from ...description.shape import Shape
 from ...description.urdf import UrdfJoint, UrdfLink, UrdfModel
 from ...exceptions import DescriptionError
-from ..grasp_planning.geometry import scaled
-from ..grasp_planning.graspable import urdf_of
 from .engine import sapien
 
 Array = NDArray[np.float64]
@@ -38,7 +36,7 @@ def build_hand(scene: Any, hand: HandDescription, material: Any) -> HandBodies:
     Links on fixed joints become part of the link that carries them.
     """
     physx, pose = sapien().physx, sapien().Pose
-    urdf = urdf_of(hand)
+    urdf = hand.urdf
     components: dict[str, Any] = {}
     entities: list[Any] = []
 
@@ -113,7 +111,7 @@ def build_object(scene: Any, obj: ObjectDescription, material: Any, scale: float
     entity.name = obj.name
     body = sapien().physx.PhysxRigidDynamicComponent()
     for shape in obj.shapes:
-        sized = scaled(shape, scale)
+        sized = shape.scaled(scale)
         _attach(body, sized, sized.transform, material, group=0)
     body.linear_damping = body.angular_damping = 0.0
     entity.add_component(body)
