@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from .._extras import require
 from ..description import HandDescription, ObjectDescription, Shape
 from ..kinematics import HandKinematics
+from ..typing import Array
 
-Array = NDArray[np.float64]
 Colour = tuple[float, float, float]
 
 _PALM, _PHALANX, _TIP, _OBJECT = (0.45, 0.47, 0.50), (0.72, 0.74, 0.77), (0.00, 0.45, 0.70), (0.90, 0.62, 0.0)

@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._extras import require
+from ..typing import Array
 from .scene import Scene, shape_mesh
-
-Array = NDArray[np.float64]
 
 
 def save_animation(scene: Scene, path: Path, frame_seconds: float = 0.25) -> Path:

@@ -19,6 +19,7 @@ from ..exceptions import ParameterError
 from ..kinematics.se3 import log
 from ..plant import Observation, PlantStatus
 from ..rendering import Picture, make_scene
+from ..typing import Array
 from .config import PlantConfig
 from .parameters import PlantParameters
 from .presets import preset
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 else:
     gymnasium = require("gymnasium")
 
-Array = NDArray[np.float64]
 _DEG = math.pi / 180
 
 

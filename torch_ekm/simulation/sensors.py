@@ -7,12 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..kinematics.se3 import exp
+from ..typing import Array
 from .parameters import PlantParameters
-
-Array = NDArray[np.float64]
 
 
 class TimedState(NamedTuple):

@@ -6,13 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..description import HandDescription, ObjectDescription, load_hand, load_object
 from ..exceptions import EquilibriumError, GraspError, ParameterError
 from ..kinematics import GraspState
 from ..plant import Observation, PlantStatus, Truth
-from ..typing import Float, Tensor
+from ..typing import Array, Float, Tensor
 from .config import PlantConfig
 from .grasp_planning.pinch import PinchPlan, make_planner, turning_axis
 from .grasp_planning.pinch_problem import PinchRequest
@@ -21,8 +20,6 @@ from .parameters import PlantParameters
 from .physics.rig import Gravity, Rig, RigState
 from .presets import preset as parameters_of
 from .sensors import Sensors, SensorState, TimedState
-
-Array = NDArray[np.float64]
 
 _ATTEMPTS = 5
 _FAR = 0.05  # [m] from where it was grasped: out of the hand

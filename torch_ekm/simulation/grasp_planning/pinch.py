@@ -6,17 +6,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..._extras import require
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import EquilibriumError
+from ...typing import Array
 from ..config import PlantConfig
 from ..mechanism.assembly import make_transmission
 from ..parameters import PlantParameters
 from .pinch_problem import PinchProblem, PinchRequest
-
-Array = NDArray[np.float64]
 
 _FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
 _GOOD_COST = 20.0  # half a sum of squares; the wishes of a good pinch cost about 0.3

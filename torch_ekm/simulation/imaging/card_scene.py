@@ -12,8 +12,7 @@ from ..._extras import require
 from ...description import Shape
 from ...exceptions import ShapeError
 from ...sensing.vision.camera import PinholeCamera
-
-Array = NDArray[np.float64]
+from ...typing import Array
 
 
 class Card(Protocol):

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import ParameterError, ShapeError
 from ...kinematics import HandKinematics
 from ...sensing.vision.board import MarkerBoard
-from ...typing import Float, Tensor
+from ...typing import Array, Float, Tensor
 from .card_scene import CardScene, ConvexBody, PlacedCard
-
-Array = NDArray[np.float64]
 
 
 class GraspView:
