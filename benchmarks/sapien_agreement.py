@@ -24,14 +24,14 @@ from test_model_sapien import true_state, turning_step
 from torch_ekm.exceptions import GraspError
 from torch_ekm.model import KinematicModel, ModelOptions
 from torch_ekm.plant.plant import PlantStatus
-from torch_ekm.simulation import PlantParameters, SimulatedHand
+from torch_ekm.simulation import SimulatedHand
 
 DEG = np.pi / 180
 
 
 def turn(name: str, seed: int, degrees: float) -> tuple[float, float, float, bool]:
     """``(rms, cone, failure, announced)``: [deg] of error, and of rotation at the two events (NaN: never)."""
-    plant = SimulatedHand("icub_right", name, parameters=PlantParameters.exact())
+    plant = SimulatedHand("icub_right", name)
     observation = plant.reset(seed)
     model = KinematicModel(plant.hand, plant.object, ModelOptions(on_unstable="flag"))
     axis, start = plant.rotation_axis, true_state(observation)

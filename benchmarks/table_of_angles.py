@@ -32,7 +32,7 @@ def turn(object: str, seed: int, level: str) -> list[dict[str, Any]]:
     """All angles of Table I from the grasp of one seed, each from a new grasp."""
     torch.set_num_threads(1)
     config = PlantConfig(relative_to="setpoint")
-    plant = SimulatedHand("icub_right", object, config, preset(level))
+    plant = SimulatedHand("icub_right", object, config, preset=level)
     # a noisy pose may show a gap of some millimetres where there is contact
     model = KinematicModel(*plant.true_descriptions(), ModelOptions(contact_margin=0.004))
     rule = Setting(preset=level).stopping_rule()

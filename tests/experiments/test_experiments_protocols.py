@@ -29,7 +29,7 @@ from torch_ekm.experiments.runner import Bench
 from torch_ekm.kinematics import GraspState
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.plant import Observation, PlantStatus
-from torch_ekm.simulation import PlantParameters
+from torch_ekm.simulation import preset
 
 ONLINE = OnlineConfig(trials=2, angles_deg=(4.0, 5.0), dislocations=(2,), tendons_replaced=2)
 
@@ -117,7 +117,7 @@ def test_every_learner_of_the_ablation_starts_at_zero_and_learns() -> None:
 
 
 def test_ablation_covers_every_disturbance_of_the_nominal_plant() -> None:
-    nominal, exact = PlantParameters.nominal_mismatch(), PlantParameters.exact()
+    nominal, exact = preset("nominal"), preset("none")
     disturbed = {
         f.name for f in dataclasses.fields(nominal) if getattr(nominal, f.name) != getattr(exact, f.name)
     }

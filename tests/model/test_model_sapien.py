@@ -11,7 +11,7 @@ pytest.importorskip("coal")
 
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel, ModelStatus
-from torch_ekm.simulation import PlantParameters, SimulatedHand
+from torch_ekm.simulation import SimulatedHand
 
 DEG = np.pi / 180
 F64 = torch.float64
@@ -36,7 +36,7 @@ def turning_step(lin, axis, step, grip):
 
 
 def test_steps_of_a_large_rotation_are_predicted():
-    plant = SimulatedHand("icub_right", "box", parameters=PlantParameters.exact())
+    plant = SimulatedHand("icub_right", "box")
     try:
         observation = plant.reset(0)
         model = KinematicModel(plant.hand, plant.object)

@@ -23,7 +23,7 @@ from torch_ekm.exceptions import (
     UnknownNameError,
 )
 from torch_ekm.plant import Plant, PlantStatus
-from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
+from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand, preset
 
 pytest.importorskip("sapien")
 
@@ -96,7 +96,7 @@ def run(plant, seed):
     return torch.cat([torch.cat(part) for part in parts])
 
 
-@pytest.mark.parametrize("parameters", [PlantParameters.exact(), PlantParameters.nominal_mismatch()])
+@pytest.mark.parametrize("parameters", [preset("none"), preset("nominal")])
 def test_one_seed_gives_one_run_bit_by_bit(parameters):
     first, second = (SimulatedHand("icub_right", "box", parameters=parameters) for _ in range(2))
     a = run(first, 3)
@@ -106,7 +106,7 @@ def test_one_seed_gives_one_run_bit_by_bit(parameters):
 
 
 def test_a_snapshot_can_be_returned_to_bit_by_bit():
-    plant = SimulatedHand("icub_right", "box", parameters=PlantParameters.nominal_mismatch())
+    plant = SimulatedHand("icub_right", "box", preset="nominal")
     plant.reset(5)
     plant.command(ROLL)
     snapshot = plant.snapshot()
@@ -199,7 +199,7 @@ def test_a_held_object_does_not_grow(plant, grasped):
     plant.restore(grasped)
     with pytest.raises(ParameterError, match=r"held; close\(\)"):
         plant.change(object_scale=1.05, mass=2.0)
-    assert plant.parameters == PlantParameters.exact()
+    assert plant.parameters == PlantParameters()
     plant.change(object_scale=1.0)  # no change
 
 
@@ -236,13 +236,22 @@ def test_errors_say_what_would_be_right():
         SimulatedHand("icub_right", "box", parameters=PlantParameters(object_scale=4.0)).reset(0)
 
 
+def test_a_preset_is_given_by_name_or_as_parameters():
+    assert SimulatedHand("icub_right", "box", preset="worn").parameters == preset("worn")
+    assert SimulatedHand("icub_right", "box").parameters == preset("none") == PlantParameters()
+    with pytest.raises(UnknownNameError, match="hostile"):
+        SimulatedHand("icub_right", "box", preset="nasty")
+    with pytest.raises(ParameterError, match="preset"):
+        SimulatedHand("icub_right", "box", parameters=PlantParameters(), preset="none")
+
+
 @pytest.mark.parametrize(
     "changes",
     [{"spring": 0.0}, {"dead_zone": -1.0}, {"mass": float("nan")}, {"frame_loss": 2.0}, {"sprung": 1.0}],
 )
 def test_impossible_parameters_are_refused(changes):
     with pytest.raises(ParameterError, match=next(iter(changes))):
-        PlantParameters.exact().replace(**changes)
+        PlantParameters().replace(**changes)
 
 
 @pytest.mark.parametrize(

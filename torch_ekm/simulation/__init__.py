@@ -13,11 +13,11 @@ from .grasp_planning.pinch_problem import PinchRequest as PinchRequest
 from .hall_sensors import HallQuality as HallQuality
 from .hall_sensors import HallSensors as HallSensors
 from .hall_sensors import Stuck as Stuck
+from .imaging.card_scene import CardScene as CardScene
+from .imaging.card_scene import ConvexBody as ConvexBody
+from .imaging.card_scene import PlacedCard as PlacedCard
 from .imaging.grasp_view import GraspView as GraspView
 from .imaging.sapien_camera import SapienCamera as SapienCamera
-from .imaging.scene import ConvexBody as ConvexBody
-from .imaging.scene import PlacedCard as PlacedCard
-from .imaging.scene import Scene as Scene
 from .imaging.simulated_camera import ImageQuality as ImageQuality
 from .imaging.simulated_camera import SimulatedCamera as SimulatedCamera
 from .imaging.simulated_video import SimulatedVideo as SimulatedVideo
@@ -48,7 +48,7 @@ __all__ = [
     "PlantSnapshot",
     "PRESETS",
     "SapienCamera",
-    "Scene",
+    "CardScene",
     "SensedPlant",
     "SimulatedCamera",
     "SimulatedHand",

@@ -7,22 +7,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..description import HandDescription, ObjectDescription, load_hand, load_object
 from ..exceptions import EquilibriumError, GraspError, ParameterError
 from ..kinematics import GraspState
 from ..plant import Observation, PlantStatus, Truth
-from ..typing import Float, Tensor
+from ..typing import Array, Float, Tensor
 from .config import PlantConfig
-from .grasp_planning.pinch import PinchPlan
+from .grasp_planning.pinch import PinchPlan, make_planner, turning_axis
 from .grasp_planning.pinch_problem import PinchRequest
-from .mechanism.assembly import make_planner, moment_arms, true_descriptions, turning_axis
+from .mechanism.assembly import moment_arms, true_descriptions
 from .parameters import PlantParameters
 from .physics.rig import Gravity, Rig, RigState
-from .sensors import Frame, Sensors, SensorState
-
-Array = NDArray[np.float64]
+from .presets import preset as parameters_of
+from .sensors import Sensors, SensorState, TimedState
 
 _ATTEMPTS = 5
 _FAR = 0.05  # [m] from where it was grasped: out of the hand
@@ -42,7 +40,7 @@ class SimulatedHand:
 
     ::
 
-        plant = SimulatedHand("icub_right", "box", parameters=PlantParameters.nominal_mismatch())
+        plant = SimulatedHand("icub_right", "box", preset="nominal")
         observation = plant.reset(seed=0)
         observation = plant.command(delta_a)
 
@@ -53,7 +51,12 @@ class SimulatedHand:
         hand: a description, or the name or path that :func:`load_hand` takes.
         object: a description, or the name or path that :func:`load_object` takes.
         config: time, gravity, the grasp.
-        parameters: what the plant really is; :meth:`PlantParameters.exact` by default.
+        parameters: what the plant really is; as described by default.
+        preset: the parameters by name, as :func:`torch_ekm.simulation.preset` takes it.
+
+    Raises:
+        UnknownNameError: there is no such hand, object or preset; the message lists them.
+        ParameterError: both ``parameters`` and ``preset`` are given.
     """
 
     def __init__(
@@ -62,13 +65,17 @@ class SimulatedHand:
         object: ObjectDescription | str = "box",
         config: PlantConfig | None = None,
         parameters: PlantParameters | None = None,
+        preset: str | None = None,
     ) -> None:
+        if parameters is not None and preset is not None:
+            valid = "None with parameters: preset(name).replace(...) changes single figures of a preset"
+            raise ParameterError("preset", preset, valid)
         self.hand = load_hand(hand) if isinstance(hand, str) else hand
         self.object = load_object(object) if isinstance(object, str) else object
         self.config = PlantConfig() if config is None else config
         if self.config.gravity is not None:
             self.hand = dataclasses.replace(self.hand, gravity=self.config.gravity)
-        self.parameters = PlantParameters.exact() if parameters is None else parameters
+        self.parameters = parameters_of(preset or "none") if parameters is None else parameters
         self._planner = make_planner(self.hand, self.object, self.config, self.parameters)
         self._sensors = Sensors(self.parameters, self.hand.n_q, len(self.hand.pads), self.hand.joint_names)
         self._generator = np.random.default_rng(0)
@@ -125,7 +132,7 @@ class SimulatedHand:
         q, (position, rotation) = rig.scene.q, rig.scene.object_pose
         status = self.status
         joints = self._sensors.joints(q, draw)
-        picture = self._sensors.pictured(Frame(rig.time, q, position, rotation))
+        picture = self._sensors.pictured(TimedState(rig.time, q, position, rotation))
         seen_position, seen_rotation, seen = self._sensors.pose(picture.position, picture.rotation, draw)
         force = self._sensors.forces(rig.normal, draw)
         if not seen and status is PlantStatus.HELD:
@@ -268,7 +275,7 @@ class SimulatedHand:
         if self._rig is not None:
             remember = self._sensors.remember
             self._rig.on_frame = (
-                (lambda *state: remember(Frame(*state))) if self._sensors.wants_history else None
+                (lambda *state: remember(TimedState(*state))) if self._sensors.wants_history else None
             )
 
     def _request(self) -> PinchRequest:

@@ -11,7 +11,7 @@ import torch
 from ...control import ClosedLoop, LookAndMoveController, PoseTarget, StoppingRule
 from ...enhanced import EnhancedModel
 from ...model import KinematicModel
-from ...simulation import Change, DisturbedPlant, PlantParameters, SimulatedHand
+from ...simulation import Change, DisturbedPlant, SimulatedHand
 from .recording import Recording
 
 _DEG = math.pi / 180
@@ -40,7 +40,7 @@ def record_simulated_hand(
         GraspError, EquilibriumError: the object could not be grasped.
     """
     draw = np.random.default_rng(seed)
-    plant = SimulatedHand(hand, object, parameters=PlantParameters.nominal_mismatch())
+    plant = SimulatedHand(hand, object, preset="nominal")
     events = [] if new_moment_arm is None else [Change.new_tendons(n // 2, new_moment_arm)]
     disturbed = DisturbedPlant(plant, events)
     model = KinematicModel(plant.hand, plant.object)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ...simulation import PlantParameters
+from ...simulation import PRESETS
 from ..config import Setting, digest
 from ..learners import LEARNERS
 from ..reporting.metrics import bootstrap_mean
@@ -112,10 +112,10 @@ def variants(config: AblationConfig) -> list[Variant]:
     ):
         found.append(Variant("controller", name, {"control": {**base.control, **option}}, who))
     found.append(Variant("preset", f"{base.preset}: {_BASE}"))
-    for preset in ("none", "nominal", "worn", "hostile"):
+    for preset in PRESETS:
         if preset != base.preset:
             found.append(Variant("preset", preset, {"preset": preset}, _ALL))
-    nominal = dataclasses.asdict(PlantParameters.nominal_mismatch())
+    nominal = dataclasses.asdict(PRESETS["nominal"])
     for name, fields in DISTURBANCES.items():
         plant = {key: nominal[key] for key in fields}
         changes = {"preset": "none", "plant": plant}

@@ -16,7 +16,7 @@ from ...enhanced import EnhancedModel, grasp_learner
 from ...exceptions import ParameterError, UnknownNameError
 from ...model import KinematicModel, ModelOptions
 from ...plant import Observation
-from ...simulation import PlantConfig, PlantParameters, SimulatedHand
+from ...simulation import PlantConfig, SimulatedHand
 from ..runner import record_of
 
 #: Rotations of the paper's Table I [deg].
@@ -75,7 +75,7 @@ def run_session(
         raise UnknownNameError("controller", controller, CONTROLLERS)
     torch.set_num_threads(1)  # small matrices: more threads only wait for each other
     plant_config = PlantConfig()
-    plant = SimulatedHand(config.hand, config.object, plant_config, PlantParameters.nominal_mismatch())
+    plant = SimulatedHand(config.hand, config.object, plant_config, preset="nominal")
     # a noisy pose may show a gap of some millimetres where there is contact
     options = ModelOptions(contact_margin=0.004)
     model = KinematicModel(plant.hand, plant.object, options)

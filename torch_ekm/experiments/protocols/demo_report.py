@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ...description import load_hand, load_object
-from ...rendering.scene import make_scene, save_animation, save_picture
-from ...simulation import PlantConfig, PlantParameters
+from ...rendering import make_scene, save_animation, save_picture
+from ...simulation import PlantConfig, preset
 from ..config import Setting, digest
 from ..jobs import run_jobs
 from ..reporting.metrics import Estimate, bootstrap_mean, compare_errors
@@ -55,7 +55,7 @@ def run_demo(
         figures=figures,
         configuration={
             "demo": dataclasses.asdict(config),
-            "plant": dataclasses.asdict(PlantParameters.nominal_mismatch()),
+            "plant": dataclasses.asdict(preset("nominal")),
             "plant_config": dataclasses.asdict(PlantConfig()),
         },
     )

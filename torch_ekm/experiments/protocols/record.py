@@ -94,4 +94,4 @@ def _turn(bench: Bench, log: TrialLog, seed: int, trial: int, angle: float) -> N
         outcome = {"reason": type(error).__name__, "message": str(error)}
     outcome.pop("seconds", None)  # of the wall: equal runs are to give equal logs
     if trial not in log:
-        log.write(trial, bench.plant.recording, outcome)
+        log.write(trial, bench.plant.trajectory, outcome)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ...description import HandDescription, load_hand
 from ...kinematics import ActuationMap
 from ...plant import PlantStatus
-from ...rendering.scene import Scene, make_scene
+from ...rendering import Scene, make_scene
 from ...simulation import PlantConfig, PlantParameters, SimulatedHand
 
 Array = NDArray[np.float64]

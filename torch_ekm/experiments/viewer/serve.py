@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...description import list_hands, load_hand
 from ...exceptions import DescriptionError, ParameterError, UnknownNameError
-from ...rendering.scene import Scene, draw, place, save_animation, start_server
+from ...rendering import Scene, draw, place, save_animation, start_server
 from .hand import GraspShow, HandShow
 from .trial import LogShow
 

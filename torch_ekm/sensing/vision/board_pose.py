@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..._extras import require
+from ...typing import Array
 from .camera import PinholeCamera
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,14 +137,12 @@ def projection_jacobian(camera: PinholeCamera, X: Array, rotation: Array, positi
     rvec = cv2.Rodrigues(rotation)[0]
     _, full = cv2.projectPoints(X, rvec, position, camera.matrix, camera.distortion_array)
     by_position = full[:, 3:6].reshape(-1, 2, 3)  # dpi/dx, since x = R X + t
-    arm = X @ rotation.T
-    return np.concatenate([by_position, -by_position @ skew(arm)], axis=-1).reshape(-1, 6)
+    return np.concatenate([by_position, -by_position @ skew(X @ rotation.T)], axis=-1).reshape(-1, 6)
 
 
 def skew(v: Array) -> Array:
-    """``[v]x`` of each vector ``(*batch, 3)``."""
-    x, y, z = np.moveaxis(v, -1, 0)
-    zero = np.zeros_like(x)
+    """``[v]x`` of vectors ``(*batch, 3)``."""
+    (x, y, z), zero = np.moveaxis(v, -1, 0), np.zeros(v.shape[:-1])
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape, 3)
 
 

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from ..._extras import require
 from ...exceptions import ParameterError, ShapeError
+from ...typing import Array
 from .board import MarkerBoard, get_dictionary
 from .board_pose import BoardPose, angle_between, estimate_board_pose, skew
 from .camera import PinholeCamera
 from .edge_refinement import refine_on_edges
 from .static_pose import StaticPose
 from .track import Track, TrackStatus
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -200,7 +199,7 @@ class MarkerTracker:
         return True
 
     def _near(self, other: tuple[Array, Array], position: Array, rotation: Array) -> bool:
-        turn, step = angle_between(rotation, other[1]), np.linalg.norm(position - other[0])
+        step, turn = np.linalg.norm(position - other[0]), angle_between(rotation, other[1])
         return bool(step <= self.options.max_step and turn <= self.options.max_turn)
 
 

@@ -6,17 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ...contact import signed_distance
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import UnknownNameError
 from ...kinematics import HandKinematics, LinkPoses
 from ...kinematics.se3 import exp
+from ...typing import Array
 from ..mechanism.transmission import Transmission
 from .graspable import chain, object_axes, obstacles
-
-Array = NDArray[np.float64]
 
 # Preferred joint angles as parts of their range, last joint first: the thumb bent and the fingers
 # nearly straight, since turning the object towards the fingers' flexion straightens the thumb.
