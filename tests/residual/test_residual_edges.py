@@ -165,7 +165,11 @@ def test_units_of_a_model_with_masks_are_those_of_its_own_samples():
 def test_one_kernel_for_a_fleet_as_large_as_the_inputs_are_wide():
     x, y = stream(64, 3)
     gp = SparseOnlineGP(
-        3, 2, capacity=8, batch_shape=(3,), kernel=SquaredExponential(3),
+        3,
+        2,
+        capacity=8,
+        batch_shape=(3,),
+        kernel=SquaredExponential(3),
         parts=[LearnHyperparameters()],
     )
     start = gp.kernel.log_lengthscale.clone()

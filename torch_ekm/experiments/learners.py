@@ -49,7 +49,9 @@ Factory = Callable[..., ResidualLearner]
 def _kind(make: Factory, capacity_is: str = "", **figures: Any) -> Factory:
     """A kind of learner; ``capacity_is`` names that of its arguments which is a capacity."""
 
-    def factory(d: int, m: int, *, n_actions: int = 0, capacity: int = 100, **options: Any) -> ResidualLearner:
+    def factory(
+        d: int, m: int, *, n_actions: int = 0, capacity: int = 100, **options: Any
+    ) -> ResidualLearner:
         size = {capacity_is: capacity} if capacity_is else {}
         return make(d, m, **{**figures, **size, **options})
 

@@ -87,7 +87,10 @@ def variants(config: AblationConfig) -> list[Variant]:
         if name != base.learner
     ]
     found.append(Variant("online learning", _BASE))
-    for name, option in (("no robust update", {"robust": None}), ("no forgetting", {"forgetting_factor": 1.0})):
+    for name, option in (
+        ("no robust update", {"robust": None}),
+        ("no forgetting", {"forgetting_factor": 1.0}),
+    ):
         options = {**base.learner_options, **option}
         found.append(Variant("online learning", name, {"learner_options": options}, ("E-KM",)))
     for capacity in (15, 30, 120):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from ...typing import Bool, Float, Tensor
+from ...typing import Bool, Tensor
 from ..checks import check_positive
 from .part import Host, Part, Sample
 

@@ -110,6 +110,7 @@ def absorb(
     novelty = gamma / prior.clamp_min(torch.finfo(prior.dtype).tiny)
     return UpdateReport(event, novelty, nis, weight), innovation, v
 
+
 def _add_and_prune(
     posterior: SparsePosterior, scaled: Tensor, added: Tensor, excess: Tensor, s2: Tensor
 ) -> None:

@@ -99,7 +99,12 @@ class SparseOnlineGP(DoubleStateLearner):
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__(
-            in_features, out_features, batch_shape=batch_shape, on_invalid=on_invalid, dtype=dtype, device=device
+            in_features,
+            out_features,
+            batch_shape=batch_shape,
+            on_invalid=on_invalid,
+            dtype=dtype,
+            device=device,
         )
         self.capacity = check_count("capacity", capacity)
         self.refresh_every = check_count("refresh_every", refresh_every)
@@ -278,7 +283,7 @@ class SparseOnlineGP(DoubleStateLearner):
         models: Bool[Tensor, "*batch"],
         x: Float[Tensor, "n *batch in"],
         y: Float[Tensor, "n *batch out"],
-        used: Bool[Tensor, "n *batch"],
+        used: Bool[Tensor, n * batch],
     ) -> None:
         """These models forget all but units, kernel and noise, and learn the samples ``used``."""
         self.posterior.forget(models)
