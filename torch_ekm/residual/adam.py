@@ -46,11 +46,12 @@ class Adam(nn.Module):
         """One step of the i-th parameter, in place; entries outside ``mask`` and their moments stay."""
         first, second = getattr(self, f"first_{i}"), getattr(self, f"second_{i}")
         b1, b2 = self.betas
-        m, v = b1 * first + (1 - b1) * gradient, b2 * second + (1 - b2) * gradient**2
-        if mask is not None:
-            m, v = torch.where(mask, m, first), torch.where(mask, v, second)
-        first.copy_(m)
-        second.copy_(v)
+        if mask is None:
+            first.lerp_(gradient, 1 - b1)
+            second.mul_(b2).addcmul_(gradient, gradient, value=1 - b2)
+        else:
+            first.copy_(torch.where(mask, b1 * first + (1 - b1) * gradient, first))
+            second.copy_(torch.where(mask, b2 * second + (1 - b2) * gradient**2, second))
         step = rate * first / (second.sqrt() + 1e-8)
         p.sub_(step if mask is None else step.where(mask, 0.0))
 

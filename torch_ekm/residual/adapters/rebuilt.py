@@ -9,7 +9,7 @@ from ..base import SingleLearner
 
 
 class Rebuilt(SingleLearner):
-    """A learner whose state lies partly outside of modules: copied by making it anew and loading its state."""
+    """A learner whose state lies partly outside of modules: a copy is made anew and loads its state."""
 
     _options: ClassVar[tuple[str, ...]]
 

@@ -283,7 +283,7 @@ class SparseOnlineGP(DoubleStateLearner):
         models: Bool[Tensor, "*batch"],
         x: Float[Tensor, "n *batch in"],
         y: Float[Tensor, "n *batch out"],
-        used: Bool[Tensor, n * batch],
+        used: Bool[Tensor, "*n_and_batch"],
     ) -> None:
         """These models forget all but units, kernel and noise, and learn the samples ``used``."""
         self.posterior.forget(models)
