@@ -301,7 +301,7 @@ def test_figures_that_cannot_be_are_named(kind, arguments, name):
 
 def test_a_learner_tells_its_parts():
     text = repr(learner(PARTS["all"]))
-    for told in ("RobustWeight(3.0)", "ForgettingFactor(0.98)", "samples=30", "memory=15"):
+    for told in ("RobustWeight(threshold=3.0)", "ForgettingFactor(factor=0.98)", "samples=30", "memory=15"):
         assert told in text
     assert learner(PARTS["all"]).part(ForgettingFactor).factor == 0.98  # type: ignore[union-attr]
     assert learner([]).part(ForgettingFactor) is None

@@ -58,12 +58,20 @@ class Kernel(nn.Module, ABC):
         return ProductKernel(self, other)
 
 
-class SumKernel(Kernel):
-    """``k = k_1 + k_2``."""
+class _Pair(Kernel):
+    """A kernel of two: shift invariant where both are."""
 
     def __init__(self, first: Kernel, second: Kernel) -> None:
         super().__init__()
         self.first, self.second = first, second
+
+    def shift_invariant(self, in_features: int) -> list[bool]:
+        both = self.first.shift_invariant(in_features), self.second.shift_invariant(in_features)
+        return [a and b for a, b in zip(*both, strict=True)]
+
+
+class SumKernel(_Pair):
+    """``k = k_1 + k_2``."""
 
     def forward(self, x: Tensor, z: Tensor) -> Tensor:
         return self.first(x, z) + self.second(x, z)
@@ -78,19 +86,9 @@ class SumKernel(Kernel):
     def diagonal_gradient(self, x: Tensor) -> Tensor:
         return self.first.diagonal_gradient(x) + self.second.diagonal_gradient(x)
 
-    def shift_invariant(self, in_features: int) -> list[bool]:
-        pairs = zip(
-            self.first.shift_invariant(in_features), self.second.shift_invariant(in_features), strict=True
-        )
-        return [a and b for a, b in pairs]
 
-
-class ProductKernel(Kernel):
+class ProductKernel(_Pair):
     """``k = k_1 k_2``."""
-
-    def __init__(self, first: Kernel, second: Kernel) -> None:
-        super().__init__()
-        self.first, self.second = first, second
 
     def forward(self, x: Tensor, z: Tensor) -> Tensor:
         return self.first(x, z) * self.second(x, z)
@@ -105,12 +103,6 @@ class ProductKernel(Kernel):
     def diagonal_gradient(self, x: Tensor) -> Tensor:
         k1, k2 = self.first.diagonal(x).unsqueeze(-1), self.second.diagonal(x).unsqueeze(-1)
         return self.first.diagonal_gradient(x) * k2 + self.second.diagonal_gradient(x) * k1
-
-    def shift_invariant(self, in_features: int) -> list[bool]:
-        pairs = zip(
-            self.first.shift_invariant(in_features), self.second.shift_invariant(in_features), strict=True
-        )
-        return [a and b for a, b in pairs]
 
 
 def log_parameter(

@@ -32,10 +32,6 @@ class ForgettingFactor(Part):
             learner.posterior.precision.mul_(kept)
             learner.posterior.information.mul_(kept)
 
-    def extra_repr(self) -> str:
-        """The factor."""
-        return f"{self.factor}"
-
 
 class ProcessNoise(Part):
     """``g <- sqrt(1 - q) g + sqrt(q) new`` per sample, ``new`` drawn from the prior: g itself wanders.
@@ -78,7 +74,3 @@ class ProcessNoise(Part):
         G, Lh = torch.linalg.solve_triangular(R, both, upper=False).tensor_split([L.shape[-1]], dim=-1)
         posterior.precision.copy_(kept * (posterior.precision - (1.0 - kept) * s2 * (G.mT @ G)))
         posterior.information.copy_(kept.sqrt() * (posterior.information - (1.0 - kept) * (G.mT @ Lh)))
-
-    def extra_repr(self) -> str:
-        """The share."""
-        return f"{self.share}"

@@ -118,8 +118,7 @@ class LearnHyperparameters(Part):
 
     def reset(self) -> None:
         """Forget window, snapshot, memory and step sizes."""
-        for buffer in self.buffers(recurse=False):
-            buffer.zero_()
+        super().reset()
         self.adam.reset()
         self.loss.state.reset()
         if self.past is not None:
@@ -162,10 +161,6 @@ class LearnHyperparameters(Part):
             self.adam.move(i, p, gradient.where(good, 0.0), rate, good)
             if logarithm:  # far beyond what standardised data can mean
                 p.clamp_(-14.0 if name == "log_noise" else -7.0, 7.0)
-
-    def extra_repr(self) -> str:
-        """Its figures."""
-        return f"rate={self.rate}, steps={self.steps}, memory={self.memory}, network_rate={self.network_rate}"
 
 
 def _shrink(n: Tensor) -> Tensor:

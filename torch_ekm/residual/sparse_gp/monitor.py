@@ -54,14 +54,6 @@ class CalibrateNoise(Part):
         """``c_j s2_j``."""
         return variance * self.log_factor.exp()
 
-    def reset(self) -> None:
-        """c = 1."""
-        self.log_factor.zero_()
-
-    def extra_repr(self) -> str:
-        """The rate."""
-        return f"rate={self.rate}"
-
 
 class DetectChanges(Part):
     """Start anew when most of the last samples did not fit: not outliers, another system::
@@ -107,8 +99,3 @@ class DetectChanges(Part):
         """Which of the kept samples belong to the new system, at an alarm."""
         later = (self.levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0)
         return (later > 0) & self.levels.isfinite()
-
-    def reset(self) -> None:
-        """Nothing seen."""
-        for buffer in self.buffers():
-            buffer.zero_()

@@ -132,7 +132,15 @@ class Part(nn.Module):
         """These models face another system: what was kept of the old one does not count."""
 
     def reset(self) -> None:
-        """Back to what :meth:`bind` made."""
+        """Back to what :meth:`bind` made; by default all buffers of its own to zero."""
+        for buffer in self.buffers(recurse=False):
+            buffer.zero_()
+
+    def extra_repr(self) -> str:
+        """Its figures."""
+        figures = {name: value for name, value in vars(self).items() if not name.startswith("_")}
+        plain = {name: value for name, value in figures.items() if type(value) in (int, float)}
+        return ", ".join(f"{name}={value}" for name, value in plain.items())
 
 
 P = TypeVar("P", bound=Part)

@@ -27,7 +27,3 @@ class RobustWeight(Part):
     def weigh(self, nis: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """``min(1, c^2/z2)``."""
         return (self.threshold**2 / nis).clamp_max(1.0)
-
-    def extra_repr(self) -> str:
-        """The threshold."""
-        return f"{self.threshold}"

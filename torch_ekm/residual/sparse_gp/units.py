@@ -38,33 +38,26 @@ class Standardize(Part, Units):
         self.output = RunningScale(learner.out_features, **fleet)
 
     def inputs(self, x: Tensor) -> Tensor:
-        """``(x - shift) / scale``."""
         return self.input(x)
 
     def targets(self, y: Tensor) -> Tensor:
-        """``y / scale``."""
         return y / self.output.scale
 
     def of_sets(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """The same of n samples of each model."""
         z = (x - self.input.shift.unsqueeze(-2)) / self.input.scale.unsqueeze(-2)
         return z, y / self.output.scale.unsqueeze(-2)
 
     def sets_as_given(self, z: Tensor) -> Tensor:
-        """``z scale + shift``."""
         return z * self.input.scale.unsqueeze(-2) + self.input.shift.unsqueeze(-2)
 
     def value(self, value: Tensor, power: int) -> Tensor:
-        """Times the scale of y, or its square."""
         return value * self._scale(power)
 
     def slope(self, slope: Tensor, power: int) -> Tensor:
-        """And by the scale of x."""
         first = self.input.scale.shape[-1] - slope.shape[-1]
         return slope * self._scale(power).unsqueeze(-1) / self.input.scale[..., None, first:]
 
     def curvature(self, curvature: Tensor) -> Tensor:
-        """And by two scales of x."""
         inverse = 1.0 / self.input.scale[..., self.input.scale.shape[-1] - curvature.shape[-1] :]
         scaled = curvature * (inverse.unsqueeze(-1) * inverse.unsqueeze(-2)).unsqueeze(-3)
         return scaled * self._scale(2)[..., None, None]
@@ -94,10 +87,6 @@ class Standardize(Part, Units):
         """Back to z = x, t = y."""
         self.input.reset()
         self.output.reset()
-
-    def extra_repr(self) -> str:
-        """How long the units are learned."""
-        return f"samples={self.samples}"
 
 
 class RunningScale(nn.Module):
