@@ -114,7 +114,7 @@ def reproduce(
     ] = None,
     hand: Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")] = "icub_right",
     preset: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
-    learner: Annotated[str, Option(help="rbf, action-linear, paper, deep, rls, rff, ...")] = "rbf",
+    learner: Annotated[str, Option(help="rbf, action-linear, linear RLS, SOGP deep, ...")] = "rbf",
     sensing: Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")] = True,
     angles: Annotated[
         str, Option(help="Turns [deg], e.g. 5,10,15; Table I if left out (generalize, ablation).")

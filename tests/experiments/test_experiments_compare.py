@@ -19,7 +19,7 @@ from torch_ekm.experiments.learner_comparison.compare import (
     compare,
     verdicts,
 )
-from torch_ekm.experiments.learner_comparison.learners import CONTENDERS, DEFAULT, PEERS, contender
+from torch_ekm.experiments.learner_comparison.learners import DEFAULT, PEERS
 from torch_ekm.experiments.learner_comparison.recording import (
     Recording,
     in_own_units,
@@ -28,8 +28,9 @@ from torch_ekm.experiments.learner_comparison.recording import (
 )
 from torch_ekm.experiments.learner_comparison.report import overview_table, score_table
 from torch_ekm.experiments.learner_comparison.table_file import read_table
+from torch_ekm.experiments.learners import LEARNERS, learner_factory
 from torch_ekm.experiments.reporting.report import Report, Table
-from torch_ekm.residual import SparseOnlineGP
+from torch_ekm.residual import ForgettingFactor, SparseOnlineGP
 
 WEIGHTS = torch.tensor([[1.0, -0.5], [0.3, 0.8], [0.0, 0.4]], dtype=torch.float64)
 
@@ -52,7 +53,7 @@ def test_model_alone_is_the_unit(compared: Comparison) -> None:
 
 
 def test_errors_are_those_of_predictions_made_before_learning(compared: Comparison) -> None:
-    recording, learner = linear(), contender("linear RLS")(3, 2)
+    recording, learner = linear(), learner_factory("linear RLS")(3, 2)
     squared = []
     for x, y in zip(recording.x, recording.y, strict=True):
         squared.append(float((y - learner(x)).square().mean()))
@@ -129,9 +130,8 @@ def test_what_is_finished_is_not_run_again(tmp_path: Path, monkeypatch: pytest.M
 def test_a_learner_with_other_settings_is_run_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recording = linear(60)
     first = compare([recording], ["SOGP plain"], folder=tmp_path)
-    for options in ({"forgetting": 0.9}, {"noise_variance": 0.4}):
-        changed = {**CONTENDERS, "SOGP plain": lambda d, m, o=options: SparseOnlineGP(d, m, **o)}
-        monkeypatch.setattr("torch_ekm.experiments.learner_comparison.learners.CONTENDERS", changed)
+    for options in ({"parts": [ForgettingFactor(0.9)]}, {"noise_variance": 0.4}):
+        monkeypatch.setitem(LEARNERS, "SOGP plain", lambda d, m, o=options: SparseOnlineGP(d, m, **o))
         second = compare([recording], ["SOGP plain"], folder=tmp_path)
         assert second.scores != first.scores
     assert len(list(tmp_path.glob("*.json"))) == 3
@@ -148,7 +148,7 @@ def test_what_cannot_be_compared() -> None:
         linear(30)
 
 
-@pytest.mark.parametrize("name", DEFAULT)
+@pytest.mark.parametrize("name", [*DEFAULT, "rbf"])
 def test_every_contender_runs(name: str) -> None:
     result = module.run_one(linear(44), name)
     assert len(result["squared"]) == 24
@@ -166,7 +166,7 @@ def test_wide_tables_are_printed_whole_into_a_file(capsys: pytest.CaptureFixture
 def test_every_kind_of_learner_in_the_package_contends() -> None:
     import torch_ekm.residual as residual
 
-    kinds = tuple(type(make(2, 1)) for name, make in CONTENDERS.items() if name not in PEERS)
+    kinds = tuple(type(make(2, 1)) for name, make in LEARNERS.items() if name in DEFAULT)
     peers = {"GPyTorchSVGP", "GPyTorchWindow", "RiverResidual"}  # need other libraries to be made
     assert len(PEERS) == len(peers)
     peers.add("LearnerFleet")  # holds others

@@ -15,7 +15,7 @@ from torch_ekm.description import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.camera_off import CameraOff
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
-from torch_ekm.experiments.learners import LEARNERS, make_learner
+from torch_ekm.experiments.learners import HAND_LEARNERS, LEARNERS, make_learner
 from torch_ekm.experiments.protocols.ablation import DISTURBANCES, AblationConfig, ablation_jobs, variants
 from torch_ekm.experiments.protocols.object_memory import AdaptConfig, adapt_session
 from torch_ekm.experiments.protocols.turning import (
@@ -73,7 +73,7 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
         patch.setattr("torch_ekm.experiments.config.ControllerOptions", other)
         assert of(Setting()) != unchanged
     with monkeypatch.context() as patch:  # and one whose learner has another kernel
-        patch.setitem(LEARNERS, "rbf", LEARNERS["paper"])
+        patch.setitem(LEARNERS, "rbf", LEARNERS["SOGP plain"])
         assert of(Setting()) != unchanged
     assert of(Setting()) == unchanged
     assert of(Setting(capacity=59)) != unchanged
@@ -104,14 +104,14 @@ def test_a_corrected_object_does_not_take_up_old_results(tmp_path: Path) -> None
 def test_every_learner_of_the_ablation_starts_at_zero_and_learns() -> None:
     generator = torch.Generator().manual_seed(0)
     slope = torch.randn(4, 6, generator=generator, dtype=torch.float64)
-    for name in LEARNERS:
+    for name in HAND_LEARNERS:
         learner = make_learner(name, 5, 4, 30)
         x = torch.randn(120, 9, generator=generator, dtype=torch.float64)
         y = x[:, 5:] @ slope
         assert torch.equal(learner(x), torch.zeros(120, 6, dtype=torch.float64)), name
         learner.update(x, y)
         better = float((learner(x) - y).square().mean() / y.square().mean())
-        assert better == 1.0 if name == "none" else better < 0.7, (name, better)
+        assert better == 1.0 if name == "model alone" else better < 0.7, (name, better)
     with pytest.raises(UnknownNameError, match="deep"):
         make_learner("forest", 5, 4, 30)
 

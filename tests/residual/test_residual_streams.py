@@ -23,7 +23,14 @@ from torch_ekm.experiments.learner_comparison.prequential import (
     run_prequential,
     score_objects,
 )
-from torch_ekm.residual import RecursiveLeastSquares, SparseOnlineGP, ZeroResidual
+from torch_ekm.residual import (
+    CalibrateNoise,
+    ForgettingFactor,
+    RecursiveLeastSquares,
+    RobustWeight,
+    SparseOnlineGP,
+    ZeroResidual,
+)
 
 DATA = os.environ.get("TORCH_EKM_DATA", "")
 needs_data = pytest.mark.skipif(
@@ -109,7 +116,8 @@ def test_the_learner_helps_on_a_real_hand():
     recordings = load_t42()[7:9]
 
     def make():
-        return SparseOnlineGP(15, 3, noise_variance=0.3, forgetting=0.99, robust=3.0, calibrate=True)
+        parts = [RobustWeight(3.0), CalibrateNoise(), ForgettingFactor(0.99)]
+        return SparseOnlineGP(15, 3, noise_variance=0.3, parts=parts)
 
     scores = score_objects(make, recordings, kept=True)
     assert all(s.rms < 1.0 for s in scores)

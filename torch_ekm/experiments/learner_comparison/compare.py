@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from ..._extras import require
 from ...exceptions import ParameterError
 from ..jobs import run_jobs
+from ..learners import learner_factory
 from ..reporting.metrics import Estimate
-from .learners import DEFAULT, OURS, contender
+from .learners import DEFAULT, OURS
 from .prequential import Z90, run_prequential
 from .recording import Recording
 
@@ -105,7 +106,7 @@ def compare(
 
     Args:
         recordings: with different names.
-        learners: keys of :data:`~torch_ekm.experiments.learner_comparison.learners.CONTENDERS`.
+        learners: keys of :data:`~torch_ekm.experiments.learners.LEARNERS`.
         folder: keeps what is finished, so that an interrupted comparison goes on where it stopped.
         processes: how many at once (timings are then those of a busy machine).
         on_done: called with each finished job's name.
@@ -121,7 +122,7 @@ def compare(
         raise ParameterError("recordings", names, "of different names")
     jobs: dict[str, tuple[Any, ...]] = {}
     for learner in learners:
-        contender(learner)  # refuse before anything runs
+        learner_factory(learner)  # refuse before anything runs
     for recording in recordings:
         for learner in learners:
             digest = _digest(recording, learner)
@@ -149,7 +150,7 @@ def run_one(recording: Recording, learner: str) -> dict[str, Any]:
     """One job: plain figures that JSON can hold."""
     torch.set_num_threads(1)  # small matrices: more threads only wait for each other
     torch.manual_seed(0)
-    model = contender(learner)(recording.x.shape[1], recording.y.shape[1])
+    model = learner_factory(learner)(recording.x.shape[1], recording.y.shape[1])
     run = run_prequential(model, recording.x, recording.y)
     start = recording.warm_up
     error, deviation = run.error[start:], run.deviation[start:]
@@ -222,7 +223,7 @@ def _digest(recording: Recording, learner: str) -> str:
     parts.append(str(dataclasses.asdict(recording)["segments"]).encode())
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        model = contender(learner)(recording.x.shape[1], recording.y.shape[1])
+        model = learner_factory(learner)(recording.x.shape[1], recording.y.shape[1])
     for name, module in model.named_modules():
         plain = {key: value for key, value in vars(module).items() if isinstance(value, _PLAIN)}
         parts.append(f"{name} {type(module).__name__} {sorted(plain.items())}".encode())

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ..learners import learner_factory
 from ..reporting.plots import save_figure
 from ..reporting.report import FigureFile, Report, Table
 from .compare import Comparison, compare, verdicts
-from .learners import DEFAULT, contender
+from .learners import DEFAULT
 from .plots import plot_cost, plot_learning_curves, plot_ranks, plot_scores
 from .recording import LIMIT, load_recording, load_table
 
@@ -122,7 +123,7 @@ def compare_data(
     """
     learners = tuple(learners) or DEFAULT
     for name in learners:
-        contender(name)
+        learner_factory(name)
     recordings = [
         load_table(name, targets, limit)
         if targets and Path(name).suffix

@@ -10,7 +10,7 @@ from typing import Any
 
 from ...simulation import PRESETS
 from ..config import Setting, digest
-from ..learners import LEARNERS
+from ..learners import HAND_LEARNERS
 from ..reporting.metrics import bootstrap_mean
 from ..reporting.report import Table
 from ..reporting.statistics import (
@@ -83,11 +83,14 @@ def variants(config: AblationConfig) -> list[Variant]:
     found = [Variant("learner", _BASE)]
     found += [
         Variant("learner", name, {"learner": name, "learner_options": {}}, ("E-KM",))
-        for name in LEARNERS
+        for name in HAND_LEARNERS
         if name != base.learner
     ]
     found.append(Variant("online learning", _BASE))
-    for name, option in (("no robust update", {"robust": None}), ("no forgetting", {"forgetting": 1.0})):
+    for name, option in (
+        ("no robust update", {"robust": None}),
+        ("no forgetting", {"forgetting_factor": 1.0}),
+    ):
         options = {**base.learner_options, **option}
         found.append(Variant("online learning", name, {"learner_options": options}, ("E-KM",)))
     for capacity in (15, 30, 120):
