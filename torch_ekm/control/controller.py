@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -145,19 +144,20 @@ class LookAndMoveController:
         travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
         desired = self.limiting(focused, travel)
         seen = Situation(hand, self.focus, state, a, fingertip_force, error, desired)
-        J_m = lin.manipulation_jacobian
-        da = a.new_zeros(hand.n_a)
-        for _ in range(1 if self.enhanced is None else self.sqp_iterations):
-            problem = self.program(self.linearize(lin, da), seen)
+        enhanced, J_m, da = self.enhanced, lin.manipulation_jacobian, a.new_zeros(hand.n_a)
+        encoded = None if enhanced is None else enhanced.encode(state)
+        for _ in range(1 if enhanced is None else self.sqp_iterations):
+            model = LinearizedModel.about(da, lin, enhanced, encoded)
+            problem = self.program(model, seen)
             solution = problem.solve(self.solver)
             best = torch.as_tensor(solution.u, dtype=a.dtype)
             change = best - da
-            done = float(change.abs().max()) <= self.sqp_tolerance
-            da = best if self.enhanced is None or done else da + self.sqp_damping * change
+            done = enhanced is None or float(change.abs().max()) <= self.sqp_tolerance
+            da = best if done else da + self.sqp_damping * change
             if done:
                 break
         nominal = J_m @ da
-        predicted = nominal if self.enhanced is None else self.enhanced.linearize(state, da, J_m)[0]
+        predicted = nominal if enhanced is None else enhanced.linearize(state, da, J_m, encoded)[0]
         slack = float(np.abs(solution.slack).max(initial=0.0))
         limited = slack > 0.05 * float(desired.abs().max()) and self._at_limit(a, da, problem)
         return Decision(da, StopReason.RUNNING, desired, predicted, nominal, limited, slack, lin, solution)
@@ -165,16 +165,6 @@ class LookAndMoveController:
     def program(self, model: LinearizedModel, seen: Situation) -> ControlProblem:
         """The quadratic program of one iteration: the sum of all tasks and limits."""
         return build_qp(len(seen.a), [part.rows(model, seen) for part in (*self.tasks, *self.limits)])
-
-    def linearize(self, kinematic: Linearization, action: Float[Tensor, " n_a"]) -> LinearizedModel:
-        """``(f + g)(s, a + d) ~ value + J d = (value - J a) + J (a + d)`` about one action a."""
-        enhanced, state, J = self.enhanced, kinematic.state, kinematic.manipulation_jacobian
-        if enhanced is None:
-            return LinearizedModel(kinematic, action, J.new_zeros(len(J)), J)
-        value, J = enhanced.linearize(state, action, J)
-        return LinearizedModel(
-            kinematic, action, value - J @ action, J, partial(enhanced.variance, state, action)
-        )
 
     def _at_limit(self, a: Tensor, da: Tensor, problem: ControlProblem) -> bool:
         """An actuator that may move ends at the end of its range."""

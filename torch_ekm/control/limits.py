@@ -46,14 +46,12 @@ class ActuatorLimit:
         hand, a = seen.hand, as_array(seen.a)
         lower = np.clip(hand.actuator_lower - a, -self.step, self.step)
         upper = np.clip(hand.actuator_upper - a, -self.step, self.step)
-        fixed = self.fixed
-        if fixed is None:
-            fixed = [actuator.name for actuator in hand.actuators if actuator.posture]
-        for name in fixed:
-            if name not in hand.actuator_names:
-                raise UnknownNameError("actuator", name, hand.actuator_names)
-            i = hand.actuator_names.index(name)
-            lower[i] = upper[i] = 0.0
+        names = hand.actuator_names
+        fixed = [actuator.name for actuator in hand.actuators if actuator.posture]
+        for name in fixed if self.fixed is None else self.fixed:
+            if name not in names:
+                raise UnknownNameError("actuator", name, names)
+            lower[names.index(name)] = upper[names.index(name)] = 0.0
         return Bounds(lower, upper)
 
 
@@ -94,7 +92,7 @@ class NormalForceLimit:
         measured = seen.normal_force(model.kinematic.contacts.finger)
         if measured is None:
             return None
-        low = (self.minimum - measured).clamp(max=self.step)
+        low = np.minimum(self.minimum - measured, self.step)
         return Inequality(-model.kinematic.normal_force_sensitivity, -low)
 
 

@@ -119,7 +119,7 @@ class ControlProblem:
         u = np.clip(solution.x[:n_u], *self.bounds)
         slack = np.zeros(0) if qp.A is None else (qp.b - qp.A[:, :n_u] @ u) * DEGREE
         broken = np.zeros(0) if qp.G is None else qp.G[:, :n_u] @ u - qp.h
-        residuals = solution.primal_residual(), solution.dual_residual()
+        residuals = float(solution.primal_residual()), float(solution.dual_residual())
         return ControlSolution(u * DEGREE, slack, float(np.max(broken, initial=0.0)), *residuals)
 
 
@@ -139,11 +139,11 @@ def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
     kept = reached.copy()
     for row in rows:
         if isinstance(row, Squares):
-            unit = as_array(row.unit)
-            A, b = as_array(row.A) * DEGREE / unit[..., None], as_array(row.b) / unit
-            weight = np.broadcast_to(as_array(row.weight), b.shape)
-            P += 2 * A.T @ (weight[:, None] * A)
-            q -= 2 * A.T @ (weight * b)
+            unit, weight = as_array(row.unit).reshape(-1, 1), as_array(row.weight).reshape(-1, 1)
+            A, b = as_array(row.A) * DEGREE / unit, as_array(row.b) / unit[:, 0]
+            twice = 2 * A.T
+            P += twice @ (weight * A)
+            q -= twice @ (weight[:, 0] * b)
         elif isinstance(row, Quadratic):
             P += as_array(row.curvature) * DEGREE**2
             q += as_array(row.gradient) * DEGREE
@@ -185,7 +185,7 @@ def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
 
 def as_array(x: Numbers) -> Array:
     """float64 in numpy, in which the solvers count."""
-    return np.asarray(x.detach().cpu() if isinstance(x, Tensor) else x, dtype=np.float64)
+    return np.asarray(x.numpy(force=True) if isinstance(x, Tensor) else x, np.float64)
 
 
 def _stack(parts: list[tuple[Array, Array, Array]]) -> tuple[Array, Array, Array]:

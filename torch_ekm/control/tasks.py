@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
 
 from ..enhanced import Quadratic
@@ -46,8 +47,7 @@ class OffAxisTask:
     """How much of the error is corrected in one step: [rad], [m]."""
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Squares:
-        off, n_q = seen.focus.off_matrix, model.kinematic.n_q
-        translation = off[:, :3].abs().sum(-1) > 0
+        off, translation, n_q = seen.focus.off_matrix, seen.focus.off_translation, model.kinematic.n_q
         step = torch.where(translation, self.translation_step, self.rotation_step).to(off.dtype)
         wanted = (off @ seen.error).clamp(-step, step) - off @ model.offset[n_q:]
         weight = torch.where(translation, self.translation_weight, self.rotation_weight)
@@ -76,9 +76,9 @@ class GripForceTask:
         measured = seen.normal_force(model.kinematic.contacts.finger)
         if measured is None:
             return None
-        wanted = torch.full_like(measured, self.force / max(len(measured) - 1, 1))
+        wanted = np.full(len(measured), self.force / max(len(measured) - 1, 1))
         wanted[measured.argmax()] = self.force
-        change = (wanted - measured).clamp(-self.step, self.step)
+        change = np.clip(wanted - measured, -self.step, self.step)
         return Squares(model.kinematic.normal_force_sensitivity, change, self.weight)
 
 
@@ -91,7 +91,7 @@ class EffortTask:
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Squares:
         n_a = len(seen.a)
-        return Squares(torch.eye(n_a), torch.zeros(n_a), self.weight, DEGREE)
+        return Squares(np.eye(n_a), np.zeros(n_a), self.weight, DEGREE)
 
 
 @dataclass(frozen=True)
