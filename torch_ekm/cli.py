@@ -135,7 +135,7 @@ def reproduce(
     from .experiments.reproduce import plan
     from .experiments.reproduce import reproduce as run
 
-    control = {} if step is None else {"focus_step": math.radians(step)}
+    control = {} if step is None else {"LimitingFunction.step": math.radians(step)}
     setting = Setting(hand=hand, preset=preset, learner=learner, sensing=sensing, control=control)
     turns = _numbers("angles", angles) if angles else None
     planned = plan(

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from torch_ekm.control import ControllerOptions, PoseTarget
+from torch_ekm.control import PoseTarget
 from torch_ekm.description import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.camera_off import CameraOff
@@ -54,6 +53,8 @@ def test_controllers_differ_in_the_reference_of_their_increments() -> None:
         ({"plant": {"springs": 2.0}}, ParameterError, "spring"),
         ({"model": {"rolls": False}}, ParameterError, "rolling"),
         ({"grasp": {"force": 1.0}}, ParameterError, "pinch_force"),
+        ({"control": {"OffAxisTask.wait": 1.0}}, ParameterError, "rotation_weight"),
+        ({"control": {"step": 1.0}}, ParameterError, "LimitingFunction"),
     ],
 )
 def test_wrong_settings_say_what_would_be_right(changes: dict, error: type, match: str) -> None:
@@ -68,9 +69,10 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
     base = GeneralizeConfig()
     unchanged = of(Setting())
     assert of(Setting()) == unchanged
-    other = functools.partial(ControllerOptions, focus_gain=0.5)  # a version with another default
-    with monkeypatch.context() as patch:
-        patch.setattr("torch_ekm.experiments.config.ControllerOptions", other)
+    with monkeypatch.context() as patch:  # a version with another default
+        patch.setattr(
+            LimitingFunction.__init__, "__defaults__", (0.5, *LimitingFunction.__init__.__defaults__[1:])
+        )
         assert of(Setting()) != unchanged
     with monkeypatch.context() as patch:  # and one whose learner has another kernel
         patch.setitem(LEARNERS, "rbf", LEARNERS["SOGP plain"])

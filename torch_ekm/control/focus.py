@@ -53,7 +53,7 @@ class FocusedPose:
     """``x = M_c xi`` with ``xi`` a twist ``(v; w)`` of the object (hand axes).
 
     ``matrix`` (M_c, ``(n_x, 6)``) selects what the controller must reach; ``off_matrix``
-    spans the rest, which it should keep small.
+    spans the rest, which it should keep small; ``off_translation`` marks its translations.
 
     Args:
         matrix: M_c with orthonormal rows.
@@ -68,6 +68,7 @@ class FocusedPose:
         self.matrix = matrix
         # translation and rotation rows are completed apart: they have different units
         self.off_matrix = torch.cat([_complement(matrix, slice(0, 3)), _complement(matrix, slice(3, 6))])
+        self.off_translation = self.off_matrix[:, :3].abs().sum(-1) > 0
 
     @classmethod
     def rotation_about(cls, axis: Float[Tensor, 3]) -> FocusedPose:
@@ -87,7 +88,7 @@ class FocusedPose:
 
     def off_rotation(self, increment: Float[Tensor, " n_s"]) -> float:
         """Rotation off the focus in an increment [rad]."""
-        rows = self.off_matrix[self.off_matrix[:, 3:].abs().sum(-1) > 0]
+        rows = self.off_matrix[~self.off_translation]
         return float(torch.linalg.vector_norm(rows @ increment[-6:]))
 
 

@@ -11,7 +11,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..control import ControllerOptions, StoppingRule
+from ..control import (
+    DEFAULT_LIMITS,
+    DEFAULT_TASKS,
+    ActuatorLimit,
+    EffortTask,
+    FocusTask,
+    FrictionMarginLimit,
+    GripForceTask,
+    JointLimit,
+    LimitingFunction,
+    NormalForceLimit,
+    OffAxisTask,
+    StoppingRule,
+    UncertaintyTask,
+)
 from ..description import hand_paths, list_hands, object_paths
 from ..exceptions import ParameterError, UnknownNameError
 from ..model import ModelOptions
@@ -23,6 +37,10 @@ _DEG = math.pi / 180
 #: The controllers that are compared on the same seeds, grasps, limits and stopping rule. "+I": the
 #: increments accumulate on the set-point instead of the encoder, an integrator that learns nothing.
 CONTROLLERS = ("KM", "KM+I", "E-KM", "E-KM+I")
+
+#: Parts of a controller in the order in which they are summed.
+_TASKS = (EffortTask, UncertaintyTask, OffAxisTask, GripForceTask, FocusTask)
+_LIMITS = (ActuatorLimit, NormalForceLimit, FrictionMarginLimit, JointLimit)
 
 
 @dataclass(frozen=True)
@@ -45,7 +63,9 @@ class Setting:
     model: Mapping[str, Any] = field(default_factory=dict)
     """Changes of :class:`ModelOptions`."""
     control: Mapping[str, Any] = field(default_factory=dict)
-    """Changes of :class:`ControllerOptions`."""
+    """Changes of the controller's parts, ``{"OffAxisTask.rotation_weight": 0.1}``; one that is not among the
+    defaults is added (:mod:`~torch_ekm.control.tasks`, :mod:`~torch_ekm.control.limits`, and the
+    ``LimitingFunction``)."""
     learner: str = DEFAULT_LEARNER
     learner_options: Mapping[str, Any] = field(default_factory=dict)
     capacity: int = 60
@@ -65,6 +85,7 @@ class Setting:
         self.parameters()
         self.plant_config("KM")
         self.model_options()
+        self.controller_parts()
 
     def parameters(self) -> PlantParameters:
         """The plant's."""
@@ -85,9 +106,23 @@ class Setting:
         """The kinematic model's."""
         return _changed(ModelOptions(), "model", self.model)
 
-    def controller_options(self) -> ControllerOptions:
-        """The same for every controller."""
-        return _changed(ControllerOptions(), "control", self.control)
+    def controller_parts(self) -> dict[str, Any]:
+        """``tasks``, ``limits`` and ``limiting``, the same for every :class:`LookAndMoveController`."""
+        parts: dict[str, Any] = {
+            type(part).__name__: part for part in (*DEFAULT_TASKS, *DEFAULT_LIMITS, LimitingFunction())
+        }
+        known = {kind.__name__: kind for kind in (*_TASKS, *_LIMITS, LimitingFunction)}
+        for key, value in self.control.items():
+            name, _, figure = key.partition(".")
+            if name not in known:
+                raise ParameterError("control", key, f"PART.FIGURE, the part one of {', '.join(known)}")
+            part = parts[name] if name in parts else known[name]()
+            parts[name] = _changed(part, f"control of {name}", {figure: value})
+        tasks, limits = (
+            tuple(parts[kind.__name__] for kind in kinds if kind.__name__ in parts)
+            for kinds in (_TASKS, _LIMITS)
+        )
+        return {"tasks": tasks, "limits": limits, "limiting": parts["LimitingFunction"]}
 
     def stopping_rule(self) -> StoppingRule:
         """The same for every controller."""
@@ -99,10 +134,10 @@ class Setting:
             "plant": self.parameters(),
             "plant_config": self.plant_config("KM"),
             "model": self.model_options(),
-            "controller": self.controller_options(),
             "stopping_rule": self.stopping_rule(),
         }
-        figures = {name: dataclasses.asdict(part) for name, part in parts.items()}
+        figures: dict[str, Any] = {name: dataclasses.asdict(part) for name, part in parts.items()}
+        figures["controller"] = {name: repr(parts) for name, parts in self.controller_parts().items()}
         return {**figures, "learner": learner_figures(self.learner, self.capacity, **self.learner_options)}
 
     def replace(self, **changes: Any) -> Setting:

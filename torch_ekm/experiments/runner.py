@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -155,7 +155,12 @@ class Bench:
         if start is None:
             return {**about, "grasped": False, "lost": False}
         axis = self.hand.rotation_axis
-        loop = self._controller(axis, focus_step=step_deg * _DEG, contact_step=None, actuator_step=20 * _DEG)
+        whole = {
+            "LimitingFunction.step": step_deg * _DEG,
+            "LimitingFunction.contact_travel": None,
+            "ActuatorLimit.step": 20 * _DEG,
+        }
+        loop = self._controller(axis, whole)
         seen = self.plant.observe()
         before = _true_state(seen)
         target = PoseTarget.turned(start, axis, step_deg * _DEG)
@@ -170,10 +175,12 @@ class Bench:
         """Give back what the plant holds."""
         self.plant.close()
 
-    def _controller(self, axis: torch.Tensor, **changes: Any) -> LookAndMoveController:
-        options = dataclasses.replace(self.setting.controller_options(), **changes)
+    def _controller(
+        self, axis: torch.Tensor, changes: Mapping[str, Any] | None = None
+    ) -> LookAndMoveController:
+        setting = self.setting.replace(control={**self.setting.control, **(changes or {})})
         model = self.enhanced if self.enhanced is not None else self.model
-        return LookAndMoveController(model, axis, options)
+        return LookAndMoveController(model, axis, **setting.controller_parts())
 
     def _prepare_learner(self, start: GraspState) -> None:
         setting = self.setting

@@ -105,13 +105,17 @@ def variants(config: AblationConfig) -> list[Variant]:
         found.append(Variant("model", name, {"model": {**base.model, **option}}))
     found.append(Variant("controller", _BASE))
     for name, option, who in (
-        ("gain 1 near the goal", {"focus_gain": 1.0}, _ALL),
-        ("gain 0.6 near the goal", {"focus_gain": 0.6}, _ALL),
-        ("steps of 1.5 deg", {"focus_step": 1.5 * _DEG}, _ALL),
-        ("steps of 6 deg, 2 mm", {"focus_step": 6 * _DEG, "contact_step": 2e-3}, _ALL),
-        ("actuators cut at 6 deg", {"actuator_step": 6 * _DEG}, _ALL),
-        ("uncertainty in the cost", {"uncertainty_weight": 1.0}, ("E-KM",)),
-        ("rows for the friction margin", {"margin_min": 0.5}, _ALL),
+        ("gain 1 near the goal", {"LimitingFunction.gain": 1.0}, _ALL),
+        ("gain 0.6 near the goal", {"LimitingFunction.gain": 0.6}, _ALL),
+        ("steps of 1.5 deg", {"LimitingFunction.step": 1.5 * _DEG}, _ALL),
+        (
+            "steps of 6 deg, 2 mm",
+            {"LimitingFunction.step": 6 * _DEG, "LimitingFunction.contact_travel": 2e-3},
+            _ALL,
+        ),
+        ("actuators cut at 6 deg", {"ActuatorLimit.step": 6 * _DEG, "JointLimit.horizon": 6 * _DEG}, _ALL),
+        ("uncertainty in the cost", {"UncertaintyTask.weight": 1.0}, ("E-KM",)),
+        ("rows for the friction margin", {"FrictionMarginLimit.minimum": 0.5}, _ALL),
     ):
         found.append(Variant("controller", name, {"control": {**base.control, **option}}, who))
     found.append(Variant("preset", f"{base.preset}: {_BASE}"))
