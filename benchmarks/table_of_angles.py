@@ -20,9 +20,9 @@ from torch_ekm.control import ClosedLoop, LookAndMoveController, PoseTarget
 from torch_ekm.exceptions import EKMError
 from torch_ekm.experiments.config import Setting, digest
 from torch_ekm.experiments.jobs import run_jobs
-from torch_ekm.experiments.protocols.demo import TABLE_I
-from torch_ekm.model import KinematicModel, ModelOptions
-from torch_ekm.simulation import PlantConfig, SimulatedHand, preset
+from torch_ekm.experiments.protocols.generalize import TABLE_I
+from torch_ekm.model import KinematicModel
+from torch_ekm.simulation import SimulatedHand
 
 _DEG = math.pi / 180
 _REACHED = 1.0  # [deg]
@@ -31,11 +31,10 @@ _REACHED = 1.0  # [deg]
 def turn(object: str, seed: int, level: str) -> list[dict[str, Any]]:
     """All angles of Table I from the grasp of one seed, each from a new grasp."""
     torch.set_num_threads(1)
-    config = PlantConfig(relative_to="setpoint")
-    plant = SimulatedHand("icub_right", object, config, preset=level)
-    # a noisy pose may show a gap of some millimetres where there is contact
-    model = KinematicModel(*plant.true_descriptions(), ModelOptions(contact_margin=0.004))
-    rule = Setting(preset=level).stopping_rule()
+    setting = Setting(preset=level)
+    plant = SimulatedHand("icub_right", object, setting.plant_config("KM+I"), setting.parameters())
+    model = KinematicModel(*plant.true_descriptions(), setting.model_options())
+    rule = setting.stopping_rule()
     records: list[dict[str, Any]] = []
     for angle in TABLE_I[object]:
         record: dict[str, Any] = {"object": object, "seed": seed, "angle_deg": angle, "error_deg": None}
@@ -91,7 +90,7 @@ def main() -> None:
     seeds = range(options.first, options.first + options.seeds)
     jobs = {f"{o}_{s}": (o, s, level) for s in seeds for o in options.objects}
     count = iter(range(1, len(jobs) + 1))
-    folder = options.out / digest(preset(level))  # other figures of the plant: other results
+    folder = options.out / digest(Setting(preset=level), TABLE_I)  # other figures of the plant: other results
     done = run_jobs(
         turn, jobs, folder, options.jobs, lambda name: print(f"{next(count)}/{len(jobs)} {name}", flush=True)
     )

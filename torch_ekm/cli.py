@@ -84,17 +84,16 @@ def demo(
 
     Takes about two minutes on two cores. Interrupted, it goes on where it stopped.
     """
-    from .experiments.protocols.demo import TABLE_I, DemoConfig
-    from .experiments.protocols.demo_report import demo_jobs, run_demo
+    from .experiments.config import Setting
+    from .experiments.protocols.demo import Demo
+    from .experiments.reproduce import Experiment
+    from .experiments.reproduce import reproduce as run
 
-    angles = TABLE_I.get(object, TABLE_I["box"])
-    chosen = parse_seeds(seeds)
-    if quick:
-        chosen, angles = chosen[:2], angles[:2]
-    config = DemoConfig(hand=hand, object=object, seeds=chosen, angles_deg=angles)
+    protocol, chosen = Demo(Setting(hand=hand), object), parse_seeds(seeds)
+    planned = Experiment(protocol.quick(), chosen[:2]) if quick else Experiment(protocol, chosen)
     with _progress() as progress:
-        task = progress.add_task("manipulating", total=len(demo_jobs(config)))
-        report = run_demo(config, out, jobs, on_done=lambda _: progress.advance(task))
+        task = progress.add_task("manipulating", total=len(planned.jobs))
+        report = run(planned, out, jobs, on_done=lambda _: progress.advance(task))
     _print_tables(report)
     console.print(report.summary)
     console.print(f"Report:    {(out / 'index.html').resolve()}", soft_wrap=True)
@@ -287,7 +286,7 @@ def _progress() -> Progress:
 def _print_tables(report: Report, notes: bool = False) -> None:
     for table in report.tables:
         shown = RichTable(*table.header, title=table.caption, caption=table.note if notes else None)
-        for row in table.rows:
+        for row in table.text():
             shown.add_row(*row)
         _print_table(shown)
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from torch_ekm.experiments.config import Setting
+from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.runner import Bench
 
 
@@ -13,8 +14,9 @@ def test_object_is_turned_with_camera_and_hall_sensors() -> None:
     pytest.importorskip("cv2")
     bench = Bench(Setting(sensing=True), "box", "E-KM")
     record = bench.trial(0, 0, 6.0)
-    assert record["reason"] == "reached", record["message"]
-    assert record["true_error_deg"] < 0.5  # truth is only looked at afterwards
+    assert isinstance(record, TrialRecord)
+    assert record.reason == "reached", record.message
+    assert record.true_error_deg < 0.5  # truth is only looked at afterwards
 
 
 def test_a_stuck_hall_channel_keeps_its_first_reading() -> None:

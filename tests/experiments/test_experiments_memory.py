@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from experiments_records import memory_turn
 
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.learners import make_learner
 from torch_ekm.experiments.protocols.object_memory import (
-    AdaptConfig,
     Memories,
-    _make_signature,
-    adapt_session,
+    MemoryTurn,
+    ObjectMemory,
+    comparison_table,
+    recognition,
 )
-from torch_ekm.experiments.reporting.memory_tables import memory_comparison, recognition
 from torch_ekm.experiments.runner import Bench
 
 NAMES = ("none", "bank", "labelled", "one model", "fresh")
 
 
-def made_up_session(seed: int, share: dict[str, float], wrong: int = 0) -> list[dict[str, Any]]:
+def made_up_session(seed: int, share: dict[str, float], wrong: int = 0) -> list[MemoryTurn]:
     """Two objects, eight turns each; errors are the share of a common draw."""
     draw = np.random.default_rng(seed)
     records = []
@@ -32,18 +32,20 @@ def made_up_session(seed: int, share: dict[str, float], wrong: int = 0) -> list[
         base = draw.uniform(0.5, 1.5, 8)
         errors = {name: (share.get(name, 1.0) * base).tolist() for name in NAMES}
         model = k % 2 if k < 16 - wrong else 5
-        records.append({"object": "ab"[k % 2], "model": model, "memory_errors_deg": errors})
+        records.append(memory_turn(object="ab"[k % 2], model=model, memory_errors_deg=errors))
     return records
 
 
 def test_comparison_is_paired() -> None:
     sessions = [made_up_session(seed, {"bank": 0.5, "labelled": 0.8}) for seed in range(6)]
-    table = memory_comparison(sessions)
+    table = comparison_table(sessions)
     rows = {row[0]: row for row in table.rows}
-    assert rows["bank : labelled"][1].startswith("62")  # 62.5, and no interval: the draws are common
-    assert rows["bank : fresh"][1].startswith("50")
-    assert rows["one model : labelled"][1].startswith("125")
-    assert float(rows["bank : fresh"][2]) < 1e-4
+    ratio = rows["bank : labelled"][1]
+    assert ratio.mean == pytest.approx(0.625)
+    assert ratio.high - ratio.low < 1e-9  # the draws are common
+    assert rows["bank : fresh"][1].mean == pytest.approx(0.5)
+    assert rows["one model : labelled"][1].mean == pytest.approx(1.25)
+    assert rows["bank : fresh"][2] < 1e-4
     assert all(len(row) == len(table.header) for row in table.rows)
 
 
@@ -61,7 +63,7 @@ def test_bench_feels_the_width_of_what_it_holds() -> None:
     for item in ("applier", "can"):
         bench = Bench(setting, item, "KM")
         assert bench.grasp(0, 0) is not None
-        signature = _make_signature(AdaptConfig(setting=setting), bench)
+        signature = ObjectMemory(setting).make_signature(bench)
         o = bench.plant.observe()
         seen[item] = signature(o.q, o.a, o.fingertip_force)
         # the estimate of a joint without a sensor was made with the label's shape: it has no say
@@ -75,13 +77,12 @@ def test_bench_feels_the_width_of_what_it_holds() -> None:
 
 
 def test_memory_passes_its_signature_on_and_answers_for_its_leader() -> None:
-    config = AdaptConfig(objects=("box",), turns_each=1)
-    records = adapt_session(config, 0)
-    assert records[0]["model"] == 0
-    silent = adapt_session(dataclasses.replace(config, readings=0), 0)
-    assert silent[0]["steps"] > 0
+    protocol = ObjectMemory(objects=("box",), turns_each=1)
+    assert protocol.session(0)[0].model == 0
+    silent = dataclasses.replace(protocol, readings=0).session(0)
+    assert silent[0].steps > 0
     with pytest.raises(ParameterError, match="readings"):
-        AdaptConfig(readings=-1)
+        ObjectMemory(readings=-1)
 
 
 def test_memories_speak_with_the_bank() -> None:

@@ -25,6 +25,5 @@ def test_a_lost_object_does_not_hide_the_others() -> None:
 
 
 def test_a_probability_an_ulp_above_one_is_sure() -> None:
-    records = [{"object": "box", "model": 0, "posterior": [1.0 + 2.3e-16, 0.0]}]
-    (axis,) = plot_bank(records).axes
+    (axis,) = plot_bank(["box"], [0], [[1.0 + 2.3e-16, 0.0]]).axes
     assert axis.lines[0].get_alpha() == 1.0

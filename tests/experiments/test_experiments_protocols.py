@@ -8,29 +8,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from experiments_records import not_grasped
 
 from torch_ekm.control import PoseTarget
 from torch_ekm.description import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.camera_off import CameraOff
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
-from torch_ekm.experiments.learners import HAND_LEARNERS, LEARNERS, make_learner
-from torch_ekm.experiments.protocols.ablation import DISTURBANCES, AblationConfig, ablation_jobs, variants
-from torch_ekm.experiments.protocols.object_memory import AdaptConfig, adapt_session
-from torch_ekm.experiments.protocols.turning import (
-    GeneralizeConfig,
-    OnlineConfig,
-    generalize_jobs,
-    generalize_session,
-    online_session,
-)
+from torch_ekm.experiments.learners import LEARNERS, make_learner
+from torch_ekm.experiments.protocols.ablation import DISTURBANCES, Ablation, variants
+from torch_ekm.experiments.protocols.generalize import Generalize
+from torch_ekm.experiments.protocols.object_memory import ObjectMemory
+from torch_ekm.experiments.protocols.online import Online
+from torch_ekm.experiments.records import NotGrasped, TrialRecord
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.kinematics import GraspState
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.plant import Observation, PlantStatus
 from torch_ekm.simulation import preset
 
-ONLINE = OnlineConfig(trials=2, angles_deg=(4.0, 5.0), dislocations=(2,), tendons_replaced=2)
+ONLINE = Online(trials=2, angle_range_deg=(4.0, 5.0), dislocations=(2,), tendons_replaced=2)
 
 
 # -- without a simulation ----------------------------------------------------------------------------
@@ -64,9 +61,9 @@ def test_wrong_settings_say_what_would_be_right(changes: dict, error: type, matc
 
 def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.MonkeyPatch) -> None:
     def of(setting: Setting) -> str:
-        return digest(setting, ("box",), GeneralizeConfig(setting))
+        return digest(setting, ("box",), Generalize(setting))
 
-    base = GeneralizeConfig()
+    base = Generalize()
     unchanged = of(Setting())
     assert of(Setting()) == unchanged
     with monkeypatch.context() as patch:  # a version with another default
@@ -80,10 +77,9 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
     assert of(Setting()) == unchanged
     assert of(Setting(capacity=59)) != unchanged
     assert digest(Setting(), ("can",), base) != unchanged
-    one, both = (
-        generalize_jobs(dataclasses.replace(base, objects=o), (0,)) for o in (("box",), ("box", "can"))
-    )
+    one, both = (dataclasses.replace(base, objects=o).jobs((0,)) for o in (("box",), ("box", "can")))
     assert set(one) < set(both)  # more objects: what is there is used again
+    assert set(dataclasses.replace(base, objects=("box",), controllers=("KM",)).jobs((0,))) < set(one)
     assert len(both) == 2 * len(CONTROLLERS)
 
 
@@ -93,10 +89,10 @@ def test_a_corrected_object_does_not_take_up_old_results(tmp_path: Path) -> None
     own = str(tmp_path / "box.urdf")
 
     def jobs() -> set[str]:
-        return set(generalize_jobs(GeneralizeConfig(objects=(own,)), (0,)))
+        return set(Generalize(objects=(own,)).jobs((0,)))
 
     before = jobs()
-    assert before.isdisjoint(generalize_jobs(GeneralizeConfig(objects=("box",)), (0,)))  # other angles
+    assert before.isdisjoint(Generalize(objects=("box",)).jobs((0,)))  # other angles
     urdf = tmp_path / "box.urdf"
     urdf.write_text(urdf.read_text() + "\n")
     assert jobs().isdisjoint(before)
@@ -124,16 +120,17 @@ def test_ablation_covers_every_disturbance_of_the_nominal_plant() -> None:
         f.name for f in dataclasses.fields(nominal) if getattr(nominal, f.name) != getattr(exact, f.name)
     }
     assert disturbed == {name for names in DISTURBANCES.values() for name in names}
-    config = AblationConfig()
-    for variant in variants(config):
-        changed = config.setting.replace(**variant.changes)
+    protocol = Ablation()
+    for variant in variants(protocol.setting):
+        changed = protocol.setting.replace(**variant.changes)
         if variant.group == "disturbance":
             different = [
                 name for name in disturbed if getattr(changed.parameters(), name) != getattr(exact, name)
             ]
             assert set(different) == set(DISTURBANCES[variant.name]), variant.name
-    jobs = ablation_jobs(config, (0,))
-    assert len(jobs) < sum(len(v.controllers) for v in variants(config))  # alike variants share their jobs
+    jobs = protocol.jobs((0,))
+    # alike variants share their jobs
+    assert len(jobs) < sum(len(v.controllers) for v in variants(protocol.setting))
 
 
 class Stage:
@@ -185,59 +182,72 @@ def test_without_the_camera_the_prediction_is_all_there_is() -> None:
 
 
 def test_impossible_protocols_are_refused() -> None:
-    with pytest.raises(ParameterError, match="angles_deg"):
-        OnlineConfig(angles_deg=(10.0, 5.0))
+    with pytest.raises(ParameterError, match="angle_range_deg"):
+        Online(angle_range_deg=(10.0, 5.0))
     with pytest.raises(ParameterError, match="objects"):
-        GeneralizeConfig(objects=())
-    with pytest.raises(ParameterError, match="angles_deg"):
-        GeneralizeConfig(angles_deg=(0.0,))
+        Generalize(objects=())
+    for angles in ((0.0,), (200.0,), ()):
+        with pytest.raises(ParameterError, match="angles_deg"):
+            Generalize(angles_deg=angles)
     with pytest.raises(ParameterError, match="turn"):
-        AdaptConfig(turns_each=0)
+        ObjectMemory(turns_each=0)
     with pytest.raises(UnknownNameError, match="KM\\+I"):
-        online_session(ONLINE, "PID", 0)
+        Generalize(controllers=("PID",))
+    with pytest.raises(UnknownNameError, match="KM\\+I"):
+        ONLINE.session("PID", 0)
 
 
 # -- with the simulation -----------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def online() -> dict[str, list[dict]]:
-    return {name: online_session(ONLINE, name, 0) for name in ("KM+I", "E-KM")}
+def online() -> dict[str, list[TrialRecord]]:
+    sessions = {name: ONLINE.session(name, 0) for name in ("KM+I", "E-KM")}
+    assert all(isinstance(record, TrialRecord) for session in sessions.values() for record in session)
+    return sessions
 
 
-def test_every_controller_gets_the_same_grasps_and_targets(online: dict[str, list[dict]]) -> None:
+def test_every_controller_gets_the_same_grasps_and_targets(online: dict[str, list[TrialRecord]]) -> None:
     for ours, theirs in zip(online["E-KM"], online["KM+I"], strict=True):
-        assert ours["angle_deg"] == theirs["angle_deg"]
-        assert ours["errors_deg"][0] == theirs["errors_deg"][0]  # measured before the first motion
+        assert ours.angle_deg == theirs.angle_deg
+        assert ours.errors_deg[0] == theirs.errors_deg[0]  # measured before the first motion
 
 
-def test_learner_starts_empty_and_is_trained(online: dict[str, list[dict]]) -> None:
+def test_learner_starts_empty_and_is_trained(online: dict[str, list[TrialRecord]]) -> None:
     first, second = online["E-KM"]
-    assert first["prediction_ekm_deg"][0] == first["prediction_km_deg"][0]
-    assert second["prediction_ekm_deg"][0] != second["prediction_km_deg"][0]
-    assert online["KM+I"][0]["prediction_ekm_deg"][0] is None
-    assert len(first["true_prediction_ekm_deg"]) == first["steps"]
+    assert first.prediction_ekm_deg[0] == first.prediction_km_deg[0]
+    assert second.prediction_ekm_deg[0] != second.prediction_km_deg[0]
+    assert online["KM+I"][0].prediction_ekm_deg == ()
+    assert len(first.true_prediction_ekm_deg) == len(first.prediction_ekm_deg) == first.steps
+    assert len(first.errors_deg) == first.steps + 1
 
 
-def test_knock_is_felt_in_its_trial_only(online: dict[str, list[dict]]) -> None:
+def test_knock_is_felt_in_its_trial_only(online: dict[str, list[TrialRecord]]) -> None:
     calm, knocked = online["KM+I"]
-    assert max(calm["true_prediction_km_deg"]) < 2.0
-    assert knocked["true_prediction_km_deg"][3] > 2.0  # after the third motion
+    assert max(calm.true_prediction_km_deg) < 2.0
+    assert knocked.true_prediction_km_deg[3] > 2.0  # after the third motion
 
 
 def test_same_seed_same_session() -> None:
-    config = GeneralizeConfig(
-        objects=("box",), angles_deg=(4.0,), warm_up=1, long_step_deg=3.0, blind_deg=2.0
+    protocol = Generalize(
+        objects=("box",), angles_deg=(4.0,), warm_up=1, long_step_deg=3.0, blind_deg=2.0, poses=True
     )
-    runs = [generalize_session(config, "box", "E-KM", 1) for _ in range(2)]
+    runs = [protocol.session("box", "E-KM", 1) for _ in range(2)]
     for ours, theirs in zip(*runs, strict=True):
-        assert {k: v for k, v in ours.items() if k != "seconds"} == {
-            k: v for k, v in theirs.items() if k != "seconds"
-        }
-    kinds = [record["kind"] for record in runs[0]]
-    assert kinds == ["warm-up", "turn", "long step", "long step", "camera off"]
-    assert runs[0][2]["error_deg"] < 3.0
-    assert runs[0][1]["true_error_deg"] < 1.0
+        assert isinstance(ours, TrialRecord)
+        assert isinstance(theirs, TrialRecord)
+        assert dataclasses.replace(ours, seconds=()) == dataclasses.replace(theirs, seconds=())
+    assert [record.kind for record in runs[0]] == [
+        "warm-up", "turn", "long step", "long step", "camera off",
+    ]  # fmt: skip
+    _, turned, step, *_ = runs[0]
+    assert isinstance(turned, TrialRecord)
+    assert isinstance(step, TrialRecord)
+    assert (step.steps, step.reason) == (1, "step limit")
+    assert step.true_error_deg < 3.0
+    assert turned.true_error_deg < 1.0
+    assert len(turned.poses) == turned.steps + 1
+    assert step.poses == ()  # for pictures of turns only
 
 
 def test_what_cannot_be_grasped_is_recorded_not_raised(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,33 +262,28 @@ def test_what_cannot_be_grasped_is_recorded_not_raised(monkeypatch: pytest.Monke
         raise GraspError("too wide")
 
     monkeypatch.setattr(bench.plant, "reset", fail)
-    assert bench.trial(0, 0, 5.0)["reason"] == "not grasped"
-    assert bench.long_step(0, 0)["grasped"] is False
+    assert isinstance(bench.trial(0, 0, 5.0), NotGrasped)
+    assert isinstance(bench.long_step(0, 0, 5.0), NotGrasped)
     often = len(tried)
     again = bench.trial(0, 1, 5.0)
-    assert (again["reason"], again["message"]) == ("not grasped", "too wide")
+    assert (again.reason, again.message, again.trial) == ("not grasped", "too wide", 1)
     assert len(tried) == often  # given up
 
 
 def test_the_report_names_what_was_never_grasped(tmp_path: Path) -> None:
-    from torch_ekm.experiments.reporting.reports import generalize_report
-
-    failed = {"seed": 0, "object": "box", "kind": "turn", "grasped": False, "lost": False, "angle_deg": 9.0,
-              "reason": "not grasped", "message": "too wide"}  # fmt: skip
-    results = {who: [{**failed, "controller": who}] for who in ("KM", "KM+I", "E-KM", "E-KM+I")}
-    report = generalize_report(GeneralizeConfig(objects=("box",)), (0,), results, tmp_path)
+    results = {who: [not_grasped(who)] for who in CONTROLLERS}
+    report = Generalize(objects=("box",)).report((0,), results, tmp_path)
     assert "box was never grasped (too wide)" in report.summary
     report.write(tmp_path)
     assert "never grasped" in (tmp_path / "index.html").read_text()
 
 
 def test_object_memory_runs_and_all_memories_see_the_same_motions() -> None:
-    config = AdaptConfig(objects=("box", "can"), turns_each=1)
-    records = adapt_session(config, 0)
+    records = ObjectMemory(objects=("box", "can"), turns_each=1).session(0)
     assert len(records) == 2
     for record in records:
-        assert {len(errors) for errors in record["memory_errors_deg"].values()} == {record["steps"]}
-    assert records[0]["model"] == 0
-    np.testing.assert_allclose(sum(records[0]["posterior"]), 1.0)
+        assert {len(errors) for errors in record.memory_errors_deg.values()} == {record.steps}
+    assert records[0].model == 0
+    np.testing.assert_allclose(sum(records[0].posterior), 1.0)
     # nothing is known at first: every memory predicts what the KM does
-    assert len({errors[0] for errors in records[0]["memory_errors_deg"].values()}) == 1
+    assert len({errors[0] for errors in records[0].memory_errors_deg.values()}) == 1

@@ -48,7 +48,7 @@ def test_a_sensed_trial_can_be_computed_again_from_its_log(tmp_path):
     log = record(config, (0,), tmp_path)
     again = TrialLog.open(tmp_path).read(0)
     assert again.about["outcome"]["reason"] == "reached"
-    assert again.about["outcome"]["steps"] == len(again.commands)
+    assert len(again.about["outcome"]["errors_deg"]) == len(again.commands) + 1
     assert "seconds" not in again.about["outcome"]
     assert log.configuration["parameters"]["moment_arm"] == config.setting.parameters().moment_arm
     first = again.observations[0]

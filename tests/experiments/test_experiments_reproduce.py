@@ -6,70 +6,68 @@ import csv
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from experiments_records import turn
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
 from torch_ekm.description import object_paths
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
-from torch_ekm.experiments.reproduce import EXPERIMENTS, Experiment, plan, reproduce
+from torch_ekm.experiments.protocols.generalize import Generalize
+from torch_ekm.experiments.protocols.object_memory import MemoryTurn, ObjectMemory
+from torch_ekm.experiments.protocols.online import Online
+from torch_ekm.experiments.records import TrialRecord
+from torch_ekm.experiments.reproduce import PROTOCOLS, plan, reproduce
 
 
-def turn(controller: str, seed: int, trial: int, angle: float, item: str) -> dict[str, Any]:
+def made_up_turn(controller: str, seed: int, trial: int, angle: float, item: str) -> TrialRecord:
     """A made-up turn, decided by its arguments: reports are tested here, not the hand."""
     draw = np.random.default_rng([seed, trial, len(controller), len(item)])
     n = int(draw.integers(3, 9))
-    learns = controller.startswith("E-KM")
-    km = draw.uniform(0.3, 0.7, n).tolist()
-    ekm = draw.uniform(0.1, 0.3, n).tolist() if learns else [None] * n
-    return {
-        "controller": controller, "seed": seed, "trial": trial, "angle_deg": angle, "object": item,
-        "kind": "turn",
-        "grasped": True, "reason": "reached", "message": "", "lost": False, "steps": n,
-        "true_error_deg": float(draw.uniform(0, 0.3)), "steady_state_error_deg": 0.1,
-        "errors_deg": np.linspace(angle, 0.1, n + 1).tolist(), "first_step_deg": float(draw.uniform(0.1, 1)),
-        "step_error_deg": 0.3, "prediction_km_deg": km, "prediction_ekm_deg": ekm,
-        "true_prediction_km_deg": km, "true_prediction_ekm_deg": ekm if learns else [],
-        "off_rotation_deg": float(draw.uniform(0, 2)), "seconds": [0.01] * n,
-    }  # fmt: skip
+    km = tuple(draw.uniform(0.3, 0.7, n).tolist())
+    ekm = tuple(draw.uniform(0.1, 0.3, n).tolist()) if controller.startswith("E-KM") else ()
+    return turn(
+        controller, seed, float(draw.uniform(0, 0.3)), trial=trial, angle_deg=angle, object=item,
+        errors_deg=tuple(np.linspace(angle, 0.1, n + 1).tolist()),
+        first_step_deg=float(draw.uniform(0.1, 1)), prediction_km_deg=km, prediction_ekm_deg=ekm,
+        true_prediction_km_deg=km, true_prediction_ekm_deg=ekm,
+        off_rotation_deg=float(draw.uniform(0, 2)), seconds=(0.01,) * n,
+    )  # fmt: skip
 
 
-def made_up_online(config: Any, controller: str, seed: int) -> list[dict[str, Any]]:
-    return [turn(controller, seed, trial, 8.0, "toothpaste") for trial in range(1, config.trials + 1)]
+def made_up_online(protocol: Online, controller: str, seed: int) -> list[TrialRecord]:
+    trials = range(1, protocol.trials + 1)
+    return [made_up_turn(controller, seed, trial, 8.0, "toothpaste") for trial in trials]
 
 
-def made_up_generalize(config: Any, item: str, controller: str, seed: int) -> list[dict[str, Any]]:
-    records = [turn(controller, seed, k, angle, item) for k, angle in enumerate(config.angles_of(item))]
-    draw = np.random.default_rng([seed, len(controller)])
-    probe = {"kind": "long step", "error_deg": float(draw.uniform(0.2, 2.0)), "angle_deg": 5.0}
-    dark = {**turn(controller, seed, 99, 12.0, item), "kind": "camera off"}
-    return [*records, {**records[0], **probe}, dark]
+def made_up_generalize(protocol: Generalize, item: str, controller: str, seed: int) -> list[TrialRecord]:
+    angles = enumerate(protocol.angles_of(item))
+    records = [made_up_turn(controller, seed, k, angle, item) for k, angle in angles]
+    error = float(np.random.default_rng([seed, len(controller)]).uniform(0.2, 2.0))
+    dark = made_up_turn(controller, seed, 99, 12.0, item)
+    step = turn(controller, seed, error, kind="long step", angle_deg=5.0, object=item)
+    return [*records, step, dataclasses.replace(dark, kind="camera off")]
 
 
-def made_up_adapt(config: Any, seed: int) -> list[dict[str, Any]]:
+def made_up_memory(protocol: ObjectMemory, seed: int) -> list[MemoryTurn]:
     names = ("none", "bank", "labelled", "one model", "fresh")
     records = []
     for k in range(8):
-        record = turn("E-KM", seed, k, 10.0, config.objects[k % 2])
-        errors = {name: [0.1 * (i + 1)] * record["steps"] for i, name in enumerate(names)}
-        posterior = [0.9, 0.1] + [0.0] * 7
-        records.append({**record, "model": k % 2, "posterior": posterior, "memory_errors_deg": errors})
+        record = made_up_turn("E-KM", seed, k, 10.0, protocol.objects[k % 2])
+        errors = {name: [0.1 * (i + 1)] * record.steps for i, name in enumerate(names)}
+        posterior = (0.9, 0.1, *[0.0] * 7)
+        records.append(MemoryTurn(**vars(record), model=k % 2, posterior=posterior, memory_errors_deg=errors))
     return records
 
 
-SESSIONS = {
-    "online": made_up_online,
-    "generalize": made_up_generalize,
-    "ablation": made_up_generalize,
-    "adapt": made_up_adapt,
-}
-
-
-def made_up(name: str, **options: Any) -> Experiment:
-    return dataclasses.replace(plan(name, (0, 1, 2), **options), session=SESSIONS[name])
+@pytest.fixture
+def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sessions without a simulation."""
+    monkeypatch.setattr(Online, "session", made_up_online)
+    monkeypatch.setattr(Generalize, "session", made_up_generalize)  # and with it the ablation's
+    monkeypatch.setattr(ObjectMemory, "session", made_up_memory)
 
 
 def read(folder: Path) -> dict[str, bytes]:
@@ -77,9 +75,10 @@ def read(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in names}
 
 
-@pytest.mark.parametrize("name", EXPERIMENTS)
+@pytest.mark.usefixtures("made_up")
+@pytest.mark.parametrize("name", PROTOCOLS)
 def test_report_is_complete(name: str, tmp_path: Path) -> None:
-    report = reproduce(made_up(name), tmp_path)
+    report = reproduce(plan(name, (0, 1, 2)), tmp_path)
     page = (tmp_path / "index.html").read_text()
     for table in report.tables:
         with (tmp_path / f"{table.name}.csv").open() as stream:
@@ -88,7 +87,9 @@ def test_report_is_complete(name: str, tmp_path: Path) -> None:
         assert len(rows) == len(table.rows) + 1 > 1, table.name
         assert all(len(row) == len(rows[0]) for row in rows), table.name
         assert table.caption in page
-    assert not any("nan" in cell for table in report.tables for row in table.rows for cell in row)
+        assert rows[1:] == table.text()
+    cells = [cell for table in report.tables for row in table.rows for cell in row]
+    assert not any(isinstance(cell, float) and np.isnan(cell) for cell in cells)
     for figure in report.figures:
         assert (tmp_path / figure.path).stat().st_size > 1000
         assert (tmp_path / figure.path).with_suffix(".png").exists()
@@ -100,9 +101,10 @@ def test_report_is_complete(name: str, tmp_path: Path) -> None:
     assert "no basis for a claim" in report.summary
 
 
+@pytest.mark.usefixtures("made_up")
 def test_killed_run_resumes_to_the_same_report(tmp_path: Path) -> None:
     whole, broken = tmp_path / "whole", tmp_path / "broken"
-    experiment = made_up("generalize")
+    experiment = plan("generalize", (0, 1, 2))
     reproduce(experiment, whole)
     done: list[str] = []
 
@@ -127,7 +129,8 @@ def test_objects_of_a_user(tmp_path: Path) -> None:
         for source, suffix in zip(object_paths(like), (".urdf", ".object.toml"), strict=True):
             (tmp_path / (name + suffix)).write_bytes(source.read_bytes())
     experiment = plan("generalize", (0,), objects=tmp_path)
-    assert [Path(item).name for item in experiment.config.objects] == ["mug.urdf", "pen.urdf"]
+    assert isinstance(experiment.protocol, Generalize)
+    assert [Path(item).name for item in experiment.protocol.objects] == ["mug.urdf", "pen.urdf"]
     assert any("_mug_E-KM_0" in name for name in experiment.jobs)
     with pytest.raises(ParameterError, match=r"\.urdf"):
         plan("generalize", (0,), objects=tmp_path / "nothing")
@@ -143,13 +146,14 @@ def test_plans_are_checked() -> None:
         plan("offline")
     with pytest.raises(ParameterError, match="seeds"):
         plan("online", ())
-    for name in EXPERIMENTS:
+    for name in PROTOCOLS:
         assert len(plan(name, quick=True).jobs) < len(plan(name).jobs)
 
 
 def test_angles_of_a_user() -> None:
     planned = plan("generalize", (0,), angles_deg=(4.0, 8.0))
-    assert planned.config.angles_of("box") == (4.0, 8.0)
+    assert isinstance(planned.protocol, Generalize)
+    assert planned.protocol.angles_of("box") == (4.0, 8.0)
     assert planned.jobs.keys() != plan("generalize", (0,)).jobs.keys()  # no old results are taken up
     with pytest.raises(ParameterError, match="left out"):
         plan("online", (0,), angles_deg=(4.0,))

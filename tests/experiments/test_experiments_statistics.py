@@ -1,20 +1,30 @@
-"""From records to claims: losses stay visible, pairs stay pairs, intervals cover."""
+"""From records to claims: losses stay visible, pairs stay pairs, intervals cover; closed forms."""
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+import torch
+from experiments_records import memory_turn, not_grasped, turn
 
-from torch_ekm.exceptions import ParameterError, ShapeError
-from torch_ekm.experiments.protocols.object_memory import judge_assignment
-from torch_ekm.experiments.reporting.learning_tables import learning_table, prediction_curves
+from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
+from torch_ekm.experiments.protocols.generalize import Generalize, object_table
+from torch_ekm.experiments.protocols.object_memory import MemoryTurn, ObjectMemory, judge_assignment
+from torch_ekm.experiments.protocols.online import Online, prediction_curves, recovery_trials
+from torch_ekm.experiments.records import NotGrasped, TrialRecord, prediction_error
+from torch_ekm.experiments.reporting.report import Column, Table
 from torch_ekm.experiments.reporting.statistics import (
+    Estimate,
+    bootstrap,
+    bootstrap_mean,
     bootstrap_ratio,
-    compare,
-    mean_prediction,
+    learning_curve,
+    mean_of,
     paired_means,
+    paired_test,
     rate,
-    recovery_trials,
     select,
     settle_steps,
     steady_state_error,
@@ -22,54 +32,67 @@ from torch_ekm.experiments.reporting.statistics import (
     unit_means,
 )
 from torch_ekm.experiments.reporting.tables import (
+    Target,
     comparison_table,
     controller_table,
-    object_table,
+    prediction_table,
     reason_table,
-)
-from torch_ekm.experiments.reporting.targets import (
-    adapt_targets,
-    generalize_targets,
-    goal,
-    online_targets,
+    targets_table,
 )
 
+# -- records -----------------------------------------------------------------------------------------
 
-def record(controller: str = "KM", seed: int = 0, error: float = 1.0, **changes: object) -> dict:
-    base = {
-        "controller": controller, "seed": seed, "trial": 1, "object": "box", "kind": "turn",
-        "angle_deg": 20.0, "grasped": True, "reason": "reached", "lost": False, "true_error_deg": error,
-        "steady_state_error_deg": error,
-        "steps": 3, "errors_deg": [20.0, 8.0, 0.4, 0.3], "first_step_deg": 0.5, "step_error_deg": 0.4,
-        "off_rotation_deg": 1.0, "seconds": [0.01] * 3, "prediction_km_deg": [0.6, 0.4],
-        "prediction_ekm_deg": [0.3, 0.1], "true_prediction_km_deg": [0.5, 0.5],
-        "true_prediction_ekm_deg": [0.1, 0.1],
-    }  # fmt: skip
-    return {**base, **changes}
+
+def test_records_come_back_from_json_as_they_were() -> None:
+    memory = memory_turn(
+        model=1, posterior=(0.9, 0.1), n_models=2, memory_errors_deg={"bank": [0.1, 0.2], "none": [1.0, 2.0]}
+    )
+    for record in (turn(first_step_deg=None), not_grasped(), memory):
+        kept = json.loads(json.dumps(record.to_json()))
+        again = (MemoryTurn if record is memory else TrialRecord).from_json(kept)
+        assert again == record
+        assert type(again) is type(record)
+
+
+def test_figures_that_a_record_does_not_have_are_refused() -> None:
+    figures = turn().to_json()
+    with pytest.raises(ParameterError, match="surprise"):
+        TrialRecord.from_json({**figures, "surprise": 1.0})
+    del figures["off_rotation_deg"]
+    with pytest.raises(ParameterError, match="off_rotation_deg"):
+        TrialRecord.from_json(figures)
+
+
+def test_prediction_error_picks_the_focused_rows_of_the_object() -> None:
+    increment, predicted = torch.arange(26.0), torch.zeros(26)
+    focus = torch.zeros(1, 6)
+    focus[0, 3] = 1.0
+    assert prediction_error(increment, predicted, focus).tolist() == [23.0]
 
 
 def test_lost_object_counts_with_the_whole_angle() -> None:
-    lost = record(error=3.0, lost=True, reason="object lost")
+    lost = turn(error=3.0, reason="object lost")
+    assert lost.lost
     assert steady_state_error(lost) == 20.0
     assert survivor_error(lost) is None
-    assert steady_state_error(record(error=3.0)) == 3.0
+    assert steady_state_error(turn(error=3.0)) == 3.0
 
 
 @pytest.mark.parametrize(
     ("errors", "expected"),
-    [([3, 0.4, 0.3], 1), ([3, 0.4, 0.9, 0.2], 3), ([0.2, 0.1], 0), ([3, 2, 0.6], 40)],
+    [((3, 0.4, 0.3), 1), ((3, 0.4, 0.9, 0.2), 3), ((0.2, 0.1), 0), ((3, 2, 0.6), 40)],
 )
-def test_settling_means_staying_inside(errors: list[float], expected: int) -> None:
-    assert settle_steps(record(errors_deg=errors)) == expected
+def test_settling_means_staying_inside(errors: tuple[float, ...], expected: int) -> None:
+    assert settle_steps(40)(turn(errors_deg=errors)) == expected
 
 
 def test_lost_objects_never_settle() -> None:
-    assert settle_steps(record(errors_deg=[3, 0.1], lost=True), limit=25) == 25
+    assert settle_steps(25)(turn(errors_deg=(3, 0.1), reason="object lost")) == 25
 
 
 def test_units_are_objects_and_seeds_and_pairs_need_both() -> None:
-    ours = [record("E-KM", 0, 1.0), record("E-KM", 0, 3.0), record("E-KM", 1, 5.0), record("E-KM", 2, 7.0)]
-    theirs = [record("KM", 1, 10.0), record("KM", 0, 4.0)]
+    ours = [turn("E-KM", 0, 1.0), turn("E-KM", 0, 3.0), turn("E-KM", 1, 5.0), turn("E-KM", 2, 7.0)]
+    theirs = [turn("KM", 1, 10.0), turn("KM", 0, 4.0)]
     assert unit_means(ours, steady_state_error) == {("box", 0): 2.0, ("box", 1): 5.0, ("box", 2): 7.0}
     a, b = paired_means(ours, theirs, steady_state_error)
     np.testing.assert_array_equal(a, [2.0, 5.0])
@@ -77,20 +100,42 @@ def test_units_are_objects_and_seeds_and_pairs_need_both() -> None:
 
 
 def test_what_was_not_grasped_is_not_measured_but_counted() -> None:
-    failed = {"controller": "KM", "seed": 3, "object": "box", "kind": "turn", "grasped": False,
-              "reason": "not grasped", "lost": False}  # fmt: skip
-    assert select([failed, record()], controller="KM") == [record()]
-    row = reason_table([failed, record()]).rows[0]
-    assert row[0] == "KM"
-    assert row[-1] == "1"
+    records = [not_grasped(seed=3), turn(), turn(error=2.0, reason="stalled"), turn(reason="object lost")]
+    assert select(records, controller="KM", reason="reached") == [turn()]
+    assert [row[1:] for row in reason_table(records).rows] == [
+        ["reached", 1, 1.0], ["stalled", 1, 2.0], ["object lost", 1, None], [NotGrasped.reason, 1, None],
+    ]  # fmt: skip
 
 
-def test_mean_prediction_picks_the_right_list() -> None:
-    assert mean_prediction("km")(record()) == 0.5
-    assert mean_prediction("ekm")(record()) == pytest.approx(0.2)
-    assert mean_prediction("true_km")(record()) == 0.5
-    assert mean_prediction("true_ekm")(record()) == pytest.approx(0.1)
-    assert mean_prediction("ekm")(record(prediction_ekm_deg=[None])) is None
+def test_mean_of_a_trial_picks_the_right_list() -> None:
+    assert mean_of("prediction_km_deg")(turn()) == 0.5
+    assert mean_of("prediction_ekm_deg")(turn()) == pytest.approx(0.2)
+    assert mean_of("true_prediction_ekm_deg")(turn()) == pytest.approx(0.1)
+    assert mean_of("prediction_ekm_deg")(turn(prediction_ekm_deg=())) is None
+
+
+# -- intervals and tests -----------------------------------------------------------------------------
+
+
+def test_bootstrap_interval_covers_the_mean() -> None:
+    rng = np.random.default_rng(3)
+    hits = 0
+    for _ in range(100):
+        found = bootstrap_mean(rng.exponential(1.0, 30), resamples=300)
+        hits += found.low <= 1.0 <= found.high
+    assert 84 <= hits <= 99  # percentile intervals of a skewed sample cover a little less than 95
+    one = bootstrap_mean(np.array([2.0]))
+    assert (one.mean, one.low, one.high) == (2.0, 2.0, 2.0)
+
+
+def test_bootstrap_is_scipys() -> None:
+    scipy_stats = pytest.importorskip("scipy.stats")
+    values = np.random.default_rng(4).exponential(1.0, 20)
+    theirs = scipy_stats.bootstrap(
+        (values,), np.mean, n_resamples=4000, method="percentile", rng=np.random.default_rng(0)
+    )
+    ours = bootstrap_mean(values)
+    np.testing.assert_allclose([ours.low, ours.high], theirs.confidence_interval, rtol=1e-12)
 
 
 def test_bootstrap_ratio_covers_the_truth() -> None:
@@ -111,6 +156,15 @@ def test_bootstrap_ratio_covers_the_truth() -> None:
         bootstrap_ratio(np.ones(3), np.zeros(3))
 
 
+def test_bad_samples_are_refused() -> None:
+    with pytest.raises(NonFiniteError):
+        bootstrap_mean(np.array([1.0, np.nan]))
+    with pytest.raises(ShapeError):
+        bootstrap(np.mean, np.array([]))
+    with pytest.raises(ShapeError):
+        paired_test(np.ones(3), np.ones(4))
+
+
 def test_rates_have_wilsons_interval() -> None:
     found = rate([True] + [False] * 19)
     # Wilson (1927) for 1 of 20 at 95 %
@@ -118,7 +172,47 @@ def test_rates_have_wilsons_interval() -> None:
     assert found.low == pytest.approx(0.00888, abs=1e-4)
     assert found.high == pytest.approx(0.23613, abs=1e-4)
     assert rate([]).n == 0
-    assert compare(np.ones(1), np.ones(1)) is None
+
+
+def test_paired_test_finds_a_known_difference() -> None:
+    rng = np.random.default_rng(0)
+    theirs = rng.normal(2.0, 0.5, 200)
+    result = paired_test(theirs - 1.0 + rng.normal(0, 0.1, 200), theirs)
+    assert result is not None
+    assert result.low < -1.0 < result.high
+    assert result.high - result.low < 0.05  # +- 1.96 * 0.1 / sqrt(200)
+    assert result.paired_p < result.welch_p < 1e-10
+    assert result.effect_size == pytest.approx(-10, rel=0.2)
+
+
+def test_equal_samples_are_not_significant_and_one_unit_is_no_sample() -> None:
+    values = np.array([0.5, 1.0, 2.0])
+    same, shifted = paired_test(values, values), paired_test(values + 1, values)
+    assert same is not None
+    assert same.paired_p == 1.0
+    assert shifted is not None
+    assert (shifted.paired_p, shifted.difference) == (0.0, 1.0)
+    assert paired_test(np.ones(1), np.ones(1)) is None
+
+
+def test_p_values_are_uniform_under_the_null() -> None:
+    rng = np.random.default_rng(1)
+    tests = [paired_test(rng.normal(size=20), rng.normal(size=20)) for _ in range(400)]
+    assert 0.02 < np.mean([test is not None and test.welch_p < 0.05 for test in tests]) < 0.08
+
+
+def test_learning_curve_marks_the_last_negative_result() -> None:
+    rng = np.random.default_rng(2)
+    theirs = 2 + 0.3 * rng.normal(size=45)
+    ours = theirs.copy()
+    ours[8:] = 0.5 + 0.1 * rng.normal(size=37)  # learned after eight trials
+    curve = learning_curve(ours, theirs)
+    assert 8 <= curve.last_negative <= 12
+    assert curve.last_upper < -0.5
+    assert np.isnan(curve.p[0])
+    never = learning_curve(theirs + 0.5, theirs)
+    assert never.last_negative == 45
+    assert never.last_upper > 0
 
 
 def test_recovery_counts_from_the_trial_after_the_event() -> None:
@@ -128,23 +222,51 @@ def test_recovery_counts_from_the_trial_after_the_event() -> None:
     assert recovery_trials(np.ones(8), km, event=3) is None
 
 
+# -- tables ------------------------------------------------------------------------------------------
+
+
+def test_tables_hold_numbers_and_write_them_in_the_format_of_their_column() -> None:
+    share = Column("share [%]", ".0f", percent=True)
+    cells = [
+        [0.123, 0.456],
+        [Estimate(0.5, 0.25, 0.75, 9), Estimate(0.5, 0.25, 0.75, 9)],
+        [3, 3],
+        [True, None],
+    ]
+    table = Table("name", "caption", ["plain", share], cells)
+    assert table.rows[0][0] == 0.123
+    assert table.header == ["plain", "share [%]"]
+    assert table.text() == [
+        ["0.12", "46"], ["0.50 [0.25, 0.75]", "50 [25, 75]"], ["3", "3"], ["yes", "-"],
+    ]  # fmt: skip
+    assert Column("p", ".1g").text(0.00123) == "0.001"
+    assert str(Estimate(0.12345, 0.1, 0.2, 3)) == "0.123 [0.1, 0.2]"
+    assert Column("nothing").text(float("nan")) == "-"
+
+
 def test_object_table_shows_means_ratios_and_losses() -> None:
-    records = [record("KM", seed, 2.0 + seed) for seed in range(4)]
-    records += [record("E-KM", seed, 0.5 + 0.25 * seed) for seed in range(4)]
-    records[0] = record("KM", 0, 2.0, lost=True, reason="object lost")
+    records = [turn("KM", seed, 2.0 + seed) for seed in range(4)]
+    records += [turn("E-KM", seed, 0.5 + 0.25 * seed) for seed in range(4)]
+    records[0] = turn("KM", 0, 2.0, reason="object lost")
     table = object_table(records)
     row = dict(zip(table.header, table.rows[0], strict=True))
-    assert row["KM [deg]"].startswith("8.00 [")  # (20 + 3 + 4 + 5) / 4
-    assert row["E-KM [deg]"].startswith("0.88 [")
-    assert row["E-KM:KM [%]"].startswith("11 [")
-    assert (row["KM lost"], row["E-KM lost"]) == ("1", "0")
+    assert row["KM [deg]"].mean == pytest.approx(8.0)  # (20 + 3 + 4 + 5) / 4
+    assert row["E-KM [deg]"].mean == pytest.approx(0.875)
+    assert row["E-KM:KM [%]"].mean == pytest.approx(0.875 / 8)
+    assert (row["KM lost"], row["E-KM lost"]) == (1, 0)
+    assert table.text()[0][5] == "11 [" + table.text()[0][5].split("[")[1]  # in percent
     assert table.rows[-1][0] == "all"
     controllers = controller_table(records, limit=40)
-    assert controllers.rows[0][:2] == ["KM", controllers.rows[0][1]]
-    assert controllers.rows[0][2].startswith("4.00 [")  # survivors
-    compared = comparison_table(records, limit=40)
-    assert compared.rows[0][1].startswith("11 [")
-    assert compared.rows[0][2] == "-"  # no KM+I in these records
+    shown = dict(zip(controllers.header, controllers.rows[0], strict=True))
+    assert shown["controller"] == "KM"
+    assert shown["survivors"].mean == pytest.approx(4.0)
+    compared = comparison_table([*records, not_grasped("KM+I")], limit=40)
+    assert compared.rows[0][1].mean == pytest.approx(0.875 / 8)
+    assert compared.rows[0][3] is None  # no KM+I was ever measured
+    assert len(comparison_table(records, limit=40).columns) == 3  # and here it took no part
+    predicted = dict(zip(*(prediction_table(records).header, prediction_table(records).rows[0]), strict=True))
+    assert predicted["E-KM:KM, measured [%]"].mean == pytest.approx(0.4)
+    assert predicted["E-KM, true"].mean == pytest.approx(0.1)
 
 
 def test_learning_table_finds_the_last_negative_result() -> None:
@@ -153,50 +275,48 @@ def test_learning_table_finds_the_last_negative_result() -> None:
     for trial in range(1, 25):
         ekm = 1.0 if trial <= 3 else 0.3
         noise = generator.normal(0, 0.05, size=2)
-        records.append(
-            record(
-                "E-KM",
-                0,
-                trial=trial,
-                prediction_km_deg=[1.0 + noise[0]],
-                prediction_ekm_deg=[ekm + noise[1]],
-            )
-        )
-    row = learning_table(records, events=(10, 24), trials=24).rows[0]
-    assert 3 <= int(row[1]) <= 7
-    assert 25 <= float(row[3]) <= 36  # trials 17 to 24 without 24
-    assert row[4:] == ["1", "-"]  # after the last trial there is nothing to see
+        km, ekm = (1.0 + noise[0],), (ekm + noise[1],)
+        records.append(turn("E-KM", 0, trial=trial, prediction_km_deg=km, prediction_ekm_deg=ekm))
+    online = Online(trials=24, dislocations=(10, 24), tendons_replaced=0)
+    row = online.learning_table(records).rows[0]
+    assert 3 <= row[1] <= 7
+    assert 0.25 <= row[3] <= 0.36  # trials 17 to 24 without 24
+    assert row[4:] == [1, None]  # after the last trial there is nothing to see
     curves = prediction_curves(records[:5], trials=6)
     assert np.isnan(curves[0][0][5])
 
 
-def test_goals_say_by_how_much_they_are_missed() -> None:
-    assert goal("x", 25, 20.0, " %")[-1] == "yes"
-    assert goal("x", 25, 30.0, " %")[-1] == "no, by 5 %"
-    assert goal("x", 90, 80.0, least=True)[-1] == "no, by 10"
+def test_targets_say_by_how_much_they_are_missed() -> None:
+    assert Target("x", 20.0, most=25).missed_by == 0
+    assert Target("x", 30.0, most=25).missed_by == 5
+    assert Target("x", 80.0, least=90).missed_by == 10
+    assert Target("x", 0.5, least=1, most=3).missed_by == 0.5
+    rows = targets_table([Target("a", 20.0, most=25), Target("b", 30.0, most=25)]).text()
+    assert rows == [["a", "-", "25", "20", "yes", "-"], ["b", "-", "25", "30", "no", "5"]]
 
 
 def test_targets_of_each_experiment() -> None:
     records = []
     for seed in range(5):
-        records += [record("KM", seed, 2.0 + 0.1 * seed), record("KM+I", seed, 0.3 + 0.01 * seed)]
-        records.append(record("E-KM", seed, 0.2 + 0.01 * seed, first_step_deg=0.2))
-    rows = {row[0]: row for row in generalize_targets(records, limit=40)}
-    assert rows["steady-state error E-KM : KM, box"][-1] == "yes"
-    assert rows["error of the first motion E-KM : KM+I"][2] == "40 %"
-    assert rows["motions to settle E-KM : KM+I"][-1] == "no, by 40 %"
-    assert rows["objects lost, E-KM"][2] == "0 %"
-    assert rows["steady-state error of the KM"][-1] == "yes"
-    turns = [record("E-KM", 0, trial=t) for t in range(1, 20)]
-    assert any("after 16 trials" in row[0] for row in online_targets(turns, (10,), 19))
-    memory = {name: [0.2] for name in ("bank", "labelled", "one model", "fresh")}
-    adapted = [[record("E-KM", 0, model=0, memory_errors_deg=memory) for _ in range(5)]]
-    assert adapt_targets(adapted)[0][2] == "100 %"
+        records += [turn("KM", seed, 2.0 + 0.1 * seed), turn("KM+I", seed, 0.3 + 0.01 * seed)]
+        records.append(turn("E-KM", seed, 0.2 + 0.01 * seed, first_step_deg=0.2))
+    found = {target.what: target for target in Generalize().targets({"all": records})}
+    assert found["steady-state error E-KM : KM, box [%]"].missed_by == 0
+    assert found["error of the first motion E-KM : KM+I [%]"].measured == pytest.approx(40)
+    assert found["motions to settle E-KM : KM+I [%]"].missed_by == pytest.approx(40)
+    assert found["objects lost, E-KM [%]"].measured == 0
+    assert found["steady-state error of the KM [deg]"].missed_by == 0
+    turns = [turn("E-KM", 0, trial=t) for t in range(1, 20)]
+    online = Online(trials=19, dislocations=(10,), tendons_replaced=0)
+    assert any("after 16 trials" in target.what for target in online.targets({"all": turns}))
+    errors = {name: [0.2] for name in ("bank", "labelled", "one model", "fresh")}
+    adapted = [memory_turn(model=0, memory_errors_deg=errors) for _ in range(5)]
+    assert ObjectMemory().targets({"0": adapted})[0].measured == 100
 
 
 def test_assignment_gives_every_object_one_model_at_most() -> None:
-    def turns(pairs: str) -> list[dict]:
-        return [{"object": pair[0], "model": int(pair[1])} for pair in pairs.split()]
+    def turns(pairs: str) -> list[MemoryTurn]:
+        return [memory_turn(object=pair[0], model=int(pair[1])) for pair in pairs.split()]
 
     perfect = judge_assignment(turns("a0 b1 a0 b1 a0 b1 a0 b1 a0 b1"))
     assert (perfect.right, perfect.judged, perfect.n_models) == (4, 4, 2)

@@ -34,9 +34,11 @@ from .learners import DEFAULT_LEARNER, LEARNERS, learner_figures
 
 _DEG = math.pi / 180
 
-#: The controllers that are compared on the same seeds, grasps, limits and stopping rule. "+I": the
-#: increments accumulate on the set-point instead of the encoder, an integrator that learns nothing.
+#: The controllers that are compared on the same seeds, grasps, limits and stopping rule. "+I" is integral
+#: action: the increments accumulate on the set-point instead of the encoder, which learns nothing.
 CONTROLLERS = ("KM", "KM+I", "E-KM", "E-KM+I")
+#: Seeds from here on are never used for tuning.
+FIRST_REPORTED = 1000
 
 #: Parts of a controller in the order in which they are summed.
 _TASKS = (EffortTask, UncertaintyTask, OffAxisTask, GripForceTask, FocusTask)
@@ -96,7 +98,11 @@ class Setting:
         return self.replace(plant={"hardware_seed": seed, **self.plant})
 
     def plant_config(self, controller: str) -> PlantConfig:
-        """The position controller as ``controller`` uses it, and the grasp."""
+        """The position controller as ``controller`` uses it, and the grasp.
+
+        Raises:
+            UnknownNameError: no such controller; the message lists them.
+        """
         if controller not in CONTROLLERS:
             raise UnknownNameError("controller", controller, CONTROLLERS)
         relative_to = "setpoint" if controller.endswith("+I") else "encoder"
@@ -162,6 +168,11 @@ def digest(setting: Setting, objects: Iterable[str | Path], *more: Any) -> str:
     figures = [dataclasses.asdict(setting), setting.figures(), contents, more]
     text = json.dumps(figures, sort_keys=True, default=_plain)
     return hashlib.sha256(text.encode()).hexdigest()[:10]
+
+
+def object_name(object: str) -> str:
+    """Short name of an object given by name or path."""
+    return Path(object).stem if object.endswith(".urdf") else object
 
 
 def _plain(item: Any) -> Any:

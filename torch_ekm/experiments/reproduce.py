@@ -3,42 +3,43 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..description import load_object
 from ..exceptions import ParameterError, UnknownNameError
-from .config import Setting
+from .config import FIRST_REPORTED, Setting
 from .jobs import run_jobs
-from .protocols.ablation import AblationConfig, ablation_jobs, ablation_session
-from .protocols.object_memory import AdaptConfig, adapt_jobs, adapt_session
-from .protocols.turning import (
-    GeneralizeConfig,
-    OnlineConfig,
-    generalize_jobs,
-    generalize_session,
-    online_jobs,
-    online_session,
-)
-from .reporting import reports
+from .protocols.ablation import Ablation
+from .protocols.generalize import Generalize
+from .protocols.object_memory import ObjectMemory
+from .protocols.online import Online
+from .protocols.protocol import Protocol
 from .reporting.report import Report
 
-EXPERIMENTS = ("online", "generalize", "ablation", "adapt")
+PROTOCOLS: dict[str, type[Protocol]] = {
+    "online": Online,
+    "generalize": Generalize,
+    "ablation": Ablation,
+    "adapt": ObjectMemory,
+}
 #: Seeds that nobody tuned on, at least twenty for each case.
-REPORTED_SEEDS = tuple(range(1000, 1020))
+REPORTED_SEEDS = tuple(range(FIRST_REPORTED, FIRST_REPORTED + 20))
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What is to be run, and what is made of the results."""
+    """A protocol and the seeds it is run with."""
 
-    config: Any
+    protocol: Protocol
     seeds: tuple[int, ...]
-    session: Callable[..., Any]
-    jobs: Mapping[str, tuple[Any, ...]]
-    build: Callable[[Mapping[str, Any], Path], Report]
+
+    @property
+    def jobs(self) -> dict[str, tuple[Any, ...]]:
+        """Name -> arguments of the protocol's session."""
+        return self.protocol.jobs(self.seeds)
 
 
 def plan(
@@ -50,10 +51,10 @@ def plan(
     angles_deg: tuple[float, ...] | None = None,
     quick: bool = False,
 ) -> Experiment:
-    """The jobs of an experiment, none of them run yet.
+    """An experiment, nothing of it run yet.
 
     Args:
-        name: one of :data:`EXPERIMENTS`.
+        name: a key of :data:`PROTOCOLS`.
         seeds: each is an independent run; every controller gets the same ones.
         setting: hand, plant, learner, sensing.
         objects: a folder with URDF files to be used instead of the objects that come with the package.
@@ -65,60 +66,23 @@ def plan(
         ParameterError: no seeds, no URDF file in ``objects``, or an experiment that takes no objects
             or no angles.
     """
-    if name not in EXPERIMENTS:
-        raise UnknownNameError("experiment", name, EXPERIMENTS)
+    if name not in PROTOCOLS:
+        raise UnknownNameError("experiment", name, PROTOCOLS)
     if not seeds:
         raise ParameterError("seeds", seeds, "at least one seed")
-    found = None if objects is None else object_files(objects)
-    if found is not None and name not in ("generalize", "adapt"):
-        raise ParameterError("objects", str(objects), "left out: only 'generalize' and 'adapt' take objects")
-    setting = Setting() if setting is None else setting
-    seeds = seeds[:2] if quick else seeds
-    changes: dict[str, Any] = {"setting": setting, **(_QUICK[name] if quick else {})}
-    if found is not None:
-        changes["objects"] = found
+    protocol = PROTOCOLS[name]()
+    if quick:
+        protocol, seeds = protocol.quick(), seeds[: protocol.quick_seeds]
+    changes: dict[str, Any] = {} if setting is None else {"setting": setting}
+    if objects is not None:
+        changes["objects"] = urdf_files(objects)
     if angles_deg is not None:
-        if name not in ("generalize", "ablation"):
-            raise ParameterError(
-                "angles_deg", angles_deg, "left out: only 'generalize' and 'ablation' take angles"
-            )
         changes["angles_deg"] = angles_deg
-    if name == "online":
-        online = OnlineConfig(**changes)
-        return Experiment(
-            online,
-            seeds,
-            online_session,
-            online_jobs(online, seeds),
-            lambda results, folder: reports.online_report(online, seeds, results, folder),
-        )
-    if name == "generalize":
-        general = GeneralizeConfig(**changes)
-        return Experiment(
-            general,
-            seeds,
-            generalize_session,
-            generalize_jobs(general, seeds),
-            lambda results, folder: reports.generalize_report(general, seeds, results, folder),
-        )
-    if name == "ablation":
-        ablation = AblationConfig(**changes)
-        return Experiment(
-            ablation,
-            seeds,
-            ablation_session,
-            ablation_jobs(ablation, seeds),
-            lambda results, folder: reports.ablation_report(ablation, seeds, results, folder),
-        )
-    adapt = AdaptConfig(**changes)
-    seeds = seeds[:1] if quick else seeds
-    return Experiment(
-        adapt,
-        seeds,
-        adapt_session,
-        adapt_jobs(adapt, seeds),
-        lambda results, folder: reports.adapt_report(adapt, seeds, results, folder),
-    )
+    for key in changes:
+        takers = [name for name, kind in PROTOCOLS.items() if key in _fields(kind)]
+        if name not in takers:
+            raise ParameterError(key, changes[key], f"left out: only {' and '.join(takers)} take them")
+    return Experiment(dataclasses.replace(protocol, **changes), seeds)  # pyright: ignore[reportArgumentType]
 
 
 def reproduce(
@@ -138,20 +102,21 @@ def reproduce(
         on_done: called with each finished job's name.
         address: of a Dask or Ray cluster that does the work (``dask://HOST:PORT``, ``ray://HOST:PORT``).
     """
-    jobs = dict(experiment.jobs)
-    results = run_jobs(experiment.session, jobs, folder / "runs", processes, on_done, address)
-    report = experiment.build(results, folder)
-    config = experiment.config
+    protocol, seeds = experiment.protocol, experiment.seeds
+    kept = run_jobs(protocol.run, experiment.jobs, folder / "runs", processes, on_done, address)
+    read = protocol.record.from_json
+    results = {name: [read(figures) for figures in session] for name, session in kept.items()}
+    report = protocol.report(seeds, results, folder)
     report.configuration = {
-        "experiment": dataclasses.asdict(config),
-        "seeds": list(experiment.seeds),
-        **config.setting.figures(),
+        "experiment": dataclasses.asdict(protocol),  # pyright: ignore[reportArgumentType]
+        "seeds": list(seeds),
+        **protocol.setting.figures(),
     }
     report.write(folder)
     return report
 
 
-def object_files(folder: Path) -> tuple[str, ...]:
+def urdf_files(folder: Path) -> tuple[str, ...]:
     """URDF files of a folder, sorted.
 
     Raises:
@@ -168,15 +133,5 @@ def object_files(folder: Path) -> tuple[str, ...]:
     return found
 
 
-_QUICK: dict[str, dict[str, Any]] = {
-    "online": {"trials": 4, "angles_deg": (5.0, 8.0), "dislocations": (3,), "tendons_replaced": 4},
-    "generalize": {
-        "objects": ("box", "can"),
-        "angles_deg": (5.0, 9.0),
-        "warm_up": 1,
-        "long_step_deg": 3.0,
-        "blind_deg": 0.0,
-    },
-    "ablation": {"angles_deg": (6.0,), "warm_up": 1, "groups": ("learner",)},
-    "adapt": {"objects": ("box", "can", "applier"), "turns_each": 2},
-}
+def _fields(protocol: type) -> list[str]:
+    return [field.name for field in dataclasses.fields(protocol)]

@@ -4,32 +4,29 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 
-from ..control import ClosedLoop, LookAndMoveController, Manipulation, PoseTarget
+from ..control import ClosedLoop, LookAndMoveController, PoseTarget
 from ..description import ObjectDescription
 from ..enhanced import EnhancedModel, GraspEncoding
 from ..exceptions import EquilibriumError, GraspError
 from ..kinematics import GraspState
 from ..model import KinematicModel
-from ..plant import Observation, Plant, PlantStatus
+from ..plant import Plant
 from ..residual import ResidualLearner
 from ..simulation import Change, DisturbedPlant, SimulatedHand, Tug
 from .camera_off import CameraOff
-from .config import Setting
+from .config import Setting, object_name
 from .learners import make_learner
-from .reporting.metrics import prediction_error
+from .records import NotGrasped, Record, Trial, TrialRecord, true_state
 
-Record = dict[str, Any]
 _DEG = math.pi / 180
 _TRIES = 4  # grasps drawn for one trial before it is given up
 _HOPELESS = 2  # trials without any grasp, after which the object is given up
-_MOVING = 0.5 * _DEG  # commands that ask for less tell nothing about the shortfall of a step
 
 
 class Bench:
@@ -39,8 +36,6 @@ class Bench:
         setting: hand, plant, model, learner, rule.
         object: name, path or description.
         controller: one of ``CONTROLLERS``.
-        learner: used instead of a fresh one of the setting's kind (e.g. one that knows other objects).
-        encoding: what the learner sees of a state; by default made at the first grasp.
         keep_images: with sensing, the camera's last image stays in ``info["raw"]["image"]``.
     """
 
@@ -49,14 +44,13 @@ class Bench:
         setting: Setting,
         object: str | ObjectDescription,
         controller: str,
-        learner: ResidualLearner | None = None,
-        encoding: GraspEncoding | None = None,
         *,
         keep_images: bool = False,
     ) -> None:
         torch.set_num_threads(1)  # small matrices: more threads only wait for each other
         self.setting, self.controller = setting, controller
         config = setting.plant_config(controller)
+        self.name = object_name(object) if isinstance(object, str) else object.name
         self.hand = SimulatedHand(setting.hand, object, config, setting.parameters())
         self.disturbed = DisturbedPlant(self.hand)
         self.plant: Plant = self.disturbed
@@ -64,16 +58,16 @@ class Bench:
             stuck = setting.parameters().stuck_joints
             self.plant = _sensed(self.disturbed, self.hand, stuck, keep_images)
         self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model_options())
-        self.learner, self.encoding = learner, encoding
+        self.learner: ResidualLearner | None = None
+        self.encoding: GraspEncoding | None = None
         self.enhanced: EnhancedModel | None = None
         self.no_grasp = ""
         """Why the last grasp that failed did."""
         self._ever_held, self._failed = False, 0  # trials without a grasp
-        self.on_grasp: Callable[[torch.Tensor], object] | None = None
-        """Hears of the axis of each new grasp."""
 
     @property
     def learns(self) -> bool:
+        """The controller is an E-KM."""
         return self.controller.startswith("E-KM")
 
     def grasp(self, seed: int, trial: int) -> GraspState | None:
@@ -93,83 +87,83 @@ class Bench:
             self._ever_held = True
             if self.learns and self.enhanced is None:
                 self._prepare_learner(start)
-            if self.on_grasp is not None:
-                self.on_grasp(self.hand.rotation_axis)
             return start
         self._failed += 1
         return None
 
     def adopt(self, learner: ResidualLearner, encoding: GraspEncoding) -> None:
-        """Use this learner from now on, with this encoding."""
+        """Learn with this learner (e.g. one that knows other objects) and what it sees of a state, instead
+        of a fresh one of the setting's kind."""
         self.learner, self.encoding, self.enhanced = learner, encoding, None
 
-    def trial(
+    def trial(self, seed: int, trial: int, angle_deg: float, kind: str = "turn", **options: Any) -> Record:
+        """Turn the object by ``angle_deg`` from a fresh grasp.
+
+        Args:
+            kind: what the record is called.
+            options: of :meth:`turn`.
+        """
+        start = self.grasp(seed, trial)
+        about = Trial(self.name, kind, self.controller, seed, trial, angle_deg)
+        if start is None:
+            return NotGrasped(**vars(about), message=self.no_grasp)
+        return self.turn(about, start, **options)
+
+    def turn(
         self,
-        seed: int,
-        trial: int,
-        angle_deg: float,
+        about: Trial,
+        start: GraspState,
         *,
         learn: bool = True,
         events: Sequence[Tug | Change] = (),
         blind_deg: float = 0.0,
-    ) -> Record:
-        """Turn the object by ``angle_deg`` from a fresh grasp.
+        poses: bool = False,
+    ) -> TrialRecord:
+        """Turn the object that is held.
 
         Args:
+            about: what is to be done.
+            start: from where, as measured.
             learn: train after every motion (an E-KM only).
             events: what happens on the way; ``at`` counts this trial's commands from 0.
             blind_deg: the camera is off for this last part of the turn [deg].
-
-        Returns:
-            A record of plain figures; angles [deg].
+            poses: keep the true poses, for pictures.
         """
-        about = {"controller": self.controller, "seed": seed, "trial": trial, "angle_deg": angle_deg}
-        start = self.grasp(seed, trial)
-        if start is None:
-            return {
-                **about,
-                "reason": "not grasped",
-                "message": self.no_grasp,
-                "grasped": False,
-                "lost": False,
-            }
         self.disturbed.events = tuple(
             dataclasses.replace(event, at=event.at + self.disturbed.count) for event in events
         )
         axis = self.hand.rotation_axis
-        target = PoseTarget.turned(start, axis, angle_deg * _DEG)
+        target = PoseTarget.turned(start, axis, about.angle_deg * _DEG)
         controller, plant = self._controller(axis), self.plant
         if blind_deg:
             model = self.model if self.enhanced is None else self.enhanced
             plant = CameraOff(plant, model, target, axis, blind_deg * _DEG)
         done = ClosedLoop(plant, controller, self.setting.stopping_rule(), learn=learn).run(target)
-        return {**about, **record_of(done, axis, self.learns)}
+        return TrialRecord.of(about, done, axis, learns=self.learns, poses=poses)
 
-    def long_step(self, seed: int, trial: int, step_deg: float = 5.0) -> Record:
-        """One step of ``step_deg`` from a fresh grasp: how far from it does the object come to rest?
+    def long_step(self, seed: int, trial: int, step_deg: float) -> Record:
+        """One motion of ``step_deg`` from a fresh grasp: how far from it does the object come to rest?
 
-        Feedback has no say in it. The error is against the plant's truth, the learner stays as it is.
+        Feedback has no say in it. The true error is that of the rotation about the axis, from where the
+        object really was; the learner stays as it is.
         """
-        about = {"controller": self.controller, "seed": seed, "trial": trial, "angle_deg": step_deg}
         start = self.grasp(seed, trial)
+        about = Trial(self.name, "long step", self.controller, seed, trial, step_deg)
         if start is None:
-            return {**about, "grasped": False, "lost": False}
+            return NotGrasped(**vars(about), message=self.no_grasp)
         axis = self.hand.rotation_axis
-        whole = {
+        wide = {
             "LimitingFunction.step": step_deg * _DEG,
             "LimitingFunction.contact_travel": None,
             "ActuatorLimit.step": 20 * _DEG,
         }
-        loop = self._controller(axis, whole)
-        seen = self.plant.observe()
-        before = _true_state(seen)
-        target = PoseTarget.turned(start, axis, step_deg * _DEG)
-        decision = loop.decide(seen.state, seen.a, target, seen.fingertip_force)
-        seen = self.plant.command(decision.delta_a)
-        turned = _true_state(seen).minus(before)[-3:] @ axis
-        lost = seen.status is PlantStatus.LOST
-        error = abs(float(turned) / _DEG - step_deg)
-        return {**about, "grasped": True, "lost": lost, "error_deg": error}
+        rule = dataclasses.replace(self.setting.stopping_rule(), max_steps=1, off_limit=math.inf)
+        loop = ClosedLoop(self.plant, self._controller(axis, wide), rule, learn=False)
+        done = loop.run(PoseTarget.turned(start, axis, step_deg * _DEG))
+        before = true_state(done.steps[0].before if done.steps else done.stop.final)
+        turned = true_state(done.stop.final).minus(before)[-3:] @ axis
+        record = TrialRecord.of(about, done, axis, learns=self.learns)
+        return dataclasses.replace(record, true_error_deg=abs(float(turned) / _DEG - step_deg))
 
     def close(self) -> None:
         """Give back what the plant holds."""
@@ -209,52 +203,3 @@ def _sensed(
     if hall is not None:  # after the calibration: a channel that was dead by then would not be believed
         hall.stuck = [Stuck.FROZEN if joint in stuck else Stuck.NO for joint in hall.joints]
     return sensed if hall is None else ContactAligned(sensed, hand, simulated.object)
-
-
-def _true_state(observation: Observation) -> GraspState:
-    assert observation.truth is not None  # a simulated hand tells
-    return observation.truth.state
-
-
-def record_of(done: Manipulation, axis: torch.Tensor, learns: bool) -> Record:
-    """Plain figures of one manipulation in a simulated hand; angles [deg]."""
-    steps, focus, measured = done.steps, done.focus, done.errors
-    asked = [float(torch.linalg.vector_norm(step.decision.desired)) for step in steps]
-    # how much of a step was missing: |e| should have fallen by what was asked for
-    short = [abs(measured[k + 1] - (measured[k] - asked[k])) for k in range(len(steps))]
-    moving = [s for s, a in zip(short, asked, strict=False) if a >= _MOVING]
-    truth = [_true_state(seen) for seen in (*(step.before for step in steps), done.stop.final)]
-    turned = [axis @ after.minus(before)[-3:] for before, after in pairwise(truth)]
-
-    def errors_of(predictions: list[torch.Tensor]) -> list[float]:
-        pairs = zip(steps, predictions, strict=True)
-        errors = [prediction_error(step.increment, predicted, focus.matrix) for step, predicted in pairs]
-        return [float(torch.linalg.vector_norm(error)) / _DEG for error in errors]
-
-    def true_errors(predictions: list[torch.Tensor]) -> list[float]:
-        pairs = zip(turned, predictions, strict=True)
-        return [abs(float(real - axis @ predicted[-3:])) / _DEG for real, predicted in pairs]
-
-    return {
-        "grasped": True,
-        "reason": done.reason.value,
-        "message": done.stop.message,
-        "lost": done.lost,
-        "steady_state_error_deg": measured[-1] / _DEG,
-        "true_error_deg": focus.error(done.target, truth[-1]) / _DEG,
-        "steps": len(steps),
-        "errors_deg": [error / _DEG for error in measured],
-        "first_step_deg": short[0] / _DEG if short else None,
-        "step_error_deg": float(np.mean(moving)) / _DEG if moving else None,
-        "prediction_km_deg": errors_of([step.decision.nominal for step in steps]),
-        "prediction_ekm_deg": (
-            errors_of([step.decision.predicted for step in steps]) if learns else [None] * len(steps)
-        ),
-        # the same against the plant's truth, free of the camera's noise
-        "true_prediction_km_deg": true_errors([step.decision.nominal for step in steps]),
-        "true_prediction_ekm_deg": true_errors([step.decision.predicted for step in steps]) if learns else [],
-        "off_rotation_deg": (
-            focus.off_rotation(done.stop.final.state.minus(steps[0].before.state)) / _DEG if steps else 0.0
-        ),
-        "seconds": [step.seconds for step in steps],
-    }

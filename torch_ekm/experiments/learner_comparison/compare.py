@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from ..._extras import require
 from ...exceptions import ParameterError
 from ..jobs import run_jobs
-from ..learners import learner_factory
-from ..reporting.metrics import Estimate
+from ..reporting.statistics import Estimate
 from .learners import DEFAULT, OURS
 from .prequential import Z90, run_prequential
 from .recording import Recording

@@ -4,26 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
-from ...simulation import PRESETS
-from ..config import Setting, digest
-from ..learners import HAND_LEARNERS
-from ..reporting.metrics import bootstrap_mean
-from ..reporting.report import Table
-from ..reporting.statistics import (
-    Record,
-    bootstrap_ratio,
-    mean_prediction,
-    paired_means,
-    rate,
-    select,
-    steady_state_error,
-)
-from ..reporting.tables import estimate, percent, text
-from .turning import GeneralizeConfig, generalize_session, object_name
+from ..config import Setting, object_name
+from ..records import Record
+from ..reporting.report import Cell, Column, Report, Table
+from ..reporting.statistics import estimate, rate, steady_state_error
+from ..reporting.tables import by_controller, prediction_cells, which_seeds
+from .generalize import Generalize
+from .protocol import Protocol, Results
 
 _DEG = math.pi / 180
 _BASE = "as it is"
@@ -42,15 +34,10 @@ DISTURBANCES: dict[str, tuple[str, ...]] = {
     "dead zone": ("dead_zone",),
     "backlash": ("backlash",),
     "noise of the sensors": (
-        "joint_noise",
-        "position_noise",
-        "rotation_noise",
-        "force_noise",
-        "force_offset",
-        "force_hysteresis",
+        "joint_noise", "position_noise", "rotation_noise", "force_noise", "force_offset", "force_hysteresis",
         "force_range",
     ),
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -64,22 +51,8 @@ class Variant:
     controllers: tuple[str, ...] = ("KM", "E-KM")
 
 
-@dataclass(frozen=True)
-class AblationConfig:
-    """One object, some angles, every variant."""
-
-    setting: Setting = field(default_factory=Setting)
-    object: str = "box"
-    angles_deg: tuple[float, ...] = (9.0, 19.0, 29.0)
-    warm_up: int = 3
-    groups: tuple[str, ...] = (
-        "learner", "online learning", "model", "controller", "preset", "disturbance", "dead zone",
-    )  # fmt: skip
-
-
-def variants(config: AblationConfig) -> list[Variant]:
-    """All variants of the chosen groups; each group begins with the unchanged setting."""
-    base = config.setting
+def variants(base: Setting) -> list[Variant]:
+    """All variants of a setting; each group begins with the unchanged one."""
     found = [Variant("learner", _BASE)]
     found += [
         Variant("learner", name, {"learner": name, "learner_options": {}}, ("E-KM",))
@@ -130,82 +103,76 @@ def variants(config: AblationConfig) -> list[Variant]:
     for size in (0.0, 0.5, 0.9, 1.3, 1.7):
         plant = {**base.plant, "dead_zone": size * _DEG}
         found.append(Variant("dead zone", f"{size:g} deg", {"plant": plant}, _ALL))
-    return [variant for variant in found if variant.group in config.groups]
+    return found
 
 
-def ablation_jobs(config: AblationConfig, seeds: tuple[int, ...]) -> dict[str, tuple[Any, ...]]:
-    """One job for each seed, variant and controller; variants that are alike share their jobs."""
-    jobs: dict[str, tuple[Any, ...]] = {}
-    for variant in variants(config):
-        jobs.update(_jobs_of(config, variant, seeds))
-    return jobs
+@dataclass(frozen=True)
+class Ablation(Protocol):
+    """One object, some angles, every variant."""
 
+    setting: Setting = field(default_factory=Setting)
+    object: str = "box"
+    angles_deg: tuple[float, ...] = (9.0, 19.0, 29.0)
+    warm_up: int = 3
+    groups: tuple[str, ...] = (
+        "learner", "online learning", "model", "controller", "preset", "disturbance", "dead zone",
+    )  # fmt: skip
 
-def ablation_tables(
-    config: AblationConfig, seeds: tuple[int, ...], results: Mapping[str, list[Record]]
-) -> list[Table]:
-    """One table for each group."""
-    tables = []
-    for group in config.groups:
-        rows = []
-        for variant in variants(config):
-            if variant.group == group:
-                names = _jobs_of(config, variant, seeds)
-                rows.append(_row(variant, [r for name in names for r in results[name]]))
-        header = [
-            group, "steady-state error KM", "KM+I", "E-KM", "prediction KM", "E-KM", "E-KM:KM [%]",
-            "E-KM:KM, true [%]", "lost: KM", "E-KM",
+    def quick(self) -> Self:
+        """The learners, with one turn."""
+        return dataclasses.replace(self, angles_deg=(6.0,), warm_up=1, groups=("learner",))
+
+    def variants(self, group: str) -> list[Variant]:
+        """What is compared in one group."""
+        return [variant for variant in variants(self.setting) if variant.group == group]
+
+    def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[Generalize, str, int]]:
+        """One for each seed, variant and controller; variants that are alike share their jobs."""
+        chosen = [variant for group in self.groups for variant in self.variants(group)]
+        return {name: job for variant in chosen for name, job in self._jobs_of(variant, seeds).items()}
+
+    def session(self, variant: Generalize, controller: str, seed: int) -> list[Record]:
+        """All turns with one variant, controller and seed."""
+        return variant.session(self.object, controller, seed)
+
+    def report(self, seeds: Sequence[int], results: Results[Record], folder: Path) -> Report:
+        """One table for each group."""
+        tables = [self.table(group, seeds, results) for group in self.groups]
+        summary = f"One change at a time, {object_name(self.object)}. {which_seeds(seeds)}"
+        return Report("Ablations: what each part is worth", summary, tables)
+
+    def table(self, group: str, seeds: Sequence[int], results: Results[Record]) -> Table:
+        """The variants of one group."""
+        rows: list[list[Cell]] = []
+        for variant in self.variants(group):
+            records = [r for name in self._jobs_of(variant, seeds) for r in results[name]]
+            turns = by_controller(records)
+            row: list[Cell] = [variant.name]
+            row += [estimate(turns.get(name, []), steady_state_error) for name in _ALL]
+            row += [*prediction_cells(records), prediction_cells(records, "true_")[-1]]
+            lost = [turns.get(name, []) for name in ("KM", "E-KM")]
+            rows.append(row + [rate(r.lost for r in mine) if mine else None for mine in lost])
+        columns = [
+            group, "steady-state error KM", "KM+I", "E-KM", "prediction KM", "prediction E-KM",
+            Column("E-KM:KM [%]", ".0f", percent=True), Column("E-KM:KM, true [%]", ".0f", percent=True),
+            "lost: KM", "lost: E-KM",
         ]  # fmt: skip
         note = (
-            f"{object_name(config.object)}, {', '.join(f'{a:g}' for a in config.angles_deg)} deg, "
+            f"{object_name(self.object)}, {', '.join(f'{a:g}' for a in self.angles_deg)} deg, "
             f"{len(seeds)} seeds. Steady-state error by the truth, lost objects with the whole angle; "
             "one-step prediction error on the E-KM's own motions; both in degrees with 95 % bootstrap "
             "intervals over seeds."
         )
-        tables.append(Table(f"ablation_{group.replace(' ', '_')}", f"Ablation: {group}", header, rows, note))
-    return tables
+        return Table(f"ablation_{group.replace(' ', '_')}", f"Ablation: {group}", columns, rows, note)
 
-
-def _row(variant: Variant, records: list[Record]) -> list[str]:
-    by = {name: select(records, controller=name, kind="turn") for name in ("KM", "KM+I", "E-KM")}
-    row = [variant.name, *(text(estimate(by[name], steady_state_error)) for name in ("KM", "KM+I", "E-KM"))]
-    mine = [r for r in by["E-KM"] if r["prediction_ekm_deg"]]
-    if mine:
-        ours, theirs = paired_means(mine, mine, mean_prediction("ekm"), mean_prediction("km"))
-        true = paired_means(mine, mine, mean_prediction("true_ekm"), mean_prediction("true_km"))
-        row += [text(bootstrap_mean(theirs)), text(bootstrap_mean(ours))]
-        row += [percent(bootstrap_ratio(ours, theirs)), percent(bootstrap_ratio(*true))]
-    else:
-        row += ["-"] * 4
-    return row + [str(rate(r["lost"] for r in by[name])) if by[name] else "-" for name in ("KM", "E-KM")]
-
-
-def _jobs_of(config: AblationConfig, variant: Variant, seeds: tuple[int, ...]) -> dict[str, tuple[Any, ...]]:
-    one = GeneralizeConfig(
-        config.setting.replace(**variant.changes),
-        objects=(config.object,),
-        angles_deg=config.angles_deg,
-        warm_up=config.warm_up,
-        long_step_deg=0.0,
-        blind_deg=0.0,
-    )
-    stem = f"ablation_{digest(one.setting, one.objects, one)}"
-    return {
-        f"{stem}_{name}_{seed}": (one, config.object, name, seed)
-        for seed in seeds
-        for name in variant.controllers
-    }
-
-
-#: What :func:`run_jobs` runs.
-ablation_session = generalize_session
-
-__all__ = [
-    "DISTURBANCES",
-    "AblationConfig",
-    "Variant",
-    "ablation_jobs",
-    "ablation_session",
-    "ablation_tables",
-    "variants",
-]
+    def _jobs_of(self, variant: Variant, seeds: Sequence[int]) -> dict[str, tuple[Generalize, str, int]]:
+        one = Generalize(
+            self.setting.replace(**variant.changes),
+            objects=(self.object,),
+            angles_deg=self.angles_deg,
+            warm_up=self.warm_up,
+            long_step_deg=0.0,
+            blind_deg=0.0,
+            controllers=variant.controllers,
+        )
+        return {name: (one, controller, seed) for name, (_, controller, seed) in one.jobs(seeds).items()}

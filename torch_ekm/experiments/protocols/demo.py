@@ -2,103 +2,154 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
-from typing import Any
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
 
-import torch
+import numpy as np
 
-from ...control import ClosedLoop, LookAndMoveController, PoseTarget, StoppingRule
 from ...description import load_hand, load_object
-from ...enhanced import EnhancedModel, grasp_learner
-from ...exceptions import ParameterError, UnknownNameError
-from ...model import KinematicModel, ModelOptions
-from ...plant import Observation
-from ...simulation import PlantConfig, SimulatedHand
-from ..runner import record_of
+from ...rendering import make_scene, save_animation, save_picture
+from ..config import Setting
+from ..records import Record, TrialRecord
+from ..reporting.plots import plot_convergence, plot_prediction_error, save_figure
+from ..reporting.report import Cell, Column, FigureFile, Report, Table
+from ..reporting.statistics import Array, select, steady_state_error
+from .generalize import Generalize
+from .protocol import Protocol, Results, records_of
 
-#: Rotations of the paper's Table I [deg].
-TABLE_I: dict[str, tuple[float, ...]] = {
-    "box": (9, 14, 19, 24, 29),
-    "weighted_box": (6, 11, 16, 21, 26),
-    "can": (9, 13, 23, 31, 38),
-    "bottle": (7, 13, 18, 23, 28),
-    "applier": (3, 8, 13, 18, 23),
-}
 CONTROLLERS = ("KM", "E-KM")
-_DEG = math.pi / 180
 
 
 @dataclass(frozen=True)
-class DemoConfig:
-    """What the demo does. Reported seeds start at 1000; figures were chosen on seeds below 100.
+class Demo(Protocol):
+    """One object of :class:`Generalize` with the KM and with an E-KM that starts empty, without the probes
+    and with pictures.
 
     Raises:
-        UnknownNameError: no such hand or object; the message lists them.
-        DescriptionError: a file of theirs is missing or wrong.
-        ParameterError: nothing to do, or an angle that is no rotation.
+        UnknownNameError: no such object; the message lists them.
+        DescriptionError: its files are missing or wrong.
+        ParameterError: an angle that is no rotation.
     """
 
-    hand: str = "icub_right"
+    setting: Setting = field(default_factory=Setting)
     object: str = "box"
-    seeds: tuple[int, ...] = tuple(range(1000, 1008))
-    angles_deg: tuple[float, ...] = TABLE_I["box"]
-    capacity: int = 60
-    tolerance_deg: float = 0.25
-    max_steps: int = 60
+    angles_deg: tuple[float, ...] | None = None
+    """None: those of :class:`Generalize`."""
 
     def __post_init__(self) -> None:
-        load_hand(self.hand)
         load_object(self.object)
-        if not self.seeds:
-            raise ParameterError("seeds", self.seeds, "at least one seed")
-        if not self.angles_deg or not all(0 < abs(angle) < 180 for angle in self.angles_deg):
-            raise ParameterError("angles_deg", self.angles_deg, "angles between 0 and 180 deg")
+        assert self.turns  # its angles are checked
+
+    @property
+    def turns(self) -> Generalize:
+        """What is run."""
+        return Generalize(
+            self.setting,
+            objects=(self.object,),
+            angles_deg=self.angles_deg,
+            warm_up=0,
+            long_step_deg=0.0,
+            blind_deg=0.0,
+            controllers=CONTROLLERS,
+            poses=True,
+        )
+
+    def quick(self) -> Self:
+        """The first two angles."""
+        return dataclasses.replace(self, angles_deg=self.turns.angles_of(self.object)[:2])
+
+    def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[str, str, int]]:
+        """One for each seed and controller."""
+        return self.turns.jobs(seeds)
+
+    def session(self, object: str, controller: str, seed: int) -> list[Record]:
+        """All angles, each from a new grasp; the E-KM learns from angle to angle."""
+        return self.turns.session(object, controller, seed)
+
+    def report(self, seeds: Sequence[int], results: Results[Record], folder: Path) -> Report:
+        """That of the turns, each target on its own, the motions, and pictures."""
+        report, records = self.turns.report(seeds, results, folder), select(records_of(results))
+        report.title = (
+            f"Turning the {_spoken(self.object)} with the hand {_spoken(self.setting.hand)}: KM and E-KM"
+        )
+        shown = ("controllers", "comparison", "prediction", "stop_reasons", "timing")
+        report.tables = [self.angle_table(records)] + [t for t in report.tables if t.name in shown]
+        report.figures = [*self._pictures(records, folder), *self._motions(records, folder), *report.figures]
+        return report
+
+    def angle_table(self, records: Sequence[TrialRecord]) -> Table:
+        """Each target on its own."""
+        columns: list[Column | str] = [Column("target", "g")]
+        for name in CONTROLLERS:
+            columns += [f"{name}: error", Column(f"{name}: motions", ".1f"), f"{name}: lost"]
+        rows: list[list[Cell]] = []
+        for angle in self.turns.angles_of(self.object):
+            row: list[Cell] = [float(angle)]
+            for name in CONTROLLERS:
+                mine = select(records, controller=name, angle_deg=angle)
+                figures = np.array([(steady_state_error(r), r.steps, r.lost) for r in mine])
+                row += [*map(float, figures.mean(0)[:2]), int(figures[:, 2].sum())] if mine else [None] * 3
+            rows.append(row)
+        caption = "Steady-state error, motions and lost objects for each target [deg]"
+        return Table("by_angle", caption, columns, rows)
+
+    def _motions(self, records: Sequence[TrialRecord], folder: Path) -> list[FigureFile]:
+        """How the prediction improves with each motion, and how the error falls in the longest turn."""
+        mine = select(records, controller="E-KM")
+        runs = [select(mine, seed=seed) for seed in sorted({r.seed for r in mine})]
+        ekm, km = (
+            [_running_mean(np.concatenate([getattr(r, name) for r in run])) for run in runs]
+            for name in ("prediction_ekm_deg", "prediction_km_deg")
+        )
+        shortest, figures = min(map(len, ekm), default=0), []
+        if shortest >= 5:
+            caption = (
+                "One-step prediction error of KM and E-KM on the same motions, running mean over 5 motions; "
+                "the learner starts empty at motion 1 (the paper's Fig. 5a)."
+            )
+            curves = (np.stack([curve[:shortest] for curve in found]) for found in (ekm, km))
+            figure = plot_prediction_error(*curves, xlabel="motion")
+            figures.append(save_figure(figure, folder, "prediction_error", caption))
+        last = self.turns.angles_of(self.object)[-1]
+        histories = {
+            name: [np.array(r.errors_deg) for r in select(records, controller=name, angle_deg=last)]
+            for name in CONTROLLERS
+        }
+        caption = f"Error on the way to {last:g} deg, as measured."
+        return [
+            *figures,
+            save_figure(plot_convergence(histories, f"{last:g} deg"), folder, "convergence", caption),
+        ]
+
+    def _pictures(self, records: Sequence[TrialRecord], folder: Path) -> list[FigureFile]:
+        """The E-KM's best long turn: before and after, and as an animation."""
+        turns = [r for r in select(records, controller="E-KM") if r.poses and not r.lost]
+        if not turns:
+            return []
+        turn = max(turns, key=lambda r: (r.reason == "reached", r.angle_deg, -r.true_error_deg))
+        q, position, rotation = (np.array(part) for part in zip(*turn.poses, strict=True))
+        hand, obj = load_hand(self.setting.hand), load_object(self.object)
+        scene = make_scene(hand, obj, q, position, rotation, np.array(hand.gravity))
+        save_picture(scene, folder / "hand.png", frames=(0, -1))
+        save_animation(scene, folder / "animation.html")
+        what = f"a turn of {turn.angle_deg:g} deg (seed {turn.seed})"
+        return [
+            FigureFile("hand.png", f"The {_spoken(self.object)} before and after {what}."),
+            FigureFile("animation.html", "The same turn, motion by motion: drag to look around."),
+        ]
 
 
-def stopping_rule(config: DemoConfig) -> StoppingRule:
-    """The same rule for every controller."""
-    return StoppingRule(tolerance=config.tolerance_deg * _DEG, max_steps=config.max_steps)
+def _spoken(name: str) -> str:
+    """A name, or the stem of a path, as words."""
+    return Path(name).stem.replace("_", " ")
 
 
-def run_session(
-    config: DemoConfig, controller: str, seed: int, on_trial: Callable[[], None] | None = None
-) -> list[dict[str, Any]]:
-    """All angles from the grasp of one seed; the E-KM starts empty and learns from angle to angle.
-
-    Returns:
-        One record of plain figures for each angle (angles [deg]).
-    """
-    if controller not in CONTROLLERS:
-        raise UnknownNameError("controller", controller, CONTROLLERS)
-    torch.set_num_threads(1)  # small matrices: more threads only wait for each other
-    plant_config = PlantConfig()
-    plant = SimulatedHand(config.hand, config.object, plant_config, preset="nominal")
-    # a noisy pose may show a gap of some millimetres where there is contact
-    options = ModelOptions(contact_margin=0.004)
-    model = KinematicModel(plant.hand, plant.object, options)
-    enhanced: EnhancedModel | None = None
-    records = []
-    for angle in config.angles_deg:
-        start = plant.reset(seed).state
-        if enhanced is None and controller == "E-KM":
-            enhanced = EnhancedModel.for_grasp(model, start, partial(grasp_learner, capacity=config.capacity))
-        axis = plant.rotation_axis
-        loop = LookAndMoveController(model if enhanced is None else enhanced, axis)
-        target = PoseTarget.turned(start, axis, degrees=angle)
-        done = ClosedLoop(plant, loop, stopping_rule(config)).run(target)
-        about = {"controller": controller, "seed": seed, "angle_deg": angle}
-        frames = [_frame(seen) for seen in (*(step.before for step in done.steps), done.stop.final)]
-        records.append({**about, **record_of(done, axis, enhanced is not None), "frames": frames})
-        if on_trial is not None:
-            on_trial()
-    plant.close()
-    return records
-
-
-def _frame(seen: Observation) -> list[list[float]]:
-    """True joint angles, position and rotation, for a picture."""
-    assert seen.truth is not None  # a simulated hand tells
-    return [part.tolist() for part in (seen.truth.q, seen.truth.position, seen.truth.rotation)]
+def _running_mean(values: Array, window: int = 5) -> Array:
+    """Mean over the last ``window`` values (fewer at the start)."""
+    total = np.cumsum(np.insert(values, 0, 0.0))
+    end = np.arange(1, len(values) + 1)
+    start = np.maximum(end - window, 0)
+    return (total[end] - total[start]) / (end - start)

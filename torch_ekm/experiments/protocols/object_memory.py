@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -18,40 +21,184 @@ from ...residual import ResidualLearner, UpdateReport
 from ...typing import Tensor
 from ..config import Setting, digest
 from ..learners import make_learner
-from ..runner import Bench, Record
-from .demo import TABLE_I
-from .turning import OTHER_ANGLES, object_name
+from ..records import Trial, TrialRecord
+from ..reporting.plots import plot_bank, save_figure
+from ..reporting.report import Cell, Column, Report, Table
+from ..reporting.statistics import Array, bootstrap_mean, bootstrap_ratio, rate
+from ..reporting.tables import Target, ratio_and_p, targets_table, which_seeds
+from ..runner import Bench
+from .generalize import OTHER_ANGLES, TABLE_I
+from .protocol import Protocol, Results
 
 #: How the knowledge of several objects may be kept.
 MEMORIES = ("bank", "labelled", "one model", "fresh")
 #: The residuals of one grasp are far from independent, and they speak for whichever model has seen most:
 #: beside a signature they count for little.
 _TEMPERATURE = 0.1
+#: Motions of a turn before the learner of a wrong object could have been corrected.
+_FIRST = 5
+#: Turns of each object before its assignment is judged.
+_LEARNING_TURNS = 3
 
 
 @dataclass(frozen=True)
-class AdaptConfig:
+class MemoryTurn(TrialRecord):
+    """A turn, and what every memory predicted of its motions."""
+
+    model: int | None = None
+    """Of the bank, that the turn went to; None: to none."""
+    posterior: tuple[float, ...] = ()
+    """Probabilities of the models at the end of the turn."""
+    n_models: int = 0
+    memory_errors_deg: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    """One-step prediction error about the axis for each motion, of each memory and of "none", the KM."""
+
+
+@dataclass(frozen=True)
+class ObjectMemory(Protocol):
     """A random sequence of objects, one grasp and one turn each; nobody tells which object it is.
 
     Raises:
         ParameterError: no object, or fewer than one turn each.
     """
 
-    setting: Setting = field(default_factory=lambda: Setting())
+    setting: Setting = field(default_factory=Setting)
     objects: tuple[str, ...] = field(default_factory=list_objects)
     turns_each: int = 8
     models: int = 8
     """Largest number of models that the bank may keep."""
     readings: int = 8
     """Sensor readings at rest that make up a grasp's signature; 0: residuals alone tell objects apart."""
-    bank: dict[str, float] = field(default_factory=dict)
-    """Changes of :class:`ModelBank`'s figures."""
+
+    record: ClassVar[type[TrialRecord]] = MemoryTurn
+    quick_seeds: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
         if not self.objects or self.turns_each < 1:
             raise ParameterError("objects", self.objects, "at least one object and one turn each")
         if self.readings < 0:
             raise ParameterError("readings", self.readings, "0 or more")
+
+    def quick(self) -> Self:
+        """Three objects, two turns each."""
+        return dataclasses.replace(self, objects=("box", "can", "applier"), turns_each=2)
+
+    def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[int]]:
+        """One for each seed."""
+        stem = f"adapt_{digest(self.setting, self.objects, self)}"
+        return {f"{stem}_{seed}": (seed,) for seed in seeds}
+
+    def session(self, seed: int) -> list[MemoryTurn]:
+        """All turns of one seed, those of objects that could not be grasped left out."""
+        generator = np.random.default_rng(seed)
+        sequence = generator.permutation(np.repeat(np.arange(len(self.objects)), self.turns_each))
+        benches: dict[str, Bench] = {}
+        memories: Memories | None = None
+        encoding: GraspEncoding | None = None
+        signature: GraspSignature | None = None
+        records: list[MemoryTurn] = []
+        for trial, index in enumerate(sequence.tolist()):
+            item = self.objects[index]
+            if item not in benches:
+                benches[item] = Bench(self.setting.hardware_instance(seed), item, "E-KM")
+                if memories is not None and encoding is not None:
+                    benches[item].adopt(memories, encoding)
+            bench = benches[item]
+            if memories is None:  # the first grasp decides what is seen of a state
+                if bench.grasp(seed, trial) is None or bench.encoding is None:
+                    del benches[item]
+                    continue
+                encoding = bench.encoding
+                signature = self.make_signature(bench) if self.readings else None
+                memories = Memories(self._make_bank(encoding.n_features, bench.model.hand.n_a, signature))
+                bench.adopt(memories, encoding)
+            angle = float(generator.uniform(0.4, 1.0) * max(TABLE_I.get(item, OTHER_ANGLES)))
+            start = bench.grasp(seed, trial)
+            if start is None:
+                continue
+            # the object is at rest: feel it, and ask the bank what it is
+            felt = None if signature is None else _feel(bench, signature, self.readings)
+            slot = memories.begin(item, felt)
+            if records:
+                records[-1] = dataclasses.replace(records[-1], model=slot)
+            memories.axis.copy_(bench.hand.rotation_axis)
+            turn = bench.turn(Trial(bench.name, "turn", "E-KM", seed, trial, angle), start)
+            records.append(
+                MemoryTurn(
+                    **vars(turn),
+                    posterior=tuple(memories.bank.posterior.tolist()),
+                    n_models=memories.bank.n_models,
+                    memory_errors_deg={name: tuple(errors) for name, errors in memories.errors.items()},
+                )
+            )
+        if memories is not None and records:
+            slot = memories.bank.end()
+            records[-1] = dataclasses.replace(records[-1], model=slot, n_models=memories.bank.n_models)
+        for bench in benches.values():
+            bench.close()
+        return records
+
+    def targets(self, results: Results[MemoryTurn]) -> list[Target]:
+        """Is it recognised, and what is it worth?"""
+        judged = [judge_assignment(records) for records in results.values()]
+        total = sum(one.judged for one in judged)
+        found = []
+        if total:
+            right = 100 * sum(one.right for one in judged) / total
+            found.append(Target("turns that went to the right model [%]", right, least=90))
+        models = max(one.n_models for one in judged)
+        found.append(Target("models, most in one sequence", models, most=8))
+        turns = [r for records in results.values() for r in records]
+        errors = {name: np.mean(_errors(turns, name)) for name in MEMORIES}
+        for other, aim in (("labelled", 105), ("one model", 100), ("fresh", 100)):
+            share = 100 * float(errors["bank"] / errors[other])
+            found.append(Target(f"prediction error, bank : {other} [%]", share, most=aim))
+        return found
+
+    def report(self, seeds: Sequence[int], results: Results[MemoryTurn], folder: Path) -> Report:
+        """Who is recognised, and what it is worth."""
+        sessions = list(results.values())
+        figures = []
+        if sessions and sessions[0]:
+            shown = zip(*((r.object, r.model, r.posterior) for r in sessions[0]), strict=True)
+            caption = f"Where the bank put each turn, seed {seeds[0]}."
+            figures.append(save_figure(plot_bank(*shown), folder, "bank", caption))
+        tables = [
+            targets_table(self.targets(results)),
+            _memory_table(sessions),
+            comparison_table(sessions),
+            _assignment_table(dict(zip(map(str, seeds), sessions, strict=True))),
+        ]
+        lost = rate(r.lost for s in sessions for r in s)
+        summary = (
+            f"{len(self.objects)} objects in random order, {self.turns_each} turns each, without labels; "
+            f"objects lost: {lost}. {which_seeds(seeds)}"
+        )
+        return Report("Object memory: familiar objects and new ones", summary, tables, figures)
+
+    def make_signature(self, bench: Bench) -> GraspSignature:
+        """What tells grasps apart, without the object's label."""
+        hand = bench.model.hand
+        thumb, *fingers = bench.hand.plan.pads  # the pads that the hand closes
+        blind: list[str] = []
+        if self.setting.sensing and hand.hall_sensors:
+            # what the sensed plant says of these joints was made with the shape of the labelled object
+            sensed = {sensor.joint for sensor in hand.hall_sensors}
+            movable = hand.joint_upper > hand.joint_lower
+            blind = [name for name, moves in zip(hand.joint_names, movable, strict=True) if moves]
+            blind = [name for name in blind if name not in sensed]
+        return GraspSignature(hand, thumb, fingers, from_encoders=blind)
+
+    def _make_bank(self, n_s: int, n_a: int, signature: GraspSignature | None) -> ModelBank:
+        setting = self.setting
+
+        def factory() -> ResidualLearner:
+            return make_learner(setting.learner, n_s, n_a, setting.capacity, **setting.learner_options)
+
+        options: dict[str, Any] = {}
+        if signature is not None:
+            options = {"temperature": _TEMPERATURE, "signature_features": signature.n_features}
+        return ModelBank(factory, self.models, **options)
 
 
 class Memories(ResidualLearner):
@@ -113,68 +260,6 @@ class Memories(ResidualLearner):
         return self.bank.update(x, y, mask)
 
 
-def adapt_session(config: AdaptConfig, seed: int) -> list[Record]:
-    """All turns of one seed; each record says which model the bank chose, and everybody's errors."""
-    generator = np.random.default_rng(seed)
-    sequence = generator.permutation(np.repeat(np.arange(len(config.objects)), config.turns_each))
-    benches: dict[str, Bench] = {}
-    memories: Memories | None = None
-    encoding: GraspEncoding | None = None
-    signature: GraspSignature | None = None
-    records: list[Record] = []
-    for trial, index in enumerate(sequence.tolist()):
-        item = config.objects[index]
-        if item not in benches:
-            benches[item] = Bench(config.setting.hardware_instance(seed), item, "E-KM", memories, encoding)
-        bench = benches[item]
-        if memories is None or encoding is None:  # the first grasp decides what is seen of a state
-            if bench.grasp(seed, trial) is None or bench.encoding is None:
-                del benches[item]
-                continue
-            encoding = bench.encoding
-            signature = _make_signature(config, bench) if config.readings else None
-            memories = Memories(_make_bank(config, encoding.n_features, bench.model.hand.n_a, signature))
-            bench.adopt(memories, encoding)
-
-        def begin(
-            axis: Tensor,
-            item: str = item,
-            bench: Bench = bench,
-            memories: Memories = memories,
-            signature: GraspSignature | None = signature,
-        ) -> None:
-            """The object is grasped and at rest: feel it, and ask the bank what it is."""
-            felt = None if signature is None else _feel(bench, signature, config.readings)
-            slot = memories.begin(item, felt)
-            if records:
-                records[-1]["model"] = slot
-            memories.axis.copy_(axis)
-
-        bench.on_grasp = begin
-        angles = TABLE_I.get(item, OTHER_ANGLES)
-        angle = float(generator.uniform(0.4, 1.0) * max(angles))
-        record = bench.trial(seed, trial, angle)
-        if not record["grasped"]:
-            continue
-        record |= {"object": object_name(item), "kind": "turn", "model": None}
-        record["posterior"] = memories.bank.posterior.tolist()
-        record["n_models"] = memories.bank.n_models
-        record["memory_errors_deg"] = {name: list(errors) for name, errors in memories.errors.items()}
-        records.append(record)
-    if memories is not None and records:
-        records[-1]["model"] = memories.bank.end()
-        records[-1]["n_models"] = memories.bank.n_models
-    for bench in benches.values():
-        bench.close()
-    return records
-
-
-def adapt_jobs(config: AdaptConfig, seeds: tuple[int, ...]) -> dict[str, tuple[Any, ...]]:
-    """One job for each seed."""
-    stem = f"adapt_{digest(config.setting, config.objects, config)}"
-    return {f"{stem}_{seed}": (config, seed) for seed in seeds}
-
-
 @dataclass(frozen=True)
 class Assignment:
     """How well a bank told objects apart, over one sequence."""
@@ -185,9 +270,9 @@ class Assignment:
     n_models: int
 
 
-def judge_assignment(records: list[Record], learning_turns: int = 3) -> Assignment:
+def judge_assignment(records: Sequence[MemoryTurn]) -> Assignment:
     """A model belongs to the object that most of its turns were of; each object owns one model at most."""
-    placed = [(r["object"], r["model"]) for r in records if r.get("model") is not None]
+    placed = [(r.object, r.model) for r in records if r.model is not None]
     counts: dict[tuple[str, int], int] = {}
     for pair in placed:
         counts[pair] = counts.get(pair, 0) + 1
@@ -200,23 +285,10 @@ def judge_assignment(records: list[Record], learning_turns: int = 3) -> Assignme
     right = judged = 0
     for item, model in placed:
         seen[item] = seen.get(item, 0) + 1
-        if seen[item] > learning_turns:
+        if seen[item] > _LEARNING_TURNS:
             judged += 1
             right += home.get(item) == model
     return Assignment(right, judged, len({model for _, model in placed}))
-
-
-def _make_signature(config: AdaptConfig, bench: Bench) -> GraspSignature:
-    hand = bench.model.hand
-    thumb, *fingers = bench.hand.plan.pads  # the pads that the hand closes
-    blind: list[str] = []
-    if config.setting.sensing and hand.hall_sensors:
-        # what the sensed plant says of these joints was made with the shape of the labelled object
-        sensed = {sensor.joint for sensor in hand.hall_sensors}
-        movable = hand.joint_upper > hand.joint_lower
-        blind = [name for name, moves in zip(hand.joint_names, movable, strict=True) if moves]
-        blind = [name for name in blind if name not in sensed]
-    return GraspSignature(hand, thumb, fingers, from_encoders=blind)
 
 
 def _feel(bench: Bench, signature: GraspSignature, readings: int) -> Tensor:
@@ -225,13 +297,69 @@ def _feel(bench: Bench, signature: GraspSignature, readings: int) -> Tensor:
     return torch.stack([signature(o.q, o.a, o.fingertip_force) for o in seen]).mean(0)
 
 
-def _make_bank(config: AdaptConfig, n_s: int, n_a: int, signature: GraspSignature | None) -> ModelBank:
-    setting = config.setting
+def _memory_table(sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
+    columns: dict[Column, Callable[[str], Cell]] = {
+        Column("all", ".3f"): lambda name: bootstrap_mean(_means(sessions, name)),
+        Column("first motions", ".3f"): lambda name: float(
+            np.mean(_errors([r for s in sessions for r in s], name, _FIRST))
+        ),
+    }
+    note = (
+        "Mean over all motions [deg], 95 % bootstrap interval over sequences; and over the first five "
+        "motions of each turn. All memories see the same motions, those that the bank's E-KM chose; "
+        "'none' is the KM."
+    )
+    items = {name: name for name in ("none", *MEMORIES)}
+    return Table.of("memories", "One-step prediction error", "memory", items, columns, note)
 
-    def factory() -> ResidualLearner:
-        return make_learner(setting.learner, n_s, n_a, setting.capacity, **setting.learner_options)
 
-    options: dict[str, Any] = {}
-    if signature is not None:
-        options = {"temperature": _TEMPERATURE, "signature_features": signature.n_features}
-    return ModelBank(factory, config.models, **{**options, **config.bank})
+def comparison_table(sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
+    """Ratios of mean prediction errors, paired by sequence: the sequence is the independent unit."""
+    rows: list[list[Cell]] = []
+    pairs = [("bank", other) for other in ("labelled", "one model", "fresh", "none")]
+    for ours, theirs in [*pairs, ("one model", "labelled")]:
+        row: list[Cell] = [f"{ours} : {theirs}"]
+        for first in (None, _FIRST):
+            row += ratio_and_p(_means(sessions, ours, first), _means(sessions, theirs, first))
+        rows.append(row)
+    columns: list[Column | str] = ["memories"]
+    for what in ("all motions", f"first {_FIRST} of a turn"):
+        columns += [Column(f"{what} [%]", ".0f", percent=True), Column(f"paired p, {what}", ".1g")]
+    note = (
+        "Ratio of mean one-step prediction errors with 95 % bootstrap interval over sequences "
+        f"({len(sessions)}); p of the paired t-test. Right model: {recognition(sessions)}."
+    )
+    return Table("memory_comparison", "The same motions, other memories", columns, rows, note)
+
+
+def recognition(sessions: Sequence[Sequence[MemoryTurn]]) -> str:
+    """Share of judged turns that went to the right model, with its interval over sequences."""
+    judged = [judge_assignment(records) for records in sessions]
+    right, of, models = (
+        np.array([getattr(one, name) for one in judged], dtype=float)
+        for name in ("right", "judged", "n_models")
+    )
+    if not of.sum():
+        return "none judged"
+    share = f"{right.sum():.0f} of {of.sum():.0f} turns, {100 * bootstrap_ratio(right, of):.0f} %"
+    return f"{share}; models {bootstrap_mean(models):.1f}, at most {models.max():.0f}"
+
+
+def _assignment_table(sessions: Mapping[str, Sequence[MemoryTurn]]) -> Table:
+    columns: dict[Column, Callable[[Assignment], Cell]] = {
+        Column("right"): lambda one: one.right,
+        Column("of"): lambda one: one.judged,
+        Column("models"): lambda one: one.n_models,
+    }
+    items = {seed: judge_assignment(records) for seed, records in sessions.items()}
+    note = "Turns after the first three of their object; a model belongs to the object of most of its turns."
+    return Table.of("assignments", "Recognised objects", "seed", items, columns, note)
+
+
+def _errors(turns: Sequence[MemoryTurn], memory: str, first: int | None = None) -> list[float]:
+    """Prediction errors of all motions, or of the first few of each turn [deg]."""
+    return [error for turn in turns for error in turn.memory_errors_deg[memory][:first]]
+
+
+def _means(sessions: Sequence[Sequence[MemoryTurn]], memory: str, first: int | None = None) -> Array:
+    return np.array([float(np.mean(_errors(turns, memory, first))) for turns in sessions])

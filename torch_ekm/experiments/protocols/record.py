@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ...exceptions import EKMError, ParameterError, UnknownNameError
+from ...description import load_hand
+from ...exceptions import EKMError, ParameterError
 from ...plant import RecordingPlant, TrialLog
-from ..config import CONTROLLERS, Setting
+from ..config import Setting
 from ..runner import Bench
 
 
@@ -31,8 +32,7 @@ class RecordConfig:
     """Keep the camera's images too, 0.2 MB each."""
 
     def __post_init__(self) -> None:
-        if self.controller not in CONTROLLERS:
-            raise UnknownNameError("controller", self.controller, CONTROLLERS)
+        self.setting.plant_config(self.controller)
         if not self.angles_deg or not all(0 < abs(angle) < 180 for angle in self.angles_deg):
             raise ParameterError("angles_deg", self.angles_deg, "angles between 0 and 180 deg")
         if self.images and not self.setting.sensing:
@@ -44,7 +44,8 @@ class RecordConfig:
         figures = dataclasses.asdict(self)
         plant = self.setting.plant_config(self.controller)
         parameters = dataclasses.asdict(self.setting.parameters())
-        return {"hand": self.setting.hand, "gravity": plant.gravity, "parameters": parameters, **figures}
+        gravity = plant.gravity or load_hand(self.setting.hand).gravity
+        return {"hand": self.setting.hand, "gravity": gravity, "parameters": parameters, **figures}
 
 
 def record(
@@ -89,7 +90,7 @@ def _bench(config: RecordConfig) -> Bench:
 def _turn(bench: Bench, log: TrialLog, seed: int, trial: int, angle: float) -> None:
     assert isinstance(bench.plant, RecordingPlant)
     try:
-        outcome = bench.trial(seed, trial, angle)
+        outcome = bench.trial(seed, trial, angle).to_json()
     except EKMError as error:  # kept, or the run would stop at this trial each time
         outcome = {"reason": type(error).__name__, "message": str(error)}
     outcome.pop("seconds", None)  # of the wall: equal runs are to give equal logs

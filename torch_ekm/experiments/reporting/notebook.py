@@ -75,7 +75,7 @@ class TableView:
         head = "".join(f"<th>{html.escape(name)}</th>" for name in self.table.header)
         body = "".join(
             "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
-            for row in self.table.rows
+            for row in self.table.text()
         )
         caption, note = html.escape(self.table.caption), html.escape(self.table.note)
         return (
@@ -84,7 +84,7 @@ class TableView:
         )
 
     def __repr__(self) -> str:
-        rows = [list(self.table.header), *map(list, self.table.rows)]
+        rows = [self.table.header, *self.table.text()]
         widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
         lines = [
             "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 
 from ..._extras import require
 from ...exceptions import ShapeError
-from .metrics import learning_curve
+from .report import FigureFile
+from .statistics import ALPHA, learning_curve
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,12 +35,12 @@ def _figure(width: float, height: float, columns: int = 1):
     return figure, axes[0]
 
 
-def save_figure(figure: Figure, folder: Path, name: str) -> tuple[Path, Path]:
-    """Write ``name.svg`` and ``name.png``."""
-    paths = folder / f"{name}.svg", folder / f"{name}.png"
-    figure.savefig(paths[0], metadata={"Date": None})  # the same figure gives the same file
-    figure.savefig(paths[1], dpi=150)
-    return paths
+def save_figure(figure: Figure, folder: Path, name: str, caption: str = "") -> FigureFile:
+    """Write ``name.svg`` and ``name.png`` into ``folder``, which is made if it is not there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    figure.savefig(folder / f"{name}.svg", metadata={"Date": None})  # the same figure gives the same file
+    figure.savefig(folder / f"{name}.png", dpi=150)
+    return FigureFile(f"{name}.svg", caption)
 
 
 def plot_prediction_error(ekm_deg: Array, km_deg: Array, xlabel: str = "trial") -> Figure:
@@ -68,17 +70,17 @@ def plot_prediction_error(ekm_deg: Array, km_deg: Array, xlabel: str = "trial") 
     return figure
 
 
-def plot_learning_test(ekm_deg: Array, km_deg: Array, alpha: float = 0.05) -> Figure:
+def plot_learning_test(ekm_deg: Array, km_deg: Array) -> Figure:
     """p(k) and b(k) of the first k trials (the paper's Fig. 5b).
 
     Args:
         ekm_deg, km_deg: ``(n_trials,)`` absolute errors [deg].
     """
-    curve = learning_curve(ekm_deg, km_deg, alpha)
+    curve = learning_curve(ekm_deg, km_deg)
     k = np.arange(1, len(curve.p) + 1)
     figure, (left, right) = _figure(8.0, 3.2, columns=2)
     left.plot(k, curve.p, color=COLOURS["E-KM"])
-    left.axhline(alpha, color=COLOURS["limit"], linewidth=1, linestyle="--", label=f"{alpha:g}")
+    left.axhline(ALPHA, color=COLOURS["limit"], linewidth=1, linestyle="--", label=f"{ALPHA:g}")
     left.set_yscale("log")
     left.set(xlabel="k", ylabel="p(k)")
     left.set_title(f"last negative result: {curve.last_negative}", loc="left", fontsize=10)
@@ -153,26 +155,29 @@ def plot_convergence(histories_deg: dict[str, list[Array]], target: str = "") ->
     return figure
 
 
-def plot_bank(records: list[dict]) -> Figure:
+def plot_bank(
+    objects: Sequence[str], models: Sequence[int | None], posteriors: Sequence[Sequence[float]]
+) -> Figure:
     """Which model of an object memory each turn went to, and how sure it was.
 
     Args:
-        records: turns in order, with "object", "model" (or None) and "posterior".
+        objects: of the turns, in order.
+        models: that they went to, if any.
+        posteriors: probabilities of the models at the end of each turn.
     """
-    objects = list(dict.fromkeys(record["object"] for record in records))
+    names = list(dict.fromkeys(objects))
     figure, (axis,) = _figure(8.0, 3.2)
     palette = list(COLOURS.values())
-    for k, record in enumerate(records):
-        if record["model"] is None:
+    for k, (name, model, posterior) in enumerate(zip(objects, models, posteriors, strict=True), start=1):
+        if model is None:
             continue
-        colour = palette[record["model"] % len(palette)]
-        marker = "osD^v*PX"[record["model"] % 8]
-        sure = min(max(record["posterior"]), 1.0)  # sums of probabilities end an ulp above
-        axis.plot(k + 1, objects.index(record["object"]), marker, color=colour, alpha=0.25 + 0.75 * sure)
-    used = sorted({record["model"] for record in records if record["model"] is not None})
+        sure = min(max(posterior), 1.0)  # sums of probabilities end an ulp above
+        style = {"color": palette[model % len(palette)], "alpha": 0.25 + 0.75 * sure}
+        axis.plot(k, names.index(name), "osD^v*PX"[model % 8], **style)
+    used = sorted({model for model in models if model is not None})
     for model in used:
         axis.plot([], [], "osD^v*PX"[model % 8], color=palette[model % len(palette)], label=f"model {model}")
-    axis.set_yticks(range(len(objects)), objects)
+    axis.set_yticks(range(len(names)), names)
     axis.set(xlabel="turn")
     axis.set_title("Which model took the turn (pale: unsure)", loc="left")
     if used:

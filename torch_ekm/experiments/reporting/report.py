@@ -4,36 +4,88 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from ..._extras import require
 from ..._versions import versions_of
+from .statistics import Estimate, Rate
 
 _PACKAGES = (
-    "torch_ekm",
-    "torch",
-    "numpy",
-    "scipy",
-    "sapien",
-    "coal",
-    "qpsolvers",
-    "piqp",
-    "pytorch-kinematics",
-)
+    "torch_ekm", "torch", "numpy", "scipy", "sapien", "coal", "qpsolvers", "piqp", "pytorch-kinematics",
+)  # fmt: skip
+T = TypeVar("T")
+#: None: there is nothing to say.
+Cell = str | bool | int | float | Estimate | Rate | None
+
+
+@dataclass(frozen=True)
+class Column:
+    """A heading, and how the figures below it are written."""
+
+    name: str
+    spec: str = ".2f"
+    """Of real numbers and estimates, as in ``format(x, spec)``."""
+    percent: bool = False
+    """The cells are shares, written in percent."""
+
+    def text(self, cell: Cell) -> str:
+        """A cell as it is written."""
+        if cell is None or (isinstance(cell, float) and math.isnan(cell)):
+            return "-"
+        if isinstance(cell, bool):
+            return "yes" if cell else "no"
+        if isinstance(cell, float | Estimate):
+            return format(100 * cell if self.percent else cell, self.spec)
+        return str(cell)
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of strings, ready to be read."""
+    """Numbers with their intervals, formatted when they are written."""
 
     name: str
     caption: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    columns: Sequence[Column | str]
+    """A text stands for a column in the usual format."""
+    rows: Sequence[Sequence[Cell]]
     note: str = ""
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        caption: str,
+        label: str,
+        items: Mapping[str, T],
+        columns: Mapping[Column, Callable[[T], Cell]],
+        note: str = "",
+    ) -> Table:
+        """A row for each item; every column is a function of it, after a first one with its key.
+
+        Args:
+            label: heading of the first column.
+        """
+        rows = [[key, *(value(item) for value in columns.values())] for key, item in items.items()]
+        return cls(name, caption, [label, *columns], rows, note)
+
+    @property
+    def header(self) -> list[str]:
+        """Names of the columns."""
+        return [column.name for column in self._columns]
+
+    def text(self) -> list[list[str]]:
+        """All cells as they are written."""
+        return [
+            [column.text(cell) for column, cell in zip(self._columns, row, strict=True)] for row in self.rows
+        ]
+
+    @property
+    def _columns(self) -> list[Column]:
+        return [Column(column) if isinstance(column, str) else column for column in self.columns]
 
 
 @dataclass(frozen=True)
@@ -65,24 +117,13 @@ class Report:
         (folder / "configuration.json").write_text(configuration + "\n", encoding="utf-8")
         for table in self.tables:
             with (folder / f"{table.name}.csv").open("w", newline="", encoding="utf-8") as stream:
-                writer = csv.writer(stream)
-                writer.writerow(table.header)
-                writer.writerows(table.rows)
+                csv.writer(stream).writerows([table.header, *table.text()])
         jinja2 = require("jinja2")
         template = jinja2.Environment(autoescape=True).from_string(
             (Path(__file__).parent / "templates" / "report.html").read_text(encoding="utf-8")
         )
         page = folder / "index.html"
-        page.write_text(
-            template.render(
-                title=self.title,
-                summary=self.summary,
-                tables=self.tables,
-                figures=self.figures,
-                configuration=configuration,
-            ),
-            encoding="utf-8",
-        )
+        page.write_text(template.render(vars(self) | {"configuration": configuration}), encoding="utf-8")
         return page
 
 

@@ -1,4 +1,4 @@
-"""From records of trials to figures that can be claimed; the independent unit is a seed."""
+"""From records of trials to figures that can be claimed; the independent unit is an object and a seed."""
 
 from __future__ import annotations
 
@@ -10,67 +10,71 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..._extras import require
-from ...exceptions import ParameterError, ShapeError
-from .metrics import Comparison, Estimate, compare_errors
+from ...exceptions import NonFiniteError, ParameterError, ShapeError
+from ..records import Record, TrialRecord
 
 Array = NDArray[np.float64]
-Record = dict[str, Any]
-Value = Callable[[Record], "float | None"]
+#: A figure of a trial; None: this trial has none.
+Value = Callable[[TrialRecord], "float | None"]
 
 #: An error is settled when it stays within twice the default tolerance [deg].
 BAND_DEG = 0.5
+#: Significance level of the learning curves.
+ALPHA = 0.05
 
 
-def steady_state_error(record: Record) -> float:
+def steady_state_error(record: TrialRecord) -> float:
     """True error at the end [deg]; a lost object counts with the whole angle that was asked for."""
-    return abs(record["angle_deg"]) if record["lost"] else record["true_error_deg"]
+    return abs(record.angle_deg) if record.lost else record.true_error_deg
 
 
-def survivor_error(record: Record) -> float | None:
+def survivor_error(record: TrialRecord) -> float | None:
     """The same, only of objects that were not lost."""
-    return None if record["lost"] else record["true_error_deg"]
+    return None if record.lost else record.true_error_deg
 
 
-def settle_steps(record: Record, band_deg: float = BAND_DEG, limit: int = 40) -> float:
+def settle_steps(limit: int) -> Value:
     """Motions after which the measured error stays within the band; ``limit`` if it never does."""
-    outside = np.flatnonzero(np.asarray(record["errors_deg"]) > band_deg)
-    settled = int(outside[-1]) + 1 if outside.size else 0
-    return float(limit if record["lost"] or settled >= len(record["errors_deg"]) else settled)
 
-
-def mean_prediction(name: str) -> Value:
-    """Mean one-step prediction error of a trial, on the trial's own motions.
-
-    Args:
-        name: "km" or "ekm", as measured, or "true_..." for the same against the plant's truth.
-    """
-    kind, _, model = name.rpartition("_")
-    key = f"{kind}_prediction_{model}_deg" if kind else f"prediction_{model}_deg"
-
-    def value(record: Record) -> float | None:
-        errors = [x for x in record[key] if x is not None]
-        return float(np.mean(errors)) if errors else None
+    def value(record: TrialRecord) -> float:
+        outside = np.flatnonzero(np.asarray(record.errors_deg) > BAND_DEG)
+        settled = int(outside[-1]) + 1 if outside.size else 0
+        return float(limit if record.lost or settled >= len(record.errors_deg) else settled)
 
     return value
 
 
-def select(records: Iterable[Record], **wanted: Any) -> list[Record]:
-    """Records of grasped objects with these entries."""
-    return [r for r in records if r["grasped"] and all(r[key] == value for key, value in wanted.items())]
+def mean_of(name: str) -> Value:
+    """Mean over the motions of a trial, e.g. of "prediction_ekm_deg"."""
+
+    def value(record: TrialRecord) -> float | None:
+        figures = getattr(record, name)
+        return float(np.mean(figures)) if figures else None
+
+    return value
 
 
-def unit_means(records: Iterable[Record], value: Value) -> dict[tuple[str, int], float]:
+def select(records: Iterable[Record], **wanted: Any) -> list[TrialRecord]:
+    """Trials of grasped objects with these entries."""
+    grasped = (r for r in records if isinstance(r, TrialRecord))
+    return [r for r in grasped if all(getattr(r, key) == value for key, value in wanted.items())]
+
+
+def unit_means(records: Iterable[TrialRecord], value: Value) -> dict[tuple[str, int], float]:
     """Mean of a value for each ``(object, seed)``; trials without the value are left out."""
     found: dict[tuple[str, int], list[float]] = {}
     for record in records:
         x = value(record)
         if x is not None:
-            found.setdefault((record["object"], record["seed"]), []).append(x)
+            found.setdefault((record.object, record.seed), []).append(x)
     return {unit: float(np.mean(values)) for unit, values in sorted(found.items())}
 
 
 def paired_means(
-    ours: Iterable[Record], theirs: Iterable[Record], ours_value: Value, theirs_value: Value | None = None
+    ours: Iterable[TrialRecord],
+    theirs: Iterable[TrialRecord],
+    ours_value: Value,
+    theirs_value: Value | None = None,
 ) -> tuple[Array, Array]:
     """Unit means of two controllers, for the units that both have."""
     a, b = unit_means(ours, ours_value), unit_means(theirs, theirs_value or ours_value)
@@ -78,26 +82,71 @@ def paired_means(
     return np.array([a[unit] for unit in units]), np.array([b[unit] for unit in units])
 
 
-def bootstrap_ratio(
-    ours: Array, theirs: Array, confidence: float = 0.95, seed: int = 0, resamples: int = 4000
+@dataclass(frozen=True)
+class Estimate:
+    """A figure with its 95 % bootstrap interval."""
+
+    mean: float
+    low: float
+    high: float
+    n: int
+
+    def __format__(self, spec: str) -> str:
+        mean, low, high = (format(x, spec or ".3g") for x in (self.mean, self.low, self.high))
+        return f"{mean} [{low}, {high}]"
+
+    def __str__(self) -> str:
+        return format(self)
+
+    def __rmul__(self, factor: float) -> Estimate:
+        return Estimate(factor * self.mean, factor * self.low, factor * self.high, self.n)
+
+
+def bootstrap(
+    statistic: Callable[..., Array], *values: Array, seed: int = 0, resamples: int = 4000
 ) -> Estimate:
-    """``mean(ours) / mean(theirs)`` with the percentile bootstrap over pairs.
+    """A statistic with its 95 % percentile bootstrap interval.
+
+    Args:
+        statistic: of arrays ``(..., n)``, reduces the last axis.
+        values: ``(n,)`` each, one value for each independent unit or block; they are resampled together.
 
     Raises:
-        ShapeError: not two arrays of the same length, or empty ones.
+        ShapeError: not arrays of one length, or empty ones.
+        NonFiniteError: a value is NaN or infinite.
+    """
+    samples = _clean(values, least=1)
+    n = len(samples[0])
+    draws = np.random.default_rng(seed).integers(n, size=(resamples, n))
+    low, high = np.nanpercentile(statistic(*(sample[draws] for sample in samples)), [2.5, 97.5])
+    return Estimate(float(statistic(*samples)), float(low), float(high), n)
+
+
+def bootstrap_mean(values: Array, **options: int) -> Estimate:
+    """Mean of one value for each unit, see :func:`bootstrap`."""
+    return bootstrap(lambda x: x.mean(axis=-1), values, **options)
+
+
+def bootstrap_ratio(ours: Array, theirs: Array, **options: int) -> Estimate:
+    """``mean(ours) / mean(theirs)`` over pairs, see :func:`bootstrap`.
+
+    Raises:
         ParameterError: the mean of ``theirs`` is zero.
     """
-    ours, theirs = np.asarray(ours, dtype=float), np.asarray(theirs, dtype=float)
-    if ours.ndim != 1 or ours.shape != theirs.shape or not ours.size:
-        raise ShapeError("theirs", f"{ours.shape}, that of ours, and not empty", theirs.shape)
-    if theirs.mean() == 0:
+    if len(theirs) and np.mean(theirs) == 0:
         raise ParameterError("theirs", 0.0, "a mean that is not zero")
-    draws = np.random.default_rng(seed).integers(len(ours), size=(resamples, len(ours)))
-    below = theirs[draws].mean(axis=1)
-    ratios = ours[draws].mean(axis=1) / np.where(below == 0, np.nan, below)
-    tail = 50 * (1 - confidence)
-    low, high = np.nanpercentile(ratios, [tail, 100 - tail])
-    return Estimate(float(ours.mean() / theirs.mean()), float(low), float(high), len(ours))
+
+    def ratio(a: Array, b: Array) -> Array:
+        below = b.mean(axis=-1)
+        return a.mean(axis=-1) / np.where(below == 0, np.nan, below)
+
+    return bootstrap(ratio, ours, theirs, **options)
+
+
+def estimate(records: Iterable[TrialRecord], value: Value) -> Estimate | None:
+    """Mean of a value over units; None if there is none."""
+    means = np.array(list(unit_means(records, value).values()))
+    return bootstrap_mean(means) if means.size else None
 
 
 @dataclass(frozen=True)
@@ -123,15 +172,83 @@ def rate(events: Iterable[bool]) -> Rate:
     return Rate(count, len(outcomes), float(interval.low), float(interval.high))
 
 
-def compare(ours: Array, theirs: Array) -> Comparison | None:
-    """Welch and paired t-tests; None with fewer than two units."""
-    return compare_errors(ours, theirs) if len(ours) > 1 else None
+@dataclass(frozen=True)
+class PairedTest:
+    """Two-sample (Welch) and paired t-tests of ``ours - theirs``, two-sided."""
+
+    welch_p: float
+    paired_p: float
+    difference: float
+    """Mean of ``ours - theirs``; negative: ours is smaller."""
+    low: float
+    high: float
+    """95 % interval of the paired difference."""
+    effect_size: float
+    """Cohen's d of the paired differences."""
 
 
-def recovery_trials(ekm: Array, km: Array, event: int, share: float = 0.5) -> int | None:
-    """Trials after trial ``event`` (from 1) until the E-KM's error is below ``share`` of the KM's.
+def paired_test(ours: Array, theirs: Array) -> PairedTest | None:
+    """Compare errors of the same units; None with fewer than two.
 
-    1: already in the next trial; None: not within the recording.
+    The paper's two-sample test is applied to errors of the same trials; the paired test is the
+    stronger choice, so both are reported.
     """
-    after = np.asarray(ekm)[event:] < share * np.asarray(km)[event:]
-    return int(np.argmax(after)) + 1 if after.any() else None
+    if len(ours) < 2:
+        return None
+    stats = require("scipy.stats")
+    ours, theirs = _clean((ours, theirs))
+    difference = ours - theirs
+    spread = difference.std(ddof=1)
+    if spread == 0:  # a t-test of a constant is undefined; say what it means
+        p, d = float(difference[0] == 0), float(difference[0])
+        return PairedTest(p, p, d, d, d, 0.0)
+    paired = stats.ttest_rel(ours, theirs)
+    interval = paired.confidence_interval(0.95)
+    welch = stats.ttest_ind(ours, theirs, equal_var=False)
+    mean = difference.mean()
+    figures = (welch.pvalue, paired.pvalue, mean, interval.low, interval.high, mean / spread)
+    return PairedTest(*map(float, figures))
+
+
+@dataclass(frozen=True)
+class LearningCurve:
+    """Section IV.D of the paper: ``p(k)`` and ``b(k)`` of the first k trials."""
+
+    p: Array
+    """p(k), Welch, one-sided (ours smaller); NaN for k = 1."""
+    upper: Array
+    """b(k), upper end of the one-sided 95 % interval of ``ours - theirs``; NaN for k = 1."""
+    last_negative: int
+    """Last Index of Negative Result: the last k (from 1) with p(k) > alpha; 0 if none."""
+
+    @property
+    def last_upper(self) -> float:
+        """Last Upper Boundary of the Confidence Interval."""
+        return float(self.upper[-1])
+
+
+def learning_curve(ours: Array, theirs: Array) -> LearningCurve:
+    """Test the first k trials for every k: from where on is ours significantly better for good?"""
+    stats = require("scipy.stats")
+    ours, theirs = _clean((ours, theirs))
+    p, upper = np.full(len(ours), np.nan), np.full(len(ours), np.nan)
+    for k in range(2, len(ours) + 1):
+        if np.ptp(ours[:k]) + np.ptp(theirs[:k]) == 0:
+            p[k - 1] = float(ours[0] >= theirs[0])
+            upper[k - 1] = ours[0] - theirs[0]
+            continue
+        test = stats.ttest_ind(ours[:k], theirs[:k], equal_var=False, alternative="less")
+        p[k - 1] = test.pvalue
+        upper[k - 1] = test.confidence_interval(1 - ALPHA).high
+    negative = np.flatnonzero(~(p <= ALPHA))  # k = 1 cannot be tested and counts as negative
+    return LearningCurve(p, upper, int(negative[-1]) + 1 if negative.size else 0)
+
+
+def _clean(samples: Iterable[Array], least: int = 2) -> list[Array]:
+    found = [np.asarray(values, dtype=np.float64) for values in samples]
+    for values in found:
+        if values.ndim != 1 or len(values) < least or values.shape != found[0].shape:
+            raise ShapeError("samples", f"(n,) with n >= {least}, all alike", values.shape)
+        if not np.isfinite(values).all():
+            raise NonFiniteError("samples", np.flatnonzero(~np.isfinite(values))[:3].tolist())
+    return found

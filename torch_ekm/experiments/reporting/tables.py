@@ -1,226 +1,224 @@
-"""Tables of the experiments: what each controller did, who was better, and by how much."""
+"""What the reports of several protocols share: tables of the controllers, targets, sentences."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
 import numpy as np
-from numpy.typing import NDArray
 
-from ..config import CONTROLLERS
-from .metrics import Estimate, bootstrap_mean
-from .report import Table
-from .statistics import (
-    BAND_DEG,
-    Record,
-    Value,
-    bootstrap_ratio,
-    compare,
-    paired_means,
-    rate,
-    select,
-    settle_steps,
-    steady_state_error,
-    survivor_error,
-    unit_means,
-)
+from ...control import StopReason
+from ..config import CONTROLLERS, FIRST_REPORTED
+from ..records import NotGrasped, Record, TrialRecord
+from . import statistics as stats
+from .report import Cell, Column, Table
+from .statistics import BAND_DEG, Array, Estimate, Value, bootstrap_ratio, steady_state_error
 
-Array = NDArray[np.float64]
+Trials = Sequence[TrialRecord]
 
-STATIC_NOTE = (
-    "Mean and 95 % bootstrap interval over seeds; angles in degrees, steady-state errors by the simulation's "
-    "truth. A lost object counts with the whole angle that was asked for; 'survivors' leaves it out. "
-    f"Settled: the measured error stays within {BAND_DEG:g} deg; a turn that never settles counts with the "
-    "step limit. Intervals of rates are Wilson's."
-)
-_REASONS = (
-    "reached",
-    "stalled",
-    "step limit",
-    "actuator limits",
-    "unstable grasp",
-    "object lost",
-    "not grasped",
-)
+_PAIRS = (("E-KM", "KM"), ("E-KM", "KM+I"), ("E-KM+I", "KM+I"))
 
 
-def text(estimate: Estimate | None, digits: int = 2) -> str:
-    """``mean [low, high]``."""
-    if estimate is None:
-        return "-"
-    return f"{estimate.mean:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
+@dataclass(frozen=True)
+class Target:
+    """What was aimed at, and what was measured."""
+
+    what: str
+    """With its unit."""
+    measured: float
+    most: float | None = None
+    least: float | None = None
+
+    @property
+    def missed_by(self) -> float:
+        """0 if it is met."""
+        above = 0.0 if self.most is None else self.measured - self.most
+        below = 0.0 if self.least is None else self.least - self.measured
+        return max(above, below, 0.0)
 
 
-def estimate(records: list[Record], value: Value) -> Estimate | None:
-    """Mean of a value over ``(object, seed)`` units."""
-    means = np.array(list(unit_means(records, value).values()))
-    return bootstrap_mean(means) if means.size else None
+def targets_table(targets: Sequence[Target]) -> Table:
+    """Each target: met, or by how much not."""
+    columns: dict[Column, Callable[[Target], Cell]] = {
+        Column("at least", "g"): lambda target: target.least,
+        Column("at most", "g"): lambda target: target.most,
+        Column("measured", ".3g"): lambda target: target.measured,
+        Column("met"): lambda target: target.missed_by == 0,
+        Column("missed by", ".3g"): lambda target: target.missed_by or None,
+    }
+    note = "Targets were set before the figures were known."
+    return Table.of("targets", "Targets", "target", {t.what: t for t in targets}, columns, note)
 
 
-def controller_table(records: list[Record], limit: int) -> Table:
+def by_controller(records: Sequence[Record], kind: str = "turn") -> dict[str, list[TrialRecord]]:
+    """Trials of one kind, of each controller that has any."""
+    found = {name: stats.select(records, controller=name, kind=kind) for name in CONTROLLERS}
+    return {name: mine for name, mine in found.items() if mine}
+
+
+def controller_table(records: Sequence[Record], limit: int) -> Table:
     """Every controller on the same seeds and grasps."""
-    rows = []
-    for name in CONTROLLERS:
-        mine = select(records, controller=name, kind="turn")
-        if not mine:
-            continue
-        rows.append(
-            [
-                name,
-                text(estimate(mine, steady_state_error)),
-                text(estimate(mine, survivor_error)),
-                f"{np.median([steady_state_error(r) for r in mine]):.2f}",
-                text(estimate(mine, lambda r: settle_steps(r, limit=limit)), 1),
-                text(estimate(mine, lambda r: r["first_step_deg"])),
-                text(estimate(mine, lambda r: r["step_error_deg"])),
-                text(estimate(mine, lambda r: None if r["lost"] else r["off_rotation_deg"]), 1),
-                str(rate(r["lost"] for r in mine)),
-            ]
-        )
-    header = [
-        "controller", "steady-state error", "survivors", "median", "motions to settle", "first motion",
-        "of all motions", "off-axis rotation", "lost",
-    ]  # fmt: skip
-    return Table("controllers", "All turns of each controller", header, rows, STATIC_NOTE)
-
-
-def reason_table(records: list[Record]) -> Table:
-    """Why the controllers stopped, with the steady-state error of each kind."""
-    rows = []
-    for name in CONTROLLERS:
-        mine = [r for r in records if r["controller"] == name and r["kind"] == "turn"]
-        if not mine:
-            continue
-        row = [name]
-        for reason in _REASONS:
-            those = [r for r in mine if r["reason"] == reason]
-            cell = str(len(those))
-            if those and reason not in ("object lost", "not grasped"):
-                cell += f" ({np.mean([r['true_error_deg'] for r in those]):.2f})"
-            row.append(cell)
-        rows.append(row)
-    note = "Number of turns, and their mean true error [deg]."
-    return Table("stop_reasons", "Why the controllers stopped", ["controller", *_REASONS], rows, note)
-
-
-def object_table(records: list[Record]) -> Table:
-    """Steady-state error of each object, paired (the paper's Table II)."""
-    rows = []
-    objects = list(dict.fromkeys(r["object"] for r in records))
-    for item in [*objects, None]:
-        chosen = [r for r in records if item is None or r["object"] == item]
-        by = {name: select(chosen, controller=name, kind="turn") for name in CONTROLLERS}
-        if not by["KM"] or not by["E-KM"]:
-            continue
-        ours, theirs = paired_means(by["E-KM"], by["KM"], steady_state_error)
-        tests = compare(ours, theirs)
-        rows.append(
-            [
-                item or "all",
-                *(text(estimate(by[name], steady_state_error)) for name in CONTROLLERS),
-                percent(bootstrap_ratio(ours, theirs)),
-                "-" if tests is None else f"{tests.welch_p:.1g} / {tests.paired_p:.1g}",
-                "-" if tests is None else f"{tests.effect_size:.1f}",
-                *(str(sum(r["lost"] for r in by[name])) for name in CONTROLLERS),
-            ]
-        )
-    header = [
-        "object", *(f"{name} [deg]" for name in CONTROLLERS), "E-KM:KM [%]", "p Welch / paired", "effect",
-        *(f"{name} lost" for name in CONTROLLERS),
-    ]  # fmt: skip
+    columns: dict[Column, Callable[[Trials], Cell]] = {
+        Column("steady-state error"): lambda mine: stats.estimate(mine, steady_state_error),
+        Column("survivors"): lambda mine: stats.estimate(mine, stats.survivor_error),
+        Column("median"): lambda mine: float(np.median([steady_state_error(r) for r in mine])),
+        Column("motions", ".1f"): lambda mine: stats.estimate(mine, lambda r: r.steps),
+        Column("motions to settle", ".1f"): lambda mine: stats.estimate(mine, stats.settle_steps(limit)),
+        Column("first motion"): lambda mine: stats.estimate(mine, lambda r: r.first_step_deg),
+        Column("of all motions"): lambda mine: stats.estimate(mine, lambda r: r.step_error_deg),
+        Column("off-axis rotation", ".1f"): lambda mine: stats.estimate(mine, survivors_off_axis),
+        Column("reached"): lambda mine: stats.rate(r.reason == StopReason.REACHED.value for r in mine),
+        Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
+    }
     note = (
-        "Steady-state error, lost objects with the whole angle. Ratio of means with the bootstrap over "
-        "paired seeds; the effect size is Cohen's d of the paired differences. The paper's ratios: "
-        "28.5 to 70 %, p = 3.8e-4."
+        "Mean and 95 % bootstrap interval over seeds; angles in degrees, steady-state errors by the "
+        "simulation's truth. A lost object counts with the whole angle that was asked for; 'survivors' "
+        f"leaves it out. Settled: the measured error stays within {BAND_DEG:g} deg; a turn that never "
+        "settles counts with the step limit. Intervals of rates are Wilson's."
     )
-    return Table("by_object", "Steady-state error of each object (Table II)", header, rows, note)
+    items = by_controller(records)
+    return Table.of("controllers", "All turns of each controller", "controller", items, columns, note)
 
 
-def comparison_table(records: list[Record], limit: int) -> Table:
+def survivors_off_axis(record: TrialRecord) -> float | None:
+    """Rotation off the axis at the end [deg], of objects that were not lost."""
+    return None if record.lost else record.off_rotation_deg
+
+
+def reason_table(records: Sequence[Record]) -> Table:
+    """Why the controllers stopped, with the true error of each kind."""
+    rows: list[list[Cell]] = []
+    for name in CONTROLLERS:
+        for reason in [*(reason.value for reason in StopReason), NotGrasped.reason]:
+            those = [r for r in records if (r.controller, r.kind, r.reason) == (name, "turn", reason)]
+            errors = [r.true_error_deg for r in stats.select(those) if not r.lost]
+            if those:
+                rows.append([name, reason, len(those), float(np.mean(errors)) if errors else None])
+    columns = ["controller", "reason", "turns", "mean true error [deg]"]
+    return Table("stop_reasons", "Why the controllers stopped", columns, rows)
+
+
+def comparison_table(records: Sequence[Record], limit: int) -> Table:
     """E-KM against KM and KM+I in everything that is measured."""
-    values: list[tuple[str, Value]] = [
-        ("steady-state error", steady_state_error),
-        ("motions to settle", lambda r: settle_steps(r, limit=limit)),
-        ("error of the first motion", lambda r: r["first_step_deg"]),
-        ("error of all motions", lambda r: r["step_error_deg"]),
-        ("off-axis rotation", lambda r: None if r["lost"] else r["off_rotation_deg"]),
-    ]
-    rows = []
-    pairs = (("E-KM", "KM"), ("E-KM", "KM+I"), ("E-KM+I", "KM+I"))
-    for what, value in values:
-        row = [what]
-        for ours_name, theirs_name in pairs:
-            ours, theirs = paired_means(
-                select(records, controller=ours_name, kind="turn"),
-                select(records, controller=theirs_name, kind="turn"),
-                value,
-            )
-            row.append(_ratio_cell(ours, theirs))
-        rows.append(row)
-    for kind, value in (("long step", _long_step_error), ("camera off", steady_state_error)):
-        if not any(r["kind"] == kind for r in records):
+    values: dict[str, tuple[str, Value]] = {
+        "steady-state error": ("turn", steady_state_error),
+        "motions to settle": ("turn", stats.settle_steps(limit)),
+        "error of the first motion": ("turn", lambda r: r.first_step_deg),
+        "error of all motions": ("turn", lambda r: r.step_error_deg),
+        "off-axis rotation": ("turn", survivors_off_axis),
+        "error of one long step": ("long step", steady_state_error),
+        "steady-state error, camera off": ("camera off", steady_state_error),
+    }
+    rows: list[list[Cell]] = []
+    there = {r.controller for r in records}
+    pairs = [pair for pair in _PAIRS if there.issuperset(pair)]
+    for what, (kind, value) in values.items():
+        if kind != "turn" and not any(r.kind == kind for r in records):
             continue
-        row = [{"long step": "error of one long step", "camera off": "steady-state error, camera off"}[kind]]
+        row: list[Cell] = [what]
         for ours_name, theirs_name in pairs:
-            ours, theirs = paired_means(
-                select(records, controller=ours_name, kind=kind),
-                select(records, controller=theirs_name, kind=kind),
-                value,
-            )
-            row.append(_ratio_cell(ours, theirs))
+            ours, theirs = (stats.select(records, controller=n, kind=kind) for n in (ours_name, theirs_name))
+            row += ratio_and_p(*stats.paired_means(ours, theirs, value))
         rows.append(row)
-    header = ["", *(f"{ours} : {theirs} [%]" for ours, theirs in pairs)]
+    columns: list[Column | str] = [""]
+    for ours_name, theirs_name in pairs:
+        columns += [
+            Column(f"{ours_name} : {theirs_name} [%]", ".0f", percent=True),
+            Column("paired p", ".1g"),
+        ]
     note = (
         "Ratio of means over the same objects and seeds, 95 % bootstrap over pairs, p of the paired t-test."
     )
-    return Table("comparison", "Paired ratios", header, rows, note)
+    return Table("comparison", "Paired ratios", columns, rows, note)
 
 
-def probe_table(records: list[Record]) -> Table:
-    """What the model is worth without feedback: one long step, and turns that end in the dark."""
-    rows = []
-    for name in CONTROLLERS:
-        steps = select(records, controller=name, kind="long step")
-        dark = select(records, controller=name, kind="camera off")
-        if not steps and not dark:
-            continue
-        rows.append(
-            [
-                name,
-                text(estimate(steps, _long_step_error)),
-                str(rate(r["lost"] for r in steps)),
-                text(estimate(dark, steady_state_error)),
-                str(rate(r["lost"] for r in dark)),
-            ]
-        )
-    header = ["controller", "one long step", "lost", "camera off at the end", "lost"]
-    return Table("probes", "True error without feedback [deg]", header, rows)
+def ratio_and_p(ours: Array, theirs: Array) -> tuple[Estimate | None, float | None]:
+    """Ratio of means, and p of the paired t-test, where there are such."""
+    if not len(ours) or theirs.mean() == 0:
+        return None, None
+    tests = stats.paired_test(ours, theirs)
+    return bootstrap_ratio(ours, theirs), None if tests is None else tests.paired_p
 
 
-def timing_table(records: list[Record]) -> Table:
+def prediction_means(records: Sequence[Record], kind: str = "") -> tuple[Array, Array]:
+    """Unit means of the one-step prediction errors of E-KM and KM on the E-KM's own motions [deg].
+
+    Args:
+        kind: "true_" for errors against the plant's truth.
+    """
+    mine = [r for r in stats.select(records, controller="E-KM", kind="turn") if r.prediction_ekm_deg]
+    names = (f"{kind}prediction_ekm_deg", f"{kind}prediction_km_deg")
+    return stats.paired_means(mine, mine, *(stats.mean_of(name) for name in names))
+
+
+def prediction_cells(records: Sequence[Record], kind: str = "") -> list[Cell]:
+    """KM, E-KM, and their ratio; nothing where no E-KM moved."""
+    ours, theirs = prediction_means(records, kind)
+    if not len(ours):
+        return [None] * 3
+    return [stats.bootstrap_mean(theirs), stats.bootstrap_mean(ours), bootstrap_ratio(ours, theirs)]
+
+
+def prediction_table(records: Sequence[Record]) -> Table:
+    """One-step prediction error of KM and E-KM on the E-KM's own motions."""
+    rows = [
+        [name, *prediction_cells(mine), *prediction_cells(mine, "true_")]
+        for name, mine in by_object(records).items()
+        if len(prediction_means(mine)[0])
+    ]
+    columns: list[Column | str] = ["object"]
+    for what in ("measured", "true"):
+        ratio = Column(f"E-KM:KM, {what} [%]", ".0f", percent=True)
+        columns += [f"KM, {what}", f"E-KM, {what}", ratio]
+    note = (
+        "Mean |M_c (ds - prediction)| [deg], the prediction made before the learner trains on the motion. "
+        "'Measured' includes the camera's noise, which no model can predict; 'true' does not."
+    )
+    return Table("prediction", "One-step prediction error", columns, rows, note)
+
+
+def by_object(records: Sequence[Record]) -> dict[str, list[Record]]:
+    """Records of each object, and of all."""
+    names = dict.fromkeys(r.object for r in records)
+    return {name: [r for r in records if r.object == name] for name in names} | {"all": list(records)}
+
+
+def timing_table(records: Sequence[Record]) -> Table:
     """Decision and training, without plant and camera."""
     rows = []
-    for name in CONTROLLERS:
-        mine = select(records, controller=name, kind="turn")
-        seconds = 1e3 * np.array([s for r in mine for s in r["seconds"]])
+    for name, mine in by_controller(records).items():
+        seconds = 1e3 * np.array([s for r in mine for s in r.seconds])
         if seconds.size:
-            rows.append(
-                [name, *(f"{x:.1f}" for x in np.percentile(seconds, [50, 90, 99])), str(seconds.size)]
-            )
-    header = ["controller", "median [ms]", "90 % [ms]", "99 % [ms]", "motions"]
+            rows.append([name, *map(float, np.percentile(seconds, [50, 90, 99])), seconds.size])
+    columns = [Column(name, ".1f") for name in ("controller", "median [ms]", "90 % [ms]", "99 % [ms]")]
     note = "Wall-clock time on the machine that ran the report, with whatever else it was doing."
-    return Table("timing", "Time of one control step", header, rows, note)
+    return Table("timing", "Time of one control step", [*columns, "motions"], rows, note)
 
 
-def _long_step_error(record: Record) -> float:
-    return abs(record["angle_deg"]) if record["lost"] else record["error_deg"]
+def verdict(records: Sequence[Record], seeds: Sequence[int]) -> str:
+    """What the E-KM is worth beside the KM, in one sentence."""
+    turns = by_controller(records)
+    ours, theirs = stats.paired_means(turns.get("E-KM", []), turns.get("KM", []), steady_state_error)
+    parts = []
+    if len(ours) and theirs.mean() > 0:
+        parts.append(f"Steady-state error E-KM : KM {100 * bootstrap_ratio(ours, theirs):.0f} %")
+    ours, theirs = prediction_means(records)
+    if len(ours):
+        parts.append(f"prediction error on the same motions {100 * bootstrap_ratio(ours, theirs):.0f} %")
+    parts += [f"{name} was never grasped ({why})" for name, why in _never_grasped(records).items()]
+    return "; ".join(parts or ["Nothing to compare"]) + f". {which_seeds(seeds)}"
 
 
-def percent(ratio: Estimate) -> str:
-    """The same in percent."""
-    return f"{100 * ratio.mean:.0f} [{100 * ratio.low:.0f}, {100 * ratio.high:.0f}]"
+def _never_grasped(records: Sequence[Record]) -> Mapping[str, str]:
+    """Objects that no turn could hold, with the reason of the last try."""
+    held = {r.object for r in stats.select(records, kind="turn")}
+    failed = [r for r in records if isinstance(r, NotGrasped) and r.kind == "turn"]
+    return {r.object: r.message for r in failed if r.object not in held}
 
 
-def _ratio_cell(ours: Array, theirs: Array) -> str:
-    if not len(ours) or theirs.mean() == 0:
-        return "-"
-    tests = compare(ours, theirs)
-    return percent(bootstrap_ratio(ours, theirs)) + ("" if tests is None else f", p = {tests.paired_p:.1g}")
+def which_seeds(seeds: Sequence[int]) -> str:
+    """How many, and what may be concluded from them."""
+    few = " Fewer than 20 seeds: no basis for a claim." if len(seeds) < 20 else ""
+    development = min(seeds) < FIRST_REPORTED
+    tuned = " Development seeds: figures may have been tuned on them." if development else ""
+    return f"{len(seeds)} seeds, {seeds[0]} to {seeds[-1]}.{few}{tuned}"

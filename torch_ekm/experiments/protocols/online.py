@@ -1,0 +1,226 @@
+"""The paper's online manipulation (section IV.B): learning while turning, with things that go wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from ...exceptions import ParameterError
+from ...simulation import Change, Tug
+from ..config import CONTROLLERS, Setting, digest, object_name
+from ..records import Record
+from ..reporting import tables
+from ..reporting.plots import plot_learning_test, plot_prediction_error, save_figure
+from ..reporting.report import Cell, Column, Report, Table
+from ..reporting.statistics import Array, learning_curve, select
+from ..reporting.tables import Target
+from ..runner import Bench
+from .protocol import Protocol, Results, records_of
+
+_LEARNED = 16
+"""Trials after which the paper's learner has learned."""
+
+
+@dataclass(frozen=True)
+class Online(Protocol):
+    """Random grasps and rotations of one object, with things that go wrong on the way.
+
+    All trials of one seed are a session; an E-KM starts empty and keeps what it learns. Trials count
+    from 1, as in the paper.
+
+    Raises:
+        ParameterError: an interval or an index outside its range.
+    """
+
+    setting: Setting = field(default_factory=Setting)
+    object: str = "toothpaste"
+    trials: int = 45
+    angle_range_deg: tuple[float, float] = (6.0, 24.0)
+    """Rotations are drawn from this interval."""
+    dislocations: tuple[int, ...] = (20, 44)
+    """In these trials somebody knocks at the object after its third motion."""
+    knock: tuple[float, float, float] = (0.0, 0.10, 0.0)
+    """Torque of the knock [N m], hand frame, for 50 ms: it turns the tube by 5 to 10 deg."""
+    tendons_replaced: int = 31
+    """Before this trial the tendons are replaced (0: never)."""
+    new_tendons: Mapping[str, float] = field(
+        default_factory=lambda: {"moment_arm": 1.15, "servo_stiffness": 0.8}
+    )
+    """What the plant then is: tighter tendons, less stretch."""
+
+    def __post_init__(self) -> None:
+        low, high = self.angle_range_deg
+        if not 0 < low <= high < 180:
+            raise ParameterError("angle_range_deg", self.angle_range_deg, "0 < low <= high < 180 deg")
+        if self.trials < 1:
+            raise ParameterError("trials", self.trials, "at least 1")
+
+    @property
+    def events(self) -> tuple[int, ...]:
+        """Trials in which something happens, those that take place."""
+        replaced = (self.tendons_replaced,) if self.tendons_replaced else ()
+        return tuple(sorted(t for t in (*self.dislocations, *replaced) if t <= self.trials))
+
+    def quick(self) -> Self:
+        """Four trials, an event in the last two."""
+        small = {"trials": 4, "angle_range_deg": (5.0, 8.0), "dislocations": (3,), "tendons_replaced": 4}
+        return dataclasses.replace(self, **small)
+
+    def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[str, int]]:
+        """One for each seed and controller."""
+        stem = f"online_{digest(self.setting, (self.object,), self)}"
+        return {f"{stem}_{name}_{seed}": (name, seed) for seed in seeds for name in CONTROLLERS}
+
+    def session(self, controller: str, seed: int) -> list[Record]:
+        """All trials of one seed, in order."""
+        angles = np.random.default_rng(seed).uniform(*self.angle_range_deg, size=self.trials)
+        bench = Bench(self.setting.hardware_instance(seed), self.object, controller)
+        records = []
+        for trial, angle in enumerate(angles.tolist(), start=1):
+            if trial == self.tendons_replaced:
+                Change(0, self.new_tendons).happen(bench.hand)
+            events = (Tug(at=3, torque=self.knock),) if trial in self.dislocations else ()
+            records.append(bench.trial(seed, trial, angle, events=events))
+        bench.close()
+        return records
+
+    def targets(self, results: Results[Record]) -> list[Target]:
+        """Each figure is the mean over seeds."""
+        records = records_of(results)
+        learned = [Learning.of(ekm, km, self.events) for ekm, km in prediction_curves(records, self.trials)]
+        negatives = [one.last_negative for one in learned if one.last_negative is not None]
+        late = [100 * one.late for one in learned if one.late is not None]
+        back = [found is not None and found <= 3 for one in learned for found in one.recovery if found != 0]
+        true = [
+            100 * float(np.nanmean(ekm[_LEARNED:]) / np.nanmean(km[_LEARNED:]))
+            for ekm, km in prediction_curves(records, self.trials, "true_")
+            if self.trials > _LEARNED
+        ]
+        ratio, found = "prediction error E-KM : KM after 16 trials", []
+        if negatives:
+            mean, worst = float(np.mean(negatives)), float(max(negatives))
+            found = [Target("last index of negative result, mean of seeds", mean, most=10)]
+            found.append(Target("the same, worst seed", worst, most=10))
+        for what, values in ((f"{ratio} [%]", late), (f"{ratio}, against the truth [%]", true)):
+            if values:
+                found.append(Target(what, float(np.mean(values)), most=35))
+        if back:
+            share, what = 100 * float(np.mean(back)), "events after which half is reached within 3 trials"
+            found.append(Target(f"{what} [%]", share, least=100))
+        return found
+
+    def report(self, seeds: Sequence[int], results: Results[Record], folder: Path) -> Report:
+        """Fig. 5a and 5b, and every controller's turns."""
+        records, limit = records_of(results), self.setting.max_steps
+        curves = prediction_curves(records, self.trials)
+        figures = []
+        ekm, km = (np.stack([curve[i] for curve in curves]) for i in (0, 1))
+        some = np.isfinite(ekm).any(axis=0)
+        if some.sum() > 1:
+            events = ", ".join(map(str, self.events)) or "none"
+            caption = f"One-step prediction error in each trial (Fig. 5a). Events in trials {events}."
+            figure = plot_prediction_error(ekm[:, some], km[:, some])
+            figures.append(save_figure(figure, folder, "prediction_error", caption))
+        both = np.isfinite(ekm[0])
+        if both.sum() > 1:
+            caption = f"p(k) and b(k) of the first k trials, seed {min(seeds)} (Fig. 5b)."
+            figure = plot_learning_test(ekm[0][both], km[0][both])
+            figures.append(save_figure(figure, folder, "learning_test", caption))
+        shown = [
+            tables.targets_table(self.targets(results)),
+            self.learning_table(records),
+            self.learning_table(records, against_truth=True),
+            tables.prediction_table(records),
+            tables.controller_table(records, limit),
+            tables.comparison_table(records, limit),
+            tables.reason_table(records),
+            tables.timing_table(records),
+        ]
+        summary = f"{self.trials} turns of the {object_name(self.object)}. {tables.verdict(records, seeds)}"
+        return Report("Online manipulation: learning while turning", summary, shown, figures)
+
+    def learning_table(self, records: Sequence[Record], against_truth: bool = False) -> Table:
+        """How fast the E-KM learns (the paper's Fig. 5b), for each seed and for the mean over seeds."""
+        curves = prediction_curves(records, self.trials, "true_" if against_truth else "")
+        items = dict(zip(map(str, sorted({r.seed for r in records})), curves, strict=True))
+        if len(curves) > 1:
+            ekm, km = (np.nanmean([curve[i] for curve in curves], axis=0) for i in (0, 1))
+            items["mean of seeds"] = ekm, km
+        rows: list[list[Cell]] = []
+        for name, (ekm, km) in items.items():
+            one = Learning.of(ekm, km, self.events)
+            back = ["never" if n is None else n or None for n in one.recovery]
+            rows.append([name, one.last_negative, one.last_upper, one.late, *back])
+        columns = [
+            "seed", "last negative result", "last upper boundary [deg]",
+            Column("E-KM:KM after 16 trials [%]", ".0f", percent=True),
+            *(f"recovered after trial {event}" for event in self.events),
+        ]  # fmt: skip
+        note = (
+            "Per-trial means of the one-step prediction error. Last negative result: last k with p(k) > 0.05 "
+            "(the paper: 16; last upper boundary -0.57 deg). Recovered: trials after the event until the "
+            "E-KM's error is below half of the KM's; trials with an event are left out of the ratio."
+        )
+        name, what = ("learning_true", "the truth") if against_truth else ("learning", "measurements")
+        return Table(name, f"How fast the E-KM learns: errors against {what}", columns, rows, note)
+
+
+@dataclass(frozen=True)
+class Learning:
+    """How fast one learner learned; None where there were too few trials to say."""
+
+    last_negative: int | None
+    """Last k for which the first k trials show no advantage."""
+    last_upper: float | None
+    """Upper end of the last one-sided interval of E-KM minus KM [deg]."""
+    late: float | None
+    """E-KM : KM after 16 trials, without those with an event."""
+    recovery: tuple[int | None, ...]
+    """Trials after each event until the E-KM's error is below half of the KM's; None: never, 0: there was
+    no trial after it."""
+
+    @classmethod
+    def of(cls, ekm: Array, km: Array, events: Sequence[int]) -> Learning:
+        """From per-trial prediction errors ``(trials,)`` [deg], NaN where nothing moved."""
+        some = np.isfinite(ekm)
+        curve = learning_curve(ekm[some], km[some]) if some.sum() > 1 else None
+        calm = some.copy()
+        calm[[event - 1 for event in events]] = False
+        calm[:_LEARNED] = False
+        late = float(ekm[calm].mean() / km[calm].mean()) if calm.any() else None
+        known = np.nan_to_num(ekm, nan=np.inf)
+        recovery = tuple(recovery_trials(known, km, event) if event < len(km) else 0 for event in events)
+        if curve is None:
+            return cls(None, None, late, recovery)
+        return cls(curve.last_negative, curve.last_upper, late, recovery)
+
+
+def recovery_trials(ekm: Array, km: Array, event: int) -> int | None:
+    """Trials after trial ``event`` (from 1) until the E-KM's error is below half of the KM's.
+
+    1: already in the next trial; None: not within the recording.
+    """
+    after = ekm[event:] < 0.5 * km[event:]
+    return int(np.argmax(after)) + 1 if after.any() else None
+
+
+def prediction_curves(records: Sequence[Record], trials: int, kind: str = "") -> list[tuple[Array, Array]]:
+    """Per-trial prediction errors of E-KM and KM [deg] ``(trials,)``, for each seed; NaN: nothing moved.
+
+    Args:
+        kind: "true_" for errors against the plant's truth.
+    """
+    curves = []
+    for seed in sorted({r.seed for r in records}):
+        ekm, km = np.full(trials, np.nan), np.full(trials, np.nan)
+        for r in select(records, controller="E-KM", seed=seed):
+            if r.steps:
+                ekm[r.trial - 1] = np.mean(getattr(r, f"{kind}prediction_ekm_deg"))
+                km[r.trial - 1] = np.mean(getattr(r, f"{kind}prediction_km_deg"))
+        curves.append((ekm, km))
+    return curves

@@ -1,0 +1,185 @@
+"""What came of a trial: typed figures, kept as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+
+from ..control import Manipulation, StopReason
+from ..exceptions import ParameterError
+from ..kinematics import GraspState
+from ..plant import Observation
+from ..typing import Float, Tensor
+
+_DEG = np.pi / 180
+_MOVING = 0.5 * _DEG  # commands that ask for less tell nothing about the shortfall of a step
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What was to be done."""
+
+    object: str
+    """Short name."""
+    kind: str
+    """"turn", "warm-up", "long step" (one motion without feedback) or "camera off" (at the end)."""
+    controller: str
+    seed: int
+    trial: int
+    """Its number: together with the seed it decides the grasp."""
+    angle_deg: float
+    """Rotation that was asked for [deg]."""
+
+    grasped: ClassVar[bool]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain figures, for :meth:`TrialRecord.from_json`."""
+        return {"grasped": self.grasped, **dataclasses.asdict(self)}
+
+
+@dataclass(frozen=True)
+class NotGrasped(Trial):
+    """No pinch held the object: nothing was measured."""
+
+    message: str
+    """Why the last grasp failed."""
+
+    grasped: ClassVar[bool] = False
+    reason: ClassVar[str] = "not grasped"
+
+
+@dataclass(frozen=True)
+class TrialRecord(Trial):
+    """A manipulation of a grasped object; angles [deg]. Predictions are made before the learner trains on
+    the motion; those of the E-KM are empty where nothing learns."""
+
+    reason: str
+    """Why it ended, a value of :class:`~torch_ekm.control.StopReason`."""
+    message: str
+    true_error_deg: float
+    """At the end, by the simulation's truth."""
+    errors_deg: tuple[float, ...]
+    """Before each motion and at the end, as measured."""
+    first_step_deg: float | None
+    """How far the first motion changed the error by more or less than it was to; None: no motion."""
+    step_error_deg: float | None
+    """The same, mean over the motions that ask for at least 0.5 deg; None: there was none."""
+    prediction_km_deg: tuple[float, ...]
+    """One-step prediction error of the kinematic model for each motion, as measured."""
+    prediction_ekm_deg: tuple[float, ...]
+    """The same of the E-KM."""
+    true_prediction_km_deg: tuple[float, ...]
+    """Against the plant's truth, free of the camera's noise."""
+    true_prediction_ekm_deg: tuple[float, ...]
+    off_rotation_deg: float
+    """Rotation off the focused axis at the end, as measured."""
+    seconds: tuple[float, ...]
+    """Decision and training of each motion, without the plant [s]."""
+    poses: tuple[Any, ...] = ()
+    """True joint angles [rad], position [m] and rotation before each motion and at the end, for pictures;
+    empty unless they were asked for."""
+
+    grasped: ClassVar[bool] = True
+
+    @property
+    def lost(self) -> bool:
+        """The object was dropped, or turned off the axis beyond help."""
+        return self.reason == StopReason.OBJECT_LOST.value
+
+    @property
+    def steps(self) -> int:
+        """Number of motions."""
+        return len(self.seconds)
+
+    @classmethod
+    def from_json(cls, figures: Mapping[str, Any]) -> Self | NotGrasped:
+        """The record that :meth:`to_json` wrote.
+
+        Raises:
+            ParameterError: a figure is missing, or there is one that the record does not have.
+        """
+        given: dict[str, Any] = {key: tuple(x) if isinstance(x, list) else x for key, x in figures.items()}
+        kind = cls if given.pop("grasped", False) else NotGrasped
+        known = {field.name for field in dataclasses.fields(kind)}
+        if known != set(given):
+            wrong = ", ".join(sorted(known ^ set(given)))
+            valid = f"exactly the figures of {kind.__name__}; remove results of another version"
+            raise ParameterError("record", f"missing or unknown: {wrong}", valid)
+        return kind(**given)
+
+    @classmethod
+    def of(
+        cls, trial: Trial, done: Manipulation, axis: Float[Tensor, " 3"], *, learns: bool, poses: bool = False
+    ) -> TrialRecord:
+        """The figures of one manipulation in a simulated hand.
+
+        Args:
+            trial: what was to be done.
+            axis: about which the object was to turn, unit vector, hand frame.
+            learns: the controller has predictions of its own.
+            poses: keep the true poses.
+        """
+        steps, focus, measured = done.steps, done.focus, done.errors
+        asked = [float(torch.linalg.vector_norm(step.decision.desired)) for step in steps]
+        # how much of a step was missing: |e| should have fallen by what was asked for
+        short = [abs(measured[k + 1] - (measured[k] - asked[k])) for k in range(len(steps))]
+        moving = [s for s, a in zip(short, asked, strict=False) if a >= _MOVING]
+        truth = [true_state(seen) for seen in (*(step.before for step in steps), done.stop.final)]
+        turned = [axis @ after.minus(before)[-3:] for before, after in pairwise(truth)]
+        increments = [step.increment for step in steps]
+        nominal = [step.decision.nominal for step in steps]
+        ours = [step.decision.predicted for step in steps] if learns else []
+
+        def errors(predictions: list[Tensor]) -> tuple[float, ...]:
+            pairs = zip(increments, predictions, strict=False)
+            found = [prediction_error(increment, predicted, focus.matrix) for increment, predicted in pairs]
+            return tuple(float(torch.linalg.vector_norm(error)) / _DEG for error in found)
+
+        def true_errors(predictions: list[Tensor]) -> tuple[float, ...]:
+            pairs = zip(turned, predictions, strict=False)
+            return tuple(abs(float(real - axis @ predicted[-3:])) / _DEG for real, predicted in pairs)
+
+        off = focus.off_rotation(done.stop.final.state.minus(steps[0].before.state)) if steps else 0.0
+        return cls(
+            **vars(trial),
+            reason=done.reason.value,
+            message=done.stop.message,
+            true_error_deg=focus.error(done.target, truth[-1]) / _DEG,
+            errors_deg=tuple(error / _DEG for error in measured),
+            first_step_deg=short[0] / _DEG if short else None,
+            step_error_deg=float(np.mean(moving)) / _DEG if moving else None,
+            prediction_km_deg=errors(nominal),
+            prediction_ekm_deg=errors(ours),
+            true_prediction_km_deg=true_errors(nominal),
+            true_prediction_ekm_deg=true_errors(ours),
+            off_rotation_deg=off / _DEG,
+            seconds=tuple(step.seconds for step in steps),
+            poses=tuple([s.q.tolist(), s.position.tolist(), s.rotation.tolist()] for s in truth if poses),
+        )
+
+
+#: What a session leaves.
+Record = TrialRecord | NotGrasped
+
+
+def prediction_error(
+    increment: Float[Tensor, " n_s"], predicted: Float[Tensor, " n_s"], focus: Float[Tensor, "n_x 6"]
+) -> Float[Tensor, " n_x"]:
+    """``e(t) = M_c E_p (ds(t) - predicted(t))``: one-step error of the focused pose.
+
+    The paper prints ``e_ekm`` and ``e_km`` swapped and leaves out ``- x_f(t)`` and ``M_c``; this is
+    what its figures show. ``predicted`` must be made *before* training on the sample.
+    """
+    return focus @ (increment - predicted)[-6:]
+
+
+def true_state(seen: Observation) -> GraspState:
+    """Joint angles and pose as they are; for reports only."""
+    assert seen.truth is not None  # a simulated hand tells
+    return seen.truth.state
