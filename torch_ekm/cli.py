@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -60,11 +60,9 @@ def hands() -> None:
     """List the hands that come with the package."""
     from .description import list_hands, load_hand
 
-    table = RichTable("hand", "joints", "actuators", "contact pads", "URDF")
-    for name in list_hands():
-        hand = load_hand(name)
-        table.add_row(name, str(hand.n_q), str(hand.n_a), str(len(hand.pads)), hand.urdf_path.name)
-    _print_table(table)
+    found = [load_hand(name) for name in list_hands()]
+    rows = [(hand.name, hand.n_q, hand.n_a, len(hand.pads), hand.urdf_path.name) for hand in found]
+    _print_table(("hand", "joints", "actuators", "contact pads", "URDF"), rows)
 
 
 @app.command()
@@ -72,14 +70,12 @@ def objects() -> None:
     """List the objects that come with the package."""
     from .description import list_objects, load_object
 
-    table = RichTable("object", "mass [g]", "friction", "grasp width [mm]", "shapes")
+    rows = []
     for name in list_objects():
         obj = load_object(name)
-        shapes = ", ".join(shape.kind for shape in obj.shapes)
-        table.add_row(
-            name, f"{1e3 * obj.mass:.0f}", f"{obj.friction:g}", f"{1e3 * obj.grasp_width:.0f}", shapes
-        )
-    _print_table(table)
+        figures = f"{1e3 * obj.mass:.0f}", f"{obj.friction:g}", f"{1e3 * obj.grasp_width:.0f}"
+        rows.append((name, *figures, ", ".join(shape.kind for shape in obj.shapes)))
+    _print_table(("object", "mass [g]", "friction", "grasp width [mm]", "shapes"), rows)
 
 
 @app.command()
@@ -250,21 +246,8 @@ def replay(
 
     shown = LogShow(log, trial, estimates)
     if shown.log is not None:
-        table = RichTable(*TrialEntry._fields, title=str(log))
-        for entry in shown.log.index:
-            table.add_row(*map(str, entry))
-        _print_table(table)
+        _print_table(TrialEntry._fields, shown.log.index, str(log))
     _look(shown, html, port)
-
-
-def _look(show: Show, html: Path | None, port: int) -> None:
-    """Write a page, or serve until Ctrl-C."""
-    from .experiments.viewer.serve import save_page, serve
-
-    if html is not None:
-        console.print(f"Page:      {save_page(show, html).resolve()}", soft_wrap=True)
-        return
-    serve(show, port=port, on_ready=lambda address: console.print(f"Open {address} (Ctrl-C ends)"))
 
 
 @app.command()
@@ -278,6 +261,25 @@ def notebooks(
     found = sorted(notebook_folder().glob("[0-9]*.ipynb"))
     for path in found if copy is None else copy_notebooks(copy, overwrite=overwrite):
         console.print(str(path), soft_wrap=True, highlight=False)
+
+
+@app.command()
+def version() -> None:
+    """Print the version, and those of the packages that decide the numbers."""
+    from .experiments.reporting.report import versions
+
+    for package, number in versions().items():
+        console.print(f"{package} {number}", highlight=False)
+
+
+def _look(show: Show, html: Path | None, port: int) -> None:
+    """Write a page, or serve until Ctrl-C."""
+    from .experiments.viewer.serve import save_page, serve
+
+    if html is not None:
+        console.print(f"Page:      {save_page(show, html).resolve()}", soft_wrap=True)
+        return
+    serve(show, port=port, on_ready=lambda address: console.print(f"Open {address} (Ctrl-C ends)"))
 
 
 @contextmanager
@@ -297,13 +299,15 @@ def _print_report(report: Report, folder: Path, notes: bool = False) -> None:
 
 def _print_tables(report: Report, notes: bool = False) -> None:
     for table in report.tables:
-        shown = RichTable(*table.header, title=table.caption, caption=table.note if notes else None)
-        for row in table.rows:
-            shown.add_row(*row)
-        _print_table(shown)
+        _print_table(table.header, table.rows, table.caption, table.note if notes else None)
 
 
-def _print_table(table: RichTable) -> None:
+def _print_table(
+    header: Iterable[str], rows: Iterable[Iterable[object]], title: str | None = None, note: str | None = None
+) -> None:
+    table = RichTable(*header, title=title, caption=note)
+    for row in rows:
+        table.add_row(*map(str, row))
     for column in table.columns:
         column.overflow = "fold"  # figures are never cut short
     if console.is_terminal:
@@ -322,15 +326,6 @@ def _numbers(name: str, text: str) -> tuple[float, ...]:
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
-
-
-@app.command()
-def version() -> None:
-    """Print the version, and those of the packages that decide the numbers."""
-    from .experiments.reporting.report import versions
-
-    for package, number in versions().items():
-        console.print(f"{package} {number}", highlight=False)
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

@@ -67,14 +67,13 @@ def run_jobs(
 
 
 def _outcomes(function: Callable[..., Any], jobs: Jobs, processes: int, address: str | None) -> Any:
-    """A generator of ``(name, result)`` in the order in which the jobs end."""
+    """``(name, result)`` in the order in which the jobs end."""
     if address is None:
         return _in_processes(function, jobs, processes)
     scheme, _, place = address.partition("://")
-    ask = {"dask": _on_dask, "ray": _on_ray}.get(scheme)
-    if ask is None or not place:
+    if scheme not in ("dask", "ray") or not place:
         raise ParameterError("address", address, "dask://HOST:PORT, ray://HOST:PORT or ray://auto")
-    return ask(place, function, jobs)
+    return (_on_dask if scheme == "dask" else _on_ray)(place, function, jobs)
 
 
 def _in_processes(function: Callable[..., Any], jobs: Jobs, processes: int) -> Outcomes:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import hashlib
 import sys
 from collections.abc import Iterable, Iterator
-from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType
+from types import BuiltinFunctionType, CellType, CodeType, FunctionType, ModuleType
 from typing import Any
 
-import numpy as np
 import torch
 
 _PLAIN = (bool, int, float, complex, str, bytes, type(None), torch.dtype, torch.device)
@@ -22,50 +21,41 @@ def fingerprint(*values: Any) -> str:
     functions count with their bytecode, and with that of the functions, classes and plain constants that it
     names in its module; those of Python, torch, numpy and scipy count with their names.
     """
-    return _Walk().digest(values)
+    known: dict[int, tuple[Any, str]] = {}  # holds the value too: its id must not come again
 
-
-class _Walk:
-    def __init__(self) -> None:
-        self._known: dict[int, tuple[Any, str]] = {}  # holds the value too: its id must not come again
-
-    def digest(self, value: Any) -> str:
+    def digest(value: Any) -> str:
         if isinstance(value, _PLAIN):
             return f"{type(value).__name__} {value!r}"
-        if id(value) not in self._known:
-            self._known[id(value)] = value, "itself"  # what a circle ends at
-            parts = [type(value).__name__, *self._parts(value)]
-            self._known[id(value)] = value, hashlib.sha1(repr(parts).encode()).hexdigest()
-        return self._known[id(value)][1]
+        if id(value) not in known:
+            known[id(value)] = value, "itself"  # what a circle ends at
+            parts = [digest(part) for part in _parts(value)]
+            parts = sorted(parts) if isinstance(value, set | frozenset) else parts
+            text = repr([type(value).__name__, *parts])
+            known[id(value)] = value, hashlib.sha1(text.encode()).hexdigest()
+        return known[id(value)][1]
 
-    def _parts(self, value: Any) -> Iterable[str]:
-        match value:
-            case torch.Tensor():
-                return self._parts(value.detach().cpu().numpy())
-            case np.ndarray() if value.dtype != object:
-                return str(value.dtype), str(value.shape), hashlib.sha1(value.tobytes()).hexdigest()
-            case dict():
-                return self._all(part for item in value.items() for part in item)
-            case list() | tuple():
-                return self._all(value)
-            case set() | frozenset():
-                return sorted(self._all(value))
-            case CodeType():
-                return self._all([value.co_code, value.co_names, *value.co_consts])
-            case MethodType():
-                return self._all([value.__func__, value.__self__])
-            case ModuleType() | BuiltinFunctionType():
-                return [value.__name__]
-            case CellType():
-                return self._all([value.cell_contents] if value != CellType() else [])
-            case FunctionType():
-                return self._all(_function(value))
-            case type():
-                return self._all(_class(value))
-        return self._all(_object(value))
+    return digest(values)
 
-    def _all(self, values: Iterable[Any]) -> list[str]:
-        return [self.digest(value) for value in values]
+
+def _parts(value: Any) -> Iterable[Any]:
+    match value:
+        case torch.Tensor():
+            return [value.detach().cpu().numpy()]
+        case dict():
+            return (part for item in value.items() for part in item)
+        case list() | tuple() | set() | frozenset():
+            return value
+        case CodeType():
+            return [value.co_code, value.co_names, *value.co_consts]
+        case ModuleType() | BuiltinFunctionType():
+            return [value.__name__]
+        case CellType():
+            return [value.cell_contents] if value != CellType() else []
+        case FunctionType():
+            return _function(value)
+        case type():
+            return _class(value)
+    return _object(value)
 
 
 def _function(function: FunctionType) -> Iterator[Any]:
