@@ -101,7 +101,7 @@ class Part:
 HELPER_SOURCE = """
 LIMIT = {limit}
 def helper(x):
-    return min(x, LIMIT)
+    return {bound}(x, LIMIT)
 class Learner:
     def __init__(self, part):
         self.part = part
@@ -111,14 +111,15 @@ class Learner:
 
 
 def test_fingerprint_sees_what_decides() -> None:
-    def learner(limit: float = 1.0, rate: float = 0.9) -> object:
+    def learner(limit: float = 1.0, rate: float = 0.9, bound: str = "min") -> object:
         space: dict = {"__name__": "notebook"}
-        exec(HELPER_SOURCE.format(limit=limit), space)
+        exec(HELPER_SOURCE.format(limit=limit, bound=bound), space)
         return space["Learner"](Part(rate))
 
     same = fingerprint(learner())
     assert fingerprint(learner()) == same
     assert fingerprint(learner(limit=2.0)) != same  # a constant that a function names that a method names
+    assert fingerprint(learner(bound="max")) != same  # the code of that function
     assert fingerprint(learner(rate=0.8)) != same  # a figure of a part
     one, other = torch.zeros(2), torch.zeros(2)
     assert fingerprint([one, one]) == fingerprint([one, other])
@@ -158,12 +159,17 @@ def test_what_makes_no_learner_is_refused_by_name_before_anything_runs(tmp_path:
 
 
 def test_nothing_of_the_caller_is_left_changed() -> None:
+    threads = torch.get_num_threads()
     torch.manual_seed(3)
-    expected, threads = torch.rand(1), torch.get_num_threads()
+    expected = torch.rand(1)
     torch.manual_seed(3)
-    compare(stream(), {"mine": lambda d, m: RecursiveLeastSquares(d, m)})
+    torch.set_num_threads(2)
+    try:
+        compare(stream(), {"mine": lambda d, m: RecursiveLeastSquares(d, m)})
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
     assert torch.equal(torch.rand(1), expected)
-    assert torch.get_num_threads() == threads
 
 
 def test_importing_experiments_is_cheap() -> None:
