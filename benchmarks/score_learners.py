@@ -14,15 +14,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from stream_scores import load_split, score_objects, score_split
 
-from torch_ekm.experiments.learner_comparison.datasets import (
-    ResidualRecording,
-    Stream,
-    load_stream,
-    load_t42,
-)
-from torch_ekm.experiments.learner_comparison.prequential import compare_learners, score_objects
-from torch_ekm.experiments.learners import LEARNERS, Factory
+from torch_ekm.experiments.learner_comparison.recordings import load_t42
+from torch_ekm.experiments.learner_comparison.stream import Stream
 from torch_ekm.residual import (
     CalibrateNoise,
     LearnHyperparameters,
@@ -86,7 +81,7 @@ def hand(names: list[str], half: str, quick: bool, kept: bool) -> None:
     """Every second object; a learner is kept over all of them, or fresh for each."""
     objects = load_t42()[0 if half == "development" else 1 :: 2]
     if quick:
-        objects = [ResidualRecording(o.name, o.x[:60], o.y[:60]) for o in objects[:2]]
+        objects = [Stream(o.name, o.x[:60], o.y[:60]) for o in objects[:2]]
     d, m = objects[0].x.shape[1], objects[0].y.shape[1]
     print(f"{half} half: {len(objects)} objects, {sum(len(o.x) for o in objects)} samples, kept: {kept}\n")
     print("| learner | rms, second half, winsorised | median, second half | rms, all | median, all |")
@@ -120,13 +115,15 @@ def streams(names: list[str], which: list[str], seed: int, quick: bool) -> None:
     """One pass, a tenth held out, targets of unit variance, nothing tuned per set."""
     print("| learner | stream | test RMSE | NLL | us per sample |")
     for stream_name in which:
-        stream = load_stream(stream_name, seed)
+        split = load_split(stream_name, seed)
         if quick:
-            stream = Stream(stream.name, stream.x[:200], stream.y[:200], stream.x_test, stream.y_test)
+            split = split._replace(x=split.x[:200], y=split.y[:200])
         for name in names:
             torch.manual_seed(seed)
-            (s,) = compare_learners({name: STREAMS[name]}, [stream])
-            print(f"| {name} | {s.stream} | {s.rmse:.4f} | {s.nll:.2f} | {s.microseconds:.0f} |", flush=True)
+            s = score_split(STREAMS[name], split)
+            print(
+                f"| {name} | {split.name} | {s.rmse:.4f} | {s.nll:.2f} | {s.microseconds:.0f} |", flush=True
+            )
 
 
 def main() -> None:

@@ -19,6 +19,7 @@ _EXTRA_OF = {
     "cv2": "sim",
     "gymnasium": "sim",
     "h5py": "sim",
+    "joblib": "experiments",
     "matplotlib": "experiments",
     "mpl_toolkits": "experiments",
     "jinja2": "experiments",

@@ -8,14 +8,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from change_scores import Stream, outlier_cost, recovery_after_change
 
 from torch_ekm.exceptions import EKMError, NonFiniteError, ParameterError, ShapeError
-from torch_ekm.experiments.learner_comparison.datasets import Stream
-from torch_ekm.experiments.learner_comparison.prequential import (
-    outlier_cost,
-    recovery_after_change,
-    run_prequential,
-)
+from torch_ekm.experiments.learner_comparison.prequential import run_prequential
 from torch_ekm.residual import (
     ActionLinearKernel,
     CalibrateNoise,
