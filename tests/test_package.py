@@ -28,7 +28,10 @@ _HEAVY = (
 )
 
 
-@pytest.mark.parametrize("module", ["torch_ekm", "torch_ekm.residual", "torch_ekm.enhanced.enhanced_model"])
+_LIGHT = ("", ".residual", ".enhanced.enhanced_model", ".plant", ".sensing", ".simulation", ".rendering")
+
+
+@pytest.mark.parametrize("module", [f"torch_ekm{name}" for name in _LIGHT])
 def test_import_needs_only_torch_and_numpy(module: str) -> None:
     blocked = ", ".join(repr(name) for name in _HEAVY)
     code = f"""
