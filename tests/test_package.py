@@ -89,6 +89,13 @@ def test_the_front_door_needs_torch_and_numpy_only() -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize("room", ["plant", "sensing", "simulation", "rendering"])
+def test_rooms_ask_for_their_extras_when_they_need_them(room: str) -> None:
+    code = _LIGHT + f"import torch_ekm.{room}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def test_adapters_name_the_extra_when_they_are_made() -> None:
     made = """
 from torch_ekm.exceptions import MissingExtraError

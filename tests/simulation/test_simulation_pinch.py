@@ -11,8 +11,9 @@ from torch_ekm.contact.detector import ContactDetector
 from torch_ekm.description import list_objects, load_hand, load_object
 from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics import HandKinematics
-from torch_ekm.simulation import PinchRequest, PlantConfig, PlantParameters
+from torch_ekm.simulation import PlantConfig, PlantParameters
 from torch_ekm.simulation.grasp_planning.pinch import make_planner
+from torch_ekm.simulation.grasp_planning.pinch_problem import PinchRequest
 from torch_ekm.simulation.mechanism.assembly import make_transmission
 
 G = 9.81

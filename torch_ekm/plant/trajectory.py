@@ -49,7 +49,7 @@ class Trajectory:
                 its shape or comes and goes; nothing is written.
         """
         path = Path(path)
-        about = _json(self.about)
+        about = json.dumps(plain(self.about))
         arrays = self._arrays()
         part = path.with_name(path.name + ".part")
         # version 1.10 of the format has checksums on its own records too
@@ -146,12 +146,8 @@ def plain(value: Any) -> Any:
     Raises:
         ParameterError: JSON cannot hold it.
     """
-    return json.loads(_json(value))
-
-
-def _json(value: Any) -> str:
     try:
-        return json.dumps(value, sort_keys=True, default=_as_plain)
+        return json.loads(json.dumps(value, sort_keys=True, default=_as_plain))
     except TypeError as error:
         raise ParameterError("about", error, "figures, texts, lists and mappings of those") from None
 

@@ -137,12 +137,14 @@ def projection_jacobian(camera: PinholeCamera, X: Array, rotation: Array, positi
     rvec = cv2.Rodrigues(rotation)[0]
     _, full = cv2.projectPoints(X, rvec, position, camera.matrix, camera.distortion_array)
     by_position = full[:, 3:6].reshape(-1, 2, 3)  # dpi/dx, since x = R X + t
-    return np.concatenate([by_position, -by_position @ skew(X @ rotation.T)], axis=-1).reshape(-1, 6)
+    arm = X @ rotation.T
+    return np.concatenate([by_position, -by_position @ skew(arm)], axis=-1).reshape(-1, 6)
 
 
 def skew(v: Array) -> Array:
-    """``[v]x`` of vectors ``(*batch, 3)``."""
-    (x, y, z), zero = np.moveaxis(v, -1, 0), np.zeros(v.shape[:-1])
+    """``[v]x`` of each vector ``(*batch, 3)``."""
+    x, y, z = np.moveaxis(v, -1, 0)
+    zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape, 3)
 
 

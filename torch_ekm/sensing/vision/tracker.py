@@ -199,7 +199,7 @@ class MarkerTracker:
         return True
 
     def _near(self, other: tuple[Array, Array], position: Array, rotation: Array) -> bool:
-        step, turn = np.linalg.norm(position - other[0]), angle_between(rotation, other[1])
+        turn, step = angle_between(rotation, other[1]), np.linalg.norm(position - other[0])
         return bool(step <= self.options.max_step and turn <= self.options.max_turn)
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...description import ContactPad, HandDescription, ObjectDescription
 from ...description.shape import Shape
-from ...typing import Array
+
+Array = NDArray[np.float64]
 
 
 def chain(hand: HandDescription, link: str) -> list[int]:

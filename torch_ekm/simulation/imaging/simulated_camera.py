@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +43,7 @@ class ImageQuality:
         if not 0 <= self.black < self.white <= 255:
             raise ParameterError("ImageQuality.black", self.black, "below white, both within 0..255")
 
-    def spoil(self, image: NDArray[np.float32], generator: np.random.Generator) -> NDArray[np.uint8]:
+    def spoil(self, image: NDArray[Any], generator: np.random.Generator) -> NDArray[np.uint8]:
         """The picture with blur and noise, in whole grey levels."""
         if self.blur > 0:
             image = require("cv2").GaussianBlur(image, (0, 0), self.blur)
