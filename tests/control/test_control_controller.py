@@ -292,7 +292,8 @@ def test_decision_is_the_best_of_all(grasp, taught: EnhancedModel) -> None:
     loop, decision, _ = decide(grasp, taught, 30.0, sqp_iterations=40)
     error = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG).error(state)
     at = Situation(plant.hand, loop.focus, state, seen.a, seen.fingertip_force, error, decision.desired)
-    model = LinearizedModel.about(decision.delta_a, decision.linearization, taught)
+    value, J = taught.linearize(state, decision.delta_a, decision.linearization.manipulation_jacobian)
+    model = LinearizedModel(decision.linearization, decision.delta_a, value - J @ decision.delta_a, J)
     loop.tasks = loop.tasks[:-1]  # all but the variance, which is added by brute force
     qp = loop.program(model, at).qp
     n_u, n_t = plant.hand.n_a, len(qp.h)
@@ -316,6 +317,26 @@ def test_decision_is_the_best_of_all(grasp, taught: EnhancedModel) -> None:
             u = np.where((u >= lower) & (u <= upper), u, best)
             if np.abs(E @ (u - best)).max() < 1e-9:
                 assert cost(u) > found - 1e-4 * size
+
+
+def test_uncertainty_task_costs_the_variance_that_the_learner_predicts(grasp, taught: EnhancedModel) -> None:
+    plant, km, seen, state = grasp
+    n_a = plant.hand.n_a
+    at = Situation(
+        plant.hand,
+        FocusedPose.rotation_about(plant.rotation_axis),
+        state,
+        seen.a,
+        None,
+        torch.zeros(6).double(),
+        torch.zeros(1).double(),
+    )
+    generator = torch.Generator().manual_seed(1)
+    action, u = 2 * DEG * torch.randn(2, n_a, generator=generator, dtype=torch.float64)
+    rows = UncertaintyTask(3.0).rows(LinearizedModel.about(action, km.linearize(state), taught), at)
+    variance = plant.rotation_axis.square() @ taught.predict(state, u).variance[-3:]
+    # no action, no doubt: the constant that the rows leave out is zero
+    torch.testing.assert_close(u @ rows.curvature @ u / 2 + rows.gradient @ u, 3.0 * variance / DEG**2)
 
 
 def test_learner_without_uncertainty_is_refused(grasp, taught: EnhancedModel) -> None:

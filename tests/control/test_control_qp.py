@@ -48,9 +48,10 @@ def test_unreachable_target_goes_to_the_bounds_and_says_so() -> None:
     np.testing.assert_allclose(solution.slack, 0.3, atol=1e-5)
 
 
-def test_bounds_intersect() -> None:
-    u = solve(Bounds(np.array([-1.0, 0.04]), np.array([0.03, 1.0])), d=0.9).u
-    np.testing.assert_allclose(u, [0.03, 0.435], atol=1e-6)
+@pytest.mark.parametrize(("d", "u"), [(0.9, [0.03, 0.2]), (-0.9, [-0.2, 0.04])])
+def test_bounds_intersect(d: float, u: list[float]) -> None:
+    row = Bounds(np.array([-1.0, 0.04]), np.array([0.03, 1.0]))
+    np.testing.assert_allclose(solve(row, d=d, bound=0.2).u, u, atol=1e-6)
 
 
 def test_l1_slack_is_exact_when_the_target_is_reachable() -> None:

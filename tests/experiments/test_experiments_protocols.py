@@ -10,7 +10,15 @@ import pytest
 import torch
 from experiments_records import not_grasped
 
-from torch_ekm.control import PoseTarget
+from torch_ekm.control import (
+    DEFAULT_LIMITS,
+    DEFAULT_TASKS,
+    EffortTask,
+    FrictionMarginLimit,
+    LimitingFunction,
+    OffAxisTask,
+    PoseTarget,
+)
 from torch_ekm.description import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.camera_off import CameraOff
@@ -66,10 +74,9 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
     base = Generalize()
     unchanged = of(Setting())
     assert of(Setting()) == unchanged
-    with monkeypatch.context() as patch:  # a version with another default
-        patch.setattr(
-            LimitingFunction.__init__, "__defaults__", (0.5, *LimitingFunction.__init__.__defaults__[1:])
-        )
+    other = (EffortTask(weight=0.02), *DEFAULT_TASKS[1:])  # a version with another default
+    with monkeypatch.context() as patch:
+        patch.setattr("torch_ekm.experiments.config.DEFAULT_TASKS", other)
         assert of(Setting()) != unchanged
     with monkeypatch.context() as patch:  # and one whose learner has another kernel
         patch.setitem(LEARNERS, "rbf", LEARNERS["SOGP plain"])
@@ -81,6 +88,21 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
     assert set(one) < set(both)  # more objects: what is there is used again
     assert set(dataclasses.replace(base, objects=("box",), controllers=("KM",)).jobs((0,))) < set(one)
     assert len(both) == 2 * len(CONTROLLERS)
+
+
+def test_a_setting_names_figures_of_the_controllers_parts() -> None:
+    changes = {
+        "FrictionMarginLimit.minimum": 0.6,
+        "OffAxisTask.rotation_weight": 0.1,
+        "LimitingFunction.gain": 1.0,
+    }
+    parts = Setting(control=changes).controller_parts()
+    plain = Setting().controller_parts()
+    assert plain == {"tasks": DEFAULT_TASKS, "limits": DEFAULT_LIMITS, "limiting": LimitingFunction()}
+    assert set(parts["limits"]) - set(DEFAULT_LIMITS) == {FrictionMarginLimit(minimum=0.6)}
+    assert set(parts["tasks"]) - set(DEFAULT_TASKS) == {OffAxisTask(rotation_weight=0.1)}
+    assert len(parts["tasks"]) == len(DEFAULT_TASKS)
+    assert parts["limiting"] == LimitingFunction(gain=1.0)
 
 
 def test_a_corrected_object_does_not_take_up_old_results(tmp_path: Path) -> None:

@@ -78,10 +78,6 @@ class FocusedPose:
             raise ParameterError("axis", axis.tolist(), "a vector of non-zero length")
         return cls(torch.cat([torch.zeros(3, dtype=axis.dtype), axis / norm])[None])
 
-    @property
-    def n_x(self) -> int:
-        return self.matrix.shape[0]
-
     def error(self, target: PoseTarget, state: GraspState) -> float:
         """``|M_c e|``, e the twist from the state to the target [unit of the focus]."""
         return float(torch.linalg.vector_norm(self.matrix @ target.error(state)))

@@ -74,7 +74,7 @@ class ControlSolution:
 
 @dataclass(frozen=True)
 class ControlProblem:
-    """The program over ``z = [u; sl+; sl-; t]``, u in degrees, rows in their units.
+    """The ``qpsolvers.Problem`` over ``z = [u; sl+; sl-; t]``, u in degrees, rows in their units.
 
     ::
 
@@ -89,7 +89,6 @@ class ControlProblem:
     """
 
     qp: Any
-    """The ``qpsolvers.Problem``."""
     n_u: int
 
     @property

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
-from ..description import HandDescription
 from ..enhanced import EnhancedModel, Quadratic
 from ..kinematics import GraspState
-from ..model import Linearization
 from ..typing import Float, Tensor
 from .focus import FocusedPose
 from .qp import Array, as_array
+
+if TYPE_CHECKING:
+    from ..description import HandDescription
+    from ..model import Linearization
 
 
 @dataclass(frozen=True)

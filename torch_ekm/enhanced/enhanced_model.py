@@ -110,16 +110,8 @@ class EnhancedModel(nn.Module):
     def forward(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_s"]:
         """``f(s, da) + g(s, da)``."""
         nominal = self.model(state, action)
-        return nominal + self.correction(state, action, nominal)
-
-    def correction(self, state: Any, action: Tensor, like: Tensor) -> Float[Tensor, "*batch n_s"]:
-        """``g(s, da)`` in the increment's unit, zero in the outputs that are not learned.
-
-        Args:
-            like: any increment of the right shape (usually ``f(s, da)``).
-        """
         mean = self.learner(self.features(state, action)) / self.output_scale
-        return self._scatter(mean, like)
+        return nominal + self._scatter(mean, nominal)
 
     @torch.no_grad()
     def update(
