@@ -25,16 +25,16 @@ _LIMITS = 0.1, 0.1  # [mm], [deg]
 def hold(plant: SimulatedHand, seed: int, duration: float) -> tuple[float, float, float] | None:
     """Drift [mm], [deg] and times real time; None if there was no grasp, or the object was lost."""
     try:
-        before = plant.reset(seed).info["truth"]
+        before = plant.reset(seed).truth
     except (EquilibriumError, GraspError):
         return None
     began = time.process_time()
     plant.wait(duration)
     speed = duration / (time.process_time() - began)
     seen = plant.observe()
-    after = seen.info["truth"]
-    drift = 1e3 * float((after["position"] - before["position"]).norm())
-    turned = math.degrees(float(log(after["rotation"] @ before["rotation"].mT).norm()))
+    after = seen.truth
+    drift = 1e3 * float((after.position - before.position).norm())
+    turned = math.degrees(float(log(after.rotation @ before.rotation.mT).norm()))
     return None if seen.status is PlantStatus.LOST else (drift, turned, speed)
 
 

@@ -16,12 +16,11 @@ from typing import Any
 
 import torch
 
-from torch_ekm.control import ControllerOptions, FocusedPose, LookAndMoveController, PoseTarget
+from torch_ekm.control import ClosedLoop, LookAndMoveController, PoseTarget
 from torch_ekm.exceptions import EKMError
 from torch_ekm.experiments.config import Setting, digest
 from torch_ekm.experiments.jobs import run_jobs
-from torch_ekm.experiments.manipulation import run_manipulation, state_of
-from torch_ekm.experiments.protocols.demo import TABLE_I, fixed_actuators
+from torch_ekm.experiments.protocols.demo import TABLE_I
 from torch_ekm.model import KinematicModel, ModelOptions
 from torch_ekm.simulation import PlantConfig, SimulatedHand, preset
 
@@ -41,17 +40,12 @@ def turn(object: str, seed: int, level: str) -> list[dict[str, Any]]:
     for angle in TABLE_I[object]:
         record: dict[str, Any] = {"object": object, "seed": seed, "angle_deg": angle, "error_deg": None}
         try:
-            start = state_of(plant.reset(seed))
+            start = plant.reset(seed).state
             axis = plant.rotation_axis
-            loop = LookAndMoveController(
-                model,
-                FocusedPose.rotation_about(axis),
-                ControllerOptions(fixed_actuators=fixed_actuators(plant.hand)),
-            )
-            target = PoseTarget.turned(start, axis, angle * _DEG)
-            done = run_manipulation(plant, loop, target, rule, learn=False)
-            assert done.true_error is not None
-            error, lost = done.true_error / _DEG, done.lost
+            target = PoseTarget.turned(start, axis, degrees=angle)
+            done = ClosedLoop(plant, LookAndMoveController(model, axis), rule).run(target)
+            assert done.stop.final.truth is not None  # a simulated hand tells
+            error, lost = done.focus.error(target, done.stop.final.truth.state) / _DEG, done.lost
             record |= {
                 "reason": done.reason.value,
                 "steps": len(done.steps),

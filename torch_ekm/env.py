@@ -17,7 +17,7 @@ from ._extras import require
 from .description import HandDescription, ObjectDescription
 from .exceptions import ParameterError
 from .kinematics.se3 import log
-from .plant.plant import Observation, PlantStatus
+from .plant import Observation, PlantStatus
 from .rendering.grasp_viewer import GraspViewer
 from .simulation.config import PlantConfig
 from .simulation.parameters import PlantParameters
@@ -188,7 +188,9 @@ class InHandRotation(gymnasium.Env):
         return {
             "is_success": held and abs(self._target - turned) < self.tolerance,
             "status": observation.status.value,
-            "truth": {name: value.numpy() for name, value in observation.info["truth"].items()},
+            "truth": {
+                name: value.numpy() for name, value in vars(observation.truth).items() if name != "pictured"
+            },
         }
 
 

@@ -194,6 +194,8 @@ def urdf_text(left: bool) -> str:
     return head + "\n".join(parts) + "\n</robot>\n"
 
 
+#: Abduction, ring and little finger shape the hand before a pinch.
+POSTURE = ("hand_finger", "pinky")
 # name, range [deg], offset [deg], tendon, moment arms, remark
 ACTUATORS: list[tuple[str, tuple[int, int], int, bool, dict[str, float], str]] = [
     ("hand_finger", (0, 60), 60, False, {"index_0": -1, "ring_0": -1, "little_0": -1},
@@ -257,6 +259,7 @@ gravity = [0.0, 0.0, 9.81]  # [m/s^2]: the palm faces down
 # tendon = true: it can only pull, springs open the joint. stiffness [N m/rad]: tendon and servo in
 # series, {ACTUATOR_STIFFNESS} is an estimate of what the position controller shows at the joint.""")
     for name, (lower, upper), offset, tendon, arms, remark in ACTUATORS:
+        posture = "\nposture = true" if name in POSTURE else ""
         out.append(f"""
 [[actuators]]  # {remark}
 name = "{name}"
@@ -264,7 +267,7 @@ range_deg = [{float(lower)}, {float(upper)}]
 offset_deg = {float(offset)}
 moment_arms = {inline(arms)}
 tendon = {str(tendon).lower()}
-stiffness = {ACTUATOR_STIFFNESS}""")
+stiffness = {ACTUATOR_STIFFNESS}{posture}""")
     out.append("\n# Rigid couplings: sum of weight x joint angle stays what it is at rest.")
     out += [f'\n[[couplings]]\nname = "{name}"\njoints = {inline(arms)}' for name, arms in COUPLINGS]
     out.append(f"""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_ekm.control import ControllerOptions, Decision, PoseTarget, StopReason
+from torch_ekm.control import ControllerOptions, PoseTarget
 from torch_ekm.description import object_files
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.camera_off import CameraOff
@@ -165,23 +165,18 @@ def test_without_the_camera_the_prediction_is_all_there_is() -> None:
     target = PoseTarget.turned(start, axis, 0.5)
     tilt = exp(torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64))  # off the axis: no help for it
     target = PoseTarget(target.position, tilt @ target.rotation)
-    plant = CameraOff(stage, target, axis, switch_off=0.25)
+    half = torch.tensor([0.0] * 6 + [0.5], dtype=torch.float64)  # a model that predicts half of every turn
+    plant = CameraOff(stage, lambda _, delta_a: half * delta_a, target, axis, switch_off=0.25)
     plant.reset(0)
-    predicted = torch.zeros(7, dtype=torch.float64)
-    predicted[-1] = 0.1
     step = torch.tensor([0.2], dtype=torch.float64)
-    decision = Decision(step, StopReason.RUNNING, step, predicted, predicted)
 
     def angle(seen: Observation) -> float:
         return float(torch.atan2(seen.rotation[1, 0], seen.rotation[0, 0]))
 
-    plant.expect(decision)
     assert angle(plant.command(step)) == pytest.approx(0.2)  # seen: 0.3 rad to go
     assert not plant.dark
-    plant.expect(decision)
     assert angle(plant.command(step)) == pytest.approx(0.4)  # seen, and then the camera goes dark
     assert plant.dark
-    plant.expect(decision)
     assert angle(plant.command(step)) == pytest.approx(0.5)  # believed; really 0.6
     assert stage.angle == pytest.approx(0.6)
     assert plant.observe().status is PlantStatus.HELD

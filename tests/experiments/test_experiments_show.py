@@ -104,8 +104,8 @@ def test_a_log_is_played_from_command_to_command(folder):
     recording = TrialLog.open(folder).read(1)
     assert show.scene().transforms.shape[0] == 3
     for k, seen in enumerate(recording.observations):
-        truth = seen.info["truth"]
-        np.testing.assert_allclose(show.scene().transforms[k, -1, :3, 3], truth["position"], atol=1e-12)
+        truth = seen.truth
+        np.testing.assert_allclose(show.scene().transforms[k, -1, :3, 3], truth.position, atol=1e-12)
     show.add_controls(gui)
     gui.controls["play"].value = False
     assert show.update() is None

@@ -18,8 +18,7 @@ F64 = torch.float64
 
 
 def true_state(observation) -> GraspState:
-    truth = observation.info["truth"]
-    return GraspState(truth["q"], truth["position"], truth["rotation"])
+    return observation.truth.state
 
 
 def turning_step(lin, axis, step, grip):

@@ -12,7 +12,7 @@ from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import ObjectLostError, ParameterError, ShapeError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.kinematics.se3 import exp, log
-from torch_ekm.plant.plant import Observation, Plant, PlantStatus
+from torch_ekm.plant import Observation, Plant, PlantStatus, Truth
 from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera, StreamOptions, TrackStatus
 from torch_ekm.simulation import ICUB_PALM_MOUNT, GraspView, HallSensors, SensedPlant
 
@@ -57,9 +57,9 @@ class Puppet:
         a = q @ torch.from_numpy(self.hand.actuation_jacobian).mT + torch.from_numpy(
             self.hand.actuator_offset
         )
-        truth = {"q": q, "position": position, "rotation": rotation}
+        truth = Truth(q, position, rotation)
         wrong = torch.zeros_like(position)  # nobody may read the pose but from the images
-        return Observation(q, a, wrong, torch.eye(3).double(), torch.ones(3), info={"truth": truth})
+        return Observation(q, a, wrong, torch.eye(3).double(), torch.ones(3), truth=truth)
 
     def command(self, delta_a):
         self.turn += float(delta_a[0])
@@ -117,14 +117,14 @@ def test_sensed_plant_knows_only_what_its_sensors_say(hand, obj):
     turn = torch.zeros(hand.n_a, dtype=torch.float64)
     turn[0] = 4 * DEG
     for _ in range(4):
-        truth = observation.info["truth"]
+        truth = observation.truth
         assert observation.status is PlantStatus.HELD
         assert observation.info["track"].ok
         assert observation.info["raw"]["hall"].shape == (15,)
-        assert (observation.position - truth["position"]).norm() < 1e-3
-        assert 0 < log(observation.rotation @ truth["rotation"].mT).norm() < 0.5 * DEG
+        assert (observation.position - truth.position).norm() < 1e-3
+        assert 0 < log(observation.rotation @ truth.rotation.mT).norm() < 0.5 * DEG
         has_channel = [hand.joint_names.index(joint) for joint in hall.joints]
-        error = (observation.q - truth["q"])[has_channel]
+        error = (observation.q - truth.q)[has_channel]
         assert 0 < error.square().mean().sqrt() < 1.0 * DEG
         observation = plant.command(turn)
     moved = log(observation.rotation @ grasp(hand)[2].mT)
@@ -179,15 +179,15 @@ def test_the_camera_shows_the_picture_that_has_arrived(hand, obj):
 
     class Late(Puppet):
         def command(self, delta_a):
-            before = super().observe().info["truth"]
+            before = super().observe().truth
             now = super().command(delta_a)
-            return dataclasses.replace(now, info={**now.info, "picture": before})
+            return dataclasses.replace(now, truth=dataclasses.replace(now.truth, pictured=before.state))
 
     plant = SensedPlant(Late(hand), hand, obj, hall=HallSensors(hand, seed=1))
     first = plant.reset(seed=0)
     late = plant.command(torch.full((hand.n_a,), 6 * DEG))
     assert log(late.rotation @ first.rotation.mT).norm() < 0.5 * DEG
-    assert log(late.info["truth"]["rotation"] @ first.rotation.mT).norm() > 5 * DEG
+    assert log(late.truth.rotation @ first.rotation.mT).norm() > 5 * DEG
 
 
 def test_raw_readings_of_an_observation(hand, obj):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torch_ekm.plant import Observation
-from torch_ekm.sensing import TouchAligned
+from torch_ekm.sensing import ContactAligned
 from torch_ekm.simulation import SimulatedHand
 
 
@@ -45,15 +45,15 @@ def hand() -> SimulatedHand:
 @pytest.mark.parametrize("error_deg", [-9.0, 4.0, 11.0])
 def test_touch_corrects_the_joint_that_no_sensor_reads(hand: SimulatedHand, error_deg: float) -> None:
     thumb = hand.hand.joint_names.index("thumb_0")
-    plant = TouchAligned(Blurred(hand, thumb, math.radians(error_deg)), hand.hand, hand.object)
+    plant = ContactAligned(Blurred(hand, thumb, math.radians(error_deg)), hand.hand, hand.object)
     seen = plant.reset(0)
-    off = torch.rad2deg(seen.q - seen.info["truth"]["q"]).abs()
+    off = torch.rad2deg(seen.q - seen.truth.q).abs()
     assert float(off[thumb]) < 1.0
     assert float(off[[i for i in range(len(off)) if i != thumb]].max()) < 0.5  # the others are let alone
 
 
 def test_finger_that_feels_nothing_says_nothing(hand: SimulatedHand) -> None:
     thumb = hand.hand.joint_names.index("thumb_0")
-    plant = TouchAligned(Blurred(hand, thumb, 0.1, numb=True), hand.hand, hand.object)
+    plant = ContactAligned(Blurred(hand, thumb, 0.1, numb=True), hand.hand, hand.object)
     seen = plant.reset(0)
-    assert float(seen.q[thumb] - seen.info["truth"]["q"][thumb]) == pytest.approx(0.1, abs=1e-9)
+    assert float(seen.q[thumb] - seen.truth.q[thumb]) == pytest.approx(0.1, abs=1e-9)

@@ -14,8 +14,8 @@ DEG = math.pi / 180
 
 def motion(earlier: Observation, later: Observation) -> tuple[torch.Tensor, torch.Tensor]:
     """True translation [m] and rotation vector [rad] of the object between two observations."""
-    a, b = earlier.info["truth"], later.info["truth"]
-    return b["position"] - a["position"], log(b["rotation"] @ a["rotation"].mT)
+    a, b = earlier.truth, later.truth
+    return b.position - a.position, log(b.rotation @ a.rotation.mT)
 
 
 def increment(**moves: float) -> torch.Tensor:

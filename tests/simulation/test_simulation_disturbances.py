@@ -50,7 +50,7 @@ def turned(plant, delta):
 
 
 def truth(observation, name="q"):
-    return observation.info["truth"][name]
+    return getattr(observation.truth, name)
 
 
 # -- the mechanism ------------------------------------------------------------------------------------
@@ -282,8 +282,8 @@ def test_sensor_disturbances_touch_their_own_reading_and_never_the_truth(exact, 
     exact.restore(grasped)
     exact.change(**{name: SENSOR_DISTURBANCES[name]})
     seen = exact.command(ROLL)
-    for key, value in clean.info["truth"].items():
-        assert torch.equal(seen.info["truth"][key], value), key
+    for key in ("q", "position", "rotation", "fingertip_force", "actuator_torque"):
+        assert torch.equal(getattr(seen.truth, key), getattr(clean.truth, key)), key
     kind = name.split("_")[0]
     own = {"joint": {"q"}, "stuck": {"q"}, "force": {"fingertip_force"}, "position": {"position"}}
     own |= {"rotation": {"rotation"}, "latency": {"position", "rotation"}, "frame": {"position", "rotation"}}
@@ -297,9 +297,9 @@ def test_sensor_disturbances_touch_their_own_reading_and_never_the_truth(exact, 
 @pytest.mark.parametrize(
     ("name", "size", "reading"),
     [
-        ("joint_noise", 0.5 * DEG, lambda o: o.q - o.info["truth"]["q"]),
-        ("position_noise", 2e-4, lambda o: o.position - o.info["truth"]["position"]),
-        ("force_noise", 0.1, lambda o: (o.fingertip_force - o.info["truth"]["fingertip_force"])[:3]),
+        ("joint_noise", 0.5 * DEG, lambda o: o.q - o.truth.q),
+        ("position_noise", 2e-4, lambda o: o.position - o.truth.position),
+        ("force_noise", 0.1, lambda o: (o.fingertip_force - o.truth.fingertip_force)[:3]),
     ],
 )
 def test_noise_has_its_size_and_no_mean(exact, name, size, reading):
@@ -314,7 +314,7 @@ def test_rotation_noise_has_its_size(exact):
 
     exact.change(rotation_noise=0.2 * DEG)
     seen = [exact.observe() for _ in range(300)]
-    sample = torch.stack([log(o.rotation @ o.info["truth"]["rotation"].mT) for o in seen])
+    sample = torch.stack([log(o.rotation @ o.truth.rotation.mT) for o in seen])
     assert float(sample.std()) == pytest.approx(0.2 * DEG, rel=0.1)
 
 
@@ -363,11 +363,10 @@ def test_the_picture_is_as_old_as_the_camera_is_late(exact):
     exact._rig.run(100, lambda part: motor + part * ROLL.numpy())
     now = exact.observe()
     exact._rig.run(100, lambda part: motor + ROLL.numpy())
-    then = exact.observe().info["picture"]
-    assert float(then["time"]) == pytest.approx(now.time, abs=1e-9)
+    then = exact.observe().truth.pictured
     for name in ("q", "position", "rotation"):
-        assert torch.equal(then[name], now.info["truth"][name])
-    assert not torch.equal(now.info["picture"]["q"], now.info["truth"]["q"])
+        assert torch.equal(getattr(then, name), getattr(now.truth, name))
+    assert not torch.equal(now.truth.pictured.q, now.truth.q)
 
 
 def test_lost_frames_repeat_the_last_pose_and_say_so(exact):

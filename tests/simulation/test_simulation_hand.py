@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 import time
@@ -56,27 +57,27 @@ def test_it_holds_still_for_ten_seconds(plant, seed):
 
 @pytest.mark.parametrize("time_step", [0.002, 0.004])
 def test_longer_time_steps_hold_the_same_grasp(plant, grasped, time_step):
-    fine = plant.restore(grasped).info["truth"]
+    fine = plant.restore(grasped).truth
     coarse = SimulatedHand("icub_right", "box", PlantConfig(time_step=time_step))
     before = coarse.reset(0)
     coarse.wait(2.0)
     assert motion(before, coarse.observe())[0].norm() < 1e-6
-    assert (before.info["truth"]["q"] - fine["q"]).abs().max() < 0.3 * DEG
+    assert (before.truth.q - fine.q).abs().max() < 0.3 * DEG
 
 
 def test_the_grasp_is_the_planned_one(plant, grasped):
-    truth = plant.restore(grasped).info["truth"]
+    truth = plant.restore(grasped).truth
     plan = plant.plan
-    assert np.linalg.norm(truth["position"].numpy() - plan.position) < 1e-3
-    assert np.abs(truth["q"].numpy() - plan.q).max() < 1.0 * DEG
+    assert np.linalg.norm(truth.position.numpy() - plan.position) < 1e-3
+    assert np.abs(truth.q.numpy() - plan.q).max() < 1.0 * DEG
     wanted = -np.einsum("ci,ci->c", plan.forces, plan.normals)
-    np.testing.assert_allclose(truth["fingertip_force"][:3], wanted, rtol=0.15)
+    np.testing.assert_allclose(truth.fingertip_force[:3], wanted, rtol=0.15)
     assert wanted[0] == pytest.approx(plant.config.pinch_force, rel=0.01)
 
 
 def test_contact_forces_balance_the_weight(plant, grasped):
     """PhysX reports normal forces; along the pinch line they must cancel up to weight and friction."""
-    force = plant.restore(grasped).info["truth"]["fingertip_force"]
+    force = plant.restore(grasped).truth.fingertip_force
     assert abs(float(force[0] - force[1] - force[2])) < plant.object.mass * 9.81 + 0.2
 
 
@@ -120,9 +121,9 @@ def test_a_snapshot_can_be_returned_to_bit_by_bit():
 
 def test_restored_and_unbroken_runs_differ_by_micrometres(plant, grasped):
     plant.reset(0)
-    unbroken = plant.command(ROLL).info["truth"]["position"]
+    unbroken = plant.command(ROLL).truth.position
     plant.restore(grasped)
-    restored = plant.command(ROLL).info["truth"]["position"]
+    restored = plant.command(ROLL).truth.position
     assert (unbroken - restored).norm() < 20e-6
 
 
@@ -187,7 +188,7 @@ def test_a_snapshot_outlives_the_scene_it_was_taken_in():
     after = plant.restore(snapshot)
     assert plant.gravity == gravity
     assert plant.parameters.object_scale == 1.0
-    torch.testing.assert_close(after.info["truth"], before.info["truth"])
+    torch.testing.assert_close(dataclasses.astuple(after.truth)[:5], dataclasses.astuple(before.truth)[:5])
     plant.wait(1.0)
     assert motion(before, plant.observe())[0].norm() < 1e-5
 
@@ -217,7 +218,7 @@ def test_bad_commands_are_refused_and_move_nothing(plant, grasped):
     for bad, error in ((torch.zeros(8), ShapeError), (torch.full((9,), torch.nan), NonFiniteError)):
         with pytest.raises(error):
             plant.command(bad)
-    assert torch.equal(plant.observe().info["truth"]["q"], before.info["truth"]["q"])
+    assert torch.equal(plant.observe().truth.q, before.truth.q)
 
 
 def test_errors_say_what_would_be_right():

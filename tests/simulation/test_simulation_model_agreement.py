@@ -7,7 +7,6 @@ import pytest
 import torch
 from simulation_helpers import DEG
 
-from torch_ekm.kinematics import GraspState
 from torch_ekm.kinematics.se3 import log
 from torch_ekm.model import KinematicModel, ModelOptions
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
@@ -15,10 +14,6 @@ from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
 pytest.importorskip("sapien")
 
 STEP = 0.1 * DEG  # small enough that no contact slips
-
-
-def state_of(truth):
-    return GraspState(truth["q"], truth["position"], truth["rotation"])
 
 
 OTHER = PlantParameters(
@@ -39,10 +34,10 @@ def grasp(request):
     name, parameters = request.param
     config = PlantConfig(gravity_tilt=0.5)
     plant = SimulatedHand("icub_right", name, config, parameters)
-    truth = plant.reset(0).info["truth"]
+    truth = plant.reset(0).truth
     hand, obj = plant.true_descriptions()
     model = KinematicModel(hand, obj, ModelOptions(gravity=plant.gravity))
-    return plant, truth, model.linearize(state_of(truth))
+    return plant, truth, model.linearize(truth.state)
 
 
 def test_detected_contacts_are_where_the_simulator_touches(grasp):
@@ -53,8 +48,8 @@ def test_detected_contacts_are_where_the_simulator_touches(grasp):
 
 def test_forces_of_the_model_are_those_of_the_simulator(grasp):
     _, truth, linear = grasp
-    torch.testing.assert_close(linear.forces.normal, truth["fingertip_force"][:3], rtol=0.05, atol=0.02)
-    torch.testing.assert_close(-linear.forces.lam, truth["actuator_torque"], rtol=0.05, atol=0.01)
+    torch.testing.assert_close(linear.forces.normal, truth.fingertip_force[:3], rtol=0.05, atol=0.02)
+    torch.testing.assert_close(-linear.forces.lam, truth.actuator_torque, rtol=0.05, atol=0.01)
     assert linear.forces.residual.abs().max() < 1e-4  # [N m] of about 0.1
 
 
@@ -67,9 +62,9 @@ def test_manipulation_jacobian_is_what_the_simulator_does(grasp):
             plant.restore(snapshot)
             delta = torch.zeros(plant.hand.n_a, dtype=torch.float64)
             delta[k] = sign * STEP
-            ends.append(plant.command(delta).info["truth"])
+            ends.append(plant.command(delta).truth)
         plus, minus = ends
-        column = [plus["position"] - minus["position"], log(plus["rotation"] @ minus["rotation"].mT) * 0.03]
+        column = [plus.position - minus.position, log(plus.rotation @ minus.rotation.mT) * 0.03]
         measured.append(torch.cat(column).numpy() / (2 * STEP))
     measured = np.array(measured).T
     predicted = linear.manipulation_jacobian[-6:, :-1].numpy() * np.array([[1.0]] * 3 + [[0.03]] * 3)

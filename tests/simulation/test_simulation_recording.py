@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import DescriptionError, ParameterError
-from torch_ekm.plant import Observation, Plant, PlantStatus, Recording, RecordingPlant, ReplayedPlant
+from torch_ekm.plant import Observation, Plant, PlantStatus, Recording, RecordingPlant, ReplayedPlant, Truth
 from torch_ekm.simulation import Tug
 
 h5py = pytest.importorskip("h5py")
@@ -26,14 +26,23 @@ class FakePlant:
         status = PlantStatus.LOST if self.state[0] > 8 else PlantStatus.HELD
         eye = torch.eye(3, dtype=torch.float64)
         info = {
-            "truth": {"q": self.state + 0.5},
             "raw": {"hall": self.state.to(torch.uint8), "corners": torch.full((2, 4, 2), torch.nan)},
             "track": object(),  # not kept
         }
         if self.state[0] == 7:
             info["events"] = (Tug(at=1, force=(0.0, 0.0, 5.0)),)
         return Observation(
-            self.state, self.state[:2], self.state, eye, self.state[:1], float(self.state[0]), status, info
+            *(
+                self.state,
+                self.state[:2],
+                self.state,
+                eye,
+                self.state[:1],
+                float(self.state[0]),
+                status,
+                info,
+            ),
+            truth=Truth(self.state + 0.5, self.state, eye),
         )
 
     def command(self, delta_a):
@@ -64,7 +73,7 @@ def test_a_saved_recording_replays_like_the_original(tmp_path):
         for name in ("q", "a", "position", "rotation", "fingertip_force"):
             assert torch.equal(getattr(now, name), getattr(then, name))
         assert (now.time, now.status) == (then.time, then.status)
-        assert torch.equal(now.info["truth"]["q"], then.info["truth"]["q"])
+        assert torch.equal(now.truth.q, then.truth.q)
         torch.testing.assert_close(now.info["raw"], then.info["raw"], rtol=0, atol=0, equal_nan=True)
         assert now.info["raw"]["hall"].dtype == torch.uint8
     assert [o.info.get("events", ()) for o in seen] == [(), (), (str(Tug(at=1, force=(0.0, 0.0, 5.0))),), ()]
@@ -127,7 +136,7 @@ def test_any_flipped_byte_of_the_data_is_noticed(tmp_path):
         unnoticed += 1  # unused space
         for now, then in zip(read.observations, original.observations, strict=True):
             assert torch.equal(now.q, then.q)
-            assert torch.equal(now.info["truth"]["q"], then.info["truth"]["q"])
+            assert torch.equal(now.truth.q, then.truth.q)
     assert unnoticed < 0.9 * len(range(0, len(whole), 97))
 
 

@@ -60,7 +60,7 @@ def test_a_trial_says_all_about_itself(unbroken):
     assert recording.about["outcome"] == {"reason": "done"}
     assert recording.about["trial"] == 2
     assert {"python", "torch", "sapien"} <= set(recording.about["versions"])
-    assert recording.observations[-1].info["truth"]["q"].shape == (4,)
+    assert recording.observations[-1].truth.q.shape == (4,)
     entry = log.index[2]
     last = recording.observations[-1]
     assert entry == TrialEntry(2, 2, 2, round(last.time, 6), "held", "done")

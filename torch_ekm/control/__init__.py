@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from .closed_loop import ClosedLoop as ClosedLoop
+from .closed_loop import Manipulation as Manipulation
+from .closed_loop import Step as Step
+from .closed_loop import Stop as Stop
 from .controller import ControllerOptions as ControllerOptions
 from .controller import Decision as Decision
 from .controller import LookAndMoveController as LookAndMoveController
@@ -15,6 +19,10 @@ from .termination import StoppingRule as StoppingRule
 from .termination import StopReason as StopReason
 
 __all__ = [
+    "ClosedLoop",
+    "Manipulation",
+    "Step",
+    "Stop",
     "ControlProblem",
     "ControlSolution",
     "ControllerOptions",

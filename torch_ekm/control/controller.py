@@ -65,8 +65,8 @@ class ControllerOptions:
     joint_horizon: float = 8 * _DEGREE
     """Joints have a row where actuator motions of this size could bring them to a stop. Longer ones
     are rare, and every row costs time."""
-    fixed_actuators: tuple[str, ...] = ()
-    """Actuators that must not move."""
+    fixed_actuators: tuple[str, ...] | None = None
+    """Actuators that must not move; None: those that the hand's description calls posture actuators."""
     sqp_iterations: int = 6
     sqp_damping: float = 0.6
     """Damped iterations for a model that is not linear in the action."""
@@ -119,29 +119,32 @@ class LookAndMoveController:
 
     Args:
         model: a :class:`KinematicModel`, or an :class:`EnhancedModel` around one.
-        focus: what of the pose must be reached.
+        focus: what of the pose must be reached, or the axis about which the object is to be turned.
         options: figures; defaults suit the iCub hand.
     """
 
     def __init__(
         self,
         model: KinematicModel | EnhancedModel,
-        focus: FocusedPose,
+        focus: FocusedPose | Float[Tensor, 3],
         options: ControllerOptions | None = None,
     ) -> None:
         self.enhanced = model if isinstance(model, EnhancedModel) else None
         self.kinematic: KinematicModel = model.model if isinstance(model, EnhancedModel) else model  # type: ignore[assignment]
-        self.focus = focus
+        self.focus = focus if isinstance(focus, FocusedPose) else FocusedPose.rotation_about(focus)
         self.options = options if options is not None else ControllerOptions()
         hand = self.kinematic.hand
         self._a_lower, self._a_upper = hand.actuator_lower, hand.actuator_upper
-        self._fixed = [hand.actuator_names.index(name) for name in self.options.fixed_actuators]
+        fixed = self.options.fixed_actuators
+        if fixed is None:
+            fixed = tuple(actuator.name for actuator in hand.actuators if actuator.posture)
+        self._fixed = [hand.actuator_names.index(name) for name in fixed]
         self._pad_index = {pad.name: i for i, pad in enumerate(hand.pads)}
         self._moving = np.flatnonzero(hand.joint_upper > hand.joint_lower)
         self._previous: Linearization | None = None
 
     def reset(self) -> None:
-        """Forget the contact forces of the last grasp; call it where one controller serves several."""
+        """Forget the contact forces of the last grasp; a :class:`ClosedLoop` does so when it begins."""
         self._previous = None
 
     def decide(

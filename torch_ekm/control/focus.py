@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -25,8 +26,23 @@ class PoseTarget:
         return torch.cat([self.position - state.position, log(self.rotation @ state.rotation.mT)])
 
     @classmethod
-    def turned(cls, state: GraspState, axis: Float[Tensor, 3], angle: float) -> PoseTarget:
-        """The pose of ``state`` turned by ``angle`` [rad] about ``axis`` through the object point."""
+    def turned(
+        cls,
+        state: GraspState,
+        axis: Float[Tensor, 3],
+        angle: float | None = None,
+        *,
+        degrees: float | None = None,
+    ) -> PoseTarget:
+        """The pose of ``state`` turned by ``angle`` [rad] or ``degrees`` about ``axis`` through its point o.
+
+        Raises:
+            ParameterError: both angles are given, or none.
+            NonFiniteError: the angle is NaN or infinite.
+        """
+        if (angle is None) == (degrees is None):
+            raise ParameterError("angle, degrees", (angle, degrees), "one of the two")
+        angle = math.radians(degrees) if angle is None else angle  # type: ignore[arg-type]
         if not torch.isfinite(torch.as_tensor(angle)):
             raise NonFiniteError("angle")
         axis = axis / torch.linalg.vector_norm(axis)
@@ -64,6 +80,15 @@ class FocusedPose:
     @property
     def n_x(self) -> int:
         return self.matrix.shape[0]
+
+    def error(self, target: PoseTarget, state: GraspState) -> float:
+        """``|M_c e|``, e the twist from the state to the target [unit of the focus]."""
+        return float(torch.linalg.vector_norm(self.matrix @ target.error(state)))
+
+    def off_rotation(self, increment: Float[Tensor, " n_s"]) -> float:
+        """Rotation off the focus in an increment [rad]."""
+        rows = self.off_matrix[self.off_matrix[:, 3:].abs().sum(-1) > 0]
+        return float(torch.linalg.vector_norm(rows @ increment[-6:]))
 
 
 def _complement(matrix: Tensor, block: slice) -> Tensor:

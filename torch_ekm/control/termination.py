@@ -34,14 +34,14 @@ class StoppingRule:
       ``off_limit`` [rad]: it is dislocated, and no small step brings it back.
     """
 
-    tolerance: float
+    tolerance: float = math.radians(0.25)
     """[unit of the focused pose: rad for a rotation]"""
     settle_steps: int = 2
     stall_window: int = 12
-    stall_progress: float = 1e-3
+    stall_progress: float = math.radians(0.1)
     """[same unit]"""
     max_steps: int = 60
-    off_limit: float = 30 * math.pi / 180
+    off_limit: float = math.radians(30.0)
 
     def __post_init__(self) -> None:
         for name in ("tolerance", "settle_steps", "stall_window", "max_steps", "off_limit"):

@@ -32,6 +32,8 @@ class Actuator:
     """True: it can only pull (tension ``-lam >= 0``); False: a looped cable, both directions."""
     stiffness: float = np.inf
     """Series stiffness of tendon and servo [N m/rad]; infinite: rigid."""
+    posture: bool = False
+    """True: it shapes the hand before a grasp; a controller leaves it alone while something is held."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,17 @@ from .urdf import UrdfModel
 TABLES = ("hand", "joints", "actuators", "couplings", "pads", "hall_sensors", "notes")
 HAND = ("name", "base_link", "planar_normal", "gravity")
 JOINT = ("spring", "rest", "rest_deg", "friction")
-ACTUATOR = ("name", "range", "range_deg", "offset", "offset_deg", "moment_arms", "tendon", "stiffness")
+ACTUATOR = (
+    "name",
+    "range",
+    "range_deg",
+    "offset",
+    "offset_deg",
+    "moment_arms",
+    "tendon",
+    "stiffness",
+    "posture",
+)
 COUPLING = ("name", "joints")
 PAD = ("name", "link", "start", "end", "radius", "direction", "torsional_friction")
 HALL = ("joint", "channel", "open", "closed")
@@ -106,6 +116,7 @@ def _actuator(path: Path, place: str, data: Any) -> tuple[Actuator, dict[str, fl
         offset=table.angle("offset", 0.0),
         tendon=table.flag("tendon", False),
         stiffness=table.number("stiffness", np.inf, positive=True),
+        posture=table.flag("posture", False),
     )
     return actuator, table.weights("moment_arms")
 

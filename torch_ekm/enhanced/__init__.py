@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from .encoding import GraspEncoding as GraspEncoding
 from .enhanced_model import EnhancedModel as EnhancedModel
+from .grasp_learner import grasp_learner as grasp_learner
 
 __all__ = [
     "EnhancedModel",
     "GraspEncoding",
+    "grasp_learner",
 ]

@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+from typing import Any, Protocol
+
 import torch
 
 from ..exceptions import ParameterError, UnknownNameError
 from ..kinematics.grasp_state import GraspState
 from ..typing import Float, Tensor
+
+
+class GraspModel(Protocol):
+    """What an encoding asks of a kinematic model."""
+
+    hand: Any
+    link_names: tuple[str, ...]
+    kinematics: Any
+
+    def contacts(self, state: GraspState) -> Any:
+        """Contacts at a state, with the name of each contact's ``link``."""
+        ...
+
+    def __call__(self, state: GraspState, delta_a: Tensor) -> Tensor:
+        """f(s, da)."""
+        ...
 
 
 class GraspEncoding:
@@ -44,6 +62,20 @@ class GraspEncoding:
                 raise UnknownNameError("joint index", str(joint), [f"0..{n_q - 1}"])
         self.reference, self.joints = reference, joints
         self.q_scale, self.position_scale, self.rotation_scale = q_scale, position_scale, rotation_scale
+
+    @classmethod
+    def of(cls, model: GraspModel, state: GraspState) -> GraspEncoding:
+        """About ``state``, with the joints that can move a finger which touches the object.
+
+        Raises:
+            NoContactError: nothing touches the object.
+        """
+        hand = model.hand
+        moved = torch.zeros(hand.n_q, dtype=torch.bool)
+        for link in model.contacts(state).link:
+            moved |= model.kinematics.upstream[model.link_names.index(link)]
+        free = torch.from_numpy(hand.joint_upper > hand.joint_lower)
+        return cls(state, torch.nonzero(moved & free).flatten().tolist())
 
     @property
     def n_features(self) -> int:

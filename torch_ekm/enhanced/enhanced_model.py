@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
@@ -10,9 +11,12 @@ from torch import nn
 from torch.func import jacrev
 
 from ..exceptions import NonFiniteError, ShapeError
+from ..kinematics import GraspState
 from ..residual.base import ResidualLearner, UpdateReport
 from ..typing import Float, Tensor
 from .action_variance import Quadratic, action_variance
+from .encoding import GraspEncoding, GraspModel
+from .grasp_learner import grasp_learner
 
 
 @runtime_checkable
@@ -66,6 +70,38 @@ class EnhancedModel(nn.Module):
         self.outputs = outputs
         self.action_scale = action_scale
         self.register_buffer("output_scale", torch.as_tensor(output_scale))
+
+    @classmethod
+    def for_grasp(
+        cls,
+        model: GraspModel,
+        state: GraspState,
+        learner: ResidualLearner | Callable[[int, int], ResidualLearner] | None = None,
+        encode: GraspEncoding | None = None,
+    ) -> EnhancedModel:
+        """An E-KM of a grasped object, with nothing learned yet.
+
+        g corrects the object's six rows in mm and deg. It sees the joints of the fingers that touch and the
+        object's pose, relative to ``state``, and the increments in units of 2 deg.
+
+        Args:
+            model: kinematic model of hand and object.
+            state: of the grasp at the start.
+            learner: of ``[encode(s); da]``, or ``learner(n_s, n_a)`` that makes one for ``n_s`` features of
+                the state and ``n_a`` actuators; None: :func:`~torch_ekm.enhanced.grasp_learner`.
+            encode: what it sees of a state; None: of this grasp.
+
+        Raises:
+            NoContactError: nothing touches the object.
+        """
+        n_q, n_a = state.q.shape[-1], model.hand.n_a
+        encode = GraspEncoding.of(model, state) if encode is None else encode
+        if not isinstance(learner, ResidualLearner):
+            learner = (grasp_learner if learner is None else learner)(encode.n_features, n_a)
+        scale = torch.tensor([1e3] * 3 + [180 / math.pi] * 3, dtype=state.q.dtype)  # m -> mm, rad -> deg
+        rows = list(range(n_q, n_q + 6))
+        step = math.radians(2.0)
+        return cls(model, learner, encode=encode, outputs=rows, action_scale=1 / step, output_scale=scale)
 
     def features(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_x"]:
         """``x = [encode(s); action_scale * da]``."""

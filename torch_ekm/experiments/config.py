@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from ..control import ControllerOptions, StoppingRule
-from ..description import HandDescription, hand_files, list_hands, load_hand, object_files
+from ..description import hand_files, list_hands, object_files
 from ..exceptions import ParameterError, UnknownNameError
 from ..model import ModelOptions
 from ..simulation import PlantConfig, PlantParameters, preset
 from .learners import DEFAULT_LEARNER, LEARNERS, learner_figures
-from .protocols.demo import fixed_actuators
 
 _DEG = math.pi / 180
 
@@ -86,16 +85,13 @@ class Setting:
         """The kinematic model's."""
         return _changed(ModelOptions(), "model", self.model)
 
-    def controller_options(self, hand: HandDescription) -> ControllerOptions:
+    def controller_options(self) -> ControllerOptions:
         """The same for every controller."""
-        options = ControllerOptions(fixed_actuators=fixed_actuators(hand))
-        return _changed(options, "control", self.control)
+        return _changed(ControllerOptions(), "control", self.control)
 
     def stopping_rule(self) -> StoppingRule:
         """The same for every controller."""
-        return StoppingRule(
-            tolerance=self.tolerance_deg * _DEG, stall_progress=0.1 * _DEG, max_steps=self.max_steps
-        )
+        return StoppingRule(tolerance=self.tolerance_deg * _DEG, max_steps=self.max_steps)
 
     def figures(self) -> dict[str, Any]:
         """All figures of plant, model, controller, stopping rule and learner, defaults included."""
@@ -103,7 +99,7 @@ class Setting:
             "plant": self.parameters(),
             "plant_config": self.plant_config("KM"),
             "model": self.model_options(),
-            "controller": self.controller_options(load_hand(self.hand)),
+            "controller": self.controller_options(),
             "stopping_rule": self.stopping_rule(),
         }
         figures = {name: dataclasses.asdict(part) for name, part in parts.items()}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..control import Decision, FocusedPose, LookAndMoveController, PoseTarget
+from ..control import ClosedLoop, LookAndMoveController, Manipulation, PoseTarget
 from ..description import ObjectDescription
 from ..enhanced import EnhancedModel, GraspEncoding
 from ..exceptions import EquilibriumError, GraspError
@@ -22,8 +22,8 @@ from ..residual import ResidualLearner
 from ..simulation import Change, DisturbedPlant, SimulatedHand, Tug
 from .camera_off import CameraOff
 from .config import Setting
-from .learners import enhance, make_encoding, make_learner
-from .manipulation import Manipulation, run_manipulation, state_of
+from .learners import make_learner
+from .reporting.metrics import prediction_error
 
 Record = dict[str, Any]
 _DEG = math.pi / 180
@@ -86,7 +86,7 @@ class Bench:
         for attempt in range(_TRIES):
             drawn = int(np.random.SeedSequence([seed, trial, attempt]).generate_state(1)[0])
             try:
-                start = state_of(self.plant.reset(drawn))
+                start = self.plant.reset(drawn).state
             except (EquilibriumError, GraspError) as error:
                 self.no_grasp = str(error)
                 continue
@@ -138,19 +138,12 @@ class Bench:
         )
         axis = self.hand.rotation_axis
         target = PoseTarget.turned(start, axis, angle_deg * _DEG)
-        loop = self._controller(axis)
-        plant = CameraOff(self.plant, target, axis, blind_deg * _DEG) if blind_deg else self.plant
-        notes: list[tuple[GraspState, Decision]] = []
-
-        def note(seen: Observation, decision: Decision) -> None:
-            notes.append((_true_state(seen), decision))
-            if isinstance(plant, CameraOff):
-                plant.expect(decision)
-
-        done = run_manipulation(
-            plant, loop, target, self.setting.stopping_rule(), learn=learn and self.learns, on_step=note
-        )
-        return {**about, **_record(done, notes, axis, self.learns)}
+        controller, plant = self._controller(axis), self.plant
+        if blind_deg:
+            model = self.model if self.enhanced is None else self.enhanced
+            plant = CameraOff(plant, model, target, axis, blind_deg * _DEG)
+        done = ClosedLoop(plant, controller, self.setting.stopping_rule(), learn=learn).run(target)
+        return {**about, **record_of(done, axis, self.learns)}
 
     def long_step(self, seed: int, trial: int, step_deg: float = 5.0) -> Record:
         """One step of ``step_deg`` from a fresh grasp: how far from it does the object come to rest?
@@ -166,7 +159,7 @@ class Bench:
         seen = self.plant.observe()
         before = _true_state(seen)
         target = PoseTarget.turned(start, axis, step_deg * _DEG)
-        decision = loop.decide(state_of(seen), seen.a, target, seen.fingertip_force)
+        decision = loop.decide(seen.state, seen.a, target, seen.fingertip_force)
         seen = self.plant.command(decision.delta_a)
         turned = _true_state(seen).minus(before)[-3:] @ axis
         lost = seen.status is PlantStatus.LOST
@@ -178,14 +171,14 @@ class Bench:
         self.plant.close()
 
     def _controller(self, axis: torch.Tensor, **changes: Any) -> LookAndMoveController:
-        options = dataclasses.replace(self.setting.controller_options(self.hand.hand), **changes)
+        options = dataclasses.replace(self.setting.controller_options(), **changes)
         model = self.enhanced if self.enhanced is not None else self.model
-        return LookAndMoveController(model, FocusedPose.rotation_about(axis), options)
+        return LookAndMoveController(model, axis, options)
 
     def _prepare_learner(self, start: GraspState) -> None:
         setting = self.setting
         if self.encoding is None:
-            self.encoding = make_encoding(self.model, start)
+            self.encoding = GraspEncoding.of(self.model, start)
         if self.learner is None:
             self.learner = make_learner(
                 setting.learner,
@@ -194,13 +187,13 @@ class Bench:
                 setting.capacity,
                 **setting.learner_options,
             )
-        self.enhanced = enhance(self.model, self.learner, self.encoding)
+        self.enhanced = EnhancedModel.for_grasp(self.model, start, self.learner, self.encoding)
 
 
 def _sensed(
     plant: DisturbedPlant, simulated: SimulatedHand, stuck: tuple[str, ...], keep_images: bool
 ) -> Plant:
-    from ..sensing import TouchAligned  # OpenCV is needed only here
+    from ..sensing import ContactAligned  # OpenCV is needed only here
     from ..simulation import HallSensors, SensedPlant, Stuck
 
     hand = simulated.hand
@@ -208,27 +201,28 @@ def _sensed(
     sensed = SensedPlant(plant, hand, simulated.object, hall=hall, keep_images=keep_images)
     if hall is not None:  # after the calibration: a channel that was dead by then would not be believed
         hall.stuck = [Stuck.FROZEN if joint in stuck else Stuck.NO for joint in hall.joints]
-    return sensed if hall is None else TouchAligned(sensed, hand, simulated.object)
+    return sensed if hall is None else ContactAligned(sensed, hand, simulated.object)
 
 
 def _true_state(observation: Observation) -> GraspState:
-    truth = observation.info["truth"]
-    return GraspState(truth["q"], truth["position"], truth["rotation"])
+    assert observation.truth is not None  # a simulated hand tells
+    return observation.truth.state
 
 
-def _record(
-    done: Manipulation, notes: list[tuple[GraspState, Decision]], axis: torch.Tensor, learns: bool
-) -> Record:
-    steps = done.steps
-    measured = [step.error for step in steps] + [done.steady_state_error]
-    asked = [float(torch.linalg.vector_norm(decision.desired)) for _, decision in notes]
+def record_of(done: Manipulation, axis: torch.Tensor, learns: bool) -> Record:
+    """Plain figures of one manipulation in a simulated hand; angles [deg]."""
+    steps, focus, measured = done.steps, done.focus, done.errors
+    asked = [float(torch.linalg.vector_norm(step.decision.desired)) for step in steps]
     # how much of a step was missing: |e| should have fallen by what was asked for
     short = [abs(measured[k + 1] - (measured[k] - asked[k])) for k in range(len(steps))]
     moving = [s for s, a in zip(short, asked, strict=False) if a >= _MOVING]
-    truth = [state for state, _ in notes]
-    if done.final is not None:
-        truth.append(_true_state(done.final))
+    truth = [_true_state(seen) for seen in (*(step.before for step in steps), done.stop.final)]
     turned = [axis @ after.minus(before)[-3:] for before, after in pairwise(truth)]
+
+    def errors_of(predictions: list[torch.Tensor]) -> list[float]:
+        pairs = zip(steps, predictions, strict=True)
+        errors = [prediction_error(step.increment, predicted, focus.matrix) for step, predicted in pairs]
+        return [float(torch.linalg.vector_norm(error)) / _DEG for error in errors]
 
     def true_errors(predictions: list[torch.Tensor]) -> list[float]:
         pairs = zip(turned, predictions, strict=True)
@@ -237,21 +231,23 @@ def _record(
     return {
         "grasped": True,
         "reason": done.reason.value,
-        "message": done.message,
+        "message": done.stop.message,
         "lost": done.lost,
-        "steady_state_error_deg": done.steady_state_error / _DEG,
-        "true_error_deg": None if done.true_error is None else done.true_error / _DEG,
+        "steady_state_error_deg": measured[-1] / _DEG,
+        "true_error_deg": focus.error(done.target, truth[-1]) / _DEG,
         "steps": len(steps),
         "errors_deg": [error / _DEG for error in measured],
         "first_step_deg": short[0] / _DEG if short else None,
         "step_error_deg": float(np.mean(moving)) / _DEG if moving else None,
-        "prediction_km_deg": [step.prediction_error_km / _DEG for step in steps],
-        "prediction_ekm_deg": [
-            None if step.prediction_error_ekm is None else step.prediction_error_ekm / _DEG for step in steps
-        ],
+        "prediction_km_deg": errors_of([step.decision.nominal for step in steps]),
+        "prediction_ekm_deg": (
+            errors_of([step.decision.predicted for step in steps]) if learns else [None] * len(steps)
+        ),
         # the same against the plant's truth, free of the camera's noise
-        "true_prediction_km_deg": true_errors([decision.nominal for _, decision in notes]),
-        "true_prediction_ekm_deg": true_errors([d.predicted for _, d in notes]) if learns else [],
-        "off_rotation_deg": steps[-1].off_rotation / _DEG if steps else 0.0,
+        "true_prediction_km_deg": true_errors([step.decision.nominal for step in steps]),
+        "true_prediction_ekm_deg": true_errors([step.decision.predicted for step in steps]) if learns else [],
+        "off_rotation_deg": (
+            focus.off_rotation(done.stop.final.state.minus(steps[0].before.state)) / _DEG if steps else 0.0
+        ),
         "seconds": [step.seconds for step in steps],
     }

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from .plant import Observation as Observation
+from .observation import Observation as Observation
+from .observation import PlantStatus as PlantStatus
+from .observation import Truth as Truth
 from .plant import Plant as Plant
-from .plant import PlantStatus as PlantStatus
 from .recording_plant import RecordingPlant as RecordingPlant
 from .replayed_plant import ReplayedPlant as ReplayedPlant
 from .trajectory import Recording as Recording
 from .trial_log import TrialEntry as TrialEntry
 from .trial_log import TrialLog as TrialLog
+from .wrapper import PlantWrapper as PlantWrapper
 
 __all__ = [
     "Observation",
     "Plant",
     "PlantStatus",
+    "PlantWrapper",
     "Recording",
     "RecordingPlant",
     "ReplayedPlant",
+    "Truth",
     "TrialEntry",
     "TrialLog",
 ]

@@ -7,12 +7,14 @@ import dataclasses
 import torch
 
 from ..typing import Float, Tensor
-from .plant import Observation, Plant
+from .observation import Observation
+from .plant import Plant
 from .trajectory import Recording
+from .wrapper import PlantWrapper
 
 
-class RecordingPlant:
-    """Passes everything on to a plant and remembers it in ``recording``; implements :class:`Plant`.
+class RecordingPlant(PlantWrapper):
+    """Passes everything on to a plant and remembers it in ``recording``, which outlives the plant.
 
     With a :class:`~torch_ekm.plant.TrialLog` each trial is kept::
 
@@ -24,7 +26,7 @@ class RecordingPlant:
     """
 
     def __init__(self, plant: Plant) -> None:
-        self.plant = plant
+        super().__init__(plant)
         self.recording = Recording()
 
     def reset(self, seed: int) -> Observation:
@@ -50,7 +52,3 @@ class RecordingPlant:
         self.recording.commands.append(torch.as_tensor(delta_a).detach().cpu().double().clone())
         self.recording.observations.append(observation)
         return observation
-
-    def close(self) -> None:
-        """Close the plant; the recording stays."""
-        self.plant.close()

@@ -6,7 +6,7 @@ import dataclasses
 
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
-from .plant import Observation
+from .observation import Observation
 from .trajectory import Recording
 
 

@@ -15,18 +15,19 @@ import torch
 from .._extras import require
 from ..exceptions import DescriptionError, ParameterError
 from ..typing import Tensor
-from .plant import Observation, PlantStatus
+from .observation import Observation, PlantStatus, Truth
 
 FORMAT = "torch_ekm trial 1"
 _FIELDS = ("q", "a", "position", "rotation", "fingertip_force")
-_GROUPS = ("truth", "raw", "estimate")  # what is kept of Observation.info, and "events"
+_TRUTH = ("q", "position", "rotation", "fingertip_force", "actuator_torque")
+_GROUPS = ("raw", "estimate")  # what is kept of Observation.info, and "events"
 
 
 @dataclass
 class Recording:
     """Commands and observations of one grasp: ``n`` commands, ``n + 1`` observations.
 
-    Of ``Observation.info`` it keeps the named arrays in "truth", "raw" (readings: Hall counts, marker
+    Beside readings and truth it keeps of ``Observation.info`` the named arrays in "raw" (Hall counts, marker
     corners, perhaps images) and "estimate" (what else was estimated, such as covariances), and what
     is in "events", as text.
     """
@@ -84,9 +85,10 @@ class Recording:
                 commands = list(torch.from_numpy(file["commands"][()]))
                 info = {
                     group: {name: torch.from_numpy(item[()]) for name, item in file[group].items()}
-                    for group in _GROUPS
+                    for group in ("truth", *_GROUPS)
                     if group in file
                 }
+                truth = info.pop("truth", None)
             observations = []
             for k, time in enumerate(times):
                 more: dict[str, Any] = {
@@ -95,7 +97,13 @@ class Recording:
                 }
                 more |= {"events": tuple(events[k])} if events[k] else {}
                 sensors = (data[name][k] for name in _FIELDS)
-                observations.append(Observation(*sensors, time=time, status=status[k], info=more))
+                told = (
+                    None
+                    if truth is None
+                    else Truth(**{name: truth[name][k] for name in _TRUTH if name in truth})
+                )  # type: ignore[arg-type]
+                seen = Observation(*sensors, time=time, status=status[k], info=more, truth=told)
+                observations.append(seen)
         except DescriptionError:
             raise
         except Exception as error:  # a damaged file fails in any way that HDF5 can think of
@@ -115,14 +123,22 @@ class Recording:
             ),
         }
         arrays |= {name: _stack(name, [getattr(o, name) for o in seen]) for name in _FIELDS}
-        for group in _GROUPS:
-            named = [o.info.get(group, {}) for o in seen]
+        for group in ("truth", *_GROUPS):
+            named = [_told(o) if group == "truth" else o.info.get(group, {}) for o in seen]
             for name in sorted({name for values in named for name in values}):
                 place = f"{group}/{name}"
                 if not all(name in values for values in named):
                     raise ParameterError(place, "missing in some observations", "there in all, or in none")
                 arrays[place] = _stack(place, [values[name] for values in named])
         return arrays
+
+
+def _told(seen: Observation) -> dict[str, Tensor]:
+    """The truth's arrays by name; none of an observation without one."""
+    if seen.truth is None:
+        return {}
+    arrays = {name: getattr(seen.truth, name) for name in _TRUTH}
+    return {name: value for name, value in arrays.items() if value is not None}
 
 
 def _stack(name: str, values: list[Any]) -> np.ndarray:

@@ -2,12 +2,12 @@
 
 Vision: an image source gives frames, :class:`MarkerTracker` turns them into the object's pose in the hand
 frame. Hall sensors: :class:`HallCalibration` turns counts into angles, :class:`JointEstimator` joins them
-with the encoders, :class:`TouchAligned` corrects the joints that no sensor reads. The same code serves
+with the encoders, :class:`ContactAligned` corrects the joints that no sensor reads. The same code serves
 simulated and real readings."""
 
 from __future__ import annotations
 
-from .contact_alignment import TouchAligned as TouchAligned
+from .contact_alignment import ContactAligned as ContactAligned
 from .hall.calibration import HallCalibration as HallCalibration
 from .hall.calibration import HallEstimate as HallEstimate
 from .hall.channel import HallChannel as HallChannel
@@ -47,7 +47,7 @@ __all__ = [
     "MarkerTracker",
     "PinholeCamera",
     "StreamOptions",
-    "TouchAligned",
+    "ContactAligned",
     "Track",
     "TrackStatus",
     "TrackerOptions",

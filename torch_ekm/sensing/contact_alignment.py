@@ -10,8 +10,7 @@ import torch
 from ..contact.detector import ContactDetector
 from ..description import HandDescription, ObjectDescription
 from ..kinematics import HandKinematics
-from ..plant import Observation, Plant
-from ..typing import Float, Tensor
+from ..plant import Observation, Plant, PlantWrapper
 
 _STEP = math.radians(2.0)
 _LIMIT = math.radians(25.0)
@@ -20,7 +19,7 @@ _ITERATIONS = 4
 _CLOSED = 5e-5  # [m]
 
 
-class TouchAligned:
+class ContactAligned(PlantWrapper):
     """``gap_i(q + delta_u e_u) = 0`` for each pad i that feels a force, u its joint without a Hall sensor.
 
     The angle of such a joint is known from the motor's encoder alone, through a tendon with another
@@ -38,7 +37,8 @@ class TouchAligned:
     def __init__(
         self, plant: Plant, hand: HandDescription, obj: ObjectDescription, least_force: float = 0.5
     ) -> None:
-        self.plant, self.hand, self.least_force = plant, hand, least_force
+        super().__init__(plant)
+        self.hand, self.least_force = hand, least_force
         self._detector = ContactDetector(hand, obj, margin=math.inf)
         kinematics = HandKinematics(hand)
         sensed = {sensor.joint for sensor in hand.hall_sensors}
@@ -57,21 +57,10 @@ class TouchAligned:
     def reset(self, seed: int) -> Observation:
         """Grasp anew."""
         self._delta.zero_()
-        return self._aligned(self.plant.reset(seed))
+        return super().reset(seed)
 
-    def observe(self) -> Observation:
-        """Read the sensors."""
-        return self._aligned(self.plant.observe())
-
-    def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
-        """Move the actuators by ``delta_a`` [rad], wait, read the sensors."""
-        return self._aligned(self.plant.command(delta_a))
-
-    def close(self) -> None:
-        """Give back what the plant holds."""
-        self.plant.close()
-
-    def _aligned(self, seen: Observation) -> Observation:
+    def observation(self, seen: Observation) -> Observation:
+        """``seen`` with joints that agree with the contacts."""
         for i, pad in enumerate(self.hand.pads):
             if float(seen.fingertip_force[i]) >= self.least_force:
                 for j in self._joints[i]:

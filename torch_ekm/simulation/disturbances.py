@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..exceptions import ParameterError
-from ..plant.plant import Observation
+from ..plant import Observation, PlantWrapper
 from ..typing import Float, Tensor
 from .simulated_hand import SimulatedHand
 
@@ -48,9 +48,8 @@ class Tug:
         plant.tug(np.array(self.force), np.array(self.torque), self.duration)
 
 
-@dataclass
-class DisturbedPlant:
-    """A simulated hand to which things happen at given commands; implements :class:`Plant`.
+class DisturbedPlant(PlantWrapper):
+    """A simulated hand to which things happen at given commands.
 
     Commands are counted from construction on, across resets, since a worn tendon stays worn.
     Each observation names what happened just before it in ``info["events"]``.
@@ -60,23 +59,15 @@ class DisturbedPlant:
     """
 
     plant: SimulatedHand
-    events: Iterable[Change | Tug] = ()
-    count: int = field(default=0, init=False)
-    """Commands given so far."""
 
-    def __post_init__(self) -> None:
-        self.events = tuple(sorted(self.events, key=lambda event: event.at))
+    def __init__(self, plant: SimulatedHand, events: Iterable[Change | Tug] = ()) -> None:
+        super().__init__(plant)
+        self.events = tuple(sorted(events, key=lambda event: event.at))
+        self.count = 0
+        """Commands given so far."""
         for event in self.events:
             if event.at < 0:
                 raise ParameterError("event.at", event.at, "0 or more")
-
-    def reset(self, seed: int) -> Observation:
-        """Grasp the object anew."""
-        return self.plant.reset(seed)
-
-    def observe(self) -> Observation:
-        """Read the sensors."""
-        return self.plant.observe()
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Let happen what is due, then move the actuators by ``delta_a`` [rad] and read the sensors."""
@@ -88,7 +79,3 @@ class DisturbedPlant:
         if due:
             observation.info["events"] = tuple(due)
         return observation
-
-    def close(self) -> None:
-        """Give back what the plant holds."""
-        self.plant.close()

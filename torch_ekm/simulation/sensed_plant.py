@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..description import HandDescription, ObjectDescription
 from ..exceptions import ObjectLostError, ParameterError
-from ..plant.plant import Observation, Plant, PlantStatus
+from ..plant import Observation, Plant, PlantStatus, PlantWrapper, Truth
 from ..sensing.hall.calibration import HallCalibration
 from ..sensing.joint_estimator import JointEstimator
 from ..sensing.vision.board import MarkerBoard
@@ -28,12 +28,12 @@ from .imaging.simulated_video import SimulatedVideo
 ICUB_PALM_MOUNT = np.array([[1.0, 0, 0, -0.048], [0, 1, 0, 0], [0, 0, 1, 0.004], [0, 0, 0, 1]])
 
 
-class SensedPlant:
-    """Observations through images and Hall counts instead of the truth; implements :class:`Plant`.
+class SensedPlant(PlantWrapper):
+    """Observations through images and Hall counts instead of the truth.
 
-    The inner plant moves; its ``info["truth"]`` (``q``, ``position``, ``rotation``) is read by Hall sensors,
-    and drawn by a camera: as it is, or as it was when the picture was taken where the inner plant tells
-    (``info["picture"]``, ``PlantParameters.latency``). Only what :class:`MarkerTracker` and
+    The inner plant moves; its ``Observation.truth`` is read by Hall sensors, and drawn by a camera: as it
+    is, or as it was when the picture was taken where the inner plant tells (``Truth.pictured``,
+    ``PlantParameters.latency``). Only what :class:`MarkerTracker` and
     :class:`JointEstimator` make of that is passed on. Up to ``looks`` frames are tried until one shows
     both boards; if none does, the last pose is repeated with the status NOT_SEEN. Where the inner plant
     does not see its object, something hides it in the pictures.
@@ -57,7 +57,7 @@ class SensedPlant:
         keep_images: the last image of an observation stays in ``info["raw"]["image"]``.
 
     Raises:
-        ParameterError: ``looks`` is less than 1.
+        ParameterError: ``looks`` is less than 1, or the inner plant tells no truth.
     """
 
     def __init__(
@@ -77,7 +77,8 @@ class SensedPlant:
     ) -> None:
         if looks < 1:
             raise ParameterError("looks", looks, "1 or more")
-        self.plant, self.hand, self.object, self.looks, self.distance = plant, hand, obj, looks, distance
+        super().__init__(plant)
+        self.hand, self.object, self.looks, self.distance = hand, obj, looks, distance
         self.keep_images = keep_images
         self.camera, self.stream = camera or SimulatedCamera(), stream or StreamOptions()
         palm = MarkerBoard(0) if tracker is None else tracker.palm_board
@@ -104,9 +105,9 @@ class SensedPlant:
             ObjectLostError: none of the looks showed both boards.
         """
         observation = self.plant.reset(seed)
-        truth = observation.info["truth"]
+        truth = _truth_of(observation)
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = truth["rotation"], truth["position"]
+        pose[:3, :3], pose[:3, 3] = truth.rotation, truth.position
         palm, board = self.boards
         camera_pose = GraspView.facing(palm.mount, pose @ board.mount, self.distance)
         self._view = GraspView(self.hand, self.object, palm, board, camera_pose)
@@ -116,29 +117,19 @@ class SensedPlant:
         self._generator.manual_seed(own)
         self._frames, self._last = 0, None
         self.tracker.reset()
-        return self._sensed(observation)
+        return self.observation(observation)
 
-    def observe(self) -> Observation:
-        """Read the sensors."""
-        return self._sensed(self.plant.observe())
-
-    def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
-        """Move the actuators by ``delta_a`` [rad], wait, read the sensors."""
-        return self._sensed(self.plant.command(delta_a))
-
-    def close(self) -> None:
-        self.plant.close()
-
-    def _sensed(self, observation: Observation) -> Observation:
+    def observation(self, seen: Observation) -> Observation:
+        """``seen`` with what camera and Hall sensors make of its truth in place of the readings."""
         if self._view is None:
             raise ParameterError("SensedPlant", "not started", "reset with reset(seed) first")
-        truth = observation.info["truth"]
-        shown = observation.info.get("picture", truth)
-        self._scene: Scene = self._view.scene(shown["q"], shown["position"], shown["rotation"])
-        if observation.status is PlantStatus.NOT_SEEN:
+        truth = _truth_of(seen)
+        shown = truth.state if truth.pictured is None else truth.pictured
+        self._scene: Scene = self._view.scene(shown.q, shown.position, shown.rotation)
+        if seen.status is PlantStatus.NOT_SEEN:
             self._scene = self._scene.obstructed(1)
         track, image = self._look()
-        status = observation.status
+        status = seen.status
         if track.ok:
             self._last = track.pose()
         elif self._last is None:
@@ -148,19 +139,17 @@ class SensedPlant:
             )
         elif status is PlantStatus.HELD:
             status = PlantStatus.NOT_SEEN
-        q, raw = observation.q, {"corners": self._corners(track)}
+        q, raw = seen.q, {"corners": self._corners(track)}
         if self.keep_images:
             raw["image"] = torch.from_numpy(image)
         if self.hall is not None and self.joints is not None:
-            raw["hall"] = self.hall.read(truth["q"], self._generator)
-            q = self.joints(raw["hall"], observation.a).q
+            raw["hall"] = self.hall.read(truth.q, self._generator)
+            q = self.joints(raw["hall"], seen.a).q
         unknown = torch.full((6, 6), torch.nan, dtype=torch.float64)
         estimate = {"pose_covariance": unknown if track.covariance is None else track.covariance}
         position, rotation = self._last
-        info = {**observation.info, "track": track, "raw": raw, "estimate": estimate}
-        return dataclasses.replace(
-            observation, q=q, position=position, rotation=rotation, status=status, info=info
-        )
+        info = {**seen.info, "track": track, "raw": raw, "estimate": estimate}
+        return dataclasses.replace(seen, q=q, position=position, rotation=rotation, status=status, info=info)
 
     def _look(self) -> tuple[Track, NDArray[np.uint8]]:
         """The first frame that shows both boards, or the last one tried; a dropped frame is black."""
@@ -181,3 +170,9 @@ class SensedPlant:
         ids = [number for board in self.boards for number in board.ids]
         missing = np.full((4, 2), np.nan)
         return torch.from_numpy(np.stack([track.markers.get(number, missing) for number in ids]))
+
+
+def _truth_of(seen: Observation) -> Truth:
+    if seen.truth is None:
+        raise ParameterError("Observation.truth", None, "that of a simulation: there is nothing to draw")
+    return seen.truth

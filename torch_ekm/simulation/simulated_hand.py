@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +11,8 @@ from numpy.typing import NDArray
 
 from ..description import HandDescription, ObjectDescription, load_hand, load_object
 from ..exceptions import EquilibriumError, GraspError, ParameterError
-from ..plant.plant import Observation, PlantStatus
+from ..kinematics import GraspState
+from ..plant import Observation, PlantStatus, Truth
 from ..typing import Float, Tensor
 from .config import PlantConfig
 from .grasp_planning.pinch import PinchPlan
@@ -46,9 +46,8 @@ class SimulatedHand:
         observation = plant.reset(seed=0)
         observation = plant.command(delta_a)
 
-    Everything is in the hand frame, SI units. ``observation.info["truth"]`` is for reports; a
-    controller that reads it cheats. ``info["picture"]`` is the same at the moment of the newest picture,
-    for a camera to draw. The same seed gives the same run, bit by bit.
+    Everything is in the hand frame, SI units. ``observation.truth`` is for reports and for
+    sensors that are simulated. The same seed gives the same run, bit by bit.
 
     Args:
         hand: a description, or the name or path that :func:`load_hand` takes.
@@ -131,13 +130,14 @@ class SimulatedHand:
         force = self._sensors.forces(rig.normal, draw)
         if not seen and status is PlantStatus.HELD:
             status = PlantStatus.NOT_SEEN
-        truth = {
-            "q": q,
-            "position": position,
-            "rotation": rotation,
-            "fingertip_force": rig.normal.copy(),
-            "actuator_torque": rig.transmission.actuator_torque(q, rig.servo.output),
-        }
+        truth = (
+            q,
+            position,
+            rotation,
+            rig.normal.copy(),
+            rig.transmission.actuator_torque(q, rig.servo.output),
+        )
+        pictured = GraspState(*_tensors(picture.q, picture.position, picture.rotation))
         return Observation(
             q=torch.from_numpy(joints),
             a=torch.from_numpy(rig.servo.encoder),
@@ -146,7 +146,7 @@ class SimulatedHand:
             fingertip_force=torch.from_numpy(force),
             time=rig.time,
             status=status,
-            info={"truth": _tensors(truth), "picture": _tensors(picture._asdict())},
+            truth=Truth(*_tensors(*truth), pictured=pictured),
         )
 
     def close(self) -> None:
@@ -284,8 +284,8 @@ class SimulatedHand:
         )
 
 
-def _tensors(arrays: Mapping[str, Any]) -> dict[str, Tensor]:
-    return {name: torch.from_numpy(np.asarray(value)) for name, value in arrays.items()}
+def _tensors(*arrays: Array) -> list[Tensor]:
+    return [torch.from_numpy(np.asarray(value)) for value in arrays]
 
 
 def _tilted(gravity: Gravity, angle: float, turn: float) -> Gravity:

@@ -8,22 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from ...control import (
-    ControllerOptions,
-    Decision,
-    FocusedPose,
-    LookAndMoveController,
-    PoseTarget,
-    StoppingRule,
-)
-from ...kinematics import GraspState
+from ...control import ClosedLoop, LookAndMoveController, PoseTarget, StoppingRule
+from ...enhanced import EnhancedModel
 from ...model import KinematicModel
-from ...plant import Observation
 from ...simulation import Change, DisturbedPlant, PlantParameters, SimulatedHand
-from ...typing import Tensor
-from ..learners import make_enhanced
-from ..manipulation import run_manipulation, state_of
-from ..protocols.demo import fixed_actuators
 from .recording import Recording
 
 _DEG = math.pi / 180
@@ -56,29 +44,20 @@ def record_simulated_hand(
     events = [] if new_moment_arm is None else [Change.new_tendons(n // 2, new_moment_arm)]
     disturbed = DisturbedPlant(plant, events)
     model = KinematicModel(plant.hand, plant.object)
-    rule = StoppingRule(tolerance=0.25 * _DEG, stall_progress=0.1 * _DEG, max_steps=10)
+    rule = StoppingRule(max_steps=10)
     enhanced, x, y, segments = None, [], [], []
     while len(x) < n:
-        start = state_of(disturbed.reset(seed + len(segments)))
-        enhanced = make_enhanced(model, start, 1) if enhanced is None else enhanced
-        controller = LookAndMoveController(
-            model,
-            FocusedPose.rotation_about(plant.rotation_axis),
-            ControllerOptions(fixed_actuators=fixed_actuators(plant.hand)),
-        )
-        before: list[tuple[GraspState, Tensor, Tensor]] = []
-
-        def remember(seen: Observation, decision: Decision, log: list = before) -> None:
-            log.append((state_of(seen), decision.delta_a, decision.nominal))
+        start = disturbed.reset(seed + len(segments)).state
+        enhanced = EnhancedModel.for_grasp(model, start) if enhanced is None else enhanced
+        controller = LookAndMoveController(model, plant.rotation_axis)
+        target = PoseTarget.turned(start, plant.rotation_axis, draw.uniform(5, 20) * _DEG)
+        before = len(x)
+        for step in ClosedLoop(disturbed, controller, rule).steps(target):
+            x.append(enhanced.features(step.before.state, step.decision.delta_a))
+            y.append((step.increment - step.decision.nominal)[enhanced.outputs] * enhanced.output_scale)
             if on_sample is not None:
                 on_sample()
-
-        target = PoseTarget.turned(start, plant.rotation_axis, draw.uniform(5, 20) * _DEG)
-        done = run_manipulation(disturbed, controller, target, rule, learn=False, on_step=remember)
-        for (state, action, nominal), step in zip(before, done.steps, strict=False):
-            x.append(enhanced.features(state, action))
-            y.append((step.increment - nominal)[enhanced.outputs] * torch.as_tensor(enhanced.output_scale))
-        segments.append(len(done.steps))
+        segments.append(len(x) - before)
     plant.close()
     segments[-1] -= len(x) - n
     about = f"simulated {hand} turning the {object}, new tendons at {n // 2}; alone: the kinematic model"

@@ -5,19 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 
-from ...control import ControllerOptions, FocusedPose, LookAndMoveController, PoseTarget, StoppingRule
-from ...description import HandDescription, load_hand, load_object
-from ...enhanced import EnhancedModel
+from ...control import ClosedLoop, LookAndMoveController, PoseTarget, StoppingRule
+from ...description import load_hand, load_object
+from ...enhanced import EnhancedModel, grasp_learner
 from ...exceptions import ParameterError, UnknownNameError
 from ...model import KinematicModel, ModelOptions
+from ...plant import Observation
 from ...simulation import PlantConfig, PlantParameters, SimulatedHand
-from ..learners import make_enhanced
-from ..manipulation import Manipulation, run_manipulation, state_of
+from ..runner import record_of
 
 #: Rotations of the paper's Table I [deg].
 TABLE_I: dict[str, tuple[float, ...]] = {
@@ -60,9 +60,7 @@ class DemoConfig:
 
 def stopping_rule(config: DemoConfig) -> StoppingRule:
     """The same rule for every controller."""
-    return StoppingRule(
-        tolerance=config.tolerance_deg * _DEG, stall_progress=0.1 * _DEG, max_steps=config.max_steps
-    )
+    return StoppingRule(tolerance=config.tolerance_deg * _DEG, max_steps=config.max_steps)
 
 
 def run_session(
@@ -84,55 +82,23 @@ def run_session(
     enhanced: EnhancedModel | None = None
     records = []
     for angle in config.angles_deg:
-        start = state_of(plant.reset(seed))
+        start = plant.reset(seed).state
         if enhanced is None and controller == "E-KM":
-            enhanced = make_enhanced(model, start, config.capacity)
+            enhanced = EnhancedModel.for_grasp(model, start, partial(grasp_learner, capacity=config.capacity))
         axis = plant.rotation_axis
-        frames: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-        loop = LookAndMoveController(
-            enhanced if enhanced is not None else model,
-            FocusedPose.rotation_about(axis),
-            ControllerOptions(fixed_actuators=fixed_actuators(plant.hand)),
-        )
-        done = run_manipulation(
-            plant,
-            loop,
-            PoseTarget.turned(start, axis, angle * _DEG),
-            stopping_rule(config),
-            learn=enhanced is not None,
-            on_step=lambda *_: frames.append(plant.hand_state()),  # noqa: B023 - used before the next turn
-        )
-        frames.append(plant.hand_state())
-        records.append(_record(controller, seed, angle, done, frames))
+        loop = LookAndMoveController(model if enhanced is None else enhanced, axis)
+        target = PoseTarget.turned(start, axis, degrees=angle)
+        done = ClosedLoop(plant, loop, stopping_rule(config)).run(target)
+        about = {"controller": controller, "seed": seed, "angle_deg": angle}
+        frames = [_frame(seen) for seen in (*(step.before for step in done.steps), done.stop.final)]
+        records.append({**about, **record_of(done, axis, enhanced is not None), "frames": frames})
         if on_trial is not None:
             on_trial()
     plant.close()
     return records
 
 
-def fixed_actuators(hand: HandDescription) -> tuple[str, ...]:
-    """Actuators that a pinch leaves alone: on the iCub abduction, ring and little finger."""
-    return tuple(name for name in ("hand_finger", "pinky") if name in hand.actuator_names)
-
-
-def _record(controller: str, seed: int, angle: float, done: Manipulation, frames: list) -> dict[str, Any]:
-    steps = done.steps
-    return {
-        "controller": controller,
-        "seed": seed,
-        "angle_deg": angle,
-        "reason": done.reason.value,
-        "message": done.message,
-        "lost": done.lost,
-        "steady_state_error_deg": done.steady_state_error / _DEG,
-        "true_error_deg": None if done.true_error is None else done.true_error / _DEG,
-        "steps": len(steps),
-        "errors_deg": [step.error / _DEG for step in steps] + [done.steady_state_error / _DEG],
-        "prediction_km_deg": [step.prediction_error_km / _DEG for step in steps],
-        "prediction_ekm_deg": [
-            None if step.prediction_error_ekm is None else step.prediction_error_ekm / _DEG for step in steps
-        ],
-        "off_rotation_deg": steps[-1].off_rotation / _DEG if steps else 0.0,
-        "seconds": [step.seconds for step in steps],
-        "frames": [[np.asarray(part).tolist() for part in frame] for frame in frames],
-    }
+def _frame(seen: Observation) -> list[list[float]]:
+    """True joint angles, position and rotation, for a picture."""
+    assert seen.truth is not None  # a simulated hand tells
+    return [part.tolist() for part in (seen.truth.q, seen.truth.position, seen.truth.rotation)]

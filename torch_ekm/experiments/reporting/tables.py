@@ -76,7 +76,7 @@ def controller_table(records: list[Record], limit: int) -> Table:
             ]
         )
     header = [
-        "controller", "steady-state error", "survivors", "median", "motions to settle", "error of first motion",
+        "controller", "steady-state error", "survivors", "median", "motions to settle", "first motion",
         "of all motions", "off-axis rotation", "lost",
     ]  # fmt: skip
     return Table("controllers", "All turns of each controller", header, rows, STATIC_NOTE)
@@ -128,8 +128,8 @@ def object_table(records: list[Record]) -> Table:
     ]  # fmt: skip
     note = (
         "Steady-state error, lost objects with the whole angle. Ratio of means with the bootstrap over "
-        "paired seeds; the effect size is Cohen's d of the paired differences. The paper's ratios: 28.5 to 70 %, "
-        "p = 3.8e-4."
+        "paired seeds; the effect size is Cohen's d of the paired differences. The paper's ratios: "
+        "28.5 to 70 %, p = 3.8e-4."
     )
     return Table("by_object", "Steady-state error of each object (Table II)", header, rows, note)
 

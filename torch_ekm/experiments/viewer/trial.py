@@ -112,8 +112,8 @@ class LogShow:
         hand, obj = self._bodies
         states = []
         for seen in recording.observations:
-            truth = {} if self.estimates else seen.info.get("truth", {})
-            states.append([truth.get(n, getattr(seen, n)) for n in ("q", "position", "rotation")])
+            state = seen.state if self.estimates or seen.truth is None else seen.truth.state
+            states.append([state.q, state.position, state.rotation])
         q, position, rotation = (torch.stack(part).numpy() for part in zip(*states, strict=True))
         if q.shape[-1] != hand.n_q:
             problem = f"has {q.shape[-1]} joints, the hand '{hand.name}' {hand.n_q}: it was of another hand"
@@ -125,9 +125,8 @@ class LogShow:
         first, seen = self.recording.observations[0], self.recording.observations[frame]
         turned = math.degrees(float(rotation_vector(seen.rotation @ first.rotation.mT).norm()))
         lines = [f"{seen.time:.2f} s, **{seen.status.value}**, turned by {turned:.1f} deg"]
-        truth = seen.info.get("truth")
-        if truth is not None:
-            wrong = math.degrees(float(rotation_vector(seen.rotation @ truth["rotation"].mT).norm()))
+        if seen.truth is not None:
+            wrong = math.degrees(float(rotation_vector(seen.rotation @ seen.truth.rotation.mT).norm()))
             lines.append(f"measured rotation wrong by {wrong:.2f} deg")
         if frame:
             moved = self.recording.commands[frame - 1].rad2deg().tolist()

@@ -1,0 +1,74 @@
+"""What is put around a plant passes on all that it does not change."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from torch_ekm.exceptions import NonFiniteError
+from torch_ekm.plant import Observation, Plant, PlantWrapper, Truth
+
+EYE, ORIGIN = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+
+
+class Counter:
+    """Reports how often it was commanded."""
+
+    rotation_axis = "beyond the contract"
+
+    def __init__(self) -> None:
+        self.count, self.closed = 0, False
+
+    def reset(self, seed: int) -> Observation:
+        self.count = seed
+        return self.observe()
+
+    def observe(self) -> Observation:
+        q = torch.full((2,), float(self.count), dtype=torch.float64)
+        return Observation(q, q[:1], ORIGIN, EYE, q[:1], truth=Truth(q, ORIGIN, EYE))
+
+    def command(self, delta_a: torch.Tensor) -> Observation:
+        self.count += int(delta_a)
+        return self.observe()
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Shifted(PlantWrapper):
+    """Joints read 10 too large."""
+
+    def observation(self, seen: Observation) -> Observation:
+        return dataclasses.replace(seen, q=seen.q + 10)
+
+
+def test_a_wrapper_changes_every_observation_and_nothing_else() -> None:
+    inner = Counter()
+    plant = Shifted(Shifted(inner))
+    assert isinstance(plant, Plant)
+    assert float(plant.reset(3).q[0]) == 23
+    assert float(plant.command(torch.tensor(2)).q[0]) == 25
+    assert float(plant.observe().q[0]) == 25
+    assert float(plant.observe().a[0]) == 5
+    assert float(plant.observe().truth.q[0]) == 5
+    assert plant.unwrapped is inner
+    assert plant.rotation_axis == "beyond the contract"
+    plant.close()
+    assert inner.closed
+
+
+def test_what_no_plant_has_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no_such_thing"):
+        _ = Shifted(Counter()).no_such_thing
+    with pytest.raises(AttributeError, match="_private"):
+        _ = Shifted(Counter())._private
+
+
+def test_states_of_an_observation() -> None:
+    seen = Shifted(Counter()).reset(1)
+    assert torch.equal(seen.state.q, seen.q)
+    assert torch.equal(seen.truth.state.q, seen.q - 10)
+    with pytest.raises(NonFiniteError, match=r"Observation\.q"):
+        dataclasses.replace(seen, q=seen.q * torch.nan)

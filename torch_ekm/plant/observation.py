@@ -1,0 +1,83 @@
+"""What a plant reports: readings for whoever controls, the truth of a simulation for reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+import torch
+
+from ..exceptions import NonFiniteError
+from ..kinematics import GraspState
+from ..typing import Float, Tensor
+
+
+class PlantStatus(Enum):
+    """What a plant knows about its object."""
+
+    HELD = "held"
+    LOST = "lost"  # dropped, thrown, or out of the fingers
+    NOT_SEEN = "not_seen"  # the camera did not find it in this frame
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a simulation knows, hand frame. For reports and for sensors that are simulated; nothing that
+    controls, senses or learns may read it."""
+
+    q: Float[Tensor, " n_q"]
+    """Joint angles [rad]."""
+    position: Float[Tensor, " 3"]
+    """Object point o [m]."""
+    rotation: Float[Tensor, "3 3"]
+    """Object orientation R."""
+    fingertip_force: Float[Tensor, " n_pads"] | None = None
+    """Normal force of each contact pad [N]."""
+    actuator_torque: Float[Tensor, " n_a"] | None = None
+    """[N m]"""
+    pictured: GraspState | None = None
+    """The state when the newest picture was taken; None: the present one."""
+
+    @property
+    def state(self) -> GraspState:
+        """Joint angles and object pose."""
+        return GraspState(self.q, self.position, self.rotation)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the sensors say, in SI units and the hand frame.
+
+    Raises:
+        NonFiniteError: any entry is NaN or infinite.
+    """
+
+    q: Float[Tensor, " n_q"]
+    """Estimated joint angles [rad] (Hall sensors)."""
+    a: Float[Tensor, " n_a"]
+    """Actuator encoders [rad]."""
+    position: Float[Tensor, " 3"]
+    """Object point o [m] (markers)."""
+    rotation: Float[Tensor, "3 3"]
+    """Object orientation R."""
+    fingertip_force: Float[Tensor, " n_pads"]
+    """Normal force of each contact pad [N], in the order of ``HandDescription.pads``."""
+    time: float = 0.0
+    """[s]"""
+    status: PlantStatus = PlantStatus.HELD
+    info: dict[str, Any] = field(default_factory=dict)
+    """Anything else, such as raw readings for a log."""
+    truth: Truth | None = None
+    """Of a simulation: for reports only."""
+
+    def __post_init__(self) -> None:
+        for name in ("q", "a", "position", "rotation", "fingertip_force"):
+            finite = torch.isfinite(getattr(self, name))
+            if not bool(finite.all()):
+                raise NonFiniteError(f"Observation.{name}", torch.nonzero(~finite)[:3].tolist())
+
+    @property
+    def state(self) -> GraspState:
+        """Joint angles and object pose, as measured."""
+        return GraspState(self.q, self.position, self.rotation)

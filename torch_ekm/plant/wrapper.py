@@ -1,0 +1,51 @@
+"""What is put around a plant: one base, as ``gymnasium.Wrapper`` is for environments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..typing import Float, Tensor
+from .observation import Observation
+from .plant import Plant
+
+
+class PlantWrapper:
+    """Passes everything on to ``plant``; implements :class:`Plant`.
+
+    A subclass overrides :meth:`observation` to change what is seen, :meth:`command` to change what is
+    commanded, :meth:`reset` to begin anew. What a plant offers beyond the contract (``hand``, ``object``,
+    ``rotation_axis`` of a simulated hand) is found on the wrapper, too.
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name == "plant":  # not yet set: no endless search
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return getattr(self.plant, name)
+
+    @property
+    def unwrapped(self) -> Plant:
+        """The innermost plant."""
+        return self.plant.unwrapped if isinstance(self.plant, PlantWrapper) else self.plant
+
+    def reset(self, seed: int) -> Observation:
+        """Grasp the object anew."""
+        return self.observation(self.plant.reset(seed))
+
+    def observe(self) -> Observation:
+        """Read the sensors."""
+        return self.observation(self.plant.observe())
+
+    def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
+        """Move the actuators by ``delta_a`` [rad], wait, read the sensors."""
+        return self.observation(self.plant.command(delta_a))
+
+    def observation(self, seen: Observation) -> Observation:
+        """What is passed on of what ``plant`` has seen."""
+        return seen
+
+    def close(self) -> None:
+        """Give back what the plant holds."""
+        self.plant.close()
