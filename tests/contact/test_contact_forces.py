@@ -94,14 +94,20 @@ def test_without_enough_friction_the_grasp_is_said_to_be_impossible():
 
 
 @pytest.mark.parametrize(
-    "directions", [THREE, [[1.0, 0, 0], [-1.0, 0, 0]], [[1.0, 0, 0], [1.0, 0.1, 0], [1.0, 0, 0.1]]]
+    ("directions", "friction", "closure"),
+    [
+        (THREE, 0.6, True),
+        (THREE, 0.12, True),
+        (THREE, 0.08, False),
+        ([[1.0, 0, 0], [-1.0, 0, 0]], 0.6, False),  # nothing resists turning about their line
+        ([[1.0, 0, 0], [1.0, 0.1, 0], [1.0, 0, 0.1]], 0.6, False),
+    ],
 )
-def test_any_load_is_borne_where_there_is_force_closure_and_only_there(directions):
-    kin = held(directions, friction=0.6)
-    closure = ferrari_canny(kin) > 1e-6
-    assert closure is (directions is THREE)
+def test_any_load_is_borne_where_there_is_force_closure_and_only_there(directions, friction, closure):
+    kin = held(directions, friction=friction)
+    assert (ferrari_canny(kin) > 1e-3) is closure
     G = grasp_matrix(kin).numpy()
-    cones = friction_cones(kin.models, [0.6] * len(directions), [0.0] * len(directions))
+    cones = friction_cones(kin.models, [friction] * len(directions), [0.0] * len(directions))
     borne = []
     for load in np.random.default_rng(0).normal(size=(12, 6)) * [1, 1, 1, 0.03, 0.03, 0.03]:
         eq = BalanceEquations(

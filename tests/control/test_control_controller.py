@@ -30,7 +30,7 @@ from torch_ekm.control import (
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.kinematics import GraspState
-from torch_ekm.model import KinematicModel
+from torch_ekm.model import KinematicModel, ModelStatus
 from torch_ekm.residual import ActionLinearKernel, SparseOnlineGP, ZeroResidual
 from torch_ekm.simulation import SimulatedHand
 
@@ -75,6 +75,27 @@ def test_prediction_meets_the_limited_error(grasp, enhanced: bool) -> None:
     # an untrained E-KM leaves what its damped iterations leave: 0.4^6
     assert turn == pytest.approx(STEP, rel=5e-3 if enhanced else 1e-5)
     torch.testing.assert_close(decision.predicted, decision.nominal)
+
+
+def test_where_no_forces_are_found_those_of_the_same_grasp_stand_in(grasp) -> None:
+    plant, model, seen, state = grasp
+    contacts = model.contacts(state)
+    slippery = contacts.replace(friction=torch.full_like(contacts.friction, 1e-4))
+    shown = [contacts]
+    forgetful = KinematicModel(
+        plant.hand, plant.object, kinematics=model.kinematics, detector=lambda *_: shown[0]
+    )
+    loop = LookAndMoveController(forgetful, FocusedPose.rotation_about(plant.rotation_axis))
+    target = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG)
+
+    def status() -> ModelStatus:
+        return loop.decide(state, seen.a, target, seen.fingertip_force).linearization.status
+
+    assert status() is ModelStatus.OK
+    shown[0] = slippery
+    assert [status(), status()] == [ModelStatus.REUSED_FORCES] * 2
+    loop.reset()
+    assert status() is ModelStatus.NO_FORCES
 
 
 def test_limits_are_kept_and_told(grasp) -> None:

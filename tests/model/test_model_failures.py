@@ -103,22 +103,22 @@ def test_forces_of_the_previous_step_are_reused_for_the_same_contacts_only():
 @pytest.mark.parametrize("batched", [False, True])
 def test_forces_of_a_previous_step_stand_in_for_every_state_of_a_batch(batched):
     toy = three_finger()
+    turn = torch.tensor([[0.0], [0.004]], dtype=F64)
+    states = GraspState(
+        toy.state.q + turn, toy.state.position.expand(2, 3), toy.state.rotation.expand(2, 3, 3)
+    )
+    fields = ("point", "normal", "gap", "finger_curvature", "object_curvature")
 
     def twice(contacts):
-        fields = ("point", "normal", "gap", "finger_curvature", "object_curvature")
-        return contacts.replace(
-            **{n: getattr(contacts, n).expand(2, *getattr(contacts, n).shape) for n in fields}
-        )
+        return contacts.replace(**{name: torch.stack([getattr(contacts, name)] * 2) for name in fields})
 
-    states = GraspState(
-        *(x.expand(2, *x.shape) for x in (toy.state.q, toy.state.position, toy.state.rotation))
-    )
     slippery = toy.contacts.replace(friction=torch.full((3,), 0.01, dtype=F64))
-    good = toy.model.linearize(toy.state)
-    previous = toy.model.linearize(states, twice(toy.contacts)) if batched else good
+    before = (states, twice(toy.contacts)) if batched else (toy.state, toy.contacts)
+    previous = toy.model.linearize(*before)
     again = toy.model.linearize(states, twice(slippery), previous=previous)
     assert again.status is ModelStatus.REUSED_FORCES
-    assert torch.equal(again.forces.mu, good.forces.mu.expand(2, -1))
+    assert torch.equal(again.forces.mu, previous.forces.mu.expand(2, -1))
+    assert torch.equal(again.forces.mu[0], again.forces.mu[1]) is not batched
 
 
 def test_a_finger_through_the_object():

@@ -103,7 +103,7 @@ class LookAndMoveController:
         self._previous: Linearization | None = None
 
     def reset(self) -> None:
-        """Forget the contact forces of the last grasp; call it where one controller serves several."""
+        """Forget the contact forces of the last grasp; a :class:`ClosedLoop` does so when it begins."""
         self._previous = None
 
     def decide(

@@ -91,10 +91,7 @@ def _classify_failure(eq: BalanceEquations, options: ForceOptions, cuts: Array, 
         violation = _unpack(eq, scale * solution.x, solves).violation
         if violation > 1e-6:  # else the balance is possible after all, and only the solver failed
             status = ForceStatus.NOT_GRASPABLE
-    sizes = (
-        eq.object_matrix.shape[1],
-        eq.actuator_matrix.shape[1],
-        len(eq.bound_lower),
-        len(eq.hand_load),
-    )
-    return ForceSolution(status, *(np.full(size, np.nan) for size in sizes), violation, solves + 1)
+    n_h, n_a = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1]
+    nothing = np.full(n_h + n_a + len(eq.bound_lower) + len(eq.hand_load), np.nan)
+    mu, lam, bound, residual = np.split(nothing, np.cumsum([n_h, n_a, len(eq.bound_lower)]))
+    return ForceSolution(status, mu, lam, bound, residual, violation, solves + 1)
