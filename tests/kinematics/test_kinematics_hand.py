@@ -16,7 +16,7 @@ from torch_ekm.kinematics import HandKinematics, LinkPoses
 from torch_ekm.kinematics.se3 import hat, log
 
 HANDS = ("icub_right", "icub_left", "planar_two_finger")
-SHAPES = ((), (1,), (5,), (2, 3))
+SHAPES = ((), (1,), (5,), (2, 3), (0,))
 
 
 def postures(name: str, *shape: int, seed: int = 3) -> torch.Tensor:

@@ -91,14 +91,20 @@ class HandKinematics(nn.Module):
             ShapeError: the last dimension is not ``n_q``; the message lists the joints in order.
             ParameterError: ``q`` has another dtype than this module.
         """
-        self._check(q)
-        flat = q.reshape(-1, q.shape[-1])
+        shape, n_q = q.shape, len(self.joint_names)
+        if not shape or shape[-1] != n_q:
+            joints = ", ".join(self.joint_names)
+            raise ShapeError("q", f"(*batch, {n_q})", shape, f"the joints are, in order: {joints}")
+        if q.dtype != self._chain.dtype:
+            valid = f"{self.dtype}, the dtype of this module (change it with .to())"
+            raise ParameterError("q.dtype", q.dtype, valid)
+        flat = q.reshape(-1, n_q)
         if self._joint_order is not None:
             flat = flat.index_select(1, self._joint_order)
         # the library's analytical gradient is a custom Function: once differentiable, not by torch.func
         frames = self._chain.forward_kinematics_tensor(flat, analytical_grad=False)
         transforms = frames.transpose(0, 1).index_select(1, self._frame_of_link)
-        return LinkPoses(transforms.reshape(*q.shape[:-1], -1, 4, 4), self.link_names)
+        return LinkPoses(transforms.view(*shape[:-1], len(self.link_names), 4, 4), self.link_names)
 
     def joint_axes(
         self, poses_or_q: LinkPoses | Float[Tensor, "*batch n_q"]
@@ -140,15 +146,6 @@ class HandKinematics(nn.Module):
         v = torch.linalg.cross(axis, x[..., None, :] - origin)
         moves = self.upstream[k][:, None]
         return (torch.cat([v, axis.expand_as(v)], dim=-1) * moves).mT
-
-    def _check(self, q: Tensor) -> None:
-        n_q = len(self.joint_names)
-        if q.dim() == 0 or q.shape[-1] != n_q:
-            joints = ", ".join(self.joint_names)
-            raise ShapeError("q", f"(*batch, {n_q})", q.shape, f"the joints are, in order: {joints}")
-        if q.dtype != self.dtype:
-            valid = f"{self.dtype}, the dtype of this module (change it with .to())"
-            raise ParameterError("q.dtype", q.dtype, valid)
 
     def extra_repr(self) -> str:
         return f"'{self.hand.name}', links={len(self.link_names)}, joints={len(self.joint_names)}"
