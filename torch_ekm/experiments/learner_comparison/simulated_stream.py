@@ -30,7 +30,7 @@ def record_simulated_hand(n: int = 400, seed: int = 1000, *, new_moment_arm: flo
         GraspError, EquilibriumError: the object could not be grasped.
     """
     draw = np.random.default_rng(seed)
-    plant = SimulatedHand(hand, object, preset="nominal")
+    plant = SimulatedHand("icub_right", "box", preset="nominal")
     events = [] if new_moment_arm is None else [Change.new_tendons(n // 2, new_moment_arm)]
     disturbed = DisturbedPlant(plant, events)
     model = KinematicModel(plant.hand, plant.object)

@@ -9,7 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
+from ...simulation import PRESETS
 from ..config import Setting, object_name
+from ..learners import HAND_LEARNERS
 from ..records import Record
 from ..reporting.report import Cell, Column, Report, Table
 from ..reporting.statistics import estimate, rate, steady_state_error
