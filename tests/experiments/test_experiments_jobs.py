@@ -88,9 +88,11 @@ def test_a_dead_worker_ends_the_run(tmp_path: Path) -> None:
 
 
 SLEEPERS = """
-import sys, time
+import signal, sys, time
 from pathlib import Path
 from torch_ekm.experiments.jobs import run_jobs
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts what it runs behind without one
 
 def work(x):
     time.sleep(0.1 if x < 2 else 60)

@@ -112,9 +112,10 @@ def _on_ray(place: str, function: Callable[..., Any], jobs: Jobs) -> Outcomes:
             # a head that wants a token lets clients without one wait until they give up
             hint = f"{error}; a recent Ray wants RAY_AUTH_MODE=token and the head's token on both sides"
             raise _silent("ray", place, hint) from error
-    run = ray.remote(num_cpus=1, max_retries=0)(_alone)
-    waiting = {run.remote(function, job): name for name, job in jobs.items()}
+    waiting = {}
     try:
+        run = ray.remote(num_cpus=1, max_retries=0)(_alone)
+        waiting.update((run.remote(function, job), name) for name, job in jobs.items())
         while waiting:
             done, _ = ray.wait(list(waiting), num_returns=1)
             try:
