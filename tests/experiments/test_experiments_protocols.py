@@ -23,7 +23,7 @@ from torch_ekm.description import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.camera_off import CameraOff
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
-from torch_ekm.experiments.learners import LEARNERS, make_learner
+from torch_ekm.experiments.learners import HAND_LEARNERS, LEARNERS, make_learner
 from torch_ekm.experiments.protocols.ablation import DISTURBANCES, Ablation, variants
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.protocols.object_memory import ObjectMemory

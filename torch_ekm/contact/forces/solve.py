@@ -62,6 +62,7 @@ def _solve(problem):
     status = str(getattr(solution.extras.get("info"), "status", ""))
     if solution.found or "PRIMAL_INFEASIBLE" in status:
         return solution
+    require("clarabel")  # where it is missing, this names the extra
     G, A = (None if M is None else csc(M) for M in (problem.G, problem.A))
     sparse = qpsolvers.Problem(csc(problem.P), problem.q, G, problem.h, A, problem.b, problem.lb, problem.ub)
     with warnings.catch_warnings():
