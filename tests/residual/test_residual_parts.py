@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable
 
 import pytest
 import torch
+from torch import nn
 
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.residual import (
@@ -52,7 +54,7 @@ PARTS = {
 every_part = pytest.mark.parametrize("name", PARTS)
 
 
-def learner(parts: list[Part], **options) -> SparseOnlineGP:
+def learner(parts: Iterable[nn.Module], **options) -> SparseOnlineGP:
     return SparseOnlineGP(3, 2, **{"capacity": 10, "refresh_every": 8, "parts": parts, **options})
 
 
@@ -94,7 +96,7 @@ def test_one_specification_serves_several_learners(name):
     two.update(x, y)
     assert same(two, one, x)
     assert not any(list(part.buffers()) for part in parts)  # what was given is a specification still
-    again = learner(list(one.parts))  # and so are the parts of a learner that has learned
+    again = learner(one.parts)  # and so are the parts of a learner that has learned
     assert same(again, fresh, x)
     again.update(x, y)
     assert same(again, one, x)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
+
+from torch import nn
 
 from ..kernels.deep import DeepKernel
 from ..kernels.stationary import SquaredExponential
 from .forgetting import ProcessNoise
 from .hyperparameters import LearnHyperparameters
-from .part import Part, copy_parts
+from .part import copy_parts
 from .sparse_online_gp import SparseOnlineGP
 
 
@@ -20,7 +22,7 @@ def DeepKernelSOGP(  # noqa: N802  a kind of learner, called like the others
     hidden: Sequence[int] | None = None,
     features: int | None = None,
     seed: int = 0,
-    parts: Sequence[Part] = (),
+    parts: Iterable[nn.Module] = (),
     **options: Any,
 ) -> SparseOnlineGP:
     """A SparseOnlineGP on ``[x / L, net(x)]``, network and kernel learned online in constant memory.
@@ -41,12 +43,12 @@ def DeepKernelSOGP(  # noqa: N802  a kind of learner, called like the others
     Raises:
         ParameterError: from SparseOnlineGP and DeepKernel.
     """
-    parts = copy_parts(parts)
-    learning = next((part for part in parts if isinstance(part, LearnHyperparameters)), None)
+    own = copy_parts(parts)
+    learning = next((part for part in own if isinstance(part, LearnHyperparameters)), None)
     if learning is None:
-        wanders = any(isinstance(part, ProcessNoise) for part in parts)
+        wanders = any(isinstance(part, ProcessNoise) for part in own)
         learning = LearnHyperparameters() if wanders else LearnHyperparameters(steps=2, memory=2000)
-        parts.append(learning)
+        own.append(learning)
     fleet = {name: options[name] for name in ("batch_shape", "device") if name in options}
     kernel = DeepKernel(
         SquaredExponential(in_features, **fleet),
@@ -54,4 +56,4 @@ def DeepKernelSOGP(  # noqa: N802  a kind of learner, called like the others
         features=features if features is not None else 16 if learning.memory else 6,
         seed=seed,
     )
-    return SparseOnlineGP(in_features, out_features, kernel=kernel, parts=parts, **options)
+    return SparseOnlineGP(in_features, out_features, kernel=kernel, parts=own, **options)

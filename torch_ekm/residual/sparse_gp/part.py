@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import ClassVar, NamedTuple, Protocol, TypeVar
 
 import torch
@@ -146,20 +146,22 @@ class Part(nn.Module):
 P = TypeVar("P", bound=Part)
 
 
-def copy_parts(parts: Sequence[Part]) -> list[Part]:
+def copy_parts(parts: Iterable[nn.Module]) -> list[Part]:
     """Copies of specifications, for one learner.
 
     Raises:
         ParameterError: not a list of parts, two of a kind, or the last one not last.
     """
     valid = "a list of parts such as [ForgettingFactor(0.99), RobustWeight(3.0)]"
-    if not isinstance(parts, Sequence) or not all(isinstance(part, Part) for part in parts):
+    given = list(parts) if isinstance(parts, Iterable) else []
+    found = [part for part in given if isinstance(part, Part)]
+    if not isinstance(parts, Iterable) or len(found) < len(given):
         raise ParameterError("parts", parts, valid)
-    kinds = [type(part) for part in parts]
+    kinds = [type(part) for part in found]
     names = [kind.__name__ for kind in kinds]
     for place, kind in enumerate(kinds):
         if kinds.count(kind) > 1:
             raise ParameterError("parts", names, f"with one {kind.__name__} at most")
         if kind.stands_last and place < len(kinds) - 1:
             raise ParameterError("parts", names, f"with {kind.__name__} last")
-    return [copy.deepcopy(part) for part in parts]
+    return [copy.deepcopy(part) for part in found]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -90,7 +90,7 @@ class SparseOnlineGP(DoubleStateLearner):
         jitter: float = 1e-6,
         projection: Literal["kl", "fitc"] = "kl",
         pruning: Literal["kl", "mean", "novelty", "oldest", "freeze"] = "kl",
-        parts: Sequence[Part] = (),
+        parts: Iterable[nn.Module] = (),
         refresh_every: int = 32,
         compile_step: bool = False,
         batch_shape: tuple[int, ...] = (),
