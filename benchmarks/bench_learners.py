@@ -1,7 +1,7 @@
 """Speed of the learners: ``pytest benchmarks/bench_learners.py``, or ``python benchmarks/bench_learners.py``
 for a table of everything measured in one run with its ratios.
 
-Twenty inputs, one thread, float64, a full basis with an addition and a deletion at every sample. Plain C,
+Twenty inputs, one thread, float64, a full basis with a point added and one pruned at every sample. Plain C,
 compiled on the spot, is the limit; GPyTorch, scikit-learn and river take part where they are installed.
 """
 
@@ -23,7 +23,13 @@ import numpy as np
 import pytest
 import torch
 
-from torch_ekm.residual import DeepKernelSOGP, SparseOnlineGP
+from torch_ekm.residual import (
+    DeepKernel,
+    DeepKernelSOGP,
+    LearnHyperparameters,
+    SparseOnlineGP,
+    SquaredExponential,
+)
 
 D = 20
 SOURCE = Path(__file__).with_name("sogp_learners_reference.c")
@@ -231,7 +237,7 @@ def test_plain_c_gives_the_same_numbers():
     reference = PlainC(30, 6)
     xs, ys = stream(40, 6, seed=5)
     gp = reference.gp
-    gp.posterior.deletion = "mean"
+    gp.posterior.pruning = "mean"
     for x, y in zip(xs, ys, strict=True):
         reference.update(np.ascontiguousarray(x.numpy()), np.ascontiguousarray(y.numpy()))
         gp.update(x, y)
@@ -273,8 +279,12 @@ def table(compiled: bool) -> list[tuple[str, float, str]]:
     rows.append(("update b=100 m=26", microseconds(updates(gp, 26)), "1.2 x m=6"))
     rows.append(("predict+jacobians b=100 m=26", microseconds(predictions(gp, 26)), "1.2 x m=6"))
     for name, plain, adaptive in (
-        ("kernel", SparseOnlineGP(D, 6), SparseOnlineGP(D, 6, adapt=True)),
-        ("deep kernel", DeepKernelSOGP(D, 6, adapt=False), DeepKernelSOGP(D, 6)),
+        ("kernel", SparseOnlineGP(D, 6), SparseOnlineGP(D, 6, parts=[LearnHyperparameters()])),
+        (
+            "deep kernel",
+            SparseOnlineGP(D, 6, kernel=DeepKernel(SquaredExponential(D))),
+            DeepKernelSOGP(D, 6),
+        ),
     ):
         for gp in (plain, adaptive):
             gp.update(*stream(2110, 6, seed=1))  # a memory is full then

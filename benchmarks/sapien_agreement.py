@@ -24,25 +24,26 @@ from test_model_sapien import true_state, turning_step
 from torch_ekm.exceptions import GraspError
 from torch_ekm.model import KinematicModel, ModelOptions
 from torch_ekm.plant.plant import PlantStatus
-from torch_ekm.simulation import PlantParameters, SimulatedHand
+from torch_ekm.simulation import SimulatedHand
 
 DEG = np.pi / 180
 
 
 def turn(name: str, seed: int, degrees: float) -> tuple[float, float, float, bool]:
     """``(rms, cone, failure, announced)``: [deg] of error, and of rotation at the two events (NaN: never)."""
-    plant = SimulatedHand("icub_right", name, parameters=PlantParameters.exact())
+    plant = SimulatedHand("icub_right", name)
     observation = plant.reset(seed)
-    gravity = plant.config.gravity
-    model = KinematicModel(plant.hand, plant.object, ModelOptions(gravity=gravity, on_unstable="flag"))
+    model = KinematicModel(plant.hand, plant.object, ModelOptions(on_unstable="flag"))
     axis, start = plant.rotation_axis, true_state(observation)
     lower, upper = (torch.as_tensor(x) for x in (plant.hand.actuator_lower, plant.hand.actuator_upper))
     state, errors, grip, cone, failure, least = start, [], None, np.nan, np.nan, np.inf
+    known = None
     while (turned := float(state.minus(start)[-3:] @ axis) / DEG) < degrees and len(errors) < 60:
         try:
-            lin = model.linearize(state)
+            lin = model.linearize(state, previous=known)
         except GraspError:
             break
+        known = lin if lin.forces.solved else known
         least = min(least, float(lin.forces.relative_margin.min()))
         if np.isnan(cone) and least <= 0.01:
             cone = turned

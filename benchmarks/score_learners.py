@@ -10,83 +10,70 @@ from __future__ import annotations
 import argparse
 import re
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
+from stream_scores import load_split, score_objects, score_split
 
-from torch_ekm.experiments.learner_comparison.datasets import (
-    ResidualRecording,
-    Stream,
-    load_stream,
-    load_t42,
-)
-from torch_ekm.experiments.learner_comparison.prequential import compare_learners, score_objects
+from torch_ekm.experiments.learner_comparison.recordings import load_t42
+from torch_ekm.experiments.learner_comparison.stream import Stream
 from torch_ekm.residual import (
-    DeepKernelSOGP,
-    GPyTorchSVGP,
-    GPyTorchWindow,
-    KRLSTracker,
-    LocalGPs,
+    CalibrateNoise,
+    LearnHyperparameters,
     MixtureResidual,
-    RandomFeatureRLS,
-    RecursiveLeastSquares,
-    ReplayMLP,
+    ProcessNoise,
     ResidualLearner,
-    RiverResidual,
-    SparseOnlineGP,
-    WindowGP,
-    ZeroResidual,
 )
 
-Factory = Callable[[int, int], ResidualLearner]
-_OLD: dict[str, Any] = {"noise_variance": 0.3, "forgetting": 0.99, "robust": 3.0}
-_NEW: dict[str, Any] = {"noise_variance": 0.3, "diffusion": 0.003, "robust": 3.0}
+
+def chosen(name: str, **options: Any) -> Factory:
+    """A learner of the registry with other figures."""
+    return lambda d, m: LEARNERS[name](d, m, **options)
 
 
-def sogp(**options: Any) -> Factory:
-    return lambda d, m: SparseOnlineGP(d, m, **options)
-
-
-def deep(**options: Any) -> Factory:
-    return lambda d, m: DeepKernelSOGP(d, m, **options)
-
-
+_LOUD: dict[str, Any] = {"noise_variance": 0.3}
+_WANDERING = [ProcessNoise(0.003)]
+_CALIBRATED = [*_WANDERING, CalibrateNoise()]
+_ADAPTED = [*_WANDERING, LearnHyperparameters()]
 HAND: dict[str, Factory] = {
-    "zero": lambda d, m: ZeroResidual(d, m),
-    "SOGP as published (100 points)": sogp(noise_variance=0.3),
-    "SOGP, forgetting .99, robust 3, calibrated": sogp(calibrate=True, **_OLD),
-    "SOGP, diffusion .003, robust 3, calibrated": sogp(calibrate=True, **_NEW),
-    "SOGP, diffusion .003, robust 3": sogp(**_NEW),
-    "SOGP, diffusion .003, robust 3, adaptation": sogp(adapt=True, **_NEW),
-    "deep SOGP, diffusion .003, robust 3": deep(**_NEW),
-    "RLS, forgetting .99, robust 3": lambda d, m: RecursiveLeastSquares(d, m, **_OLD),
-    "random features, forgetting .99, robust 3": lambda d, m: RandomFeatureRLS(d, m, **_OLD),
-    "sliding-window GP 100, robust 3": lambda d, m: WindowGP(d, m, noise_variance=0.3, robust=3.0),
-    "KRLS-T 100, forgetting .99": lambda d, m: KRLSTracker(d, m, noise_variance=0.3, forgetting=0.99),
-    "local GPs, 40 x 100": lambda d, m: LocalGPs(d, m, noise_variance=0.3),
-    "ensemble of four networks": lambda d, m: ReplayMLP(d, m, members=4),
-    "river, adaptive random forest": lambda d, m: RiverResidual(d, m),
+    "zero": chosen("model alone"),
+    "SOGP as published (100 points)": chosen("SOGP plain", **_LOUD),
+    "SOGP, forgetting .99, robust 3, calibrated": chosen("SOGP", parts=[CalibrateNoise()], **_LOUD),
+    "SOGP, process noise .003, robust 3, calibrated": chosen(
+        "SOGP plain", robust=3.0, parts=_CALIBRATED, **_LOUD
+    ),
+    "SOGP, process noise .003, robust 3": chosen("SOGP plain", robust=3.0, parts=_WANDERING, **_LOUD),
+    "SOGP, process noise .003, robust 3, adaptation": chosen(
+        "SOGP plain", robust=3.0, parts=_ADAPTED, **_LOUD
+    ),
+    "deep SOGP, process noise .003, robust 3": chosen("SOGP deep", parts=_WANDERING, **_LOUD),
+    "RLS, forgetting .99, robust 3": chosen("linear RLS", **_LOUD),
+    "random features, forgetting .99, robust 3": chosen("random features", **_LOUD),
+    "sliding-window GP 100, robust 3": chosen("window GP", **_LOUD),
+    "KRLS-T 100, forgetting .99": chosen("KRLS-T", **_LOUD),
+    "local GPs, 40 x 100": chosen("local GPs", **_LOUD),
+    "ensemble of four networks": chosen("MLP ensemble", members=4),
+    "river, adaptive random forest": chosen("river forest"),
 }
 
-_START: dict[str, Any] = {"noise_variance": 0.1}
+_STILL: dict[str, Any] = {"forgetting_factor": 1.0, "robust": None}
 STREAMS: dict[str, Factory] = {
-    "zero": lambda d, m: ZeroResidual(d, m),
-    "RLS": lambda d, m: RecursiveLeastSquares(d, m, **_START),
-    "random features, 2 x 100": lambda d, m: RandomFeatureRLS(d, m, **_START),
-    "SOGP 100": sogp(**_START),
-    "SOGP 100, adaptation": sogp(adapt=True, **_START),
-    "SOGP 300, adaptation": sogp(capacity=300, adapt=True, **_START),
-    "deep SOGP 100": deep(**_START),
-    "deep SOGP 300": deep(capacity=300, **_START),
-    "sliding-window GP 100": lambda d, m: WindowGP(d, m, **_START),
-    "KRLS-T 100": lambda d, m: KRLSTracker(d, m, **_START),
-    "local GPs, 40 x 100": lambda d, m: LocalGPs(d, m, **_START),
-    "GPyTorch SVGP 100": lambda d, m: GPyTorchSVGP(d, m, inducing=100),
-    "GPyTorch window 100": lambda d, m: GPyTorchWindow(d, m, window=100, **_START),
-    "river, adaptive random forest": lambda d, m: RiverResidual(d, m),
-    "ensemble of four networks, all replayed": lambda d, m: ReplayMLP(d, m, members=4, memory=10_000),
+    "zero": chosen("model alone"),
+    "RLS": chosen("linear RLS", **_STILL),
+    "random features, 2 x 100": chosen("random features", **_STILL),
+    "SOGP 100": chosen("SOGP plain"),
+    "SOGP 100, adaptation": chosen("SOGP plain", parts=[LearnHyperparameters()]),
+    "SOGP 300, adaptation": chosen("SOGP plain", capacity=300, parts=[LearnHyperparameters()]),
+    "deep SOGP 100": chosen("SOGP deep", parts=(), robust=None),
+    "deep SOGP 300": chosen("SOGP deep", parts=(), robust=None, capacity=300),
+    "sliding-window GP 100": chosen("window GP", robust=None),
+    "KRLS-T 100": chosen("KRLS-T", forgetting_factor=1.0),
+    "local GPs, 40 x 100": chosen("local GPs"),
+    "GPyTorch SVGP 100": chosen("GPyTorch SVGP", memory=1, minibatch=1),
+    "GPyTorch window 100": chosen("GPyTorch window"),
+    "river, adaptive random forest": chosen("river forest"),
+    "ensemble of four networks, all replayed": chosen("MLP ensemble", members=4, memory=10_000),
 }
 
 
@@ -94,7 +81,7 @@ def hand(names: list[str], half: str, quick: bool, kept: bool) -> None:
     """Every second object; a learner is kept over all of them, or fresh for each."""
     objects = load_t42()[0 if half == "development" else 1 :: 2]
     if quick:
-        objects = [ResidualRecording(o.name, o.x[:60], o.y[:60]) for o in objects[:2]]
+        objects = [Stream(o.name, o.x[:60], o.y[:60]) for o in objects[:2]]
     d, m = objects[0].x.shape[1], objects[0].y.shape[1]
     print(f"{half} half: {len(objects)} objects, {sum(len(o.x) for o in objects)} samples, kept: {kept}\n")
     print("| learner | rms, second half, winsorised | median, second half | rms, all | median, all |")
@@ -128,13 +115,15 @@ def streams(names: list[str], which: list[str], seed: int, quick: bool) -> None:
     """One pass, a tenth held out, targets of unit variance, nothing tuned per set."""
     print("| learner | stream | test RMSE | NLL | us per sample |")
     for stream_name in which:
-        stream = load_stream(stream_name, seed)
+        split = load_split(stream_name, seed)
         if quick:
-            stream = Stream(stream.name, stream.x[:200], stream.y[:200], stream.x_test, stream.y_test)
+            split = split._replace(x=split.x[:200], y=split.y[:200])
         for name in names:
             torch.manual_seed(seed)
-            (s,) = compare_learners({name: STREAMS[name]}, [stream])
-            print(f"| {name} | {s.stream} | {s.rmse:.4f} | {s.nll:.2f} | {s.microseconds:.0f} |", flush=True)
+            s = score_split(STREAMS[name], split)
+            print(
+                f"| {name} | {split.name} | {s.rmse:.4f} | {s.nll:.2f} | {s.microseconds:.0f} |", flush=True
+            )
 
 
 def main() -> None:

@@ -17,7 +17,7 @@ import time
 
 import torch
 
-from torch_ekm.residual import DeepKernelSOGP, SparseOnlineGP, SquaredExponential
+from torch_ekm.residual import DeepKernelSOGP, LearnHyperparameters, SparseOnlineGP, SquaredExponential
 
 
 def trajectory(start: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -34,8 +34,9 @@ def make(options: argparse.Namespace, deep: bool) -> SparseOnlineGP:
     dtype = torch.float32 if options.float32 else torch.float64
     common = {"capacity": options.capacity, "dtype": dtype}
     if options.deep:
-        kind = DeepKernelSOGP if deep else SparseOnlineGP
-        return kind(4, 2, noise_variance=0.1, adapt=True, **common)
+        if deep:
+            return DeepKernelSOGP(4, 2, noise_variance=0.1, **common)
+        return SparseOnlineGP(4, 2, noise_variance=0.1, parts=[LearnHyperparameters()], **common)
     kernel = SquaredExponential(4, lengthscale=1.0)
     return SparseOnlineGP(4, 2, kernel=kernel, noise_variance=1e-4, **common)
 
@@ -58,7 +59,7 @@ def soak(gp: SparseOnlineGP, samples: int) -> None:
     quarter = max(len(errors) // 4, 1)
     first, last = (sum(part) / quarter for part in (errors[:quarter], errors[-quarter:]))
     print(
-        f"{type(gp).__name__}, {samples} samples, {gp.dtype}, {gp.capacity} points: finite, "
+        f"{type(gp.kernel).__name__}, {samples} samples, {gp.dtype}, {gp.capacity} points: finite, "
         f"smallest variance {smallest:.2e}, largest drift {drift:.1e}, "
         f"condition {float(gp.condition_number):.1e}, {memory:.0f} MB, "
         f"{(time.perf_counter() - begin) / samples * 1e6:.0f} us per sample, rms of the next "

@@ -40,7 +40,6 @@ def turn(object: str, seed: int, level: str) -> list[dict[str, Any]]:
         record: dict[str, Any] = {"object": object, "seed": seed, "angle_deg": angle, "error_deg": None}
         try:
             start = plant.reset(seed).state
-            model.reset()
             axis = plant.rotation_axis
             target = PoseTarget.turned(start, axis, degrees=angle)
             done = ClosedLoop(plant, LookAndMoveController(model, axis), rule).run(target)

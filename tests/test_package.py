@@ -2,51 +2,155 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import pickle
 import pkgutil
+import re
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 
 import torch_ekm
 from torch_ekm import exceptions
-from torch_ekm._extras import require
+from torch_ekm._extras import _EXTRA_OF, require
 from torch_ekm.exceptions import EKMError, MissingExtraError
 
-_HEAVY = (
-    "scipy",
-    "coal",
-    "sapien",
-    "cv2",
-    "qpsolvers",
-    "pytorch_kinematics",
-    "matplotlib",
-    "typer",
-    "gymnasium",
-)
+# Run where every installed package is missing but torch, numpy and what torch itself asks for.
+_LIGHT = """
+import importlib.machinery, importlib.metadata, re, sys
 
+def plain(name):
+    return re.match(r"[\\w.-]+", name)[0].lower().replace("-", "_")
 
-@pytest.mark.parametrize("module", ["torch_ekm", "torch_ekm.residual", "torch_ekm.enhanced.enhanced_model"])
-def test_import_needs_only_torch_and_numpy(module: str) -> None:
-    blocked = ", ".join(repr(name) for name in _HEAVY)
-    code = f"""
-import sys
-for name in ({blocked}):
-    sys.modules[name] = None  # importing it now raises ModuleNotFoundError
-import {module}
+def needed(name, found):
+    if name not in found:
+        found.add(name)
+        try:
+            lines = importlib.metadata.requires(name) or ()
+        except importlib.metadata.PackageNotFoundError:  # of another platform
+            return found
+        for line in lines:
+            if "extra ==" not in line:
+                needed(plain(line), found)
+    return found
+
+allowed = needed("torch", {"torch_ekm"}) | needed("numpy", set())
+owners = importlib.metadata.packages_distributions()
+found = {name for name, who in owners.items() if allowed & {plain(one) for one in who}}
+
+class Light(importlib.machinery.PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        spec = super().find_spec(name, path, target)
+        places = [str(spec.origin), *(spec.submodule_search_locations or ())] if spec else []
+        outside = any("-packages" in place for place in places)
+        return None if outside and name.split(".")[0] not in found else spec
+
+sys.meta_path = [Light if one is importlib.machinery.PathFinder else one for one in sys.meta_path]
+for package in ("scipy", "sapien", "cv2", "qpsolvers", "pytorch_kinematics", "yourdfpy", "jaxtyping", "coal"):
+    try:
+        __import__(package)
+    except ModuleNotFoundError:
+        continue
+    raise AssertionError(f"{package} can be imported")
 """
+_FRONT_DOOR = """
+import torch, torch_ekm
+from torch_ekm import EnhancedModel, LearnHyperparameters, SparseOnlineGP, Standardize
+
+for name in torch_ekm.__all__:
+    getattr(torch_ekm, name)
+state, action = torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64)
+for learner in (
+    SparseOnlineGP(in_features=4, out_features=2, parts=[Standardize(), LearnHyperparameters()]),
+    torch_ekm.RecursiveLeastSquares(4, 2),
+    torch_ekm.WindowGP(4, 2),
+    torch_ekm.MixtureResidual(torch_ekm.KRLSTracker(4, 2)),
+    torch_ekm.DeepKernelSOGP(4, 2),
+    torch_ekm.LearnerFleet(torch_ekm.ReplayMLP, 4, 2, batch_shape=(1,))[0],
+):
+    ekm = EnhancedModel(lambda s, a: s + a, learner)
+    for _ in range(40):
+        assert ekm.update(state, action, state + 2.0 * action).accepted
+    value, jacobian = ekm.linearize(state, action)
+    assert float((value - 2.0).abs().max()) < 0.5, (learner, value)
+    assert jacobian.shape == (2, 2)
+"""
+
+
+def test_the_front_door_needs_torch_and_numpy_only() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _LIGHT + _FRONT_DOOR], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("room", ["plant", "sensing", "simulation", "rendering"])
+def test_rooms_ask_for_their_extras_when_they_need_them(room: str) -> None:
+    code = _LIGHT + f"import torch_ekm.{room}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
-def test_missing_extra_is_named() -> None:
-    with pytest.raises(MissingExtraError, match=r"torch_ekm\[all\]|torch_ekm\[") as info:
-        require("surely_not_installed")
+def test_adapters_name_the_extra_when_they_are_made() -> None:
+    made = """
+from torch_ekm.exceptions import MissingExtraError
+from torch_ekm.residual import GPyTorchSVGP, GPyTorchWindow, RiverResidual
+
+for kind in (GPyTorchSVGP, GPyTorchWindow, RiverResidual):
+    try:
+        kind(3, 2)
+    except MissingExtraError as error:
+        assert error.extra == "peers"
+        continue
+    raise AssertionError(kind)
+"""
+    done = subprocess.run([sys.executable, "-c", _LIGHT + made], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "coal", None)  # importing it raises ModuleNotFoundError
+    with pytest.raises(MissingExtraError, match=r"pip install 'torch_ekm\[robot\]'") as info:
+        require("coal")
     assert isinstance(info.value, EKMError)
     assert isinstance(info.value, ImportError)
-    assert info.value.module == "surely_not_installed"
+    assert info.value.module == "coal"
+    with pytest.raises(KeyError):  # no extra is made up for a module that the table does not have
+        require("surely_not_installed")
+
+
+def imported_roots() -> set[str]:
+    """First parts of the names of all modules that the package imports or requires."""
+    names: set[str] = set()
+    for file in Path(torch_ekm.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                names.add(str(node.module))
+            elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "require":
+                assert isinstance(node.args[0], ast.Constant), f"{file}: the name must be written out"
+                names.add(node.args[0].value)
+    core = {"torch", "numpy", "torch_ekm", "jaxtyping"}  # jaxtyping: of the tests, see typing.py
+    return {name.split(".")[0] for name in names} - sys.stdlib_module_names - core
+
+
+def test_every_optional_module_has_an_extra_that_brings_it() -> None:
+    """The table holds each module that is asked for and no other; each extra exists and lists its package."""
+    assert imported_roots() == set(_EXTRA_OF)
+    project = Path(torch_ekm.__file__).parents[1] / "pyproject.toml"
+    if not project.is_file():
+        pytest.skip("pyproject.toml is not part of this installation")
+    extras = tomllib.loads(project.read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    packages = {"cv2": "opencv-python", "mpl_toolkits": "matplotlib", "IPython": "ipykernel"}
+    for root, extra in _EXTRA_OF.items():
+        listed = {re.split(r"[\[>=]", line)[0] for line in extras[extra]}
+        assert packages.get(root, root.replace("_", "-")) in listed, f"{root}: not in the extra '{extra}'"
 
 
 def test_errors_cross_process_boundaries_whole() -> None:

@@ -9,19 +9,20 @@ from .exceptions import MissingExtraError
 
 _EXTRA_OF = {
     "pytorch_kinematics": "robot",
+    "yourdfpy": "robot",
+    "trimesh": "robot",
     "coal": "robot",
     "qpsolvers": "robot",
-    "piqp": "robot",
     "clarabel": "robot",
     "scipy": "robot",
     "sapien": "sim",
     "cv2": "sim",
     "gymnasium": "sim",
     "h5py": "sim",
+    "joblib": "experiments",
     "matplotlib": "experiments",
     "mpl_toolkits": "experiments",
     "jinja2": "experiments",
-    "trimesh": "experiments",
     "pyvista": "experiments",
     "viser": "experiments",
     "typer": "experiments",
@@ -30,22 +31,22 @@ _EXTRA_OF = {
     "pyarrow": "notebooks",
     "gpytorch": "peers",
     "river": "peers",
-    "sklearn": "peers",
     "distributed": "cluster",
     "ray": "cluster",
 }
 
 
 def require(module: str) -> ModuleType:
-    """Import ``module`` and return it.
+    """Import ``module``, whose root must be in the table above, and return it.
 
     Raises:
         MissingExtraError: it is not installed; the message names the extra.
     """
+    root = module.split(".")[0]
+    extra = _EXTRA_OF[root]
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        root = module.split(".")[0]
         if error.name is not None and error.name.split(".")[0] != root:
             raise  # the package is there and something inside it is broken: do not hide it
-        raise MissingExtraError(root, _EXTRA_OF.get(root, "all")) from None
+        raise MissingExtraError(root, extra) from None

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from ._extras import require
-from .exceptions import EKMError, MissingExtraError
+from .exceptions import EKMError, MissingExtraError, ParameterError
 
 try:
     typer = require("typer")
@@ -31,8 +33,17 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     context_settings={"help_option_names": ["-h", "--help"]},
+    rich_markup_mode=None,  # rich would take "[deg]" for a style and drop it
 )
-console = Console()
+console = Console(markup=False)  # the units of a table are no styles either
+
+Hand = Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")]
+Preset = Annotated[str, Option(help="none, nominal, worn or hostile.")]
+Sensing = Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")]
+Jobs = Annotated[int, Option(min=1, help="Processes at once.")]
+Html = Annotated[Path | None, Option(help="Write a stand-alone page instead of serving.")]
+Port = Annotated[int, Option(help="To serve at; the next free one if it is taken.")]
+_AN_OBJECT = "An object (see 'torch-ekm objects') or a path to a URDF."
 
 
 def main() -> None:
@@ -49,11 +60,9 @@ def hands() -> None:
     """List the hands that come with the package."""
     from .description import list_hands, load_hand
 
-    table = RichTable("hand", "joints", "actuators", "contact pads", "URDF")
-    for name in list_hands():
-        hand = load_hand(name)
-        table.add_row(name, str(hand.n_q), str(hand.n_a), str(len(hand.pads)), hand.urdf_path.name)
-    _print_table(table)
+    found = [load_hand(name) for name in list_hands()]
+    rows = [(hand.name, hand.n_q, hand.n_a, len(hand.pads), hand.urdf_path.name) for hand in found]
+    _print_table(("hand", "joints", "actuators", "contact pads", "URDF"), rows)
 
 
 @app.command()
@@ -61,23 +70,21 @@ def objects() -> None:
     """List the objects that come with the package."""
     from .description import list_objects, load_object
 
-    table = RichTable("object", "mass [g]", "friction", "grasp width [mm]", "shapes")
+    rows = []
     for name in list_objects():
         obj = load_object(name)
-        shapes = ", ".join(shape.kind for shape in obj.shapes)
-        table.add_row(
-            name, f"{1e3 * obj.mass:.0f}", f"{obj.friction:g}", f"{1e3 * obj.grasp_width:.0f}", shapes
-        )
-    _print_table(table)
+        figures = f"{1e3 * obj.mass:.0f}", f"{obj.friction:g}", f"{1e3 * obj.grasp_width:.0f}"
+        rows.append((name, *figures, ", ".join(shape.kind for shape in obj.shapes)))
+    _print_table(("object", "mass [g]", "friction", "grasp width [mm]", "shapes"), rows)
 
 
 @app.command()
 def demo(
-    object: Annotated[str, Argument(help="An object (see 'torch-ekm objects') or a path to a URDF.")] = "box",
+    object: Annotated[str, Argument(help=_AN_OBJECT)] = "box",
     out: Annotated[Path, Option(help="Folder for the report.")] = Path("demo_output"),
-    hand: Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")] = "icub_right",
+    hand: Hand = "icub_right",
     seeds: Annotated[str, Option(help="FIRST:END, e.g. 1000:1008; each seed is one grasp.")] = "1000:1008",
-    jobs: Annotated[int, Option(min=1, help="Processes at once.")] = 2,
+    jobs: Jobs = 2,
     quick: Annotated[bool, Option(help="Two grasps, two angles: to see that it works.")] = False,
 ) -> None:
     """Turn a grasped object in the simulated hand, with the KM and with the E-KM, and report.
@@ -91,12 +98,9 @@ def demo(
 
     protocol, chosen = Demo(Setting(hand=hand), object), parse_seeds(seeds)
     planned = Experiment(protocol.quick(), chosen[:2]) if quick else Experiment(protocol, chosen)
-    with _progress() as progress:
-        task = progress.add_task("manipulating", total=len(planned.jobs))
-        report = run(planned, out, jobs, on_done=lambda _: progress.advance(task))
-    _print_tables(report)
-    console.print(report.summary)
-    console.print(f"Report:    {(out / 'index.html').resolve()}", soft_wrap=True)
+    with _progress("manipulating", len(planned.jobs)) as advance:
+        report = run(planned, out, jobs, advance)
+    _print_report(report, out)
     for figure in report.figures:
         console.print(f"           {(out / figure.path).resolve()}", soft_wrap=True)
 
@@ -105,16 +109,16 @@ def demo(
 def reproduce(
     experiment: Annotated[str, Argument(help="online, generalize, ablation or adapt.")] = "generalize",
     seeds: Annotated[str, Option(help="FIRST:END; each seed is an independent run.")] = "1000:1020",
-    jobs: Annotated[int, Option(min=1, help="Processes at once.")] = 2,
+    jobs: Jobs = 2,
     out: Annotated[Path | None, Option(help="Folder for the report [reproduce_<experiment>].")] = None,
     quick: Annotated[bool, Option(help="Two seeds, small turns: to see that it works.")] = False,
     objects: Annotated[
         Path | None, Option(help="Folder with URDF files of your own objects (generalize, adapt).")
     ] = None,
-    hand: Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")] = "icub_right",
-    preset: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
-    learner: Annotated[str, Option(help="rbf, action-linear, paper, deep, rls, rff, ...")] = "rbf",
-    sensing: Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")] = True,
+    hand: Hand = "icub_right",
+    preset: Preset = "nominal",
+    learner: Annotated[str, Option(help="rbf, action-linear, linear RLS, SOGP deep, ...")] = "rbf",
+    sensing: Sensing = True,
     angles: Annotated[
         str, Option(help="Turns [deg], e.g. 5,10,15; Table I if left out (generalize, ablation).")
     ] = "",
@@ -134,19 +138,16 @@ def reproduce(
     from .experiments.reproduce import plan
     from .experiments.reproduce import reproduce as run
 
-    control = {} if step is None else {"focus_step": math.radians(step)}
+    control = {} if step is None else {"LimitingFunction.step": math.radians(step)}
     setting = Setting(hand=hand, preset=preset, learner=learner, sensing=sensing, control=control)
     turns = _numbers("angles", angles) if angles else None
     planned = plan(
         experiment, parse_seeds(seeds), setting=setting, objects=objects, angles_deg=turns, quick=quick
     )
     folder = out if out is not None else Path(f"reproduce_{experiment}")
-    with _progress() as progress:
-        task = progress.add_task(experiment, total=len(planned.jobs))
-        report = run(planned, folder, jobs, lambda _: progress.advance(task), address)
-    _print_tables(report)
-    console.print(report.summary)
-    console.print(f"Report:    {(folder / 'index.html').resolve()}", soft_wrap=True)
+    with _progress(experiment, len(planned.jobs)) as advance:
+        report = run(planned, folder, jobs, advance, address)
+    _print_report(report, folder)
 
 
 @app.command()
@@ -158,7 +159,7 @@ def compare(
     targets: Annotated[str, Option(help="Columns to predict; y, y1, y2, ... or the last by default.")] = "",
     out: Annotated[Path, Option(help="Folder for tables and figures.")] = Path("compare_output"),
     limit: Annotated[int, Option(min=0, help="Samples of a recording that are used; 0: all.")] = 1500,
-    jobs: Annotated[int, Option(min=1, help="Processes at once.")] = 2,
+    jobs: Jobs = 2,
 ) -> None:
     """Compare residual learners on streams: predict, score, update, in the order of time.
 
@@ -167,35 +168,33 @@ def compare(
     (Kaixhin/SARCOS), kin40k and powerplant (treforevans/uci_datasets), mimo, lorenz, mackey_glass and
     santafe (steven2358/kafbox).
     """
-    from .experiments.learner_comparison.report import compare_data
+    from .experiments import compare as run
+    from .experiments.learner_comparison.learners import DEFAULT
 
-    with _progress() as progress:
-        task = progress.add_task("comparing", total=None)
-        report = compare_data(
+    chosen = _names(learners) or DEFAULT
+    with _progress("comparing", len(data) * len(chosen)) as advance:
+        compared = run(
             data,
-            _names(learners),
-            _names(targets),
-            out,
-            limit or None,
-            jobs,
-            on_total=lambda total: progress.update(task, total=total),
-            on_done=lambda _: progress.advance(task),
+            chosen,
+            targets=_names(targets),
+            limit=limit or None,
+            folder=out / "runs",
+            processes=jobs,
+            on_done=advance,
         )
-    _print_tables(report, notes=True)
-    console.print(report.summary)
-    console.print(f"Report:    {(out / 'index.html').resolve()}", soft_wrap=True)
+    _print_report(compared.write(out), out, notes=True)
 
 
 @app.command()
 def record(
     log: Annotated[Path, Argument(help="Folder of the log; one that is there goes on.")],
-    object: Annotated[str, Option(help="An object (see 'torch-ekm objects') or a path to a URDF.")] = "box",
-    hand: Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")] = "icub_right",
-    angles: Annotated[str, Option(help="Rotations in degrees, separated by commas.")] = "10,20",
+    object: Annotated[str, Option(help=_AN_OBJECT)] = "box",
+    hand: Hand = "icub_right",
+    angles: Annotated[str, Option(help="Turns [deg], e.g. 10,20.")] = "10,20",
     seeds: Annotated[str, Option(help="FIRST:END; each angle is turned once for each seed.")] = "0:3",
     controller: Annotated[str, Option(help="KM, KM+I, E-KM or E-KM+I.")] = "KM",
-    preset: Annotated[str, Option(help="none, nominal, worn or hostile.")] = "nominal",
-    sensing: Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")] = True,
+    preset: Preset = "nominal",
+    sensing: Sensing = True,
     images: Annotated[bool, Option(help="Keep the camera's images too.")] = False,
 ) -> None:
     """Turn an object in the simulated hand and log all of it, one HDF5 file for each turn.
@@ -209,9 +208,8 @@ def record(
     setting = Setting(hand=hand, preset=preset, sensing=sensing)
     config = RecordConfig(setting, object, controller, _numbers("angles", angles), images)
     chosen = parse_seeds(seeds)
-    with _progress() as progress:
-        task = progress.add_task("recording", total=len(chosen) * len(config.angles_deg))
-        made = run(config, chosen, log, on_trial=lambda _: progress.advance(task))
+    with _progress("recording", len(chosen) * len(config.angles_deg)) as advance:
+        made = run(config, chosen, log, on_trial=advance)
     console.print(f"{len(made)} trials in {made.folder.resolve()}", soft_wrap=True)
 
 
@@ -220,8 +218,8 @@ def show(
     what: Annotated[str, Argument(metavar="[HAND|LOG]", help="A hand, a URDF, or a log.")] = "icub_right",
     object: Annotated[str | None, Option(help="An object for the hand to hold.")] = None,
     seed: Annotated[int, Option(help="Which grasp of the object.")] = 0,
-    html: Annotated[Path | None, Option(help="Write a stand-alone page instead of serving.")] = None,
-    port: Annotated[int, Option(help="To serve at; the next free one if it is taken.")] = 8080,
+    html: Html = None,
+    port: Port = 8080,
 ) -> None:
     """Turn and zoom a hand, a grasp or a log in the browser.
 
@@ -238,8 +236,8 @@ def replay(
     log: Annotated[Path, Argument(help="A log's folder, or the file of one trial.")],
     trial: Annotated[int | None, Option(help="Which trial; the first one by default.")] = None,
     estimates: Annotated[bool, Option(help="Show what was measured, not the truth.")] = False,
-    html: Annotated[Path | None, Option(help="Write a stand-alone page instead of serving.")] = None,
-    port: Annotated[int, Option(help="To serve at; the next free one if it is taken.")] = 8080,
+    html: Html = None,
+    port: Port = 8080,
 ) -> None:
     """List the trials of a log, and play one in the browser."""
     from .experiments.viewer.trial import LogShow
@@ -247,21 +245,8 @@ def replay(
 
     shown = LogShow(log, trial, estimates)
     if shown.log is not None:
-        table = RichTable(*TrialEntry._fields, title=str(log))
-        for entry in shown.log.index:
-            table.add_row(*map(str, entry))
-        _print_table(table)
+        _print_table(TrialEntry._fields, shown.log.index, str(log))
     _look(shown, html, port)
-
-
-def _look(show: Show, html: Path | None, port: int) -> None:
-    """Write a page, or serve until Ctrl-C."""
-    from .experiments.viewer.serve import save_page, serve
-
-    if html is not None:
-        console.print(f"Page:      {save_page(show, html).resolve()}", soft_wrap=True)
-        return
-    serve(show, port=port, on_ready=lambda address: console.print(f"Open {address} (Ctrl-C ends)"))
 
 
 @app.command()
@@ -277,32 +262,61 @@ def notebooks(
         console.print(str(path), soft_wrap=True, highlight=False)
 
 
-def _progress() -> Progress:
-    """What, a bar, how many of how many, and for how long."""
+@app.command()
+def version() -> None:
+    """Print the version, and those of the packages that decide the numbers."""
+    from .experiments.reporting.report import versions
+
+    for package, number in versions().items():
+        console.print(f"{package} {number}", highlight=False)
+
+
+def _look(show: Show, html: Path | None, port: int) -> None:
+    """Write a page, or serve until Ctrl-C."""
+    from .experiments.viewer.serve import save_page, serve
+
+    if html is not None:
+        console.print(f"Page:      {save_page(show, html).resolve()}", soft_wrap=True)
+        return
+    serve(show, port=port, on_ready=lambda address: console.print(f"Open {address} (Ctrl-C ends)"))
+
+
+@contextmanager
+def _progress(what: str, total: int) -> Iterator[Callable[[object], None]]:
+    """What, a bar, how many of how many, and for how long; gives what is to be called after each."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=console)
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task(what, total=total)
+        yield lambda _: progress.advance(task)
+
+
+def _print_report(report: Report, folder: Path, notes: bool = False) -> None:
+    _print_tables(report, notes)
+    console.print(report.summary)
+    console.print(f"Report:    {(folder / 'index.html').resolve()}", soft_wrap=True)
 
 
 def _print_tables(report: Report, notes: bool = False) -> None:
     for table in report.tables:
-        shown = RichTable(*table.header, title=table.caption, caption=table.note if notes else None)
-        for row in table.text():
-            shown.add_row(*row)
-        _print_table(shown)
+        _print_table(table.header, table.text(), table.caption, table.note if notes else None)
 
 
-def _print_table(table: RichTable) -> None:
+def _print_table(
+    header: Iterable[str], rows: Iterable[Iterable[object]], title: str | None = None, note: str | None = None
+) -> None:
+    table = RichTable(*header, title=title, caption=note)
+    for row in rows:
+        table.add_row(*map(str, row))
     for column in table.columns:
         column.overflow = "fold"  # figures are never cut short
     if console.is_terminal:
         console.print(table)
     else:  # a file or a pipe has no width of its own
-        Console(width=Console(width=1000).measure(table).maximum).print(table)
+        width = Console(width=1000, markup=False).measure(table).maximum
+        Console(width=width, markup=False).print(table)
 
 
 def _numbers(name: str, text: str) -> tuple[float, ...]:
-    from .exceptions import ParameterError
-
     try:
         return tuple(float(part) for part in text.split(",") if part.strip())
     except ValueError:
@@ -313,23 +327,12 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
-@app.command()
-def version() -> None:
-    """Print the version, and those of the packages that decide the numbers."""
-    from .experiments.reporting.report import versions
-
-    for package, number in versions().items():
-        console.print(f"{package} {number}", highlight=False)
-
-
 def parse_seeds(text: str) -> tuple[int, ...]:
     """``"1000:1006"`` as 1000..1005; a single number as itself.
 
     Raises:
         ParameterError: it is neither.
     """
-    from .exceptions import ParameterError
-
     try:
         numbers = [int(part) for part in text.split(":")]
     except ValueError:

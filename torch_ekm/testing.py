@@ -108,10 +108,10 @@ def _check_prior(learner: ResidualLearner, x: Tensor) -> None:
 
 def _check_report(report: UpdateReport, learner: ResidualLearner, n: int | None = None) -> None:
     shape = learner.batch_shape if n is None else (n, *learner.batch_shape)
-    for name in ("event", "novelty", "surprise", "weight"):
+    for name in ("event", "novelty", "nis", "weight"):
         assert getattr(report, name).shape == torch.Size(shape), f"report.{name} has the wrong shape"
     assert bool(report.accepted.all()), "a good sample was not accepted"
-    for name in ("novelty", "weight"):  # surprise may be NaN: a learner without uncertainty has none
+    for name in ("novelty", "weight"):  # nis may be NaN: a learner without uncertainty has none
         assert bool(getattr(report, name).isfinite().all()), f"report.{name} is not finite"
 
 

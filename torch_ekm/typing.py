@@ -8,7 +8,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor as Tensor
+
+Array = NDArray[np.float64]
 
 if TYPE_CHECKING:
     from jaxtyping import Bool as Bool
@@ -25,4 +29,4 @@ else:
 
         Bool = Float = Int = _Inert
 
-__all__ = ["Bool", "Float", "Int", "Tensor"]
+__all__ = ["Array", "Bool", "Float", "Int", "Tensor"]

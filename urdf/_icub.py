@@ -22,6 +22,7 @@ from _writer import (
     number,
     solid_inertia,
 )
+from trimesh.transformations import compose_matrix
 
 HALF_TURN = math.pi / 2
 
@@ -134,9 +135,7 @@ def _signs(link: str, left: bool) -> Vector:
 
 def _joint_frame(xyz: Vector, rpy: Vector, parent: Vector, child: Vector) -> tuple[Vector, Vector]:
     """``p' = D_parent p``, ``R' = D_parent R D_child`` with diagonal reflections D."""
-    from torch_ekm.description.urdf import pose
-
-    T = pose(np.array(xyz, dtype=float), np.array(rpy, dtype=float))
+    T = compose_matrix(translate=xyz, angles=rpy)
     R = np.array(parent)[:, None] * T[:3, :3] * np.array(child)
     p = np.array(parent) * T[:3, 3]
     turn = (math.atan2(R[2, 1], R[2, 2]), -math.asin(np.clip(R[2, 0], -1, 1)), math.atan2(R[1, 0], R[0, 0]))
@@ -234,6 +233,7 @@ def transmission_text(left: bool) -> str:
 [hand]
 name = "icub_{side}"
 base_link = "hand"
+gravity = [0.0, 0.0, 9.81]  # [m/s^2]: the palm faces down
 
 # Springs [N m/rad] and their rest angles, Coulomb friction [N m] of every joint.
 #
@@ -271,8 +271,8 @@ stiffness = {ACTUATOR_STIFFNESS}{posture}""")
     out += [f'\n[[couplings]]\nname = "{name}"\njoints = {inline(arms)}' for name, arms in COUPLINGS]
     out.append(f"""
 # Fingertips: capsules of {PAD_RADIUS * 1e3:g} mm, the same as the URDF's collision shapes [m, link frame].
-# direction: the palmar side. torsional_friction [m]: {PAD_TORSION:g} is a hard finger, as a single contact
-# point of a simulator is; a soft pad has 2 to 4 mm.""")
+# direction: the palmar side. torsional_friction [m]: {PAD_TORSION:g} is a point contact with friction, as
+# a simulator's is; a soft pad has 2 to 4 mm.""")
     for finger in FINGERS:
         out.append(f"""
 [[pads]]

@@ -65,6 +65,7 @@ def transmission_text() -> str:
 name = "planar_two_finger"
 base_link = "hand"
 planar_normal = [0.0, 0.0, 1.0]  # everything moves in the plane z = 0
+gravity = [0.0, 0.0, 9.81]  # [m/s^2]
 
 [joints]  # spring [N m/rad], rest angle, Coulomb friction [N m]"""
     ]

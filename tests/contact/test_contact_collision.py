@@ -12,7 +12,7 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from torch_ekm.contact._primitives import signed_distance, surface_curvature, tangents
+from torch_ekm.contact.signed_distance import point_distance, surface_curvature, tangents
 from torch_ekm.description import (
     ContactPad,
     ObjectDescription,
@@ -186,7 +186,7 @@ def test_invariants(kind: str, pose: tuple[float, ...]) -> None:
         # within the crown: n leans by at most half/R from the perpendicular
         assert float(distance) == pytest.approx(RADIUS, abs=1e-6)
         on_object = rotation.mT @ (x - gap / 2 * n - position)
-        d, _ = signed_distance(obj.shapes[0])(*on_object.tolist())
+        d, _ = point_distance(obj.shapes[0])(*on_object.tolist())
         assert d == pytest.approx(0.0, abs=1e-9)
 
 
@@ -194,7 +194,7 @@ def test_invariants(kind: str, pose: tuple[float, ...]) -> None:
 def test_normals_are_gradients_and_curvature_their_derivative(kind: str) -> None:
     """``n = grad d``; on a smooth feature ``dn/dx = K_o`` at the surface."""
     shape = thing(kind).shapes[0]
-    distance = signed_distance(shape)
+    distance = point_distance(shape)
     rng = np.random.default_rng(2)
     checked = 0
     for _ in range(300):

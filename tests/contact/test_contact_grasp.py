@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 from contact_samples import F64, RADIUS, THREE, ball_contacts, held
@@ -16,15 +15,8 @@ from torch_ekm.contact.contact_kinematics import (
     hand_jacobian,
     rolling_mobility,
 )
-from torch_ekm.contact.contact_model import ContactModel, normal_rows, selection_matrix
-from torch_ekm.contact.grasp_analysis import (
-    analyse,
-    ferrari_canny,
-    has_force_closure,
-    null_space,
-    scaled_grasp_matrix,
-)
-from torch_ekm.exceptions import ParameterError
+from torch_ekm.contact.contact_model import ContactModel, normal_rows, selected_rows
+from torch_ekm.contact.grasp_analysis import analyse
 from torch_ekm.kinematics.se3 import exp, hat
 
 
@@ -83,9 +75,9 @@ def test_constraint_rows_are_the_velocities_of_the_contact_points():
 
 
 def test_selection_of_contact_models():
-    models = [ContactModel.FRICTIONLESS, ContactModel.HARD_FINGER, ContactModel.SOFT_FINGER]
+    models = [ContactModel.FRICTIONLESS, ContactModel.POINT_WITH_FRICTION, ContactModel.SOFT_FINGER]
     kin = held(THREE, models=models)
-    H = selection_matrix(models)
+    H = torch.eye(18, dtype=F64)[selected_rows(models)]
     assert H.shape == (8, 18)
     assert normal_rows(models) == [0, 1, 4]
     assert torch.equal(hand_jacobian(kin), H @ full_hand_jacobian(kin))
@@ -113,13 +105,12 @@ def test_rolling_mobility_of_ball_on_ball_cylinder_and_pin():
 
 
 @pytest.mark.parametrize(("gamma", "rank"), [(0.0, 5), (0.004, 6)])
-def test_two_hard_fingers_cannot_turn_the_object_about_their_line_but_soft_ones_can(gamma, rank):
+def test_two_points_cannot_turn_the_object_about_their_line_but_soft_fingers_can(gamma, rank):
     kin = held([[1.0, 0, 0], [-1.0, 0, 0]], gamma=gamma)
-    G = scaled_grasp_matrix(kin)
-    assert int(torch.linalg.matrix_rank(G, rtol=1e-10)) == rank
     analysis = analyse(kin, torch.eye(2, 6, dtype=F64))
     assert analysis.indeterminate is (rank == 5)
-    assert has_force_closure(kin) is (rank == 6)
+    assert analysis.internal_forces == grasp_matrix(kin).shape[1] - rank
+    assert (analysis.smallest_singular_value > 1e-3) is (rank == 6)
 
 
 def test_ranks_of_a_three_finger_grasp():
@@ -134,44 +125,3 @@ def test_ranks_of_a_three_finger_grasp():
     assert not analysis.defective
     # all 9 joints driven: 9 + 9 unknown forces against 15 equations
     assert analyse(kin, torch.eye(9, dtype=F64)).undetermined_forces == 3
-
-
-def test_null_space_is_complete_and_its_rank_decision_does_not_depend_on_units():
-    A = constraint_matrix(held(THREE))
-    R = null_space(A, 9)
-    assert R.shape == (15, 6)
-    assert (A @ R).abs().max() < 1e-14
-    doubled = torch.cat([A, A[:2] * 1e-5])  # redundant rows in other units
-    assert null_space(doubled, 9).shape == (15, 6)
-    with pytest.raises(ParameterError, match="length"):
-        null_space(A, 9, length=0.0)
-
-
-def test_ferrari_canny_of_four_points_on_a_circle_is_known():
-    # planar, moments vanish for normals through the centre: no closure against a moment
-    four = [[1.0, 0, 0], [0.0, 1, 0], [-1.0, 0, 0], [0.0, -1, 0]]
-    kin = held(four, friction=0.0, plane=(0.0, 0.0, 1.0), models=[ContactModel.FRICTIONLESS] * 4)
-    assert ferrari_canny(kin, planar=True) == 0.0
-    # with friction mu on a circle of radius L each cone edge is (n + mu t, mu): the weakest direction
-    # is the pure moment, resisted by mu
-    mu = 0.3
-    kin = held(four, friction=mu, plane=(0.0, 0.0, 1.0))
-    epsilon = ferrari_canny(kin, length=RADIUS, planar=True)
-    points = np.array(
-        [
-            [-np.cos(a) - s * mu * -np.sin(a), -np.sin(a) - s * mu * np.cos(a), -s * mu]
-            for a in np.arange(4) * np.pi / 2
-            for s in (1.0, -1.0)
-        ]
-    )
-    directions = np.random.default_rng(0).normal(size=(200_000, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    support = (directions @ points.T).max(1).min()  # sampled: an upper bound that comes close
-    assert epsilon == pytest.approx(mu, rel=1e-12)
-    assert epsilon <= support < 1.02 * epsilon
-
-
-def test_quality_falls_as_the_fingers_move_together():
-    spread = [ferrari_canny(held([[1, 0, 0], [-1, s, 0.05], [-1, -s, -0.05]])) for s in (1.5, 0.8, 0.3)]
-    assert spread[0] > spread[1] > spread[2] > 0
-    assert not has_force_closure(held([[1.0, 0, 0], [1.0, 0.1, 0], [1.0, 0, 0.1]]))

@@ -9,17 +9,24 @@ import torch
 
 from torch_ekm.residual import (
     ActionLinearKernel,
+    CalibrateNoise,
     DeepKernel,
     DeepKernelSOGP,
+    DetectChanges,
+    ForgettingFactor,
     KRLSTracker,
     LearnerFleet,
+    LearnHyperparameters,
     LocalGPs,
     MixtureResidual,
+    ProcessNoise,
     RandomFeatureRLS,
     RecursiveLeastSquares,
     ReplayMLP,
+    RobustWeight,
     SparseOnlineGP,
     SquaredExponential,
+    Standardize,
     WindowGP,
     ZeroResidual,
 )
@@ -28,7 +35,7 @@ from torch_ekm.testing import check_residual_learner
 
 def deep(dtype=torch.float64, **options):
     base = SquaredExponential(3, batch_shape=options.get("batch_shape", ()))
-    options = {"normalize": True, "adapt": True, "refresh_every": 4, **options}
+    options = {"parts": [Standardize(), LearnHyperparameters()], "refresh_every": 4, **options}
     return SparseOnlineGP(3, 2, capacity=8, kernel=DeepKernel(base, hidden=(8,)), dtype=dtype, **options)
 
 
@@ -38,36 +45,38 @@ def sogp(**options):
 
 LEARNERS = {
     "zero": lambda **o: ZeroResidual(3, 2, **o),
-    "rls": lambda **o: RecursiveLeastSquares(3, 2, forgetting=0.99, robust=3.0, **o),
+    "rls": lambda **o: RecursiveLeastSquares(3, 2, forgetting_factor=0.99, robust=3.0, **o),
     "rff": lambda **o: RandomFeatureRLS(3, 2, n_frequencies=20, **o),
     "window": lambda **o: WindowGP(3, 2, window=10, **o),
-    "krls_t": lambda **o: KRLSTracker(3, 2, capacity=8, forgetting=0.99, **o),
+    "krls_t": lambda **o: KRLSTracker(3, 2, capacity=8, forgetting_factor=0.99, **o),
     "local": lambda **o: LocalGPs(3, 2, experts=3, window=6, **o),
     "mlp": lambda **o: ReplayMLP(3, 2, hidden=(8,), **o),
     "ensemble": lambda **o: ReplayMLP(3, 2, hidden=(8,), members=3, **o),
     "sogp": sogp,
     "sogp_all": lambda **o: sogp(
-        normalize=True,
-        adapt=True,
-        forgetting=0.99,
-        robust=3.0,
         refresh_every=4,
         projection="fitc",
-        calibrate=True,
-        detect_changes=True,
+        parts=[
+            RobustWeight(3.0),
+            CalibrateNoise(),
+            DetectChanges(),
+            ForgettingFactor(0.99),
+            Standardize(),
+            LearnHyperparameters(memory=20),
+        ],
         **o,
     ),
     "sogp_skip": lambda **o: sogp(on_invalid="skip", **o),
-    "sogp_action": lambda **o: sogp(kernel=ActionLinearKernel(3, 1), normalize=True, **o),
-    "sogp_diffusion": lambda **o: sogp(diffusion=0.01, refresh_every=4, **o),
-    "mixture": lambda **o: MixtureResidual(sogp(robust=3.0, diffusion=0.003, **o)),
+    "sogp_action": lambda **o: sogp(kernel=ActionLinearKernel(3, 1), parts=[Standardize()], **o),
+    "sogp_process_noise": lambda **o: sogp(parts=[ProcessNoise(0.01)], refresh_every=4, **o),
+    "mixture": lambda **o: MixtureResidual(sogp(parts=[RobustWeight(3.0), ProcessNoise(0.003)], **o)),
     "mixture_of_two": lambda **o: MixtureResidual(
-        [sogp(diffusion=0.01, **o), RecursiveLeastSquares(3, 2, **o)], shares=(0.0, 1.0)
+        [sogp(parts=[ProcessNoise(0.01)], **o), RecursiveLeastSquares(3, 2, **o)], shares=(0.0, 1.0)
     ),
     "deep": deep,
     "deep_sogp": lambda **o: DeepKernelSOGP(3, 2, capacity=8, hidden=(8,), refresh_every=4, **o),
 }
-FLEETS = ("zero", "rls", "rff", "window", "sogp", "sogp_all", "sogp_diffusion", "mixture_of_two", "deep")
+FLEETS = ("zero", "rls", "rff", "window", "sogp", "sogp_all", "sogp_process_noise", "mixture_of_two", "deep")
 
 
 @pytest.mark.parametrize("name", LEARNERS)
@@ -83,7 +92,7 @@ def test_contract_of_fleets(name, shape):
 
 
 SINGLE = {
-    "krls_t": (KRLSTracker, {"capacity": 8, "forgetting": 0.99}),
+    "krls_t": (KRLSTracker, {"capacity": 8, "forgetting_factor": 0.99}),
     "local": (LocalGPs, {"experts": 3, "window": 6}),
     "mlp": (ReplayMLP, {"hidden": (8,)}),
     "ensemble": (ReplayMLP, {"hidden": (8,), "members": 3}),

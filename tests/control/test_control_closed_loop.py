@@ -18,7 +18,7 @@ from torch_ekm.control import StopReason as Reason
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NonFiniteError
 from torch_ekm.kinematics.se3 import exp
-from torch_ekm.model import KinematicModel, ModelOptions
+from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, Plant, PlantStatus
 from torch_ekm.simulation import SimulatedHand
 
@@ -52,7 +52,7 @@ class FrozenPlant:
 def held():
     plant = SimulatedHand("icub_right", "box")
     seen = plant.reset(seed=4)
-    model = KinematicModel(plant.hand, plant.object, ModelOptions(gravity=plant.config.gravity))
+    model = KinematicModel(plant.hand, plant.object)
     axis = plant.rotation_axis
     loop = LookAndMoveController(model, axis)
     return seen, axis, loop

@@ -9,21 +9,33 @@ import pytest
 import torch
 
 from torch_ekm.control import (
-    ControllerOptions,
+    DEFAULT_LIMITS,
+    DEFAULT_TASKS,
+    ActuatorLimit,
     FocusedPose,
+    FocusTask,
+    FrictionMarginLimit,
+    Inequality,
+    JointLimit,
+    LimitingFunction,
+    LinearizedModel,
     LookAndMoveController,
+    NormalForceLimit,
     PoseTarget,
+    Situation,
+    Squares,
     StopReason,
+    UncertaintyTask,
 )
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
+from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.kinematics import GraspState
-from torch_ekm.model import KinematicModel, ModelOptions
+from torch_ekm.model import KinematicModel, ModelStatus
 from torch_ekm.residual import ActionLinearKernel, SparseOnlineGP, ZeroResidual
 from torch_ekm.simulation import SimulatedHand
 
 DEG = math.pi / 180
-STEP = ControllerOptions().focus_step
+STEP = LimitingFunction().step
 
 
 @pytest.fixture(scope="module")
@@ -31,24 +43,24 @@ def grasp():
     """A held box: plant, kinematic model, first observation and its state."""
     plant = SimulatedHand("icub_right", "box")
     seen = plant.reset(seed=3)
-    model = KinematicModel(plant.hand, plant.object, ModelOptions(gravity=plant.config.gravity))
+    model = KinematicModel(plant.hand, plant.object)
     return plant, model, seen, GraspState(seen.q, seen.position, seen.rotation)
 
 
-def controller(grasp, options: ControllerOptions | None = None, enhanced: bool = False):
+def controller(grasp, enhanced: bool = False, **parts) -> LookAndMoveController:
     plant, model, _, _ = grasp
     used = model
     if enhanced:
         learner = SparseOnlineGP(6 + plant.hand.n_a, 6)
         rows = list(range(plant.hand.n_q, plant.hand.n_q + 6))
         used = EnhancedModel(model, learner, encode=lambda s: s.coordinates(s)[..., -6:], outputs=rows)
-    return LookAndMoveController(used, FocusedPose.rotation_about(plant.rotation_axis), options)
+    return LookAndMoveController(used, FocusedPose.rotation_about(plant.rotation_axis), **parts)
 
 
 def test_zero_error_gives_almost_no_command(grasp) -> None:
     _, _, seen, state = grasp
     here = PoseTarget(state.position, state.rotation)
-    decision = controller(grasp, ControllerOptions(grip_force=None)).decide(state, seen.a, here)
+    decision = controller(grasp).decide(state, seen.a, here)  # no forces measured: no rows for the grip
     assert decision.status is StopReason.RUNNING
     assert float(decision.delta_a.abs().max()) < 1e-4  # [rad]; an encoder a hair outside its range comes back
 
@@ -65,14 +77,112 @@ def test_prediction_meets_the_limited_error(grasp, enhanced: bool) -> None:
     torch.testing.assert_close(decision.predicted, decision.nominal)
 
 
+def test_where_no_forces_are_found_those_of_the_same_grasp_stand_in(grasp) -> None:
+    plant, model, seen, state = grasp
+    contacts = model.contacts(state)
+    slippery = contacts.replace(friction=torch.full_like(contacts.friction, 1e-4))
+    shown = [contacts]
+    forgetful = KinematicModel(
+        plant.hand, plant.object, kinematics=model.kinematics, detector=lambda *_: shown[0]
+    )
+    loop = LookAndMoveController(forgetful, FocusedPose.rotation_about(plant.rotation_axis))
+    target = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG)
+
+    def status() -> ModelStatus:
+        return loop.decide(state, seen.a, target, seen.fingertip_force).linearization.status
+
+    assert status() is ModelStatus.OK
+    shown[0] = slippery
+    assert [status(), status()] == [ModelStatus.REUSED_FORCES] * 2
+    loop.reset()
+    assert status() is ModelStatus.NO_FORCES
+
+
 def test_limits_are_kept_and_told(grasp) -> None:
     plant, _, seen, state = grasp
-    options = ControllerOptions(actuator_step=0.05 * DEG, fixed_actuators=("thumb_oppose",))
+    small = ActuatorLimit(0.05 * DEG, fixed=("thumb_oppose",))
     target = PoseTarget.turned(state, plant.rotation_axis, 20 * DEG)
-    decision = controller(grasp, options).decide(state, seen.a, target, seen.fingertip_force)
+    decision = controller(grasp, limits=(small,)).decide(state, seen.a, target, seen.fingertip_force)
     assert float(decision.delta_a.abs().max()) <= 0.05 * DEG + 1e-9
     assert decision.delta_a[plant.hand.actuator_names.index("thumb_oppose")] == 0
     assert decision.slack > 0.5 * DEG  # unreachable in one step: reported, not raised
+    with pytest.raises(UnknownNameError, match="thumb_oppose"):
+        controller(grasp, limits=(ActuatorLimit(fixed=("thumb",)),)).decide(state, seen.a, target)
+
+
+def test_actuators_at_the_end_of_their_range_are_told(grasp) -> None:
+    plant, _, seen, state = grasp
+    target = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG)
+    short = controller(grasp, limits=(ActuatorLimit(0.05 * DEG),))
+    free = short.decide(state, seen.a, target)
+    assert free.slack > 0.1 * STEP
+    assert not free.limited  # by the step, not by the end of a range
+    lower, upper = (torch.from_numpy(x) for x in (plant.hand.actuator_lower, plant.hand.actuator_upper))
+    a = torch.where(free.delta_a > 0, upper, lower).where(free.delta_a.abs() > 1e-6, seen.a)
+    decision = short.decide(state, a, target)
+    assert decision.limited
+    after = a + decision.delta_a
+    assert bool(((after <= upper + 1e-9) & (after >= lower - 1e-9)).all())
+
+
+class HoldJoint:
+    """A wish from outside the package: one joint keeps its angle."""
+
+    def __init__(self, joint: int, weight: float = 1e3) -> None:
+        self.joint, self.weight = joint, weight
+
+    def rows(self, model: LinearizedModel, seen: Situation) -> Squares:
+        j = [self.joint]
+        return Squares(model.jacobian[j], -model.offset[j], self.weight, DEG)
+
+
+class SlowJoint(HoldJoint):
+    """A limit from outside: it closes by no more than 0.1 deg."""
+
+    def rows(self, model: LinearizedModel, seen: Situation) -> Inequality:
+        j = [self.joint]
+        return Inequality(model.jacobian[j], 0.1 * DEG - model.offset[j], DEG)
+
+
+@pytest.mark.parametrize("enhanced", [False, True])
+def test_a_wish_and_a_limit_of_ones_own_have_effect(grasp, enhanced: bool) -> None:
+    plant, _, seen, state = grasp
+    target = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG)
+    plain = controller(grasp, enhanced).decide(state, seen.a, target, seen.fingertip_force)
+    joint = int(plain.predicted[: plant.hand.n_q].argmax())
+    closes = float(plain.predicted[joint])
+    assert closes > 0.5 * DEG
+    for part, most in (
+        ({"tasks": (*DEFAULT_TASKS, HoldJoint(joint))}, 0.05 * closes),
+        ({"limits": (*DEFAULT_LIMITS, SlowJoint(joint))}, 0.1 * DEG + 1e-4),
+    ):
+        decision = controller(grasp, enhanced, **part).decide(state, seen.a, target, seen.fingertip_force)
+        assert abs(float(decision.predicted[joint])) <= most
+        turn = float(plant.rotation_axis @ decision.predicted[-3:])
+        assert turn == pytest.approx(STEP, rel=2e-2)  # and the turn is still made
+
+
+def test_without_a_focus_task_the_rest_is_done(grasp) -> None:
+    plant, _, seen, state = grasp
+    target = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG)
+    rest = [task for task in DEFAULT_TASKS if not isinstance(task, FocusTask)]
+    decision = controller(grasp, tasks=rest).decide(state, seen.a, target, 0.5 * seen.fingertip_force)
+    change = decision.linearization.normal_force_sensitivity @ decision.delta_a
+    assert float(change.max()) > 0.3
+    assert decision.slack == 0.0
+
+
+def test_joints_stop_before_their_stops(grasp) -> None:
+    plant, _, seen, state = grasp
+    target = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG)
+    plain = controller(grasp).decide(state, seen.a, target, seen.fingertip_force)
+    change = plain.predicted[: plant.hand.n_q]
+    joint = int(change.argmax())
+    stop = float(state.q[joint] + 0.3 * change[joint])  # in the midst of the way
+    margin = float(plant.hand.joint_upper[joint]) - stop
+    kept = controller(grasp, limits=(ActuatorLimit(), NormalForceLimit(), JointLimit(margin)))
+    decision = kept.decide(state, seen.a, target, seen.fingertip_force)
+    assert float(state.q[joint] + decision.predicted[joint]) <= stop + 1e-6
 
 
 def test_grip_rows_ask_for_the_missing_force(grasp) -> None:
@@ -86,19 +196,19 @@ def test_grip_rows_ask_for_the_missing_force(grasp) -> None:
 
 
 def test_limiting_function_keeps_direction() -> None:
-    loop = LookAndMoveController.__new__(LookAndMoveController)
-    loop.options = ControllerOptions(focus_step=1.0, focus_gain=0.5)
+    limiting = LimitingFunction(gain=0.5, step=1.0, contact_travel=2e-3)
     error = torch.tensor([3.0, -4.0])
-    torch.testing.assert_close(loop.limit(error), error / 5)
-    torch.testing.assert_close(loop.limit(error / 10), error / 20)
-    torch.testing.assert_close(loop.limit(error * 0), error * 0)
+    torch.testing.assert_close(limiting(error), error / 5)
+    torch.testing.assert_close(limiting(error / 10), error / 20)
+    torch.testing.assert_close(limiting(error * 0), error * 0)
+    torch.testing.assert_close(limiting(error, travel=20e-3), error / 10)
 
 
 def test_no_contact_is_asked_to_travel_far(grasp) -> None:
     plant, _, seen, state = grasp
     target = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG)
-    options = ControllerOptions(contact_step=0.4e-3)
-    decision = controller(grasp, options).decide(state, seen.a, target, seen.fingertip_force)
+    limiting = LimitingFunction(contact_travel=0.4e-3)
+    decision = controller(grasp, limiting=limiting).decide(state, seen.a, target, seen.fingertip_force)
     lever = decision.linearization.contacts.point - state.position
     lever = lever - (lever @ plant.rotation_axis)[:, None] * plant.rotation_axis
     farthest = float(torch.linalg.vector_norm(lever, dim=-1).max())
@@ -110,11 +220,11 @@ def test_a_translation_carries_every_contact_as_far(grasp) -> None:
     _, model, seen, state = grasp
     focus = FocusedPose(torch.eye(6, dtype=torch.float64)[:3])
     target = PoseTarget(state.position + torch.tensor([3e-3, 4e-3, 0.0]), state.rotation)
-    options = ControllerOptions(focus_step=1.0, contact_step=0.5e-3)
-    decision = LookAndMoveController(model, focus, options).decide(state, seen.a, target)
+    short = LimitingFunction(step=1.0, contact_travel=0.5e-3)
+    decision = LookAndMoveController(model, focus, limiting=short).decide(state, seen.a, target)
     torch.testing.assert_close(decision.desired, torch.tensor([0.3e-3, 0.4e-3, 0.0], dtype=torch.float64))
-    free = ControllerOptions(focus_step=1.0, contact_step=None, focus_gain=0.8)
-    decision = LookAndMoveController(model, focus, free).decide(state, seen.a, target)
+    free = LimitingFunction(gain=0.8, step=1.0, contact_travel=None)
+    decision = LookAndMoveController(model, focus, limiting=free).decide(state, seen.a, target)
     torch.testing.assert_close(decision.desired, 0.8 * torch.tensor([3e-3, 4e-3, 0.0], dtype=torch.float64))
 
 
@@ -170,24 +280,25 @@ def taught(grasp) -> EnhancedModel:
     return enhanced
 
 
-def decide(grasp, taught: EnhancedModel, **options: float):
+def decide(grasp, taught: EnhancedModel, weight: float | None = None, **options: int):
     plant, _, seen, state = grasp
     target = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG)
     focus = FocusedPose.rotation_about(plant.rotation_axis)
-    loop = LookAndMoveController(taught, focus, ControllerOptions(**options))
+    more = () if weight is None else (UncertaintyTask(weight),)
+    loop = LookAndMoveController(taught, focus, (*DEFAULT_TASKS, *more), **options)
     decision = loop.decide(state, seen.a, target, seen.fingertip_force)
-    weight = torch.cat([torch.zeros(plant.hand.n_q + 3), plant.rotation_axis.square()]).double()
-    return loop, decision, float(taught.variance(state, decision.delta_a, weight).value) / DEG**2
+    about = torch.cat([torch.zeros(plant.hand.n_q + 3), plant.rotation_axis.square()]).double()
+    return loop, decision, float(taught.variance(state, decision.delta_a, about).value) / DEG**2
 
 
 def test_without_weight_nothing_changes(grasp, taught: EnhancedModel) -> None:
-    plain, zero = (decide(grasp, taught, **o)[1] for o in ({}, {"uncertainty_weight": 0.0}))
+    plain, zero = (decide(grasp, taught, weight)[1] for weight in (None, 0.0))
     assert torch.equal(plain.delta_a, zero.delta_a)
 
 
 def test_uncertain_actions_are_avoided_at_little_cost(grasp, taught: EnhancedModel) -> None:
     plant = grasp[0]
-    runs = [decide(grasp, taught, uncertainty_weight=w) for w in (0.0, 3.0, 30.0)]
+    runs = [decide(grasp, taught, w) for w in (0.0, 3.0, 30.0)]
     variances = [variance for _, _, variance in runs]
     assert variances[1] < 0.8 * variances[0]
     assert variances[2] < 0.6 * variances[0]
@@ -199,37 +310,54 @@ def test_uncertain_actions_are_avoided_at_little_cost(grasp, taught: EnhancedMod
 def test_decision_is_the_best_of_all(grasp, taught: EnhancedModel) -> None:
     """The QP's cost with the true variance, at the decision and at random steps that turn as far."""
     plant, _, seen, state = grasp
-    options = {"uncertainty_weight": 30.0, "sqp_iterations": 40}
-    loop, decision, _ = decide(grasp, taught, **options)
+    loop, decision, _ = decide(grasp, taught, 30.0, sqp_iterations=40)
     error = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG).error(state)
-    lin = decision.linearization
-    value, J = taught.linearize(state, decision.delta_a, lin.manipulation_jacobian)
-    problem = loop._problem(
-        state, seen.a, error, decision.desired, lin, J, value - J @ decision.delta_a, seen.fingertip_force
-    )
+    at = Situation(plant.hand, loop.focus, state, seen.a, seen.fingertip_force, error, decision.desired)
+    value, J = taught.linearize(state, decision.delta_a, decision.linearization.manipulation_jacobian)
+    model = LinearizedModel(decision.linearization, decision.delta_a, value - J @ decision.delta_a, J)
+    loop.tasks = loop.tasks[:-1]  # all but the variance, which is added by brute force
+    qp = loop.program(model, at).qp
+    n_u, n_t = plant.hand.n_a, len(qp.h)
+    P, q, E, C = qp.P[:n_u, :n_u], qp.q[:n_u], qp.A[:, :n_u], qp.G[:, :n_u]
+    lower, upper = qp.lb[:n_u], qp.ub[:n_u]
     weight = torch.cat([torch.zeros(plant.hand.n_q + 3), plant.rotation_axis.square()]).double()
 
     def cost(u: np.ndarray) -> float:
-        total = float(u @ problem.weight @ u)
-        total += sum(float(w @ (A @ u - b) ** 2) for A, b, w in problem.least_squares)
-        broken = sum(np.maximum(C @ u - h, 0).sum() for C, h in problem.soft_inequality)
-        da = torch.from_numpy(u * DEG)
-        # brute force: the variance that the learner itself predicts
-        law = taught.predict(state, da)
+        broken = qp.q[-n_t:] @ np.maximum(C @ u - qp.h, 0)
+        law = taught.predict(state, torch.from_numpy(u * DEG))  # what the learner itself predicts
         variance = float(weight[-6:] @ law.variance) / DEG**2
-        return total + problem.soft_penalty * float(broken) + 30.0 * variance
+        return float(0.5 * u @ P @ u + q @ u + broken) + 30.0 * variance
 
     best = decision.delta_a.numpy() / DEG
-    E, _ = problem.equality
     free = np.linalg.svd(E)[2][len(E) :].T  # steps that leave the focused motion alone
     generator = np.random.default_rng(0)
     found = cost(best)
     for size in (1e-2, 0.1, 1.0):
         for _ in range(40):
             u = best + free @ (size * generator.normal(size=free.shape[1]))
-            u = np.where((u >= problem.lower) & (u <= problem.upper), u, best)
+            u = np.where((u >= lower) & (u <= upper), u, best)
             if np.abs(E @ (u - best)).max() < 1e-9:
                 assert cost(u) > found - 1e-4 * size
+
+
+def test_uncertainty_task_costs_the_variance_that_the_learner_predicts(grasp, taught: EnhancedModel) -> None:
+    plant, km, seen, state = grasp
+    n_a = plant.hand.n_a
+    at = Situation(
+        plant.hand,
+        FocusedPose.rotation_about(plant.rotation_axis),
+        state,
+        seen.a,
+        None,
+        torch.zeros(6).double(),
+        torch.zeros(1).double(),
+    )
+    generator = torch.Generator().manual_seed(1)
+    action, u = 2 * DEG * torch.randn(2, n_a, generator=generator, dtype=torch.float64)
+    rows = UncertaintyTask(3.0).rows(LinearizedModel.about(action, km.linearize(state), taught), at)
+    variance = plant.rotation_axis.square() @ taught.predict(state, u).variance[-3:]
+    # no action, no doubt: the constant that the rows leave out is zero
+    torch.testing.assert_close(u @ rows.curvature @ u / 2 + rows.gradient @ u, 3.0 * variance / DEG**2)
 
 
 def test_learner_without_uncertainty_is_refused(grasp, taught: EnhancedModel) -> None:
@@ -239,7 +367,7 @@ def test_learner_without_uncertainty_is_refused(grasp, taught: EnhancedModel) ->
         model, ZeroResidual(6 + plant.hand.n_a, 6), encode=lambda s: s.coordinates(s)[..., -6:], outputs=rows
     )
     with pytest.raises(ParameterError, match="ZeroResidual"):
-        decide(grasp, never_unsure, uncertainty_weight=1.0)
+        decide(grasp, never_unsure, 1.0)
 
 
 def test_margin_rows_keep_away_from_the_friction_cone(grasp) -> None:
@@ -252,14 +380,13 @@ def test_margin_rows_keep_away_from_the_friction_cone(grasp) -> None:
         return lin.margins + lin.margin_sensitivity @ decision.delta_a
 
     bound = float(after(free).min()) + 0.2
-    kept = controller(grasp, ControllerOptions(margin_min=bound)).decide(
-        state, seen.a, target, seen.fingertip_force
-    )
+    limits = (*DEFAULT_LIMITS, FrictionMarginLimit(bound))
+    kept = controller(grasp, limits=limits).decide(state, seen.a, target, seen.fingertip_force)
     assert float(after(kept).min()) > bound - 1e-4
     assert float(plant.rotation_axis @ kept.predicted[-3:]) == pytest.approx(STEP, rel=1e-4)
     # far more than can be had: as much as one step may ask for, and the turn is still made
-    much = ControllerOptions(margin_min=50.0)
-    decision = controller(grasp, much).decide(state, seen.a, target, seen.fingertip_force)
+    much = (*DEFAULT_LIMITS, FrictionMarginLimit(50.0))
+    decision = controller(grasp, limits=much).decide(state, seen.a, target, seen.fingertip_force)
     assert decision.status is StopReason.RUNNING
     assert decision.solution is not None
     assert float((after(decision) - lin.margins).min()) > float((after(free) - lin.margins).min())

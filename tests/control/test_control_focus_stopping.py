@@ -34,7 +34,8 @@ def test_focus_and_rest_span_all_directions() -> None:
     rows = torch.cat([focus.matrix, focus.off_matrix])
     assert rows.shape == (6, 6)
     torch.testing.assert_close(rows @ rows.mT, torch.eye(6, dtype=torch.float64))
-    assert focus.n_x == 1
+    assert len(focus.matrix) == 1
+    assert focus.off_translation.tolist() == [True] * 3 + [False] * 2
 
 
 def test_bad_focus_is_refused() -> None:

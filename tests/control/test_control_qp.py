@@ -2,87 +2,108 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
-from torch_ekm.control.qp import ControlProblem, build_qp, solve_qp
+from torch_ekm.control import (
+    Bounds,
+    ControlSolution,
+    Equality,
+    Inequality,
+    Squares,
+    build_qp,
+)
+from torch_ekm.enhanced.action_variance import Quadratic
 from torch_ekm.exceptions import ParameterError
 
+DEG = math.pi / 180
+EFFORT = Squares(np.diag([1.0, 2.0]), np.zeros(2))  # u1^2 + 4 u2^2
+E = np.array([[1.0, 2.0]])
 
-def problem(d: float = 1.0, bound: float = 10.0, **changes) -> ControlProblem:
-    fields = {
-        "weight": np.diag([1.0, 4.0]),
-        "lower": np.full(2, -bound),
-        "upper": np.full(2, bound),
-        "equality": (np.array([[1.0, 2.0]]), np.array([d])),
-    }
-    return ControlProblem(**(fields | changes))
+
+def solve(*rows, d: float = 0.1, bound: float = 1.0, solver: str = "piqp") -> ControlSolution:
+    """Rows beside ``u1 + 2 u2 = d`` and the effort."""
+    always = (EFFORT, Equality(E, np.array([d])), Bounds(np.full(2, -bound), np.full(2, bound)))
+    return build_qp(2, [*always, *rows]).solve(solver)
 
 
 def test_weighted_least_norm_step() -> None:
-    # min u1^2 + 4 u2^2 with u1 + 2 u2 = 1: u = W^-1 E^T (E W^-1 E^T)^-1 = (1/2, 1/4)
-    solution = solve_qp(problem())
-    np.testing.assert_allclose(solution.u, [0.5, 0.25], atol=1e-7)
-    np.testing.assert_allclose(solution.slack, 0, atol=1e-7)
+    # min u1^2 + 4 u2^2 with u1 + 2 u2 = d: u = W^-1 E^T (E W^-1 E^T)^-1 d = (1/2, 1/4) d
+    solution = solve()
+    np.testing.assert_allclose(solution.u, [0.05, 0.025], atol=1e-8)
+    np.testing.assert_allclose(solution.slack, 0, atol=1e-8)
     assert solution.primal_residual < 1e-6
-    assert not solution.at_bounds.any()
+    assert solution.dual_residual < 1e-6
 
 
 def test_zero_error_gives_zero_command() -> None:
-    np.testing.assert_allclose(solve_qp(problem(d=0.0)).u, 0, atol=1e-9)
+    np.testing.assert_allclose(solve(d=0.0).u, 0, atol=1e-10)
 
 
 def test_unreachable_target_goes_to_the_bounds_and_says_so() -> None:
-    solution = solve_qp(problem(d=30.0, bound=2.0))
-    np.testing.assert_allclose(solution.u, [2, 2], atol=1e-5)
-    np.testing.assert_allclose(solution.slack, 24, atol=1e-4)
-    assert solution.at_bounds.all()
+    solution = solve(d=0.9, bound=0.2)
+    np.testing.assert_allclose(solution.u, [0.2, 0.2], atol=1e-6)
+    np.testing.assert_allclose(solution.slack, 0.3, atol=1e-5)
+
+
+@pytest.mark.parametrize(("d", "u"), [(0.9, [0.03, 0.2]), (-0.9, [-0.2, 0.04])])
+def test_bounds_intersect(d: float, u: list[float]) -> None:
+    row = Bounds(np.array([-1.0, 0.04]), np.array([0.03, 1.0]))
+    np.testing.assert_allclose(solve(row, d=d, bound=0.2).u, u, atol=1e-6)
 
 
 def test_l1_slack_is_exact_when_the_target_is_reachable() -> None:
     # a quadratic slack of any weight would leave a part of the target unmet
-    row = (np.array([[1.0, 0.0]]), np.array([-5.0]), np.array([3.0]))
-    solution = solve_qp(problem(least_squares=[row]))
-    np.testing.assert_allclose(solution.slack, 0, atol=1e-6)
+    solution = solve(Squares(np.array([[1.0, 0.0]]), np.array([-0.1]), 3.0, DEG))
+    np.testing.assert_allclose(solution.slack, 0, atol=1e-7)
 
 
 def test_soft_inequality_holds_if_it_can_and_yields_if_it_must() -> None:
-    rows = [(np.array([[1.0, 0.0]]), np.array([0.1]))]
-    solution = solve_qp(problem(soft_inequality=rows))
-    assert solution.u[0] <= 0.1 + 1e-6
+    solution = solve(Inequality(np.array([[1.0, 0.0]]), np.array([0.01]), DEG))
+    assert solution.u[0] <= 0.01 + 1e-7
     assert solution.violation < 1e-6
-    contradictory = [(np.array([[1.0, 0.0], [-1.0, 0.0]]), np.array([-1.0, -1.0]))]
-    assert solve_qp(problem(soft_inequality=contradictory)).violation > 0.99
+    contradictory = Inequality(np.array([[1.0, 0.0], [-1.0, 0.0]]), np.array([-0.1, -0.1]))
+    assert solve(contradictory).violation > 0.099
 
 
-def test_least_squares_rows_pull() -> None:
-    free = problem(equality=(np.zeros((0, 2)), np.zeros(0)))
-    free.least_squares = [(np.eye(2), np.array([1.0, 1.0]), np.array([1.0, 4.0]))]
-    np.testing.assert_allclose(solve_qp(free).u, [0.5, 0.5], atol=1e-6)
+def test_cheaper_of_two_limits_is_broken() -> None:
+    up, down = (
+        Inequality(np.array([[s, 0.0]]), np.array([-0.1]), DEG, p) for s, p in ((1, 10.0), (-1, 20.0))
+    )
+    assert solve(up, down, d=0.0).u[0] == pytest.approx(0.1, abs=1e-6)
+
+
+def test_squares_pull_and_weigh_each_row_in_its_unit() -> None:
+    rows = Squares(np.eye(2), np.array([0.1, 0.1]), np.array([1.0, 4.0]), np.array([1.0, 2.0]))
+    free = build_qp(2, [Squares(np.eye(2), np.zeros(2)), rows]).solve()
+    np.testing.assert_allclose(free.u, [0.05, 0.05], atol=1e-7)
+
+
+def test_quadratic_cost_and_rows_that_ask_for_nothing() -> None:
+    # 1/2 u^T H u + c^T u at its minimum -H^-1 c; the value decides nothing
+    H, c = np.array([[2.0, 0.5], [0.5, 1.0]]), np.array([-0.1, 0.2])
+    u = build_qp(2, [None, Quadratic(7.0, c, H)]).solve().u  # type: ignore[arg-type]
+    np.testing.assert_allclose(u, -np.linalg.solve(H, c), atol=1e-7)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # dense matrices are copied for sparse solvers
 def test_every_installed_solver_agrees() -> None:
     import qpsolvers
 
-    reference = solve_qp(problem(soft_inequality=[(np.array([[1.0, 0.0]]), np.array([0.1]))])).u
+    row = Inequality(np.array([[1.0, 0.0]]), np.array([0.01]), DEG)
     for solver in qpsolvers.available_solvers:
-        u = solve_qp(problem(soft_inequality=[(np.array([[1.0, 0.0]]), np.array([0.1]))]), solver).u
-        np.testing.assert_allclose(u, reference, atol=1e-4, err_msg=solver)
+        np.testing.assert_allclose(solve(row, solver=solver).u, solve(row).u, atol=1e-5, err_msg=solver)
 
 
-@pytest.mark.parametrize(
-    ("changes", "match"),
-    [
-        ({"lower": np.array([1.0, 0.0]), "upper": np.array([0.0, 1.0])}, r"lower\[0\]"),
-        ({"equality": (np.array([[np.nan, 1.0]]), np.array([1.0]))}, "finite"),
-    ],
-)
-def test_bad_problem_is_refused(changes: dict, match: str) -> None:
-    with pytest.raises(ParameterError, match=match):
-        build_qp(problem(**changes))
+def test_bad_problem_is_refused() -> None:
+    with pytest.raises(ParameterError, match=r"lower\[0\].*upper\[0\] = -1"):
+        build_qp(2, [Bounds(np.array([1.0, 0.0]), np.array([-1.0, 1.0]))])
+    with pytest.raises(ParameterError, match="finite"):
+        build_qp(2, [Equality(np.array([[np.nan, 1.0]]), np.array([1.0]))])
 
 
 def test_unknown_solver_lists_the_installed_ones() -> None:
     with pytest.raises(ParameterError, match="piqp"):
-        solve_qp(problem(), "no_such_solver")
+        solve(solver="no_such_solver")

@@ -32,7 +32,6 @@ def test_the_printed_example_loads_and_moves(page: str, tmp_path: Path) -> None:
     (tmp_path / "finger.transmission.toml").write_text(block(page, "toml"))
     hand = load_hand(tmp_path / "finger.urdf")
     assert hand.base_link == "base"
-    assert hand.urdf is not None
     assert [shape.kind for shape in hand.urdf.link("distal").collisions] == ["capsule"]
     q = ActuationMap(hand).joints(torch.tensor([1.14], dtype=torch.float64))
     torch.testing.assert_close(q, torch.tensor([0.5, 0.8], dtype=torch.float64))

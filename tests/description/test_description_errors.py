@@ -45,6 +45,13 @@ URDF_FAULTS = {
     "no limit": ("<limit ", "<bounds ", "joint 'left_0': <joint> needs a <limit>"),
     "type": ('type="revolute"', 'type="prismatic"', "type 'prismatic' is not supported; supported: revolute"),
     "mimic": ('<axis xyz="0 0 -1"/>', '<mimic joint="right_0"/>', "mimic.*couplings"),
+    "commas": ('xyz="-0.03 0 0"', 'xyz="-0.03,0,0"', "'xyz' must be three numbers, got '-0.03,0,0'"),
+    "no axis": ('<axis xyz="0 0 -1"/>', "<axis/>", "axis: <axis> needs the attribute 'xyz'"),
+    "no inertia": ('ixx="', 'mxx="', "link 'hand', inertial, inertia: .* the attribute 'ixx'"),
+    "infinite": ('ixy="0"', 'ixy="inf"', "inertial, inertia: 'ixy' must be a finite number, got 'inf'"),
+    "no parent": ('<parent link="hand"/>', "", "joint 'left_0': <joint> needs a <parent>"),
+    "no name": ('<link name="left_tip"/>', "<link/>", "a <link> has no name"),
+    "no shape": ("<cylinder ", "<tube ", "<geometry> needs one of box, cylinder, sphere, capsule, mesh"),
     "zero axis": ('<axis xyz="0 0 -1"/>', '<axis xyz="0 0 0"/>', "axis must not be zero"),
     "mass": (
         'mass value="0.1"',
@@ -60,7 +67,7 @@ URDF_FAULTS = {
     "loop": ('<parent link="hand"/>', '<parent link="left_tip"/>', "one tree"),
     "twice": ('<link name="left_tip"/>', '<link name="hand"/>', "repeated: hand"),
 }
-EVERYWHERE = ("not a robot", "size")  # replaced at each place, not only at the first
+EVERYWHERE = ("not a robot", "size", "no shape")  # replaced at each place, not only at the first
 
 
 @pytest.mark.parametrize("fault", list(URDF_FAULTS))
@@ -158,7 +165,11 @@ OBJECT_FAULTS = {
     "no axis": (".object.toml", "grasp_axis = [0.0, 1.0, 0.0]", "grasp_axis = [0, 0, 0]", "must not be zero"),
     "key": (".object.toml", "[marker]", "[markers]", "unknown key 'markers'"),
     "mesh": (".urdf", '<collision><origin xyz="0 0 0"/><geometry><box size="0.09 0.03 0.04"/>',
-             '<collision><geometry><mesh filename="a.stl"/>', "box, cylinder, sphere or capsule only"),
+             '<collision><geometry><mesh filename="a.stl"/>', "or capsule only, found a mesh"),
+    "mesh beside a box": (".urdf", "</inertial>",
+                          '</inertial><collision><geometry><mesh filename="a.stl"/></geometry></collision>',
+                          "found a mesh"),
+    "no shape": (".urdf", "collision>", "nothing>", "found no shape"),
     "massless": (".urdf", "inertial>", "nothing>", "needs an <inertial>"),
     "two links": (".urdf", "</robot>", '<link name="b"/><joint name="j" type="fixed"><parent link="box"/>'
                   '<child link="b"/></joint></robot>', "single link, found box, b"),
@@ -174,7 +185,9 @@ def test_object_faults(fault: str, tmp_path: Path) -> None:
     path = tmp_path / f"thing{suffix}"
     text = path.read_text()
     assert old in text
-    path.write_text(text.replace(old, new) if fault == "massless" else text.replace(old, new, 1))
+    path.write_text(
+        text.replace(old, new) if fault in ("massless", "no shape") else text.replace(old, new, 1)
+    )
     with pytest.raises(DescriptionError, match=message):
         load_object(urdf)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_ekm.description import data_folder, list_hands, load_hand, read_urdf, registry
+from torch_ekm.description import list_hands, load_hand, registry, urdf_folder
 from torch_ekm.exceptions import DescriptionError, EKMError, UnknownNameError
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
@@ -101,7 +101,6 @@ def test_icub_weighs_what_its_cad_says(side: str) -> None:
     from torch_ekm.kinematics import HandKinematics
 
     hand = load_hand(f"icub_{side}")
-    assert hand.urdf is not None
     poses = HandKinematics(hand)(torch.zeros(20, dtype=torch.float64))
     mass = sum(link.mass for link in hand.urdf.links)
     com = sum(link.mass * (poses.of(link.name).numpy() @ [*link.com, 1.0])[:3] for link in hand.urdf.links)
@@ -118,7 +117,6 @@ def test_icub_weighs_what_its_cad_says(side: str) -> None:
 def test_pads_lie_on_collision_shapes(name: str) -> None:
     """The detector (pads) and a simulator (URDF collisions) must see the same surface."""
     hand = load_hand(name)
-    assert hand.urdf is not None
     for pad in hand.pads:
         (capsule,) = hand.urdf.link(pad.link).collisions
         assert capsule.kind == "capsule"
@@ -137,6 +135,23 @@ def test_planar_hand_says_so() -> None:
     np.testing.assert_array_equal(hand.actuation_jacobian, [[1, 0.8, 0, 0], [0, 0, 1, 0.8]])
 
 
+@pytest.mark.parametrize("name", list_hands())
+def test_gravity_is_the_files(name: str, tmp_path: Path) -> None:
+    hand = load_hand(name)
+    assert hand.gravity == (0.0, 0.0, 9.81)
+    urdf = tmp_path / hand.urdf_path.name
+    urdf.write_text(hand.urdf_path.read_text())
+    text = hand.transmission_path.read_text()
+    other = urdf.with_suffix(".transmission.toml")
+    other.write_text(text.replace("gravity = [0.0, 0.0, 9.81]", "gravity = [0, -9.8, 0]"))
+    assert load_hand(str(urdf)).gravity == (0.0, -9.8, 0.0)
+    other.write_text(text.replace("gravity = [0.0, 0.0, 9.81]", ""))
+    assert load_hand(str(urdf)).gravity == hand.gravity
+    other.write_text(text.replace("gravity = [0.0, 0.0, 9.81]", "gravity = [0.0, nan, 0.0]"))
+    with pytest.raises(DescriptionError, match="gravity"):
+        load_hand(str(urdf))
+
+
 def test_unknown_names_list_the_right_ones() -> None:
     with pytest.raises(UnknownNameError, match=r"icub_right, icub_left, planar_two_finger.*\.urdf") as caught:
         load_hand("shadow")
@@ -147,7 +162,7 @@ def test_unknown_names_list_the_right_ones() -> None:
 
 def test_files_are_what_the_generator_writes() -> None:
     """Nobody edits the written files by hand; the figures live in one place."""
-    script = data_folder() / "generate.py"
+    script = urdf_folder() / "generate.py"
     done = subprocess.run(
         [sys.executable, str(script), "--check"], capture_output=True, text=True, check=False
     )
@@ -159,18 +174,7 @@ def test_data_of_an_installed_package(tmp_path: Path, monkeypatch: pytest.Monkey
     package = tmp_path / "torch_ekm" / "description"
     (package.parent / "_urdf" / "objects").mkdir(parents=True)
     monkeypatch.setattr(registry, "__file__", str(package / "registry.py"))
-    assert data_folder() == package.parent / "_urdf"
+    assert urdf_folder() == package.parent / "_urdf"
     (package.parent / "_urdf" / "objects").rmdir()
     with pytest.raises(DescriptionError, match="not installed"):
-        data_folder()
-
-
-def test_urdf_is_read_alike_by_others() -> None:
-    yourdfpy = pytest.importorskip("yourdfpy")
-    for name in list_hands():
-        hand = load_hand(name)
-        robot = yourdfpy.URDF.load(str(hand.urdf_path), load_meshes=False, build_scene_graph=False)
-        assert tuple(robot.actuated_joint_names) == hand.joint_names
-        ours = {joint.name: joint for joint in read_urdf(hand.urdf_path).joints}
-        for theirs in robot.robot.joints:
-            np.testing.assert_allclose(theirs.origin, ours[theirs.name].transform, atol=1e-12)
+        urdf_folder()

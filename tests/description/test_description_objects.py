@@ -48,14 +48,13 @@ def support(shape: Shape, direction: np.ndarray) -> float:
 @pytest.mark.parametrize("name", list_objects())
 def test_grasp_width_is_the_width_at_the_origin(name: str) -> None:
     """How long the line along the grasp axis through the origin is inside the object."""
-    from torch_ekm.contact._primitives import signed_distance
+    from torch_ekm.contact.signed_distance import signed_distance
 
     obj = load_object(name)
 
     def inside(y: float) -> bool:
         p = obj.grasp_axis * y
-        locals_ = [shape.transform[:3, :3].T @ (p - shape.transform[:3, 3]) for shape in obj.shapes]
-        return any(signed_distance(s)(*x)[0] <= 0 for s, x in zip(obj.shapes, locals_, strict=True))
+        return bool(signed_distance(obj.shapes, p)[0] <= 0)
 
     ys = np.linspace(-0.05, 0.05, 20001)
     within = [y for y in ys if inside(y)]

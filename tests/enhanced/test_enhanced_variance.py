@@ -8,13 +8,15 @@ import torch
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.enhanced.action_variance import action_variance
 from torch_ekm.exceptions import ParameterError
-from torch_ekm.experiments.learners import LEARNERS, make_learner
+from torch_ekm.experiments.learners import HAND_LEARNERS, make_learner
 from torch_ekm.object_memory import ModelBank
 from torch_ekm.residual import (
     ActionLinearKernel,
+    Part,
     ReplayMLP,
     ResidualLearner,
     SparseOnlineGP,
+    Standardize,
     ZeroResidual,
 )
 
@@ -32,12 +34,12 @@ def train(learner: ResidualLearner, generator: torch.Generator, n: int = 40) -> 
     return learner
 
 
-@pytest.mark.parametrize("normalize", [False, True])
+@pytest.mark.parametrize("parts", [[], [Standardize()]])
 def test_exact_for_every_action_with_an_action_linear_kernel(
-    normalize: bool, generator: torch.Generator
+    parts: list[Part], generator: torch.Generator
 ) -> None:
     scale = torch.tensor([1e3, 1e3, 60.0], dtype=torch.float64)
-    learner = train(linear_learner(normalize=normalize), generator)
+    learner = train(linear_learner(parts=parts), generator)
     model = EnhancedModel(lambda s, a: s * a.sum(), learner, action_scale=30.0, output_scale=scale)
     state = torch.randn(N_S, generator=generator, dtype=torch.float64)
     weight = torch.tensor([0.3, 0.0, 2.0], dtype=torch.float64)
@@ -64,7 +66,7 @@ def test_bank_speaks_with_the_voice_of_its_leader(generator: torch.Generator) ->
         assert torch.equal(ours, theirs)
 
 
-@pytest.mark.parametrize("name", [n for n in LEARNERS if n not in ("none", "mlp")])
+@pytest.mark.parametrize("name", [n for n in HAND_LEARNERS if n not in ("model alone", "MLP")])
 def test_other_learners_by_differentiation(name: str, generator: torch.Generator) -> None:
     learner = train(make_learner(name, N_S, N_A, 20), generator)
     x = torch.randn(N_S + N_A, generator=generator, dtype=torch.float64)

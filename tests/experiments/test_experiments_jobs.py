@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -11,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from torch_ekm.exceptions import MissingExtraError, ParameterError
-from torch_ekm.experiments import clusters
+from torch_ekm.experiments import jobs as module
 from torch_ekm.experiments.jobs import run_jobs
 
 
@@ -45,6 +48,76 @@ def test_interrupted_run_resumes(tmp_path: Path) -> None:
     result = run_jobs(counted, {"a": (1,), "b": (3,), "c": (2,)}, tmp_path)
     assert calls == [3, 2]
     assert result["b"]["square"] == 9
+
+
+def die(x: int) -> int:
+    if x == 0:
+        os._exit(3)
+    return x
+
+
+def mark(folder: str, x: int) -> int:
+    """Leaves a trace; the job 0 fails."""
+    (Path(folder) / str(x)).touch()
+    if x == 0:
+        raise ValueError("job 0")
+    time.sleep(0.02)
+    return x
+
+
+def test_a_failure_cancels_what_has_not_begun(tmp_path: Path) -> None:
+    traces = tmp_path / "traces"
+    traces.mkdir()
+    with pytest.raises(ValueError, match="job 0"):
+        run_jobs(mark, {f"job_{x}": (str(traces), x) for x in range(60)}, tmp_path / "runs", processes=2)
+    time.sleep(1.5)
+    assert len(list(traces.iterdir())) < 30
+
+
+def test_workers_are_fresh_and_take_lambdas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_PATIENCE", 7.0)  # a forked worker would see it
+    factor = 3
+    jobs = {f"job_{x}": (x,) for x in range(2)}
+    results = run_jobs(lambda x: [factor * x, module._PATIENCE], jobs, tmp_path, processes=2)
+    assert results == {"job_0": [0, 10.0], "job_1": [3, 10.0]}
+
+
+def test_a_dead_worker_ends_the_run(tmp_path: Path) -> None:
+    with pytest.raises(Exception, match="unexpectedly terminated"):
+        run_jobs(die, {f"job_{x}": (x,) for x in range(4)}, tmp_path, processes=2)
+
+
+SLEEPERS = """
+import signal, sys, time
+from pathlib import Path
+from torch_ekm.experiments.jobs import run_jobs
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts what it runs behind without one
+
+def work(x):
+    time.sleep(0.1 if x < 2 else 60)
+    return x
+
+def tell(name):
+    print(name, flush=True)
+
+run_jobs(work, {f"job_{x}": (x,) for x in range(6)}, Path(sys.argv[1]), 2, on_done=tell)
+"""
+
+
+def test_ctrl_c_leaves_what_is_finished_and_nothing_hangs(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", SLEEPERS, str(tmp_path)]
+    # a group of its own, as a terminal has: Ctrl-C goes to the workers too
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as run:
+        assert run.stdout is not None
+        assert {run.stdout.readline().strip(), run.stdout.readline().strip()} == {"job_0", "job_1"}
+        time.sleep(0.5)
+        os.killpg(run.pid, signal.SIGINT)
+        _, errors = run.communicate(timeout=20)
+    assert "KeyboardInterrupt" in errors
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["job_0.json", "job_1.json"]
 
 
 # -- clusters ----------------------------------------------------------------------------------------
@@ -92,6 +165,30 @@ def test_dask_cluster(dask_address: str, tmp_path: Path) -> None:
     check_cluster(dask_address, tmp_path)
 
 
+@pytest.mark.slow
+def test_dead_dask_worker_ends_the_run(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    import dask
+
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
+    ):
+        address = cluster.scheduler_address.replace("tcp://", "dask://")
+        with pytest.raises(distributed.KilledWorker):
+            run_jobs(die, {f"job_{x}": (x,) for x in range(2)}, tmp_path, address=address)
+
+
+def test_failure_on_dask_cancels_what_has_not_begun(dask_address: str, tmp_path: Path) -> None:
+    traces = tmp_path / "traces"
+    traces.mkdir()
+    jobs = {f"job_{x}": (str(traces), x) for x in range(60)}
+    with pytest.raises(ValueError, match="job 0"):
+        run_jobs(mark, jobs, tmp_path / "runs", address=dask_address)
+    time.sleep(2.0)
+    assert len(list(traces.iterdir())) < 30
+
+
 def test_worker_with_threads_runs_one_job_at_a_time(dask_address: str, tmp_path: Path) -> None:
     jobs = {f"job_{k}": (0.05 + 1e-3 * k,) for k in range(6)}
     results = run_jobs(running_together, jobs, tmp_path, address=dask_address)
@@ -118,7 +215,7 @@ def test_wrong_addresses_say_what_would_be_right(address: str, tmp_path: Path) -
 
 def test_cluster_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr(clusters, "_PATIENCE", 0.5)
+    monkeypatch.setattr(module, "_PATIENCE", 0.5)
     with pytest.raises(ParameterError, match="answers"):
         run_jobs(truediv, DIVISIONS, tmp_path, address="dask://127.0.0.1:1")
     monkeypatch.setitem(sys.modules, "distributed", None)

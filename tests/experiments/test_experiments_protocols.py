@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +10,20 @@ import pytest
 import torch
 from experiments_records import not_grasped
 
-from torch_ekm.control import ControllerOptions, PoseTarget
-from torch_ekm.description import object_files
+from torch_ekm.control import (
+    DEFAULT_LIMITS,
+    DEFAULT_TASKS,
+    EffortTask,
+    FrictionMarginLimit,
+    LimitingFunction,
+    OffAxisTask,
+    PoseTarget,
+)
+from torch_ekm.description import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.camera_off import CameraOff
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
-from torch_ekm.experiments.learners import LEARNERS, make_learner
+from torch_ekm.experiments.learners import HAND_LEARNERS, LEARNERS, make_learner
 from torch_ekm.experiments.protocols.ablation import DISTURBANCES, Ablation, variants
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.protocols.object_memory import ObjectMemory
@@ -26,7 +33,7 @@ from torch_ekm.experiments.runner import Bench
 from torch_ekm.kinematics import GraspState
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.plant import Observation, PlantStatus
-from torch_ekm.simulation import PlantParameters
+from torch_ekm.simulation import preset
 
 ONLINE = Online(trials=2, angle_range_deg=(4.0, 5.0), dislocations=(2,), tendons_replaced=2)
 
@@ -51,6 +58,8 @@ def test_controllers_differ_in_the_reference_of_their_increments() -> None:
         ({"plant": {"springs": 2.0}}, ParameterError, "spring"),
         ({"model": {"rolls": False}}, ParameterError, "rolling"),
         ({"grasp": {"force": 1.0}}, ParameterError, "pinch_force"),
+        ({"control": {"OffAxisTask.wait": 1.0}}, ParameterError, "rotation_weight"),
+        ({"control": {"step": 1.0}}, ParameterError, "LimitingFunction"),
     ],
 )
 def test_wrong_settings_say_what_would_be_right(changes: dict, error: type, match: str) -> None:
@@ -65,12 +74,12 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
     base = Generalize()
     unchanged = of(Setting())
     assert of(Setting()) == unchanged
-    other = functools.partial(ControllerOptions, focus_gain=0.5)  # a version with another default
+    other = (EffortTask(weight=0.02), *DEFAULT_TASKS[1:])  # a version with another default
     with monkeypatch.context() as patch:
-        patch.setattr("torch_ekm.experiments.config.ControllerOptions", other)
+        patch.setattr("torch_ekm.experiments.config.DEFAULT_TASKS", other)
         assert of(Setting()) != unchanged
     with monkeypatch.context() as patch:  # and one whose learner has another kernel
-        patch.setitem(LEARNERS, "rbf", LEARNERS["paper"])
+        patch.setitem(LEARNERS, "rbf", LEARNERS["SOGP plain"])
         assert of(Setting()) != unchanged
     assert of(Setting()) == unchanged
     assert of(Setting(capacity=59)) != unchanged
@@ -81,8 +90,23 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
     assert len(both) == 2 * len(CONTROLLERS)
 
 
+def test_a_setting_names_figures_of_the_controllers_parts() -> None:
+    changes = {
+        "FrictionMarginLimit.minimum": 0.6,
+        "OffAxisTask.rotation_weight": 0.1,
+        "LimitingFunction.gain": 1.0,
+    }
+    parts = Setting(control=changes).controller_parts()
+    plain = Setting().controller_parts()
+    assert plain == {"tasks": DEFAULT_TASKS, "limits": DEFAULT_LIMITS, "limiting": LimitingFunction()}
+    assert set(parts["limits"]) - set(DEFAULT_LIMITS) == {FrictionMarginLimit(minimum=0.6)}
+    assert set(parts["tasks"]) - set(DEFAULT_TASKS) == {OffAxisTask(rotation_weight=0.1)}
+    assert len(parts["tasks"]) == len(DEFAULT_TASKS)
+    assert parts["limiting"] == LimitingFunction(gain=1.0)
+
+
 def test_a_corrected_object_does_not_take_up_old_results(tmp_path: Path) -> None:
-    for source in object_files("box"):
+    for source in object_paths("box"):
         (tmp_path / source.name).write_bytes(source.read_bytes())
     own = str(tmp_path / "box.urdf")
 
@@ -100,20 +124,20 @@ def test_a_corrected_object_does_not_take_up_old_results(tmp_path: Path) -> None
 def test_every_learner_of_the_ablation_starts_at_zero_and_learns() -> None:
     generator = torch.Generator().manual_seed(0)
     slope = torch.randn(4, 6, generator=generator, dtype=torch.float64)
-    for name in LEARNERS:
+    for name in HAND_LEARNERS:
         learner = make_learner(name, 5, 4, 30)
         x = torch.randn(120, 9, generator=generator, dtype=torch.float64)
         y = x[:, 5:] @ slope
         assert torch.equal(learner(x), torch.zeros(120, 6, dtype=torch.float64)), name
         learner.update(x, y)
         better = float((learner(x) - y).square().mean() / y.square().mean())
-        assert better == 1.0 if name == "none" else better < 0.7, (name, better)
+        assert better == 1.0 if name == "model alone" else better < 0.7, (name, better)
     with pytest.raises(UnknownNameError, match="deep"):
         make_learner("forest", 5, 4, 30)
 
 
 def test_ablation_covers_every_disturbance_of_the_nominal_plant() -> None:
-    nominal, exact = PlantParameters.nominal_mismatch(), PlantParameters.exact()
+    nominal, exact = preset("nominal"), preset("none")
     disturbed = {
         f.name for f in dataclasses.fields(nominal) if getattr(nominal, f.name) != getattr(exact, f.name)
     }

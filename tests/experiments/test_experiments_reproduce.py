@@ -13,7 +13,7 @@ from experiments_records import turn
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
-from torch_ekm.description import object_files
+from torch_ekm.description import object_paths
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.protocols.object_memory import MemoryTurn, ObjectMemory
@@ -126,7 +126,7 @@ def test_killed_run_resumes_to_the_same_report(tmp_path: Path) -> None:
 
 def test_objects_of_a_user(tmp_path: Path) -> None:
     for name, like in (("mug", "can"), ("pen", "toothpaste")):
-        for source, suffix in zip(object_files(like), (".urdf", ".object.toml"), strict=True):
+        for source, suffix in zip(object_paths(like), (".urdf", ".object.toml"), strict=True):
             (tmp_path / (name + suffix)).write_bytes(source.read_bytes())
     experiment = plan("generalize", (0,), objects=tmp_path)
     assert isinstance(experiment.protocol, Generalize)

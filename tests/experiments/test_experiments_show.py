@@ -16,8 +16,8 @@ from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameEr
 from torch_ekm.experiments.viewer.hand import GraspShow
 from torch_ekm.experiments.viewer.serve import choose_show, save_page, serve
 from torch_ekm.experiments.viewer.trial import LogShow
-from torch_ekm.plant import Recording, RecordingPlant, TrialLog
-from torch_ekm.rendering.scene import make_scene
+from torch_ekm.plant import RecordingPlant, Trajectory, TrialLog
+from torch_ekm.rendering import make_scene
 from torch_ekm.simulation import SimulatedHand
 
 pytest.importorskip("viser")
@@ -59,8 +59,8 @@ def folder(tmp_path_factory):
         plant.reset(trial)
         for step in (0.03, 0.03):
             plant.command(torch.tensor([step, -step]))
-        log.write(trial, plant.recording, {"reason": "stalled"})
-    log.write(2, Recording(9), {"reason": "not grasped"})
+        log.write(trial, plant.trajectory, {"reason": "stalled"})
+    log.write(2, Trajectory(9), {"reason": "not grasped"})
     return folder
 
 
@@ -164,7 +164,7 @@ def test_what_cannot_be_shown_is_named(folder, tmp_path):
         ({"hand": "icub_right"}, "no object"),
         ({"hand": "icub_right", "object": "box"}, "4 joints"),
     ):
-        path = Recording(
+        path = Trajectory(
             0, recording.commands, recording.observations, {"configuration": configuration}
         ).save(tmp_path / "trial.h5")
         with pytest.raises(DescriptionError, match=match):

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import copy
+import pickle
+import re
+from pathlib import Path
 
 import pytest
 import torch
 
-from torch_ekm.description import load_hand
+from torch_ekm.description import HandDescription, load_hand
 from torch_ekm.exceptions import ParameterError, ShapeError, UnknownNameError
 from torch_ekm.kinematics import HandKinematics, LinkPoses
-from torch_ekm.kinematics.reference import reference_transforms
-from torch_ekm.kinematics.se3 import log
+from torch_ekm.kinematics.se3 import hat, log
 
 HANDS = ("icub_right", "icub_left", "planar_two_finger")
-SHAPES = ((), (1,), (5,), (2, 3))
+SHAPES = ((), (1,), (5,), (2, 3), (0,))
 
 
 def postures(name: str, *shape: int, seed: int = 3) -> torch.Tensor:
@@ -24,13 +26,41 @@ def postures(name: str, *shape: int, seed: int = 3) -> torch.Tensor:
     return lower + uniform * (upper - lower)
 
 
+def reference_transforms(hand: HandDescription, q: torch.Tensor) -> torch.Tensor:
+    """``T_j = T_parent(j) O_j (I + sin q_j [z_j]x + (1 - cos q_j) [z_j]x^2)``, link by link, in float64."""
+    poses = {hand.urdf.root: torch.eye(4, dtype=torch.float64).expand(*q.shape[:-1], 4, 4)}
+    joints = list(hand.urdf.joints)
+    while joints:
+        joint = next(joint for joint in joints if joint.parent in poses)
+        joints.remove(joint)
+        turn = torch.eye(4, dtype=torch.float64).repeat(*q.shape[:-1], 1, 1)
+        if joint.name in hand.joint_names:
+            angle = q[..., hand.joint_names.index(joint.name), None, None]
+            K = hat(torch.from_numpy(joint.axis))
+            turn[..., :3, :3] += torch.sin(angle) * K + 2 * torch.sin(angle / 2) ** 2 * (K @ K)
+        poses[joint.child] = poses[joint.parent] @ torch.from_numpy(joint.transform) @ turn
+    T = torch.stack([poses[name] for name in hand.link_names], dim=-3)
+    return torch.linalg.inv(poses[hand.base_link])[..., None, :, :] @ T
+
+
 @pytest.mark.parametrize("name", HANDS)
-def test_agrees_with_pytorch_kinematics(name: str) -> None:
-    pytest.importorskip("pytorch_kinematics")
-    hand, q = load_hand(name), postures(name, 2, 10)
-    expected = reference_transforms(hand, q)
-    # pytorch-kinematics builds the joints' origins in float32
-    torch.testing.assert_close(HandKinematics(hand)(q).transforms, expected, atol=3e-7, rtol=0)
+def test_poses_to_the_last_digits(name: str) -> None:
+    """In float64: the library's own reader would leave 1e-7 of its float32 origins."""
+    hand, q = load_hand(name), 5 * postures(name, 2, 100)  # turns of more than pi, too
+    actual, expected = HandKinematics(hand)(q).transforms, reference_transforms(hand, q)
+    torch.testing.assert_close(actual, expected, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_agrees_with_another_reader_of_the_file(name: str) -> None:
+    """pytorch-kinematics parses the URDF itself, with origins in float32."""
+    pk = pytest.importorskip("pytorch_kinematics")
+    hand, q = load_hand(name), postures(name, 10)
+    chain = pk.build_chain_from_urdf(hand.urdf_path.read_bytes()).to(dtype=torch.float64)
+    assert tuple(chain.get_joint_parameter_names()) == hand.joint_names
+    frames, poses = chain.forward_kinematics(q), HandKinematics(hand)(q)
+    for link in hand.link_names:
+        torch.testing.assert_close(poses.of(link), frames[link].get_matrix(), atol=3e-7, rtol=0)
 
 
 def test_the_planar_hand_by_hand() -> None:
@@ -126,6 +156,21 @@ def test_float32_and_to() -> None:
         double(q.float())
 
 
+def test_copies_are_copies() -> None:
+    """The chain is no Module and changes in place: a copy's dtype must not reach the original."""
+    q = postures("icub_right", 4)
+    kinematics = HandKinematics(load_hand("icub_right"))
+    before = kinematics(q).transforms
+    for other in (copy.deepcopy(kinematics), pickle.loads(pickle.dumps(kinematics))):
+        torch.testing.assert_close(other(q).transforms, before, atol=0, rtol=0)
+        torch.nn.Sequential(other).float()  # as a part of a larger module
+        assert other.dtype == torch.float32
+        assert other(q.float()).transforms.dtype == torch.float32
+        torch.testing.assert_close(kinematics(q).transforms, before, atol=0, rtol=0)
+    assert not kinematics.state_dict()  # all of it is in the description
+    kinematics.load_state_dict({})
+
+
 def test_gradcheck_first_and_second_order() -> None:
     kinematics = HandKinematics(load_hand("planar_two_finger"))
     q = postures("planar_two_finger", 2).requires_grad_()
@@ -135,17 +180,22 @@ def test_gradcheck_first_and_second_order() -> None:
 
 
 def test_function_transforms() -> None:
-    """jacrev, jacfwd, hessian and vmap go through the forward kinematics."""
+    """jacrev, jacfwd and hessian go through the forward kinematics; batch dimensions stand for vmap."""
     kinematics, q = HandKinematics(load_hand("icub_right")), postures("icub_right", 3)
 
     def tip(x: torch.Tensor) -> torch.Tensor:
-        return kinematics(x).of("index_tip")[:3, 3]
+        return kinematics(x).of("index_tip")[..., :3, 3]
 
-    forward = torch.func.vmap(torch.func.jacfwd(tip))(q)
-    reverse = torch.func.vmap(torch.func.jacrev(tip))(q)
-    torch.testing.assert_close(forward, reverse)
-    torch.testing.assert_close(forward, kinematics.jacobian(q, "index_tip")[:, :3], atol=1e-10, rtol=0)
-    assert torch.func.hessian(tip)(q[0]).shape == (3, 20, 20)
+    J = kinematics.jacobian(q, "index_tip")[:, :3]
+    for transform in (torch.func.jacfwd, torch.func.jacrev):
+        torch.testing.assert_close(transform(tip)(q[0]), J[0], atol=1e-10, rtol=0)
+        batched = transform(lambda x: tip(x).sum(0))(q).movedim(1, 0)  # a row depends on its own angles only
+        torch.testing.assert_close(batched, J, atol=1e-10, rtol=0)
+    H = torch.func.hessian(tip)(q[0])
+    expected = torch.func.jacrev(lambda x: kinematics.jacobian(x, "index_tip")[:3])(q[0])
+    torch.testing.assert_close(H, expected, atol=1e-10, rtol=0)
+    with pytest.raises(RuntimeError, match="vmap"):
+        torch.func.vmap(tip)(q)
 
 
 def test_base_link_behind_a_fixed_joint(tmp_path) -> None:
@@ -160,12 +210,31 @@ def test_base_link_behind_a_fixed_joint(tmp_path) -> None:
     q = postures("planar_two_finger", 2)
     expected = HandKinematics(hand)(q)
     actual = HandKinematics(mounted)(q)
-    assert mounted.urdf is not None
     assert mounted.urdf.root == "wrist"
     for link in hand.link_names:
         torch.testing.assert_close(actual.of(link), expected.of(link), atol=1e-13, rtol=0)
-    pytest.importorskip("pytorch_kinematics")
-    torch.testing.assert_close(actual.transforms, reference_transforms(mounted, q), atol=3e-7, rtol=0)
+    torch.testing.assert_close(actual.transforms, reference_transforms(mounted, q), atol=1e-12, rtol=0)
+
+
+def test_joints_in_another_order_than_the_tree(tmp_path: Path) -> None:
+    """``q`` is in document order, whatever order the chain walks its tree in."""
+    hand = load_hand("planar_two_finger")
+    text = hand.urdf_path.read_text()
+    joints = re.findall(
+        r'  <joint name="left_0".*?</joint>|  <joint name="right_1".*?</joint>', text, re.DOTALL
+    )
+    swapped = text.replace(joints[0], "@").replace(joints[1], joints[0]).replace("@", joints[1])
+    (tmp_path / "a.urdf").write_text(swapped)
+    (tmp_path / "a.transmission.toml").write_text(hand.transmission_path.read_text())
+    other = load_hand(tmp_path / "a.urdf")
+    assert other.joint_names == ("right_1", "left_1", "right_0", "left_0")
+    q = postures("planar_two_finger", 2)
+    order = [hand.joint_names.index(name) for name in other.joint_names]
+    mine, theirs = HandKinematics(hand), HandKinematics(other)
+    for link in hand.link_names:
+        torch.testing.assert_close(theirs(q[:, order]).of(link), mine(q).of(link), atol=1e-14, rtol=0)
+        J = mine.jacobian(q, link)[..., order]
+        torch.testing.assert_close(theirs.jacobian(q[:, order], link), J, atol=1e-14, rtol=0)
 
 
 def test_errors_list_what_would_be_right() -> None:

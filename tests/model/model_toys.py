@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import nn
 
 from torch_ekm.contact.contact_set import ContactSet
-from torch_ekm.description.hand import Actuator, HandDescription
+from torch_ekm.description import Actuator, HandDescription, UrdfModel
 from torch_ekm.kinematics import se3
 
 F64 = torch.float64
@@ -82,7 +83,7 @@ def toy_hand(
     J_a = np.atleast_2d(np.asarray(J_a, dtype=float))
     return HandDescription(
         name="toy",
-        urdf_path=Path("toy.urdf"),
+        urdf=UrdfModel(Path("toy.urdf"), "toy", (), (), "palm"),
         transmission_path=Path("toy.toml"),
         base_link="palm",
         link_names=tuple(f"l{j}" for j in range(n_q)),
@@ -103,7 +104,9 @@ def toy_hand(
 
 
 def transform(xyz, rpy=(0.0, 0.0, 0.0)):
-    return se3.from_xyz_rpy(tuple(xyz), tuple(rpy)).numpy()
+    placed = np.eye(4)
+    placed[:3, :3], placed[:3, 3] = Rotation.from_euler("xyz", rpy).as_matrix(), xyz
+    return placed
 
 
 def isotropic(normal: torch.Tensor, curvature: float) -> torch.Tensor:
@@ -124,6 +127,24 @@ def contact_set(links, points, normals, k_f, k_o, *, friction=3.0, gamma=0.0, pi
         friction=torch.full((n_c,), friction, dtype=F64),
         torsional_friction=torch.full((n_c,), gamma, dtype=F64),
         pinned=(pinned,) * n_c,
+    )
+
+
+def select(contacts: ContactSet, index: list[int]) -> ContactSet:
+    """The contacts with the given indices, in that order."""
+    names = (
+        "point",
+        "normal",
+        "gap",
+        "finger_curvature",
+        "object_curvature",
+        "friction",
+        "torsional_friction",
+    )
+    tuples = ("finger", "link", "pinned")
+    return contacts.replace(
+        **{name: getattr(contacts, name)[index] for name in names},
+        **{name: tuple(getattr(contacts, name)[i] for i in index) for name in tuples},
     )
 
 

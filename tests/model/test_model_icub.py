@@ -104,19 +104,6 @@ def test_the_weight_of_the_links():
     assert relative_error(J, expected, 20) > 1e-5
 
 
-def test_dry_friction_takes_up_part_of_the_residual():
-    model, solver, at = gripped("box")
-    (state,) = noisy_states(at, 1, 5)
-    contacts = solver.surfaces(state.q, state.position, state.rotation)
-    plain = model.linearize(state, contacts).forces
-    rough = variant(model, joint_friction=True).linearize(state, contacts)
-    limit = torch.as_tensor(model.hand.joint_friction)
-    assert (rough.forces.stop_torque.abs() <= limit + 1e-9).all()
-    assert rough.forces.stop_torque.abs().max() > 0
-    assert rough.forces.residual.norm() < plain.residual.norm()
-    assert not rough.held_joints.any()
-
-
 def noisy_states(at, draws, seed):
     generator = torch.Generator().manual_seed(seed)
     for _ in range(draws):
@@ -152,7 +139,9 @@ def test_a_joint_at_its_stop_is_held_and_a_pull_away_from_it_is_not():
     # the thumb pushes the object: the reaction drives thumb_1 open, against its lower stop
     lower[j] = float(at.state.q[j])
     hand = dataclasses.replace(model.hand, joint_lower=lower)
-    at_stop = KinematicModel(hand, model.obj, kinematics=model.kinematics, detector=model.detector)
+    at_stop = KinematicModel(
+        hand, model.obj, model.options, kinematics=model.kinematics, detector=model.detector
+    )
     lin = at_stop.linearize(at.state, at.contacts)
     assert lin.held_joints.nonzero()[:, 0].tolist() == [j]
     assert float(lin.forces.stop_torque[j]) > 1e-3
@@ -161,9 +150,9 @@ def test_a_joint_at_its_stop_is_held_and_a_pull_away_from_it_is_not():
     # an upper stop at the same place cannot pull
     upper[j] = float(at.state.q[j])
     hand = dataclasses.replace(model.hand, joint_upper=upper)
-    lin = KinematicModel(hand, model.obj, kinematics=model.kinematics, detector=model.detector).linearize(
-        at.state, at.contacts
-    )
+    lin = KinematicModel(
+        hand, model.obj, model.options, kinematics=model.kinematics, detector=model.detector
+    ).linearize(at.state, at.contacts)
     assert not lin.held_joints.any()
     assert relative_error(lin.manipulation_jacobian, free.manipulation_jacobian, 20) < 1e-4
 
@@ -179,7 +168,9 @@ def test_how_much_a_stop_bears_is_told_by_the_fingertips():
         limits = model.hand.joint_lower.copy()
         limits[j] = lower
         hand = dataclasses.replace(model.hand, joint_lower=limits)
-        return KinematicModel(hand, model.obj, kinematics=model.kinematics, detector=model.detector)
+        return KinematicModel(
+            hand, model.obj, model.options, kinematics=model.kinematics, detector=model.detector
+        )
 
     # 0.3 deg away from a stop it plays no part
     near = with_stop(float(at.state.q[j]) - 0.3 * DEG).linearize(at.state, at.contacts)

@@ -10,8 +10,8 @@ pytest.importorskip("sapien")
 pytest.importorskip("coal")
 
 from torch_ekm.kinematics import GraspState
-from torch_ekm.model import KinematicModel, ModelOptions, ModelStatus
-from torch_ekm.simulation import PlantParameters, SimulatedHand
+from torch_ekm.model import KinematicModel, ModelStatus
+from torch_ekm.simulation import SimulatedHand
 
 DEG = np.pi / 180
 F64 = torch.float64
@@ -36,10 +36,10 @@ def turning_step(lin, axis, step, grip):
 
 
 def test_steps_of_a_large_rotation_are_predicted():
-    plant = SimulatedHand("icub_right", "box", parameters=PlantParameters.exact())
+    plant = SimulatedHand("icub_right", "box")
     try:
         observation = plant.reset(0)
-        model = KinematicModel(plant.hand, plant.object, ModelOptions(gravity=plant.config.gravity))
+        model = KinematicModel(plant.hand, plant.object)
         axis, start = plant.rotation_axis.to(F64), true_state(observation)
         lower, upper = (torch.as_tensor(x) for x in (plant.hand.actuator_lower, plant.hand.actuator_upper))
         state, errors, grip = start, [], None

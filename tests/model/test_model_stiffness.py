@@ -8,12 +8,11 @@ from model_icub import gripped
 from model_toys import F64, planar_two_finger, soft_two_finger, three_finger
 
 from torch_ekm.contact.contact_kinematics import constraint_matrix, contact_kinematics
-from torch_ekm.contact.grasp_analysis import null_space
+from torch_ekm.kinematics.null_space import null_space
 from torch_ekm.kinematics.se3 import exp, hat
 from torch_ekm.model.potential import (
     gravity_gradient,
     gravity_hessian,
-    link_weight_terms,
     posture_stiffness,
     spring_torque,
 )
@@ -70,16 +69,9 @@ def test_projected_stiffness_equals_automatic_differentiation(make):
     F = equilibrium_function(model, state, solver.surfaces, toy.contacts, forces.force, forces.spin_moment)
     automatic = torch.func.jacfwd(F)(torch.zeros(state.n_s, dtype=F64))
     Z = model.reduction.basis
-    R = Z @ null_space_reduced(constraint_matrix(kin) @ Z)
+    R = Z @ null_space(constraint_matrix(kin) @ Z)
     difference = R.mT @ (closed_form(model, state, kin, forces) - automatic) @ R
     assert difference.norm() < 1e-10 * (R.mT @ automatic @ R).norm()
-
-
-def null_space_reduced(A):
-    _, sigma, Vh = torch.linalg.svd(
-        A * torch.where(torch.arange(A.shape[1]) < 0, 1.0, 1.0), full_matrices=True
-    )
-    return Vh[int((sigma > 1e-10 * sigma[0]).sum()) :].mT
 
 
 @pytest.mark.parametrize("shape", ["box", "can"])
@@ -89,7 +81,7 @@ def test_projected_stiffness_of_the_icub_pinch(shape):
     kin = model.contact_kinematics(at.state, at.contacts)
     F = equilibrium_function(model, at.state, solver.surfaces, at.contacts, forces.force, forces.spin_moment)
     automatic = torch.func.jacfwd(F)(torch.zeros(26, dtype=F64))
-    R = null_space(constraint_matrix(kin), 20)
+    R = null_space(constraint_matrix(kin))
     difference = R.mT @ (closed_form(model, at.state, kin, forces) - automatic) @ R
     assert difference.norm() < 1e-10 * (R.mT @ automatic @ R).norm()
 
@@ -98,7 +90,7 @@ def test_holonomic_contacts_give_a_symmetric_stiffness_and_rolling_in_space_does
     def asymmetry(toy):
         kin = toy.model.contact_kinematics(toy.state, toy.contacts)
         Z = toy.model.reduction.basis
-        R = Z @ null_space_reduced(constraint_matrix(kin) @ Z)
+        R = Z @ null_space(constraint_matrix(kin) @ Z)
         K = R.mT @ closed_form(toy.model, toy.state, kin, toy.forces()) @ R
         return float((K - K.mT).norm() / K.norm())
 
@@ -124,9 +116,22 @@ def test_posture_stiffness_is_the_hessian_of_the_work_of_constant_forces():
     velocity = torch.linalg.cross(axis[None] * kin.upstream[..., None].to(F64), x[:, None] - origin[None])
     S = posture_stiffness(force, velocity, axis, precedes)
     assert torch.allclose(S, torch.func.hessian(work)(q), atol=1e-12)
-    gradient, hessian = link_weight_terms(-force, x, axis, origin, kin.upstream, precedes)
-    assert torch.allclose(gradient, torch.func.grad(work)(q), atol=1e-12)
-    assert torch.allclose(hessian, S, atol=1e-14)
+
+
+def test_the_weight_of_the_links_is_the_gradient_of_their_height():
+    model, _, at = gripped("box", link_weights=True)
+    links = [link for link in model.hand.urdf.links if link.mass > 0]
+    gravity = torch.tensor(model.gravity, dtype=F64)
+
+    def potential(q):
+        poses = model.kinematics(q)
+        places = [poses.of(link.name) @ torch.tensor([*link.com, 1.0], dtype=F64) for link in links]
+        return -sum(link.mass * gravity @ x[:3] for link, x in zip(links, places, strict=True))
+
+    gradient, hessian = model.link_weights(model.kinematics(at.state.q))
+    assert torch.allclose(gradient, torch.func.grad(potential)(at.state.q), atol=1e-14)
+    assert torch.allclose(hessian, torch.func.hessian(potential)(at.state.q), atol=1e-14)
+    assert gradient.abs().max() > 1e-3
 
 
 def test_gravity_terms_are_derivatives_of_the_height():

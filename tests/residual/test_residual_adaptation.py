@@ -11,9 +11,21 @@ import torch
 
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.learner_comparison.prequential import run_prequential
-from torch_ekm.residual import DeepKernel, DeepKernelSOGP, Matern52, SparseOnlineGP, SquaredExponential
-from torch_ekm.residual.sparse_gp.hyperparameters import PrequentialAdaptation, Queries
+from torch_ekm.residual import (
+    DeepKernel,
+    DeepKernelSOGP,
+    DetectChanges,
+    ForgettingFactor,
+    LearnHyperparameters,
+    Matern52,
+    ProcessNoise,
+    RobustWeight,
+    SparseOnlineGP,
+    SquaredExponential,
+    Standardize,
+)
 from torch_ekm.residual.sparse_gp.posterior import basis_gram
+from torch_ekm.residual.sparse_gp.prequential_loss import Queries
 from torch_ekm.residual.sparse_gp.replay import ReplayMemory
 
 
@@ -24,26 +36,33 @@ def system(seed: int, n: int, noise: float = 0.1) -> tuple[torch.Tensor, torch.T
     return torch.from_numpy(x), torch.from_numpy(np.sin(x @ w) + noise * rng.normal(size=(n, 2)))
 
 
-def adaptation_of(gp: SparseOnlineGP) -> PrequentialAdaptation:
-    assert gp.adaptation is not None
-    return gp.adaptation
+def learning_of(gp: SparseOnlineGP) -> LearnHyperparameters:
+    part = gp.part(LearnHyperparameters)
+    assert part is not None
+    return part
 
 
-def loss_by_dense_algebra(
-    a: PrequentialAdaptation, gp: SparseOnlineGP, queries: Queries, robust: float | None
-) -> torch.Tensor:
+def past_of(gp: SparseOnlineGP) -> ReplayMemory:
+    past = learning_of(gp).past
+    assert past is not None
+    return past
+
+
+def loss_by_dense_algebra(gp: SparseOnlineGP, queries: Queries, robust: float | None) -> torch.Tensor:
     """The loss as its docstring states it, with inverses, for autograd to go through."""
     log_noise, kernel = gp.log_noise_variance, gp.kernel
     s2 = log_noise.mean(-1).exp()[..., None, None]
-    K = basis_gram(kernel, a.old.basis, a.old.active, gp.posterior.jitter)
-    k = kernel(a.old.basis, queries.x) * a.old.active.unsqueeze(-1)
-    W, h = a.old.precision / s2, a.old.information / s2
+    loss = learning_of(gp).loss
+    old = loss.state
+    K = basis_gram(kernel, old.basis, old.active, gp.posterior.jitter)
+    k = kernel(old.basis, queries.x) * old.active.unsqueeze(-1)
+    W, h = old.precision / s2, old.information / s2
     eye = torch.eye(K.shape[-1], dtype=K.dtype)
     alpha, C = torch.linalg.solve(eye + W @ K, h), -torch.linalg.solve(eye + W @ K, W)
     u = (k * (torch.linalg.inv(K) @ k)).sum(-2)
     v = kernel.diagonal_of_set(queries.x) + (k * (C @ k)).sum(-2)
     p = u + (k * (C @ k)).sum(-2)
-    share = queries.absorbed * queries.weight * a.forgetting**queries.age * p / s2.squeeze(-1)
+    share = queries.absorbed * queries.weight * loss.forgetting_factor**queries.age * p / s2.squeeze(-1)
     left_out = torch.where(share < 1, torch.minimum(1.0 / (1.0 - share), u / p), u / p)
     variance = (v + p * (left_out - 1.0)).unsqueeze(-1) + log_noise.exp().unsqueeze(-2)
     z2 = ((queries.y - k.mT @ alpha) * left_out.unsqueeze(-1)).square() / variance
@@ -55,32 +74,33 @@ def loss_by_dense_algebra(
 
 @pytest.mark.parametrize("fleet", [(), (3,)])
 @pytest.mark.parametrize("robust", [None, 3.0])
-@pytest.mark.parametrize("fading", [{}, {"forgetting": 0.98}])
+@pytest.mark.parametrize("fading", [[], [ForgettingFactor(0.98)]])
 @pytest.mark.parametrize("kind", [SquaredExponential, Matern52, DeepKernel])
 def test_gradients_in_closed_form_are_those_of_autograd(kind, robust, fleet, fading):
     kernel = SquaredExponential(4, batch_shape=fleet) if kind is DeepKernel else kind(4, batch_shape=fleet)
     if kind is DeepKernel:
         kernel = DeepKernel(kernel, hidden=(8, 8), features=3)
+    weight = [] if robust is None else [RobustWeight(robust)]
     gp = SparseOnlineGP(
-        4, 2, capacity=20, kernel=kernel, noise_variance=0.05, robust=robust, normalize=True,
-        refresh_every=16, adapt=True, adapt_memory=50, batch_shape=fleet, **fading,
+        4, 2, capacity=20, kernel=kernel, noise_variance=0.05, refresh_every=16, batch_shape=fleet,
+        parts=[*weight, *fading, Standardize(), LearnHyperparameters(memory=50)],
     )  # fmt: skip
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(111, *fleet, 4, generator=generator, dtype=torch.float64)
     y = torch.sin(2 * x[..., :2]) + 0.1 * torch.randn(x[..., :2].shape, generator=generator).double()
     gp.update(x, y)  # the last window is full but for one sample, so not used up
-    a = adaptation_of(gp)
-    queries = a.queries(gp.units.of_sets)
+    learning = learning_of(gp)
+    queries = learning.queries(gp)
     assert queries.x.shape[-2] > 16
     parameters = [*gp.kernel.parameters(), gp.log_noise_variance]
     for moved in (False, True):
         if moved:
             for p in parameters:
                 p.mul_(0.97)
-        found = a.loss_and_gradients(gp.kernel, gp.log_noise_variance, queries, moved=moved)
+        found = learning.loss.with_gradients(gp.kernel, gp.log_noise_variance, queries, moved=moved)
         for p in parameters:
             p.requires_grad_(True)
-        loss = loss_by_dense_algebra(a, gp, queries, robust)
+        loss = loss_by_dense_algebra(gp, queries, robust)
         gradients = torch.autograd.grad(loss.sum(), parameters)
         for p in parameters:
             p.requires_grad_(False)
@@ -92,13 +112,13 @@ def test_gradients_in_closed_form_are_those_of_autograd(kind, robust, fleet, fad
 
 def test_lagged_loss_is_the_density_of_the_old_state():
     x, y = system(4, 64)
-    gp = SparseOnlineGP(4, 2, capacity=20, adapt=True, refresh_every=16)
+    gp = SparseOnlineGP(4, 2, capacity=20, refresh_every=16, parts=[LearnHyperparameters()])
     gp.update(x[:48], y[:48])
     law = gp.predict(x[48:63], observation=True)
     expected = -law.log_prob(y[48:63]).mean(-1).mean()
     gp.update(x[48:63], y[48:63])
-    a = adaptation_of(gp)
-    loss, _ = a.loss_and_gradients(gp.kernel, gp.log_noise_variance, a.queries(gp.units.of_sets))
+    learning = learning_of(gp)
+    loss, _ = learning.loss.with_gradients(gp.kernel, gp.log_noise_variance, learning.queries(gp))
     assert float(loss) == pytest.approx(float(expected), abs=1e-6)
 
 
@@ -108,15 +128,14 @@ def test_a_replayed_sample_is_predicted_by_the_exact_gp_of_all_others():
         4,
         2,
         capacity=24,
-        adapt=True,
-        adapt_memory=24,
         refresh_every=24,
         jitter=1e-10,
         noise_variance=0.01,
+        parts=[LearnHyperparameters(memory=24)],
     )
-    gp.adaptation.steps = 0  # type: ignore[union-attr]  # the kernel stays
+    learning_of(gp).steps = 0  # the kernel stays
     gp.update(x, y)
-    a = adaptation_of(gp)
+    a = learning_of(gp).loss
     s2 = gp.noise_variance
     K = gp.kernel(x, x) + s2.mean() * torch.eye(24, dtype=torch.float64)
     for i in (0, 11, 23):
@@ -126,9 +145,9 @@ def test_a_replayed_sample_is_predicted_by_the_exact_gp_of_all_others():
         expected = -torch.distributions.Normal(mean, variance.sqrt()).log_prob(y[i]).mean()
         one = torch.ones(1, dtype=torch.float64)
         query = Queries(x[i : i + 1], y[i : i + 1], one, one, one)
-        loss, _ = a.loss_and_gradients(gp.kernel, gp.log_noise_variance, query)
+        loss, _ = a.with_gradients(gp.kernel, gp.log_noise_variance, query)
         assert float(loss) == pytest.approx(float(expected), abs=1e-6)
-        seen, _ = a.loss_and_gradients(gp.kernel, gp.log_noise_variance, query._replace(absorbed=0.0 * one))
+        seen, _ = a.with_gradients(gp.kernel, gp.log_noise_variance, query._replace(absorbed=0.0 * one))
         assert float(seen) < float(loss) - 1e-3  # what was seen flatters itself
 
 
@@ -188,7 +207,8 @@ def test_adaptation_beats_a_wrong_start():
     wrong = {"capacity": 40, "kernel": SquaredExponential(4, lengthscale=0.3), "noise_variance": 0.5}
     errors, nll = [], []
     for adapt in (False, True):
-        gp = SparseOnlineGP(4, 2, **copy.deepcopy(wrong), adapt=adapt, refresh_every=8)
+        parts = [LearnHyperparameters()] if adapt else []
+        gp = SparseOnlineGP(4, 2, **copy.deepcopy(wrong), parts=parts, refresh_every=8)
         run = run_prequential(gp, x, y)
         errors.append(float(run.error[600:].square().mean().sqrt()))
         nll.append(run.nll(600))
@@ -202,7 +222,8 @@ def test_each_output_finds_its_own_noise():
     generator = torch.Generator().manual_seed(0)
     sd = torch.tensor([0.05, 0.4], dtype=torch.float64)
     y = y + sd * torch.randn(y.shape, generator=generator, dtype=torch.float64)
-    gp = SparseOnlineGP(4, 2, capacity=50, adapt=True, noise_variance=0.05, refresh_every=8)
+    parts = [LearnHyperparameters()]
+    gp = SparseOnlineGP(4, 2, capacity=50, noise_variance=0.05, refresh_every=8, parts=parts)
     gp.update(x, y)
     found = gp.noise_variance.sqrt()
     assert 0.03 < float(found[0]) < 0.15
@@ -217,7 +238,7 @@ def test_deep_kernel_starts_as_the_plain_one_and_does_not_collapse():
         DeepKernel(SquaredExponential(4), hidden=(16,), initial_scale=1e-6),
         DeepKernel(SquaredExponential(4), hidden=(16,)),
     ):
-        gp = SparseOnlineGP(4, 2, capacity=40, kernel=kernel, adapt=True)
+        gp = SparseOnlineGP(4, 2, capacity=40, kernel=kernel, parts=[LearnHyperparameters()])
         gp.update(x[:31], y[:31])
         early = gp(x[:31])
         gp.update(x[31:], y[31:])
@@ -233,7 +254,8 @@ def test_features_learned_from_the_past_beat_those_of_the_last_samples():
     y = torch.sin(3.0 * x[:, :1] * x[:, 1:2]) + torch.cos(2.5 * (x[:, 2:3] + x[:, 3:4] * x[:, 4:5]))
     errors = []
     for memory in (0, 1000):
-        gp = DeepKernelSOGP(6, 1, capacity=40, noise_variance=0.1, adapt_memory=memory)
+        parts = [LearnHyperparameters(steps=2, memory=memory)]
+        gp = DeepKernelSOGP(6, 1, capacity=40, noise_variance=0.1, parts=parts)
         gp.update(x[:2000], y[:2000])
         errors.append(float((gp(x[2000:]) - y[2000:]).square().mean().sqrt()))
     assert errors[1] < 0.85 * errors[0]
@@ -241,7 +263,8 @@ def test_features_learned_from_the_past_beat_those_of_the_last_samples():
 
 def test_deep_kernel_gradient_is_autograds():
     x, y = system(12, 60)
-    gp = SparseOnlineGP(4, 2, capacity=20, kernel=DeepKernel(SquaredExponential(4)), normalize=True)
+    kernel = DeepKernel(SquaredExponential(4))
+    gp = SparseOnlineGP(4, 2, capacity=20, kernel=kernel, parts=[Standardize()])
     gp.update(x, y)
     p = gp.predict_with_jacobians(x[:5])
     torch.testing.assert_close(
@@ -253,7 +276,8 @@ def test_deep_kernel_gradient_is_autograds():
 
 def test_a_learner_with_a_memory_goes_on_after_a_reload_as_if_nothing_had_been():
     x, y = system(13, 400)
-    options = {"hidden": (8,), "features": 2, "capacity": 15, "adapt_memory": 150, "normalize": True}
+    options = {"hidden": (8,), "features": 2, "capacity": 15}
+    options["parts"] = [Standardize(), LearnHyperparameters(steps=2, memory=150)]
     options["refresh_every"] = 8  # so that a turn is a part of the memory
     whole, first, second = (DeepKernelSOGP(4, 2, **options) for _ in range(3))
     whole.update(x, y)
@@ -263,20 +287,16 @@ def test_a_learner_with_a_memory_goes_on_after_a_reload_as_if_nothing_had_been()
         half.update(x[238:], y[238:])
         assert torch.equal(half(x), whole(x))
     whole.reset()
-    memory = adaptation_of(whole).memory
-    assert memory is not None
-    assert float(memory.weight.sum()) == 0
+    assert float(past_of(whole).weight.sum()) == 0
 
 
 def test_after_a_change_the_memory_holds_the_new_system_only():
     x, y = system(14, 700, noise=0.02)
     y = torch.cat([y[:400], -2.0 * y[400:]])
-    gp = SparseOnlineGP(
-        4, 2, capacity=40, adapt=True, adapt_memory=200, robust=3.0, detect_changes=True, noise_variance=0.01
-    )
+    parts = [RobustWeight(3.0), DetectChanges(), LearnHyperparameters(memory=200)]
+    gp = SparseOnlineGP(4, 2, capacity=40, noise_variance=0.01, parts=parts)
     gp.update(x, y)
-    memory = adaptation_of(gp).memory
-    assert memory is not None
+    memory = past_of(gp)
     kept = memory.x[memory.weight > 0]
     numbers = [int((x == row).all(-1).nonzero()) for row in kept]
     assert len(numbers) > 50
@@ -284,13 +304,7 @@ def test_after_a_change_the_memory_holds_the_new_system_only():
 
 
 def test_where_g_wanders_there_is_no_memory():
-    assert adaptation_of(DeepKernelSOGP(4, 2, diffusion=0.003)).memory is None
-    assert adaptation_of(DeepKernelSOGP(4, 2)).memory is not None
+    assert learning_of(DeepKernelSOGP(4, 2, parts=[ProcessNoise(0.003)])).past is None
+    assert learning_of(DeepKernelSOGP(4, 2)).past is not None
     with pytest.raises(ParameterError, match="another g"):
-        SparseOnlineGP(4, 2, adapt=True, adapt_memory=100, diffusion=0.003)
-
-
-@pytest.mark.parametrize("options", [{"adapt_memory": -1}, {"adapt_memory": 1.5}, {"adapt_steps": 0}])
-def test_wrong_parameters_are_named(options):
-    with pytest.raises(ParameterError, match=next(iter(options))):
-        SparseOnlineGP(4, 2, adapt=True, **options)
+        SparseOnlineGP(4, 2, parts=[ProcessNoise(0.003), LearnHyperparameters(memory=100)])

@@ -5,7 +5,17 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torch_ekm.residual import DeepKernel, RecursiveLeastSquares, SparseOnlineGP, SquaredExponential
+from torch_ekm.residual import (
+    CalibrateNoise,
+    DeepKernel,
+    ForgettingFactor,
+    LearnHyperparameters,
+    RecursiveLeastSquares,
+    RobustWeight,
+    SparseOnlineGP,
+    SquaredExponential,
+    Standardize,
+)
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 
@@ -13,13 +23,15 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA d
 def make(name: str, device: str):
     options = {"batch_shape": (16,), "on_invalid": "skip", "device": device}
     if name == "rls":
-        return RecursiveLeastSquares(4, 2, forgetting=0.99, robust=3.0, refresh_every=8, **options)
-    options |= {"capacity": 12, "refresh_every": 8, "robust": 3.0, "forgetting": 0.99}
+        return RecursiveLeastSquares(4, 2, forgetting_factor=0.99, robust=3.0, refresh_every=8, **options)
+    options |= {"capacity": 12, "refresh_every": 8}
+    parts = [RobustWeight(3.0), ForgettingFactor(0.99)]
     if name == "plain":
-        return SparseOnlineGP(4, 2, **options)
+        return SparseOnlineGP(4, 2, parts=parts, **options)
     kernel = SquaredExponential(4, batch_shape=(16,), device=device)
     kernel = DeepKernel(kernel, hidden=(8,)) if name == "deep" else kernel
-    return SparseOnlineGP(4, 2, kernel=kernel, adapt=True, calibrate=True, normalize=True, **options)
+    parts += [CalibrateNoise(), Standardize(), LearnHyperparameters()]
+    return SparseOnlineGP(4, 2, kernel=kernel, parts=parts, **options)
 
 
 @pytest.mark.parametrize("name", ["rls", "plain", "adaptive", "deep"])

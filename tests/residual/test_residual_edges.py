@@ -12,12 +12,18 @@ from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
 from torch_ekm.residual import (
     ActionLinearKernel,
     DeepKernelSOGP,
+    DetectChanges,
+    ForgettingFactor,
     KRLSTracker,
+    LearnHyperparameters,
     MixtureResidual,
+    ProcessNoise,
     RandomFeatureRLS,
     RecursiveLeastSquares,
+    RobustWeight,
     SparseOnlineGP,
     SquaredExponential,
+    Standardize,
     WindowGP,
     ZeroResidual,
 )
@@ -63,7 +69,7 @@ def test_least_squares_far_from_the_origin(offset, bound):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda **o: SparseOnlineGP(3, 2, capacity=8, normalize=True, **o),
+        lambda **o: SparseOnlineGP(3, 2, capacity=8, parts=[Standardize()], **o),
         lambda **o: RecursiveLeastSquares(3, 2, **o),
         lambda **o: MixtureResidual(SparseOnlineGP(3, 2, capacity=8, **o), **o),
     ],
@@ -87,12 +93,12 @@ def test_numbers_without_a_square_are_refused(make, value):
 
 
 @pytest.mark.parametrize(
-    "options", [{"adapt": True}, {"forgetting": 0.9}, {"diffusion": 0.05}, {"normalize": True}]
+    "part", [LearnHyperparameters(), ForgettingFactor(0.9), ProcessNoise(0.05), Standardize()]
 )
-def test_a_step_without_a_sample_leaves_no_trace_even_when_a_rebuild_is_due(options):
+def test_a_step_without_a_sample_leaves_no_trace_even_when_a_rebuild_is_due(part):
     x, y = stream(40)
     for on_invalid in ("raise", "skip"):
-        g = SparseOnlineGP(3, 2, capacity=10, refresh_every=8, on_invalid=on_invalid, **options)
+        g = SparseOnlineGP(3, 2, capacity=10, refresh_every=8, on_invalid=on_invalid, parts=[part])
         g.update(x[:7], y[:7])
         other = copy.deepcopy(g)
         if on_invalid == "raise":
@@ -130,8 +136,8 @@ def test_a_fleet_that_detects_changes_with_a_memory_is_so_many_single_models():
     x, y = stream(400, 3)
     y[250:, 1] *= -3.0
     options = {
-        "capacity": 12, "adapt": True, "adapt_memory": 50, "robust": 3.0, "detect_changes": True,
-        "noise_variance": 0.01,
+        "capacity": 12, "noise_variance": 0.01,
+        "parts": [RobustWeight(3.0), DetectChanges(), LearnHyperparameters(memory=50)],
     }  # fmt: skip
     fleet = SparseOnlineGP(3, 2, batch_shape=(3,), **options)
     fleet.update(x, y)
@@ -144,19 +150,28 @@ def test_a_fleet_that_detects_changes_with_a_memory_is_so_many_single_models():
 def test_units_of_a_model_with_masks_are_those_of_its_own_samples():
     x, y = stream(60, 2, 3)
     mask = torch.rand(60, 2, 3, generator=torch.Generator().manual_seed(1)) < 0.7
-    fleet = SparseOnlineGP(3, 2, capacity=12, batch_shape=(2, 3), normalize=True, normalize_for=100)
+    fleet = SparseOnlineGP(3, 2, capacity=12, batch_shape=(2, 3), parts=[Standardize(samples=100)])
     fleet.update(x, y, mask)
     fleet.refresh()
+    units = fleet.part(Standardize)
+    assert units is not None
     for i, j in itertools.product(range(2), range(3)):
         own_x, own_y = x[mask[:, i, j], i, j], y[mask[:, i, j], i, j]
-        torch.testing.assert_close(fleet.units.input.shift[i, j], own_x.mean(0))
-        torch.testing.assert_close(fleet.units.input.scale[i, j], own_x.std(0, correction=0))
-        torch.testing.assert_close(fleet.units.output.scale[i, j], own_y.square().mean(0).sqrt())
+        torch.testing.assert_close(units.input.shift[i, j], own_x.mean(0))
+        torch.testing.assert_close(units.input.scale[i, j], own_x.std(0, correction=0))
+        torch.testing.assert_close(units.output.scale[i, j], own_y.square().mean(0).sqrt())
 
 
 def test_one_kernel_for_a_fleet_as_large_as_the_inputs_are_wide():
     x, y = stream(64, 3)
-    gp = SparseOnlineGP(3, 2, capacity=8, batch_shape=(3,), kernel=SquaredExponential(3), adapt=True)
+    gp = SparseOnlineGP(
+        3,
+        2,
+        capacity=8,
+        batch_shape=(3,),
+        kernel=SquaredExponential(3),
+        parts=[LearnHyperparameters()],
+    )
     start = gp.kernel.log_lengthscale.clone()
     gp.update(x, y, torch.tensor([True, False, False]).expand(64, 3))
     assert bool((gp.kernel.log_lengthscale != start).all())
@@ -193,8 +208,6 @@ def test_a_basis_must_be_finite():
         (SparseOnlineGP, {"kernel": "se"}),
         (SparseOnlineGP, {"kernel": SquaredExponential(4)}),
         (SparseOnlineGP, {"kernel": SquaredExponential(3, batch_shape=(2,))}),
-        (SparseOnlineGP, {"adapt_rate": -1.0}),
-        (SparseOnlineGP, {"adapt_memory": "many"}),
         (SparseOnlineGP, {"refresh_every": "often"}),
         (DeepKernelSOGP, {"hidden": 8}),
         (RandomFeatureRLS, {"lengthscale": 0.0}),

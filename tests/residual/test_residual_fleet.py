@@ -10,6 +10,7 @@ from torch_ekm.residual import (
     KRLSTracker,
     LearnerFleet,
     MixtureResidual,
+    RobustWeight,
     SparseOnlineGP,
     SquaredExponential,
 )
@@ -55,7 +56,7 @@ def test_heavy_tails_stay() -> None:
     x, y = stream(60, 2)
 
     def kind(n_in: int, n_out: int, **options) -> MixtureResidual:
-        return MixtureResidual(SparseOnlineGP(n_in, n_out, capacity=8, robust=3.0, **options))
+        return MixtureResidual(SparseOnlineGP(n_in, n_out, capacity=8, parts=[RobustWeight(3.0)], **options))
 
     fleet = LearnerFleet(kind, 3, 2, batch_shape=(2,))
     fleet.update(x, y)

@@ -10,7 +10,14 @@ from torch.distributions import StudentT
 
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.learner_comparison.prequential import run_prequential
-from torch_ekm.residual import MixtureResidual, RecursiveLeastSquares, SparseOnlineGP, ZeroResidual
+from torch_ekm.residual import (
+    MixtureResidual,
+    ProcessNoise,
+    RecursiveLeastSquares,
+    RobustWeight,
+    SparseOnlineGP,
+    ZeroResidual,
+)
 
 
 def noisy_pose(seed: int, n: int, pose: float, motion: float = 0.1):
@@ -62,7 +69,7 @@ def test_what_cannot_be_learned_costs_next_to_nothing():
     y = StudentT(2.5).sample((600, 1)).double()
     ratios = []
     for wrap in (MixtureResidual, lambda learner: learner):
-        learner = wrap(SparseOnlineGP(3, 1, capacity=40, noise_variance=0.1, diffusion=0.003))
+        learner = wrap(SparseOnlineGP(3, 1, capacity=40, noise_variance=0.1, parts=[ProcessNoise(0.003)]))
         ratios.append(run_prequential(learner, x, y).rms_ratio(100))
     assert ratios[1] > 1.05
     assert ratios[0] < 1.02
@@ -131,7 +138,7 @@ def test_a_fleet_is_so_many_single_mixtures():
     mask = torch.rand(120, 3, generator=generator) < 0.7
 
     def make(**options):
-        gp = SparseOnlineGP(2, 1, capacity=10, robust=3.0, **options)
+        gp = SparseOnlineGP(2, 1, capacity=10, parts=[RobustWeight(3.0)], **options)
         return MixtureResidual([gp, linear(**options)])
 
     fleet = make(batch_shape=(3,))

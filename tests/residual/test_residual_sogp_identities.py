@@ -10,15 +10,21 @@ import torch
 
 from torch_ekm.residual import (
     ActionLinearKernel,
+    ForgettingFactor,
     LinearKernel,
     Matern32,
     Matern52,
+    ProcessNoise,
     ResidualLearner,
+    RobustWeight,
     SparseOnlineGP,
     SquaredExponential,
+    Standardize,
     UpdateEvent,
+    action_covariance,
+    action_jacobian,
 )
-from torch_ekm.residual.sparse_gp.pruning import DELETION_SCORES, kl_score
+from torch_ekm.residual.sparse_gp.pruning import PRUNING_SCORES, kl_score
 
 D, M, N, S2 = 4, 3, 40, 0.05
 
@@ -51,7 +57,7 @@ def exact_gp(k, x, y, xs, s2=S2):
 
 
 def learner(**options):
-    options = {"capacity": N, "noise_variance": S2, "novelty_tolerance": 0.0, "jitter": 0.0, **options}
+    options = {"capacity": N, "noise_variance": S2, "novelty_threshold": 0.0, "jitter": 0.0, **options}
     return SparseOnlineGP(D, M, kernel=options.pop("kernel", None) or kernel(), **options)
 
 
@@ -114,7 +120,7 @@ def test_fixed_basis_is_dtc_or_fitc(projection):
     """q(y) = N(0, Qff + Lambda): Quinonero-Candela & Rasmussen 2005, eqs. 19-27."""
     x, y, xs = data()
     z = data(12, seed=3)[0]
-    gp = learner(capacity=12, deletion="freeze", projection=projection)
+    gp = learner(capacity=12, pruning="freeze", projection=projection)
     gp.set_basis(z)
     gp.update(x, y)
     X, Y, Z, T = x.numpy(), y.numpy(), z.numpy(), xs.numpy()
@@ -168,13 +174,13 @@ def test_a_pruned_step_is_the_streaming_variational_step():
 
 def test_deleting_the_newest_is_the_projection(monkeypatch):
     x, y, xs = data()
-    gp = learner(capacity=10, refresh_every=10**6, deletion="freeze")
+    gp = learner(capacity=10, refresh_every=10**6, pruning="freeze")
     gp.set_basis(x[:10])
     gp.update(x[10], y[10])
-    monkeypatch.setitem(DELETION_SCORES, "newest", lambda alpha, c, q, w, age: -age)
-    other = learner(capacity=10, refresh_every=10**6, deletion="newest")
+    monkeypatch.setitem(PRUNING_SCORES, "newest", lambda alpha, c, q, w, age: -age)
+    other = learner(capacity=10, refresh_every=10**6, pruning="newest")
     other.set_basis(x[:10])
-    other._n_samples = 5
+    other.n_samples = 5
     assert other.update(x[10], y[10]).event == UpdateEvent.REPLACED
     assert int(other.posterior.slot) == 10
     torch.testing.assert_close(other(xs), gp(xs), atol=1e-11, rtol=0)
@@ -184,7 +190,7 @@ def test_deleting_the_newest_is_the_projection(monkeypatch):
 @pytest.mark.parametrize("capacity", [12, N])
 def test_recursion_equals_a_rebuild_from_the_natural_form(capacity):
     x, y, xs = data()
-    gp = learner(capacity=capacity, refresh_every=10**6, novelty_tolerance=1e-3)
+    gp = learner(capacity=capacity, refresh_every=10**6, novelty_threshold=1e-3)
     gp.update(x, y)
     mean, variance = gp(xs), gp.variance(xs)
     gp.refresh()
@@ -239,7 +245,7 @@ def test_kl_score_is_the_true_divergence():
 
 def test_forgetting_is_a_weighted_gp_and_returns_to_the_prior():
     x, y, xs = data()
-    gp = learner(forgetting=0.9, refresh_every=1)
+    gp = learner(parts=[ForgettingFactor(0.9)], refresh_every=1)
     gp.update(x, y)
     weight = 0.9 ** np.arange(N, 0, -1)
     X, Y, T = x.numpy(), y.numpy(), xs.numpy()
@@ -252,7 +258,7 @@ def test_forgetting_is_a_weighted_gp_and_returns_to_the_prior():
 def test_forgetting_between_rebuilds_counts_every_sample():
     """With a rebuild every 4 samples, sample t of 40 has been forgotten 4 (10 - t // 4) times."""
     x, y, xs = data()
-    gp = learner(forgetting=0.9, refresh_every=4)
+    gp = learner(parts=[ForgettingFactor(0.9)], refresh_every=4)
     gp.update(x, y)
     weight = 0.9 ** (4 * (10 - np.arange(N) // 4))
     X, Y, T = x.numpy(), y.numpy(), xs.numpy()
@@ -261,10 +267,10 @@ def test_forgetting_between_rebuilds_counts_every_sample():
 
 
 @pytest.mark.parametrize("every", [1, 5])
-def test_diffusion_is_the_exact_gp_in_space_and_time(every):
+def test_process_noise_is_the_exact_gp_in_space_and_time(every):
     """f wanders like an Ornstein-Uhlenbeck process, one step per rebuild: k(x, x') kept^(|t - t'|/2)."""
     x, y, xs = data()
-    gp = learner(diffusion=0.05, refresh_every=every)
+    gp = learner(parts=[ProcessNoise(0.05)], refresh_every=every)
     gp.update(x, y)
     now = np.arange(N + 1) // every * every
 
@@ -283,7 +289,7 @@ def test_robust_weight_scales_the_gain_beyond_c():
     """One update by hand: the mean moves by ``w k/(s2 + v) i``, w = min(1, c^2/z2), v shrinks alike."""
     x, y, _ = data()
     for shift, outlier in ((0.05, False), (3.0, True)):
-        gp = learner(robust=2.0)
+        gp = learner(parts=[RobustWeight(2.0)])
         gp.update(x[:20], y[:20])
         law, latent = gp.predict(x[20], observation=True), gp.variance(x[20])
         innovation = law.mean + shift - law.mean
@@ -291,16 +297,16 @@ def test_robust_weight_scales_the_gain_beyond_c():
         report = gp.update(x[20], law.mean + shift)
         weight = min(1.0, float(4.0 / z2))
         assert (weight < 1.0) == outlier
-        torch.testing.assert_close(report.surprise, z2, rtol=1e-7, atol=0)
+        torch.testing.assert_close(report.nis, z2, rtol=1e-7, atol=0)
         torch.testing.assert_close(report.weight, torch.tensor(weight).double(), rtol=1e-7, atol=0)
         gain = weight * latent / law.variance
         torch.testing.assert_close(gp(x[20]), law.mean + gain * innovation, atol=1e-9, rtol=0)
         torch.testing.assert_close(gp.variance(x[20]), latent * (1 - gain), atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("deletion", ["kl", "mean", "novelty", "oldest", "freeze"])
+@pytest.mark.parametrize("pruning", ["kl", "mean", "novelty", "oldest", "freeze"])
 @pytest.mark.parametrize("masked", [False, True])
-def test_fleet_equals_single_models(deletion, masked):
+def test_fleet_equals_single_models(pruning, masked):
     generator = torch.Generator().manual_seed(3)
     shape = (2, 3)
     x = torch.randn(60, *shape, D, generator=generator, dtype=torch.float64)
@@ -308,8 +314,8 @@ def test_fleet_equals_single_models(deletion, masked):
     mask = torch.rand(60, *shape, generator=generator) < (0.7 if masked else 2.0)
     # units settle at the same step for the whole fleet, so later for a model with fewer samples
     options = {
-        "capacity": 12, "deletion": deletion, "robust": 3.0, "normalize": not masked, "normalize_for": 30,
-        "novelty_tolerance": 0.05, "refresh_every": 10**6,
+        "capacity": 12, "pruning": pruning, "novelty_threshold": 0.05, "refresh_every": 10**6,
+        "parts": [RobustWeight(3.0)] if masked else [RobustWeight(3.0), Standardize(samples=30)],
     }  # fmt: skip
     fleet = learner(batch_shape=shape, **options)
     report = fleet.update(x, y, mask)
@@ -341,10 +347,10 @@ KERNELS = {
 
 
 @pytest.mark.parametrize("name", KERNELS)
-@pytest.mark.parametrize("normalize", [False, True])
-def test_closed_form_gradients_are_autograds(name, normalize):
+@pytest.mark.parametrize("parts", [[], [Standardize()]])
+def test_closed_form_gradients_are_autograds(name, parts):
     x, y, xs = data()
-    gp = SparseOnlineGP(D, M, capacity=15, kernel=KERNELS[name](), normalize=normalize)
+    gp = SparseOnlineGP(D, M, capacity=15, kernel=KERNELS[name](), parts=parts)
     gp.update(x * 3 + 1, y * 5)
     p = gp.predict_with_jacobians(xs)
     mean, jacobian = ResidualLearner.linearize(gp, xs)
@@ -365,13 +371,13 @@ def test_matern_gradient_at_a_basis_point_is_finite():
     torch.testing.assert_close(gp.linearize(x[0])[1], jacobian, atol=1e-9, rtol=1e-9)
 
 
-@pytest.mark.parametrize("normalize", [False, True])
-def test_action_linear_kernel(normalize):
+@pytest.mark.parametrize("parts", [[], [Standardize()]])
+def test_action_linear_kernel(parts):
     x, y, xs = data()
-    gp = SparseOnlineGP(D, M, capacity=15, kernel=KERNELS["action"](), normalize=normalize)
+    gp = SparseOnlineGP(D, M, capacity=15, kernel=KERNELS["action"](), parts=parts)
     gp.update(x * 2 + 1, y * 7)
     s, a = xs[:, :2], xs[:, 2:]
-    G, V = gp.action_jacobian(s), gp.action_covariance(s)
+    G, V = action_jacobian(gp, s), action_covariance(gp, s)
     torch.testing.assert_close(gp(xs), (G @ a[..., None])[..., 0], atol=1e-10, rtol=1e-10)
     quadratic = (a[:, None, None] @ V @ a[:, None, :, None])[..., 0, 0]
     torch.testing.assert_close(gp.variance(xs), quadratic, atol=1e-9, rtol=1e-9)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,19 +12,20 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import DescriptionError, UnknownNameError
-from torch_ekm.experiments.learner_comparison.datasets import (
-    ResidualRecording,
-    Stream,
-    load_stream,
-    load_t42,
+from torch_ekm.experiments.learner_comparison.prequential import Prequential, run_prequential
+from torch_ekm.experiments.learner_comparison.recordings import load_t42
+from torch_ekm.experiments.learner_comparison.stream import Stream
+from torch_ekm.residual import (
+    CalibrateNoise,
+    ForgettingFactor,
+    RecursiveLeastSquares,
+    RobustWeight,
+    SparseOnlineGP,
+    ZeroResidual,
 )
-from torch_ekm.experiments.learner_comparison.prequential import (
-    Prequential,
-    compare_learners,
-    run_prequential,
-    score_objects,
-)
-from torch_ekm.residual import RecursiveLeastSquares, SparseOnlineGP, ZeroResidual
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+from stream_scores import Split, load_split, score_objects, score_split, winsorised_ratio
 
 DATA = os.environ.get("TORCH_EKM_DATA", "")
 needs_data = pytest.mark.skipif(
@@ -36,7 +38,7 @@ def test_missing_folder_and_wrong_name_are_told(monkeypatch):
     with pytest.raises(DescriptionError, match="TORCH_EKM_DATA"):
         load_t42()
     with pytest.raises(UnknownNameError, match="kin40k"):
-        load_stream("boston", 0)
+        load_split("boston", 0)
 
 
 def test_scores_by_hand():
@@ -45,12 +47,12 @@ def test_scores_by_hand():
     assert run.rms_ratio() == pytest.approx(0.5)
     assert run.median_ratio(2) == pytest.approx(0.5)
     assert float(run.coverage()) == pytest.approx(0.75)  # |error| is .5, 1, 1.5, 2
-    assert run.winsorised_ratio() == pytest.approx(0.5, rel=0.02)
+    assert winsorised_ratio(run) == pytest.approx(0.5, rel=0.02)
     glitch = torch.tensor([[1e3]], dtype=torch.float64)
     many = torch.cat([y.repeat(25, 1), glitch])
     missed = Prequential(torch.where(many > 100, 0.0, 0.5 * many), torch.ones_like(many), many, 0.0)
     assert missed.rms_ratio() > 0.99
-    assert missed.winsorised_ratio(level=0.98) == pytest.approx(0.5, rel=0.1)
+    assert winsorised_ratio(missed, level=0.98) == pytest.approx(0.5, rel=0.1)
     expected = 0.5 * np.log(2 * np.pi) + 0.125 * float(y.square().mean())
     assert run.nll() == pytest.approx(expected)
 
@@ -66,20 +68,28 @@ def test_prediction_comes_before_learning():
 def test_kept_and_fresh_differ_only_from_the_second_object_on():
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(60, 3, generator=generator, dtype=torch.float64)
-    objects = [ResidualRecording(n, x, torch.sin(x[:, :2])) for n in ("a", "b")]
+    objects = [Stream(n, x, torch.sin(x[:, :2])) for n in ("a", "b")]
     kept = score_objects(lambda: SparseOnlineGP(3, 2), objects, kept=True)
     fresh = score_objects(lambda: SparseOnlineGP(3, 2), objects, kept=False)
     assert kept[0] == fresh[0] == dataclasses.replace(fresh[1], name="a")
     assert kept[1].rms < 0.5 * fresh[1].rms
 
 
-def test_compare_learners_ranks():
+def test_a_held_out_part_tells_learners_apart():
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(200, 3, generator=generator, dtype=torch.float64)
-    stream = Stream("line", x[:150], x[:150, :1] * 2, x[150:], x[150:, :1] * 2)
-    scores = compare_learners({"zero": ZeroResidual, "rls": RecursiveLeastSquares}, [stream])
-    assert [s.learner for s in scores] == ["zero", "rls"]
-    assert scores[1].rmse < 0.05 < scores[0].rmse
+    split = Split("line", x[:150], x[:150, :1] * 2, x[150:], x[150:, :1] * 2)
+    assert score_split(RecursiveLeastSquares, split).rmse < 0.05 < score_split(ZeroResidual, split).rmse
+
+
+def test_a_regression_set_is_split_and_standardized(tmp_path):
+    (tmp_path / "uci").mkdir()
+    values = np.random.default_rng(0).normal(3.0, 5.0, size=(400, 5))
+    np.savetxt(tmp_path / "uci" / "power-plant.csv", values, delimiter=",", header="a,b,c,d,y", comments="")
+    split = load_split("powerplant", 0, tmp_path, limit=300)
+    assert (split.x.shape, split.y.shape, split.x_test.shape) == ((270, 4), (270, 1), (30, 4))
+    torch.testing.assert_close(split.y.var(0, correction=0), torch.ones(1, dtype=torch.float64))
+    assert not torch.equal(split.x[:5], load_split("powerplant", 1, tmp_path, limit=300).x[:5])
 
 
 @needs_data
@@ -89,7 +99,7 @@ def test_public_streams_have_their_known_sizes():
         "kin40k": (8000, 8, 1),
         "powerplant": (8000, 4, 1),
     }.items():
-        s = load_stream(name, 0)
+        s = load_split(name, 0)
         assert len(s.x) + len(s.x_test) == n
         assert (s.x.shape[1], s.y.shape[1]) == (d, m)
         torch.testing.assert_close(s.y.var(0, correction=0), torch.ones(m, dtype=torch.float64))
@@ -109,7 +119,8 @@ def test_the_learner_helps_on_a_real_hand():
     recordings = load_t42()[7:9]
 
     def make():
-        return SparseOnlineGP(15, 3, noise_variance=0.3, forgetting=0.99, robust=3.0, calibrate=True)
+        parts = [RobustWeight(3.0), CalibrateNoise(), ForgettingFactor(0.99)]
+        return SparseOnlineGP(15, 3, noise_variance=0.3, parts=parts)
 
     scores = score_objects(make, recordings, kept=True)
     assert all(s.rms < 1.0 for s in scores)

@@ -9,7 +9,7 @@ import pytest
 
 from torch_ekm.exceptions import CalibrationError, DescriptionError, ParameterError
 from torch_ekm.sensing import CharucoTarget, PinholeCamera, calibrate_camera
-from torch_ekm.simulation import PlacedCard, Scene, SimulatedCamera
+from torch_ekm.simulation import CardScene, PlacedCard, SimulatedCamera
 
 cv2 = pytest.importorskip("cv2")
 
@@ -63,7 +63,7 @@ def target_views(pose_of):
             azimuth_deg=rng.uniform(0, 360),
             spin_deg=rng.uniform(-30, 30),
         )
-        views.append(camera.render(Scene((PlacedCard(target, pose),)), rng))
+        views.append(camera.render(CardScene((PlacedCard(target, pose),)), rng))
     return views
 
 

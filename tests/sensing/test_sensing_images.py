@@ -8,7 +8,7 @@ import pytest
 from torch_ekm.description import Shape
 from torch_ekm.exceptions import ParameterError, ShapeError, UnknownNameError
 from torch_ekm.sensing import MarkerBoard, PinholeCamera
-from torch_ekm.simulation import ConvexBody, ImageQuality, PlacedCard, Scene, SimulatedCamera
+from torch_ekm.simulation import CardScene, ConvexBody, ImageQuality, PlacedCard, SimulatedCamera
 
 cv2 = pytest.importorskip("cv2")
 
@@ -27,7 +27,7 @@ def inside(polygon, points, margin=0.0):
 def test_markers_are_found_where_they_were_drawn(pose_of, lens, rng):
     camera = SimulatedCamera(PinholeCamera(distortion=lens))
     board, pose = MarkerBoard(8, columns=3, rows=2), pose_of(0.05, 0.03)
-    image = camera.render(Scene((PlacedCard(board, pose),)), rng)
+    image = camera.render(CardScene((PlacedCard(board, pose),)), rng)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     parameters.relativeCornerRefinmentWinSize = 0.5
@@ -45,7 +45,7 @@ def test_card_is_as_bright_as_its_print(pose_of, rng):
     board, pose = MarkerBoard(), pose_of(tilt_deg=20)
     quality = ImageQuality(noise=0.0, blur=0.0, vignette=0.0, black=0.0, white=255.0, background=100.0)
     camera = SimulatedCamera(quality=quality)
-    image = camera.render(Scene((PlacedCard(board, pose),)), rng).astype(float)
+    image = camera.render(CardScene((PlacedCard(board, pose),)), rng).astype(float)
     corners = camera.camera.project(PlacedCard(board, pose).outline)
     area = cv2.contourArea(corners.astype(np.float32))
     light = 0.7 + 0.3 * abs(pose[:3, 2] @ pose[:3, 3]) / np.linalg.norm(pose[:3, 3])
@@ -58,8 +58,8 @@ def test_a_ball_hides_a_card_only_from_before(pose_of, rng, depth, hidden):
     board, pose = MarkerBoard(), pose_of(tilt_deg=10)
     camera = SimulatedCamera(quality=CLEAN)
     ball = ConvexBody(np.array([[0, 0, depth]]), np.array([0.01]), shade=77)
-    free = camera.render(Scene((PlacedCard(board, pose),)), rng)
-    image = camera.render(Scene((PlacedCard(board, pose),), (ball,)), rng)
+    free = camera.render(CardScene((PlacedCard(board, pose),)), rng)
+    image = camera.render(CardScene((PlacedCard(board, pose),), (ball,)), rng)
     covered = cv2.contourArea(ball.outline(camera.camera).astype(np.float32))
     if hidden:
         assert (image == 77).sum() == pytest.approx(covered, rel=0.05)
@@ -72,8 +72,8 @@ def test_the_nearer_card_wins(pose_of, rng):
     camera = SimulatedCamera(quality=CLEAN)
     near = PlacedCard(MarkerBoard(0), pose_of(z=0.30, tilt_deg=0))
     far = PlacedCard(MarkerBoard(4), pose_of(z=0.40, tilt_deg=0))
-    alone = camera.render(Scene((near,)), rng)
-    both = camera.render(Scene((near, far)), rng)
+    alone = camera.render(CardScene((near,)), rng)
+    both = camera.render(CardScene((near, far)), rng)
     width = int(0.5 * 0.052 / 0.40 * 600) - 1  # the far card would have covered this much
     window = np.s_[240 - width : 240 + width, 320 - width : 320 + width]
     np.testing.assert_array_equal(alone[window], both[window])
@@ -82,20 +82,20 @@ def test_the_nearer_card_wins(pose_of, rng):
 def test_back_of_a_card_shows_no_markers(pose_of, rng):
     pose = pose_of()
     pose[:3, :3] = pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])
-    image = SimulatedCamera(quality=CLEAN).render(Scene((PlacedCard(MarkerBoard(), pose),)), rng)
+    image = SimulatedCamera(quality=CLEAN).render(CardScene((PlacedCard(MarkerBoard(), pose),)), rng)
     assert len(np.unique(image)) < 60
     assert image.min() > 100  # no black print
 
 
 def test_noise_and_blur_have_the_stated_size(rng):
     quality = ImageQuality(noise=5.0, blur=0.0, vignette=0.0)
-    image = SimulatedCamera(quality=quality).render(Scene(), rng).astype(float)
+    image = SimulatedCamera(quality=quality).render(CardScene(), rng).astype(float)
     assert image.std() == pytest.approx(np.hypot(5.0, 12**-0.5), rel=0.01)
     assert image.mean() == pytest.approx(quality.background, abs=0.1)
 
 
 def test_same_generator_same_image(pose_of, simulated):
-    scene = Scene((PlacedCard(MarkerBoard(), pose_of()),))
+    scene = CardScene((PlacedCard(MarkerBoard(), pose_of()),))
     a, b, c = (simulated.render(scene, np.random.default_rng(s)) for s in (3, 3, 4))
     np.testing.assert_array_equal(a, b)
     assert (a != c).any()
@@ -103,13 +103,15 @@ def test_same_generator_same_image(pose_of, simulated):
 
 def test_cards_outside_or_behind_are_not_drawn(pose_of, rng):
     camera = SimulatedCamera(quality=CLEAN)
-    empty = camera.render(Scene(), rng)
+    empty = camera.render(CardScene(), rng)
     behind = pose_of()
     behind[2, 3] = -0.4
     for pose in (pose_of(x=2.0), pose_of(y=-2.0), behind, pose_of(z=0.005)):
-        np.testing.assert_array_equal(camera.render(Scene((PlacedCard(MarkerBoard(), pose),)), rng), empty)
+        np.testing.assert_array_equal(
+            camera.render(CardScene((PlacedCard(MarkerBoard(), pose),)), rng), empty
+        )
     half = pose_of(x=0.4 * 320 / 600)  # cut by the border of the image
-    assert (camera.render(Scene((PlacedCard(MarkerBoard(), half),)), rng) != empty).any()
+    assert (camera.render(CardScene((PlacedCard(MarkerBoard(), half),)), rng) != empty).any()
 
 
 @pytest.mark.parametrize(

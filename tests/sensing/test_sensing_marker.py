@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from tracking_accuracy import measure_tracking
 
 from torch_ekm.exceptions import ObjectLostError, ParameterError, ShapeError
 from torch_ekm.kinematics.se3 import exp, log
@@ -19,8 +20,7 @@ from torch_ekm.sensing import (
     TrackerOptions,
     TrackStatus,
 )
-from torch_ekm.simulation import ConvexBody, PlacedCard, Scene, SimulatedCamera
-from torch_ekm.simulation.imaging.accuracy import measure_tracking
+from torch_ekm.simulation import CardScene, ConvexBody, PlacedCard, SimulatedCamera
 
 cv2 = pytest.importorskip("cv2")
 
@@ -39,7 +39,7 @@ def mounted(pose_of):
 def scene_of(pose_of, shift=0.0, turn=0.0, boards=(PALM, OBJECT), bodies=()):
     poses = pose_of(-0.05, tilt_deg=35), pose_of(0.05 + shift, 0.01, tilt_deg=30, spin_deg=20 + turn)
     cards = tuple(PlacedCard(board, pose) for board, pose in zip(boards, poses, strict=True))
-    return Scene(cards, tuple(bodies))
+    return CardScene(cards, tuple(bodies))
 
 
 def ball_before(card: PlacedCard) -> ConvexBody:

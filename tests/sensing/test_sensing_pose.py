@@ -10,7 +10,7 @@ from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.sensing import BoardPose, MarkerBoard, PinholeCamera, estimate_board_pose, refine_on_edges
 from torch_ekm.sensing.vision.board_pose import projection_jacobian
 from torch_ekm.sensing.vision.static_pose import StaticPose
-from torch_ekm.simulation import ConvexBody, ImageQuality, PlacedCard, Scene, SimulatedCamera
+from torch_ekm.simulation import CardScene, ConvexBody, ImageQuality, PlacedCard, SimulatedCamera
 
 LENSES = [PinholeCamera(), PinholeCamera(fx=580, cx=300, distortion=(-0.15, 0.1, 1e-3, -5e-4, 0.0))]
 
@@ -106,7 +106,7 @@ def test_prior_decides_between_mirror_images(pose_of):
 def test_edges_correct_a_rough_pose(pose_of, camera, rng):
     board, pose = MarkerBoard(), pose_of(0.03, 0.02, tilt_deg=30)
     quality = ImageQuality(noise=1.0, vignette=0.0)
-    image = SimulatedCamera(camera, quality).render(Scene((PlacedCard(board, pose),)), rng)
+    image = SimulatedCamera(camera, quality).render(CardScene((PlacedCard(board, pose),)), rng)
     rough = exp(torch.tensor([0.01, -0.008, 0.005], dtype=torch.float64)).numpy() @ pose[:3, :3]
     start = BoardPose(rough, pose[:3, 3] + [1e-4, -1e-4, 1e-3], np.eye(6), 0.0, 16, 0, False)
     error = twist(refine_on_edges(image, camera, board, start), pose)
@@ -119,7 +119,7 @@ def test_edges_correct_a_rough_pose(pose_of, camera, rng):
 def test_edges_of_a_half_hidden_board_still_count(pose_of, rng, shade):
     camera, board, pose = PinholeCamera(), MarkerBoard(), pose_of(tilt_deg=30)
     finger = ConvexBody.capsule(np.array([-0.03, 0.012, 0.33]), np.array([0.04, 0.02, 0.33]), 0.007, shade)
-    image = SimulatedCamera(camera).render(Scene((PlacedCard(board, pose),), (finger,)), rng)
+    image = SimulatedCamera(camera).render(CardScene((PlacedCard(board, pose),), (finger,)), rng)
     start = BoardPose(pose[:3, :3], pose[:3, 3], np.eye(6), 0.0, 16, 0, False)
     refined = refine_on_edges(image, camera, board, start)
     assert refined is not start

@@ -10,11 +10,11 @@ from torch_ekm.exceptions import ParameterError
 from torch_ekm.kinematics.se3 import log
 from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera
 from torch_ekm.simulation import (
+    CardScene,
     ConvexBody,
     ImageQuality,
     PlacedCard,
     SapienCamera,
-    Scene,
     SimulatedCamera,
 )
 
@@ -30,7 +30,7 @@ def test_two_renderers_agree(pose_of, rng):
     finger = ConvexBody.capsule(np.array([0.02, 0.03, 0.33]), np.array([0.10, 0.03, 0.36]), 0.007)
     box = ConvexBody.box((0.03, 0.04, 0.05)).moved(pose_of(0, -0.06, 0.4))
     cards = tuple(PlacedCard(board, pose) for board, pose in zip(boards, poses, strict=True))
-    scene, quality = Scene(cards, (finger, box)), ImageQuality(vignette=0.0)
+    scene, quality = CardScene(cards, (finger, box)), ImageQuality(vignette=0.0)
     ours, theirs = (kind(quality=quality).render(scene, rng) for kind in (SimulatedCamera, SapienCamera))
     smooth = cv2.GaussianBlur(ours.astype(np.float32) - theirs.astype(np.float32), (0, 0), 2)
     assert np.abs(smooth).mean() < 1.5  # the same things at the same places; light differs a little

@@ -15,7 +15,7 @@ from torch_ekm.sensing import (
     TrackStatus,
     VideoCapture,
 )
-from torch_ekm.simulation import PlacedCard, Scene, SimulatedCamera, SimulatedVideo
+from torch_ekm.simulation import CardScene, PlacedCard, SimulatedCamera, SimulatedVideo
 
 cv2 = pytest.importorskip("cv2")
 
@@ -24,7 +24,7 @@ cv2 = pytest.importorskip("cv2")
 def moving(pose_of):
     """A scene that moves 10 mm a second."""
     boards = MarkerBoard(0), MarkerBoard(4)
-    return lambda t: Scene(
+    return lambda t: CardScene(
         (
             PlacedCard(boards[0], pose_of(-0.05, tilt_deg=30)),
             PlacedCard(boards[1], pose_of(0.04 + 0.01 * t, tilt_deg=30)),
@@ -57,7 +57,7 @@ def test_frames_do_not_depend_on_what_was_looked_at(moving, simulated):
 
 def test_dropped_frames_come_at_the_stated_rate(simulated):
     small = SimulatedCamera(simulated.camera)
-    video = SimulatedVideo(small, lambda t: Scene(), StreamOptions(dropped=0.25, latency=0.0))
+    video = SimulatedVideo(small, lambda t: CardScene(), StreamOptions(dropped=0.25, latency=0.0))
     small.render = lambda scene, generator: np.zeros((1, 1), np.uint8)
     dropped = np.array([video.frame(k).image is None for k in range(2000)])
     assert dropped.mean() == pytest.approx(0.25, abs=0.03)

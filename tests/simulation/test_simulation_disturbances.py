@@ -399,7 +399,7 @@ def test_a_stuck_channel_stays_where_it_was(exact):
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_grasps(name):
-    plant = SimulatedHand("icub_right", "box", parameters=preset(name))
+    plant = SimulatedHand("icub_right", "box", preset=name)
     assert plant.reset(0).status is not PlantStatus.LOST
     assert plant.command(ROLL).status is not PlantStatus.LOST
 

@@ -14,7 +14,7 @@ from torch_ekm.exceptions import ParameterError, UnknownNameError
 pytest.importorskip("sapien")
 gymnasium = pytest.importorskip("gymnasium")
 
-ID = "torch_ekm.env:torch_ekm/InHandRotation-v0"
+ID = "torch_ekm.simulation.env:torch_ekm/InHandRotation-v0"
 
 
 def make(**options):
@@ -117,7 +117,7 @@ def test_forty_steps_are_the_end():
     ],
 )
 def test_wrong_options_are_refused(options, error):
-    from torch_ekm.env import InHandRotation
+    from torch_ekm.simulation.env import InHandRotation
 
     with pytest.raises(error):
         InHandRotation(**options)

@@ -12,7 +12,9 @@ import pytest
 import torch
 from simulation_helpers import DEG, ROLL, SQUEEZE, motion
 
+from torch_ekm.description import load_hand
 from torch_ekm.exceptions import (
+    DescriptionError,
     EquilibriumError,
     GraspError,
     NonFiniteError,
@@ -21,7 +23,7 @@ from torch_ekm.exceptions import (
     UnknownNameError,
 )
 from torch_ekm.plant import Plant, PlantStatus
-from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
+from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand, preset
 
 pytest.importorskip("sapien")
 
@@ -94,7 +96,7 @@ def run(plant, seed):
     return torch.cat([torch.cat(part) for part in parts])
 
 
-@pytest.mark.parametrize("parameters", [PlantParameters.exact(), PlantParameters.nominal_mismatch()])
+@pytest.mark.parametrize("parameters", [preset("none"), preset("nominal")])
 def test_one_seed_gives_one_run_bit_by_bit(parameters):
     first, second = (SimulatedHand("icub_right", "box", parameters=parameters) for _ in range(2))
     a = run(first, 3)
@@ -104,7 +106,7 @@ def test_one_seed_gives_one_run_bit_by_bit(parameters):
 
 
 def test_a_snapshot_can_be_returned_to_bit_by_bit():
-    plant = SimulatedHand("icub_right", "box", parameters=PlantParameters.nominal_mismatch())
+    plant = SimulatedHand("icub_right", "box", preset="nominal")
     plant.reset(5)
     plant.command(ROLL)
     snapshot = plant.snapshot()
@@ -165,7 +167,7 @@ def test_a_hard_tug_loses_the_object_and_a_gentle_one_does_not(plant, grasped):
 
 def test_the_hand_can_be_oriented_anew_at_each_grasp():
     plant = SimulatedHand("icub_right", "box", PlantConfig(gravity_tilt=40 * DEG))
-    down = np.array(plant.config.gravity) / 9.81
+    down = np.array(plant.hand.gravity) / 9.81
     angles = []
     for seed in range(3):
         before = plant.reset(seed)
@@ -197,7 +199,7 @@ def test_a_held_object_does_not_grow(plant, grasped):
     plant.restore(grasped)
     with pytest.raises(ParameterError, match=r"held; close\(\)"):
         plant.change(object_scale=1.05, mass=2.0)
-    assert plant.parameters == PlantParameters.exact()
+    assert plant.parameters == PlantParameters()
     plant.change(object_scale=1.0)  # no change
 
 
@@ -234,13 +236,22 @@ def test_errors_say_what_would_be_right():
         SimulatedHand("icub_right", "box", parameters=PlantParameters(object_scale=4.0)).reset(0)
 
 
+def test_a_preset_is_given_by_name_or_as_parameters():
+    assert SimulatedHand("icub_right", "box", preset="worn").parameters == preset("worn")
+    assert SimulatedHand("icub_right", "box").parameters == preset("none") == PlantParameters()
+    with pytest.raises(UnknownNameError, match="hostile"):
+        SimulatedHand("icub_right", "box", preset="nasty")
+    with pytest.raises(ParameterError, match="preset"):
+        SimulatedHand("icub_right", "box", parameters=PlantParameters(), preset="none")
+
+
 @pytest.mark.parametrize(
     "changes",
     [{"spring": 0.0}, {"dead_zone": -1.0}, {"mass": float("nan")}, {"frame_loss": 2.0}, {"sprung": 1.0}],
 )
 def test_impossible_parameters_are_refused(changes):
     with pytest.raises(ParameterError, match=next(iter(changes))):
-        PlantParameters.exact().replace(**changes)
+        PlantParameters().replace(**changes)
 
 
 @pytest.mark.parametrize(
@@ -257,3 +268,18 @@ def test_importing_the_simulator_warns_of_nothing():
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "ulkan" not in done.stderr
+
+
+def test_a_pad_on_a_mesh_is_refused(tmp_path):
+    """Its finger would reach through the object."""
+    hand = load_hand("icub_right")
+    before, found, rest = hand.urdf_path.read_text().partition('<link name="index_3">')
+    link, end, after = rest.partition("</link>")
+    for shape in ("cylinder", "sphere"):
+        link = link.replace(f"<{shape} ", '<mesh filename="tip.stl" ')
+    (tmp_path / "a.urdf").write_text(before + found + link + end + after)
+    (tmp_path / "a.transmission.toml").write_text(hand.transmission_path.read_text())
+    with pytest.raises(
+        DescriptionError, match=r"link 'index_3' carries the pad .* a mesh; write the pad's capsule"
+    ):
+        SimulatedHand(load_hand(tmp_path / "a.urdf"), "box").reset(0)

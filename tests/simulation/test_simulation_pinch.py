@@ -11,16 +11,18 @@ from torch_ekm.contact.detector import ContactDetector
 from torch_ekm.description import list_objects, load_hand, load_object
 from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics import HandKinematics
-from torch_ekm.simulation import PinchRequest, PlantConfig, PlantParameters
-from torch_ekm.simulation.mechanism.assembly import make_planner, make_transmission
+from torch_ekm.simulation import PlantConfig, PlantParameters
+from torch_ekm.simulation.grasp_planning.pinch import make_planner
+from torch_ekm.simulation.grasp_planning.pinch_problem import PinchRequest
+from torch_ekm.simulation.mechanism.assembly import make_transmission
 
 G = 9.81
 
 
 def plan_for(name, request=None, **changes):
     hand, obj = load_hand("icub_right"), load_object(name)
-    parameters = PlantParameters.exact().replace(**changes)
-    plan = make_planner(hand, obj, PlantConfig(), parameters).plan(request or PinchRequest())
+    parameters = PlantParameters(**changes)
+    plan = make_planner(hand, obj, PlantConfig(), parameters).plan(request or PinchRequest(hand.gravity))
     return hand, obj, plan, make_transmission(hand, parameters)
 
 
@@ -70,7 +72,7 @@ def test_a_plan_keeps_well_inside_cones_and_stops(name):
 
 
 def test_requests_are_met():
-    request = PinchRequest(force=3.0, along=0.008, across=0.002, tilt=(0.05, -0.05))
+    request = PinchRequest((0.0, 0.0, 9.81), force=3.0, along=0.008, across=0.002, tilt=(0.05, -0.05))
     _, _, plan, _ = plan_for("box", request)
     assert -plan.forces[0] @ plan.normals[0] == pytest.approx(3.0, abs=0.05)
     local = (plan.points - plan.position) @ plan.rotation

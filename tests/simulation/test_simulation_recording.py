@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import DescriptionError, ParameterError
-from torch_ekm.plant import Observation, Plant, PlantStatus, Recording, RecordingPlant, ReplayedPlant, Truth
+from torch_ekm.plant import Observation, Plant, PlantStatus, RecordingPlant, ReplayedPlant, Trajectory, Truth
 from torch_ekm.simulation import Tug
 
 h5py = pytest.importorskip("h5py")
@@ -60,14 +60,14 @@ def record():
     plant.reset(5)
     for k in range(3):
         plant.command(torch.tensor([1.0, 2.0, k]))
-    return plant.recording
+    return plant.trajectory
 
 
 def test_a_saved_recording_replays_like_the_original(tmp_path):
     original = record()
-    replayed = ReplayedPlant(Recording.load(original.save(tmp_path / "run.h5")))
+    replayed = ReplayedPlant(Trajectory.load(original.save(tmp_path / "run.h5")))
     assert isinstance(replayed, Plant)
-    assert replayed.recording.seed == 5
+    assert replayed.trajectory.seed == 5
     seen = [replayed.reset(0)] + [replayed.command(torch.zeros(3)) for _ in range(3)]
     for now, then in zip(seen, original.observations, strict=True):
         for name in ("q", "a", "position", "rotation", "fingertip_force"):
@@ -87,36 +87,36 @@ def test_a_saved_recording_replays_like_the_original(tmp_path):
 def test_a_recording_without_commands(tmp_path):
     plant = RecordingPlant(FakePlant())
     plant.reset(9)
-    loaded = Recording.load(plant.recording.save(tmp_path / "run.h5"))
+    loaded = Trajectory.load(plant.trajectory.save(tmp_path / "run.h5"))
     assert loaded.commands == []
     assert ReplayedPlant(loaded).observe().status is PlantStatus.LOST
 
 
 def test_what_is_not_a_recording_is_refused(tmp_path):
     with pytest.raises(DescriptionError, match="no such recording"):
-        Recording.load(tmp_path / "nothing.h5")
+        Trajectory.load(tmp_path / "nothing.h5")
     (tmp_path / "text.h5").write_text("not HDF5")
     with pytest.raises(DescriptionError, match="damaged"):
-        Recording.load(tmp_path / "text.h5")
+        Trajectory.load(tmp_path / "text.h5")
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["x"] = 1
     with pytest.raises(DescriptionError, match="not a recording"):
-        Recording.load(tmp_path / "other.h5")
+        Trajectory.load(tmp_path / "other.h5")
     path = record().save(tmp_path / "run.h5")
     with h5py.File(path, "a") as file:
         del file["q"]
     with pytest.raises(DescriptionError, match="damaged"):
-        Recording.load(path)
+        Trajectory.load(path)
     for about, match in (({"x": object()}, "about"), ({"x": {1, 2}}, "about")):
         with pytest.raises(ParameterError, match=match):
-            Recording(about=about).save(tmp_path / "never.h5")
+            Trajectory(about=about).save(tmp_path / "never.h5")
     ragged = record()
     ragged.observations[1].info["raw"] = {"hall": torch.zeros(5)}
     with pytest.raises(ParameterError, match="raw/"):
         ragged.save(tmp_path / "never.h5")
     assert not list(tmp_path.glob("never*"))
     with pytest.raises(ParameterError, match="at least one"):
-        ReplayedPlant(Recording())
+        ReplayedPlant(Trajectory())
 
 
 def test_any_flipped_byte_of_the_data_is_noticed(tmp_path):
@@ -130,7 +130,7 @@ def test_any_flipped_byte_of_the_data_is_noticed(tmp_path):
         damaged[place] ^= 0x55
         path.write_bytes(damaged)
         try:
-            read = Recording.load(path)
+            read = Trajectory.load(path)
         except DescriptionError:
             continue
         unnoticed += 1  # unused space
@@ -148,6 +148,6 @@ def test_the_last_reading_before_a_command_is_the_one_that_counts():
     plant.command(torch.ones(3))
     plant.plant.state = plant.plant.state + 0.25  # another reading
     seen = plant.observe()
-    kept = plant.recording.observations
+    kept = plant.trajectory.observations
     assert [float(o.q[0]) for o in kept] == [6.0, 7.25]
     assert kept[-1].info["events"] == seen.info["events"] == (Tug(at=1, force=(0.0, 0.0, 5.0)),)

@@ -79,7 +79,7 @@ def test_snapshot_brings_everything_back():
     servo.restore(state)
     np.testing.assert_allclose(servo.encoder, [0.6, 0.7, 0.4])
     np.testing.assert_allclose(servo.output, [0.59, 0.69, 0.41])
-    np.testing.assert_allclose(servo.setpoint, [0.6, 0.7, 0.4])
+    np.testing.assert_allclose(servo.snapshot().setpoint, [0.6, 0.7, 0.4])
 
 
 @pytest.mark.parametrize(("delta", "error"), [([0.1, 0.1], ShapeError), ([0.1, np.nan, 0.1], NonFiniteError)])
@@ -87,7 +87,7 @@ def test_bad_commands_change_nothing(delta, error):
     servo = make()
     with pytest.raises(error):
         command(servo, delta)
-    np.testing.assert_allclose(servo.setpoint, 0.5)
+    np.testing.assert_allclose(servo.snapshot().setpoint, 0.5)
     np.testing.assert_allclose(servo.encoder, 0.5)
 
 

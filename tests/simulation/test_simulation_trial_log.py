@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import DescriptionError, GraspError, ParameterError
-from torch_ekm.plant import Recording, RecordingPlant, TrialEntry, TrialLog
+from torch_ekm.plant import RecordingPlant, Trajectory, TrialEntry, TrialLog
 from torch_ekm.simulation import PlantParameters, SimulatedHand
 
 pytest.importorskip("h5py")
@@ -38,7 +38,7 @@ def run(folder, trials, plant=None):
         plant.reset(trial)
         for sign in (1, -1):
             plant.command(sign * torch.tensor([0.02, 0.01]))
-        log.write(trial, plant.recording, {"reason": "done"})
+        log.write(trial, plant.trajectory, {"reason": "done"})
     return log
 
 
@@ -136,7 +136,7 @@ def test_a_grasp_that_failed_is_a_trial_too(tmp_path):
     plant, log = RecordingPlant(Clumsy("planar_two_finger")), TrialLog(tmp_path, {})
     with pytest.raises(GraspError):
         plant.reset(7)
-    log.write(0, plant.recording, {"reason": "not grasped"})
+    log.write(0, plant.trajectory, {"reason": "not grasped"})
     assert log.index == (TrialEntry(0, 7, 0, 0.0, "not grasped", "not grasped"),)
     assert log.read(0).observations == []
 
@@ -158,9 +158,9 @@ def test_what_is_no_log_of_this_run_is_refused(unbroken, tmp_path):
     with pytest.raises(DescriptionError, match=r"no trial 9; there are 0, 1, 2, 3"):
         log.read(9)
     with pytest.raises(ParameterError, match="not in the log yet"):
-        log.write(3, Recording())
+        log.write(3, Trajectory())
     with pytest.raises(ParameterError, match="trial"):
-        log.write(-1, Recording())
+        log.write(-1, Trajectory())
     assert digests(unbroken) == before
 
 

@@ -10,14 +10,12 @@ from .contact_kinematics import hand_jacobian as hand_jacobian
 from .contact_model import ContactModel as ContactModel
 from .contact_set import ContactSet as ContactSet
 from .detector import ContactDetector as ContactDetector
-from .forces.problem import ForceOptions as ForceOptions
-from .forces.problem import ForceStatus as ForceStatus
-from .forces.problem import contact_forces as contact_forces
+from .forces.balance import ForceStatus as ForceStatus
+from .forces.options import ForceOptions as ForceOptions
+from .forces.solve import contact_forces as contact_forces
 from .grasp_analysis import GraspAnalysis as GraspAnalysis
 from .grasp_analysis import analyse as analyse
-from .grasp_analysis import ferrari_canny as ferrari_canny
-from .grasp_analysis import has_force_closure as has_force_closure
-from .grasp_analysis import null_space as null_space
+from .signed_distance import signed_distance as signed_distance
 from .surface import TrackedContacts as TrackedContacts
 
 __all__ = [
@@ -33,9 +31,7 @@ __all__ = [
     "constraint_matrix",
     "contact_forces",
     "contact_kinematics",
-    "ferrari_canny",
     "grasp_matrix",
     "hand_jacobian",
-    "has_force_closure",
-    "null_space",
+    "signed_distance",
 ]

@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import Enum
 
-import torch
-
-from ..typing import Float, Tensor
 from .contact_set import ContactSet
 
 
@@ -15,10 +12,12 @@ class ContactModel(Enum):
     """Rows of a contact's six components ``[f_n, f_t1, f_t2, m_n, m_t1, m_t2]`` that it transmits."""
 
     FRICTIONLESS = (0,)
-    HARD_FINGER = (0, 1, 2)
+    POINT_WITH_FRICTION = (0, 1, 2)
+    """Point contact with friction, also called hard finger."""
+    PLANAR_POINT_WITH_FRICTION = (0, 1)
+    """The same in a planar hand: ``t1`` lies in the plane of motion."""
     SOFT_FINGER = (0, 1, 2, 3)
-    PLANAR_HARD_FINGER = (0, 1)
-    """Hard finger of a planar hand: ``t1`` lies in the plane of motion."""
+    """And a moment about the normal."""
 
     @property
     def rows(self) -> tuple[int, ...]:
@@ -28,21 +27,25 @@ class ContactModel(Enum):
 def contact_models(contacts: ContactSet, *, planar: bool = False) -> tuple[ContactModel, ...]:
     """The model that each contact's coefficients ask for.
 
-    No friction: frictionless; a torsional coefficient ``gamma > 0``: soft finger; else hard finger.
+    No friction: frictionless; a torsional coefficient ``gamma > 0``: soft finger; else point contact
+    with friction.
     """
     models = []
     for mu_s, gamma in zip(contacts.friction.tolist(), contacts.torsional_friction.tolist(), strict=True):
         if mu_s <= 0:
             models.append(ContactModel.FRICTIONLESS)
         elif planar:
-            models.append(ContactModel.PLANAR_HARD_FINGER)
+            models.append(ContactModel.PLANAR_POINT_WITH_FRICTION)
         else:
-            models.append(ContactModel.SOFT_FINGER if gamma > 0 else ContactModel.HARD_FINGER)
+            models.append(ContactModel.SOFT_FINGER if gamma > 0 else ContactModel.POINT_WITH_FRICTION)
     return tuple(models)
 
 
 def selected_rows(models: Sequence[ContactModel]) -> list[int]:
-    """Indices into the ``6 n_c`` stacked components that ``H`` keeps (``n_h`` of them)."""
+    """Indices into the ``6 n_c`` stacked components that ``H`` keeps (``n_h`` of them).
+
+    ``J_h = H J~_h`` and ``G = G~ H^T`` (Prattichizzo and Trinkle, Grasping, 2008).
+    """
     return [6 * i + row for i, model in enumerate(models) for row in model.rows]
 
 
@@ -53,10 +56,3 @@ def normal_rows(models: Sequence[ContactModel]) -> list[int]:
         starts.append(at)
         at += len(model.rows)
     return starts
-
-
-def selection_matrix(
-    models: Sequence[ContactModel], dtype: torch.dtype = torch.float64
-) -> Float[Tensor, "n_h 6*n_c"]:
-    """``H`` with ``J_h = H J~_h`` and ``G = G~ H^T`` (Prattichizzo and Trinkle, Grasping, 2008)."""
-    return torch.eye(6 * len(models), dtype=dtype)[selected_rows(models)]

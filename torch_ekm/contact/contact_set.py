@@ -10,6 +10,9 @@ import torch
 from ..exceptions import ShapeError
 from ..typing import Float, Tensor
 
+CHARACTERISTIC_LENGTH = 0.03
+"""L [m], size of a held object: what makes lengths comparable with angles, and moments with forces."""
+
 
 @dataclass(frozen=True)
 class ContactSet:
@@ -37,7 +40,7 @@ class ContactSet:
     friction: Float[Tensor, " n_c"]
     """Coulomb coefficient mu_s of each contact."""
     torsional_friction: Float[Tensor, " n_c"]
-    """Soft-finger coefficient gamma [m]; 0: a hard finger."""
+    """Soft-finger coefficient gamma [m]; 0: a point contact with friction."""
     pinned: tuple[bool, ...] = ()
     """Contact is a material point of both bodies (sharp tip or edge): no rolling term."""
 
@@ -63,18 +66,3 @@ class ContactSet:
     def replace(self, **changes: object) -> ContactSet:
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
-
-    def select(self, index: list[int]) -> ContactSet:
-        """The contacts with the given indices, in that order."""
-        return ContactSet(
-            finger=tuple(self.finger[i] for i in index),
-            link=tuple(self.link[i] for i in index),
-            point=self.point[..., index, :],
-            normal=self.normal[..., index, :],
-            gap=self.gap[..., index],
-            finger_curvature=self.finger_curvature[..., index, :, :],
-            object_curvature=self.object_curvature[..., index, :, :],
-            friction=self.friction[index],
-            torsional_friction=self.torsional_friction[index],
-            pinned=tuple(self.pinned[i] for i in index),
-        )

@@ -17,8 +17,8 @@ from ..description import HandDescription, ObjectDescription
 from ..exceptions import NonFiniteError, ParameterError, ShapeError
 from ..kinematics import HandKinematics, LinkPoses
 from ..typing import Float, Tensor
-from ._touch import Pad, Solid, Touch, touch
 from .contact_set import ContactSet
+from .pad_contact import Pad, PadContact, Solid, pad_contact
 
 Array = NDArray[np.float64]
 
@@ -105,21 +105,21 @@ class ContactDetector:
         T_object[:3, 3] = position.detach().to("cpu", torch.float64).numpy()
         solids = [(solid, T_object @ solid.shape.transform) for solid in self._shapes]
 
-        found: list[tuple[int, Touch]] = []
+        found: list[tuple[int, PadContact]] = []
         for k, (pad, T_link) in enumerate(zip(self._pads, frames, strict=True)):
             contact = self._nearest(pad, T_link, solids)
             if contact is not None:
                 found.append((k, contact))
         return self._contact_set(found, position.dtype, position.device)
 
-    def _nearest(self, pad: Pad, T_link: Array, solids: list[tuple[Solid, Array]]) -> Touch | None:
+    def _nearest(self, pad: Pad, T_link: Array, solids: list[tuple[Solid, Array]]) -> PadContact | None:
         """The contact with the smallest gap over the object's primitives (the first one of equals)."""
         T_pad = T_link @ pad.transform
-        best: Touch | None = None
+        best: PadContact | None = None
         for solid, T_solid in solids:
             if math.isfinite(self.margin) and self._coarse_distance(pad, T_pad, solid, T_solid) > self.margin:
                 continue
-            contact = touch(pad, T_pad, solid, T_solid, self.crown_radius)
+            contact = pad_contact(pad, T_pad, solid, T_solid, self.crown_radius)
             if contact.gap <= self.margin and (best is None or contact.gap < best.gap):
                 best = contact
         return best
@@ -138,7 +138,7 @@ class ContactDetector:
         )
 
     def _contact_set(
-        self, found: list[tuple[int, Touch]], dtype: torch.dtype, device: torch.device
+        self, found: list[tuple[int, PadContact]], dtype: torch.dtype, device: torch.device
     ) -> ContactSet:
         pads = [self.hand.pads[k] for k, _ in found]
         contacts = [contact for _, contact in found]

@@ -115,6 +115,7 @@ class ClosedLoop:
     def steps(self, target: PoseTarget) -> Generator[Step, None, Stop]:
         """The motions one by one; the generator's return value is the :class:`Stop`."""
         seen = self.plant.observe()
+        self.controller.reset()
         start, focus = seen.state, self.controller.focus
         errors, limited, off_rotation = [focus.error(target, start)], False, 0.0
         while True:

@@ -9,6 +9,7 @@ import torch
 
 from ..exceptions import NonFiniteError, ParameterError, ShapeError
 from ..kinematics.grasp_state import GraspState
+from ..kinematics.null_space import null_space
 from ..kinematics.se3 import exp, log
 from ..typing import Float, Tensor
 
@@ -52,7 +53,7 @@ class FocusedPose:
     """``x = M_c xi`` with ``xi`` a twist ``(v; w)`` of the object (hand axes).
 
     ``matrix`` (M_c, ``(n_x, 6)``) selects what the controller must reach; ``off_matrix``
-    spans the rest, which it should keep small.
+    spans the rest, which it should keep small; ``off_translation`` marks its translations.
 
     Args:
         matrix: M_c with orthonormal rows.
@@ -67,6 +68,7 @@ class FocusedPose:
         self.matrix = matrix
         # translation and rotation rows are completed apart: they have different units
         self.off_matrix = torch.cat([_complement(matrix, slice(0, 3)), _complement(matrix, slice(3, 6))])
+        self.off_translation = self.off_matrix[:, :3].abs().sum(-1) > 0
 
     @classmethod
     def rotation_about(cls, axis: Float[Tensor, 3]) -> FocusedPose:
@@ -76,25 +78,19 @@ class FocusedPose:
             raise ParameterError("axis", axis.tolist(), "a vector of non-zero length")
         return cls(torch.cat([torch.zeros(3, dtype=axis.dtype), axis / norm])[None])
 
-    @property
-    def n_x(self) -> int:
-        return self.matrix.shape[0]
-
     def error(self, target: PoseTarget, state: GraspState) -> float:
         """``|M_c e|``, e the twist from the state to the target [unit of the focus]."""
         return float(torch.linalg.vector_norm(self.matrix @ target.error(state)))
 
     def off_rotation(self, increment: Float[Tensor, " n_s"]) -> float:
         """Rotation off the focus in an increment [rad]."""
-        rows = self.off_matrix[self.off_matrix[:, 3:].abs().sum(-1) > 0]
+        rows = self.off_matrix[~self.off_translation]
         return float(torch.linalg.vector_norm(rows @ increment[-6:]))
 
 
 def _complement(matrix: Tensor, block: slice) -> Tensor:
     """Rows of the 6-vector block that M_c leaves free: null space of its columns in that block."""
-    part = matrix[:, block]
-    _, singular, vh = torch.linalg.svd(part, full_matrices=True)
-    free = vh[int((singular > 1e-9).sum()) :]
+    free = null_space(matrix[:, block]).mT
     rows = torch.zeros(len(free), 6, dtype=matrix.dtype)
     rows[:, block] = free
     return rows

@@ -1,137 +1,192 @@
-"""The controller's quadratic program: one function builds it, another solves it."""
+"""The controller's quadratic program: rows in, one function sums them, another solves the sum."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import pi
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .._extras import require
+from ..enhanced import Quadratic
 from ..exceptions import ParameterError, SolverError
+from ..typing import Tensor
 
 Array = NDArray[np.float64]
+Numbers = Tensor | Array | float
+
+DEGREE = pi / 180  #: the program is solved for u in degrees: of the order of 1, like its rows
 
 
-@dataclass
+class Squares(NamedTuple):
+    """``sum_j w_j ((A_j u - b_j) / unit_j)^2``: what is wanted, more or less."""
+
+    A: Numbers
+    b: Numbers
+    weight: Numbers = 1.0
+    unit: Numbers = 1.0
+    """In which a row's error is weighed: of a rotation e.g. one degree, in rad."""
+
+
+class Equality(NamedTuple):
+    """``rho |A u - b|_1 / (1 deg)``: what must be reached, if it can be."""
+
+    A: Numbers
+    b: Numbers
+    penalty: float = 1e3
+
+
+class Inequality(NamedTuple):
+    """``C u <= h``, else ``rho max(0, C u - h) / unit``: what should hold, if it can."""
+
+    C: Numbers
+    h: Numbers
+    unit: float = 1.0
+    penalty: float = 1e2
+
+
+class Bounds(NamedTuple):
+    """``lower <= u <= upper`` [rad]: what always holds."""
+
+    lower: Numbers
+    upper: Numbers
+
+
+Rows = Squares | Quadratic | Equality | Inequality | Bounds
+
+
+@dataclass(frozen=True)
+class ControlSolution:
+    """The best increment, certified by the residuals of its program."""
+
+    u: Array
+    """[rad]"""
+    slack: Array
+    """``b - A u``: what of the equalities could not be met, in their unit."""
+    violation: float
+    """Largest violation of an inequality, in its unit."""
+    primal_residual: float
+    dual_residual: float
+
+
+@dataclass(frozen=True)
 class ControlProblem:
-    """The step ``u`` (all of ``(n_u,)``, in the caller's unit) that is best among those allowed.
+    """The ``qpsolvers.Problem`` over ``z = [u; sl+; sl-; t]``, u in degrees, rows in their units.
 
     ::
 
-        min_u,sl,t   u^T W u + c.u + sum_j w_j (A_j u - b_j)^2 + rho |sl|_1 + rho_t |t|_1
-        s.t.         E u + sl = d            what must be reached, if it can be
-                     C u - t <= h, t >= 0    what should hold, if it can
-                     lower <= u <= upper     what always holds
+        min_u,sl,t   1/2 u^T P u + q.u + rho |sl|_1 + rho_t |t|_1
+        s.t.         A u + sl = b
+                     C u - t <= h, t >= 0
+                     lower <= u <= upper
 
     The l1 slacks are exact: for ``rho`` above the multipliers they are zero whenever the rows
     can be met, and otherwise the violation is least. So the problem is never infeasible
     as long as ``lower <= upper``.
     """
 
-    weight: Array
-    """W, ``(n_u, n_u)``, positive definite."""
-    lower: Array
-    upper: Array
-    equality: tuple[Array, Array]
-    """(E, d)"""
-    least_squares: list[tuple[Array, Array, Array]] = field(default_factory=list)
-    """[(A, b, w)] with ``w`` the weight of each row."""
-    soft_inequality: list[tuple[Array, Array]] = field(default_factory=list)
-    """[(C, h)]"""
-    linear: Array | None = None
-    """c, ``(n_u,)``; None: zero."""
-    slack_penalty: float = 1e3
-    soft_penalty: float = 1e2
+    qp: Any
+    n_u: int
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """(lower, upper) of u in degrees."""
+        return self.qp.lb[: self.n_u], self.qp.ub[: self.n_u]
+
+    def solve(self, solver: str = "piqp") -> ControlSolution:
+        """The best u.
+
+        Args:
+            solver: any solver that qpsolvers finds installed; the open-source "piqp" by default.
+
+        Raises:
+            ParameterError: the solver is not installed (the message lists those that are).
+            SolverError: the solver did not find a solution.
+        """
+        qpsolvers, qp, n_u = require("qpsolvers"), self.qp, self.n_u
+        if solver not in qpsolvers.available_solvers:
+            raise ParameterError("solver", solver, f"one of {', '.join(qpsolvers.available_solvers)}")
+        try:
+            solution = qpsolvers.solve_problem(qp, solver=solver)
+        except Exception as error:  # back ends raise types of their own
+            raise SolverError(solver, f"{type(error).__name__}: {error}") from error
+        if not solution.found or solution.x is None:
+            raise SolverError(solver, "no solution found", "bounds may be far out of scale")
+        u = np.clip(solution.x[:n_u], *self.bounds)
+        slack = np.zeros(0) if qp.A is None else (qp.b - qp.A[:, :n_u] @ u) * DEGREE
+        broken = np.zeros(0) if qp.G is None else qp.G[:, :n_u] @ u - qp.h
+        residuals = float(solution.primal_residual()), float(solution.dual_residual())
+        return ControlSolution(u * DEGREE, slack, float(np.max(broken, initial=0.0)), *residuals)
 
 
-@dataclass(frozen=True)
-class ControlSolution:
-    """A solved :class:`ControlProblem`, certified by its residuals."""
-
-    u: Array
-    slack: Array
-    """``d - E u``: what of the equality could not be met."""
-    violation: float
-    """Largest violation of a soft inequality."""
-    at_bounds: NDArray[np.bool_]
-    primal_residual: float
-    dual_residual: float
-
-
-def build_qp(problem: ControlProblem):
-    """The ``qpsolvers.Problem`` over ``z = [u; sl+; sl-; t]``.
-
-    Raises:
-        ParameterError: ``lower > upper`` somewhere, or a non-finite figure.
-    """
-    qpsolvers = require("qpsolvers")
-    E, d = problem.equality
-    n_u, n_e = len(problem.lower), len(d)
-    C = np.vstack([c for c, _ in problem.soft_inequality]) if problem.soft_inequality else np.zeros((0, n_u))
-    h = np.concatenate([v for _, v in problem.soft_inequality]) if problem.soft_inequality else np.zeros(0)
-    n_t = len(h)
-    n = n_u + 2 * n_e + n_t
-    crossed = np.flatnonzero(problem.lower > problem.upper)
-    if crossed.size:
-        i = int(crossed[0])
-        raise ParameterError(f"lower[{i}]", problem.lower[i], f"at most upper[{i}] = {problem.upper[i]}")
-
-    P = np.zeros((n, n))
-    q = np.zeros(n)
-    P[:n_u, :n_u] = 2 * problem.weight
-    if problem.linear is not None:
-        q[:n_u] += problem.linear
-    for A, b, w in problem.least_squares:
-        P[:n_u, :n_u] += 2 * A.T @ (w[:, None] * A)
-        q[:n_u] -= 2 * A.T @ (w * b)
-    q[n_u : n_u + 2 * n_e] = problem.slack_penalty
-    q[n_u + 2 * n_e :] = problem.soft_penalty
-    A_eq = np.hstack([E, np.eye(n_e), -np.eye(n_e), np.zeros((n_e, n_t))])
-    G = np.hstack([C, np.zeros((n_t, 2 * n_e)), -np.eye(n_t)])
-    lb = np.concatenate([problem.lower, np.zeros(2 * n_e + n_t)])
-    ub = np.concatenate([problem.upper, np.full(2 * n_e + n_t, np.inf)])
-    for name, value in (
-        ("cost", P),
-        ("cost", q),
-        ("equality", A_eq),
-        ("target", d),
-        ("rows", G),
-        ("rows", h),
-    ):
-        if not np.isfinite(value).all():
-            raise ParameterError(name, "NaN or infinity", "finite")
-    rows = (G, h) if n_t else (None, None)
-    equalities = (A_eq, d) if n_e else (None, None)
-    return qpsolvers.Problem(P, q, *rows, *equalities, lb, ub)
-
-
-def solve_qp(problem: ControlProblem, solver: str = "piqp") -> ControlSolution:
-    """Solve a :class:`ControlProblem`.
+def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
+    """The sum of what tasks and limits ask for; None asks for nothing.
 
     Args:
-        solver: any solver that qpsolvers finds installed; the open-source "piqp" by default.
+        n_u: number of actuators.
 
     Raises:
-        ParameterError: the solver is not installed (the message lists those that are), or the
-            problem holds crossed bounds or non-finite figures.
-        SolverError: the solver did not find a solution.
+        ParameterError: bounds that cross, or a figure that is not finite.
     """
     qpsolvers = require("qpsolvers")
-    if solver not in qpsolvers.available_solvers:
-        raise ParameterError("solver", solver, f"one of {', '.join(qpsolvers.available_solvers)}")
-    built = build_qp(problem)
-    try:
-        solution = qpsolvers.solve_problem(built, solver=solver)
-    except Exception as error:  # back ends raise types of their own
-        raise SolverError(solver, f"{type(error).__name__}: {error}") from error
-    if not solution.found or solution.x is None:
-        raise SolverError(solver, "no solution found", "bounds may be far out of scale")
-    E, d = problem.equality
-    u = np.clip(solution.x[: len(problem.lower)], problem.lower, problem.upper)
-    violation = max((float(np.max(C @ u - h, initial=0.0)) for C, h in problem.soft_inequality), default=0.0)
-    span = np.maximum(problem.upper - problem.lower, 1e-12)
-    at_bounds = (u - problem.lower < 1e-5 * span) | (problem.upper - u < 1e-5 * span)
-    return ControlSolution(
-        u, d - E @ u, max(violation, 0.0), at_bounds, solution.primal_residual(), solution.dual_residual()
+    P, q = np.zeros((n_u, n_u)), np.zeros(n_u)
+    lower, upper = np.full(n_u, -np.inf), np.full(n_u, np.inf)
+    reached: list[tuple[Array, Array, Array]] = [(np.zeros((0, n_u)), np.zeros(0), np.zeros(0))]
+    kept = reached.copy()
+    for row in rows:
+        if isinstance(row, Squares):
+            unit, weight = as_array(row.unit).reshape(-1, 1), as_array(row.weight).reshape(-1, 1)
+            A, b = as_array(row.A) * DEGREE / unit, as_array(row.b) / unit[:, 0]
+            twice = 2 * A.T
+            P += twice @ (weight * A)
+            q -= twice @ (weight[:, 0] * b)
+        elif isinstance(row, Quadratic):
+            P += as_array(row.curvature) * DEGREE**2
+            q += as_array(row.gradient) * DEGREE
+        elif isinstance(row, Equality):
+            d = as_array(row.b) / DEGREE
+            reached.append((as_array(row.A), d, np.full(len(d), row.penalty)))
+        elif isinstance(row, Inequality):
+            h = as_array(row.h) / row.unit
+            kept.append((as_array(row.C) * (DEGREE / row.unit), h, np.full(len(h), row.penalty)))
+        elif row is not None:
+            lower = np.maximum(lower, as_array(row.lower) / DEGREE)
+            upper = np.minimum(upper, as_array(row.upper) / DEGREE)
+    crossed = np.flatnonzero(lower > upper)
+    if crossed.size:
+        i = int(crossed[0])
+        raise ParameterError(f"lower[{i}]", lower[i] * DEGREE, f"at most upper[{i}] = {upper[i] * DEGREE}")
+
+    E, d, rho = _stack(reached)
+    C, h, rho_t = _stack(kept)
+    for name, value in (("cost", P), ("cost", q), ("equality", E), ("equality", d), ("rows", C), ("rows", h)):
+        if not np.isfinite(value).all():
+            raise ParameterError(name, "NaN or infinity", "finite")
+    n_e, n_t = len(d), len(h)
+    n = n_u + 2 * n_e + n_t
+    P_z = np.zeros((n, n))
+    P_z[:n_u, :n_u] = P
+    A = np.hstack([E, np.eye(n_e), -np.eye(n_e), np.zeros((n_e, n_t))])
+    G = np.hstack([C, np.zeros((n_t, 2 * n_e)), -np.eye(n_t)])
+    qp = qpsolvers.Problem(
+        P_z,
+        np.concatenate([q, rho, rho, rho_t]),
+        *((G, h) if n_t else (None, None)),
+        *((A, d) if n_e else (None, None)),
+        np.concatenate([lower, np.zeros(2 * n_e + n_t)]),
+        np.concatenate([upper, np.full(2 * n_e + n_t, np.inf)]),
     )
+    return ControlProblem(qp, n_u)
+
+
+def as_array(x: Numbers) -> Array:
+    """float64 in numpy, in which the solvers count."""
+    return np.asarray(x.numpy(force=True) if isinstance(x, Tensor) else x, np.float64)
+
+
+def _stack(parts: list[tuple[Array, Array, Array]]) -> tuple[Array, Array, Array]:
+    A, b, rho = zip(*parts, strict=True)
+    return np.vstack(A), np.concatenate(b), np.concatenate(rho)

@@ -7,13 +7,13 @@ from .hand import ContactPad as ContactPad
 from .hand import HallSensor as HallSensor
 from .hand import HandDescription as HandDescription
 from .objects import ObjectDescription as ObjectDescription
-from .registry import data_folder as data_folder
-from .registry import hand_files as hand_files
+from .registry import hand_paths as hand_paths
 from .registry import list_hands as list_hands
 from .registry import list_objects as list_objects
 from .registry import load_hand as load_hand
 from .registry import load_object as load_object
-from .registry import object_files as object_files
+from .registry import object_paths as object_paths
+from .registry import urdf_folder as urdf_folder
 from .shape import Shape as Shape
 from .urdf import UrdfJoint as UrdfJoint
 from .urdf import UrdfLink as UrdfLink
@@ -30,12 +30,12 @@ __all__ = [
     "UrdfJoint",
     "UrdfLink",
     "UrdfModel",
-    "data_folder",
-    "hand_files",
+    "urdf_folder",
+    "hand_paths",
     "list_hands",
     "list_objects",
     "load_hand",
     "load_object",
-    "object_files",
+    "object_paths",
     "read_urdf",
 ]

@@ -74,7 +74,8 @@ class HandDescription:
     """
 
     name: str
-    urdf_path: Path
+    urdf: UrdfModel = field(repr=False)
+    """The tree of links and joints as it was read, with inertias and collision shapes."""
     transmission_path: Path
     base_link: str
     """The hand frame: every pose and Jacobian in torch_ekm is expressed in it."""
@@ -97,9 +98,14 @@ class HandDescription:
     hall_sensors: tuple[HallSensor, ...] = ()
     planar_normal: tuple[float, float, float] | None = None
     """Normal of the plane in which a planar hand moves (hand frame); None: a spatial hand."""
+    gravity: tuple[float, float, float] = (0.0, 0.0, 9.81)
+    """Nominal gravity in the hand frame [m/s^2], that of plant and model unless one is told otherwise. The
+    iCub's palm faces down: its fingers hang, and the line of a pinch is level."""
     notes: dict[str, str] = field(default_factory=dict)
-    urdf: UrdfModel | None = field(default=None, repr=False)
-    """The tree of links and joints as it was read, with inertias and collision shapes."""
+
+    @property
+    def urdf_path(self) -> Path:
+        return self.urdf.path
 
     @property
     def n_q(self) -> int:

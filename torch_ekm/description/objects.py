@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from .._extras import require
 from ..exceptions import DescriptionError
-from ._table import Table, read_toml
+from ._toml import TomlTable, read_toml
 from .shape import Shape
-from .urdf import UrdfModel, pose
+from .urdf import UrdfModel
 
 Array = NDArray[np.float64]
 
@@ -54,16 +55,18 @@ def read_object(path: Path, urdf: UrdfModel) -> ObjectDescription:
     if body.mass <= 0:
         raise DescriptionError(urdf.path, f"link '{body.name}' needs an <inertial> with a positive mass")
     if body.has_mesh or not body.collisions:
-        problem = f"link '{body.name}' needs <collision> shapes made of box, cylinder, sphere or capsule only"
-        raise DescriptionError(urdf.path, problem)
-    top = Table(path, "top level", read_toml(path, "object file"), ("object", "marker", "notes"))
+        problem = "contacts need <collision> shapes made of box, cylinder, sphere or capsule only"
+        found = "a mesh" if body.has_mesh else "no shape"
+        raise DescriptionError(urdf.path, f"link '{body.name}': {problem}, found {found}")
+    top = TomlTable(path, "top level", read_toml(path, "object file"), ("object", "marker", "notes"))
     keys = ("name", "friction", "torsional_friction", "grasp_axis", "grasp_width")
-    table = Table(path, "[object]", top.data.get("object"), keys)
-    marker = Table(path, "[marker]", top.data.get("marker", {}), ("xyz", "rpy", "rpy_deg"))
+    table = TomlTable(path, "[object]", top.data.get("object"), keys)
+    marker = TomlTable(path, "[marker]", top.data.get("marker", {}), ("xyz", "rpy", "rpy_deg"))
     axis = np.array(table.vector("grasp_axis", 3, (0.0, 1.0, 0.0)))
     if np.linalg.norm(axis) < 1e-9:
         raise table.error("'grasp_axis' must not be zero")
     xyz, rpy = marker.vector("xyz", 3, (0.0, 0.0, 0.0)), marker.angles("rpy", 3, (0.0, 0.0, 0.0))
+    pose = require("trimesh.transformations").compose_matrix  # as for the origins of a URDF
     return ObjectDescription(
         name=table.text("name"),
         urdf_path=urdf.path,
@@ -73,7 +76,7 @@ def read_object(path: Path, urdf: UrdfModel) -> ObjectDescription:
         friction=table.number("friction", minimum=0.0),
         torsional_friction=table.number("torsional_friction", 0.0, minimum=0.0),
         shapes=body.collisions,
-        marker_transform=pose(np.array(xyz), np.array(rpy)),
+        marker_transform=pose(translate=xyz, angles=rpy),
         grasp_axis=axis / np.linalg.norm(axis),
         grasp_width=table.number("grasp_width", positive=True),
         notes=top.notes(),

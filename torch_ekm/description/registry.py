@@ -18,7 +18,7 @@ _HANDS = {
 _OBJECTS = ("toothpaste", "applier", "box", "weighted_box", "bottle", "can")
 
 
-def data_folder() -> Path:
+def urdf_folder() -> Path:
     """Where the URDF files are: inside an installed package, or in the repository of an editable one."""
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "_urdf", package.parent / "urdf"):
@@ -45,7 +45,7 @@ def load_hand(name: str | Path) -> HandDescription:
         DescriptionError: a file is missing or wrong; the message names file and place.
         JointMismatchError: URDF and transmission file name different joints.
     """
-    urdf, transmission = hand_files(name)
+    urdf, transmission = hand_paths(name)
     return read_transmission(transmission, read_urdf(urdf))
 
 
@@ -56,27 +56,27 @@ def load_object(name: str | Path) -> ObjectDescription:
         UnknownNameError: ``name`` is neither a known object nor a path to a ``.urdf`` file.
         DescriptionError: a file is missing or wrong; the message names file and place.
     """
-    urdf, about = object_files(name)
+    urdf, about = object_paths(name)
     return read_object(about, read_urdf(urdf))
 
 
-def hand_files(name: str | Path) -> tuple[Path, Path]:
+def hand_paths(name: str | Path) -> tuple[Path, Path]:
     """URDF and transmission file of a hand, whether they exist or not.
 
     Raises:
         UnknownNameError: as :func:`load_hand`.
     """
-    path = _resolve("hand", name, {key: data_folder() / file for key, file in _HANDS.items()})
+    path = _resolve("hand", name, {key: urdf_folder() / file for key, file in _HANDS.items()})
     return path, path.with_suffix(".transmission.toml")
 
 
-def object_files(name: str | Path) -> tuple[Path, Path]:
+def object_paths(name: str | Path) -> tuple[Path, Path]:
     """URDF and object file of an object, whether they exist or not.
 
     Raises:
         UnknownNameError: as :func:`load_object`.
     """
-    folder = data_folder() / "objects"
+    folder = urdf_folder() / "objects"
     path = _resolve("object", name, {key: folder / f"{key}.urdf" for key in _OBJECTS})
     return path, path.with_suffix(".object.toml")
 

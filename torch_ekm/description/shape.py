@@ -42,6 +42,12 @@ class Shape:
         rod = np.pi * radius**2 * self.size[1]
         return float(rod if self.kind == "cylinder" else rod + ball)
 
+    def scaled(self, factor: float) -> Shape:
+        """The shape with all lengths, its distance from the origin included, times ``factor``."""
+        transform = self.transform.copy()
+        transform[:3, 3] *= factor
+        return Shape(self.kind, tuple(factor * size for size in self.size), transform)
+
 
 def merge_capsules(shapes: tuple[Shape, ...], tolerance: float = 1e-7) -> tuple[Shape, ...]:
     """Read a cylinder with a ball of the same radius on either end as one capsule.

@@ -13,12 +13,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..exceptions import DescriptionError, JointMismatchError
-from ._table import Table, read_toml
+from ._toml import TomlTable, read_toml
 from .hand import Actuator, ContactPad, HallSensor, HandDescription
 from .urdf import UrdfModel
 
 TABLES = ("hand", "joints", "actuators", "couplings", "pads", "hall_sensors", "notes")
-HAND = ("name", "base_link", "planar_normal")
+HAND = ("name", "base_link", "planar_normal", "gravity")
 JOINT = ("spring", "rest", "rest_deg", "friction")
 ACTUATOR = (
     "name",
@@ -46,18 +46,18 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
             coupling holds.
         JointMismatchError: the file names joints that the URDF lacks, or leaves some out.
     """
-    top = Table(path, "top level", read_toml(path, "transmission file"), TABLES)
+    top = TomlTable(path, "top level", read_toml(path, "transmission file"), TABLES)
     joints = urdf.moving_joints
     names = tuple(joint.name for joint in joints)
     if not names:
         raise DescriptionError(urdf.path, "there is no revolute or continuous joint")
-    hand = Table(path, "[hand]", top.data.get("hand"), HAND)
+    hand = TomlTable(path, "[hand]", top.data.get("hand"), HAND)
     base = hand.text("base_link", urdf.root)
     _check_base(path, base, urdf)
 
     springs = _joint_table(path, top.data.get("joints", {}), names)
     actuators = _each(top, "actuators", lambda place, data: _actuator(path, place, data), minimum=1)
-    couplings = _each(top, "couplings", lambda place, data: Table(path, place, data, COUPLING))
+    couplings = _each(top, "couplings", lambda place, data: TomlTable(path, place, data, COUPLING))
     J_a = _rows(path, names, [(f"actuator '{a.name}'", arms) for a, arms in actuators])
     C = _rows(path, names, [(table.place, table.weights("joints")) for table in couplings])
     K_s = springs[:, 0]
@@ -68,9 +68,10 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
     _check_unique(path, "pad", [pad.name for pad in pads])
     _check_unique(path, "Hall channel", [str(sensor.channel) for sensor in hall])
     normal = hand.vector("planar_normal", 3) if "planar_normal" in hand.data else None
+    gravity = hand.vector("gravity", 3, HandDescription.gravity)
     return HandDescription(
         name=hand.text("name"),
-        urdf_path=urdf.path,
+        urdf=urdf,
         transmission_path=path,
         base_link=base,
         link_names=tuple(link.name for link in urdf.links),
@@ -86,12 +87,12 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
         pads=tuple(pads),
         hall_sensors=tuple(hall),
         planar_normal=None if normal is None else (normal[0], normal[1], normal[2]),
+        gravity=(gravity[0], gravity[1], gravity[2]),
         notes=top.notes(),
-        urdf=urdf,
     )
 
 
-def _each(top: Table, key: str, read: Callable[[str, Any], T], minimum: int = 0) -> list[T]:
+def _each(top: TomlTable, key: str, read: Callable[[str, Any], T], minimum: int = 0) -> list[T]:
     entries = top.data.get(key, [])
     if not isinstance(entries, list) or len(entries) < minimum:
         raise DescriptionError(top.path, f"[[{key}]]: at least {minimum} such table(s) must be given")
@@ -103,7 +104,7 @@ def _each(top: Table, key: str, read: Callable[[str, Any], T], minimum: int = 0)
 
 
 def _actuator(path: Path, place: str, data: Any) -> tuple[Actuator, dict[str, float]]:
-    table = Table(path, place, data, ACTUATOR)
+    table = TomlTable(path, place, data, ACTUATOR)
     lower, upper = table.angles("range", 2)
     if lower >= upper:
         raise table.error(f"range reversed or empty: {lower:g} to {upper:g} rad")
@@ -120,7 +121,7 @@ def _actuator(path: Path, place: str, data: Any) -> tuple[Actuator, dict[str, fl
 
 
 def _pad(path: Path, place: str, data: Any, urdf: UrdfModel) -> ContactPad:
-    table = Table(path, place, data, PAD)
+    table = TomlTable(path, place, data, PAD)
     link, links = table.text("link"), [link.name for link in urdf.links]
     if link not in links:
         raise table.error(f"unknown link '{link}'; the URDF's links are: {', '.join(links)}")
@@ -142,7 +143,7 @@ def _pad(path: Path, place: str, data: Any, urdf: UrdfModel) -> ContactPad:
 
 
 def _hall(path: Path, place: str, data: Any, names: tuple[str, ...]) -> HallSensor:
-    table = Table(path, place, data, HALL)
+    table = TomlTable(path, place, data, HALL)
     joint = table.text("joint")
     if joint not in names:
         raise JointMismatchError(path, (), (joint,), names)
@@ -154,14 +155,14 @@ def _hall(path: Path, place: str, data: Any, names: tuple[str, ...]) -> HallSens
 
 def _joint_table(path: Path, data: Any, names: tuple[str, ...]) -> np.ndarray:
     """Rows (spring stiffness [N m/rad], rest [rad], Coulomb friction [N m]) in the order of ``names``."""
-    given = Table(path, "[joints]", data, data if isinstance(data, dict) else ()).data
+    given = TomlTable(path, "[joints]", data, data if isinstance(data, dict) else ()).data
     missing = [name for name in names if name not in given]
     unexpected = [name for name in given if name not in names]
     if missing or unexpected:
         raise JointMismatchError(path, missing, unexpected, names)
     rows = []
     for name in names:
-        table = Table(path, f"[joints] {name}", given[name], JOINT)
+        table = TomlTable(path, f"[joints] {name}", given[name], JOINT)
         spring, friction = (table.number(key, 0.0, minimum=0.0) for key in ("spring", "friction"))
         rows.append((spring, table.angle("rest", 0.0), friction))
     return np.array(rows)

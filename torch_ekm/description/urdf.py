@@ -1,25 +1,51 @@
-"""Read a URDF: links with inertia and primitive shapes, joints with axes and limits.
+"""Read a URDF through yourdfpy: links with inertia and primitive shapes, joints with axes and limits.
 
-Only what a hand or an object of this package needs: revolute, continuous and fixed joints; boxes,
-cylinders, spheres and capsules. Meshes are left out (contacts come from pads, see
-:mod:`torch_ekm.description.hand`), and every figure must be finite.
+yourdfpy repairs what is malformed, fills in what is missing and takes NaN for a number. So a file is
+looked through first, and only what a hand or an object of this package needs is handed over: revolute,
+continuous and fixed joints; boxes, cylinders, spheres and capsules. Mesh files are never opened.
 """
 
 from __future__ import annotations
 
+import io
 import math
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .._extras import require
 from ..exceptions import DescriptionError
 from .shape import Shape, merge_capsules
 
 Array = NDArray[np.float64]
 MOVING = ("revolute", "continuous")
+_SHAPES = ("box", "cylinder", "sphere", "capsule", "mesh")
+# what is read of an element: its children, those of them that it needs, ...
+_CHILDREN = {
+    "link": ("inertial", "collision"),
+    "inertial": ("origin", "mass", "inertia"),
+    "collision": ("origin", "geometry"),
+    "geometry": _SHAPES,
+    "joint": ("parent", "child", "origin", "axis", "limit"),
+}
+_NEEDED = {"inertial": ("mass", "inertia"), "collision": ("geometry",), "joint": ("parent", "child")}
+# ... and the attributes that hold figures: those that it needs, and the others
+_FIGURES = {
+    "origin": ((), ("xyz", "rpy")),
+    "mass": (("value",), ()),
+    "inertia": (("ixx", "iyy", "izz"), ("ixy", "ixz", "iyz")),
+    "axis": (("xyz",), ()),
+    "limit": ((), ("lower", "upper", "effort", "velocity")),
+    "box": (("size",), ()),
+    "cylinder": (("radius", "length"), ()),
+    "sphere": (("radius",), ()),
+    "capsule": (("radius", "length"), ()),
+}
+_TRIPLES = ("xyz", "rpy", "size")
 
 
 @dataclass(frozen=True)
@@ -32,6 +58,7 @@ class UrdfLink:
     inertia: Array
     collisions: tuple[Shape, ...]
     has_mesh: bool = False
+    """Whether there are meshes, which ``collisions`` leaves out."""
 
 
 @dataclass(frozen=True)
@@ -75,158 +102,138 @@ def read_urdf(path: str | Path) -> UrdfModel:
     Raises:
         DescriptionError: no such file, malformed XML, a missing or non-finite figure, an unknown
             joint type, ``<mimic>``, reversed limits, or links that do not form one tree.
+        MissingExtraError: yourdfpy is not installed.
     """
     path = Path(path)
     if not path.is_file():
         raise DescriptionError(path, "no such URDF file")
     try:
-        robot = ET.parse(path).getroot()
+        root = ET.parse(path).getroot()  # fetches no external entity, refuses those that blow up
     except ET.ParseError as error:
         raise DescriptionError(path, f"not well-formed XML: {error}") from None
-    if robot.tag != "robot":
-        raise DescriptionError(path, f"the root element must be <robot>, found <{robot.tag}>")
-    reader = _Reader(path)
-    links = tuple(reader.link(element) for element in robot.findall("link"))
-    joints = tuple(reader.joint(element) for element in robot.findall("joint"))
-    root = _root(path, links, joints)
-    return UrdfModel(path, robot.get("name", path.stem), links, joints, root)
+    if root.tag != "robot":
+        raise DescriptionError(path, f"the root element must be <robot>, found <{root.tag}>")
+    strict = ET.Element("robot", name=root.get("name", path.stem))
+    for element in root:
+        if element.tag == "link":
+            strict.append(_strict(path, element, _place(path, element)))
+        elif element.tag == "joint":
+            strict.append(_strict_joint(path, element))
+    document = io.BytesIO(ET.tostring(strict))
+    robot = require("yourdfpy").URDF.load(document, build_scene_graph=False, load_meshes=False).robot
+    links = tuple(_link(path, link) for link in robot.links)
+    joints = tuple(_joint(path, joint) for joint in robot.joints)
+    return UrdfModel(path, robot.name, links, joints, _root(path, links, joints))
 
 
-def pose(xyz: Array, rpy: Array) -> Array:
-    """URDF origin: ``R = Rz(yaw) Ry(pitch) Rx(roll)`` and translation ``xyz`` [m], ``(4, 4)``."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    transform = np.eye(4)
-    transform[:3, :3] = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    transform[:3, 3] = xyz
-    return transform
+def _place(path: Path, element: ET.Element) -> str:
+    name = element.get("name")
+    if not name:
+        raise DescriptionError(path, f"a <{element.tag}> has no name")
+    return f"{element.tag} '{name}'"
 
 
-class _Reader:
-    """Elements of one file to data; errors name the file, the element and the attribute."""
+def _strict_joint(path: Path, element: ET.Element) -> ET.Element:
+    place, kind = _place(path, element), element.get("type", "")
+    if kind not in (*MOVING, "fixed"):
+        valid = "revolute, continuous and fixed"
+        raise DescriptionError(path, f"{place}: type '{kind}' is not supported; supported: {valid}")
+    if element.find("mimic") is not None:
+        hint = "write it as a [[couplings]] entry of the transmission file"
+        raise DescriptionError(path, f"{place}: <mimic> is not supported; {hint}")
+    if kind == "revolute" and element.find("limit") is None:
+        raise DescriptionError(path, f"{place}: <joint> needs a <limit>")
+    unread = {"revolute": (), "continuous": ("limit",), "fixed": ("axis", "limit")}
+    return _strict(path, element, place, unread[kind])
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
 
-    def link(self, element: ET.Element) -> UrdfLink:
-        name = self._name(element, "link")
-        place = f"link '{name}'"
-        mass, com, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
-        inertial = element.find("inertial")
-        if inertial is not None:
-            frame = self._origin(inertial, f"{place}, inertial")
-            mass = self._number(self._child(inertial, "mass", place), "value", f"{place}, mass")
-            tensor = self._child(inertial, "inertia", place)
-            ixx, iyy, izz = (self._number(tensor, k, f"{place}, inertia") for k in ("ixx", "iyy", "izz"))
-            ixy, ixz, iyz = (self._number(tensor, k, f"{place}, inertia", 0.0) for k in ("ixy", "ixz", "iyz"))
-            com = frame[:3, 3]
-            inertia = frame[:3, :3] @ np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
-            inertia = inertia @ frame[:3, :3].T
-            if mass <= 0 or np.linalg.eigvalsh(inertia).min() <= 0:
-                raise DescriptionError(self.path, f"{place}: mass and principal inertias must be positive")
-        found = [self._shape(c, f"{place}, collision") for c in element.findall("collision")]
-        shapes = merge_capsules(tuple(shape for shape in found if shape is not None))
-        return UrdfLink(name, mass, com, inertia, shapes, has_mesh=None in found)
-
-    def joint(self, element: ET.Element) -> UrdfJoint:
-        name = self._name(element, "joint")
-        place = f"joint '{name}'"
-        kind = element.get("type", "")
-        if kind not in (*MOVING, "fixed"):
-            valid = "revolute, continuous and fixed"
-            raise DescriptionError(self.path, f"{place}: type '{kind}' is not supported; supported: {valid}")
-        if element.find("mimic") is not None:
-            hint = "write it as a [[couplings]] entry of the transmission file"
-            raise DescriptionError(self.path, f"{place}: <mimic> is not supported; {hint}")
-        ends = [self._child(element, tag, place).get("link", "") for tag in ("parent", "child")]
-        axis, lower, upper, effort, velocity = np.array([1.0, 0.0, 0.0]), -np.inf, np.inf, np.inf, np.inf
-        if kind in MOVING:
-            axis_element = element.find("axis")
-            if axis_element is not None:
-                axis = self._vector(axis_element, "xyz", f"{place}, axis")
-            length = float(np.linalg.norm(axis))
-            if length < 1e-9:
-                raise DescriptionError(self.path, f"{place}: the axis must not be zero")
-            axis = axis / length
-        if kind == "revolute":
-            limit = self._child(element, "limit", place)
-            lower, upper, effort, velocity = (
-                self._number(limit, key, f"{place}, limit", default)
-                for key, default in (("lower", 0.0), ("upper", 0.0), ("effort", np.inf), ("velocity", np.inf))
-            )
-            if lower > upper:
-                raise DescriptionError(self.path, f"{place}: limits reversed, lower {lower} > upper {upper}")
-        origin = self._origin(element, place)
-        return UrdfJoint(name, kind, ends[0], ends[1], origin, axis, lower, upper, effort, velocity)
-
-    def _shape(self, element: ET.Element, place: str) -> Shape | None:
-        geometry = self._child(element, "geometry", place)
-        origin = self._origin(element, place)
-        for kind in ("box", "cylinder", "sphere", "capsule"):
-            found = geometry.find(kind)
-            if found is None:
-                continue
-            if kind == "box":
-                size = tuple(self._vector(found, "size", f"{place}, box").tolist())
-            else:
-                keys = ("radius",) if kind == "sphere" else ("radius", "length")
-                size = tuple(self._number(found, key, f"{place}, {kind}") for key in keys)
-            if min(size) <= 0:
-                raise DescriptionError(
-                    self.path, f"{place}: the size of a {kind} must be positive, got {size}"
-                )
-            return Shape(kind, size, origin)
-        return None  # a mesh
-
-    def _name(self, element: ET.Element, tag: str) -> str:
-        name = element.get("name")
-        if not name:
-            raise DescriptionError(self.path, f"a <{tag}> has no name")
-        return name
-
-    def _child(self, element: ET.Element, tag: str, place: str) -> ET.Element:
-        child = element.find(tag)
-        if child is None:
-            raise DescriptionError(self.path, f"{place}: <{element.tag}> needs a <{tag}>")
-        return child
-
-    def _origin(self, element: ET.Element, place: str) -> Array:
-        origin = element.find("origin")
-        if origin is None:
-            return np.eye(4)
-        xyz, rpy = (
-            self._vector(origin, key, f"{place}, origin") if key in origin.attrib else np.zeros(3)
-            for key in ("xyz", "rpy")
-        )
-        return pose(xyz, rpy)
-
-    def _vector(self, element: ET.Element, key: str, place: str) -> Array:
-        words = element.get(key, "").split()
-        if len(words) != 3:
-            raise DescriptionError(
-                self.path, f"{place}: '{key}' must be three numbers, got '{' '.join(words)}'"
-            )
-        return np.array([self._parse(word, key, place) for word in words])
-
-    def _number(self, element: ET.Element, key: str, place: str, default: float | None = None) -> float:
+def _strict(path: Path, element: ET.Element, place: str, unread: tuple[str, ...] = ()) -> ET.Element:
+    """What is read of ``element``: nothing missing, every figure a finite number."""
+    tag = element.tag
+    strict = ET.Element(tag, {} if tag == "mesh" else element.attrib)
+    needed, optional = _FIGURES.get(tag, ((), ()))
+    for key in (*needed, *optional):
         text = element.get(key)
-        if text is None:
-            if default is None:
-                raise DescriptionError(self.path, f"{place}: <{element.tag}> needs the attribute '{key}'")
-            return default
-        return self._parse(text, key, place)
+        if text is not None:
+            strict.set(key, _figures(path, f"{place}: '{key}'", text, key in _TRIPLES))
+        elif key in needed:
+            raise DescriptionError(path, f"{place}: <{tag}> needs the attribute '{key}'")
+    for key in _NEEDED.get(tag, ()):
+        if element.find(key) is None:
+            raise DescriptionError(path, f"{place}: <{tag}> needs a <{key}>")
+    for child in element:
+        if child.tag in _CHILDREN.get(tag, ()) and child.tag not in unread:
+            strict.append(_strict(path, child, f"{place}, {child.tag}"))
+    if tag == "geometry" and len(strict) != 1:
+        raise DescriptionError(path, f"{place}: <geometry> needs one of {', '.join(_SHAPES)}")
+    if tag == "collision":  # yourdfpy knows no capsule: it travels as a cylinder whose name tells
+        shape = next(strict.iter("geometry"))[0]
+        strict.set("name", shape.tag)
+        shape.tag = "cylinder" if shape.tag == "capsule" else shape.tag
+    return strict
 
-    def _parse(self, text: str, key: str, place: str) -> float:
+
+def _figures(path: Path, what: str, text: str, triple: bool) -> str:
+    words = text.split() if triple else [text]
+    if len(words) != (3 if triple else 1):
+        raise DescriptionError(path, f"{what} must be three numbers, got '{text}'")
+    for word in words:
         try:
-            value = float(text)
+            finite = math.isfinite(float(word))
         except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise DescriptionError(self.path, f"{place}: '{key}' must be a finite number, got '{text}'")
-        return value
+            finite = False
+        if not finite:
+            raise DescriptionError(path, f"{what} must be a finite number, got '{word}'")
+    return " ".join(repr(float(word)) for word in words)
+
+
+def _link(path: Path, link: Any) -> UrdfLink:
+    """From a ``yourdfpy.Link``."""
+    mass, com, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
+    if link.inertial is not None:
+        frame = _pose(link.inertial.origin)
+        mass, com = link.inertial.mass, frame[:3, 3]
+        inertia = frame[:3, :3] @ link.inertial.inertia @ frame[:3, :3].T
+        if mass <= 0 or np.linalg.eigvalsh(inertia).min() <= 0:
+            raise DescriptionError(path, f"link '{link.name}': mass and principal inertias must be positive")
+    shapes = [_shape(path, link.name, found) for found in link.collisions if found.name != "mesh"]
+    has_mesh = len(shapes) < len(link.collisions)
+    return UrdfLink(link.name, mass, com, inertia, merge_capsules(tuple(shapes)), has_mesh)
+
+
+def _shape(path: Path, link: str, collision: Any) -> Shape:
+    kind, geometry = collision.name, collision.geometry
+    if geometry.box is not None:
+        size = tuple(geometry.box.size.tolist())
+    elif geometry.sphere is not None:
+        size = (geometry.sphere.radius,)
+    else:
+        size = (geometry.cylinder.radius, geometry.cylinder.length)
+    if min(size) <= 0:
+        problem = f"the size of a {kind} must be positive, got {size}"
+        raise DescriptionError(path, f"link '{link}', collision: {problem}")
+    return Shape(kind, size, _pose(collision.origin))
+
+
+def _joint(path: Path, joint: Any) -> UrdfJoint:
+    """From a ``yourdfpy.Joint``."""
+    place, length = f"joint '{joint.name}'", float(np.linalg.norm(joint.axis))
+    if length < 1e-9:
+        raise DescriptionError(path, f"{place}: the axis must not be zero")
+    lower, upper, effort, velocity = -np.inf, np.inf, np.inf, np.inf
+    if joint.limit is not None:
+        limit = joint.limit
+        lower, upper = limit.lower or 0.0, limit.upper or 0.0
+        effort, velocity = (np.inf if x is None else x for x in (limit.effort, limit.velocity))
+        if lower > upper:
+            raise DescriptionError(path, f"{place}: limits reversed, lower {lower} > upper {upper}")
+    ends = joint.parent or "", joint.child or ""
+    frame, axis = _pose(joint.origin), joint.axis / length
+    return UrdfJoint(joint.name, joint.type, *ends, frame, axis, lower, upper, effort, velocity)
+
+
+def _pose(origin: Array | None) -> Array:
+    return np.eye(4) if origin is None else origin
 
 
 def _root(path: Path, links: tuple[UrdfLink, ...], joints: tuple[UrdfJoint, ...]) -> str:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 
 from ..exceptions import ParameterError
-from ..residual import ActionLinearKernel, ResidualLearner, SparseOnlineGP
+from ..residual import ActionLinearKernel, ResidualLearner, SparseOnlineGP, action_covariance
 from ..typing import Float, Tensor
 
 
@@ -25,7 +25,7 @@ def action_variance(
     """``v(a) = sum_j w_j Var[g_j([s; a])]`` about the action in ``x``, in the learner's units.
 
     With an :class:`ActionLinearKernel` exact for every action: ``v(a) = a^T V a``, V from
-    ``SparseOnlineGP.action_covariance``. For any other learner gradient and curvature by automatic
+    :func:`~torch_ekm.residual.action_covariance`. For any other learner gradient and curvature by automatic
     differentiation, and of the curvature the positive semidefinite part (section 10.2 of the
     controller's derivation): where v bends down, the gradient alone pulls.
 
@@ -44,7 +44,7 @@ def action_variance(
         and learner.kernel.action_features == n_a
     ):
         s, a = x[:-n_a], x[-n_a:]
-        V = torch.einsum("j,jab->ab", weight, learner.action_covariance(s).detach())
+        V = torch.einsum("j,jab->ab", weight, action_covariance(learner, s).detach())
         V = (V + V.mT) / 2
         return Quadratic(a @ V @ a, 2 * V @ a, 2 * V)
     return _by_differentiation(learner, x, n_a, weight)

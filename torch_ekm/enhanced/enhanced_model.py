@@ -66,7 +66,7 @@ class EnhancedModel(nn.Module):
         super().__init__()
         self.model: Any = model  # a Module is registered, any other callable is kept as it is
         self.learner: ResidualLearner = learner
-        self.encode = encode if encode is not None else _identity
+        self.encode: Callable[[Any], Tensor] = encode if encode is not None else _identity
         self.outputs = outputs
         self.action_scale = action_scale
         self.register_buffer("output_scale", torch.as_tensor(output_scale))
@@ -110,16 +110,8 @@ class EnhancedModel(nn.Module):
     def forward(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_s"]:
         """``f(s, da) + g(s, da)``."""
         nominal = self.model(state, action)
-        return nominal + self.correction(state, action, nominal)
-
-    def correction(self, state: Any, action: Tensor, like: Tensor) -> Float[Tensor, "*batch n_s"]:
-        """``g(s, da)`` in the increment's unit, zero in the outputs that are not learned.
-
-        Args:
-            like: any increment of the right shape (usually ``f(s, da)``).
-        """
         mean = self.learner(self.features(state, action)) / self.output_scale
-        return self._scatter(mean, like)
+        return nominal + self._scatter(mean, nominal)
 
     @torch.no_grad()
     def update(
@@ -161,11 +153,13 @@ class EnhancedModel(nn.Module):
         state: Any,
         action: Float[Tensor, " n_a"],
         nominal_jacobian: Float[Tensor, "n_s n_a"] | None = None,
+        encoded: Float[Tensor, " d"] | None = None,
     ) -> tuple[Float[Tensor, " n_s"], Float[Tensor, "n_s n_a"]]:
         """``(f + g, d(f + g)/d da)`` at one state and action.
 
         Args:
             nominal_jacobian: J_m if it is known already (then ``f = J_m da``).
+            encoded: ``encode(state)`` if it is known already.
         """
         J = nominal_jacobian
         if J is None and isinstance(self.model, LinearizableModel):
@@ -176,7 +170,8 @@ class EnhancedModel(nn.Module):
             f: Any = self.model
             nominal = f(state, action)
             J = jacrev(lambda a: f(state, a))(action)
-        mean, dmean = self.learner.linearize(self.features(state, action))
+        seen = self.encode(state) if encoded is None else encoded
+        mean, dmean = self.learner.linearize(torch.cat([seen, self.action_scale * action], dim=-1))
         n_a = action.shape[-1]
         value = nominal + self._scatter(mean / self.output_scale, nominal)
         slope = dmean[..., -n_a:] * self.action_scale / self.output_scale.reshape(-1, 1)

@@ -11,8 +11,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..control import ControllerOptions, StoppingRule
-from ..description import hand_files, list_hands, object_files
+from ..control import (
+    DEFAULT_LIMITS,
+    DEFAULT_TASKS,
+    ActuatorLimit,
+    EffortTask,
+    FocusTask,
+    FrictionMarginLimit,
+    GripForceTask,
+    JointLimit,
+    LimitingFunction,
+    NormalForceLimit,
+    OffAxisTask,
+    StoppingRule,
+    UncertaintyTask,
+)
+from ..description import hand_paths, list_hands, object_paths
 from ..exceptions import ParameterError, UnknownNameError
 from ..model import ModelOptions
 from ..simulation import PlantConfig, PlantParameters, preset
@@ -25,6 +39,10 @@ _DEG = math.pi / 180
 CONTROLLERS = ("KM", "KM+I", "E-KM", "E-KM+I")
 #: Seeds from here on are never used for tuning.
 FIRST_REPORTED = 1000
+
+#: Parts of a controller in the order in which they are summed.
+_TASKS = (EffortTask, UncertaintyTask, OffAxisTask, GripForceTask, FocusTask)
+_LIMITS = (ActuatorLimit, NormalForceLimit, FrictionMarginLimit, JointLimit)
 
 
 @dataclass(frozen=True)
@@ -47,7 +65,9 @@ class Setting:
     model: Mapping[str, Any] = field(default_factory=dict)
     """Changes of :class:`ModelOptions`."""
     control: Mapping[str, Any] = field(default_factory=dict)
-    """Changes of :class:`ControllerOptions`."""
+    """Changes of the controller's parts, ``{"OffAxisTask.rotation_weight": 0.1}``; one that is not among the
+    defaults is added (:mod:`~torch_ekm.control.tasks`, :mod:`~torch_ekm.control.limits`, and the
+    ``LimitingFunction``)."""
     learner: str = DEFAULT_LEARNER
     learner_options: Mapping[str, Any] = field(default_factory=dict)
     capacity: int = 60
@@ -67,6 +87,7 @@ class Setting:
         self.parameters()
         self.plant_config("KM")
         self.model_options()
+        self.controller_parts()
 
     def parameters(self) -> PlantParameters:
         """The plant's."""
@@ -89,12 +110,25 @@ class Setting:
 
     def model_options(self) -> ModelOptions:
         """The kinematic model's."""
-        gravity = self.plant_config("KM").gravity
-        return _changed(ModelOptions(gravity=gravity), "model", self.model)
+        return _changed(ModelOptions(), "model", self.model)
 
-    def controller_options(self) -> ControllerOptions:
-        """The same for every controller."""
-        return _changed(ControllerOptions(), "control", self.control)
+    def controller_parts(self) -> dict[str, Any]:
+        """``tasks``, ``limits`` and ``limiting``, the same for every :class:`LookAndMoveController`."""
+        parts: dict[str, Any] = {
+            type(part).__name__: part for part in (*DEFAULT_TASKS, *DEFAULT_LIMITS, LimitingFunction())
+        }
+        known = {kind.__name__: kind for kind in (*_TASKS, *_LIMITS, LimitingFunction)}
+        for key, value in self.control.items():
+            name, _, figure = key.partition(".")
+            if name not in known:
+                raise ParameterError("control", key, f"PART.FIGURE, the part one of {', '.join(known)}")
+            part = parts[name] if name in parts else known[name]()
+            parts[name] = _changed(part, f"control of {name}", {figure: value})
+        tasks, limits = (
+            tuple(parts[kind.__name__] for kind in kinds if kind.__name__ in parts)
+            for kinds in (_TASKS, _LIMITS)
+        )
+        return {"tasks": tasks, "limits": limits, "limiting": parts["LimitingFunction"]}
 
     def stopping_rule(self) -> StoppingRule:
         """The same for every controller."""
@@ -106,10 +140,10 @@ class Setting:
             "plant": self.parameters(),
             "plant_config": self.plant_config("KM"),
             "model": self.model_options(),
-            "controller": self.controller_options(),
             "stopping_rule": self.stopping_rule(),
         }
-        figures = {name: dataclasses.asdict(part) for name, part in parts.items()}
+        figures: dict[str, Any] = {name: dataclasses.asdict(part) for name, part in parts.items()}
+        figures["controller"] = {name: repr(parts) for name, parts in self.controller_parts().items()}
         return {**figures, "learner": learner_figures(self.learner, self.capacity, **self.learner_options)}
 
     def replace(self, **changes: Any) -> Setting:
@@ -129,7 +163,7 @@ def digest(setting: Setting, objects: Iterable[str | Path], *more: Any) -> str:
         objects: names or paths of those that take part.
         more: configurations and figures that decide the results as well.
     """
-    files = [*hand_files(setting.hand), *(path for item in objects for path in object_files(item))]
+    files = [*hand_paths(setting.hand), *(path for item in objects for path in object_paths(item))]
     contents = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
     figures = [dataclasses.asdict(setting), setting.figures(), contents, more]
     text = json.dumps(figures, sort_keys=True, default=_plain)

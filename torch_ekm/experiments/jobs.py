@@ -1,21 +1,33 @@
-"""Run independent jobs in processes or on a cluster, with progress, and resume what was interrupted."""
+"""Run independent jobs in processes or on a cluster, with progress, and resume what was interrupted.
+
+Processes are joblib's (loky): fresh ones, since a forked copy of PhysX or of a thread pool is not safe to
+use, and they take lambdas and classes of a notebook. A cluster is asked directly, because joblib's Dask
+backend waits for ever when a worker dies, and Ray's gives no result before the last job is done.
+"""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from .clusters import cluster_outcomes
+from .._extras import require
+from ..exceptions import ParameterError
+
+Jobs = Mapping[str, tuple[Any, ...]]
+Outcomes = Iterator[tuple[str, Any]]
+
+_PATIENCE = 10.0  # [s] for a scheduler to answer
+_one_at_a_time = threading.Lock()
 
 
 def run_jobs(
     function: Callable[..., Any],
-    jobs: dict[str, tuple[Any, ...]],
+    jobs: Jobs,
     folder: Path,
     processes: int = 1,
     on_done: Callable[[str], None] | None = None,
@@ -23,53 +35,114 @@ def run_jobs(
 ) -> dict[str, Any]:
     """``{name: function(*arguments)}`` for all jobs, each result kept in ``folder/name.json``.
 
-    A job whose file exists is not run again, so an interrupted run goes on where it stopped. A file
-    appears whole or not at all.
+    A job whose file exists is not run again, so an interrupted run goes on where it stopped. A file appears
+    whole or not at all, and is written here, wherever the job ran. When a job fails, or the caller stops
+    asking, what has not begun is cancelled.
 
     Args:
-        function: importable, with results that JSON can hold.
+        function: with results that JSON can hold; on a cluster, importable there.
         jobs: name -> arguments.
         processes: 1 runs in this process. PhysX steps hold the interpreter's lock: threads do not help.
         on_done: called with the name of each job that is done, those of an earlier run first.
-        address: of a cluster that does the work instead of processes here, see
-            :func:`~torch_ekm.experiments.clusters.cluster_outcomes`.
+        address: of a cluster that does the work instead of processes here: ``dask://HOST:PORT`` of a
+            scheduler, ``ray://HOST:PORT`` of a head's client server, or ``ray://auto`` on a machine of the
+            Ray cluster. torch_ekm must be installed on its workers, with the same versions, and files that
+            the arguments name must be found there under the same paths.
+
+    Raises:
+        ParameterError: ``address`` is none of these, or nobody answers there.
+        MissingExtraError: joblib, or the cluster's package, is not installed.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    tell = on_done or (lambda name: None)
     results = {name: read for name in jobs if (read := _read(folder / f"{name}.json")) is not None}
     for name in results:
-        _tell(on_done, name)
-    waiting = [name for name in jobs if name not in results]
-    for name, result in _outcomes(function, jobs, waiting, processes, address):
-        _write(folder / f"{name}.json", result)
-        results[name] = json.loads(json.dumps(result))  # the same types as after a resume
-        _tell(on_done, name)
+        tell(name)
+    waiting = {name: arguments for name, arguments in jobs.items() if name not in results}
+    with closing(_outcomes(function, waiting, processes, address)) as outcomes:
+        for name, result in outcomes:
+            results[name] = _write(folder / f"{name}.json", result)
+            tell(name)
     return {name: results[name] for name in jobs}
 
 
-def _outcomes(
-    function: Callable[..., Any],
-    jobs: dict[str, tuple[Any, ...]],
-    waiting: list[str],
-    processes: int,
-    address: str | None,
-) -> Iterable[tuple[str, Any]]:
-    if address is not None:
-        yield from cluster_outcomes(address, function, {name: jobs[name] for name in waiting})
-        return
-    if processes <= 1 or len(waiting) <= 1:
-        for name in waiting:
-            yield name, function(*jobs[name])
-        return
-    # spawn: a forked copy of PhysX or of a thread pool is not safe to use
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        futures = {pool.submit(function, *jobs[name]): name for name in waiting}
+def _outcomes(function: Callable[..., Any], jobs: Jobs, processes: int, address: str | None) -> Any:
+    """``(name, result)`` in the order in which the jobs end."""
+    if address is None:
+        return _in_processes(function, jobs, processes)
+    scheme, _, place = address.partition("://")
+    if scheme not in ("dask", "ray") or not place:
+        raise ParameterError("address", address, "dask://HOST:PORT, ray://HOST:PORT or ray://auto")
+    return (_on_dask if scheme == "dask" else _on_ray)(place, function, jobs)
+
+
+def _in_processes(function: Callable[..., Any], jobs: Jobs, processes: int) -> Outcomes:
+    joblib, processes = require("joblib"), max(min(processes, len(jobs)), 1)
+    run = joblib.Parallel(
+        processes, backend="loky", return_as="generator_unordered", batch_size=1, max_nbytes=None
+    )
+    try:
+        with closing(run(joblib.delayed(_named)(name, function, job) for name, job in jobs.items())) as done:
+            yield from done
+    finally:
+        if processes > 1:  # idle workers would keep what they have imported: SAPIEN, code edited since
+            require("joblib.externals.loky").get_reusable_executor(reuse=True).shutdown(kill_workers=True)
+
+
+def _on_dask(place: str, function: Callable[..., Any], jobs: Jobs) -> Outcomes:
+    distributed = require("distributed")
+    try:
+        client = distributed.Client(f"tcp://{place}", timeout=_PATIENCE, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise _silent("dask", place, error) from error
+    with client:  # its end cancels what has not begun
+        # pure=False: a name is what a job is known by, not a hash of its arguments
+        futures = {client.submit(_alone, function, job, pure=False): name for name, job in jobs.items()}
+        for future in distributed.as_completed(futures, loop=client.loop):
+            yield futures[future], future.result()
+
+
+def _on_ray(place: str, function: Callable[..., Any], jobs: Jobs) -> Outcomes:
+    ray = require("ray")
+    mine = not ray.is_initialized()
+    if mine:
         try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BaseException:
-            for future in futures:
-                future.cancel()
-            raise
+            ray.init("auto" if place == "auto" else f"ray://{place}", log_to_driver=False)
+        except (ConnectionError, ValueError) as error:
+            # a head that wants a token lets clients without one wait until they give up
+            hint = f"{error}; a recent Ray wants RAY_AUTH_MODE=token and the head's token on both sides"
+            raise _silent("ray", place, hint) from error
+    waiting = {}
+    try:
+        run = ray.remote(num_cpus=1, max_retries=0)(_alone)
+        waiting.update((run.remote(function, job), name) for name, job in jobs.items())
+        while waiting:
+            done, _ = ray.wait(list(waiting), num_returns=1)
+            try:
+                result = ray.get(done[0])
+            except ray.exceptions.RayTaskError as error:
+                raise error.cause from error  # the job's own error, as everywhere else
+            yield waiting.pop(done[0]), result
+    finally:
+        for task in waiting:
+            ray.cancel(task)
+        if mine:
+            ray.shutdown()
+
+
+def _silent(scheme: str, place: str, reason: object) -> ParameterError:
+    return ParameterError("address", f"{scheme}://{place}", f"a cluster that answers ({reason})")
+
+
+def _named(name: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[str, Any]:
+    return name, function(*arguments)
+
+
+def _alone(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    """One at a time in this process: a cluster's worker may have several threads, and two simulations or two
+    settings of torch's threads in one process get into each other's way."""
+    with _one_at_a_time:
+        return function(*arguments)
 
 
 def _read(path: Path) -> Any:
@@ -79,12 +152,9 @@ def _read(path: Path) -> Any:
         return None
 
 
-def _write(path: Path, result: Any) -> None:
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(result), encoding="utf-8")
+def _write(path: Path, result: Any) -> Any:
+    """``result`` in the types that a resumed run reads."""
+    part, text = path.with_suffix(".part"), json.dumps(result)
+    part.write_text(text, encoding="utf-8")
     os.replace(part, path)
-
-
-def _tell(on_done: Callable[[str], None] | None, name: str) -> None:
-    if on_done is not None:
-        on_done(name)
+    return json.loads(text)

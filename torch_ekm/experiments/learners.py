@@ -1,4 +1,4 @@
-"""Learners by name, in the units of a grasp, and the enhanced model around them."""
+"""Every learner by name, for any stream and for a grasp, and the enhanced model around one."""
 
 from __future__ import annotations
 
@@ -7,15 +7,27 @@ from typing import Any
 
 import torch
 
-from ..enhanced.grasp_learner import NOISE_VARIANCE, grasp_learner
+from ..enhanced.grasp_learner import NOISE_VARIANCE, grasp_kernel
 from ..exceptions import UnknownNameError
 from ..residual import (
     ActionLinearKernel,
+    CalibrateNoise,
     DeepKernelSOGP,
+    DetectChanges,
+    ForgettingFactor,
+    GPyTorchSVGP,
+    GPyTorchWindow,
+    KRLSTracker,
+    LearnHyperparameters,
+    LocalGPs,
+    MixtureResidual,
+    ProcessNoise,
     RandomFeatureRLS,
     RecursiveLeastSquares,
     ReplayMLP,
     ResidualLearner,
+    RiverResidual,
+    RobustWeight,
     SparseOnlineGP,
     SquaredExponential,
     WindowGP,
@@ -25,64 +37,107 @@ from ..residual import (
 #: Outputs: translation [mm] and rotation [deg] of the object in the hand frame.
 N_OUT = 6
 
-
-def _action_linear(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
-    state = SquaredExponential(n_s, lengthscale=6.0)
-    kernel = ActionLinearKernel(n_s + n_a, n_a, state_kernel=state, action_variance=0.1)
-    chosen = {"noise_variance": NOISE_VARIANCE, "robust": 3.0, "forgetting": 0.995, **options}
-    return SparseOnlineGP(n_s + n_a, N_OUT, capacity=capacity, kernel=kernel, **chosen)
+Factory = Callable[..., ResidualLearner]
 
 
-def _paper(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
-    """As in the paper: squared exponential, one lengthscale; nothing forgotten, every sample trusted."""
-    chosen = {"noise_variance": NOISE_VARIANCE, **options}
-    return SparseOnlineGP(n_s + n_a, N_OUT, capacity=capacity, **chosen)
+def _kind(make: Factory, capacity_is: str = "", **figures: Any) -> Factory:
+    """A kind of learner; ``capacity_is`` names that of its arguments which is a capacity."""
+
+    def factory(
+        d: int, m: int, *, n_actions: int = 0, capacity: int = 100, **options: Any
+    ) -> ResidualLearner:
+        size = {capacity_is: capacity} if capacity_is else {}
+        return make(d, m, **{**figures, **size, **options})
+
+    return factory
 
 
-def _deep(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
-    chosen = {"noise_variance": NOISE_VARIANCE, "robust": 3.0, "forgetting": 0.995, **options}
-    return DeepKernelSOGP(n_s + n_a, N_OUT, capacity=capacity, **chosen)
+def _sogp(make: Factory = SparseOnlineGP, **figures: Any) -> Factory:
+    """A sparse online GP that distrusts and forgets by two figures, and has other parts."""
+
+    def factory(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearner:
+        chosen = {"capacity": 100, "noise_variance": NOISE_VARIANCE, "robust": None, "forgetting_factor": 1.0}
+        chosen |= {"parts": (), **figures, **options}
+        robust, factor, parts = (chosen.pop(name) for name in ("robust", "forgetting_factor", "parts"))
+        weight = [] if robust is None else [RobustWeight(robust)]
+        fading = [] if factor == 1.0 else [ForgettingFactor(factor)]
+        return make(d, m, parts=[*weight, *fading, *parts], **chosen)
+
+    return factory
 
 
-def _rls(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
-    chosen = {"noise_variance": NOISE_VARIANCE, "forgetting": 0.995, "robust": 3.0, **options}
-    return RecursiveLeastSquares(n_s + n_a, N_OUT, weight_variance=0.1, **chosen)
+def _rbf(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearner:
+    """The learner of :meth:`EnhancedModel.for_grasp`."""
+    kernel = grasp_kernel(d - n_actions, n_actions)
+    return _sogp(robust=3.0, forgetting_factor=0.995, kernel=kernel)(d, m, **options)
 
 
-def _rff(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
-    chosen = {"noise_variance": NOISE_VARIANCE, "forgetting": 0.995, "robust": 3.0, **options}
-    return RandomFeatureRLS(n_s + n_a, N_OUT, n_frequencies=capacity, **chosen)
+def _action_linear(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearner:
+    state = SquaredExponential(d - n_actions, lengthscale=6.0)
+    kernel = ActionLinearKernel(d, n_actions, state_kernel=state, action_variance=0.1)
+    return _sogp(robust=3.0, forgetting_factor=0.995, kernel=kernel)(d, m, **options)
 
 
-def _window(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
-    return WindowGP(
-        n_s + n_a, N_OUT, window=capacity, **{"noise_variance": NOISE_VARIANCE, "robust": 3.0, **options}
-    )
+def _mixture(d: int, m: int, **options: Any) -> ResidualLearner:
+    """One that stands still and learns features, one that wanders: evidence decides."""
+    still = _sogp(DeepKernelSOGP, robust=3.0)
+    wandering = _sogp(robust=3.0, parts=[ProcessNoise(0.003), LearnHyperparameters()])
+    return MixtureResidual([still(d, m, **options), wandering(d, m, **options)])
 
 
-def _mlp(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
-    return ReplayMLP(n_s + n_a, N_OUT, **options)
+_FRESH: dict[str, Any] = {"noise_variance": NOISE_VARIANCE, "forgetting_factor": 0.99, "robust": 3.0}
+_LEARNING = [LearnHyperparameters()]
 
-
-def _none(n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
-    return ZeroResidual(n_s + n_a, N_OUT, noise_variance=NOISE_VARIANCE, **options)
-
-
+#: Name -> ``factory(in_features, out_features, n_actions=0, capacity=100, **options)``; the last n_actions
+#: inputs are an action. Inputs and outputs are of the order of 1; all but the first two start from the same
+#: generic prior: lengthscale sqrt(d), unit variance, and about 100 of whatever they keep.
+LEARNERS: dict[str, Factory] = {
+    "rbf": _rbf,
+    "action-linear": _action_linear,
+    "model alone": _kind(ZeroResidual),
+    "linear RLS": _kind(RecursiveLeastSquares, **_FRESH),
+    "random features": _kind(RandomFeatureRLS, "n_frequencies", **_FRESH),
+    "window GP": _kind(WindowGP, "window", noise_variance=NOISE_VARIANCE, robust=3.0),
+    "local GPs": _kind(LocalGPs, "window", experts=40, noise_variance=NOISE_VARIANCE),
+    "KRLS-T": _kind(KRLSTracker, "capacity", noise_variance=NOISE_VARIANCE, forgetting_factor=0.99),
+    "MLP": _kind(ReplayMLP),
+    "MLP ensemble": _kind(ReplayMLP, members=3),
+    "SOGP plain": _sogp(),  # as in the paper: nothing forgotten, every sample trusted
+    "SOGP": _sogp(forgetting_factor=0.99, robust=3.0),
+    "SOGP adaptive": _sogp(forgetting_factor=0.99, robust=3.0, parts=[CalibrateNoise(), *_LEARNING]),
+    "SOGP detecting": _sogp(robust=3.0, parts=[CalibrateNoise(), DetectChanges(), *_LEARNING]),
+    # no forgetting: what features are learned from is the past
+    "SOGP deep": _sogp(DeepKernelSOGP, robust=3.0, parts=[CalibrateNoise(), DetectChanges()]),
+    "SOGP mixture": _mixture,
+    "river forest": _kind(RiverResidual),
+    "GPyTorch window": _kind(GPyTorchWindow, "window", noise_variance=NOISE_VARIANCE),
+    "GPyTorch SVGP": _kind(GPyTorchSVGP, "inducing", memory=500, minibatch=20),
+}
 #: What demo and experiments take unless told otherwise.
 DEFAULT_LEARNER = "rbf"
-
-#: Name -> ``factory(n_s, n_a, capacity, **options)``; n_s features of the state, n_a actuators.
-LEARNERS: dict[str, Callable[..., ResidualLearner]] = {
-    "rbf": grasp_learner,
-    "action-linear": _action_linear,
-    "paper": _paper,
-    "deep": _deep,
-    "rls": _rls,
-    "rff": _rff,
-    "window": _window,
-    "mlp": _mlp,
-    "none": _none,
+#: Those that the ablation of a hand compares.
+HAND_LEARNERS = (
+    "rbf", "action-linear", "SOGP plain", "SOGP deep", "linear RLS", "random features", "window GP", "MLP",
+    "model alone",
+)  # fmt: skip
+#: What a hand wants other than any stream: it wears slowly, and a motion says little of a slope.
+_ON_A_HAND: dict[str, dict[str, Any]] = {
+    "SOGP deep": {"forgetting_factor": 0.995, "parts": ()},
+    "linear RLS": {"forgetting_factor": 0.995, "weight_variance": 0.1},
+    "random features": {"forgetting_factor": 0.995},
+    "model alone": {"noise_variance": NOISE_VARIANCE},
 }
+
+
+def learner_factory(name: str) -> Factory:
+    """The factory of that name.
+
+    Raises:
+        UnknownNameError: no such learner; the message lists them.
+    """
+    if name not in LEARNERS:
+        raise UnknownNameError("learner", name, LEARNERS)
+    return LEARNERS[name]
 
 
 def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
@@ -97,23 +152,29 @@ def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -
     Raises:
         UnknownNameError: no such learner; the message lists them.
     """
-    if name not in LEARNERS:
-        raise UnknownNameError("learner", name, LEARNERS)
-    return LEARNERS[name](n_s, n_a, capacity, **options)
+    options = {"capacity": capacity, **_ON_A_HAND.get(name, {}), **options}
+    return learner_factory(name)(n_s + n_a, N_OUT, n_actions=n_a, **options)
 
 
 def learner_figures(name: str, capacity: int, **options: Any) -> dict[str, Any]:
-    """Kind, kernel and switches of a learner as plain figures, by an example with one state and action."""
+    """Kind, kernel, parts and switches of a learner as plain figures, by one with one state and action."""
     learner = make_learner(name, 1, 1, capacity, **options)
-    figures: dict[str, Any] = {"kind": type(learner).__name__}
-    for key, value in vars(learner).items():
-        if not key.startswith("_") and isinstance(value, bool | int | float | str | tuple | None):
-            figures[key] = value
+    figures = _plain(learner)
     kernel = getattr(learner, "kernel", None)
     if kernel is not None:
         parameters = {k: p.tolist() for k, p in kernel.named_parameters() if "log_" in k}
         figures["kernel"] = {"kind": type(kernel).__name__, **parameters}
+    figures["parts"] = [_plain(part) for part in getattr(learner, "parts", ())]
     noise = getattr(learner, "noise_variance", None)
     if noise is not None:
         figures["noise_variance"] = torch.as_tensor(noise).tolist()
     return figures
+
+
+def _plain(module: torch.nn.Module) -> dict[str, Any]:
+    plain = {
+        key: value
+        for key, value in vars(module).items()
+        if not key.startswith("_") and isinstance(value, bool | int | float | str | tuple | None)
+    }
+    return {"kind": type(module).__name__, **plain}

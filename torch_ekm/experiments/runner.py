@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -85,7 +85,6 @@ class Bench:
                 self.no_grasp = str(error)
                 continue
             self._ever_held = True
-            self.model.reset()
             if self.learns and self.enhanced is None:
                 self._prepare_learner(start)
             return start
@@ -153,9 +152,13 @@ class Bench:
         if start is None:
             return NotGrasped(**vars(about), message=self.no_grasp)
         axis = self.hand.rotation_axis
-        wide = {"focus_step": step_deg * _DEG, "contact_step": None, "actuator_step": 20 * _DEG}
+        wide = {
+            "LimitingFunction.step": step_deg * _DEG,
+            "LimitingFunction.contact_travel": None,
+            "ActuatorLimit.step": 20 * _DEG,
+        }
         rule = dataclasses.replace(self.setting.stopping_rule(), max_steps=1, off_limit=math.inf)
-        loop = ClosedLoop(self.plant, self._controller(axis, **wide), rule, learn=False)
+        loop = ClosedLoop(self.plant, self._controller(axis, wide), rule, learn=False)
         done = loop.run(PoseTarget.turned(start, axis, step_deg * _DEG))
         before = true_state(done.steps[0].before if done.steps else done.stop.final)
         turned = true_state(done.stop.final).minus(before)[-3:] @ axis
@@ -166,10 +169,12 @@ class Bench:
         """Give back what the plant holds."""
         self.plant.close()
 
-    def _controller(self, axis: torch.Tensor, **changes: Any) -> LookAndMoveController:
-        options = dataclasses.replace(self.setting.controller_options(), **changes)
+    def _controller(
+        self, axis: torch.Tensor, changes: Mapping[str, Any] | None = None
+    ) -> LookAndMoveController:
+        setting = self.setting.replace(control={**self.setting.control, **(changes or {})})
         model = self.enhanced if self.enhanced is not None else self.model
-        return LookAndMoveController(model, axis, options)
+        return LookAndMoveController(model, axis, **setting.controller_parts())
 
     def _prepare_learner(self, start: GraspState) -> None:
         setting = self.setting

@@ -8,6 +8,7 @@ from torch import nn
 from ..description import HandDescription
 from ..exceptions import ShapeError
 from ..typing import Float, Tensor
+from .null_space import null_space
 
 
 class ActuationMap(nn.Module):
@@ -42,8 +43,7 @@ class ActuationMap(nn.Module):
         J_a, C = torch.from_numpy(hand.actuation_jacobian), torch.from_numpy(hand.coupling)
         K_s = torch.diag(torch.from_numpy(hand.spring_stiffness))
         B = torch.cat([J_a, C])
-        _, _, V = torch.linalg.svd(B)
-        N = V[len(B) :].mT
+        N = null_space(B)
         P = torch.linalg.pinv(B)[:, : hand.n_a]
         if N.shape[-1]:  # remove from P what the springs would not do by themselves
             P = P - N @ torch.linalg.solve(N.mT @ K_s @ N, N.mT @ K_s @ P)

@@ -2,40 +2,43 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from torch import nn
 
-from ..description import HandDescription, UrdfModel, read_urdf
+from .._extras import require
+from ..description import HandDescription
 from ..exceptions import ParameterError, ShapeError, UnknownNameError
 from ..typing import Bool, Float, Tensor
 from .link_poses import LinkPoses
-from .se3 import hat
 
 
 class HandKinematics(nn.Module):
     r"""``T_j(q) = T_parent(j) O_j exp([z_j] q_j)``, for every link of the tree.
 
-    ``O_j`` is the joint's origin in its parent link, ``z_j`` its unit axis. By Rodrigues the local
-    transform is linear in ``(1, sin q_j, 1 - cos q_j)`` with constant matrices, so all joints are turned at
-    once, and the tree is then multiplied level by level (five fingers at a time) instead of joint by joint.
-    All poses, axes and Jacobians are in the hand frame ``hand.base_link`` [m, rad]; Jacobian rows are
-    ``(v; w)``. Differentiable any number of times, and usable under ``torch.func``.
-    :func:`~torch_ekm.kinematics.reference.reference_transforms` is the same map through pytorch-kinematics.
+    ``O_j`` is the joint's origin in its parent link, ``z_j`` its unit axis. The poses are those of a
+    pytorch-kinematics chain that is built from ``hand.urdf`` in the precision of this module (the
+    library's own URDF reader builds origins in float32); axes and Jacobians follow from the poses.
+    All of them are in the hand frame ``hand.base_link`` [m, rad]; Jacobian rows are ``(v; w)``.
+
+    Differentiable any number of times, by autograd and by ``torch.func.jacrev``, ``jacfwd`` and
+    ``hessian``. ``torch.func.vmap`` over ``q`` is refused by the chain, which writes in place: pass the
+    batch dimensions, which cost less.
 
     Args:
         hand: the hand; links and joints keep its names and order.
         dtype: of the buffers, and then of ``q``; change it later with ``.to()``.
+
+    Raises:
+        MissingExtraError: pytorch-kinematics is not installed.
     """
 
     upstream: Bool[Tensor, "n_link n_q"]
     """True where the joint moves the link."""
-    # one entry per link, level by level from the root
-    _constant: Tensor
-    _sine: Tensor
-    _versine: Tensor
-    _joint_of_link: Tensor
-    _unsort: Tensor
-    # one entry per joint
+    _frame_of_link: Tensor
+    _joint_order: Tensor | None  # None: that of ``q``
     _child_of_joint: Tensor
     _axes: Tensor
 
@@ -44,74 +47,32 @@ class HandKinematics(nn.Module):
         self.hand = hand
         self.link_names = hand.link_names
         self.joint_names = hand.joint_names
-        urdf = hand.urdf if hand.urdf is not None else read_urdf(hand.urdf_path)
-        self._build(urdf, dtype)
+        self._chain = chain = _build_chain(hand, dtype, torch.device("cpu"))
+        joints = {joint.name: joint for joint in hand.urdf.joints}
+        frames = torch.tensor([chain.frame_to_idx[name] for name in self.link_names])
+        children = [self.link_names.index(joints[name].child) for name in self.joint_names]
+        above = torch.zeros(len(frames), len(frames), dtype=torch.bool)  # frame, frame on the way to it
+        for frame, path in enumerate(chain.parents_indices):
+            above[frame, path] = True
+        order = [self.joint_names.index(name) for name in chain.get_joint_parameter_names()]
+        for name, value in {
+            "_frame_of_link": frames,
+            "_joint_order": None if order == sorted(order) else torch.tensor(order),
+            "_child_of_joint": torch.tensor(children),
+            "_axes": torch.tensor([joints[name].axis.tolist() for name in self.joint_names], dtype=dtype),
+            "upstream": above[frames][:, frames[children]],
+        }.items():
+            self.register_buffer(name, value, persistent=False)  # made from the description, never learned
 
-    def _build(self, urdf: UrdfModel, dtype: torch.dtype) -> None:
-        n_link, n_q = len(self.link_names), len(self.joint_names)
-        index = {name: k for k, name in enumerate(self.link_names)}
-        of_child = {joint.child: joint for joint in urdf.joints}
-        constant = torch.eye(4, dtype=torch.float64).repeat(n_link, 1, 1)
-        sine, versine = torch.zeros_like(constant), torch.zeros_like(constant)
-        upstream = torch.zeros(n_link, n_q, dtype=torch.bool)
-        joint_of_link, child_of_joint = [0] * n_link, [0] * n_q
-        axes = torch.zeros(n_q, 3, dtype=torch.float64)
-
-        levels: list[list[int]] = [[index[urdf.root]]]
-        parents: list[list[int]] = [[0]]  # place of the parent in the level above
-        while levels[-1]:
-            level, above = [], []
-            for place, parent in enumerate(levels[-1]):
-                for name in self.link_names:
-                    joint = of_child.get(name)
-                    if joint is None or joint.parent != self.link_names[parent]:
-                        continue
-                    link = index[name]
-                    level.append(link)
-                    above.append(place)
-                    origin = torch.from_numpy(joint.transform.copy())
-                    constant[link] = origin
-                    upstream[link] = upstream[parent]
-                    if joint.name in self.joint_names:
-                        j = self.joint_names.index(joint.name)
-                        joint_of_link[link], child_of_joint[j] = j, link
-                        axes[j] = torch.from_numpy(joint.axis.copy())
-                        K = hat(axes[j])
-                        sine[link, :3, :3] = origin[:3, :3] @ K
-                        versine[link, :3, :3] = origin[:3, :3] @ K @ K
-                        upstream[link, j] = True
-            levels.append(level)
-            parents.append(above)
-        levels.pop()
-        parents.pop()
-
-        # the hand frame may sit behind fixed joints: start the tree at inv(T_root_base)
-        base, T = self.hand.base_link, torch.eye(4, dtype=torch.float64)
-        while base != urdf.root:
-            T = constant[index[base]] @ T
-            base = of_child[base].parent
-        constant[index[urdf.root]] = torch.linalg.inv(T)
-
-        order = [link for level in levels for link in level]
-        self._sizes = [len(level) for level in levels]
-        self._register("_constant", constant[order].to(dtype))
-        self._register("_sine", sine[order].to(dtype))
-        self._register("_versine", versine[order].to(dtype))
-        self._register("_joint_of_link", torch.tensor([joint_of_link[link] for link in order]))
-        self._register("_unsort", torch.tensor([order.index(link) for link in range(n_link)]))
-        self._register("_child_of_joint", torch.tensor(child_of_joint))
-        self._register("_axes", axes.to(dtype))
-        self._register("upstream", upstream)
-        for depth, above in enumerate(parents):
-            self._register(f"_parents_{depth}", torch.tensor(above))
-
-    def _register(self, name: str, tensor: Tensor) -> None:
-        self.register_buffer(name, tensor, persistent=False)  # made from the description, never learned
+    def _apply(self, fn: Any, recurse: bool = True) -> HandKinematics:
+        super()._apply(fn, recurse)
+        self._chain = _build_chain(self.hand, self._axes.dtype, self._axes.device)  # it is no Module
+        return self
 
     @property
     def dtype(self) -> torch.dtype:
         """Of the buffers, and so of the ``q`` that :meth:`forward` takes."""
-        return self._constant.dtype
+        return self._axes.dtype
 
     def link_index(self, name: str) -> int:
         """Place of a link in ``link_names``.
@@ -124,25 +85,26 @@ class HandKinematics(nn.Module):
         return self.link_names.index(name)
 
     def forward(self, q: Float[Tensor, "*batch n_q"]) -> LinkPoses:
-        """Poses of all links at joint angles ``q`` [rad].
-
-        Finiteness is not checked here (it would stop ``vmap``): a NaN angle gives NaN poses.
+        """Poses of all links at joint angles ``q`` [rad]; a NaN angle gives NaN poses.
 
         Raises:
             ShapeError: the last dimension is not ``n_q``; the message lists the joints in order.
             ParameterError: ``q`` has another dtype than this module.
         """
-        self._check(q)
-        angle = q[..., self._joint_of_link, None, None]
-        # versine as 2 sin^2(q/2): 1 - cos q loses half its digits near 0
-        local = self._constant + torch.sin(angle) * self._sine
-        local = local + 2 * torch.sin(angle / 2) ** 2 * self._versine
-        levels = list(local.split(self._sizes, dim=-3))
-        for depth in range(1, len(levels)):
-            above = levels[depth - 1][..., getattr(self, f"_parents_{depth}"), :, :]
-            levels[depth] = above @ levels[depth]
-        transforms = torch.cat(levels, dim=-3)[..., self._unsort, :, :]
-        return LinkPoses(transforms, self.link_names)
+        shape, n_q = q.shape, len(self.joint_names)
+        if not shape or shape[-1] != n_q:
+            joints = ", ".join(self.joint_names)
+            raise ShapeError("q", f"(*batch, {n_q})", shape, f"the joints are, in order: {joints}")
+        if q.dtype != self._chain.dtype:
+            valid = f"{self.dtype}, the dtype of this module (change it with .to())"
+            raise ParameterError("q.dtype", q.dtype, valid)
+        flat = q.reshape(-1, n_q)
+        if self._joint_order is not None:
+            flat = flat.index_select(1, self._joint_order)
+        # the library's analytical gradient is a custom Function: once differentiable, not by torch.func
+        frames = self._chain.forward_kinematics_tensor(flat, analytical_grad=False)
+        transforms = frames.transpose(0, 1).index_select(1, self._frame_of_link)
+        return LinkPoses(transforms.view(*shape[:-1], len(self.link_names), 4, 4), self.link_names)
 
     def joint_axes(
         self, poses_or_q: LinkPoses | Float[Tensor, "*batch n_q"]
@@ -185,14 +147,36 @@ class HandKinematics(nn.Module):
         moves = self.upstream[k][:, None]
         return (torch.cat([v, axis.expand_as(v)], dim=-1) * moves).mT
 
-    def _check(self, q: Tensor) -> None:
-        n_q = len(self.joint_names)
-        if q.dim() == 0 or q.shape[-1] != n_q:
-            joints = ", ".join(self.joint_names)
-            raise ShapeError("q", f"(*batch, {n_q})", q.shape, f"the joints are, in order: {joints}")
-        if q.dtype != self.dtype:
-            valid = f"{self.dtype}, the dtype of this module (change it with .to())"
-            raise ParameterError("q.dtype", q.dtype, valid)
-
     def extra_repr(self) -> str:
         return f"'{self.hand.name}', links={len(self.link_names)}, joints={len(self.joint_names)}"
+
+
+def _build_chain(hand: HandDescription, dtype: torch.dtype, device: torch.device) -> Any:
+    """The ``pytorch_kinematics`` chain of a hand, its world frame the hand frame.
+
+    Made of the library's own frames, so that origins and axes are those of the description to the last
+    digit.
+    """
+    pk = require("pytorch_kinematics")
+    to = {"dtype": dtype, "device": device}
+
+    def offset(transform: np.ndarray) -> Any:
+        return pk.Transform3d(matrix=torch.from_numpy(transform).to(**to))
+
+    urdf = hand.urdf
+    frames = {link.name: pk.Frame(link.name, pk.Link(link.name)) for link in urdf.links}
+    carried_by = {joint.child: joint for joint in urdf.joints}
+    for joint in urdf.joints:
+        kind = "revolute" if joint.name in hand.joint_names else "fixed"
+        frames[joint.child].joint = pk.Joint(
+            joint.name, offset(joint.transform), kind, joint.axis.tolist(), **to
+        )
+        frames[joint.parent].add_child(frames[joint.child])
+    link, T = hand.base_link, np.eye(4)  # T_root_base: the hand frame may sit behind fixed joints
+    while link != urdf.root:
+        T, link = carried_by[link].transform @ T, carried_by[link].parent
+    frames[urdf.root].link.offset = offset(np.linalg.inv(T))
+    chain = pk.Chain(frames[urdf.root], **to)
+    # The frames of a level are neighbours: slices read and write them without a gather, a tenth faster.
+    chain._bfs_levels = [slice(int(level[0]), int(level[-1]) + 1) for level in chain._bfs_levels]
+    return chain

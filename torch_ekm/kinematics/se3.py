@@ -68,18 +68,3 @@ def _log_near_half_turn(rotation: Tensor) -> Tensor:
     k = diagonal.argmax(-1)
     column = torch.take_along_dim(outer, k[..., None, None].expand(*k.shape, 3, 1), -1)[..., 0]
     return torch.pi * column / torch.linalg.vector_norm(column, dim=-1, keepdim=True)
-
-
-def from_xyz_rpy(xyz: tuple[float, ...], rpy: tuple[float, ...]) -> Float[Tensor, "4 4"]:
-    """URDF origin: ``R = Rz(yaw) Ry(pitch) Rx(roll)``, translation ``xyz`` [m], float64."""
-    transform = torch.eye(4, dtype=torch.float64)
-    transform[:3, :3] = from_rpy(torch.tensor(rpy, dtype=torch.float64))
-    transform[:3, 3] = torch.tensor(xyz, dtype=torch.float64)
-    return transform
-
-
-def from_rpy(rpy: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """``R = Rz(yaw) Ry(pitch) Rx(roll)``, angles [rad] in the order roll, pitch, yaw."""
-    axes = torch.eye(3, dtype=rpy.dtype, device=rpy.device)
-    roll, pitch, yaw = (exp(rpy[..., k, None] * axes[k]) for k in range(3))
-    return yaw @ pitch @ roll

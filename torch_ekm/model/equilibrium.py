@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -32,10 +33,6 @@ class Equilibrium:
     contacts: ContactSet
     residual: float
     """Largest entry of the scaled equations that were solved."""
-
-    @property
-    def n_c(self) -> int:
-        return self.contacts.n_c
 
 
 class EquilibriumSolver:
@@ -129,17 +126,11 @@ class EquilibriumSolver:
         at = Equilibrium(self.start, a, forces.mu, forces.lam, stop, kin.contacts, float("inf"))
         unexplained = self._balance(at.state, kin, at.mu, at.lam, at.stop)
         gap = kin.contacts.gap
-        fraction, size = 1.0, 1.0 / steps
-        while fraction > 0:
-            target = max(0.0, fraction - size)
-            try:
-                at = self._newton(at, a, target * unexplained, target * gap)
-                fraction = target
-            except EquilibriumError:
-                size /= 2
-                if size < 1e-3:
-                    raise
-        return at
+
+        def faded(at: Equilibrium, done: float) -> Equilibrium:
+            return self._newton(at, a, (1 - done) * unexplained, (1 - done) * gap)
+
+        return _follow(at, faded, steps)
 
     @torch.no_grad()
     def move(self, start: Equilibrium, a: Float[Tensor, " n_a"]) -> Equilibrium:
@@ -148,21 +139,9 @@ class EquilibriumSolver:
         Raises:
             EquilibriumError: the path ends before (a fold: the grasp buckles, or a contact is lost).
         """
-        at, total = start, a - start.a
+        total = a - start.a
         steps = max(1, int(torch.ceil(total.abs().amax() / self.max_step - 1e-9)))
-        done, size = 0.0, 1.0 / steps
-        while done < 1 - 1e-12:
-            target = min(1.0, done + size)
-            try:
-                at = self._newton(at, start.a + target * total)
-                done = target
-            except EquilibriumError as error:
-                size /= 2
-                if size * steps < 1 / 64:
-                    raise EquilibriumError(
-                        "newton", f"{100 * done:.0f} % of the way: {error.status}"
-                    ) from error
-        return at
+        return _follow(start, lambda at, done: self._newton(at, start.a + done * total), steps)
 
     @torch.no_grad()
     def grip(
@@ -183,7 +162,7 @@ class EquilibriumSolver:
             tolerance: largest miss [N].
 
         Raises:
-            EquilibriumError: not reached (three hard fingers can hold only certain combinations).
+            EquilibriumError: not reached (three point contacts can hold only certain combinations).
         """
         at, known = start, torch.isfinite(normal_force)
         for _ in range(max_rounds):
@@ -302,3 +281,18 @@ class EquilibriumSolver:
             mask = torch.tensor([row // 6 in pinned and row % 6 < 3 for row in kin.rows])
             value = torch.where(mask, translations, value)
         return value
+
+
+def _follow(at: Equilibrium, step: Callable[[Equilibrium, float], Equilibrium], steps: int) -> Equilibrium:
+    """The end of a path from 0 to 1, in steps that are halved where Newton fails."""
+    done, size = 0.0, 1.0 / steps
+    while done < 1 - 1e-12:
+        target = min(1.0, done + size)
+        try:
+            at = step(at, target)
+            done = target
+        except EquilibriumError as error:
+            size /= 2
+            if size * steps < 1 / 64:
+                raise EquilibriumError("newton", f"{100 * done:.0f} % of the way: {error.status}") from error
+    return at

@@ -7,8 +7,9 @@ import torch
 from numpy.typing import NDArray
 
 from ..contact.contact_kinematics import ContactKinematics
-from ..contact.forces.friction import friction_cones
-from ..contact.forces.problem import BalanceEquations, ForceStatus, contact_forces, margins
+from ..contact.forces.balance import BalanceEquations, ForceStatus
+from ..contact.forces.friction import friction_cones, margins
+from ..contact.forces.solve import contact_forces
 from ..description.hand import HandDescription
 from ..typing import Bool, Float, Tensor
 from .linearization import GraspForces
@@ -21,8 +22,8 @@ Mask = NDArray[np.bool_]
 class ForceBalance:
     """Builds :class:`BalanceEquations` for each state of a batch and solves them one by one.
 
-    Joints near a limit get a one-sided stop torque, locked joints a free one, and dry friction a box,
-    beside the soft joint residual.
+    Joints near a limit get a one-sided stop torque and locked joints a free one, beside the soft joint
+    residual.
     """
 
     def __init__(self, hand: HandDescription, options: ModelOptions, reduction: Reduction) -> None:
@@ -31,9 +32,10 @@ class ForceBalance:
         self.pose_basis = reduction.pose_basis.double().numpy()
         self.actuation = (reduction.actuation.double().numpy() @ self.joint_basis).T
         self.tendon = torch.tensor([actuator.tendon for actuator in hand.actuators])
-        self.lower, self.upper = hand.joint_lower, hand.joint_upper
-        self.friction = hand.joint_friction
-        self.movable = (np.abs(self.joint_basis) > 1e-9).any(1)
+        # a joint beyond one of these touches its stop
+        stops = (np.abs(self.joint_basis) > 1e-9).any(1)
+        self.low = np.where(stops, hand.joint_lower + options.stop_tolerance, -np.inf)
+        self.high = np.where(stops, hand.joint_upper - options.stop_tolerance, np.inf)
         gram = self.joint_basis.T @ self.joint_basis
         self.weight = None if np.allclose(gram, np.eye(len(gram))) else np.linalg.inv(gram)
         # smallest joint torques that make up a generalised residual
@@ -41,29 +43,12 @@ class ForceBalance:
         # in a plane the third row of the pose basis is the rotation
         self.moment_rows: Mask = np.any(np.abs(self.pose_basis[3:]) > 1e-9, axis=0)
 
-    def near_stop(self, q: Float[Tensor, "*batch n_q"]) -> Bool[Tensor, "*batch n_q"]:
-        """Joints within the tolerance of a limit (or beyond it)."""
-        low, high, movable = (
-            torch.as_tensor(v, device=q.device)
-            for v in (
-                self.lower + self.options.stop_tolerance,
-                self.upper - self.options.stop_tolerance,
-                self.movable,
-            )
-        )
-        return ((q <= low) | (q >= high)) & movable
-
     def held_by_stops(
         self, q: Float[Tensor, "*batch n_q"], torque: Float[Tensor, "*batch n_q"]
     ) -> Bool[Tensor, "*batch n_q"]:
-        """Joints near a stop that bears more than the threshold (and than the joint's dry friction)."""
-        options = self.options
-        if not options.joint_stops:
-            return torch.zeros_like(q, dtype=torch.bool)
-        threshold = torch.full_like(q, options.stop_torque)
-        if options.joint_friction:
-            threshold = threshold + torch.as_tensor(self.friction).to(q)
-        return (torque.abs() > threshold) & self.near_stop(q)
+        """Joints near a stop that bears more than the threshold."""
+        low, high = (torch.as_tensor(stop, device=q.device) for stop in (self.low, self.high))
+        return (torque.abs() > self.options.stop_torque) & ((q <= low) | (q >= high))
 
     def __call__(
         self,
@@ -74,10 +59,10 @@ class ForceBalance:
         V_p: Tensor,
         locked: list[int],
         measured_normal: Tensor | None,
-        last: tuple[Tensor, Tensor] | None,
+        last: GraspForces | None,
         normal_std: float = 0.3,
     ) -> GraspForces:
-        """Solve every state; where there is no answer use ``last = (mu, lam)`` or zeros."""
+        """Solve every state; where there is no answer use the forces of ``last`` or zeros."""
         batch, n_q = q.shape[:-1], q.shape[-1]
         flat = [
             x.detach().reshape(-1, *x.shape[len(batch) :]).double().cpu().numpy() for x in (q, A, V_q, V_p)
@@ -100,6 +85,7 @@ class ForceBalance:
                 actuator_matrix=self.actuation,
                 hand_load=self.joint_basis.T @ V_q_k,
                 cones=cones,
+                length=self.options.length,
                 moment_rows=self.moment_rows,
                 tendon=self.tendon.numpy(),
                 spin_columns=spins,
@@ -117,7 +103,8 @@ class ForceBalance:
                 residual = self.lift @ solution.residual
                 np.add.at(torque, joints, solution.bound)
             elif last is not None:
-                mu, lam = (x.detach().double().cpu().numpy() for x in last)
+                mu, lam = (x.expand(*batch, -1).reshape(-1, x.shape[-1])[k] for x in (last.mu, last.lam))
+                mu, lam = (x.detach().double().cpu().numpy() for x in (mu, lam))
             else:
                 mu, lam = np.zeros_like(mu), np.zeros_like(lam)
             slack, relative = margins(cones, mu)
@@ -143,13 +130,8 @@ class ForceBalance:
     def _bounded(self, q: np.ndarray, locked: list[int]) -> tuple[list[int], np.ndarray, np.ndarray]:
         """Joints with a torque of their own, and its bounds: stops push inwards, locks both ways."""
         lower, upper = np.zeros(len(q)), np.zeros(len(q))
-        if self.options.joint_stops:
-            tolerance = self.options.stop_tolerance
-            upper[(q <= self.lower + tolerance) & self.movable] = np.inf
-            lower[(q >= self.upper - tolerance) & self.movable] = -np.inf
+        upper[q <= self.low], lower[q >= self.high] = np.inf, -np.inf
         lower[locked], upper[locked] = -np.inf, np.inf
-        if self.options.joint_friction:
-            lower, upper = lower - self.friction, upper + self.friction
         joints = [int(j) for j in np.flatnonzero((lower < 0) | (upper > 0))]
         return joints, lower[joints], upper[joints]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from ..contact.contact_set import ContactSet
-from ..contact.forces.problem import ForceStatus
+from ..contact.forces.balance import ForceStatus
 from ..exceptions import ShapeError
 from ..kinematics.grasp_state import GraspState
 from ..typing import Bool, Float, Tensor
@@ -41,7 +41,7 @@ class GraspForces:
     residual: Float[Tensor, "*batch n_q"]
     """e, unexplained joint torque [N m]: large means a wrong spring, a wrong rest angle, or slipping."""
     stop_torque: Float[Tensor, "*batch n_q"]
-    """Torque of joint stops, locks and dry friction on the joint [N m]."""
+    """Torque of joint stops and locks on the joint [N m]."""
     margin: Float[Tensor, "*batch n_c"]
     """``mu_s f_n - |f_t|`` [N] (soft fingers: with the scaled spin moment): 0 at the friction cone."""
     relative_margin: Float[Tensor, "*batch n_c"]

@@ -6,23 +6,27 @@ import torch
 from torch import nn
 
 from ..description.hand import HandDescription
-from ..description.urdf import read_urdf
 from ..typing import Float, Tensor
-from .potential import link_weight_terms
+from .potential import posture_stiffness
 from .stiffness import precedence
 
 
 class LinkWeights(nn.Module):
-    """``V = -sum_l m_l g . x_l(q)``: gradient [N m] and Hessian [N m/rad] over the joints.
-
-    Masses and centres of mass are those of the hand's URDF.
+    """``V = -sum_l m_l g . x_l(q)``: gradient ``-sum_l J_l^T m_l g`` [N m] and Hessian [N m/rad].
 
     Args:
-        hand: gives the URDF.
+        hand: its URDF gives masses and centres of mass.
         kinematics: of the same hand.
         gravity: g in the hand frame [m/s^2].
         dtype: of the buffers.
     """
+
+    weights: Float[Tensor, "n_l 3"]
+    """m_l g [N]."""
+    com: Float[Tensor, "n_l 3"]
+    """Centres of mass in the links' frames [m]."""
+    upstream: Tensor
+    precedes: Tensor
 
     def __init__(
         self,
@@ -32,26 +36,27 @@ class LinkWeights(nn.Module):
         dtype: torch.dtype,
     ) -> None:
         super().__init__()
-        urdf = read_urdf(hand.urdf_path)
         upstream: Tensor = kinematics.upstream  # type: ignore[assignment]
         names = list(kinematics.link_names)  # type: ignore[arg-type]
-        links = [link for link in urdf.links if link.mass > 0 and upstream[names.index(link.name)].any()]
-        self.kinematics_joint_axes = kinematics.joint_axes
-        self.index = [names.index(link.name) for link in links]
+        links = [link for link in hand.urdf.links if link.mass > 0 and upstream[names.index(link.name)].any()]
+        self._joint_axes, self._index = kinematics.joint_axes, [names.index(link.name) for link in links]
         mass = torch.tensor([link.mass for link in links], dtype=dtype)
-        self.weights: Tensor
-        self.com: Tensor
-        self.upstream: Tensor
-        self.precedes: Tensor
-        self.register_buffer("weights", mass[:, None] * torch.tensor(gravity, dtype=dtype), persistent=False)
-        com = torch.stack([torch.as_tensor(link.com).to(dtype) for link in links])
-        self.register_buffer("com", com, persistent=False)
-        self.register_buffer("upstream", upstream[self.index], persistent=False)
-        self.register_buffer("precedes", precedence(upstream), persistent=False)
+        for name, value in (
+            ("weights", mass[:, None] * torch.tensor(gravity, dtype=dtype)),
+            ("com", torch.stack([torch.as_tensor(link.com).to(dtype) for link in links])),
+            ("upstream", upstream[self._index]),
+            ("precedes", precedence(upstream)),
+        ):
+            self.register_buffer(name, value, persistent=False)
 
     def forward(self, poses) -> tuple[Float[Tensor, "*batch n_q"], Float[Tensor, "*batch n_q n_q"]]:
         """Gradient and Hessian at the link poses of a posture."""
-        T = poses.transforms[..., self.index, :, :]
+        T = poses.transforms[..., self._index, :, :]
         centre = T[..., :3, 3] + (T[..., :3, :3] @ self.com[..., None])[..., 0]
-        axis, origin = self.kinematics_joint_axes(poses)  # type: ignore[operator]
-        return link_weight_terms(self.weights, centre, axis, origin, self.upstream, self.precedes)
+        axis, origin = self._joint_axes(poses)  # type: ignore[operator]
+        velocity = torch.linalg.cross(
+            axis[..., None, :, :] * self.upstream[..., None].to(axis.dtype),
+            centre[..., :, None, :] - origin[..., None, :, :],
+        )
+        gradient = -torch.einsum("lk,...ljk->...j", self.weights, velocity)
+        return gradient, posture_stiffness(-self.weights.expand_as(centre), velocity, axis, self.precedes)

@@ -1,4 +1,4 @@
-"""The quasi-static step of an elastic hand: three algebraically identical forms.
+"""The quasi-static step of an elastic hand, in the two-stage form.
 
 ```
 D ds + E^T dnu = F da        E = [A; B],  dnu = [dmu; dlam]
@@ -20,8 +20,8 @@ from ..typing import Float, Tensor
 
 
 @dataclass(frozen=True)
-class Step:
-    """Answer of the grasp to a unit motion of each actuator."""
+class KKTSolution:
+    """Motion and reactions per unit motion of each actuator."""
 
     motion: Float[Tensor, "*batch n n_a"]
     """J: ds = J da."""
@@ -40,7 +40,7 @@ def two_stage(
     rank_tolerance: float = 1e-8,
     stiffness_tolerance: float = 1e-9,
     on_unstable: str = "raise",
-) -> Step:
+) -> KKTSolution:
     """``J = P - N (N^T D N)^-1 N^T (D P - F)``, ``P = E^+ R``, ``N = null(E)``.
 
     Only the stiffness with the actuators locked, ``N^T D N``, is inverted, by LU: it is not symmetric
@@ -79,47 +79,7 @@ def two_stage(
             _judge(K, N, stability, stiffness_tolerance * size, on_unstable)
         J = P - N @ torch.linalg.solve(K, N.mT @ load)
     unbalanced = D @ J if F is None else D @ J - F
-    return Step(J, -(pinv.mT @ unbalanced), stability)
-
-
-def kkt_form(
-    D: Float[Tensor, "*batch n n"],
-    E: Float[Tensor, "*batch m n"],
-    R: Float[Tensor, "m n_a"],
-    F: Float[Tensor, "*batch n n_a"] | None = None,
-    compliance: Float[Tensor, " m"] | None = None,
-) -> tuple[Float[Tensor, "*batch n n_a"], Float[Tensor, "*batch m n_a"]]:
-    """``[[D, E^T], [E, -compliance]] [J; dnu/da] = [F; R]``: motion and multipliers at once.
-
-    Args:
-        compliance: ``1/K`` of each row (tendon, servo, contact); 0 or None: rigid.
-    """
-    n, m = D.shape[-1], E.shape[-2]
-    corner = torch.zeros(*D.shape[:-2], m, m, dtype=D.dtype, device=D.device)
-    if compliance is not None:
-        corner = corner - torch.diag(compliance)
-    matrix = torch.cat([torch.cat([D, E.mT], -1), torch.cat([E, corner], -1)], -2)
-    top = torch.zeros(*D.shape[:-2], n, R.shape[-1], dtype=D.dtype, device=D.device) if F is None else F
-    rhs = torch.cat([top, R.expand(*D.shape[:-2], *R.shape)], -2)
-    J, dnu = torch.linalg.solve(matrix, rhs).split([n, m], dim=-2)
-    return J, dnu
-
-
-def null_space_form(
-    D: Float[Tensor, "n n"],
-    A: Float[Tensor, "n_h n"],
-    B: Float[Tensor, "n_a n"],
-    rank_tolerance: float = 1e-8,
-) -> Float[Tensor, "n n_a"]:
-    """``J = R K^-1 R^T B^T (B R K^-1 R^T B^T)^-1``, ``R = null(A)``, ``K = R^T D R``: the paper's form.
-
-    For comparison: it needs K itself to be invertible, which a stable grasp does not promise, and it is
-    silently wrong if there are more actuators than mobility.
-    """
-    _, basis = _range_and_null(A, rank_tolerance)
-    K = basis.mT @ D @ basis
-    X = basis @ torch.linalg.solve(K, basis.mT @ B.mT)
-    return X @ torch.linalg.inv(B @ X)
+    return KKTSolution(J, -(pinv.mT @ unbalanced), stability)
 
 
 def _range_and_null(E: Tensor, rank_tolerance: float) -> tuple[Tensor, Tensor]:
@@ -155,7 +115,7 @@ def _raise_contradiction(lost: Tensor, P: Tensor) -> None:
     raise SingularGraspError(
         f"actuator {int(worst)} cannot move alone: contacts, couplings and the other rigid actuators forbid "
         f"it (rows violated by {float(lost.abs().max()):.2g}); there are more rigid actuators than mobility. "
-        "Give the actuators or the contacts a finite stiffness",
+        "Give the actuators a finite stiffness",
         direction=(direction / torch.linalg.vector_norm(direction).clamp_min(1e-300)).detach(),
     )
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from ..contact.contact_model import ContactModel
-from ..contact.forces.problem import ForceOptions
+from ..contact.contact_set import CHARACTERISTIC_LENGTH
+from ..contact.forces.options import ForceOptions
 from ..exceptions import ParameterError
 
 
@@ -18,14 +18,13 @@ class ModelOptions:
         ParameterError: a value outside its range.
     """
 
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
-    """g in the **hand frame** [m/s^2], constant while the hand's pose is static."""
+    gravity: tuple[float, float, float] | None = None
+    """g in the **hand frame** [m/s^2], constant while the hand's pose is static. None: the hand's."""
     link_weights: bool = False
     """Count the weight of the hand's own links (masses of its URDF)."""
-    length: float = 0.03
-    """L, size of the object: translations are divided by it before ranks are decided [m]."""
-    contact_model: ContactModel | None = None
-    """One model for all contacts; None: what each contact's friction coefficients say."""
+    length: float = CHARACTERISTIC_LENGTH
+    """L, size of the object [m]: translations and moments are divided by it before they are compared with
+    rotations and forces, in the rank decisions and in the force problem."""
     hand_stiffness: bool = True
     """Keep S, the change of moment arms with posture. False only for ablation."""
     object_stiffness: bool = True
@@ -34,25 +33,17 @@ class ModelOptions:
     """Contact points run over the surfaces. False treats them as pinned."""
     actuator_compliance: bool = True
     """Use the actuators' series stiffness K_a where it is finite. False: all rigid."""
-    contact_stiffness: float = math.inf
-    """K_c of every force row of a contact [N/m]; infinite: rigid contacts."""
     stiffness_floor: float = 0.0
     """Added to every joint's stiffness [N m/rad]: a floor for springless free joints, e.g. 1e-4."""
     contact_margin: float = 0.002
     """Gap up to which the detector takes a pad for touching [m]; more for noisy poses."""
     max_overlap: float = 0.005
     """Deepest penetration of finger and object that is still modelled [m]."""
-    joint_stops: bool = True
-    """A joint that its stop holds does not move."""
     stop_tolerance: float = math.radians(0.1)
     """How near to a limit a joint counts as touching its stop [rad]. Joint angles alone cannot tell how
     much torque a stop takes from the contact forces: fingertip sensors can, so give them if there are any."""
     stop_torque: float = 0.01
     """Torque above which a stop holds its joint [N m]; below, the joint may leave."""
-    slack_tension: float | None = None
-    """Tendons with at most this tension [N m] are slack and move nothing. None: servos keep all taut."""
-    joint_friction: bool = False
-    """Let each joint's Coulomb friction take up part of the joint residual."""
     on_unstable: str = "raise"
     """"raise" UnstableGraspError, or "flag": return the formal Jacobian with status "unstable"."""
     forces: ForceOptions = field(default_factory=ForceOptions)
@@ -60,11 +51,11 @@ class ModelOptions:
     def __post_init__(self) -> None:
         if self.on_unstable not in ("raise", "flag"):
             raise ParameterError("on_unstable", self.on_unstable, "'raise' or 'flag'")
-        for name in ("length", "contact_stiffness", "max_overlap"):
+        for name in ("length", "max_overlap"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
         for name in ("stiffness_floor", "stop_tolerance", "stop_torque", "contact_margin"):
             if not getattr(self, name) >= 0:
                 raise ParameterError(name, getattr(self, name), "not negative")
-        if len(self.gravity) != 3 or not all(math.isfinite(g) for g in self.gravity):
+        if self.gravity is not None and (len(self.gravity) != 3 or not all(map(math.isfinite, self.gravity))):
             raise ParameterError("gravity", self.gravity, "three finite numbers [m/s^2]")

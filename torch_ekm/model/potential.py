@@ -44,32 +44,6 @@ def gravity_hessian(
     return result
 
 
-def link_weight_terms(
-    weights: Float[Tensor, "n_l 3"],
-    centre: Float[Tensor, "*batch n_l 3"],
-    axis: Float[Tensor, "*batch n_q 3"],
-    origin: Float[Tensor, "*batch n_q 3"],
-    upstream: Bool[Tensor, "n_l n_q"],
-    precedes: Bool[Tensor, "n_q n_q"],
-) -> tuple[Float[Tensor, "*batch n_q"], Float[Tensor, "*batch n_q n_q"]]:
-    """Gradient ``-sum_l J_l^T m_l g`` and Hessian of the weight of the hand's own links.
-
-    Args:
-        weights: ``m_l g`` of each link, hand frame [N].
-        centre: centre of mass of each link [m].
-        axis, origin: joint axes ``z_j`` and points ``o_j`` on them [m].
-        upstream: joint j moves link l.
-        precedes: joint a is proximal to joint b or equal to it.
-    """
-    velocity = torch.linalg.cross(
-        axis[..., None, :, :] * upstream[..., None].to(axis.dtype),
-        centre[..., :, None, :] - origin[..., None, :, :],
-    )
-    gradient = -torch.einsum("lk,...ljk->...j", weights, velocity)
-    hessian = posture_stiffness(-weights.expand_as(centre), velocity, axis, precedes)
-    return gradient, hessian
-
-
 def posture_stiffness(
     force: Float[Tensor, "*batch n_c 3"],
     velocity: Float[Tensor, "*batch n_c n_q 3"],

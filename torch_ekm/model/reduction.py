@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
-import math
+from typing import NamedTuple
 
 import torch
 from torch import nn
 
 from ..description.hand import HandDescription
 from ..exceptions import SingularGraspError, UnstableGraspError
+from ..kinematics.null_space import null_space
 from ..typing import Bool, Float, Tensor
-from .manipulation import Step, two_stage
+from .manipulation import two_stage
 from .options import ModelOptions
+
+
+class GraspResponse(NamedTuple):
+    """How the grasp answers to a unit motion of each actuator."""
+
+    motion: Float[Tensor, "*batch n_s n_a"]
+    """J_m."""
+    contact_force: Float[Tensor, "*batch n_h n_a"]
+    """dmu/da."""
+    actuator_force: Float[Tensor, "*batch n_a n_a"]
+    """dlam/da."""
+    stability: Float[Tensor, "*batch"]
+    """Smallest eigenvalue of the stiffness with the actuators locked."""
 
 
 class Reduction(nn.Module):
@@ -58,23 +72,36 @@ class Reduction(nn.Module):
         D: Float[Tensor, "*batch n_s n_s"],
         A: Float[Tensor, "*batch n_h n_s"],
         rows: list[int],
-        held: Bool[Tensor, " n_q"],
-        slack: Bool[Tensor, " n_a"],
-    ) -> tuple[Step, Float[Tensor, "*batch n_h n_a"], Float[Tensor, "*batch n_a n_a"]]:
-        """J_m, dmu/da and dlam/da in full coordinates.
+        held: Bool[Tensor, "*batch n_q"],
+    ) -> GraspResponse:
+        """J_m, dmu/da and dlam/da in full coordinates; states that differ in what is held are grouped.
 
         ```
-        D' = Z^T D Z + B_c^T K_a B_c (+ A^T K_c A)     compliant rows stand in the stiffness
-        E  = [A Z; B_r Z; e_j^T Z]                     rigid rows: contacts, rigid actuators, held joints
+        D' = Z^T D Z + B_c^T K_a B_c          compliant actuators stand in the stiffness
+        E  = [A Z; B_r Z; e_j^T Z]            rigid rows: contacts, rigid actuators, held joints
         ```
 
         Args:
             D, A: stiffness and constraint matrix.
             rows: which of the 6 n_c contact components are the rows of A.
             held: joints that do not move.
-            slack: tendons without tension; they move nothing.
         """
-        n_q, n_a, L = self.joint_basis.shape[0], self.actuation.shape[0], self.options.length
+        pattern = held.reshape(-1, held.shape[-1])
+        if len(pattern) == 1 or bool((pattern == pattern[0]).all()):
+            return self._solve(D, A, rows, pattern[0])
+        batch = held.shape[:-1]
+        flat_D, flat_A = D.reshape(-1, *D.shape[-2:]), A.reshape(-1, *A.shape[-2:])
+        parts: list[Tensor] = []
+        for unique in torch.unique(pattern, dim=0):
+            at = (pattern == unique).all(-1)
+            group = self._solve(flat_D[at], flat_A[at], rows, unique)
+            parts = parts or [part.new_empty(len(pattern), *part.shape[1:]) for part in group]
+            for whole, part in zip(parts, group, strict=True):
+                whole[at] = part
+        return GraspResponse(*(part.reshape(*batch, *part.shape[1:]) for part in parts))
+
+    def _solve(self, D: Tensor, A: Tensor, rows: list[int], held: Tensor) -> GraspResponse:
+        n_q, n_a, n_h, L = self.joint_basis.shape[0], self.actuation.shape[0], len(rows), self.options.length
         S = self.scaled_basis
         D = _left(S, D @ S)
         row_scale = torch.tensor(
@@ -83,28 +110,19 @@ class Reduction(nn.Module):
         A = row_scale[:, None] * (A @ S)
         B = self.actuation @ S[:n_q]
         finite = torch.isfinite(self.stiffness)
-        rigid = (~finite & ~slack).nonzero()[:, 0]
-        soft = (finite & ~slack).nonzero()[:, 0]
+        rigid, soft = (~finite).nonzero()[:, 0], finite.nonzero()[:, 0]
         eye = torch.eye(n_a, dtype=D.dtype, device=D.device)
         F = None
         if len(soft):
             K_B = self.stiffness[soft, None] * B[soft]
             D = D + B[soft].mT @ K_B
             F = K_B.mT @ eye[soft]
-        K_c = self.options.contact_stiffness
-        stiff_contacts = math.isinf(K_c)
-        if not stiff_contacts:
-            D = D + K_c * L * L * (A.mT @ A)
         batch = D.shape[:-2]
         arm = torch.linalg.vector_norm(B[rigid], dim=-1, keepdim=True).clamp_min(1e-12)
         fixed = [B[rigid] / arm, S[:n_q][held]]
-        n_h = A.shape[-2]
-        parts = [A] if stiff_contacts else []
-        parts += [part.expand(*batch, *part.shape) for part in fixed if len(part)]
-        E = torch.cat(parts, dim=-2) if parts else D.new_zeros(*batch, 0, D.shape[-1])
+        E = torch.cat([A, *(part.expand(*batch, *part.shape) for part in fixed if len(part))], dim=-2)
         R = D.new_zeros(E.shape[-2], n_a)
-        first = n_h if stiff_contacts else 0
-        R[first : first + len(rigid)] = eye[rigid] / arm
+        R[n_h : n_h + len(rigid)] = eye[rigid] / arm
         try:
             step = two_stage(D, E, R, F, on_unstable=self.options.on_unstable)
         except (SingularGraspError, UnstableGraspError) as error:
@@ -113,11 +131,11 @@ class Reduction(nn.Module):
                 error.direction = direction / torch.linalg.vector_norm(direction).clamp_min(1e-300)
             raise
         dlam = D.new_zeros(*batch, n_a, n_a)
-        dlam[..., rigid, :] = step.reaction[..., first : first + len(rigid), :] / arm
+        dlam[..., rigid, :] = step.reaction[..., n_h : n_h + len(rigid), :] / arm
         if len(soft):
             dlam[..., soft, :] = self.stiffness[soft, None] * (_left(B[soft].mT, step.motion) - eye[soft])
-        dmu = step.reaction[..., :n_h, :] if stiff_contacts else K_c * L * L * (A @ step.motion)
-        return Step(_left(S.mT, step.motion), step.reaction, step.stability), row_scale[:, None] * dmu, dlam
+        dmu = row_scale[:, None] * step.reaction[..., :n_h, :]
+        return GraspResponse(_left(S.mT, step.motion), dmu, dlam, step.stability)
 
 
 def _left(S: Tensor, X: Tensor) -> Tensor:
@@ -133,18 +151,12 @@ def joint_basis(hand: HandDescription) -> Float[Tensor, "n_q n_z"]:
     C = torch.cat([C, eye[fixed]])
     free = ~(C != 0).any(0)  # joints outside every coupling keep their own axis: the basis stays sparse
     coupled = (~free).nonzero()[:, 0]
-    blocks = [eye[:, free]]
-    if len(coupled):
-        _, sigma, Vh = torch.linalg.svd(C[:, coupled], full_matrices=True)
-        rank = int((sigma > 1e-10 * sigma.amax()).sum())
-        blocks.append(eye[:, coupled] @ Vh[rank:].mT)
-    return torch.cat(blocks, dim=1)
+    return torch.cat([eye[:, free], eye[:, coupled] @ null_space(C[:, coupled])], dim=1)
 
 
 def planar_pose_basis(normal: Float[Tensor, 3]) -> Float[Tensor, "6 3"]:
     """Two translations in the plane and the rotation about its normal."""
     normal = normal / torch.linalg.vector_norm(normal)
-    tangents = torch.linalg.svd(normal[None])[2][1:].mT
     basis = torch.zeros(6, 3, dtype=normal.dtype)
-    basis[:3, :2], basis[3:, 2] = tangents, normal
+    basis[:3, :2], basis[3:, 2] = null_space(normal[None]), normal
     return basis

@@ -9,6 +9,7 @@ import torch
 from ..description import HandDescription
 from ..exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
 from ..kinematics import HandKinematics
+from ..kinematics.null_space import null_space
 from ..typing import Float, Tensor
 
 
@@ -139,8 +140,7 @@ class GraspSignature:
 def _null(rows: Tensor, moved: Tensor) -> Float[Tensor, "n_q k"]:
     """Orthonormal motions of the ``moved`` joints that no row sees; the last joint bends."""
     at = torch.nonzero(moved).flatten()
-    _, singular, vh = torch.linalg.svd(rows[:, at], full_matrices=True)
-    free = vh[int((singular > 1e-9).sum()) :]
-    out = rows.new_zeros(rows.shape[1], len(free))
-    out[at] = (free * torch.sign(free[:, -1:] + 1e-12)).mT
+    free = null_space(rows[:, at])
+    out = rows.new_zeros(rows.shape[1], free.shape[1])
+    out[at] = free * torch.sign(free[-1:] + 1e-12)
     return out

@@ -69,7 +69,6 @@ class ModelBank(ResidualLearner):
         new_prior: nu, the weight of "new" in episodes.
         temperature: tau in (0, 1]; below 1 since the samples of one grasp are not independent.
         common_weights: shares of the common learner's information that a new model may start with.
-        soften: multiplies a learner's information by a share in place; :func:`discount` by default.
         signature_features: width of z; 0: grasps have no signature.
         signatures: how signatures scatter; by default a :class:`SignatureModel` with its own figures.
         remember: grasps that are remembered with their signatures and samples.
@@ -96,7 +95,6 @@ class ModelBank(ResidualLearner):
         new_prior: float = 0.3,
         temperature: float = 0.5,
         common_weights: Sequence[float] = (0.1, 0.01, 0.0),
-        soften: Callable[[ResidualLearner, float], None] | None = None,
         signature_features: int = 0,
         signatures: SignatureModel | None = None,
         remember: int = 96,
@@ -120,7 +118,6 @@ class ModelBank(ResidualLearner):
             raise ParameterError("new_prior", new_prior, "positive")
         self.models, self.window, self.new_prior = models, window, new_prior
         self.temperature, self.common_weights = temperature, tuple(common_weights)
-        self._soften = discount if soften is None else soften
         self.common = first
         self.kept = nn.ModuleList(copy.deepcopy(first) for _ in range(models))
         hypotheses = models + len(self.common_weights)  # the last ones: "new"
@@ -223,7 +220,7 @@ class ModelBank(ResidualLearner):
     def _begin_new(self, learner: ResidualLearner, weight: float) -> None:
         if weight > 0:
             _copy(self.common, learner)
-            self._soften(learner, weight)
+            discount(learner, weight)
         else:
             learner.reset()
 
@@ -354,7 +351,7 @@ def discount(learner: ResidualLearner, share: float) -> None:
     """Multiply what a learner knows by ``share``: about the same mean, ``1 / share`` times the variance.
 
     A :class:`SparseOnlineGP` holds its knowledge as information and can be discounted exactly; any
-    other learner is left as it is (give :class:`ModelBank` a ``soften`` of your own).
+    other learner is left as it is.
     """
     if isinstance(learner, SparseOnlineGP):
         learner.refresh()  # forgetting that is due comes first

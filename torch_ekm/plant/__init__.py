@@ -8,7 +8,7 @@ from .observation import Truth as Truth
 from .plant import Plant as Plant
 from .recording_plant import RecordingPlant as RecordingPlant
 from .replayed_plant import ReplayedPlant as ReplayedPlant
-from .trajectory import Recording as Recording
+from .trajectory import Trajectory as Trajectory
 from .trial_log import TrialEntry as TrialEntry
 from .trial_log import TrialLog as TrialLog
 from .wrapper import PlantWrapper as PlantWrapper
@@ -18,10 +18,10 @@ __all__ = [
     "Plant",
     "PlantStatus",
     "PlantWrapper",
-    "Recording",
     "RecordingPlant",
     "ReplayedPlant",
-    "Truth",
+    "Trajectory",
     "TrialEntry",
     "TrialLog",
+    "Truth",
 ]

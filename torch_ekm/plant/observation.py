@@ -23,8 +23,11 @@ class PlantStatus(Enum):
 
 @dataclass(frozen=True)
 class Truth:
-    """What a simulation knows, hand frame. For reports and for sensors that are simulated; nothing that
-    controls, senses or learns may read it."""
+    """What a simulation knows, hand frame.
+
+    For reports and for sensors that are simulated; a :class:`Trajectory` stores it. Nothing that controls,
+    senses or learns may read it (held by a test).
+    """
 
     q: Float[Tensor, " n_q"]
     """Joint angles [rad]."""
@@ -43,6 +46,10 @@ class Truth:
     def state(self) -> GraspState:
         """Joint angles and object pose."""
         return GraspState(self.q, self.position, self.rotation)
+
+    def arrays(self) -> dict[str, Tensor]:
+        """What is known of this moment, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ import torch
 from ..typing import Float, Tensor
 from .observation import Observation
 from .plant import Plant
-from .trajectory import Recording
+from .trajectory import Trajectory
 from .wrapper import PlantWrapper
 
 
 class RecordingPlant(PlantWrapper):
-    """Passes everything on to a plant and remembers it in ``recording``, which outlives the plant.
+    """Passes everything on to a plant and remembers it in ``trajectory``, which outlives the plant.
 
     With a :class:`~torch_ekm.plant.TrialLog` each trial is kept::
 
@@ -22,33 +22,34 @@ class RecordingPlant(PlantWrapper):
         for trial in log.missing(range(1000)):
             plant.reset(trial)
             ...
-            log.write(trial, plant.recording)
+            log.write(trial, plant.trajectory)
     """
 
     def __init__(self, plant: Plant) -> None:
         super().__init__(plant)
-        self.recording = Recording()
+        self.trajectory = Trajectory()
 
     def reset(self, seed: int) -> Observation:
-        """Grasp anew, and start a new recording, which stays empty if there is no grasp."""
-        self.recording = Recording(seed)
+        """Grasp anew, and start a new trajectory, which stays empty if there is no grasp."""
+        self.trajectory = Trajectory(seed)
         observation = self.plant.reset(seed)
-        self.recording.observations.append(observation)
+        self.trajectory.observations.append(observation)
         return observation
 
     def observe(self) -> Observation:
         """Read the sensors; recorded in the place of the last reading, since the hand has not moved."""
         observation = self.plant.observe()
-        if self.recording.observations:
-            before = self.recording.observations[-1].info
-            kept = {name: before[name] for name in ("events",) if name in before}
-            observation = dataclasses.replace(observation, info={**observation.info, **kept})
-            self.recording.observations[-1] = observation
+        if self.trajectory.observations:
+            before = self.trajectory.observations[-1].info
+            if "events" in before:
+                info = {**observation.info, "events": before["events"]}
+                observation = dataclasses.replace(observation, info=info)
+            self.trajectory.observations[-1] = observation
         return observation
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Pass the command on."""
         observation = self.plant.command(delta_a)
-        self.recording.commands.append(torch.as_tensor(delta_a).detach().cpu().double().clone())
-        self.recording.observations.append(observation)
+        self.trajectory.commands.append(torch.as_tensor(delta_a).detach().cpu().double().clone())
+        self.trajectory.observations.append(observation)
         return observation

@@ -7,7 +7,7 @@ import dataclasses
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .observation import Observation
-from .trajectory import Recording
+from .trajectory import Trajectory
 
 
 class ReplayedPlant:
@@ -17,13 +17,13 @@ class ReplayedPlant:
     five lines: send the increment, wait until it is done, read the sensors.
 
     Raises:
-        ParameterError: the recording is empty.
+        ParameterError: the trajectory is empty.
     """
 
-    def __init__(self, recording: Recording) -> None:
-        if not recording.observations:
-            raise ParameterError("recording", "empty", "one with at least one observation")
-        self.recording = recording
+    def __init__(self, trajectory: Trajectory) -> None:
+        if not trajectory.observations:
+            raise ParameterError("trajectory", "empty", "one with at least one observation")
+        self.trajectory = trajectory
         self._place = 0
 
     def reset(self, seed: int = 0) -> Observation:
@@ -33,19 +33,19 @@ class ReplayedPlant:
 
     def observe(self) -> Observation:
         """The observation of this moment."""
-        return self.recording.observations[self._place]
+        return self.trajectory.observations[self._place]
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """The next observation.
 
         Raises:
-            ParameterError: the recording ends here.
+            ParameterError: the trajectory ends here.
         """
-        if self._place >= len(self.recording.commands):
+        if self._place >= len(self.trajectory.commands):
             raise ParameterError(
-                "command", self._place, f"at most {len(self.recording.commands)}: it ends there"
+                "command", self._place, f"at most {len(self.trajectory.commands)}: it ends there"
             )
-        command = self.recording.commands[self._place]
+        command = self.trajectory.commands[self._place]
         self._place += 1
         observation = self.observe()
         return dataclasses.replace(observation, info={**observation.info, "recorded_command": command})

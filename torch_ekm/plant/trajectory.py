@@ -19,12 +19,11 @@ from .observation import Observation, PlantStatus, Truth
 
 FORMAT = "torch_ekm trial 1"
 _FIELDS = ("q", "a", "position", "rotation", "fingertip_force")
-_TRUTH = ("q", "position", "rotation", "fingertip_force", "actuator_torque")
 _GROUPS = ("raw", "estimate")  # what is kept of Observation.info, and "events"
 
 
 @dataclass
-class Recording:
+class Trajectory:
     """Commands and observations of one grasp: ``n`` commands, ``n + 1`` observations.
 
     Beside readings and truth it keeps of ``Observation.info`` the named arrays in "raw" (Hall counts, marker
@@ -50,7 +49,7 @@ class Recording:
                 its shape or comes and goes; nothing is written.
         """
         path = Path(path)
-        about = _json(self.about)
+        about = json.dumps(plain(self.about))
         arrays = self._arrays()
         part = path.with_name(path.name + ".part")
         # version 1.10 of the format has checksums on its own records too
@@ -59,11 +58,11 @@ class Recording:
             for name, value in arrays.items():
                 large = {"fletcher32": True, "compression": "gzip"} if value.size else {}
                 file.create_dataset(name, data=value, track_times=False, **large)
-        _publish(part, path)
+        publish(part, path)
         return path
 
     @classmethod
-    def load(cls, path: str | Path) -> Recording:
+    def load(cls, path: str | Path) -> Trajectory:
         """Read what :meth:`save` wrote.
 
         Raises:
@@ -78,32 +77,24 @@ class Recording:
                 if file.attrs.get("format") != FORMAT:
                     raise DescriptionError(path, "this HDF5 file is not a recording of torch_ekm")
                 seed, about = int(file.attrs["seed"]), json.loads(file.attrs["about"])
-                data = {name: torch.from_numpy(file[name][()]) for name in _FIELDS}
-                times = file["time"][()].tolist()
-                status = [PlantStatus(word.decode()) for word in file["status"][()]]
-                events = [json.loads(word) for word in file["events"][()]]
-                commands = list(torch.from_numpy(file["commands"][()]))
-                info = {
+                sensors = {name: torch.from_numpy(file[name][()]) for name in (*_FIELDS, "commands")}
+                times, words, events = (file[name][()].tolist() for name in ("time", "status", "events"))
+                groups = {
                     group: {name: torch.from_numpy(item[()]) for name, item in file[group].items()}
                     for group in ("truth", *_GROUPS)
                     if group in file
                 }
-                truth = info.pop("truth", None)
+            commands, truth = list(sensors.pop("commands")), groups.pop("truth", None)
             observations = []
             for k, time in enumerate(times):
-                more: dict[str, Any] = {
-                    group: {name: value[k] for name, value in values.items()}
-                    for group, values in info.items()
-                }
-                more |= {"events": tuple(events[k])} if events[k] else {}
-                sensors = (data[name][k] for name in _FIELDS)
-                told = (
-                    None
-                    if truth is None
-                    else Truth(**{name: truth[name][k] for name in _TRUTH if name in truth})
-                )  # type: ignore[arg-type]
-                seen = Observation(*sensors, time=time, status=status[k], info=more, truth=told)
-                observations.append(seen)
+                info: dict[str, Any] = {group: _row(arrays, k) for group, arrays in groups.items()}
+                if happened := json.loads(events[k]):
+                    info["events"] = tuple(happened)
+                told = None if truth is None else Truth(**_row(truth, k))
+                status = PlantStatus(words[k].decode())
+                observations.append(
+                    Observation(**_row(sensors, k), time=time, status=status, info=info, truth=told)
+                )
         except DescriptionError:
             raise
         except Exception as error:  # a damaged file fails in any way that HDF5 can think of
@@ -124,7 +115,9 @@ class Recording:
         }
         arrays |= {name: _stack(name, [getattr(o, name) for o in seen]) for name in _FIELDS}
         for group in ("truth", *_GROUPS):
-            named = [_told(o) if group == "truth" else o.info.get(group, {}) for o in seen]
+            named = [o.info.get(group, {}) for o in seen]
+            if group == "truth":
+                named = [{} if o.truth is None else o.truth.arrays() for o in seen]
             for name in sorted({name for values in named for name in values}):
                 place = f"{group}/{name}"
                 if not all(name in values for values in named):
@@ -133,12 +126,9 @@ class Recording:
         return arrays
 
 
-def _told(seen: Observation) -> dict[str, Tensor]:
-    """The truth's arrays by name; none of an observation without one."""
-    if seen.truth is None:
-        return {}
-    arrays = {name: getattr(seen.truth, name) for name in _TRUTH}
-    return {name: value for name, value in arrays.items() if value is not None}
+def _row(arrays: Mapping[str, Tensor], k: int) -> dict[str, Any]:
+    """Those of one observation."""
+    return {name: value[k] for name, value in arrays.items()}
 
 
 def _stack(name: str, values: list[Any]) -> np.ndarray:
@@ -156,12 +146,8 @@ def plain(value: Any) -> Any:
     Raises:
         ParameterError: JSON cannot hold it.
     """
-    return json.loads(_json(value))
-
-
-def _json(value: Any) -> str:
     try:
-        return json.dumps(value, sort_keys=True, default=_as_plain)
+        return json.loads(json.dumps(value, sort_keys=True, default=_as_plain))
     except TypeError as error:
         raise ParameterError("about", error, "figures, texts, lists and mappings of those") from None
 
@@ -174,14 +160,14 @@ def _as_plain(value: Any) -> Any:
     raise TypeError(f"a {type(value).__name__}")
 
 
-def _publish(part: Path, path: Path) -> None:
+def publish(part: Path, path: Path) -> None:
     """Give a finished file its name, once it is safe on the disk."""
-    sync(part)
+    _sync(part)
     os.replace(part, path)
-    sync(path.parent)
+    _sync(path.parent)
 
 
-def sync(path: Path) -> None:
+def _sync(path: Path) -> None:
     """Wait until a file, or a folder's list of names, is on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from .._versions import versions_of
 from ..exceptions import DescriptionError, ParameterError
-from .trajectory import Recording, plain, sync
+from .trajectory import Trajectory, plain, publish
 
 _NAME = re.compile(r"trial_(\d{6,})\.h5")
 _PACKAGES = ("torch_ekm", "torch", "numpy", "sapien", "opencv-python")
@@ -33,15 +33,15 @@ class TrialEntry(NamedTuple):
     """Why the trial ended: ``outcome["reason"]``, if there is one."""
 
     @classmethod
-    def of(cls, trial: int, recording: Recording) -> TrialEntry:
-        last = recording.observations[-1] if recording.observations else None
+    def of(cls, trial: int, trajectory: Trajectory) -> TrialEntry:
+        last = trajectory.observations[-1] if trajectory.observations else None
         return cls(
             trial,
-            recording.seed,
-            len(recording.commands),
+            trajectory.seed,
+            len(trajectory.commands),
             0.0 if last is None else round(last.time, 6),
             "not grasped" if last is None else last.status.value,
-            str(recording.about.get("outcome", {}).get("reason", "")),
+            str(trajectory.about.get("outcome", {}).get("reason", "")),
         )
 
 
@@ -87,7 +87,7 @@ class TrialLog:
         first = next(iter(_trials(folder)), None)
         if first is None:
             raise DescriptionError(folder, "no log: there is no file named trial_000000.h5 or the like in it")
-        return cls(folder, Recording.load(_path(folder, first)).about.get("configuration", {}))
+        return cls(folder, Trajectory.load(_path(folder, first)).about.get("configuration", {}))
 
     @property
     def trials(self) -> tuple[int, ...]:
@@ -115,7 +115,7 @@ class TrialLog:
         """Where a trial is, or will be."""
         return _path(self.folder, trial)
 
-    def read(self, trial: int) -> Recording:
+    def read(self, trial: int) -> Trajectory:
         """One trial.
 
         Raises:
@@ -125,13 +125,13 @@ class TrialLog:
             there = ", ".join(map(str, self.trials[:8])) + (", ..." if len(self) > 8 else "")
             raise DescriptionError(self.folder, f"no trial {trial}; there are {there or 'none'}")
         try:
-            return Recording.load(self.path(trial))
+            return Trajectory.load(self.path(trial))
         except DescriptionError as error:
             raise DescriptionError(
                 error.source, f"{error.problem}; delete the file to have the trial run again"
             ) from None
 
-    def write(self, trial: int, recording: Recording, outcome: Mapping[str, Any] | None = None) -> Path:
+    def write(self, trial: int, trajectory: Trajectory, outcome: Mapping[str, Any] | None = None) -> Path:
         """Keep a finished trial; ``outcome`` says what came of it (no wall-clock times).
 
         Raises:
@@ -140,13 +140,13 @@ class TrialLog:
         if trial < 0 or trial in self:
             raise ParameterError("trial", trial, "0 or more, and not in the log yet")
         about = {
-            **recording.about,
+            **trajectory.about,
             "configuration": self.configuration,
             "outcome": dict(outcome or {}),
             "trial": trial,
             "versions": versions_of(_PACKAGES),
         }
-        kept = Recording(recording.seed, recording.commands, recording.observations, plain(about))
+        kept = Trajectory(trajectory.seed, trajectory.commands, trajectory.observations, plain(about))
         path = kept.save(self.path(trial))
         entry = TrialEntry.of(trial, kept)
         last = max(self._index, default=-1)
@@ -171,8 +171,7 @@ class TrialLog:
         if right != written:
             part = self._index_path.with_suffix(".part")
             part.write_bytes(right)
-            sync(part)
-            os.replace(part, self._index_path)
+            publish(part, self._index_path)
         return {entry.trial: entry for entry in entries}
 
 

@@ -1,65 +1,19 @@
-"""The contract of a learner: what every residual model is, and the checks that all share."""
+"""The contract of a learner: what every residual model is."""
 
 from __future__ import annotations
 
-import enum
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import nn
 from torch.distributions import Distribution, Normal
 
-from ..exceptions import NonFiniteError, ParameterError, ShapeError
-from ..typing import Bool, Float, Int, Tensor
-
-
-class UpdateEvent(enum.IntEnum):
-    """What an update did with a sample."""
-
-    REFUSED = 0  #: masked out, or not finite under ``on_invalid="skip"``: nothing was learned
-    ABSORBED = 1  #: taken in; the learner has no basis, or projected the sample onto it
-    ADDED = 2  #: became a new basis point
-    REPLACED = 3  #: became a basis point, and another was deleted for it
-
-
-@dataclass(frozen=True)
-class UpdateReport:
-    """What an update did. All tensors have shape ``(*time, *batch_shape)``.
-
-    Attributes:
-        event: an :class:`UpdateEvent` per sample.
-        novelty: share of the prior variance at x that the basis does not explain, 0 to 1
-            (0 for learners without a basis).
-        surprise: mean squared standardised innovation before the update, expected to be 1
-            (NaN for learners without uncertainty).
-        weight: weight given to the sample, 1 unless a robust update distrusted it.
-    """
-
-    event: Int[Tensor, "*time_and_batch"]
-    novelty: Float[Tensor, "*time_and_batch"]
-    surprise: Float[Tensor, "*time_and_batch"]
-    weight: Float[Tensor, "*time_and_batch"]
-
-    @property
-    def accepted(self) -> Bool[Tensor, "*time_and_batch"]:
-        """Samples that changed the state."""
-        return self.event != UpdateEvent.REFUSED
-
-    @staticmethod
-    def stack(reports: list[UpdateReport]) -> UpdateReport:
-        """Reports of successive samples as one, time first."""
-        names = ("event", "novelty", "surprise", "weight")
-        return UpdateReport(*(torch.stack([getattr(r, n) for r in reports]) for n in names))
-
-    @staticmethod
-    def of_nothing(like: Bool[Tensor, "*batch"], dtype: torch.dtype) -> UpdateReport:
-        """No model had a sample."""
-        zero = torch.zeros_like(like, dtype=dtype)
-        return UpdateReport(torch.zeros_like(like, dtype=torch.int64), zero, zero, zero)
+from ..exceptions import ParameterError, ShapeError
+from ..typing import Bool, Float, Tensor
+from .checks import check_count, check_counts, check_finite
+from .report import UpdateReport
 
 
 class ResidualLearner(nn.Module, ABC):
@@ -207,12 +161,6 @@ class ResidualLearner(nn.Module, ABC):
         """Device of the state."""
         return self._like.device
 
-    def _check_single(self) -> None:
-        """For learners that are one model each."""
-        if self.batch_shape:
-            valid = "() for this learner; LearnerFleet holds several"
-            raise ParameterError("batch_shape", tuple(self.batch_shape), valid)
-
     def _cast(self, x: Tensor) -> Tensor:
         return torch.as_tensor(x, dtype=self._like.dtype, device=self._like.device)
 
@@ -268,37 +216,41 @@ class ResidualLearner(nn.Module, ABC):
         return f"in_features={self.in_features}, out_features={self.out_features}{fleet}"
 
 
-def check_count(name: str, value: int, least: int = 1) -> int:
-    """``value`` as an int of at least ``least``, or ParameterError."""
-    try:
-        good = not isinstance(value, bool) and int(value) == value and value >= least
-    except (TypeError, ValueError, OverflowError):
-        good = False
-    if not good:
-        raise ParameterError(name, value, f"an integer of at least {least}")
-    return int(value)
+class DoubleStateLearner(ResidualLearner):
+    """A learner whose state is float64 whatever the dtype of its inputs and outputs.
+
+    Device moves take all along; a change of dtype is one of the interface only: float32 cannot hold the
+    inverse of a smooth kernel's matrix.
+    """
+
+    def _apply(self, fn, recurse=True):
+        def keep_double(tensor):
+            moved = fn(tensor)
+            if tensor is self._like or not tensor.is_floating_point():
+                return moved
+            return tensor.to(moved.device)
+
+        return super()._apply(keep_double, recurse)
 
 
-def check_counts(name: str, values: Iterable[int]) -> tuple[int, ...]:
-    """``values`` as positive ints, or ParameterError."""
-    if isinstance(values, str) or not isinstance(values, Iterable):
-        raise ParameterError(name, values, "a tuple of positive integers")
-    return tuple(check_count(name, value) for value in values)
+class SingleLearner(ResidualLearner):
+    """A learner that is one model: ``batch_shape`` must be ``()``; ``LearnerFleet`` holds several.
 
+    Its ``_absorb`` gets samples only, never a mask.
+    """
 
-def check_positive(name: str, value: float) -> float:
-    """``value`` as a positive finite float, or ParameterError."""
-    try:
-        good = math.isfinite(value) and value > 0
-    except (TypeError, ValueError):
-        good = False
-    if not good:
-        raise ParameterError(name, value, "positive and finite")
-    return float(value)
+    def __init__(self, in_features: int, out_features: int, **options) -> None:
+        super().__init__(in_features, out_features, **options)
+        if self.batch_shape:
+            valid = "() for this learner; LearnerFleet holds several"
+            raise ParameterError("batch_shape", tuple(self.batch_shape), valid)
 
+    def _step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        if mask is not None and not bool(mask):
+            return UpdateReport.of_nothing(mask, self.dtype)
+        return self._absorb(x, y, None)
 
-def check_finite(name: str, value: Tensor) -> None:
-    """NonFiniteError, with the first places, if a square in ``value`` is not finite."""
-    where = (~value.square().isfinite()).nonzero()
-    if len(where):
-        raise NonFiniteError(name, [tuple(place) for place in where[:5].tolist()])
+    def _absorbed(self, nis: Tensor) -> UpdateReport:
+        """Report of a learner without a basis that trusts every sample alike."""
+        one = torch.ones_like(nis)
+        return UpdateReport(one.to(torch.int64), 0 * one, nis, one)

@@ -13,7 +13,8 @@ from torch.distributions import Distribution, Normal, constraints
 
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
-from .base import ResidualLearner, UpdateReport
+from .base import ResidualLearner
+from .report import UpdateReport
 
 
 class LearnerFleet(ResidualLearner):
@@ -99,7 +100,7 @@ class LearnerFleet(ResidualLearner):
         n = len(self.learners)
         x, y = x.reshape(n, -1), y.reshape(n, -1)
         who = [None] * n if mask is None else list(mask.reshape(n))
-        reports = [g._absorb(g._cast(x[k]), g._cast(y[k]), who[k]) for k, g in enumerate(self._all())]
+        reports = [g._step(g._cast(x[k]), g._cast(y[k]), who[k]) for k, g in enumerate(self._all())]
         stacked = UpdateReport.stack(reports)
         return UpdateReport(*(part.reshape(self.batch_shape) for part in vars(stacked).values()))
 

@@ -12,7 +12,8 @@ from torch.distributions import Distribution, Normal
 
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
-from .base import ResidualLearner, UpdateReport
+from .base import ResidualLearner
+from .report import UpdateReport
 from .tails import ScaleMixture
 
 _PRIOR = 0.8  # belief that a learner is to be taken at its word
@@ -201,13 +202,13 @@ class MixtureResidual(ResidualLearner):
             if mask is not None:
                 value = torch.where(_trailing(mask, value), value, buffer)
             buffer.copy_(value)
-        surprise = (z.square() / self.inflation).mean(-1)
+        nis = (z.square() / self.inflation).mean(-1)
         self.tails.observe(z, self.count, mask)
         self.count += 1.0 if mask is None else mask.to(self.count.dtype)
         reports = [learner.update(x, target, mask) for learner in self.members]
         report = reports[0]
         self._settle()
-        return UpdateReport(report.event, report.novelty, surprise, report.weight)
+        return UpdateReport(report.event, report.novelty, nis, report.weight)
 
     # -- pieces ---------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Ground truth: a simulated hand, and the plant contract."""
+"""Ground truth: a simulated hand, and what its cameras and Hall sensors see."""
 
 from __future__ import annotations
 
@@ -7,17 +7,14 @@ from .disturbances import Change as Change
 from .disturbances import DisturbedPlant as DisturbedPlant
 from .disturbances import Tug as Tug
 from .grasp_planning.pinch import PinchPlan as PinchPlan
-from .grasp_planning.pinch import PinchPlanner as PinchPlanner
-from .grasp_planning.pinch_problem import PinchProblem as PinchProblem
-from .grasp_planning.pinch_problem import PinchRequest as PinchRequest
 from .hall_sensors import HallQuality as HallQuality
 from .hall_sensors import HallSensors as HallSensors
 from .hall_sensors import Stuck as Stuck
+from .imaging.card_scene import CardScene as CardScene
+from .imaging.card_scene import ConvexBody as ConvexBody
+from .imaging.card_scene import PlacedCard as PlacedCard
 from .imaging.grasp_view import GraspView as GraspView
 from .imaging.sapien_camera import SapienCamera as SapienCamera
-from .imaging.scene import ConvexBody as ConvexBody
-from .imaging.scene import PlacedCard as PlacedCard
-from .imaging.scene import Scene as Scene
 from .imaging.simulated_camera import ImageQuality as ImageQuality
 from .imaging.simulated_camera import SimulatedCamera as SimulatedCamera
 from .imaging.simulated_video import SimulatedVideo as SimulatedVideo
@@ -30,6 +27,7 @@ from .simulated_hand import PlantSnapshot as PlantSnapshot
 from .simulated_hand import SimulatedHand as SimulatedHand
 
 __all__ = [
+    "CardScene",
     "Change",
     "ConvexBody",
     "DisturbedPlant",
@@ -39,16 +37,12 @@ __all__ = [
     "ICUB_PALM_MOUNT",
     "ImageQuality",
     "PinchPlan",
-    "PinchPlanner",
-    "PinchProblem",
-    "PinchRequest",
     "PlacedCard",
     "PlantConfig",
     "PlantParameters",
     "PlantSnapshot",
     "PRESETS",
     "SapienCamera",
-    "Scene",
     "SensedPlant",
     "SimulatedCamera",
     "SimulatedHand",

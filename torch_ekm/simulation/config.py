@@ -18,9 +18,9 @@ class PlantConfig:
         ParameterError: a figure outside its range.
     """
 
-    gravity: tuple[float, float, float] = (0.0, 0.0, 9.81)
-    """[m/s^2]. Nominal: the palm faces down, the fingers hang, and the pinch line is level. It stays
-    fixed during a manipulation, as the paper assumes (section II.A)."""
+    gravity: tuple[float, float, float] | None = None
+    """In the hand frame [m/s^2]; None: the hand's. It stays fixed during a manipulation, as the paper
+    assumes (section II.A), and the plant's ``hand`` carries it to the model."""
     time_step: float = 1e-3
     """[s]; 2 ms is fine for long runs, 4 ms the most that the stiffest tendons bear."""
     ramp_time: float = 0.2
@@ -63,7 +63,7 @@ class PlantConfig:
                 raise ParameterError(name, value, "finite and not negative")
         if self.time_step > 0.004:
             raise ParameterError("time_step", self.time_step, "at most 0.004 s: the tendons need it")
-        if len(self.gravity) != 3 or not all(math.isfinite(value) for value in self.gravity):
+        if self.gravity is not None and (len(self.gravity) != 3 or not all(map(math.isfinite, self.gravity))):
             raise ParameterError("gravity", self.gravity, "three finite numbers [m/s^2]")
         if self.along is not None:
             length = math.sqrt(sum(value * value for value in self.along))

@@ -10,7 +10,7 @@ import torch
 
 from ..description import HandDescription
 from ..exceptions import ParameterError, ShapeError
-from ..typing import Bool, Float, Tensor
+from ..typing import Float, Tensor
 
 
 class Stuck(Enum):
@@ -137,11 +137,6 @@ class HallSensors:
         q = torch.zeros(n, self._n_q, dtype=torch.float64)
         q[:, self._index] = angles
         return self.read(q, generator), angles
-
-    def saturated(self, q: Float[Tensor, "*batch n_q"]) -> Bool[Tensor, "*batch n_channels"]:
-        """Truth: the channel is at an end of its scale."""
-        field = self.field(q)
-        return (field < 1) | (field >= 255)
 
     def read(
         self, q: Float[Tensor, "*batch n_q"], generator: torch.Generator

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 
 from ..exceptions import ParameterError
 
-_DEG = math.pi / 180
-
 
 @dataclass(frozen=True)
 class PlantParameters:
-    """The plant, relative to its nominal description; ``exact()`` is the description itself.
+    """The plant, relative to its nominal description; ``PlantParameters()`` is the description itself.
 
     Units are SI, angles [rad]. Factors multiply the description's figure.
 
@@ -107,45 +105,6 @@ class PlantParameters:
             if name not in known:
                 raise ParameterError("parameter", name, f"one of {', '.join(sorted(known))}")
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
-
-    @classmethod
-    def exact(cls) -> PlantParameters:
-        """The nominal description and perfect sensors: nothing to learn."""
-        return cls()
-
-    @classmethod
-    def nominal_mismatch(cls) -> PlantParameters:
-        """The mismatch that the residual learners are for: what a used iCub hand is thought to have.
-
-        Tendons run on pulleys 1.3 times as large as modelled and stretch twice as much; joints rub;
-        the position controller stops up to 1.3 deg short of its set-point and has a constant error,
-        a fresh one and play: somewhat more than the +-1 deg of the E-KM paper (section III.C.4), since
-        with less a plain KM does not stall nearly as far off as the paper's 1 to 3 deg (here 0.8 to 1.2).
-        The fingers have weight, the object is 10 % heavier, its centre 2 mm off. Sensors: 0.3 deg per
-        joint, 0.2 mm and 0.15 deg for the object (a marker board seen from 0.4 m), 0.1 N each of noise,
-        offset and hysteresis per fingertip, in 8 bit.
-        """
-        return cls(
-            moment_arm=1.3,
-            spring=0.8,
-            servo_stiffness=0.5,
-            joint_friction=1.0,
-            link_weight=True,
-            friction=0.9,
-            mass=1.1,
-            com_shift=(0.002, 0.002, 0.0),
-            actuator_bias=0.2 * _DEG,
-            actuator_error=0.1 * _DEG,
-            dead_zone=1.3 * _DEG,
-            backlash=0.5 * _DEG,
-            joint_noise=0.3 * _DEG,
-            position_noise=0.0002,
-            rotation_noise=0.15 * _DEG,
-            force_noise=0.1,
-            force_offset=0.1,
-            force_hysteresis=0.1,
-            force_range=15.0,
-        )
 
 
 _POSITIVE = {"moment_arm", "spring", "servo_stiffness", "friction", "mass", "object_scale"}

@@ -19,8 +19,8 @@ from ..sensing.vision.track import Track
 from ..sensing.vision.tracker import MarkerTracker
 from ..typing import Float, Tensor
 from .hall_sensors import HallSensors
+from .imaging.card_scene import CardScene
 from .imaging.grasp_view import GraspView
-from .imaging.scene import Scene
 from .imaging.simulated_camera import SimulatedCamera
 from .imaging.simulated_video import SimulatedVideo
 
@@ -125,7 +125,7 @@ class SensedPlant(PlantWrapper):
             raise ParameterError("SensedPlant", "not started", "reset with reset(seed) first")
         truth = _truth_of(seen)
         shown = truth.state if truth.pictured is None else truth.pictured
-        self._scene: Scene = self._view.scene(shown.q, shown.position, shown.rotation)
+        self._scene: CardScene = self._view.scene(shown.q, shown.position, shown.rotation)
         if seen.status is PlantStatus.NOT_SEEN:
             self._scene = self._scene.obstructed(1)
         track, image = self._look()

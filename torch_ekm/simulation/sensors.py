@@ -7,15 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..kinematics.se3 import exp
+from ..typing import Array
 from .parameters import PlantParameters
 
-Array = NDArray[np.float64]
 
-
-class Frame(NamedTuple):
+class TimedState(NamedTuple):
     """The true state at one moment."""
 
     time: float
@@ -31,7 +29,7 @@ class Frame(NamedTuple):
 class SensorState(NamedTuple):
     """All that :class:`Sensors` remembers between readings."""
 
-    frames: tuple[Frame, ...]
+    frames: tuple[TimedState, ...]
     seen: tuple[Array, Array] | None
     felt: Array
     stuck_at: Array | None
@@ -65,7 +63,7 @@ class Sensors:
 
     def forget(self) -> None:
         """A new grasp: no old frames, no hysteresis."""
-        self._frames: deque[Frame] = deque()
+        self._frames: deque[TimedState] = deque()
         self._seen: tuple[Array, Array] | None = None
         self._felt = np.zeros(self.n_pads)
         self._stuck_at: Array | None = None
@@ -75,13 +73,13 @@ class Sensors:
         """Whether old poses matter, so that :meth:`remember` must be called."""
         return self._p.latency > 0
 
-    def remember(self, frame: Frame) -> None:
+    def remember(self, frame: TimedState) -> None:
         """Keep a state for as long as the latency asks."""
         self._frames.append(frame)
         while len(self._frames) > 1 and self._frames[1].time <= frame.time - self._p.latency + 1e-9:
             self._frames.popleft()
 
-    def pictured(self, now: Frame) -> Frame:
+    def pictured(self, now: TimedState) -> TimedState:
         """What the camera's picture shows that is to be had now."""
         return self._frames[0] if self.wants_history and self._frames else now
 

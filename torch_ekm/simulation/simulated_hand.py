@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..description import HandDescription, ObjectDescription, load_hand, load_object
 from ..exceptions import EquilibriumError, GraspError, ParameterError
 from ..kinematics import GraspState
 from ..plant import Observation, PlantStatus, Truth
-from ..typing import Float, Tensor
+from ..typing import Array, Float, Tensor
 from .config import PlantConfig
-from .grasp_planning.pinch import PinchPlan
+from .grasp_planning.pinch import PinchPlan, make_planner, turning_axis
 from .grasp_planning.pinch_problem import PinchRequest
-from .mechanism.assembly import make_planner, moment_arms, true_descriptions, turning_axis
+from .mechanism.assembly import moment_arms, true_descriptions
 from .parameters import PlantParameters
 from .physics.rig import Gravity, Rig, RigState
-from .sensors import Frame, Sensors, SensorState
-
-Array = NDArray[np.float64]
+from .presets import preset as parameters_of
+from .sensors import Sensors, SensorState, TimedState
 
 _ATTEMPTS = 5
 _FAR = 0.05  # [m] from where it was grasped: out of the hand
@@ -41,7 +40,7 @@ class SimulatedHand:
 
     ::
 
-        plant = SimulatedHand("icub_right", "box", parameters=PlantParameters.nominal_mismatch())
+        plant = SimulatedHand("icub_right", "box", preset="nominal")
         observation = plant.reset(seed=0)
         observation = plant.command(delta_a)
 
@@ -52,7 +51,12 @@ class SimulatedHand:
         hand: a description, or the name or path that :func:`load_hand` takes.
         object: a description, or the name or path that :func:`load_object` takes.
         config: time, gravity, the grasp.
-        parameters: what the plant really is; :meth:`PlantParameters.exact` by default.
+        parameters: what the plant really is; as described by default.
+        preset: the parameters by name, as :func:`torch_ekm.simulation.preset` takes it.
+
+    Raises:
+        UnknownNameError: there is no such hand, object or preset; the message lists them.
+        ParameterError: both ``parameters`` and ``preset`` are given.
     """
 
     def __init__(
@@ -61,11 +65,17 @@ class SimulatedHand:
         object: ObjectDescription | str = "box",
         config: PlantConfig | None = None,
         parameters: PlantParameters | None = None,
+        preset: str | None = None,
     ) -> None:
+        if parameters is not None and preset is not None:
+            valid = "None with parameters: preset(name).replace(...) changes single figures of a preset"
+            raise ParameterError("preset", preset, valid)
         self.hand = load_hand(hand) if isinstance(hand, str) else hand
         self.object = load_object(object) if isinstance(object, str) else object
         self.config = PlantConfig() if config is None else config
-        self.parameters = PlantParameters.exact() if parameters is None else parameters
+        if self.config.gravity is not None:
+            self.hand = dataclasses.replace(self.hand, gravity=self.config.gravity)
+        self.parameters = parameters_of(preset or "none") if parameters is None else parameters
         self._planner = make_planner(self.hand, self.object, self.config, self.parameters)
         self._sensors = Sensors(self.parameters, self.hand.n_q, len(self.hand.pads), self.hand.joint_names)
         self._generator = np.random.default_rng(0)
@@ -122,7 +132,7 @@ class SimulatedHand:
         q, (position, rotation) = rig.scene.q, rig.scene.object_pose
         status = self.status
         joints = self._sensors.joints(q, draw)
-        picture = self._sensors.pictured(Frame(rig.time, q, position, rotation))
+        picture = self._sensors.pictured(TimedState(rig.time, q, position, rotation))
         seen_position, seen_rotation, seen = self._sensors.pose(picture.position, picture.rotation, draw)
         force = self._sensors.forces(rig.normal, draw)
         if not seen and status is PlantStatus.HELD:
@@ -168,7 +178,7 @@ class SimulatedHand:
 
     @property
     def gravity(self) -> Gravity:
-        """Gravity of this grasp in the hand frame [m/s^2]: ``config.gravity``, tilted as drawn."""
+        """Gravity of this grasp in the hand frame [m/s^2]: ``hand.gravity``, tilted as drawn."""
         return self._grasped().gravity
 
     @property
@@ -265,7 +275,7 @@ class SimulatedHand:
         if self._rig is not None:
             remember = self._sensors.remember
             self._rig.on_frame = (
-                (lambda *state: remember(Frame(*state))) if self._sensors.wants_history else None
+                (lambda *state: remember(TimedState(*state))) if self._sensors.wants_history else None
             )
 
     def _request(self) -> PinchRequest:
@@ -273,7 +283,7 @@ class SimulatedHand:
         c = self.config
         along, across, first, second, tilt, turn = self._generator.uniform(-1.0, 1.0, size=6).tolist()
         return PinchRequest(
-            gravity=_tilted(c.gravity, tilt * c.gravity_tilt, np.pi * turn),
+            gravity=_tilted(self.hand.gravity, tilt * c.gravity_tilt, np.pi * turn),
             force=c.pinch_force,
             along=along * c.offset_along,
             across=across * c.offset_across,

@@ -45,6 +45,8 @@ class BalanceEquations:
     hand_load: Array
     """Z^T V_q, ``(n_z,)``."""
     cones: tuple[FrictionCone, ...]
+    length: float
+    """L: moments are divided by it [m]."""
     moment_rows: Mask
     """Rows of ``object_load`` that are moments, bool ``(n_w,)``."""
     tendon: Mask
@@ -52,7 +54,7 @@ class BalanceEquations:
     spin_columns: tuple[int, ...] = ()
     """Components of ``mu`` that are moments."""
     bound_matrix: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    """Z^T of unit joint torques with bounds of their own (stops, dry friction), ``(n_z, n_t)``."""
+    """Z^T of unit joint torques with bounds of their own (stops, locks), ``(n_z, n_t)``."""
     bound_lower: Array = field(default_factory=lambda: np.zeros(0))
     bound_upper: Array = field(default_factory=lambda: np.zeros(0))
     weight: Array | None = None
@@ -61,6 +63,11 @@ class BalanceEquations:
     """Measured normal forces [N], NaN where there is none."""
     normal_std: float = 0.3
     """Their standard deviation [N]."""
+
+    @property
+    def row_scale(self) -> Array:
+        """1 for forces on the object, 1/L for moments, ``(n_w,)``."""
+        return np.where(self.moment_rows, 1 / self.length, 1.0)
 
 
 @dataclass(frozen=True)
@@ -73,7 +80,7 @@ class ForceSolution:
     lam: Array
     """Minus the actuator forces along +a [N or N m]."""
     bound: Array
-    """Torques of stops and dry friction [N m]."""
+    """Torques of stops and locks [N m]."""
     residual: Array
     """r: unexplained generalised torque, ``(n_z,)`` [N m]. Large: wrong spring or rest angle, slipping."""
     violation: float

@@ -1,7 +1,7 @@
-"""Friction cones: exact norm, polyhedral bounds, cutting planes.
+"""Friction cones: exact norm, polyhedra around them, cutting planes.
 
-Hard finger ``|f_t| <= mu_s f_n``; soft finger ``(|f_t|/mu_s)^2 + (m_n/gamma)^2 <= f_n^2``. Both read
-``|u| <= mu_s f_n`` with ``u = [f_t; m_n mu_s/gamma]``.
+Point contact with friction ``|f_t| <= mu_s f_n``; soft finger ``(|f_t|/mu_s)^2 + (m_n/gamma)^2 <= f_n^2``.
+Both read ``|u| <= mu_s f_n`` with ``u = [f_t; m_n mu_s/gamma]``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ..._extras import require
 from ..contact_model import ContactModel
 
 Array = NDArray[np.float64]
@@ -31,7 +30,7 @@ class FrictionCone:
 
     @property
     def dim(self) -> int:
-        """Number of friction components d: 0 (frictionless), 1 (planar), 2 (hard), 3 (soft)."""
+        """Number of friction components d: 0 (frictionless), 1 (planar), 2 (point contact), 3 (soft)."""
         return len(self.scale)
 
     def u(self, mu: Array) -> Array:
@@ -42,10 +41,10 @@ class FrictionCone:
         """``mu_s f_n - |u|`` [N]; negative: outside the cone."""
         return float(self.mu_s * mu[self.start] - np.linalg.norm(self.u(mu)))
 
-    def rows(self, directions: Array, n_h: int, factor: float = 1.0) -> Array:
-        """Rows ``g`` of ``g mu <= 0``: ``d . u <= factor mu_s f_n`` for each direction ``(k, d)``."""
+    def rows(self, directions: Array, n_h: int) -> Array:
+        """Rows ``g`` of ``g mu <= 0``: ``d . u <= mu_s f_n`` for each direction ``(k, d)``."""
         rows = np.zeros((len(directions), n_h))
-        rows[:, self.start] = -factor * self.mu_s
+        rows[:, self.start] = -self.mu_s
         rows[:, self.start + 1 : self.start + 1 + self.dim] = directions * self.scale
         return rows
 
@@ -64,27 +63,23 @@ def friction_cones(
     return tuple(cones)
 
 
-@lru_cache(maxsize=32)
-def directions(dim: int, faces: int) -> tuple[Array, float]:
-    """Unit normals of a polyhedron around the unit ball, and the cosine that makes it inscribed.
+@lru_cache(maxsize=4)
+def outer_directions(dim: int) -> Array:
+    """Unit normals d of a polyhedron ``{d . u <= 1}`` around the unit ball, ``(k, dim)``.
 
-    ``{d . u <= 1}`` for all returned d contains the ball; ``{d . u <= cosine}`` is contained in it. In the
-    plane: ``faces`` directions, cosine ``cos(pi/faces)``; for a soft finger a grid of such rings over the
-    latitudes and the two poles, cosine from the convex hull of the directions.
+    Eight around a circle; for a soft finger rings of eight over the latitudes and the two poles.
     """
     if dim == 0:
-        return np.zeros((0, 0)), 1.0
+        return np.zeros((0, 0))
     if dim == 1:
-        return np.array([[1.0], [-1.0]]), 1.0
-    angle = 2 * np.pi * np.arange(faces) / faces
+        return np.array([[1.0], [-1.0]])
+    angle = 2 * np.pi * np.arange(8) / 8
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     if dim == 2:
-        return ring, float(np.cos(np.pi / faces))
-    latitude = np.linspace(-np.pi / 2, np.pi / 2, faces // 2 + 1)[1:-1]
-    layers = [np.concatenate([np.cos(t) * ring, np.full((faces, 1), np.sin(t))], axis=-1) for t in latitude]
-    points = np.concatenate([*layers, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
-    hull = require("scipy.spatial").ConvexHull(points)
-    return points, float((-hull.equations[:, -1]).min())
+        return ring
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, 5)[1:-1]
+    layers = [np.concatenate([np.cos(t) * ring, np.full((8, 1), np.sin(t))], axis=-1) for t in latitude]
+    return np.concatenate([*layers, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
 
 
 def cutting_planes(cones: Sequence[FrictionCone], mu: Array, tolerance: float) -> Array:
@@ -95,3 +90,11 @@ def cutting_planes(cones: Sequence[FrictionCone], mu: Array, tolerance: float) -
             u = cone.u(mu)
             cuts.append(cone.rows((u / np.linalg.norm(u))[None], len(mu)))
     return np.concatenate(cuts)
+
+
+def margins(cones: Sequence[FrictionCone], mu: Array) -> tuple[Array, Array]:
+    """Per contact ``mu_s f_n - |u|`` [N], and that relative to ``mu_s f_n``: 1 no friction used, 0 slips."""
+    slack = np.array([cone.slack(mu) for cone in cones])
+    limit = np.array([cone.mu_s * mu[cone.start] for cone in cones])
+    relative = np.divide(slack, limit, out=np.zeros_like(slack), where=limit > 1e-12)
+    return slack, relative

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..._extras import require
-from .compare import Comparison
 from .learners import OURS
+from .scores import Comparison
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,23 +24,22 @@ def colour_of(learner: str) -> str:
 
 
 def plot_scores(comparison: Comparison) -> Figure:
-    """rms error over that of the model alone, with 95 % intervals: a panel for each recording."""
-    n = len(comparison.recordings)
+    """rms error over that of the model alone, with 95 % intervals: a panel for each stream."""
+    n = len(comparison.streams)
     columns = min(n, 3)
     rows = -(-n // columns)
     size = (3.2 * columns + 1.2, (0.22 * len(comparison.learners) + 0.8) * rows)
     figure, axes = _figure(size, rows, columns)
     y = np.arange(len(comparison.learners))
-    for axis, recording in zip(axes.flat, comparison.recordings, strict=False):
-        scores = comparison.row(recording.name)
-        best = comparison.best(recording.name)
+    for axis, stream in zip(axes.flat, comparison.streams, strict=False):
+        scores, best = comparison.row(stream.name), comparison.best(stream.name)
         for i, score in enumerate(scores):
             colour = colour_of(score.learner)
             axis.plot([score.rms.low, score.rms.high], [i, i], color=colour, linewidth=1.6)
             filled = colour if score is best else "white"
             axis.plot(score.rms.mean, i, "o", color=colour, markerfacecolor=filled, markersize=5.5)
         axis.axvline(1, color="black", linewidth=0.8, linestyle="--")
-        axis.set_title(recording.name, loc="left", fontsize=10)
+        axis.set_title(stream.name, loc="left", fontsize=10)
         axis.set_xlim(0, min(max(1.15, 1.1 * max(score.rms.mean for score in scores)), 2.0))
         axis.grid(axis="y", visible=False)
         axis.grid(axis="x", color="0.9", linewidth=0.8)
@@ -55,50 +54,45 @@ def plot_scores(comparison: Comparison) -> Figure:
 
 def plot_learning_curves(
     comparison: Comparison,
-    recording: str,
+    stream: str,
     learners: Sequence[str] | None = None,
     mark: dict[int, str] | None = None,
     windows: int = 25,
 ) -> Figure:
-    """rms error over the time of one recording, in windows; ``mark``: sample -> what happened there."""
+    """rms error over the time of one stream, in windows; ``mark``: sample -> what happened there."""
     figure, ((axis,),) = _figure((7.5, 3.4), 1, 1)
-    one = next(r for r in comparison.recordings if r.name == recording)
+    one = comparison.stream(stream)
     n = len(one) - one.warm_up
     edges = np.linspace(0, n, min(windows, n // 5) + 1).astype(int)
     middle = one.warm_up + 0.5 * (edges[1:] + edges[:-1])
     for name, colour in zip(learners or comparison.learners, _CYCLE * 3, strict=False):
-        total = np.concatenate([[0.0], np.cumsum(comparison.errors[recording, name])])
+        total = np.concatenate([[0.0], np.cumsum(comparison.errors[stream, name])])
         rms = np.sqrt(np.diff(total[edges]) / np.diff(edges))
         axis.plot(middle, rms, color=colour, linewidth=1.4, label=name)
     for sample, text in (mark or {}).items():
         axis.axvline(sample, color="black", linewidth=0.8, linestyle="--")
         axis.annotate(text, (sample, 0.97), xycoords=("data", "axes fraction"), fontsize=8, va="top")
     axis.set(xlabel="sample", ylabel="rms error, before learning", ylim=(0, None))
-    axis.set_title(f"{recording}: {one.about}", loc="left", fontsize=9)
+    axis.set_title(f"{stream}: {one.about}", loc="left", fontsize=9)
     axis.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
 def plot_ranks(comparison: Comparison) -> Figure:
-    """Mean rank on the recordings, +- half the critical difference: what overlaps cannot be told apart."""
+    """Mean rank on the streams, +- half the critical difference: what overlaps cannot be told apart."""
     ranks, difference = comparison.ranks().mean(0), comparison.critical_difference()
     order = np.argsort(ranks)
     figure, ((axis,),) = _figure((6.5, 0.26 * len(ranks) + 0.9), 1, 1)
     for place, i in enumerate(order):
         colour = colour_of(comparison.learners[i])
         if np.isfinite(difference):
-            axis.plot(
-                ranks[i] + np.array([-0.5, 0.5]) * difference,
-                [place, place],
-                color=colour,
-                linewidth=5,
-                alpha=0.3,
-            )
+            ends = ranks[i] + np.array([-0.5, 0.5]) * difference
+            axis.plot(ends, [place, place], color=colour, linewidth=5, alpha=0.3)
         axis.plot(ranks[i], place, "o", color=colour)
     axis.set_yticks(range(len(ranks)), [comparison.learners[i] for i in order], fontsize=8)
     axis.invert_yaxis()
     axis.grid(axis="y", visible=False)
-    axis.set_xlabel(f"mean rank on {len(comparison.recordings)} recordings (1 is best)")
+    axis.set_xlabel(f"mean rank on {len(comparison.streams)} streams (1 is best)")
     return figure
 
 
@@ -107,24 +101,16 @@ def plot_cost(comparison: Comparison) -> Figure:
     figure, ((axis,),) = _figure((7.5, 3.8), 1, 1)
     points = []
     for name in comparison.learners:
-        scores = [comparison.scores[r.name, name] for r in comparison.recordings]
+        scores = [comparison.scores[stream.name, name] for stream in comparison.streams]
         time = float(np.median([score.microseconds for score in scores]))
         ratio = float(np.exp(np.mean([np.log(max(score.rms.mean, 1e-6)) for score in scores])))
         if name != "model alone":
             points.append((ratio, time, name))
+    beside = {"textcoords": "axes fraction", "fontsize": 8, "va": "center"}
     for place, (ratio, time, name) in enumerate(sorted(points)):  # names in a column: they would overlap
-        colour = colour_of(name)
-        height = (place + 0.5) / len(points)
-        axis.annotate(
-            name,
-            (time, ratio),
-            xytext=(1.03, height),
-            textcoords="axes fraction",
-            fontsize=8,
-            va="center",
-            color=colour,
-            arrowprops={"arrowstyle": "-", "color": colour, "alpha": 0.35, "linewidth": 0.7},
-        )
+        colour, height = colour_of(name), (place + 0.5) / len(points)
+        arrow = {"arrowstyle": "-", "color": colour, "alpha": 0.35, "linewidth": 0.7}
+        axis.annotate(name, (time, ratio), (1.03, height), color=colour, arrowprops=arrow, **beside)
         axis.plot(time, ratio, "o", color=colour)
     axis.set_xscale("log")
     ticker = require("matplotlib.ticker")

@@ -1,24 +1,66 @@
-"""A comparison of learners as tables and as a report folder."""
+"""A comparison of learners as tables, as text and as a report folder."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ..reporting.plots import save_figure
 from ..reporting.report import FigureFile, Report, Table
-from .compare import Comparison, compare, verdicts
-from .learners import DEFAULT, contender
 from .plots import plot_cost, plot_learning_curves, plot_ranks, plot_scores
-from .recording import LIMIT, load_recording, load_table
+from .scores import Comparison
 
 
-def score_table(comparison: Comparison, recording: str) -> Table:
-    """Every learner on one recording."""
+class ComparisonReport(Comparison):
+    """A comparison that prints as a table and can be written."""
+
+    def tables(self) -> list[Table]:
+        """One for each stream; of several streams an overview first."""
+        tables = [score_table(self, stream.name) for stream in self.streams]
+        return [overview_table(self), *tables] if len(tables) > 1 else tables
+
+    def __str__(self) -> str:
+        table = self.tables()[0]
+        rows = [table.header, *table.text()]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+        return "\n".join([table.caption, *lines, table.note, *self.verdicts()])
+
+    def write(self, folder: str | Path) -> Report:
+        """Tables as CSV, figures as SVG and PNG, and ``index.html`` with all of them, into ``folder``."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        drawn = {"scores": (plot_scores(self), "rms error over that of the model alone, 95 % intervals.")}
+        if len(self.streams) > 1:
+            drawn["ranks"] = (plot_ranks(self), "Mean ranks; overlapping bars cannot be told apart.")
+        drawn["cost"] = (plot_cost(self), "Accuracy against time.")
+        for stream in self.streams:
+            figure = plot_learning_curves(self, stream.name, curve_learners(self, stream.name))
+            drawn[f"curve_{stream.name}"] = (figure, f"Learning curves on {stream.name}.")
+        for name, (figure, _) in drawn.items():
+            save_figure(figure, folder, name)
+        report = Report(
+            title="Residual learners compared",
+            summary=" ".join(self.verdicts()),
+            tables=self.tables(),
+            figures=[FigureFile(f"{name}.svg", caption) for name, (_, caption) in drawn.items()],
+            configuration={
+                "learners": list(self.learners),
+                "streams": {
+                    s.name: {"samples": len(s), "warm_up": s.warm_up, "about": s.about} for s in self.streams
+                },
+            },
+        )
+        report.write(folder)
+        return report
+
+
+def score_table(comparison: Comparison, stream: str) -> Table:
+    """Every learner on one stream."""
     header = ["learner", "rms / model", "95 % interval", "median / model", "NLL", "90 % coverage", "µs", "kB"]
-    best = comparison.best(recording)
+    best = comparison.best(stream)
     rows = [
         [
             score.learner + (" *" if score is best else ""),
@@ -30,19 +72,18 @@ def score_table(comparison: Comparison, recording: str) -> Table:
             f"{score.microseconds:.0f}",
             f"{score.kilobytes:.0f}",
         ]
-        for score in comparison.row(recording)
+        for score in comparison.row(stream)
     ]
-    one = next(r for r in comparison.recordings if r.name == recording)
+    one = comparison.stream(stream)
     n, parts = len(one) - one.warm_up, len(one.segments)
-    caption = f"{recording}: {one.about}"
     note = f"{n} samples scored{f' in {parts} parts' if parts else ''}, "
     note += f"{one.x.shape[1]} inputs, {one.y.shape[1]} outputs."
-    return Table(f"scores_{recording}", caption, header, rows, note)
+    return Table(f"scores_{stream}", f"{stream}: {one.about}", header, rows, note)
 
 
 def overview_table(comparison: Comparison) -> Table:
-    """rms error over that of the model alone: learners by recordings, and the mean rank."""
-    names = [recording.name for recording in comparison.recordings]
+    """rms error over that of the model alone: learners by streams, and the mean rank."""
+    names = [stream.name for stream in comparison.streams]
     ranks = comparison.ranks().mean(0)
     best = {name: comparison.best(name).learner for name in names}
     rows = [
@@ -65,78 +106,8 @@ def overview_table(comparison: Comparison) -> Table:
     )
 
 
-def write_comparison(comparison: Comparison, folder: Path) -> Report:
-    """Tables as CSV, figures as SVG and PNG, one page with all, into ``folder``."""
-    folder.mkdir(parents=True, exist_ok=True)
-    figures = []
-    drawn = {"scores": (plot_scores(comparison), "rms error over that of the model alone, 95 % intervals.")}
-    if len(comparison.recordings) > 1:
-        drawn["ranks"] = (plot_ranks(comparison), "Mean ranks; overlapping bars cannot be told apart.")
-    drawn["cost"] = (plot_cost(comparison), "Accuracy against time.")
-    for recording in comparison.recordings:
-        figure = plot_learning_curves(comparison, recording.name, curve_learners(comparison, recording.name))
-        drawn[f"curve_{recording.name}"] = (figure, f"Learning curves on {recording.name}.")
-    for name, (figure, caption) in drawn.items():
-        save_figure(figure, folder, name)
-        figures.append(FigureFile(f"{name}.svg", caption))
-    tables = [score_table(comparison, recording.name) for recording in comparison.recordings]
-    if len(tables) > 1:
-        tables.insert(0, overview_table(comparison))
-    report = Report(
-        title="Residual learners compared",
-        summary=" ".join(verdicts(comparison)),
-        tables=tables,
-        figures=figures,
-        configuration={
-            "learners": list(comparison.learners),
-            "recordings": {
-                r.name: {"samples": len(r), "warm_up": r.warm_up, "about": r.about}
-                for r in comparison.recordings
-            },
-        },
-    )
-    report.write(folder)
-    return report
-
-
-def compare_data(
-    data: Sequence[str],
-    learners: Sequence[str],
-    targets: Sequence[str],
-    folder: Path,
-    limit: int | None = LIMIT,
-    processes: int = 1,
-    on_total: Callable[[int], None] | None = None,
-    on_done: Callable[[str], None] | None = None,
-) -> Report:
-    """What ``torch-ekm compare`` does: read, compare, and leave the report in ``folder``.
-
-    Args:
-        data: names of recordings, or paths.
-        learners: the default ones if there are none.
-        targets: columns to predict, in files.
-        on_total: called with the number of jobs before they start.
-
-    Raises:
-        UnknownNameError, DescriptionError: see :func:`load_recording`; nothing has run.
-    """
-    learners = tuple(learners) or DEFAULT
-    for name in learners:
-        contender(name)
-    recordings = [
-        load_table(name, targets, limit)
-        if targets and Path(name).suffix
-        else load_recording(name, None, limit)
-        for name in data
-    ]
-    if on_total is not None:
-        on_total(len(recordings) * len(learners))
-    comparison = compare(recordings, learners, folder=folder / "runs", processes=processes, on_done=on_done)
-    return write_comparison(comparison, folder)
-
-
-def curve_learners(comparison: Comparison, recording: str, most: int = 6) -> Sequence[str]:
+def curve_learners(comparison: Comparison, stream: str, most: int = 6) -> Sequence[str]:
     """The model alone and the best few: more curves in one picture cannot be followed."""
-    order = sorted(comparison.row(recording), key=lambda score: score.rms.mean)
+    order = sorted(comparison.row(stream), key=lambda score: score.rms.mean)
     chosen = {score.learner for score in order[: most - 1]} | {"model alone"}
     return [name for name in comparison.learners if name in chosen]

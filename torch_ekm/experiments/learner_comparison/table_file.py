@@ -50,37 +50,33 @@ def _csv(path: Path) -> tuple[tuple[str, ...], Array]:
     first = next((line for line in lines if line.strip()), None)
     if first is None:
         raise DescriptionError(path, "the file is empty")
-    delimiter = max(",;\t", key=first.count)
-    reader = csv.reader(lines, delimiter=delimiter)
+    reader = csv.reader(lines, delimiter=max(",;\t", key=first.count))
     rows = [(reader.line_num, [field.strip() for field in row]) for row in reader if any(row)]
     number, names = rows[0]
     if all(_number(field) is not None for field in names):
         raise DescriptionError(
             path, f"line {number} holds numbers only; the first line must name the columns"
         )
-    return tuple(names), np.array([_row(path, line, names, row) for line, row in rows[1:]]).reshape(
-        -1, len(names)
-    )
+    for line, row in rows[1:]:
+        if problem := _problem(names, row):
+            raise DescriptionError(path, f"line {line}{problem}")
+    values = np.array([row for _, row in rows[1:]], dtype=np.float64)
+    return tuple(names), values.reshape(-1, len(names))
 
 
-def _row(path: Path, line: int, names: list[str], row: list[str]) -> list[float]:
+def _problem(names: list[str], row: list[str]) -> str | None:
+    """What is wrong with a line, to follow its number."""
     if len(row) != len(names):
-        raise DescriptionError(
-            path, f"line {line} has {len(row)} fields, but the header names {len(names)} columns"
-        )
-    values = []
+        return f" has {len(row)} fields, but the header names {len(names)} columns"
     for name, field in zip(names, row, strict=True):
-        value, place = _number(field), f"line {line}, column '{name}'"
+        value = _number(field)
         if field == "":
-            raise DescriptionError(path, f"{place} is empty; fill it in, or leave the whole line out")
+            return f", column '{name}' is empty; fill it in, or leave the whole line out"
         if value is None:
-            raise DescriptionError(
-                path, f"{place}: '{field}' is no number; leave the column out or encode it"
-            )
+            return f", column '{name}': '{field}' is no number; leave the column out or encode it"
         if not np.isfinite(value):
-            raise DescriptionError(path, f"{place}: '{field}' is not finite")
-        values.append(value)
-    return values
+            return f", column '{name}': '{field}' is not finite"
+    return None
 
 
 def _number(field: str) -> float | None:

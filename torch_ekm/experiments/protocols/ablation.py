@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
-from ...simulation import PlantParameters
+from ...simulation import PRESETS
 from ..config import Setting, object_name
-from ..learners import LEARNERS
+from ..learners import HAND_LEARNERS
 from ..records import Record
 from ..reporting.report import Cell, Column, Report, Table
 from ..reporting.statistics import estimate, rate, steady_state_error
@@ -58,11 +58,14 @@ def variants(base: Setting) -> list[Variant]:
     found = [Variant("learner", _BASE)]
     found += [
         Variant("learner", name, {"learner": name, "learner_options": {}}, ("E-KM",))
-        for name in LEARNERS
+        for name in HAND_LEARNERS
         if name != base.learner
     ]
     found.append(Variant("online learning", _BASE))
-    for name, option in (("no robust update", {"robust": None}), ("no forgetting", {"forgetting": 1.0})):
+    for name, option in (
+        ("no robust update", {"robust": None}),
+        ("no forgetting", {"forgetting_factor": 1.0}),
+    ):
         options = {**base.learner_options, **option}
         found.append(Variant("online learning", name, {"learner_options": options}, ("E-KM",)))
     for capacity in (15, 30, 120):
@@ -77,20 +80,24 @@ def variants(base: Setting) -> list[Variant]:
         found.append(Variant("model", name, {"model": {**base.model, **option}}))
     found.append(Variant("controller", _BASE))
     for name, option, who in (
-        ("gain 1 near the goal", {"focus_gain": 1.0}, _ALL),
-        ("gain 0.6 near the goal", {"focus_gain": 0.6}, _ALL),
-        ("steps of 1.5 deg", {"focus_step": 1.5 * _DEG}, _ALL),
-        ("steps of 6 deg, 2 mm", {"focus_step": 6 * _DEG, "contact_step": 2e-3}, _ALL),
-        ("actuators cut at 6 deg", {"actuator_step": 6 * _DEG}, _ALL),
-        ("uncertainty in the cost", {"uncertainty_weight": 1.0}, ("E-KM",)),
-        ("rows for the friction margin", {"margin_min": 0.5}, _ALL),
+        ("gain 1 near the goal", {"LimitingFunction.gain": 1.0}, _ALL),
+        ("gain 0.6 near the goal", {"LimitingFunction.gain": 0.6}, _ALL),
+        ("steps of 1.5 deg", {"LimitingFunction.step": 1.5 * _DEG}, _ALL),
+        (
+            "steps of 6 deg, 2 mm",
+            {"LimitingFunction.step": 6 * _DEG, "LimitingFunction.contact_travel": 2e-3},
+            _ALL,
+        ),
+        ("actuators cut at 6 deg", {"ActuatorLimit.step": 6 * _DEG, "JointLimit.horizon": 6 * _DEG}, _ALL),
+        ("uncertainty in the cost", {"UncertaintyTask.weight": 1.0}, ("E-KM",)),
+        ("rows for the friction margin", {"FrictionMarginLimit.minimum": 0.5}, _ALL),
     ):
         found.append(Variant("controller", name, {"control": {**base.control, **option}}, who))
     found.append(Variant("preset", f"{base.preset}: {_BASE}"))
-    for preset in ("none", "nominal", "worn", "hostile"):
+    for preset in PRESETS:
         if preset != base.preset:
             found.append(Variant("preset", preset, {"preset": preset}, _ALL))
-    nominal = dataclasses.asdict(PlantParameters.nominal_mismatch())
+    nominal = dataclasses.asdict(PRESETS["nominal"])
     for name, fields in DISTURBANCES.items():
         plant = {key: nominal[key] for key in fields}
         changes = {"preset": "none", "plant": plant}

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from ...description import load_hand, load_object
-from ...rendering.scene import make_scene, save_animation, save_picture
+from ...rendering import make_scene, save_animation, save_picture
 from ..config import Setting
 from ..records import Record, TrialRecord
 from ..reporting.plots import plot_convergence, plot_prediction_error, save_figure
@@ -132,8 +132,7 @@ class Demo(Protocol):
         turn = max(turns, key=lambda r: (r.reason == "reached", r.angle_deg, -r.true_error_deg))
         q, position, rotation = (np.array(part) for part in zip(*turn.poses, strict=True))
         hand, obj = load_hand(self.setting.hand), load_object(self.object)
-        gravity = np.array(self.setting.plant_config("E-KM").gravity)
-        scene = make_scene(hand, obj, q, position, rotation, gravity)
+        scene = make_scene(hand, obj, q, position, rotation, np.array(hand.gravity))
         save_picture(scene, folder / "hand.png", frames=(0, -1))
         save_animation(scene, folder / "animation.html")
         what = f"a turn of {turn.angle_deg:g} deg (seed {turn.seed})"

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ...description import load_hand
 from ...exceptions import EKMError, ParameterError
 from ...plant import RecordingPlant, TrialLog
 from ..config import Setting
@@ -43,7 +44,8 @@ class RecordConfig:
         figures = dataclasses.asdict(self)
         plant = self.setting.plant_config(self.controller)
         parameters = dataclasses.asdict(self.setting.parameters())
-        return {"hand": self.setting.hand, "gravity": plant.gravity, "parameters": parameters, **figures}
+        gravity = plant.gravity or load_hand(self.setting.hand).gravity
+        return {"hand": self.setting.hand, "gravity": gravity, "parameters": parameters, **figures}
 
 
 def record(
@@ -93,4 +95,4 @@ def _turn(bench: Bench, log: TrialLog, seed: int, trial: int, angle: float) -> N
         outcome = {"reason": type(error).__name__, "message": str(error)}
     outcome.pop("seconds", None)  # of the wall: equal runs are to give equal logs
     if trial not in log:
-        log.write(trial, bench.plant.recording, outcome)
+        log.write(trial, bench.plant.trajectory, outcome)

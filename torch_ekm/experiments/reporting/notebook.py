@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ...exceptions import DescriptionError, MissingExtraError
-from ...rendering.scene import Scene, save_animation, save_picture
+from ...rendering import Scene, save_animation, save_picture
 from .report import Table
 
 
@@ -27,7 +27,7 @@ class HandView:
     """A scene as the last line of a notebook cell: to turn and zoom where that works, a picture elsewhere.
 
     Args:
-        scene: see :func:`~torch_ekm.rendering.scene.make_scene`.
+        scene: see :func:`~torch_ekm.rendering.make_scene`.
         frames: of the picture, side by side.
         interactive: also offer the page with all frames (viser). Without viser: the picture only.
         height: of the page [pixels].

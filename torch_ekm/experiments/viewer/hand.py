@@ -13,7 +13,7 @@ from ...description import HandDescription, load_hand
 from ...kinematics import ActuationMap
 from ...plant import PlantStatus
 from ...rendering.scene import Scene, make_scene
-from ...simulation import PlantConfig, PlantParameters, SimulatedHand
+from ...simulation import PlantConfig, SimulatedHand
 
 Array = NDArray[np.float64]
 
@@ -73,7 +73,7 @@ class HandShow:
 
     def _scene(self, a: Array) -> Scene:
         q = self._map.joints(torch.from_numpy(a)).numpy().clip(self.hand.joint_lower, self.hand.joint_upper)
-        return make_scene(self.hand, None, q, None, None, np.array(PlantConfig().gravity))
+        return make_scene(self.hand, None, q, None, None, np.array(self.hand.gravity))
 
 
 class GraspShow:
@@ -83,21 +83,18 @@ class GraspShow:
         hand: name or path.
         object: name or path.
         seed: which grasp.
-        parameters: what the plant really is; exact by default.
 
     Raises:
         EquilibriumError, GraspError: the object cannot be pinched by this hand.
     """
 
-    def __init__(
-        self, hand: str, object: str, seed: int = 0, parameters: PlantParameters | None = None
-    ) -> None:
+    def __init__(self, hand: str, object: str, seed: int = 0) -> None:
         normal = load_hand(hand).planar_normal
         config = PlantConfig()
         if normal is not None:  # in the plane of a planar hand, since nothing bears its object off it
             x, y, z = (9.81 * _in_plane(np.array(normal))).tolist()
             config = PlantConfig(gravity=(x, y, z))
-        self.plant = SimulatedHand(hand, object, config, parameters)
+        self.plant = SimulatedHand(hand, object, config)
         self._seed = seed
         self._seen = self.plant.reset(seed)
         self._start = self._seen.a.numpy()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...description import list_hands, load_hand
 from ...exceptions import DescriptionError, ParameterError, UnknownNameError
-from ...rendering.scene import Scene, draw, place, save_animation, start_server
+from ...rendering import Scene, draw, place, save_animation, start_server
 from .hand import GraspShow, HandShow
 from .trial import LogShow
 
@@ -38,14 +38,13 @@ class Show(Protocol):
         ...
 
 
-def choose_show(what: str, object: str | None = None, seed: int = 0, trial: int | None = None) -> Show:
+def choose_show(what: str, object: str | None = None, seed: int = 0) -> Show:
     """What there is to show under a name.
 
     Args:
         what: a hand's name or URDF, a log's folder, or one trial's file.
         object: an object's name or URDF for the hand to hold.
         seed: which grasp.
-        trial: of a log.
 
     Raises:
         UnknownNameError: no such hand, and no log of that name; the message lists the hands.
@@ -58,7 +57,7 @@ def choose_show(what: str, object: str | None = None, seed: int = 0, trial: int 
             raise UnknownNameError("hand or log", what, (*list_hands(), "a URDF file", "a log's folder"))
         if object is not None:
             raise ParameterError("object", object, "left out with a log, which knows its own")
-        return LogShow(path, trial)
+        return LogShow(path)
     return HandShow(load_hand(what)) if object is None else GraspShow(what, object, seed)
 
 

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from ...description import HandDescription, ObjectDescription, load_hand, load_object
 from ...exceptions import DescriptionError, EKMError
 from ...kinematics.se3 import log as rotation_vector
-from ...plant import Recording, TrialLog
-from ...rendering.scene import Scene, make_scene
-from ...simulation import PlantConfig
+from ...plant import Trajectory, TrialLog
+from ...rendering import Scene, make_scene
 
 Array = NDArray[np.float64]
 
@@ -53,12 +52,12 @@ class LogShow:
 
     def open(self, trial: int | None) -> None:
         """Show another trial, from its start."""
-        recording = Recording.load(self.path) if self.log is None or trial is None else self.log.read(trial)
+        trajectory = Trajectory.load(self.path) if self.log is None or trial is None else self.log.read(trial)
         source = self.path if self.log is None or trial is None else self.log.path(trial)
-        if not recording.observations:
-            reason = recording.about.get("outcome", {}).get("reason", "it holds no observation")
+        if not trajectory.observations:
+            reason = trajectory.about.get("outcome", {}).get("reason", "it holds no observation")
             raise DescriptionError(source, f"there is nothing to show: {reason}")
-        configuration = recording.about.get("configuration", {})
+        configuration = trajectory.about.get("configuration", {})
         for name in ("hand", "object"):
             if not isinstance(configuration.get(name), str):
                 raise DescriptionError(
@@ -66,10 +65,10 @@ class LogShow:
                 )
         if self._bodies is None:
             self._bodies = load_hand(configuration["hand"]), load_object(configuration["object"])
-        gravity = configuration.get("gravity", PlantConfig().gravity)
-        self.recording, self._frame = recording, 0
-        self.trial = recording.about.get("trial", trial)
-        self._scene = self._drawn(recording, np.array(gravity, dtype=np.float64))
+        gravity = configuration.get("gravity", self._bodies[0].gravity)
+        self.trajectory, self._frame = trajectory, 0
+        self.trial = trajectory.about.get("trial", trial)
+        self._scene = self._drawn(trajectory, np.array(gravity, dtype=np.float64))
 
     def scene(self) -> Scene:
         """A frame for each observation."""
@@ -106,13 +105,13 @@ class LogShow:
 
     @property
     def _last(self) -> int:
-        return len(self.recording.observations) - 1
+        return len(self.trajectory.observations) - 1
 
-    def _drawn(self, recording: Recording, gravity: Array) -> Scene:
+    def _drawn(self, trajectory: Trajectory, gravity: Array) -> Scene:
         assert self._bodies is not None
         hand, obj = self._bodies
         states = []
-        for seen in recording.observations:
+        for seen in trajectory.observations:
             state = seen.state if self.estimates or seen.truth is None else seen.truth.state
             states.append([state.q, state.position, state.rotation])
         q, position, rotation = (torch.stack(part).numpy() for part in zip(*states, strict=True))
@@ -123,18 +122,18 @@ class LogShow:
 
     def _words(self, frame: int) -> str:
         """What is known of one moment."""
-        first, seen = self.recording.observations[0], self.recording.observations[frame]
+        first, seen = self.trajectory.observations[0], self.trajectory.observations[frame]
         turned = math.degrees(float(rotation_vector(seen.rotation @ first.rotation.mT).norm()))
         lines = [f"{seen.time:.2f} s, **{seen.status.value}**, turned by {turned:.1f} deg"]
         if seen.truth is not None:
             wrong = math.degrees(float(rotation_vector(seen.rotation @ seen.truth.rotation.mT).norm()))
             lines.append(f"measured rotation wrong by {wrong:.2f} deg")
         if frame:
-            moved = self.recording.commands[frame - 1].rad2deg().tolist()
+            moved = self.trajectory.commands[frame - 1].rad2deg().tolist()
             names = self._bodies[0].actuator_names if self._bodies else ()
             told = [f"{n} {v:+.1f}" for n, v in zip(names, moved, strict=False) if abs(v) >= 0.05]
             lines.append("commanded [deg]: " + (", ".join(told) or "nothing"))
         lines += [f"event: {event}" for event in seen.info.get("events", ())]
-        if frame == self._last and (reason := self.recording.about.get("outcome", {}).get("reason")):
+        if frame == self._last and (reason := self.trajectory.about.get("outcome", {}).get("reason")):
             lines.append(f"ended: {reason}")
         return "\n\n".join(lines)

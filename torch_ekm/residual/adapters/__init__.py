@@ -1,1 +1,1 @@
-""""""
+"""Other libraries' regressors as learners."""

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import io
-import pickle
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch.distributions import Normal
 
 from ..._extras import require
 from ...typing import Tensor
-from ..base import UpdateReport, check_count, check_positive
-from .adapter import Adapter
+from ..checks import check_count, check_positive
+from ..report import UpdateReport
+from .rebuilt import Rebuilt
 
 
-class GPyTorchSVGP(Adapter):
+class GPyTorchSVGP(Rebuilt):
     """GPyTorch's variational GP on inducing points, ``steps`` Adam steps on each sample and a replay.
 
     Independent outputs share inducing points that start as the first distinct samples. The bound's data
@@ -28,6 +28,7 @@ class GPyTorchSVGP(Adapter):
         options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
+    _options: ClassVar[tuple[str, ...]] = ("inducing", "rate", "minibatch", "memory", "steps", "seed")
     inputs: Tensor
     targets: Tensor
     _model: Any
@@ -48,7 +49,6 @@ class GPyTorchSVGP(Adapter):
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        self._check_single()
         require("gpytorch")
         self.inducing, self.seed = check_count("inducing", inducing), int(seed)
         self.rate, self.steps = check_positive("rate", rate), check_count("steps", steps)
@@ -120,25 +120,24 @@ class GPyTorchSVGP(Adapter):
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         law = self.predict(x, observation=True)
-        surprise = ((y - law.mean) / law.stddev).square().mean(-1)
-        if mask is None or bool(mask):
-            n = self._count
-            self.inputs[n % self.memory], self.targets[n % self.memory] = x, y
-            self._count += 1
-            gpytorch = require("gpytorch")
-            objective = gpytorch.mlls.VariationalELBO(self._likelihood, self._model, num_data=self._count)
-            generator = torch.Generator().manual_seed(self.seed * 1_000_003 + n)
-            self._model.train()
-            for _ in range(self.steps):
-                index = torch.randint(min(n + 1, self.memory), (self.minibatch,), generator=generator)
-                index[0] = n % self.memory
-                with torch.enable_grad():
-                    self._optimizer.zero_grad()
-                    loss = -objective(self._model(self.inputs[index]), self.targets[index])
-                    loss.backward()
-                self._optimizer.step()
-            self._model.eval()
-        return self._report(surprise, mask)
+        nis = ((y - law.mean) / law.stddev).square().mean(-1)
+        n = self._count
+        self.inputs[n % self.memory], self.targets[n % self.memory] = x, y
+        self._count += 1
+        gpytorch = require("gpytorch")
+        objective = gpytorch.mlls.VariationalELBO(self._likelihood, self._model, num_data=self._count)
+        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + n)
+        self._model.train()
+        for _ in range(self.steps):
+            index = torch.randint(min(n + 1, self.memory), (self.minibatch,), generator=generator)
+            index[0] = n % self.memory
+            with torch.enable_grad():
+                self._optimizer.zero_grad()
+                loss = -objective(self._model(self.inputs[index]), self.targets[index])
+                loss.backward()
+            self._optimizer.step()
+        self._model.eval()
+        return self._absorbed(nis)
 
     def get_extra_state(self) -> Tensor:
         """State dicts of model, likelihood and optimiser."""
@@ -157,17 +156,6 @@ class GPyTorchSVGP(Adapter):
         ):
             part.load_state_dict(values)
 
-    def __deepcopy__(self, memo: dict) -> GPyTorchSVGP:
-        return pickle.loads(pickle.dumps(self))
-
-    def __reduce__(self):
-        options = {
-            name: getattr(self, name)
-            for name in ("inducing", "rate", "minibatch", "memory", "steps", "seed", "on_invalid")
-        }
-        arguments = (self.in_features, self.out_features, {**options, "dtype": self.dtype}, self.state_dict())
-        return _restore_svgp, arguments
-
     def _apply(self, fn, recurse=True):
         super()._apply(fn, recurse)
         if "_model" in self.__dict__:
@@ -175,9 +163,3 @@ class GPyTorchSVGP(Adapter):
             self._likelihood._apply(fn, recurse)
             self._optimizer.load_state_dict(self._optimizer.state_dict())  # casts its averages
         return self
-
-
-def _restore_svgp(in_features: int, out_features: int, options: dict, state: dict) -> GPyTorchSVGP:
-    learner = GPyTorchSVGP(in_features, out_features, **options)
-    learner.load_state_dict(state)
-    return learner

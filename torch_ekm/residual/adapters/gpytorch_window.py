@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import pickle
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch.distributions import Normal
 
 from ..._extras import require
 from ...typing import Tensor
-from ..base import UpdateReport, check_count, check_positive
-from .adapter import Adapter
+from ..checks import check_count, check_positive
+from ..report import UpdateReport
+from .rebuilt import Rebuilt
 
 
-class GPyTorchWindow(Adapter):
+class GPyTorchWindow(Rebuilt):
     """An exact GP of GPyTorch on the last ``window`` samples, its hyperparameters refitted now and then.
 
     Outputs share kernel and noise. Every ``refit_every`` samples ``steps`` Adam steps climb the marginal
@@ -27,6 +27,7 @@ class GPyTorchWindow(Adapter):
         options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
+    _options: ClassVar[tuple[str, ...]] = ("window", "refit_every", "steps", "rate", "noise_variance")
     inputs: Tensor
     targets: Tensor
     _model: Any
@@ -45,7 +46,6 @@ class GPyTorchWindow(Adapter):
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        self._check_single()
         require("gpytorch")
         self.window, self.steps = check_count("window", window), check_count("steps", steps)
         self.refit_every = check_count("refit_every", refit_every)
@@ -117,15 +117,14 @@ class GPyTorchWindow(Adapter):
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         law = self.predict(x, observation=True)
-        surprise = ((y - law.mean) / law.stddev).square().mean(-1)
-        if mask is None or bool(mask):
-            place = self._count % self.window
-            self.inputs[place], self.targets[place] = x, y
-            self._count += 1
-            self._condition()
-            if self._count % self.refit_every == 0:
-                self._refit()
-        return self._report(surprise, mask)
+        nis = ((y - law.mean) / law.stddev).square().mean(-1)
+        place = self._count % self.window
+        self.inputs[place], self.targets[place] = x, y
+        self._count += 1
+        self._condition()
+        if self._count % self.refit_every == 0:
+            self._refit()
+        return self._absorbed(nis)
 
     def _refit(self) -> None:
         gpytorch = require("gpytorch")
@@ -158,23 +157,9 @@ class GPyTorchWindow(Adapter):
         self._condition()
         return result
 
-    def __deepcopy__(self, memo: dict) -> GPyTorchWindow:
-        return pickle.loads(pickle.dumps(self))
-
-    def __reduce__(self):
-        names = ("window", "refit_every", "steps", "rate", "noise_variance", "on_invalid")
-        options = {**{name: getattr(self, name) for name in names}, "dtype": self.dtype}
-        return _restore_window, (self.in_features, self.out_features, options, self.state_dict())
-
     def _apply(self, fn, recurse=True):
         super()._apply(fn, recurse)
         if "_model" in self.__dict__:
             self._model._apply(fn)
             self._condition()
         return self
-
-
-def _restore_window(in_features: int, out_features: int, options: dict, state: dict) -> GPyTorchWindow:
-    learner = GPyTorchWindow(in_features, out_features, **options)
-    learner.load_state_dict(state)
-    return learner

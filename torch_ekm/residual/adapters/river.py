@@ -10,11 +10,12 @@ from torch.distributions import Normal
 
 from ..._extras import require
 from ...typing import Tensor
-from ..base import UpdateReport, check_positive
-from .adapter import Adapter
+from ..base import SingleLearner
+from ..checks import check_positive
+from ..report import UpdateReport
 
 
-class RiverResidual(Adapter):
+class RiverResidual(SingleLearner):
     """Any river regressor, one copy per output; the variance is that of recent innovations.
 
     The mean is 0 before the first sample. River predicts on dictionaries of Python floats: it is not
@@ -39,7 +40,6 @@ class RiverResidual(Adapter):
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        self._check_single()
         require("river")
         if model is None:
             model = require("river.forest").ARFRegressor(seed=0)
@@ -81,13 +81,12 @@ class RiverResidual(Adapter):
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         error = (y - self(x)).square()
-        if mask is None or bool(mask):
-            row = dict(enumerate(x.tolist()))
-            for model, target in zip(self._models, y.tolist(), strict=True):
-                model.learn_one(row, target)
-            self.noise.lerp_(error, max(0.02, 1.0 / (self._count + 2)))
-            self._count += 1
-        return self._report((error / self.noise).mean(-1), mask)
+        row = dict(enumerate(x.tolist()))
+        for model, target in zip(self._models, y.tolist(), strict=True):
+            model.learn_one(row, target)
+        self.noise.lerp_(error, max(0.02, 1.0 / (self._count + 2)))
+        self._count += 1
+        return self._absorbed((error / self.noise).mean(-1))
 
     def get_extra_state(self) -> Tensor:
         """The pickled regressors."""

@@ -7,14 +7,15 @@ from typing import Any
 import torch
 from torch.distributions import Normal
 
-from ...exceptions import ParameterError
 from ...typing import Tensor
-from ..base import UpdateEvent, UpdateReport, check_count, check_positive
-from ..double_state import DoubleStateLearner
-from ..kernels.kernel import Kernel, SquaredExponential
+from ..base import DoubleStateLearner, SingleLearner
+from ..checks import check_count, check_factor, check_positive
+from ..kernels.kernel import Kernel
+from ..kernels.stationary import SquaredExponential
+from ..report import UpdateEvent, UpdateReport
 
 
-class KRLSTracker(DoubleStateLearner):
+class KRLSTracker(SingleLearner, DoubleStateLearner):
     """Posterior of f at the basis, ``N(mu, Sigma)``, forgotten back to the prior at every step::
 
         Sigma <- lam Sigma + (1 - lam) K,   mu <- sqrt(lam) mu
@@ -27,7 +28,7 @@ class KRLSTracker(DoubleStateLearner):
         capacity: largest number of basis points.
         kernel: default squared exponential with lengthscale sqrt(in_features).
         noise_variance: s2.
-        forgetting: lam in (0, 1].
+        forgetting_factor: lam in (0, 1].
         jitter: nugget relative to k**, also the tolerance below which a sample is not novel.
         options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
@@ -46,17 +47,15 @@ class KRLSTracker(DoubleStateLearner):
         capacity: int = 100,
         kernel: Kernel | None = None,
         noise_variance: float = 0.01,
-        forgetting: float = 1.0,
+        forgetting_factor: float = 1.0,
         jitter: float = 1e-6,
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        self._check_single()
-        if not 0 < forgetting <= 1:
-            raise ParameterError("forgetting", forgetting, "in (0, 1]")
         self.capacity = check_count("capacity", capacity)
         self.noise_variance = check_positive("noise_variance", noise_variance)
-        self.forgetting, self.jitter = float(forgetting), check_positive("jitter", jitter)
+        self.forgetting_factor = check_factor("forgetting_factor", forgetting_factor)
+        self.jitter = check_positive("jitter", jitter)
         factory = {"dtype": torch.float64, "device": self.device}
         self.kernel = SquaredExponential(in_features, **factory) if kernel is None else kernel.double()
         M = self.capacity + 1
@@ -83,15 +82,11 @@ class KRLSTracker(DoubleStateLearner):
 
     def reset(self) -> None:
         """Empty basis."""
-        for name, buffer in self.named_buffers(recurse=False):
-            if name != "_like":
-                buffer.zero_()
+        for buffer in self.buffers(recurse=False):
+            buffer.zero_()
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        x, y, lam = x.double(), y.double(), self.forgetting
-        if mask is not None and not bool(mask):
-            one = torch.ones_like(y[0])
-            return UpdateReport(torch.zeros_like(mask, dtype=torch.int64), 0 * one, torch.nan * one, one)
+        x, y, lam = x.double(), y.double(), self.forgetting_factor
         if lam < 1.0:
             on = self.active.double()
             K = self.kernel(self.basis, self.basis) * on[:, None] * on
@@ -106,7 +101,7 @@ class KRLSTracker(DoubleStateLearner):
         variance = gamma + e @ Se
         innovation = y - e @ self.mu
         D = self.noise_variance + variance
-        surprise = innovation.square().mean() / D
+        nis = innovation.square().mean() / D
 
         # always take the point in, at the free slot; then prune if it was not novel or one is too much
         new = int((~self.active).to(torch.uint8).argmax())
@@ -126,7 +121,7 @@ class KRLSTracker(DoubleStateLearner):
             self._prune(None if novel else new)
         event = UpdateEvent.ABSORBED if not novel else UpdateEvent.REPLACED if full else UpdateEvent.ADDED
         return UpdateReport(
-            torch.tensor(int(event), device=self.device), gamma / prior, surprise, torch.ones_like(gamma)
+            torch.tensor(int(event), device=self.device), gamma / prior, nis, torch.ones_like(gamma)
         )
 
     def _prune(self, i: int | None) -> None:

@@ -9,10 +9,11 @@ from typing import Any
 import torch
 from torch.distributions import Normal
 
-from ...exceptions import ParameterError
 from ...typing import Float, Tensor
-from ..base import ResidualLearner, UpdateEvent, UpdateReport, check_count, check_positive
+from ..base import ResidualLearner
+from ..checks import check_count, check_factor, check_positive
 from ..kernels.kernel import log_parameter
+from ..report import UpdateEvent, UpdateReport
 
 
 class LinearInFeatures(ResidualLearner):
@@ -27,7 +28,8 @@ class LinearInFeatures(ResidualLearner):
     Args:
         n_phi: number of features f.
         noise_variance, weight_variance: s2 and v.
-        forgetting, refresh_every: as in SparseOnlineGP.
+        forgetting_factor: lam in (0, 1], see ForgettingFactor.
+        refresh_every: samples between two rebuilds.
         robust: c of the weight ``1 / (1 + z2/c^2)`` on a sample's noise; None: weight 1.
         options: see ResidualLearner.
     """
@@ -46,7 +48,7 @@ class LinearInFeatures(ResidualLearner):
         *,
         noise_variance: float = 0.01,
         weight_variance: float = 1.0,
-        forgetting: float = 1.0,
+        forgetting_factor: float = 1.0,
         robust: float | None = None,
         refresh_every: int = 16,
         **options: Any,
@@ -54,9 +56,7 @@ class LinearInFeatures(ResidualLearner):
         super().__init__(in_features, out_features, **options)
         self.noise_variance = check_positive("noise_variance", noise_variance)
         self.weight_variance = check_positive("weight_variance", weight_variance)
-        if not 0 < forgetting <= 1:
-            raise ParameterError("forgetting", forgetting, "in (0, 1]")
-        self.forgetting = float(forgetting)
+        self.forgetting_factor = check_factor("forgetting_factor", forgetting_factor)
         self.robust = None if robust is None else check_positive("robust", robust)
         self.refresh_every = check_count("refresh_every", refresh_every)
         f, zeros = n_phi, self._like.new_zeros
@@ -98,10 +98,10 @@ class LinearInFeatures(ResidualLearner):
         Pphi = self.covariance @ column
         v = (column.mT @ Pphi).squeeze(-1).squeeze(-1)
         innovation = y - (column.mT @ self.weights).squeeze(-2)
-        surprise = innovation.square().mean(-1) / (s2 + v)
+        nis = innovation.square().mean(-1) / (s2 + v)
         weight = torch.ones_like(v)
         if self.robust is not None:
-            weight = 1.0 / (1.0 + surprise / self.robust**2)
+            weight = 1.0 / (1.0 + nis / self.robust**2)
         gain, share = 1.0 / (s2 / weight + v), weight
         if mask is not None:
             gain, share = gain * mask, share * mask
@@ -115,12 +115,12 @@ class LinearInFeatures(ResidualLearner):
         if self._n_samples % self.refresh_every == 0:
             self._rebuild()
         event = torch.full_like(v, UpdateEvent.ABSORBED, dtype=torch.int64)
-        return UpdateReport(event if mask is None else event * mask, 0.0 * v, surprise, weight)
+        return UpdateReport(event if mask is None else event * mask, 0.0 * v, nis, weight)
 
     def _rebuild(self) -> None:
         """Forget what is due; (P, w) from (A, b) by Cholesky in double precision."""
-        if self.forgetting < 1.0:
-            factor = (self.forgetting**self.pending)[..., None, None]
+        if self.forgetting_factor < 1.0:
+            factor = (self.forgetting_factor**self.pending)[..., None, None]
             self.information.mul_(factor)
             self.target.mul_(factor)
         self.pending.zero_()

@@ -9,11 +9,14 @@ from torch.distributions import Normal
 
 from ...exceptions import ParameterError
 from ...typing import Tensor
-from ..base import ResidualLearner, UpdateEvent, UpdateReport, check_count, check_positive
-from ..kernels.kernel import Kernel, SquaredExponential
+from ..base import SingleLearner
+from ..checks import check_count, check_positive
+from ..kernels.kernel import Kernel
+from ..kernels.stationary import SquaredExponential
+from ..report import UpdateEvent, UpdateReport
 
 
-class LocalGPs(ResidualLearner):
+class LocalGPs(SingleLearner):
     """Experts with centres ``c_e`` and windows of their own; the nearest few are averaged::
 
         mean = sum_e w_e mean_e / sum_e w_e,   w_e = k(x, c_e)
@@ -53,7 +56,6 @@ class LocalGPs(ResidualLearner):
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        self._check_single()
         E, n = check_count("experts", experts), check_count("window", window)
         self.experts, self.window = E, n
         self.neighbours = min(check_count("neighbours", neighbours), E)
@@ -82,9 +84,8 @@ class LocalGPs(ResidualLearner):
 
     def reset(self) -> None:
         """No experts."""
-        for name, buffer in self.named_buffers(recurse=False):
-            if name != "_like":
-                buffer.zero_()
+        for buffer in self.buffers(recurse=False):
+            buffer.zero_()
 
     def _mixture(self, x: Tensor) -> tuple[Tensor, Tensor]:
         near = self.kernel(x.unsqueeze(-2), self.centres).squeeze(-2) * (self.count > 0)
@@ -106,10 +107,8 @@ class LocalGPs(ResidualLearner):
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         mean, v = self._mixture(x)
         v = v + self.noise_variance
-        surprise = ((y - mean).square() / v).mean(-1)
-        one = torch.ones_like(surprise)
-        if mask is not None and not bool(mask):
-            return UpdateReport(torch.zeros_like(mask, dtype=torch.int64), 0 * one, surprise, one)
+        nis = ((y - mean).square() / v).mean(-1)
+        one = torch.ones_like(nis)
         used = int((self.count > 0).sum())
         prior = self.kernel.diagonal(x)
         near = self.kernel.vector(x, self.centres) * (self.count > 0)
@@ -128,4 +127,4 @@ class LocalGPs(ResidualLearner):
         self.inverse[e, :n, :n] = inverse.to(x.dtype)
         self.solution[e, :n] = (inverse.mT @ (inverse @ self.targets[e, :n].double())).to(x.dtype)
         event = torch.tensor(int(UpdateEvent.ADDED if opened else UpdateEvent.ABSORBED), device=self.device)
-        return UpdateReport(event, 1.0 - near[e] / prior if not opened else one, surprise, one)
+        return UpdateReport(event, 1.0 - near[e] / prior if not opened else one, nis, one)

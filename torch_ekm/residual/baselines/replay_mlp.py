@@ -11,10 +11,13 @@ from torch import nn
 from torch.distributions import Normal
 
 from ...typing import Tensor
-from ..base import ResidualLearner, UpdateEvent, UpdateReport, check_count, check_counts, check_positive
+from ..adam import Adam
+from ..base import SingleLearner
+from ..checks import check_count, check_counts, check_positive
+from ..report import UpdateReport
 
 
-class ReplayMLP(ResidualLearner):
+class ReplayMLP(SingleLearner):
     """``g(x) = mean_i (net_i(x; theta_i) - net_i(x; theta_i0))``: exactly 0 before the first sample.
 
     Each sample brings ``steps`` Adam steps on itself and a minibatch from the last ``memory`` ones.
@@ -53,7 +56,6 @@ class ReplayMLP(ResidualLearner):
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        self._check_single()
         self.members, self.memory = check_count("members", members), check_count("memory", memory)
         self.minibatch, self.steps = check_count("minibatch", minibatch), check_count("steps", steps)
         self.rate, self.seed = check_positive("rate", rate), int(seed)
@@ -70,8 +72,8 @@ class ReplayMLP(ResidualLearner):
             self.theta.append(nn.Parameter(zeros(self.members, n_in, n_out), requires_grad=False))
             self.theta.append(nn.Parameter(zeros(self.members, 1, n_out), requires_grad=False))
         for i, p in enumerate(self.theta):
-            for kind in ("start", "first", "second"):
-                self.register_buffer(f"{kind}_{i}", torch.zeros_like(p))
+            self.register_buffer(f"start_{i}", torch.zeros_like(p))
+        self.adam = Adam(self.theta)
         self.reset()
 
     def forward(self, x: Tensor) -> Tensor:
@@ -93,9 +95,8 @@ class ReplayMLP(ResidualLearner):
 
     def reset(self) -> None:
         """New weights from the seed, empty memory."""
-        for name, buffer in self.named_buffers(recurse=False):
-            if name != "_like":
-                buffer.zero_()
+        for buffer in self.buffers():
+            buffer.zero_()
         generator = torch.Generator().manual_seed(self.seed)
         for i, p in enumerate(self.theta):
             if i % 2 == 0:
@@ -119,10 +120,7 @@ class ReplayMLP(ResidualLearner):
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         law = self.predict(x, observation=True)
-        surprise = ((y - law.mean) / law.stddev).square().mean(-1)
-        one = torch.ones_like(surprise)
-        if mask is not None and not bool(mask):
-            return UpdateReport(torch.zeros_like(mask, dtype=torch.int64), 0 * one, surprise, one)
+        nis = ((y - law.mean) / law.stddev).square().mean(-1)
         n = int(self.count)
         self.noise.lerp_((y - law.mean).square(), max(0.02, 1.0 / (n + 2)))
         self.inputs[n % self.memory], self.targets[n % self.memory] = x, y
@@ -140,14 +138,7 @@ class ReplayMLP(ResidualLearner):
                 theta = [p.detach().requires_grad_(True) for p in self.theta]
                 loss = (self._net(bx, theta) - by).square().sum((0, 2)).mean()
                 gradients = torch.autograd.grad(loss, theta)
-            self._adam(gradients, n * self.steps + step + 1)
-        event = torch.tensor(int(UpdateEvent.ABSORBED), device=self.device)
-        return UpdateReport(event, 0 * one, surprise, one)
-
-    def _adam(self, gradients: Sequence[Tensor], t: int) -> None:
-        scale = self.rate * (1 - 0.999**t) ** 0.5 / (1 - 0.9**t)
-        for i, (p, g) in enumerate(zip(self.theta, gradients, strict=True)):
-            first, second = self.get_buffer(f"first_{i}"), self.get_buffer(f"second_{i}")
-            first.lerp_(g, 0.1)
-            second.mul_(0.999).addcmul_(g, g, value=0.001)
-            p.data.addcdiv_(first, second.sqrt().add_(1e-8), value=-scale)
+            rate = self.rate * self.adam.correction(n * self.steps + step + 1)
+            for i, (p, gradient) in enumerate(zip(self.theta, gradients, strict=True)):
+                self.adam.move(i, p, gradient, rate)
+        return self._absorbed(nis)

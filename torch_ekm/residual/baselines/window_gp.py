@@ -8,8 +8,11 @@ import torch
 from torch.distributions import Normal
 
 from ...typing import Tensor
-from ..base import ResidualLearner, UpdateEvent, UpdateReport, check_count, check_positive
-from ..kernels.kernel import Kernel, SquaredExponential
+from ..base import ResidualLearner
+from ..checks import check_count, check_positive
+from ..kernels.kernel import Kernel
+from ..kernels.stationary import SquaredExponential
+from ..report import UpdateEvent, UpdateReport
 
 
 class WindowGP(ResidualLearner):
@@ -78,16 +81,15 @@ class WindowGP(ResidualLearner):
 
     def reset(self) -> None:
         """Empty the window."""
-        for name, buffer in self.named_buffers(recurse=False):
-            if name != "_like":
-                buffer.zero_()
+        for buffer in self.buffers(recurse=False):
+            buffer.zero_()
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         law = self.predict(x, observation=True)
-        surprise = ((y - law.mean) / law.stddev).square().mean(-1)
-        weight = torch.ones_like(surprise)
+        nis = ((y - law.mean) / law.stddev).square().mean(-1)
+        weight = torch.ones_like(nis)
         if self.robust is not None:
-            weight = 1.0 / (1.0 + surprise / self.robust**2)
+            weight = 1.0 / (1.0 + nis / self.robust**2)
         here = torch.arange(self.window, device=self.device) == (self.count % self.window).unsqueeze(-1)
         if mask is not None:
             here = here & mask.unsqueeze(-1)
@@ -106,4 +108,4 @@ class WindowGP(ResidualLearner):
         self.inverse.copy_(inverse)
         event = torch.full_like(self.count, UpdateEvent.ABSORBED)
         novelty = (law.variance[..., 0] - self.noise_variance) / self.kernel.diagonal(x)
-        return UpdateReport(event if mask is None else event * mask, novelty, surprise, weight)
+        return UpdateReport(event if mask is None else event * mask, novelty, nis, weight)

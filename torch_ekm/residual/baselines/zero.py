@@ -6,7 +6,9 @@ import torch
 from torch.distributions import Normal
 
 from ...typing import Tensor
-from ..base import ResidualLearner, UpdateEvent, UpdateReport, check_positive
+from ..base import ResidualLearner
+from ..checks import check_positive
+from ..report import UpdateEvent, UpdateReport
 
 
 class ZeroResidual(ResidualLearner):
@@ -42,5 +44,5 @@ class ZeroResidual(ResidualLearner):
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         one = torch.ones_like(y[..., 0])
         event = torch.full_like(one, UpdateEvent.ABSORBED, dtype=torch.int64)
-        surprise = y.square().mean(-1) / self.noise_variance
-        return UpdateReport(event if mask is None else event * mask, 0.0 * one, surprise, one)
+        nis = y.square().mean(-1) / self.noise_variance
+        return UpdateReport(event if mask is None else event * mask, 0.0 * one, nis, one)

@@ -1,1 +1,1 @@
-""""""
+"""Covariance functions."""

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 
-from ...exceptions import ParameterError
+from ...exceptions import ParameterError, ShapeError
 from ...typing import Float, Tensor
-from ..base import check_count
-from .kernel import Kernel, SquaredExponential, log_parameter
+from ..checks import check_count
+from .kernel import Kernel, log_parameter
+from .stationary import SquaredExponential
 
 
 class ActionLinearKernel(Kernel):
@@ -105,3 +107,41 @@ class ActionLinearKernel(Kernel):
     def action_prior(self, s: Float[Tensor, "*batch n_s"]) -> Float[Tensor, "*batch n_a n_a"]:
         """``k_s(s, s) Lambda``: prior covariance of a row of G(s)."""
         return torch.diag_embed(self.state_kernel.diagonal(s).unsqueeze(-1) * self.action_variance)
+
+
+def action_jacobian(learner: Any, s: Float[Tensor, "*any n_s"]) -> Float[Tensor, "*any out n_a"]:
+    """G(s) with ``mean(s, a) = G(s) a`` exactly: ``G = sum_i alpha_i k_s(s, s_i) (Lambda a_i)'``.
+
+    Args:
+        learner: a SparseOnlineGP with an ActionLinearKernel.
+
+    Raises:
+        ParameterError: it has another kernel.
+        ShapeError: the state has another width.
+    """
+    _, _, B = _action_features(learner, s)
+    return learner.units.slope(learner.posterior.alpha.mT @ B, 1).to(learner.dtype)
+
+
+def action_covariance(learner: Any, s: Float[Tensor, "*any n_s"]) -> Float[Tensor, "*any out n_a n_a"]:
+    """V(s) with ``var(s, a)_j = a' V_j(s) a`` exactly: ``V = k_s(s,s) Lambda + B'CB``, B as in G.
+
+    Arguments and errors as of :func:`action_jacobian`.
+    """
+    kernel, z, B = _action_features(learner, s)
+    V = kernel.action_prior(z) + B.mT @ (learner.posterior.covariance @ B)
+    V = learner.units.curvature(V.unsqueeze(-3))
+    return V.expand(*V.shape[:-3], learner.out_features, *V.shape[-2:]).to(learner.dtype)
+
+
+def _action_features(learner: Any, s: Tensor) -> tuple[ActionLinearKernel, Tensor, Tensor]:
+    kernel = getattr(learner, "kernel", None)
+    if not isinstance(kernel, ActionLinearKernel) or not hasattr(learner, "posterior"):
+        valid = "a SparseOnlineGP with an ActionLinearKernel"
+        raise ParameterError("learner", f"{type(learner).__name__} with {type(kernel).__name__}", valid)
+    posterior = learner.posterior
+    s = torch.as_tensor(s, dtype=posterior.basis.dtype, device=posterior.basis.device)
+    if s.shape[-1:] != (kernel.state_features,):
+        raise ShapeError("s", f"(*any, {kernel.state_features})", s.shape)
+    z = learner.units.inputs(s)
+    return kernel, z, kernel.action_features_of(z, posterior.basis)

@@ -10,8 +10,9 @@ from torch import nn
 
 from ...exceptions import ParameterError
 from ...typing import Float, Tensor
-from ..base import check_count, check_counts
-from .kernel import Kernel, StationaryKernel, squared_distances
+from ..checks import check_count, check_counts
+from .kernel import Kernel
+from .stationary import StationaryKernel, squared_distances
 
 
 class DeepKernel(Kernel):

@@ -1,1 +1,1 @@
-""""""
+"""The sparse online Gaussian process and its parts."""

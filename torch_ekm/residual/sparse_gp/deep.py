@@ -2,50 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, final
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from torch import nn
 
 from ..kernels.deep import DeepKernel
-from ..kernels.kernel import SquaredExponential
+from ..kernels.stationary import SquaredExponential
+from .forgetting import ProcessNoise
+from .hyperparameters import LearnHyperparameters
+from .part import copy_parts
 from .sparse_online_gp import SparseOnlineGP
 
-_FROM_THE_PAST: dict[str, Any] = {"adapt_steps": 2, "adapt_memory": 2000}
 
-
-@final
-class DeepKernelSOGP(SparseOnlineGP):
+def DeepKernelSOGP(  # noqa: N802  a kind of learner, called like the others
+    in_features: int,
+    out_features: int,
+    *,
+    hidden: Sequence[int] | None = None,
+    features: int | None = None,
+    seed: int = 0,
+    parts: Iterable[nn.Module] = (),
+    **options: Any,
+) -> SparseOnlineGP:
     """A SparseOnlineGP on ``[x / L, net(x)]``, network and kernel learned online in constant memory.
 
     The basis is kept as inputs and embedded anew whenever the network moves; the natural form does not
-    contain the kernel, so nothing else has to follow. See DeepKernel and PrequentialAdaptation.
+    contain the kernel, so nothing else has to follow. See DeepKernel and LearnHyperparameters.
 
     Thousands of weights want more than the last 32 samples, which on a trajectory are one place: 2000
-    samples of the past are kept to learn them from, and each rebuild takes two steps.
+    samples of the past are kept to learn them from, and each rebuild takes two steps. Where g wanders
+    (``ProcessNoise``) the past is another g: one step, and no memory.
 
     Args:
         hidden, features: of the network; (64, 64) and 16, or (32, 32) and 6 without a memory.
         seed: of its weights.
-        options: see SparseOnlineGP (without ``kernel``; by default ``adapt=True``, ``adapt_steps=2``,
-            ``adapt_memory=2000``; with ``diffusion``, to which the past is another g, one and 0).
-    """
+        parts: as of SparseOnlineGP; ``LearnHyperparameters`` is added if it is not among them.
+        options: see SparseOnlineGP (without ``kernel``).
 
-    def __init__(
-        self,
-        in_features: int,
-        out_features: int,
-        *,
-        hidden: Sequence[int] | None = None,
-        features: int | None = None,
-        seed: int = 0,
-        **options: Any,
-    ) -> None:
-        fleet = {name: options[name] for name in ("batch_shape", "device") if name in options}
-        base = SquaredExponential(in_features, **fleet)
-        options = {"adapt": True, **({} if options.get("diffusion") else _FROM_THE_PAST), **options}
-        small = not options.get("adapt_memory")
-        if hidden is None:
-            hidden = (32, 32) if small else (64, 64)
-        if features is None:
-            features = 6 if small else 16
-        kernel = DeepKernel(base, hidden=hidden, features=features, seed=seed)
-        super().__init__(in_features, out_features, kernel=kernel, **options)
+    Raises:
+        ParameterError: from SparseOnlineGP and DeepKernel.
+    """
+    own = copy_parts(parts)
+    learning = next((part for part in own if isinstance(part, LearnHyperparameters)), None)
+    if learning is None:
+        wanders = any(isinstance(part, ProcessNoise) for part in own)
+        learning = LearnHyperparameters() if wanders else LearnHyperparameters(steps=2, memory=2000)
+        own.append(learning)
+    fleet = {name: options[name] for name in ("batch_shape", "device") if name in options}
+    kernel = DeepKernel(
+        SquaredExponential(in_features, **fleet),
+        hidden=hidden if hidden is not None else (64, 64) if learning.memory else (32, 32),
+        features=features if features is not None else 16 if learning.memory else 6,
+        seed=seed,
+    )
+    return SparseOnlineGP(in_features, out_features, kernel=kernel, parts=own, **options)

@@ -1,4 +1,4 @@
-"""Scores by which a full basis chooses the point to delete: the lowest goes.
+"""Scores by which a full basis chooses the point to prune: the lowest goes.
 
 Arguments, all ``(*batch, b)`` but the first: alpha ``(*batch, b, m)``, the diagonals of C, Q and W,
 and the sample number of each point. With a, c, q, w a point's entries:
@@ -18,7 +18,7 @@ def _remaining(c: Tensor, q: Tensor) -> Tensor:
 
 
 def kl_score(alpha: Tensor, c: Tensor, q: Tensor, w: Tensor, age: Tensor) -> Tensor:
-    """``2 KL = |a|^2/(c+q) + m (w/q + ln(1 + c/q))``: exact loss of the deletion (Csato's thesis)."""
+    """``2 KL = |a|^2/(c+q) + m (w/q + ln(1 + c/q))``: exact loss of pruning it (Csato's thesis)."""
     rest = _remaining(c, q)
     return alpha.square().sum(-1) / rest + alpha.shape[-1] * (w / q + (rest / q).log())
 
@@ -38,7 +38,7 @@ def oldest_score(alpha: Tensor, c: Tensor, q: Tensor, w: Tensor, age: Tensor) ->
     return age
 
 
-DELETION_SCORES: dict[str, Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]] = {
+PRUNING_SCORES: dict[str, Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]] = {
     "kl": kl_score,
     "mean": mean_score,
     "novelty": novelty_score,

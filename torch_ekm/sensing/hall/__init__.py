@@ -1,1 +1,1 @@
-""""""
+"""Hall readings: calibration and joint angles."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -147,8 +148,8 @@ class HallCalibration:
 
     def save(self, path: str | Path) -> None:
         """Write the calibration as JSON; :meth:`load` gives it back to the last bit."""
-        table = {"format": "torch_ekm.HallCalibration", "version": 1}
-        table["channels"] = [channel.to_dict() for channel in self.channels]  # type: ignore[assignment]
+        channels = [asdict(channel) for channel in self.channels]
+        table = {"format": "torch_ekm.HallCalibration", "version": 1, "channels": channels}
         Path(path).write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
 
     @classmethod
@@ -162,6 +163,7 @@ class HallCalibration:
             table = json.loads(Path(path).read_text(encoding="utf-8"))
             if table["format"] != "torch_ekm.HallCalibration" or table["version"] != 1:
                 raise DescriptionError(path, "no Hall calibration of version 1")
-            return cls([HallChannel.from_dict(channel) for channel in table["channels"]])
+            channels = [{**c, "coefficients": tuple(c["coefficients"])} for c in table["channels"]]
+            return cls([HallChannel(**channel) for channel in channels])
         except (json.JSONDecodeError, KeyError, TypeError) as error:
             raise DescriptionError(path, f"no Hall calibration: {error}") from error

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 
@@ -43,13 +42,6 @@ class HallChannel:
     """Unsaturated samples of the sweep."""
     stuck: bool = False
     """The channel did not answer in the sweep; its estimates are never valid."""
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, table: dict[str, Any]) -> HallChannel:
-        return cls(**{**table, "coefficients": tuple(table["coefficients"])})
 
     def summary(self) -> str:
         if self.stuck:

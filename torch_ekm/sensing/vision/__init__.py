@@ -1,1 +1,1 @@
-""""""
+"""Camera images: marker boards and their poses."""

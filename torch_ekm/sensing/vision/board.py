@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from ..._extras import require
 from ...exceptions import ParameterError, ShapeError, UnknownNameError
-
-Array = NDArray[np.float64]
+from ...typing import Array
 
 
 def get_dictionary(name: str):

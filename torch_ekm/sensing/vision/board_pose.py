@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..._extras import require
+from ...typing import Array
 from .camera import PinholeCamera
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,11 +138,14 @@ def projection_jacobian(camera: PinholeCamera, X: Array, rotation: Array, positi
     _, full = cv2.projectPoints(X, rvec, position, camera.matrix, camera.distortion_array)
     by_position = full[:, 3:6].reshape(-1, 2, 3)  # dpi/dx, since x = R X + t
     arm = X @ rotation.T
-    zero = np.zeros(len(X))
-    skew = np.stack(
-        [zero, -arm[:, 2], arm[:, 1], arm[:, 2], zero, -arm[:, 0], -arm[:, 1], arm[:, 0], zero], axis=-1
-    ).reshape(-1, 3, 3)
-    return np.concatenate([by_position, -by_position @ skew], axis=-1).reshape(-1, 6)
+    return np.concatenate([by_position, -by_position @ skew(arm)], axis=-1).reshape(-1, 6)
+
+
+def skew(v: Array) -> Array:
+    """``[v]x`` of each vector ``(*batch, 3)``."""
+    x, y, z = np.moveaxis(v, -1, 0)
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape, 3)
 
 
 def angle_between(a: Array, b: Array) -> float:

@@ -7,12 +7,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..._extras import require
 from ...exceptions import DescriptionError, ParameterError
-
-Array = NDArray[np.float64]
+from ...typing import Array
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,6 @@ from ..._extras import require
 from ...exceptions import ParameterError
 from .board import get_dictionary
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class CharucoTarget:

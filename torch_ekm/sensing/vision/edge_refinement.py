@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..._extras import require
+from ...typing import Array
 from .board import MarkerBoard
 from .board_pose import BoardPose, angle_between, projection_jacobian
 from .camera import PinholeCamera
-
-Array = NDArray[np.float64]
 
 _ITERATIONS = 3
 _REACH = 2.0  # a point of the board that moves farther went to the edge of something else [px]

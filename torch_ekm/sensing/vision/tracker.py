@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from ..._extras import require
 from ...exceptions import ParameterError, ShapeError
+from ...typing import Array
 from .board import MarkerBoard, get_dictionary
-from .board_pose import BoardPose, estimate_board_pose
+from .board_pose import BoardPose, angle_between, estimate_board_pose, skew
 from .camera import PinholeCamera
 from .edge_refinement import refine_on_edges
 from .static_pose import StaticPose
 from .track import Track, TrackStatus
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -180,8 +179,8 @@ class MarkerTracker:
         reach = obj.position + arm - palm.position
         position = M @ reach + t_hp
         zero = np.zeros((3, 3))
-        by_object = np.block([[M, -M @ _skew(arm)], [zero, M]])
-        by_palm = -np.block([[M, -M @ _skew(reach)], [zero, M]])
+        by_object = np.block([[M, -M @ skew(arm)], [zero, M]])
+        by_palm = -np.block([[M, -M @ skew(reach)], [zero, M]])
         covariance = by_object @ obj.covariance @ by_object.T + by_palm @ palm.covariance @ by_palm.T
         return position, M @ R_co, covariance
 
@@ -200,8 +199,7 @@ class MarkerTracker:
         return True
 
     def _near(self, other: tuple[Array, Array], position: Array, rotation: Array) -> bool:
-        turn = np.arccos(np.clip((np.trace(rotation @ other[1].T) - 1) / 2, -1, 1))
-        step = np.linalg.norm(position - other[0])
+        turn, step = angle_between(rotation, other[1]), np.linalg.norm(position - other[0])
         return bool(step <= self.options.max_step and turn <= self.options.max_turn)
 
 
@@ -213,7 +211,3 @@ def _make_detector(dictionary: str):
     parameters.relativeCornerRefinmentWinSize = 0.5
     parameters.cornerRefinementMinAccuracy = 0.01
     return cv2.aruco.ArucoDetector(get_dictionary(dictionary), parameters)
-
-
-def _skew(v: Array) -> Array:
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])

@@ -1,1 +1,1 @@
-""""""
+"""Pinches, planned by least squares."""

@@ -7,20 +7,13 @@ from numpy.typing import NDArray
 
 from ...description import ContactPad, HandDescription, ObjectDescription
 from ...description.shape import Shape
-from ...description.urdf import UrdfModel, read_urdf
 
 Array = NDArray[np.float64]
 
 
-def urdf_of(hand: HandDescription) -> UrdfModel:
-    """The URDF that came with the description, or the file it names."""
-    return hand.urdf if hand.urdf is not None else read_urdf(hand.urdf_path)
-
-
 def chain(hand: HandDescription, link: str) -> list[int]:
     """Joints that move a link, the nearest first."""
-    urdf = urdf_of(hand)
-    above = {joint.child: joint for joint in urdf.joints}
+    above = {joint.child: joint for joint in hand.urdf.joints}
     chain = []
     while link in above:
         if above[link].name in hand.joint_names:
@@ -34,7 +27,6 @@ def obstacles(hand: HandDescription, pads: tuple[ContactPad, ...]) -> tuple[list
 
     Returns the link of each ball, its centre in that link ``(n, 3)`` [m] and its radius ``(n,)`` [m].
     """
-    urdf = urdf_of(hand)
     links, centres, radii = [], [], []
 
     def add(link: str, centre: Array, radius: float) -> None:
@@ -43,7 +35,7 @@ def obstacles(hand: HandDescription, pads: tuple[ContactPad, ...]) -> tuple[list
         radii.append(radius)
 
     carrying = {pad.link: pad for pad in pads}
-    for link in urdf.links:
+    for link in hand.urdf.links:
         if link.name in carrying:
             add(link.name, np.array(carrying[link.name].start), carrying[link.name].radius)
             continue

@@ -6,13 +6,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..._extras import require
+from ...description import HandDescription, ObjectDescription
 from ...exceptions import EquilibriumError
+from ...typing import Array
+from ..config import PlantConfig
+from ..mechanism.assembly import make_transmission
+from ..parameters import PlantParameters
 from .pinch_problem import PinchProblem, PinchRequest
-
-Array = NDArray[np.float64]
 
 _FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
 _GOOD_COST = 20.0  # half a sum of squares; the wishes of a good pinch cost about 0.3
@@ -117,3 +119,40 @@ class PinchPlanner:
             force[1:] *= -1.0 / max(1, len(tips) - 1)
             centre = (tips[0] + tips[1:].mean(axis=0)) / 2
             yield np.concatenate([moving, centre, np.zeros(3), force.ravel()])
+
+
+def make_planner(
+    hand: HandDescription, obj: ObjectDescription, config: PlantConfig, parameters: PlantParameters
+) -> PinchPlanner:
+    """A planner that knows the plant as it is: what closes the hand is not what is studied here."""
+    thumb, fingers = opposition(hand, config)
+    problem = PinchProblem(
+        hand,
+        obj,
+        make_transmission(hand, parameters),
+        thumb,
+        fingers,
+        along=turning_axis(hand, config),
+        mass_factor=parameters.mass,
+        com_shift=parameters.com_shift,
+        friction=parameters.friction,
+        object_scale=parameters.object_scale,
+    )
+    return PinchPlanner(problem)
+
+
+def opposition(hand: HandDescription, config: PlantConfig) -> tuple[str, tuple[str, ...]]:
+    """Names of the pads that pinch: the thumb's, and those against it."""
+    names = [pad.name for pad in hand.pads]
+    thumb = config.thumb or next((name for name in names if name.startswith("thumb")), names[0])
+    if config.fingers is not None:
+        return thumb, config.fingers
+    chosen = tuple(name for name in names if name.startswith(("index", "middle")))
+    return thumb, chosen or tuple(name for name in names if name != thumb)[:1]
+
+
+def turning_axis(hand: HandDescription, config: PlantConfig) -> tuple[float, float, float]:
+    """Unit vector along which the object's long axis is held, hand frame."""
+    along = np.array(config.along or hand.planar_normal or (0.0, 1.0, 0.0))
+    x, y, z = (along / np.linalg.norm(along)).tolist()
+    return x, y, z

@@ -6,17 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from ...contact import signed_distance
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import UnknownNameError
 from ...kinematics import HandKinematics, LinkPoses
 from ...kinematics.se3 import exp
+from ...typing import Array
 from ..mechanism.transmission import Transmission
-from .geometry import scaled, signed_distance
 from .graspable import chain, object_axes, obstacles
-
-Array = NDArray[np.float64]
 
 # Preferred joint angles as parts of their range, last joint first: the thumb bent and the fingers
 # nearly straight, since turning the object towards the fingers' flexion straightens the thumb.
@@ -28,7 +26,7 @@ _FINGER_BENT = (0.4, 0.13, 0.12, 0.3)
 class PinchRequest:
     """What is wanted of a pinch. Lengths [m], angles [rad], in the object frame."""
 
-    gravity: tuple[float, float, float] = (0.0, 0.0, 9.81)
+    gravity: tuple[float, float, float]
     """In the hand frame [m/s^2]."""
     force: float = 5.0
     """Normal force of the thumb [N]; the fingers share its reaction."""
@@ -127,7 +125,7 @@ class PinchProblem:
         self._mass = mass_factor * obj.mass
         self._com = obj.com + np.array(com_shift)
         self._mu = friction * obj.friction
-        self._shapes = tuple(scaled(shape, object_scale) for shape in obj.shapes)
+        self._shapes = tuple(shape.scaled(object_scale) for shape in obj.shapes)
         self._prepare_mechanism()
         self._axes = object_axes(obj)
         self.towards = self._direction_of_grasp()
@@ -140,7 +138,7 @@ class PinchProblem:
         self.follow = np.zeros((hand.n_q, len(self.moving)))  # joints that a coupling drags along
         self.follow[self.moving] = np.eye(len(self.moving))
         self.follow[rest] = -np.linalg.pinv(C[:, rest]) @ C[:, self.moving]
-        free = _null_space(C) if len(C) else np.eye(hand.n_q)
+        free = _null_space(C)
         self._to_tension = np.linalg.pinv((J_a @ free).T) @ free.T
         tendon = np.array([actuator.tendon for actuator in hand.actuators], dtype=bool)
         self._pulling = tendon & J_a[:, self.moving].any(axis=1)

@@ -1,1 +1,1 @@
-""""""
+"""Pictures that a camera would take of marker cards and fingers."""

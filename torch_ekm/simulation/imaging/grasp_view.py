@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from ...description import HandDescription, ObjectDescription, read_urdf
+from ...description import HandDescription, ObjectDescription
 from ...exceptions import ParameterError, ShapeError
 from ...kinematics import HandKinematics
 from ...sensing.vision.board import MarkerBoard
-from ...typing import Float, Tensor
-from .scene import ConvexBody, PlacedCard, Scene
-
-Array = NDArray[np.float64]
+from ...typing import Array, Float, Tensor
+from .card_scene import CardScene, ConvexBody, PlacedCard
 
 
 class GraspView:
     """``T_camera,card = T_hand,camera^-1 T_hand,body T_body,card``, and the same for every shape.
 
-    Turns a state of hand and object into a :class:`Scene`: both marker boards, the links of the hand and
+    Turns a state of hand and object into a :class:`CardScene`: both marker boards, the links of the hand and
     the object's shapes, all of which may hide a marker.
 
     Args:
@@ -46,17 +43,16 @@ class GraspView:
         if self.camera_pose.shape != (4, 4):
             raise ShapeError("camera_pose", "(4, 4)", self.camera_pose.shape)
         self._kinematics = HandKinematics(hand)
-        urdf = hand.urdf if hand.urdf is not None else read_urdf(hand.urdf_path)
         self._links = [
             (self._kinematics.link_index(link.name), ConvexBody.of_shape(shape))
-            for link in urdf.links
+            for link in hand.urdf.links
             for shape in link.collisions
         ]
         self._object = [ConvexBody.of_shape(shape, shade=150) for shape in obj.shapes]
 
     def scene(
         self, q: Float[Tensor, " n_q"], position: Float[Tensor, 3], rotation: Float[Tensor, "3 3"]
-    ) -> Scene:
+    ) -> CardScene:
         """The scene in the camera frame, at joint angles ``q`` [rad] and an object pose in the hand frame."""
         to_camera = np.linalg.inv(self.camera_pose)
         with torch.no_grad():
@@ -69,7 +65,7 @@ class GraspView:
             PlacedCard(self.palm_board, to_camera @ self.palm_board.mount),
             PlacedCard(self.object_board, to_camera @ body_of_object @ self.object_board.mount),
         )
-        return Scene(cards, tuple(bodies))
+        return CardScene(cards, tuple(bodies))
 
     @staticmethod
     def facing(palm: Array, obj: Array, distance: float = 0.40) -> Array:

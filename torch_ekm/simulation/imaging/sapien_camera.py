@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..._extras import require
 from ...exceptions import ParameterError
 from ...sensing.vision.camera import PinholeCamera
-from .scene import Card, ConvexBody, PlacedCard, Scene
+from .card_scene import Card, CardScene, ConvexBody, PlacedCard
 from .simulated_camera import ImageQuality
 
 # SAPIEN's cameras look along x, with y to the left and z up
@@ -46,7 +46,7 @@ class SapienCamera:
         if not self.available():
             valid = "present: a GPU's driver, or Mesa's lavapipe 25 or newer"
             raise ParameterError("Vulkan device", None, valid)
-        self._textures: dict[int, tuple[Card, Any]] = {}
+        self._textures: dict[Card, Any] = {}
         sapien = require("sapien")
         sapien.render.set_camera_shader_dir("minimal")
         self._scene = sapien.Scene([sapien.render.RenderSystem()])
@@ -68,7 +68,7 @@ class SapienCamera:
         except RuntimeError:
             return False
 
-    def render(self, scene: Scene, generator: np.random.Generator) -> NDArray[np.uint8]:
+    def render(self, scene: CardScene, generator: np.random.Generator) -> NDArray[np.uint8]:
         """Picture ``(height, width)`` of the scene; the generator draws its noise."""
         cv2, quality = require("cv2"), self.quality
         drawn = [self._add(*self._card(card)) for card in scene.cards]
@@ -82,11 +82,7 @@ class SapienCamera:
         if colour.shape[-1] > 3:  # nothing was hit where alpha is 0
             grey = np.where(colour[..., 3] > 0, grey, np.float32(quality.background))
         image = cv2.resize(grey, (self.camera.width, self.camera.height), interpolation=cv2.INTER_AREA)
-        if quality.blur > 0:
-            image = cv2.GaussianBlur(image, (0, 0), quality.blur)
-        if quality.noise > 0:
-            image += quality.noise * generator.standard_normal(image.shape, dtype=np.float32)
-        return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        return quality.spoil(image, generator)
 
     def _card(self, placed: PlacedCard) -> tuple[NDArray, NDArray, NDArray, Any]:
         """Vertices, triangles, texture coordinates and material; the back is the same card, unprinted."""
@@ -130,17 +126,15 @@ class SapienCamera:
         return entity
 
     def _texture(self, card: Card) -> Any:
-        known = self._textures.get(id(card))
-        if known is None or known[0] is not card:
+        if card not in self._textures:
             quality = self.quality
             print_ = card.texture().astype(np.float32) / 255
             grey = _linear(quality.black + (quality.white - quality.black) * print_)
             rgba = np.dstack([grey, grey, grey, np.ones_like(grey)]).astype(np.float32)
-            texture = require("sapien").render.RenderTexture2D(
+            self._textures[card] = require("sapien").render.RenderTexture2D(
                 np.ascontiguousarray(rgba), "R32G32B32A32Sfloat", address_mode="edge"
             )
-            known = self._textures[id(card)] = (card, texture)
-        return known[1]
+        return self._textures[card]
 
 
 def _linear(grey: Any) -> Any:

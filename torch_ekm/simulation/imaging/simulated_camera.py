@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from ..._extras import require
 from ...exceptions import ParameterError
 from ...sensing.vision.camera import PinholeCamera
-from .scene import Card, ConvexBody, PlacedCard, Scene
+from .card_scene import Card, CardScene, ConvexBody, PlacedCard
 
 _SHIFT = 4  # fractional bits of OpenCV's polygon coordinates
 
@@ -42,6 +43,14 @@ class ImageQuality:
         if not 0 <= self.black < self.white <= 255:
             raise ParameterError("ImageQuality.black", self.black, "below white, both within 0..255")
 
+    def spoil(self, image: NDArray[Any], generator: np.random.Generator) -> NDArray[np.uint8]:
+        """The picture with blur and noise, in whole grey levels."""
+        if self.blur > 0:
+            image = require("cv2").GaussianBlur(image, (0, 0), self.blur)
+        if self.noise > 0:
+            image = image + self.noise * generator.standard_normal(image.shape, dtype=np.float32)
+        return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
 
 class SimulatedCamera:
     """Draws cards by their homography ``x ~ K [r1 r2 t] X``, then bodies, blur and noise.
@@ -66,7 +75,7 @@ class SimulatedCamera:
         self.camera = camera or PinholeCamera()
         self.quality = quality or ImageQuality()
         self.supersample = supersample
-        self._textures: dict[int, tuple[Card, NDArray[np.uint8]]] = {}
+        self._textures: dict[Card, NDArray[np.uint8]] = {}
         v, u = np.mgrid[: self.camera.height, : self.camera.width].astype(np.float32)
         self._rays = None
         if not self.camera.is_ideal:
@@ -74,7 +83,7 @@ class SimulatedCamera:
         radius2 = (u - self.camera.cx) ** 2 + (v - self.camera.cy) ** 2
         self._light = 1 - self.quality.vignette * radius2 / radius2.max()
 
-    def render(self, scene: Scene, generator: np.random.Generator) -> NDArray[np.uint8]:
+    def render(self, scene: CardScene, generator: np.random.Generator) -> NDArray[np.uint8]:
         """Picture ``(height, width)`` of the scene; the generator draws its noise."""
         cv2 = require("cv2")
         quality, shape = self.quality, (self.camera.height, self.camera.width)
@@ -89,11 +98,7 @@ class SimulatedCamera:
         for card in sorted(scene.cards, key=lambda c: -c.pose[2, 3]):
             self._draw_card(image, card, bodies)
         image *= self._light
-        if quality.blur > 0:
-            image = cv2.GaussianBlur(image, (0, 0), quality.blur)
-        if quality.noise > 0:
-            image += quality.noise * generator.standard_normal(shape, dtype=np.float32)
-        return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        return quality.spoil(image, generator)
 
     def _draw_card(
         self, image: NDArray, placed: PlacedCard, bodies: list[tuple[ConvexBody, NDArray | None]]
@@ -159,9 +164,8 @@ class SimulatedCamera:
         return np.ascontiguousarray(fine[..., 0]), np.ascontiguousarray(fine[..., 1])
 
     def _texture(self, card: Card) -> NDArray[np.uint8]:
-        known = self._textures.get(id(card))
-        if known is None or known[0] is not card:  # the card is kept, so that its id is not given again
+        if card not in self._textures:
             if len(self._textures) >= 16:
                 self._textures.clear()
-            known = self._textures[id(card)] = (card, card.texture())
-        return known[1]
+            self._textures[card] = card.texture()
+        return self._textures[card]

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...exceptions import ParameterError
 from ...sensing.vision.sources import Frame, StreamOptions
-from .scene import Scene
+from .card_scene import CardScene
 from .simulated_camera import SimulatedCamera
 
 
@@ -29,7 +29,7 @@ class SimulatedVideo:
     def __init__(
         self,
         camera: SimulatedCamera,
-        scene_at: Callable[[float], Scene],
+        scene_at: Callable[[float], CardScene],
         options: StreamOptions | None = None,
         n_frames: int | None = None,
     ) -> None:

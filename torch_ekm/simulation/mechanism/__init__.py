@@ -1,1 +1,1 @@
-""""""
+"""Tendons, springs and motors."""

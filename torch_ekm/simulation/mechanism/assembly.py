@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import ParameterError
 from ..config import PlantConfig
-from ..grasp_planning.geometry import scaled
-from ..grasp_planning.pinch import PinchPlanner
-from ..grasp_planning.pinch_problem import PinchProblem
 from ..parameters import PlantParameters
 from .servo import Servo
 from .transmission import Transmission
@@ -63,26 +60,6 @@ def make_servo(hand: HandDescription, config: PlantConfig, parameters: PlantPara
     )
 
 
-def make_planner(
-    hand: HandDescription, obj: ObjectDescription, config: PlantConfig, parameters: PlantParameters
-) -> PinchPlanner:
-    """A planner that knows the plant as it is: what closes the hand is not what is studied here."""
-    thumb, fingers = opposition(hand, config)
-    problem = PinchProblem(
-        hand,
-        obj,
-        make_transmission(hand, parameters),
-        thumb,
-        fingers,
-        along=turning_axis(hand, config),
-        mass_factor=parameters.mass,
-        com_shift=parameters.com_shift,
-        friction=parameters.friction,
-        object_scale=parameters.object_scale,
-    )
-    return PinchPlanner(problem)
-
-
 def true_descriptions(
     hand: HandDescription, obj: ObjectDescription, parameters: PlantParameters
 ) -> tuple[HandDescription, ObjectDescription]:
@@ -108,23 +85,6 @@ def true_descriptions(
         com=obj.com + np.array(parameters.com_shift),
         inertia=parameters.mass * obj.inertia,
         friction=parameters.friction * obj.friction,
-        shapes=tuple(scaled(shape, parameters.object_scale) for shape in obj.shapes),
+        shapes=tuple(shape.scaled(parameters.object_scale) for shape in obj.shapes),
     )
     return true_hand, true_object
-
-
-def opposition(hand: HandDescription, config: PlantConfig) -> tuple[str, tuple[str, ...]]:
-    """Names of the pads that pinch: the thumb's, and those against it."""
-    names = [pad.name for pad in hand.pads]
-    thumb = config.thumb or next((name for name in names if name.startswith("thumb")), names[0])
-    if config.fingers is not None:
-        return thumb, config.fingers
-    chosen = tuple(name for name in names if name.startswith(("index", "middle")))
-    return thumb, chosen or tuple(name for name in names if name != thumb)[:1]
-
-
-def turning_axis(hand: HandDescription, config: PlantConfig) -> tuple[float, float, float]:
-    """Unit vector along which the object's long axis is held, hand frame."""
-    along = np.array(config.along or hand.planar_normal or (0.0, 1.0, 0.0))
-    x, y, z = (along / np.linalg.norm(along)).tolist()
-    return x, y, z

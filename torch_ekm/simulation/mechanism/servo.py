@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...exceptions import NonFiniteError, ParameterError, ShapeError
-
-Array = NDArray[np.float64]
+from ...typing import Array
 
 
 class ServoState(NamedTuple):
@@ -71,11 +69,6 @@ class Servo:
     def output(self) -> Array:
         """Position after the backlash, where the tendon is fixed ``(n_a,)`` [rad]."""
         return self._output.copy()
-
-    @property
-    def setpoint(self) -> Array:
-        """What the controller was last told ``(n_a,)`` [rad]."""
-        return self._setpoint.copy()
 
     def place(self, motor: Array) -> None:
         """Stand at ``motor`` with the set-point there and the play in its middle."""

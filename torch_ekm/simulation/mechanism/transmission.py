@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...description.hand import HandDescription
 from ...exceptions import ParameterError
-
-Array = NDArray[np.float64]
+from ...typing import Array
 
 
 class TransmissionState(NamedTuple):
@@ -123,25 +121,6 @@ class Transmission:
             force[self._pulls_only & (force < 0)] = 0.0
         torque = self._spring_torque - self.spring_stiffness * q + force @ self._M - self._k_f * slip
         return q + torque / self.drive_stiffness
-
-    def equilibrium(self, motor: Array, external: Array | None = None) -> Array:
-        """Frictionless free posture ``K q = K_s q0 + J_a^T k_a (m - a0) + tau_ext`` ``(n_q,)`` [rad].
-
-        Slack tendons are found by repetition; joint stops are not part of it.
-        """
-        load = self._spring_torque + (0.0 if external is None else external)
-        taut = np.ones(len(self._k), bool)
-        aim = np.concatenate([motor - self.offset, np.zeros(len(self._k) - self.n_a)])
-        q = np.zeros(self.n_q)
-        for _ in range(1 + int(self._pulls_only.sum())):
-            k = self._k * taut
-            K = np.diag(self.spring_stiffness) + self._M.T @ (k[:, None] * self._M)
-            q = np.linalg.solve(K, load + self._M.T @ (k * aim))
-            slack = self._pulls_only & (aim - self._M @ q < 0)
-            if np.array_equal(~slack, taut):
-                break
-            taut = ~slack
-        return q.astype(np.float64)
 
     def lengthen(self, amount: float) -> None:
         """Make every tendon longer for good [rad at the actuator]; looped cables keep their length."""

@@ -1,1 +1,1 @@
-""""""
+"""SAPIEN: bodies, contacts, time."""

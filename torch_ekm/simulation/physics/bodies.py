@@ -11,8 +11,6 @@ from ...description import HandDescription, ObjectDescription
 from ...description.shape import Shape
 from ...description.urdf import UrdfJoint, UrdfLink, UrdfModel
 from ...exceptions import DescriptionError
-from ..grasp_planning.geometry import scaled
-from ..grasp_planning.graspable import urdf_of
 from .engine import sapien
 
 Array = NDArray[np.float64]
@@ -36,9 +34,17 @@ def build_hand(scene: Any, hand: HandDescription, material: Any) -> HandBodies:
     """The articulation of ``hand``, its base fixed at the origin: hand frame = world frame.
 
     Links on fixed joints become part of the link that carries them.
+
+    Raises:
+        DescriptionError: the link of a pad has nothing but meshes to touch with, or the base link moves.
     """
     physx, pose = sapien().physx, sapien().Pose
-    urdf = urdf_of(hand)
+    urdf = hand.urdf
+    for pad in hand.pads:
+        if urdf.link(pad.link).has_mesh and not urdf.link(pad.link).collisions:
+            problem = f"link '{pad.link}' carries the pad '{pad.name}', and its only <collision> is a mesh"
+            remedy = "write the pad's capsule there: contacts need box, cylinder, sphere or capsule"
+            raise DescriptionError(hand.urdf_path, f"{problem}; {remedy}")
     components: dict[str, Any] = {}
     entities: list[Any] = []
 
@@ -113,7 +119,7 @@ def build_object(scene: Any, obj: ObjectDescription, material: Any, scale: float
     entity.name = obj.name
     body = sapien().physx.PhysxRigidDynamicComponent()
     for shape in obj.shapes:
-        sized = scaled(shape, scale)
+        sized = shape.scaled(scale)
         _attach(body, sized, sized.transform, material, group=0)
     body.linear_damping = body.angular_damping = 0.0
     entity.add_component(body)

@@ -2,31 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import ParameterError
+from ...typing import Array
 from .bodies import build_hand, build_object, set_inertia
 from .engine import new_scene, sapien
 
-Array = NDArray[np.float64]
-
 _JOINT_DAMPING = 5e-3  # [N m s/rad]; the softest freedom (springs alone) settles in 0.1 s
 _TORQUE_LIMIT = 100.0  # [N m]; a limit that never acts
-
-
-class Touch(NamedTuple):
-    """What one link does to the object at one instant, in the hand frame."""
-
-    force: Array
-    """Sum of the normal forces on the object ``(3,)`` [N]."""
-    normal: float
-    """Sum of their sizes [N]."""
-    point: Array
-    """Their centre ``(3,)`` [m]."""
 
 
 class HandScene:
@@ -142,34 +129,25 @@ class HandScene:
         """Push the object during the next step: [N] at its centre of mass and [N m], hand frame."""
         self._object.add_force_torque(force.astype(np.float32), torque.astype(np.float32))
 
-    def touches(self) -> dict[str, Touch]:
-        """Which links touch the object now.
+    def touches(self) -> dict[str, float]:
+        """Links that touch the object now, each with the sum of the sizes of its normal forces [N].
 
         PhysX gives the normal part of each impulse; pairs within the contact offset that carry
         nothing are listed too and left out here.
         """
-        found: dict[str, list[tuple[Array, Array]]] = {}
+        found: dict[str, list[tuple[list[float], float]]] = {}
         for contact in self._system.get_contacts():
             first, second = contact.bodies
-            if first is self._object or first == self._object:
-                link, sign = second, -1.0
-            elif second is self._object or second == self._object:
-                link, sign = first, 1.0
-            else:
+            if self._object not in (first, second):
                 continue
+            link = self._hand.link_of[second if first == self._object else first]
             for point in contact.points:
                 impulse = np.asarray(point.impulse, dtype=np.float64)
                 if impulse @ impulse > 0:
-                    name = self._hand.link_of[link]
-                    force = sign * impulse / self.time_step
-                    found.setdefault(name, []).append((force, np.asarray(point.position, np.float64)))
-        touches = {}
-        for name in sorted(found):  # the order of PhysX is not defined
-            points = sorted(found[name], key=lambda pair: tuple(pair[1]))
-            sizes = np.array([np.linalg.norm(force) for force, _ in points])
-            centre = sizes @ np.array([place for _, place in points]) / sizes.sum()
-            touches[name] = Touch(np.sum([force for force, _ in points], axis=0), float(sizes.sum()), centre)
-        return touches
+                    size = float(np.linalg.norm(impulse / self.time_step))
+                    found.setdefault(link, []).append((point.position.tolist(), size))
+        # in the order of the points: that of PhysX is not defined
+        return {link: float(np.sum([size for _, size in sorted(points)])) for link, points in found.items()}
 
     def snapshot(self) -> bytes:
         """Positions and velocities. Contact caches are not in it: a run that goes on from here and

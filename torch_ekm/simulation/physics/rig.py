@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...description import HandDescription, ObjectDescription
+from ...typing import Array
 from ..config import PlantConfig
 from ..grasp_planning.graspable import chain
 from ..grasp_planning.pinch import PinchPlan
@@ -18,7 +18,6 @@ from ..mechanism.transmission import TransmissionState
 from ..parameters import PlantParameters
 from .hand_scene import HandScene
 
-Array = NDArray[np.float64]
 Gravity = tuple[float, float, float]
 
 _FORCE_WINDOW = 10  # steps over which a fingertip force is averaged
@@ -62,9 +61,9 @@ class Rig:
         """How many fingers touched the object in these steps, with any of their links."""
         self.on_frame: Callable[[float, Array, Array, Array], None] | None = None
         """Called every 10 steps with the time, the joint angles and the object's pose."""
-        self.gravity: Gravity = config.gravity
+        self.gravity: Gravity = hand.gravity
         self._finger_of = {link: joints[-1] for link in hand.link_names if (joints := chain(hand, link))}
-        self._build(config.gravity)
+        self._build(hand.gravity)
 
     def _build(self, gravity: Gravity) -> None:
         p = self.parameters
@@ -140,7 +139,7 @@ class Rig:
                 fingers |= {self._finger_of[link] for link in touches if link in self._finger_of}
                 for i, pad in enumerate(self.hand.pads):
                     if pad.link in touches:
-                        normal[i] += touches[pad.link].normal / window
+                        normal[i] += touches[pad.link] / window
         duration = steps * self.config.time_step
         transmission.age(scene.q, servo.output, duration)
         self.normal, self.fingers = normal, len(fingers)

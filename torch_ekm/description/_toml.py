@@ -27,7 +27,7 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
         raise DescriptionError(path, f"not well-formed TOML: {error}") from None
 
 
-class Table:
+class TomlTable:
     """One TOML table and where it stands. Angles: ``key`` in rad or ``key_deg`` in degrees, not both."""
 
     def __init__(self, path: Path, place: str, data: Any, valid: Iterable[str]) -> None:

@@ -12,8 +12,7 @@ from ..._extras import require
 from ...description import Shape
 from ...exceptions import ShapeError
 from ...sensing.vision.camera import PinholeCamera
-
-Array = NDArray[np.float64]
+from ...typing import Array
 
 
 class Card(Protocol):
@@ -142,13 +141,13 @@ class PlacedCard:
 
 
 @dataclass(frozen=True)
-class Scene:
+class CardScene:
     """Cards and bodies in the camera frame."""
 
     cards: tuple[PlacedCard, ...] = ()
     bodies: tuple[ConvexBody, ...] = ()
 
-    def obstructed(self, card: int, shade: int = 70) -> Scene:
+    def obstructed(self, card: int, shade: int = 70) -> CardScene:
         """The scene with a ball half way between the camera and a card, which hides all of it."""
         outline = self.cards[card].outline / 2
         centre = outline.mean(axis=0)

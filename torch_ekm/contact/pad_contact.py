@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..description import ContactPad, Shape
-from ._primitives import signed_distance, surface_curvature
+from .signed_distance import point_distance, surface_curvature, tangents
 
 Array = NDArray[np.float64]
 
@@ -22,8 +22,7 @@ class Pad:
         self.transform[:3, 3] = (start + end) / 2
         if self.half > 0:
             axis = (end - start) / (2 * self.half)
-            side = np.linalg.svd(axis[None])[2][1]
-            self.transform[:3, :3] = np.stack([side, np.cross(axis, side), axis], axis=-1)
+            self.transform[:3, :3] = np.stack([*tangents(tuple(axis.tolist())), axis], axis=-1)
             self.geometry = coal.Capsule(self.radius, 2 * self.half)
         else:
             self.geometry = coal.Sphere(self.radius)
@@ -36,10 +35,10 @@ class Solid:
         make = {"box": coal.Box, "cylinder": coal.Cylinder, "sphere": coal.Sphere, "capsule": coal.Capsule}
         self.shape = shape
         self.geometry = make[shape.kind](*shape.size)
-        self.distance = signed_distance(shape)
+        self.distance = point_distance(shape)
 
 
-class Touch:
+class PadContact:
     """One contact in the hand frame."""
 
     __slots__ = ("finger_curvature", "gap", "normal", "object_curvature", "pinned", "point")
@@ -49,7 +48,7 @@ class Touch:
         self.finger_curvature, self.object_curvature, self.pinned = K_f, K_o, pinned
 
 
-def touch(pad: Pad, T_pad: Array, solid: Solid, T_solid: Array, R: float) -> Touch:
+def pad_contact(pad: Pad, T_pad: Array, solid: Solid, T_solid: Array, R: float) -> PadContact:
     """The contact of a pad with one primitive; the equations are those of ``ContactDetector``.
 
     Args:
@@ -79,7 +78,7 @@ def touch(pad: Pad, T_pad: Array, solid: Solid, T_solid: Array, R: float) -> Tou
         e /= np.linalg.norm(e)
         K_f += (1 / R - 1 / pad.radius) * np.outer(e, e)
     point = T_pad[:3, 3] + s * T_pad[:3, 2] - (pad.radius + gap / 2) * n
-    return Touch(point, n, gap, K_f, K_o, sharp)
+    return PadContact(point, n, gap, K_f, K_o, sharp)
 
 
 def _closest(solid: Solid, m: tuple, t: tuple, half: float, epsilon: float) -> float:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from torch_ekm.contact.signed_distance import point_distance, signed_distance
 from torch_ekm.description.shape import Shape
-from torch_ekm.simulation.grasp_planning.geometry import scaled, signed_distance
 from torch_ekm.simulation.physics.bodies import x_axis_to
 
 coal = pytest.importorskip("coal")
@@ -72,6 +72,18 @@ def test_normal_is_the_gradient_inside_and_outside(kind):
     np.testing.assert_allclose(gradient[smooth], normal[smooth], atol=1e-5)
 
 
+@pytest.mark.parametrize("kind", SIZES)
+def test_one_point_and_many_give_the_same(kind):
+    shape = Shape(kind, SIZES[kind], np.eye(4))
+    points = np.random.default_rng(7).uniform(-0.06, 0.06, (300, 3))
+    points[:4] = [[0, 0, 0.01], [0, 0, -0.07], [0.001, 0, 0], [0.05, -0.05, 0.05]]  # on the axis, and far off
+    distance, normal = signed_distance((shape,), points)
+    one = [point_distance(shape)(*point) for point in points.tolist()]
+    np.testing.assert_allclose([d for d, _ in one], distance, atol=1e-16)
+    np.testing.assert_allclose([n for _, n in one][2:], normal[2:], atol=1e-14)
+    assert all(np.linalg.norm(n) == pytest.approx(1.0) for _, n in one)
+
+
 def test_a_union_is_as_near_as_its_nearest_part():
     shapes = (placed("box", 3), placed("sphere", 4))
     points = np.random.default_rng(5).uniform(-0.08, 0.08, (2, 50, 3))
@@ -84,5 +96,5 @@ def test_a_union_is_as_near_as_its_nearest_part():
 def test_scaling_scales_the_distance():
     shape, points = placed("capsule"), np.random.default_rng(6).uniform(-0.08, 0.08, (20, 3))
     np.testing.assert_allclose(
-        signed_distance((scaled(shape, 1.2),), 1.2 * points)[0], 1.2 * signed_distance((shape,), points)[0]
+        signed_distance((shape.scaled(1.2),), 1.2 * points)[0], 1.2 * signed_distance((shape,), points)[0]
     )

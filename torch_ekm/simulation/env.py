@@ -1,7 +1,7 @@
 """The simulated hand as a Gymnasium environment.
 
 Importing this module registers ``torch_ekm/InHandRotation-v0``;
-``gymnasium.make("torch_ekm.env:torch_ekm/InHandRotation-v0")`` does both at once.
+``gymnasium.make("torch_ekm.simulation.env:torch_ekm/InHandRotation-v0")`` does both at once.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ._extras import require
-from .description import HandDescription, ObjectDescription
-from .exceptions import ParameterError
-from .kinematics.se3 import log
-from .plant import Observation, PlantStatus
-from .rendering.grasp_viewer import GraspViewer
-from .simulation.config import PlantConfig
-from .simulation.parameters import PlantParameters
-from .simulation.presets import preset
-from .simulation.simulated_hand import SimulatedHand
+from .._extras import require
+from ..description import HandDescription, ObjectDescription
+from ..exceptions import ParameterError
+from ..kinematics.se3 import log
+from ..plant import Observation, PlantStatus
+from ..rendering import Picture, make_scene
+from ..typing import Array
+from .config import PlantConfig
+from .parameters import PlantParameters
+from .presets import preset
+from .simulated_hand import SimulatedHand
 
 if TYPE_CHECKING:
     import gymnasium
 else:
     gymnasium = require("gymnasium")
 
-Array = NDArray[np.float64]
 _DEG = math.pi / 180
 
 
@@ -99,7 +99,7 @@ class InHandRotation(gymnasium.Env):
         self.angles, self.step_limit, self.tolerance = angles, step_limit, tolerance
         self.off_axis, self.lost_penalty = off_axis, lost_penalty
         self.render_mode = render_mode
-        self._viewer: GraspViewer | None = None
+        self._picture: Picture | None = None
         description = self.plant.hand
         n_a = description.n_a
         high = np.concatenate(
@@ -150,16 +150,21 @@ class InHandRotation(gymnasium.Env):
         """A picture ``(height, width, 3)`` of the true state, or None without a render mode."""
         if self.render_mode is None:
             return None
-        if self._viewer is None:
-            self._viewer = GraspViewer(self.plant.hand, self.plant.object, self.plant.config.gravity)
-        return self._viewer.picture(*self.plant.hand_state())
+        q, position, rotation = self.plant.hand_state()
+        gravity = np.array(self.plant.gravity)
+        scene = make_scene(
+            self.plant.hand, self.plant.object, q[None], position[None], rotation[None], gravity
+        )
+        if self._picture is None:
+            self._picture = Picture(scene)
+        return self._picture.draw(scene)
 
     def close(self) -> None:
         """Give back the scene and the window."""
         self.plant.close()
-        if self._viewer is not None:
-            self._viewer.close()
-            self._viewer = None
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
 
     def _turned(self, observation: Observation) -> tuple[float, float]:
         """Angle about the grasp's axis and rotation about all others since the reset [rad]."""
@@ -185,12 +190,11 @@ class InHandRotation(gymnasium.Env):
     def _info(self, observation: Observation) -> dict[str, Any]:
         turned, _ = self._turned(observation)
         held = observation.status is not PlantStatus.LOST
+        assert observation.truth is not None
         return {
             "is_success": held and abs(self._target - turned) < self.tolerance,
             "status": observation.status.value,
-            "truth": {
-                name: value.numpy() for name, value in vars(observation.truth).items() if name != "pictured"
-            },
+            "truth": {name: value.numpy() for name, value in observation.truth.arrays().items()},
         }
 
 
@@ -199,7 +203,7 @@ def register() -> None:
     if "torch_ekm/InHandRotation-v0" not in gymnasium.registry:
         gymnasium.register(
             "torch_ekm/InHandRotation-v0",
-            entry_point="torch_ekm.env:InHandRotation",
+            entry_point="torch_ekm.simulation.env:InHandRotation",
             max_episode_steps=40,
         )
 

@@ -1,0 +1,60 @@
+"""Other ways to the answers of the force problem, for comparison."""
+
+from __future__ import annotations
+
+import clarabel
+import numpy as np
+from scipy import sparse
+from scipy.spatial import ConvexHull
+
+from torch_ekm.contact.contact_kinematics import ContactKinematics, grasp_matrix
+from torch_ekm.contact.forces.balance import BalanceEquations
+from torch_ekm.contact.forces.friction import friction_cones
+from torch_ekm.contact.forces.options import ForceOptions
+from torch_ekm.contact.forces.problem import force_problem
+
+
+def cone_program(eq: BalanceEquations, options: ForceOptions | None = None) -> np.ndarray | None:
+    """``[mu; lam; tau]`` with exact second-order cones in place of polyhedra and cuts; None: infeasible."""
+    n_h = eq.object_matrix.shape[1]
+    problem, scale = force_problem(eq, options or ForceOptions(), np.zeros((0, n_h)))
+    n = len(problem.q)
+    up, low = np.isfinite(problem.ub), np.isfinite(problem.lb)
+    eye = np.eye(n)
+    blocks, rhs = [problem.A, eye[up], -eye[low]], [problem.b, problem.ub[up], -problem.lb[low]]
+    cones = [clarabel.ZeroConeT(len(problem.b)), clarabel.NonnegativeConeT(int(up.sum() + low.sum()))]
+    for cone in eq.cones:
+        rows = np.zeros((1 + cone.dim, n))
+        rows[0, cone.start] = -cone.mu_s
+        rows[1:, cone.start + 1 : cone.start + 1 + cone.dim] = -np.diag(cone.scale)
+        rows[:, :n_h] *= scale[:n_h]
+        blocks.append(rows)
+        rhs.append(np.zeros(1 + cone.dim))
+        cones.append(clarabel.SecondOrderConeT(1 + cone.dim))
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-10
+    P, A = sparse.csc_matrix(np.triu(problem.P)), sparse.csc_matrix(np.concatenate(blocks))
+    solution = clarabel.DefaultSolver(P, problem.q, A, np.concatenate(rhs), cones, settings).solve()
+    found = solution.status in (clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved)
+    return scale * np.asarray(solution.x) if found else None
+
+
+def ferrari_canny(kin: ContactKinematics, length: float = 0.03, faces: int = 64) -> float:
+    """Radius of the largest ball about 0 in the hull of the wrenches of unit normal forces; 0: no closure.
+
+    Ferrari and Canny, Planning optimal grasps, ICRA 1992, L1 version; moments divided by ``length``. Points
+    with friction only.
+    """
+    scale = np.array([1.0, 1.0, 1.0, 1 / length, 1 / length, 1 / length])
+    G = scale[:, None] * grasp_matrix(kin).numpy()
+    angle = 2 * np.pi * np.arange(faces) / faces
+    wrenches = []
+    for cone in friction_cones(kin.models, kin.contacts.friction.tolist(), [0.0] * kin.contacts.n_c):
+        normal, first, second = G[:, cone.start : cone.start + 3].T
+        edge = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
+        wrenches.append(normal + cone.mu_s * edge)
+    points = np.concatenate(wrenches)
+    if np.linalg.matrix_rank(points, 1e-9) < 6:
+        return 0.0
+    return max(0.0, float((-ConvexHull(points).equations[:, -1]).min()))

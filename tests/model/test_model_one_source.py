@@ -1,0 +1,62 @@
+"""What plant and model, or two parts of the model, share is said once; linearize remembers nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from model_toys import F64, three_finger
+
+from torch_ekm.contact import ForceOptions
+from torch_ekm.description import load_hand, load_object
+from torch_ekm.model import KinematicModel, ModelOptions, ModelStatus
+from torch_ekm.simulation import PlantConfig, SimulatedHand
+
+
+@pytest.mark.parametrize("gravity", [None, (0.0, -9.81, 0.0)])
+def test_the_model_of_a_plant_is_made_with_its_gravity(gravity):
+    plant = SimulatedHand("icub_right", "box", PlantConfig(gravity=gravity))
+    model = KinematicModel(plant.hand, plant.object)
+    plant.reset(0)
+    assert plant.gravity == (gravity or (0.0, 0.0, 9.81))
+    expected = plant.object.mass * torch.tensor(plant.gravity, dtype=F64)
+    assert torch.equal(model.weight, expected)
+
+
+def test_gravity_can_be_told_to_the_model_alone():
+    hand, box = load_hand("icub_right"), load_object("box")
+    upside_down = KinematicModel(hand, box, ModelOptions(gravity=(0.0, 0.0, -9.81)))
+    assert torch.equal(upside_down.weight, -KinematicModel(hand, box).weight)
+
+
+def test_one_length_scales_ranks_and_moments():
+    toy = three_finger()
+    slippery = toy.contacts.replace(friction=torch.full((3,), 0.01, dtype=F64))
+
+    def unbalanced(length):
+        options = dataclasses.replace(toy.model.options, length=length)
+        model = KinematicModel(
+            toy.model.hand,
+            toy.model.obj,
+            options,
+            kinematics=toy.model.kinematics,
+            detector=lambda *_: slippery,
+        )
+        return float(model.linearize(toy.state).forces.violation)
+
+    # of an object held far from its centre of mass moments count for more where L is small
+    assert unbalanced(0.001) > 1.5 * unbalanced(0.03)
+    assert "length" not in {field.name for field in dataclasses.fields(ForceOptions)}
+
+
+def test_a_linearization_depends_on_its_arguments_alone():
+    toy = three_finger()
+    model = toy.model
+    slippery = toy.contacts.replace(friction=torch.full((3,), 0.01, dtype=F64))
+    first = model.linearize(toy.state, slippery)
+    good = model.linearize(toy.state)
+    again = model.linearize(toy.state, slippery)
+    assert first.status is again.status is ModelStatus.NO_FORCES
+    assert torch.equal(first.manipulation_jacobian, again.manipulation_jacobian)
+    assert not torch.equal(good.manipulation_jacobian, again.manipulation_jacobian)

@@ -1,0 +1,42 @@
+"""Where things are drawn, and from where they are looked at; no graphics needed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from torch_ekm.description import load_hand, load_object
+from torch_ekm.rendering import make_scene
+
+PALM_DOWN = np.array([0.0, 0.0, 9.81])
+
+
+def scene_of(name, gravity):
+    hand = load_hand(name)
+    position, rotation = np.array([[0.05, 0.0, 0.06]] * 2), np.stack([np.eye(3)] * 2)
+    q = np.tile(hand.spring_rest, (2, 1))
+    return make_scene(hand, load_object("box"), q, position, rotation, gravity)
+
+
+def test_the_object_is_where_it_is_said_to_be():
+    scene = scene_of("icub_right", PALM_DOWN)
+    placed = scene.transforms[:, -1] @ np.linalg.inv(load_object("box").shapes[-1].transform)
+    np.testing.assert_allclose(placed[:, :3, 3], [[0.05, 0.0, 0.06]] * 2, atol=1e-12)
+    np.testing.assert_allclose(scene.down, [0, 0, 1])
+
+
+def test_hands_are_seen_from_the_side_of_the_index_finger():
+    views = {name: scene_of(name, PALM_DOWN).camera for name in ("icub_right", "icub_left")}
+    for name, (position, focus, up) in views.items():
+        sight = position - focus
+        assert np.linalg.norm(sight) == pytest.approx(0.34)
+        np.testing.assert_allclose(up, [0, 0, -1])
+        assert sight[1] * (1 if name == "icub_left" else -1) > 0.2
+
+
+@pytest.mark.parametrize("gravity", [(0, -9.81, 0), (0, 0, 9.81), (0, 0, 0)])
+def test_a_planar_hand_is_seen_from_the_front_whatever_pulls(gravity):
+    position, focus, up = scene_of("planar_two_finger", np.array(gravity, dtype=float)).camera
+    sight = (position - focus) / np.linalg.norm(position - focus)
+    np.testing.assert_allclose(np.abs(sight), [0, 0, 1], atol=1e-9)
+    assert abs(up @ sight) < 1e-9  # else there is no up in the picture

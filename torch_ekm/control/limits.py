@@ -1,0 +1,110 @@
+"""What a step must not do: each limit is a class with its figures and ``rows``.
+
+All but the actuators' are soft (exact l1 slack): what cannot be kept is broken as little as possible,
+so the program always has a solution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ..exceptions import UnknownNameError
+from .qp import DEGREE, Bounds, Inequality, as_array
+from .situation import LinearizedModel, Situation
+
+
+class Limit(Protocol):
+    """A limit. One of your own needs no more than this method."""
+
+    def rows(self, model: LinearizedModel, seen: Situation) -> Inequality | Bounds | None:
+        """Rows in ``u = da`` [rad]; None: nothing is near this limit."""
+        ...
+
+
+@dataclass(frozen=True)
+class ActuatorLimit:
+    """``a_min <= a + u <= a_max, |u| <= step``; some actuators do not move at all.
+
+    The step is a safety limit, not the one that sets the pace: where it cuts a motion short, the focused pose
+    is served at the expense of grip and off-axis motion.
+    """
+
+    step: float = 16 * DEGREE
+    """[rad]"""
+    fixed: tuple[str, ...] | None = None
+    """Actuators that must not move; None: those that the hand's description calls posture actuators."""
+
+    def rows(self, model: LinearizedModel, seen: Situation) -> Bounds:
+        """The bounds.
+
+        Raises:
+            UnknownNameError: no actuator of the hand has a name in ``fixed``; the message lists them.
+        """
+        hand, a = seen.hand, as_array(seen.a)
+        lower = np.clip(hand.actuator_lower - a, -self.step, self.step)
+        upper = np.clip(hand.actuator_upper - a, -self.step, self.step)
+        names = hand.actuator_names
+        fixed = [actuator.name for actuator in hand.actuators if actuator.posture]
+        for name in fixed if self.fixed is None else self.fixed:
+            if name not in names:
+                raise UnknownNameError("actuator", name, names)
+            lower[names.index(name)] = upper[names.index(name)] = 0.0
+        return Bounds(lower, upper)
+
+
+@dataclass(frozen=True)
+class JointLimit:
+    """``q_min + margin <= q + dq(u) <= q_max - margin``, dq as linearized; nearer than that: no further."""
+
+    margin: float = 0.5 * DEGREE
+    """[rad]"""
+    horizon: float = 8 * DEGREE
+    """A joint has a row where actuator motions of this size could bring it to a stop [rad]. Longer ones are
+    rare, and every row costs time."""
+
+    def rows(self, model: LinearizedModel, seen: Situation) -> Inequality:
+        hand, n_q = seen.hand, model.kinematic.n_q
+        q, J, c = as_array(seen.state.q), as_array(model.jacobian[:n_q]), as_array(model.offset[:n_q])
+        reach = np.abs(J).sum(1) * self.horizon + 2 * self.margin
+        moving = hand.joint_upper > hand.joint_lower
+        C, h = [], []
+        for sign, stop in ((1.0, hand.joint_upper), (-1.0, hand.joint_lower)):
+            room = sign * (stop - q) - self.margin
+            near = np.flatnonzero(moving & (room < reach))
+            C.append(sign * J[near])
+            h.append((np.maximum(room, 0.0) - sign * c)[near])
+        return Inequality(np.concatenate(C), np.concatenate(h), DEGREE)
+
+
+@dataclass(frozen=True)
+class NormalForceLimit:
+    """``f_n + (df_n/da) u >= minimum`` of each finger, f_n as measured."""
+
+    minimum: float = 0.8
+    """[N]"""
+    step: float = 0.7
+    """At most this much of what is missing is asked for in one step [N]."""
+
+    def rows(self, model: LinearizedModel, seen: Situation) -> Inequality | None:
+        measured = seen.normal_force(model.kinematic.contacts.finger)
+        if measured is None:
+            return None
+        low = np.minimum(self.minimum - measured, self.step)
+        return Inequality(-model.kinematic.normal_force_sensitivity, -low)
+
+
+@dataclass(frozen=True)
+class FrictionMarginLimit:
+    """``m + (dm/da) u >= minimum`` of each contact, ``m = mu f_n - |f_t|`` as the kinematic model has it."""
+
+    minimum: float = 0.5
+    """[N]"""
+    step: float = 0.7
+    """At most this much of what is missing is asked for in one step [N]: a wrong model may miss a lot."""
+
+    def rows(self, model: LinearizedModel, seen: Situation) -> Inequality:
+        low = (self.minimum - model.kinematic.margins).clamp(max=self.step)
+        return Inequality(-model.kinematic.margin_sensitivity, -low)

@@ -1,0 +1,75 @@
+"""What the rows of tasks and limits are made from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+from ..enhanced import EnhancedModel, Quadratic
+from ..kinematics import GraspState
+from ..typing import Float, Tensor
+from .focus import FocusedPose
+from .qp import Array, as_array
+
+if TYPE_CHECKING:
+    from ..description import HandDescription
+    from ..model import Linearization
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What was seen and what is wanted, the same for all iterations of a decision."""
+
+    hand: HandDescription
+    focus: FocusedPose
+    state: GraspState
+    a: Float[Tensor, " n_a"]
+    """Encoders [rad]."""
+    fingertip_force: Float[Tensor, " n_pads"] | None
+    """Measured normal force of each pad [N]."""
+    error: Float[Tensor, 6]
+    """e, the twist to the target [m, rad]."""
+    desired: Float[Tensor, " n_x"]
+    """dx_d, what one step shall do to the focused pose."""
+
+    def normal_force(self, fingers: tuple[str, ...]) -> Array | None:
+        """What the pads of these fingers measure [N]; None: nothing is measured."""
+        if self.fingertip_force is None:
+            return None
+        pads = [pad.name for pad in self.hand.pads]
+        return as_array(self.fingertip_force)[[pads.index(name) for name in fingers]]
+
+
+@dataclass(frozen=True)
+class LinearizedModel:
+    """``(f + g)(s, u) ~ offset + jacobian u`` near ``u = action``."""
+
+    kinematic: Linearization
+    """f alone, with its contacts and forces and how they answer to the actuators."""
+    action: Float[Tensor, " n_a"]
+    offset: Float[Tensor, " n_s"]
+    jacobian: Float[Tensor, "n_s n_a"]
+    """Rows: joints [rad/rad], object point [m/rad], object rotation [rad/rad]."""
+    variance: Callable[[Float[Tensor, " n_s"]], Quadratic] | None = None
+    """``sum_j w_j Var[ds_j]`` of weights w, as a quadratic about ``action``; None: nothing is learned."""
+
+    @classmethod
+    def about(
+        cls,
+        action: Float[Tensor, " n_a"],
+        kinematic: Linearization,
+        enhanced: EnhancedModel | None = None,
+        encoded: Float[Tensor, " d"] | None = None,
+    ) -> LinearizedModel:
+        """``(f + g)(a + d) ~ value + J d = (value - J a) + J (a + d)`` about one action a.
+
+        Args:
+            encoded: the state as the learner sees it, if that is known already.
+        """
+        state, J = kinematic.state, kinematic.manipulation_jacobian
+        if enhanced is None:
+            return cls(kinematic, action, J.new_zeros(len(J)), J)
+        value, J = enhanced.linearize(state, action, J, encoded)
+        return cls(kinematic, action, value - J @ action, J, partial(enhanced.variance, state, action))

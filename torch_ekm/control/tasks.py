@@ -1,0 +1,121 @@
+"""What a step should do: each wish is a class with its figures and ``rows``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from ..enhanced import Quadratic
+from .qp import DEGREE, Equality, Squares
+from .situation import LinearizedModel, Situation
+
+
+class Task(Protocol):
+    """A wish. One of your own needs no more than this method."""
+
+    def rows(self, model: LinearizedModel, seen: Situation) -> Squares | Quadratic | Equality | None:
+        """Rows in ``u = da`` [rad]; None: nothing is wished here."""
+        ...
+
+
+@dataclass(frozen=True)
+class FocusTask:
+    """``M_c E_p (f + g)(s, u) + sl = dx_d``: the step meets the limited error if it can, else comes as near
+    as it can (exact l1 slack)."""
+
+    penalty: float = 1e3
+    """rho, per degree of the focused rotation that is left unmet."""
+
+    def rows(self, model: LinearizedModel, seen: Situation) -> Equality:
+        M, n_q = seen.focus.matrix, model.kinematic.n_q
+        return Equality(M @ model.jacobian[n_q:], seen.desired - M @ model.offset[n_q:], self.penalty)
+
+
+@dataclass(frozen=True)
+class OffAxisTask:
+    """The object stays where it is, and comes back, in the directions that the focus leaves free."""
+
+    rotation_weight: float = 0.3
+    """Per deg^2."""
+    translation_weight: float = 0.05
+    """Per mm^2."""
+    rotation_step: float = 0.5 * DEGREE
+    translation_step: float = 0.5e-3
+    """How much of the error is corrected in one step: [rad], [m]."""
+
+    def rows(self, model: LinearizedModel, seen: Situation) -> Squares:
+        off, translation, n_q = seen.focus.off_matrix, seen.focus.off_translation, model.kinematic.n_q
+        step = torch.where(translation, self.translation_step, self.rotation_step).to(off.dtype)
+        wanted = (off @ seen.error).clamp(-step, step) - off @ model.offset[n_q:]
+        weight = torch.where(translation, self.translation_weight, self.rotation_weight)
+        unit = torch.where(translation, 1e-3, DEGREE).to(off.dtype)
+        return Squares(off @ model.jacobian[n_q:], wanted, weight, unit)
+
+
+@dataclass(frozen=True)
+class GripForceTask:
+    """``f_n + (df_n/da) u = f``: f_n as the fingertips measure it, only its sensitivity by the model.
+
+    A grip force computed from a wrong model drops the object.
+
+    The finger that presses most opposes all others: it is regulated to ``force``, and the others to
+    equal shares of it, so that no finger is left without a grip.
+    """
+
+    force: float = 5.0
+    """[N]"""
+    weight: float = 4.0
+    """Per N^2."""
+    step: float = 0.7
+    """At most this much of an error is corrected in one step [N]."""
+
+    def rows(self, model: LinearizedModel, seen: Situation) -> Squares | None:
+        measured = seen.normal_force(model.kinematic.contacts.finger)
+        if measured is None:
+            return None
+        wanted = np.full(len(measured), self.force / max(len(measured) - 1, 1))
+        wanted[measured.argmax()] = self.force
+        change = np.clip(wanted - measured, -self.step, self.step)
+        return Squares(model.kinematic.normal_force_sensitivity, change, self.weight)
+
+
+@dataclass(frozen=True)
+class EffortTask:
+    """``w |u|^2``: of the steps that do as well, the smallest. It makes the best step unique."""
+
+    weight: float = 1e-2
+    """w, per deg^2 of an actuator."""
+
+    def rows(self, model: LinearizedModel, seen: Situation) -> Squares:
+        n_a = len(seen.a)
+        return Squares(np.eye(n_a), np.zeros(n_a), self.weight, DEGREE)
+
+
+@dataclass(frozen=True)
+class UncertaintyTask:
+    """``w tr(M_c Sigma_g(s, u) M_c^T)``: of steps that turn as far, that whose effect the learner knows best.
+
+    Convex and exact with an action-linear kernel, ``u^T V(s) u`` for each output; for other learners gradient
+    and the positive semidefinite part of the curvature. A kinematic model alone is never unsure.
+    """
+
+    weight: float = 1.0
+    """w, per deg^2 of the focused rotation, per mm^2 of a focused translation."""
+
+    def rows(self, model: LinearizedModel, seen: Situation) -> Quadratic | None:
+        """The cost about the present action.
+
+        Raises:
+            ParameterError: the learner's variance does not depend on the action.
+        """
+        if model.variance is None:
+            return None
+        translation = seen.focus.matrix[:, :3].abs().sum(-1, keepdim=True) > 0
+        rows = seen.focus.matrix / torch.where(translation, 1e-3, DEGREE)
+        weight = torch.cat([rows.new_zeros(model.kinematic.n_q), rows.square().sum(0)])
+        v = model.variance(self.weight * weight)
+        # v(a) + g.(u - a) + 1/2 (u - a)^T H (u - a), in powers of u; the constant decides nothing
+        return v._replace(gradient=v.gradient - v.curvature @ model.action)

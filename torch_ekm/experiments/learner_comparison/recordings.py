@@ -1,0 +1,203 @@
+"""Public recordings by name, read in place from a folder that the user names (``TORCH_EKM_DATA``)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..._extras import require
+from ...exceptions import DescriptionError, UnknownNameError
+from .stream import Stream, in_own_units, load_table
+
+Array = NDArray[np.float64]
+Root = str | Path | None
+LIMIT = 1500  #: samples of a recording that are used if nobody says otherwise
+
+_T42 = "t42_hand/t42_testpaths.npz"
+_T42_NOMINAL, _T42_SKIPPED = "cyl45_d_v0", "str40_d_v1"
+_T42_HORIZON = 10  # [steps] of the log in one sample
+
+
+def load_recording(
+    name: str | Path, root: Root = None, limit: int | None = LIMIT, targets: Sequence[str] = ()
+) -> Stream:
+    """A public recording by name, or a file of one's own by path.
+
+    Args:
+        name: ``simulated_hand``, a recording in the data folder (the error lists them), or a path.
+        root: the data folder; ``TORCH_EKM_DATA`` by default.
+        limit: only the first so many samples (of each object alike, where there are many); None: all.
+        targets: columns to predict, in a file of one's own.
+
+    Raises:
+        UnknownNameError: neither a known name nor a file.
+        DescriptionError: the folder or the file is missing, or cannot be used.
+    """
+    if name == "simulated_hand":
+        from .simulated_stream import record_simulated_hand  # needs the simulator
+
+        return record_simulated_hand(min(limit or 400, 400))
+    if name in _READERS:
+        return _READERS[str(name)](root, limit)
+    if Path(name).suffix:
+        return load_table(name, targets, limit)
+    known = ("simulated_hand", *_READERS, "a path to a .csv or .parquet file")
+    raise UnknownNameError("recording", str(name), known)
+
+
+def load_t42(root: Root = None) -> list[Stream]:
+    """The Yale T42 hand (Sintov et al.), a stream for each object; a constant Jacobian is the nominal model.
+
+    ``t42_hand/t42_testpaths.npz`` holds, for each object and path, states ``(n, 13)`` and actions
+    ``(n, 2)``. A sample every ten steps: input the state and the mean action over these, output the change
+    of (x, y, angle). The Jacobian is the least-squares map from actions to outputs on one object, which
+    also gives the units; the other objects follow in alphabetical order.
+
+    Raises:
+        DescriptionError: there is no such file.
+    """
+    file = np.load(_need(root, _T42))
+    samples: dict[str, list[tuple[Array, Array, Array]]] = {}
+    for key in sorted(k[:-2] for k in file.files if k.endswith("/S")):
+        states, actions = file[key + "/S"], file[key + "/A"]
+        pose = np.column_stack([states[:, :2], np.unwrap(states[:, 2])])
+        starts = np.arange(0, len(states) - _T42_HORIZON, _T42_HORIZON)
+        action = np.array([actions[t : t + _T42_HORIZON].mean(0) for t in starts])
+        samples.setdefault(key.split("/")[0], []).append(
+            (states[starts], action.reshape(-1, actions.shape[1]), pose[starts + _T42_HORIZON] - pose[starts])
+        )
+    joined = {
+        name: [np.concatenate(part) for part in zip(*paths, strict=True)] for name, paths in samples.items()
+    }
+    state, action, change = joined[_T42_NOMINAL]
+    jacobian = np.linalg.lstsq(action, change, rcond=None)[0]
+    inputs, residual = np.hstack([state, action]), change - action @ jacobian
+    mean, deviation, unit = inputs.mean(0), inputs.std(0), residual.std(0)
+    return [
+        Stream(
+            name,
+            torch.from_numpy((np.hstack([state, action]) - mean) / deviation),
+            torch.from_numpy((change - action @ jacobian) / unit),
+        )
+        for name, (state, action, change) in sorted(joined.items())
+        if name not in (_T42_NOMINAL, _T42_SKIPPED)
+    ]
+
+
+def load_regression(name: str, root: Root = None) -> tuple[Array, Array]:
+    """Inputs ``(n, d)`` and outputs ``(n, m)`` of a regression set in the order of its file, in its units.
+
+    Args:
+        name: ``sarcos`` (``sarcos/sarcos_inv_test.mat``, 21 inputs, 7 torques), ``kin40k``
+            (``uci/kin40k/data.csv.gz``, 8 inputs) or ``powerplant`` (``uci/power-plant.csv``, 4 inputs).
+
+    Raises:
+        UnknownNameError: there is no such set.
+        DescriptionError: its file is missing.
+    """
+    if name not in _REGRESSION:
+        raise UnknownNameError("regression set", name, _REGRESSION)
+    path, n_out, _ = _REGRESSION[name]
+    file = _need(root, path)
+    if file.suffix == ".mat":
+        values = next(v for k, v in require("scipy.io").loadmat(str(file)).items() if not k.startswith("__"))
+    else:
+        values = np.loadtxt(file, delimiter=",", skiprows=1 if file.suffix == ".csv" else 0)
+    return values[:, :-n_out], values[:, -n_out:]
+
+
+def _regression(name: str) -> Callable[[Root, int | None], Stream]:
+    def read(root: Root, limit: int | None) -> Stream:
+        x, y = load_regression(name, root)
+        return in_own_units(name, x[:limit], y[:limit], _REGRESSION[name][2])
+
+    return read
+
+
+def _t42(root: Root, limit: int | None) -> Stream:
+    objects = load_t42(root)
+    share = None if limit is None else max(limit // len(objects), 1)  # of each object, its first samples
+    x, y = (torch.cat([getattr(one, part)[:share] for one in objects]).double() for part in "xy")
+    about = f"Yale T42 hand moving {len(objects)} objects (Sintov et al.); alone: one constant Jacobian"
+    return Stream("t42", x, y, 0, tuple(len(one.x[:share]) for one in objects), about)
+
+
+def _icub_grasp(root: Root, limit: int | None) -> Stream:
+    """Next increment of the 9 encoders from encoders, last increment and the 5 fingers' touch."""
+    folder = _need(root, "icub_grasp/iCubGraspDataset")
+    x, y, segments = [], [], []
+    for path in sorted(folder.glob("*.txt"), key=_trial):
+        if path.name.startswith("full_coke"):  # its authors say not to trust it
+            continue
+        lines = [line.split() for line in path.read_text(encoding="latin-1").splitlines()[1:] if line.strip()]
+        slices = [
+            (a, b) for a, b in zip(lines[0::7], lines[1::7], strict=False) if (len(a), len(b)) == (9, 5)
+        ]
+        if len(slices) < 4:
+            continue
+        encoders = np.array([a for a, _ in slices], dtype=float)
+        touch, step = np.array([b for _, b in slices], dtype=float), np.diff(encoders, axis=0)
+        x.append(np.hstack([encoders[1:-1], step[:-1], touch[1:-1]]))
+        y.append(step[1:])
+        segments.append(len(step) - 1)
+        if limit is not None and sum(segments) >= limit:
+            break
+    about = "iCub hand closing on 10 objects (Soh et al.), 10 deg as unit; alone: nothing moves"
+    units = np.repeat([30.0, 10.0, 50.0], [9, 9, 5])  # [deg], [deg], [of 255]
+    inputs, outputs = torch.from_numpy(np.vstack(x) / units), torch.from_numpy(np.vstack(y) / 10.0)
+    return Stream("icub_grasp", inputs, outputs, 0, tuple(segments), about)
+
+
+def _trial(path: Path) -> tuple[int, str]:
+    """``book_7.txt`` as (7, "book"): all objects once, then all again."""
+    name, _, number = path.stem.rpartition("_")
+    return int(number), name
+
+
+def _series(path: str, name: str, lags: int, about: str) -> Callable[[Root, int | None], Stream]:
+    def read(root: Root, limit: int | None) -> Stream:
+        series = np.loadtxt(_need(root, path))[: None if limit is None else limit + lags]
+        x = np.lib.stride_tricks.sliding_window_view(series, lags)[:-1]
+        return in_own_units(name, x, series[lags:, None], f"{about}, next value; alone: the mean")
+
+    return read
+
+
+def _mimo(root: Root, limit: int | None) -> Stream:
+    """Received signal from the last four sent ones, as in the Kernel Adaptive Filtering Toolbox."""
+    sent, received = np.loadtxt(_need(root, "streams/mimotestbed8K.dat"), delimiter=",").T
+    x = np.lib.stride_tricks.sliding_window_view(sent, 4)[:limit]
+    about = "a real 2x2 radio channel that changes (kafbox); alone: the mean"
+    return in_own_units("mimo", x, received[3:, None][:limit], about)
+
+
+def _need(root: Root, path: str) -> Path:
+    root = root or os.environ.get("TORCH_EKM_DATA")
+    if not root or not Path(root).is_dir():
+        raise DescriptionError(root or "TORCH_EKM_DATA", "name a folder with the recordings here")
+    full = Path(root) / path
+    if not full.exists():
+        raise DescriptionError(full, "the recording is not there; see 'torch-ekm compare --help' for sources")
+    return full
+
+
+# name -> file, number of outputs (the last columns), and what it is
+_REGRESSION = {
+    "sarcos": ("sarcos/sarcos_inv_test.mat", 7, "seven torques of the SARCOS arm; alone: their mean"),
+    "kin40k": ("uci/kin40k/data.csv.gz", 1, "kinematics of an 8-link arm; alone: the mean"),
+    "powerplant": ("uci/power-plant.csv", 1, "a power plant's output; alone: the mean"),
+}
+_READERS: dict[str, Callable[[Root, int | None], Stream]] = {
+    "t42": _t42,
+    "icub_grasp": _icub_grasp,
+    "mimo": _mimo,
+    **{name: _regression(name) for name in _REGRESSION},
+    "lorenz": _series("streams/lorenz.dat", "lorenz", 6, "Lorenz attractor"),
+    "mackey_glass": _series("streams/mg30.dat", "mackey_glass", 10, "Mackey-Glass"),
+    "santafe": _series("streams/santafe.dat", "santafe", 10, "Santa Fe laser"),
+}

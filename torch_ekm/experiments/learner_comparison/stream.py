@@ -1,0 +1,108 @@
+"""What learners are compared on: samples in the order of time, in units of their own beginning."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...exceptions import DescriptionError, ShapeError, UnknownNameError
+from ...typing import Float, Tensor
+from .table_file import read_table
+
+Array = NDArray[np.float64]
+LEAST = 40  #: samples; fewer cannot tell learners apart
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Samples ``y_t = g(x_t) + noise`` in the order of time.
+
+    Attributes:
+        name: a word.
+        x: inputs ``(n, d)``, of the order of 1.
+        y: what the model at hand leaves over ``(n, m)``, of the order of 1; 0 is the model itself.
+        warm_up: first samples that are learned but not scored: they gave the units.
+        segments: lengths of parts that stand for themselves (objects, grasps), for the statistics.
+        about: what it is, and what "the model alone" predicts.
+
+    Raises:
+        ShapeError: lengths do not fit.
+    """
+
+    name: str
+    x: Float[Tensor, "n d"]
+    y: Float[Tensor, "n m"]
+    warm_up: int = 0
+    segments: tuple[int, ...] = ()
+    about: str = ""
+
+    def __post_init__(self) -> None:
+        n = len(self.y)
+        if len(self.x) != n:
+            raise ShapeError("x", f"({n}, d)", self.x.shape, "one input for each output")
+        if self.segments and sum(self.segments) != n:
+            raise ShapeError("segments", f"lengths that add up to {n}", self.segments)
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+    def save(self, path: Path) -> Path:
+        """Write the samples as CSV: columns ``x1..xd, y1..ym``."""
+        names = [f"x{i + 1}" for i in range(self.x.shape[1])] + [f"y{i + 1}" for i in range(self.y.shape[1])]
+        with Path(path).open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(names)
+            writer.writerows(torch.cat([self.x, self.y], dim=1).tolist())
+        return Path(path)
+
+
+def load_table(path: str | Path, targets: Sequence[str] = (), limit: int | None = None) -> Stream:
+    """A stream from a CSV or Parquet file, see ``table_file.read_table``.
+
+    Args:
+        path: the file; rows in the order of time.
+        targets: columns to predict. By default those called ``y``, ``y1``, ``y2``, ..., else the last one.
+        limit: only the first so many rows.
+
+    Raises:
+        DescriptionError: the file cannot be used; the message names line and column.
+        UnknownNameError: there is no such target column; the message lists the columns.
+    """
+    names, values = read_table(Path(path))
+    if len(values) < LEAST:
+        raise DescriptionError(path, f"it has {len(values)} samples; at least {LEAST} are needed to compare")
+    for name in targets:
+        if name not in names:
+            raise UnknownNameError("column", name, names)
+    chosen = list(targets) or [
+        name for name in names if name == "y" or (name[:1] == "y" and name[1:].isdigit())
+    ]
+    columns = [names.index(name) for name in chosen or names[-1:]]
+    inputs = [i for i in range(len(names)) if i not in columns]
+    if not inputs:
+        raise DescriptionError(path, "all columns are targets; at least one must be an input")
+    values = values[:limit]
+    about = f"{', '.join(names[i] for i in columns)} from {len(inputs)} columns of {Path(path).name}"
+    return in_own_units(Path(path).stem, values[:, inputs], values[:, columns], about)
+
+
+def in_own_units(name: str, x: Array, y: Array, about: str = "") -> Stream:
+    """Standardize by the first tenth of the stream (20 to 200 samples), which is then not scored.
+
+    Nothing of what is scored is seen beforehand. A constant input stays 0.
+    """
+    warm_up = min(max(len(x) // 10, 20), 200)
+
+    def units(values: Array) -> Tensor:
+        start = values[:warm_up]
+        deviation = start.std(0)
+        deviation = np.where(deviation > 1e-9 * np.abs(values).max(0), deviation, values.std(0))
+        return torch.from_numpy((values - start.mean(0)) / np.where(deviation > 0, deviation, 1.0))
+
+    return Stream(name, units(x), units(y), warm_up, about=about)

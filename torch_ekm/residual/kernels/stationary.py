@@ -1,0 +1,152 @@
+"""Kernels of the distance between two points."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+
+import torch
+
+from ...typing import Float, Tensor
+from ..checks import check_count
+from .kernel import Kernel, log_parameter
+
+
+def squared_distances(x: Float[Tensor, "*batch n d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
+    """``|x_i - z_j|^2`` by one product, ``(*batch, n, m)``: for points near 0, see StationaryKernel."""
+    d2 = x.square().sum(-1).unsqueeze(-1) + z.square().sum(-1).unsqueeze(-2)
+    return (d2 - 2.0 * x @ z.mT).clamp_min(0.0)
+
+
+class StationaryKernel(Kernel):
+    """``k = v phi(|x - z|^2_L)``, ``dk/dx = v psi L^-2 (z - x)`` with ``psi = -2 phi'``.
+
+    Subclasses give phi and psi as functions of the squared scaled distance.
+
+    Args:
+        in_features: width d of x.
+        lengthscale: L, one number or one per input; default ``sqrt(d)``.
+        variance: v.
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        *,
+        lengthscale: float | Sequence[float] | Tensor | None = None,
+        variance: float | Tensor = 1.0,
+        batch_shape: tuple[int, ...] = (),
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str | None = None,
+    ) -> None:
+        super().__init__()
+        d = check_count("in_features", in_features)
+        factory = {"dtype": dtype, "device": device}
+        lengthscale = math.sqrt(d) if lengthscale is None else lengthscale
+        self.log_lengthscale = log_parameter("lengthscale", lengthscale, (*batch_shape, d), **factory)
+        self.log_variance = log_parameter("variance", variance, tuple(batch_shape), **factory)
+
+    @property
+    def lengthscale(self) -> Tensor:
+        """L, in units of the (normalised) inputs, ``(*batch_shape, d)``."""
+        return self.log_lengthscale.exp()
+
+    @property
+    def variance(self) -> Tensor:
+        """v = k(x, x), ``(*batch_shape)``."""
+        return self.log_variance.exp()
+
+    @staticmethod
+    @abstractmethod
+    def phi(d2: Tensor) -> Tensor:
+        """Correlation at squared scaled distance ``d2``."""
+
+    @staticmethod
+    @abstractmethod
+    def phi_psi(d2: Tensor) -> tuple[Tensor, Tensor]:
+        """Correlation and ``-2 dphi/d(d2)``."""
+
+    def forward(self, x: Tensor, z: Tensor) -> Tensor:
+        w = self.log_lengthscale.neg().exp().unsqueeze(-2)
+        if x.shape[-2] == 1:  # differences are exact; products are faster for many queries
+            d2 = ((z - x) * w).square().sum(-1).unsqueeze(-2)
+        else:
+            # about one of the points: far from 0 the difference of large squares would be all rounding
+            centre = z[..., :1, :].detach()
+            d2 = squared_distances((x - centre) * w, (z - centre) * w)
+        return self.log_variance.exp()[..., None, None] * self.phi(d2)
+
+    def vector(self, x: Tensor, z: Tensor) -> Tensor:
+        w = self.log_lengthscale.neg().exp().unsqueeze(-2)
+        u = torch.addcmul(x.unsqueeze(-2) * w, z, w, value=-1.0)
+        # In a large fleet fresh memory costs more than arithmetic. The norm takes none, but it has no
+        # second derivative at 0.
+        d2 = u.square().sum(-1) if torch.is_grad_enabled() else torch.linalg.vector_norm(u, dim=-1).square()
+        return self.log_variance.exp().unsqueeze(-1) * self.phi(d2)
+
+    def diagonal(self, x: Tensor) -> Tensor:
+        return self.log_variance.exp().expand(x.shape[:-1])
+
+    def with_gradient(self, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        w = self.log_lengthscale.neg().exp().unsqueeze(-2)
+        u = (z - x.unsqueeze(-2)) * w
+        phi, psi = self.phi_psi(u.square().sum(-1))
+        v = self.log_variance.exp().unsqueeze(-1)
+        return v * phi, (v * psi).unsqueeze(-1) * (u * w)
+
+    def diagonal_gradient(self, x: Tensor) -> Tensor:
+        return torch.zeros_like(x)
+
+    def shift_invariant(self, in_features: int) -> list[bool]:
+        return [True] * in_features
+
+    def extra_repr(self) -> str:
+        return f"in_features={self.log_lengthscale.shape[-1]}"
+
+
+class SquaredExponential(StationaryKernel):
+    """``k = v exp(-1/2 |x - z|^2_L)``."""
+
+    @staticmethod
+    def phi(d2: Tensor) -> Tensor:
+        return torch.exp(-0.5 * d2)
+
+    @staticmethod
+    def phi_psi(d2: Tensor) -> tuple[Tensor, Tensor]:
+        phi = torch.exp(-0.5 * d2)
+        return phi, phi
+
+
+# sqrt has no derivative at 0; below this squared distance the correlation is 1 to rounding anyway
+_TINY = 1e-30
+
+
+class Matern32(StationaryKernel):
+    """``k = v (1 + sqrt(3) r) exp(-sqrt(3) r)``, r = |x - z|_L."""
+
+    @staticmethod
+    def phi(d2: Tensor) -> Tensor:
+        r = (3.0 * d2.clamp_min(_TINY)).sqrt()
+        return (1.0 + r) * torch.exp(-r)
+
+    @staticmethod
+    def phi_psi(d2: Tensor) -> tuple[Tensor, Tensor]:
+        r = (3.0 * d2).sqrt()
+        decay = torch.exp(-r)
+        return (1.0 + r) * decay, 3.0 * decay
+
+
+class Matern52(StationaryKernel):
+    """``k = v (1 + sqrt(5) r + 5/3 r^2) exp(-sqrt(5) r)``, r = |x - z|_L."""
+
+    @staticmethod
+    def phi(d2: Tensor) -> Tensor:
+        r = (5.0 * d2.clamp_min(_TINY)).sqrt()
+        return (1.0 + r + r * r / 3.0) * torch.exp(-r)
+
+    @staticmethod
+    def phi_psi(d2: Tensor) -> tuple[Tensor, Tensor]:
+        r = (5.0 * d2).sqrt()
+        decay = torch.exp(-r)
+        return (1.0 + r + r * r / 3.0) * decay, (5.0 / 3.0) * (1.0 + r) * decay

@@ -1,0 +1,55 @@
+"""What an update did with a sample."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import torch
+
+from ..typing import Bool, Float, Int, Tensor
+
+
+class UpdateEvent(enum.IntEnum):
+    """What an update did with a sample."""
+
+    REFUSED = 0  #: masked out, or not finite under ``on_invalid="skip"``: nothing was learned
+    ABSORBED = 1  #: taken in; the learner has no basis, or projected the sample onto it
+    ADDED = 2  #: became a new basis point
+    REPLACED = 3  #: became a basis point, and another was pruned for it
+
+
+@dataclass(frozen=True)
+class UpdateReport:
+    """What an update did. All tensors have shape ``(*time, *batch_shape)``.
+
+    Attributes:
+        event: an :class:`UpdateEvent` per sample.
+        novelty: share of the prior variance at x that the basis does not explain, 0 to 1
+            (0 for learners without a basis).
+        nis: normalised innovation squared ``i^2 / (v + s2)``, mean over the outputs, before the update;
+            expected to be 1 (NaN for learners without uncertainty).
+        weight: weight given to the sample, 1 unless a robust update distrusted it.
+    """
+
+    event: Int[Tensor, "*time_and_batch"]
+    novelty: Float[Tensor, "*time_and_batch"]
+    nis: Float[Tensor, "*time_and_batch"]
+    weight: Float[Tensor, "*time_and_batch"]
+
+    @property
+    def accepted(self) -> Bool[Tensor, "*time_and_batch"]:
+        """Samples that changed the state."""
+        return self.event != UpdateEvent.REFUSED
+
+    @staticmethod
+    def stack(reports: list[UpdateReport]) -> UpdateReport:
+        """Reports of successive samples as one, time first."""
+        each = zip(*(vars(report).values() for report in reports), strict=True)
+        return UpdateReport(*map(torch.stack, each))
+
+    @staticmethod
+    def of_nothing(like: Bool[Tensor, "*batch"], dtype: torch.dtype) -> UpdateReport:
+        """No model had a sample."""
+        zero = torch.zeros_like(like, dtype=dtype)
+        return UpdateReport(torch.zeros_like(like, dtype=torch.int64), zero, zero, zero)

@@ -1,0 +1,167 @@
+"""What a sparse online GP can be given beside its basis: one protocol for all of it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable
+from typing import ClassVar, NamedTuple, Protocol, TypeVar
+
+import torch
+from torch import nn
+
+from ...exceptions import ParameterError
+from ...typing import Bool, Float, Tensor
+from ..kernels.kernel import Kernel
+from ..report import UpdateReport
+from .posterior import SparsePosterior
+
+
+class Units:
+    """The units in which a learner works: those of x and y, unless a part knows others."""
+
+    def inputs(self, x: Float[Tensor, "*any columns"]) -> Float[Tensor, "*any columns"]:
+        """x, or its first columns, in the learner's units."""
+        return x
+
+    def targets(self, y: Float[Tensor, "*any out"]) -> Float[Tensor, "*any out"]:
+        """y in the learner's units."""
+        return y
+
+    def of_sets(
+        self, x: Float[Tensor, "*batch n in"], y: Float[Tensor, "*batch n out"]
+    ) -> tuple[Tensor, Tensor]:
+        """n samples of each model in the learner's units."""
+        return x, y
+
+    def sets_as_given(self, z: Float[Tensor, "*batch n in"]) -> Float[Tensor, "*batch n in"]:
+        """Inputs in the learner's units back in their own."""
+        return z
+
+    def value(self, value: Float[Tensor, "*any out_or_1"], power: int) -> Tensor:
+        """An output in its own unit, or (power 2) a variance in its square."""
+        return value
+
+    def slope(self, slope: Float[Tensor, "*any out_or_1 columns"], power: int) -> Tensor:
+        """The derivative of such a value by the last columns of x."""
+        return slope
+
+    def curvature(self, curvature: Float[Tensor, "*any out_or_1 columns columns"]) -> Tensor:
+        """The second derivative of a variance by the last columns of x."""
+        return curvature
+
+
+class Sample(NamedTuple):
+    """One sample per model after its update."""
+
+    x: Float[Tensor, "*batch in"]  #: in its own units
+    y: Float[Tensor, "*batch out"]
+    mask: Float[Tensor, "*batch"] | None  #: 1 where a model has a sample; None: all have
+    innovation: Float[Tensor, "*batch out"]  #: in the learner's units, as the latent variance
+    variance: Float[Tensor, "*batch"]
+    report: UpdateReport
+
+
+class Host(Protocol):
+    """What a part finds in its learner."""
+
+    in_features: int
+    out_features: int
+    kernel: Kernel
+    log_noise_variance: nn.Parameter
+    posterior: SparsePosterior
+    units: Units
+    refresh_every: int
+    n_samples: int
+    """Samples before the present one."""
+    pending: Tensor
+    """Samples of each model since the caches were made, ``(*batch_shape)``."""
+
+    def shared_noise(self) -> Tensor:
+        """Noise variance by which the gain is computed, ``(*batch_shape)``."""
+        ...
+
+    def part(self, kind: type[P]) -> P | None:
+        """The part of that kind, if there is one (in :meth:`Part.bind`: among those before)."""
+        ...
+
+    def start_anew(self, models: Tensor, x: Tensor, y: Tensor, used: Tensor) -> None:
+        """These models forget all and learn the n samples ``used`` ``(n, *batch_shape)``."""
+        ...
+
+
+class Part(nn.Module):
+    """One thing that a :class:`SparseOnlineGP` does beside projecting samples onto its basis.
+
+    A part holds its few figures when it is made; the learner copies it and calls :meth:`bind` once, so one
+    specification may serve several learners. From then on it has buffers, which travel with the learner.
+    The learner calls all its parts in their order:
+
+    1. :meth:`weigh` within an update, on the gain;
+    2. :meth:`after_update` after each sample;
+    3. :meth:`on_rebuild` every ``refresh_every`` samples, before the caches are made anew from the natural
+       form, and :meth:`after_rebuild` thereafter.
+
+    A subclass implements what it needs; none of it may look at data on a GPU, or updates wait for it.
+    """
+
+    stands_last: ClassVar[bool] = False
+    """Whether it asks the others what they do, and so must be the last of them."""
+
+    def bind(self, learner: Host) -> None:
+        """Make buffers for this learner; raises ParameterError if the parts before do not go with it."""
+
+    def weigh(self, nis: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Weight of a sample's gain by its normalised innovation squared."""
+        return torch.ones_like(nis)
+
+    def after_update(self, learner: Host, sample: Sample) -> bool:
+        """Take note of a sample; True if the caches must be made anew at once."""
+        return False
+
+    def on_rebuild(self, learner: Host) -> None:
+        """Change the natural form before the caches are made from it."""
+
+    def after_rebuild(self, learner: Host) -> None:
+        """Take note of a state whose caches are fresh."""
+
+    def noise(self, variance: Float[Tensor, "*batch out"]) -> Float[Tensor, "*batch out"]:
+        """What predictions take for the observation noise."""
+        return variance
+
+    def forget(self, models: Bool[Tensor, "*batch"]) -> None:
+        """These models face another system: what was kept of the old one does not count."""
+
+    def reset(self) -> None:
+        """Back to what :meth:`bind` made; by default all buffers of its own to zero."""
+        for buffer in self.buffers(recurse=False):
+            buffer.zero_()
+
+    def extra_repr(self) -> str:
+        """Its figures."""
+        figures = {name: value for name, value in vars(self).items() if not name.startswith("_")}
+        plain = {name: value for name, value in figures.items() if type(value) in (int, float)}
+        return ", ".join(f"{name}={value}" for name, value in plain.items())
+
+
+P = TypeVar("P", bound=Part)
+
+
+def copy_parts(parts: Iterable[nn.Module]) -> list[Part]:
+    """Copies of specifications, for one learner.
+
+    Raises:
+        ParameterError: not a list of parts, two of a kind, or the last one not last.
+    """
+    valid = "a list of parts such as [ForgettingFactor(0.99), RobustWeight(3.0)]"
+    given = list(parts) if isinstance(parts, Iterable) else []
+    found = [part for part in given if isinstance(part, Part)]
+    if not isinstance(parts, Iterable) or len(found) < len(given):
+        raise ParameterError("parts", parts, valid)
+    kinds = [type(part) for part in found]
+    names = [kind.__name__ for kind in kinds]
+    for place, kind in enumerate(kinds):
+        if kinds.count(kind) > 1:
+            raise ParameterError("parts", names, f"with one {kind.__name__} at most")
+        if kind.stands_last and place < len(kinds) - 1:
+            raise ParameterError("parts", names, f"with {kind.__name__} last")
+    return [copy.deepcopy(part) for part in found]
