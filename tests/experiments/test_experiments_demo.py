@@ -16,7 +16,7 @@ from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.protocols.demo import Demo
 from torch_ekm.experiments.records import TrialRecord
-from torch_ekm.experiments.reporting.report import Report, Table
+from torch_ekm.experiments.reporting.report import Report
 from torch_ekm.experiments.reproduce import Experiment, reproduce
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.model import ModelOptions
@@ -150,16 +150,3 @@ def test_seeds_are_parsed() -> None:
     for text in ("a", "3:1", "1:2:3", ""):
         with pytest.raises(ParameterError, match="FIRST:END"):
             parse_seeds(text)
-
-
-def test_units_in_brackets_reach_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    from rich.console import Console
-
-    from torch_ekm import cli
-
-    table = Table("name", "Errors [deg]", ["median [ms]"], [["box [m]"]], "of [N]")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "console", Console(width=80))
-        cli._print_tables(Report("title", "summary", [table]), notes=True)
-    shown = capsys.readouterr().out
-    assert all(text in shown for text in ("Errors [deg]", "median [ms]", "box [m]", "of [N]"))
