@@ -10,17 +10,14 @@ import math
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from .._extras import require
 from ..description import HandDescription, ObjectDescription
 from ..exceptions import NonFiniteError, ParameterError, ShapeError
 from ..kinematics import HandKinematics, LinkPoses
-from ..typing import Float, Tensor
+from ..typing import Array, Float, Tensor
 from .contact_set import ContactSet
 from .pad_contact import Pad, PadContact, Solid, pad_contact
-
-Array = NDArray[np.float64]
 
 
 class ContactDetector:

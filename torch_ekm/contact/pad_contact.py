@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..description import ContactPad, Shape
+from ..typing import Array
 from .signed_distance import point_distance, surface_curvature, tangents
-
-Array = NDArray[np.float64]
 
 
 class Pad:

@@ -14,11 +14,10 @@ from collections.abc import Callable
 from math import copysign, hypot, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..description import Shape
+from ..typing import Array
 
-Array = NDArray[np.float64]
 Vec = tuple[float, float, float]
 Distance = Callable[[float, float, float], tuple[float, Vec]]
 """Point [m] -> signed distance [m] and its gradient, the outward normal."""

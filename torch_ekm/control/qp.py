@@ -8,14 +8,12 @@ from math import pi
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._extras import require
 from ..enhanced import Quadratic
 from ..exceptions import ParameterError, SolverError
-from ..typing import Tensor
+from ..typing import Array, Tensor
 
-Array = NDArray[np.float64]
 Numbers = Tensor | Array | float
 
 DEGREE = pi / 180  #: the program is solved for u in degrees: of the order of 1, like its rows

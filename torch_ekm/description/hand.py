@@ -10,11 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..typing import Array
 from .urdf import UrdfModel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._extras import require
 from ..exceptions import DescriptionError
+from ..typing import Array
 from ._toml import TomlTable, read_toml
 from .shape import Shape
 from .urdf import UrdfModel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._extras import require
 from ..exceptions import DescriptionError
+from ..typing import Array
 from .shape import Shape, merge_capsules
 
-Array = NDArray[np.float64]
 MOVING = ("revolute", "continuous")
 _SHAPES = ("box", "cylinder", "sphere", "capsule", "mesh")
 # what is read of an element: its children, those of them that it needs, ...

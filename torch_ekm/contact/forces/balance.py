@@ -8,9 +8,9 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from ...typing import Array
 from .friction import FrictionCone
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 

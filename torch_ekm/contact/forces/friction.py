@@ -11,11 +11,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...typing import Array
 from ..contact_model import ContactModel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

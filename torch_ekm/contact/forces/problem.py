@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..._extras import require
+from ...typing import Array
 from .balance import BalanceEquations
 from .friction import outer_directions
 from .options import ForceOptions
-
-Array = NDArray[np.float64]
 
 
 def force_problem(eq: BalanceEquations, options: ForceOptions, cuts: Array, *, soft: bool = False):

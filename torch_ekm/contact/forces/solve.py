@@ -6,15 +6,13 @@ import math
 import warnings
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..._extras import require
+from ...typing import Array
 from .balance import BalanceEquations, ForceSolution, ForceStatus
 from .friction import cutting_planes
 from .options import ForceOptions
 from .problem import force_problem
-
-Array = NDArray[np.float64]
 
 _TOLERANCE = 2e-7  # [N] largest friction violation left by the cutting planes
 _MAX_CUTS = 30

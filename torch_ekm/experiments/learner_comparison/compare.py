@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ...exceptions import MissingExtraError, ParameterError, ShapeError
 from ...residual import ResidualLearner
+from ...typing import Array
 from ..jobs import run_jobs
 from ..learners import learner_factory
 from .fingerprint import fingerprint
@@ -24,7 +24,6 @@ from .report import ComparisonReport
 from .scores import Score, block_bootstrap, blocks_of
 from .stream import LEAST, Stream
 
-Array = NDArray[np.float64]
 Factory = Callable[[int, int], ResidualLearner]
 
 

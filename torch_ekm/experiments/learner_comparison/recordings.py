@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..._extras import require
 from ...exceptions import DescriptionError, UnknownNameError
+from ...typing import Array
 from .stream import Stream, in_own_units, load_table
 
-Array = NDArray[np.float64]
 Root = str | Path | None
 LIMIT = 1500  #: samples of a recording that are used if nobody says otherwise
 

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..._extras import require
+from ...typing import Array
 from ..reporting.statistics import Estimate
 from .learners import OURS
 from .stream import Stream
 
-Array = NDArray[np.float64]
 _BLOCKS = 20
 
 

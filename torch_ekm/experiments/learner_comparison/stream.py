@@ -9,13 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ...exceptions import DescriptionError, ShapeError, UnknownNameError
-from ...typing import Float, Tensor
+from ...typing import Array, Float, Tensor
 from .table_file import read_table
 
-Array = NDArray[np.float64]
 LEAST = 40  #: samples; fewer cannot tell learners apart
 
 

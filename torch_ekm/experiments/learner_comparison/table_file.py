@@ -6,12 +6,10 @@ import csv
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..._extras import require
 from ...exceptions import DescriptionError
-
-Array = NDArray[np.float64]
+from ...typing import Array
 
 
 def read_table(path: Path) -> tuple[tuple[str, ...], Array]:

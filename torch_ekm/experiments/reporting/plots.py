@@ -7,17 +7,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..._extras import require
 from ...exceptions import ShapeError
+from ...typing import Array
 from .report import FigureFile
 from .statistics import ALPHA, learning_curve
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 #: Okabe and Ito's palette, safe for colour-blind readers; grey for what is compared against.
 COLOURS = {"KM": "#7f7f7f", "KM+I": "#E69F00", "E-KM": "#0072B2", "E-KM+I": "#009E73", "limit": "#D55E00"}

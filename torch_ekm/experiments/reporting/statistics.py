@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..._extras import require
 from ...exceptions import NonFiniteError, ParameterError, ShapeError
+from ...typing import Array
 from ..records import Record, TrialRecord
 
-Array = NDArray[np.float64]
 #: A figure of a trial; None: this trial has none.
 Value = Callable[[TrialRecord], "float | None"]
 

@@ -7,15 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ...description import HandDescription, load_hand
 from ...kinematics import ActuationMap
 from ...plant import PlantStatus
 from ...rendering.scene import Scene, make_scene
 from ...simulation import PlantConfig, SimulatedHand
-
-Array = NDArray[np.float64]
+from ...typing import Array
 
 _FRAMES = 10  # of one actuator's way through its range
 _STEP_DEG = 3.0  # most that the grasp's actuators are moved at once: the object has time to follow

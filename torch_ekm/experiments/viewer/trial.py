@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ...description import HandDescription, ObjectDescription, load_hand, load_object
 from ...exceptions import DescriptionError, EKMError
 from ...kinematics.se3 import log as rotation_vector
 from ...plant import Trajectory, TrialLog
 from ...rendering import Scene, make_scene
-
-Array = NDArray[np.float64]
+from ...typing import Array
 
 _FRAME_SECONDS = 0.25
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...description import ContactPad, HandDescription, ObjectDescription
 from ...description.shape import Shape
-
-Array = NDArray[np.float64]
+from ...typing import Array
 
 
 def chain(hand: HandDescription, link: str) -> list[int]:

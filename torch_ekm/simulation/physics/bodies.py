@@ -11,9 +11,8 @@ from ...description import HandDescription, ObjectDescription
 from ...description.shape import Shape
 from ...description.urdf import UrdfJoint, UrdfLink, UrdfModel
 from ...exceptions import DescriptionError
+from ...typing import Array
 from .engine import sapien
-
-Array = NDArray[np.float64]
 
 _ARMATURE = 1e-4  # [kg m^2] motor inertia seen at a joint; lets 1 ms steps carry stiff tendons
 _HAND_GROUP = 1  # bodies that share a bit of the third collision word ignore each other
