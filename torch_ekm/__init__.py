@@ -13,37 +13,41 @@ from __future__ import annotations
 
 from importlib.metadata import PackageNotFoundError, version
 
-from . import exceptions as exceptions
-from .enhanced import EnhancedModel as EnhancedModel
-from .exceptions import EKMError as EKMError
-from .exceptions import MissingExtraError as MissingExtraError
-from .exceptions import NonFiniteError as NonFiniteError
-from .exceptions import ParameterError as ParameterError
-from .exceptions import ShapeError as ShapeError
-from .exceptions import UnknownNameError as UnknownNameError
-from .residual import ActionLinearKernel as ActionLinearKernel
-from .residual import CalibrateNoise as CalibrateNoise
-from .residual import DeepKernelSOGP as DeepKernelSOGP
-from .residual import DetectChanges as DetectChanges
-from .residual import ForgettingFactor as ForgettingFactor
-from .residual import KRLSTracker as KRLSTracker
-from .residual import LearnerFleet as LearnerFleet
-from .residual import LearnHyperparameters as LearnHyperparameters
-from .residual import LocalGPs as LocalGPs
-from .residual import MixtureResidual as MixtureResidual
-from .residual import ProcessNoise as ProcessNoise
-from .residual import RandomFeatureRLS as RandomFeatureRLS
-from .residual import RecursiveLeastSquares as RecursiveLeastSquares
-from .residual import ReplayMLP as ReplayMLP
-from .residual import ResidualLearner as ResidualLearner
-from .residual import RobustWeight as RobustWeight
-from .residual import SparseOnlineGP as SparseOnlineGP
-from .residual import SquaredExponential as SquaredExponential
-from .residual import Standardize as Standardize
-from .residual import UpdateEvent as UpdateEvent
-from .residual import UpdateReport as UpdateReport
-from .residual import WindowGP as WindowGP
-from .residual import ZeroResidual as ZeroResidual
+from . import exceptions
+from .enhanced import EnhancedModel
+from .exceptions import (
+    EKMError,
+    MissingExtraError,
+    NonFiniteError,
+    ParameterError,
+    ShapeError,
+    UnknownNameError,
+)
+from .residual import (
+    ActionLinearKernel,
+    CalibrateNoise,
+    DeepKernelSOGP,
+    DetectChanges,
+    ForgettingFactor,
+    KRLSTracker,
+    LearnerFleet,
+    LearnHyperparameters,
+    LocalGPs,
+    MixtureResidual,
+    ProcessNoise,
+    RandomFeatureRLS,
+    RecursiveLeastSquares,
+    ReplayMLP,
+    ResidualLearner,
+    RobustWeight,
+    SparseOnlineGP,
+    SquaredExponential,
+    Standardize,
+    UpdateEvent,
+    UpdateReport,
+    WindowGP,
+    ZeroResidual,
+)
 
 try:
     __version__ = version("torch_ekm")

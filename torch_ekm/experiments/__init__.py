@@ -1,5 +1,5 @@
 """Claims: protocols, metrics, figures, reports."""
 
-from .learner_comparison.compare import compare as compare
+from .learner_comparison.compare import compare
 
 __all__ = ["compare"]

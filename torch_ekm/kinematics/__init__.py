@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from .actuation import ActuationMap as ActuationMap
-from .grasp_state import GraspState as GraspState
-from .hand_kinematics import HandKinematics as HandKinematics
-from .link_poses import LinkPoses as LinkPoses
+from .actuation import ActuationMap
+from .grasp_state import GraspState
+from .hand_kinematics import HandKinematics
+from .link_poses import LinkPoses
 
 __all__ = [
     "ActuationMap",

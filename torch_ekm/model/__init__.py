@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from .kinematic_model import KinematicModel as KinematicModel
-from .linearization import GraspForces as GraspForces
-from .linearization import Linearization as Linearization
-from .linearization import ModelStatus as ModelStatus
-from .options import ModelOptions as ModelOptions
+from .kinematic_model import KinematicModel
+from .linearization import GraspForces, Linearization, ModelStatus
+from .options import ModelOptions
 
 __all__ = [
     "GraspForces",

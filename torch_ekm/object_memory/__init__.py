@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from .grasp_signature import GraspSignature as GraspSignature
-from .model_bank import ModelBank as ModelBank
-from .signature_model import SignatureModel as SignatureModel
+from .grasp_signature import GraspSignature
+from .model_bank import ModelBank
+from .signature_model import SignatureModel
 
 __all__ = [
     "GraspSignature",

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from .observation import Observation as Observation
-from .observation import PlantStatus as PlantStatus
-from .observation import Truth as Truth
-from .plant import Plant as Plant
-from .recording_plant import RecordingPlant as RecordingPlant
-from .replayed_plant import ReplayedPlant as ReplayedPlant
-from .trajectory import Trajectory as Trajectory
-from .trial_log import TrialEntry as TrialEntry
-from .trial_log import TrialLog as TrialLog
-from .wrapper import PlantWrapper as PlantWrapper
+from .observation import Observation, PlantStatus, Truth
+from .plant import Plant
+from .recording_plant import RecordingPlant
+from .replayed_plant import ReplayedPlant
+from .trajectory import Trajectory
+from .trial_log import TrialEntry, TrialLog
+from .wrapper import PlantWrapper
 
 __all__ = [
     "Observation",
