@@ -6,6 +6,8 @@ from .observation import Observation, PlantStatus, Truth
 from .plant import Plant
 from .recording_plant import RecordingPlant
 from .replayed_plant import ReplayedPlant
+from .servo_inverse import ServoInverse
+from .servo_model import ServoModel
 from .trajectory import Trajectory
 from .trial_log import TrialEntry, TrialLog
 from .wrapper import PlantWrapper
@@ -17,6 +19,8 @@ __all__ = [
     "PlantWrapper",
     "RecordingPlant",
     "ReplayedPlant",
+    "ServoInverse",
+    "ServoModel",
     "Trajectory",
     "TrialEntry",
     "TrialLog",

@@ -1,0 +1,168 @@
+"""The servo inverse against servos whose dead zone and bias are known."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
+from torch_ekm.plant import Observation, ServoInverse, ServoModel
+
+DEG = math.pi / 180
+EYE, ORIGIN = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+REACH = 60 * DEG * np.ones(3)
+HAND = SimpleNamespace(
+    actuator_names=("thumb", "index", "middle"), actuator_lower=-REACH, actuator_upper=REACH
+)
+
+
+class Servos:
+    """Three motors, ``w = D(v + b + fresh; d)``, clipped to their range."""
+
+    def __init__(self, seed: int = 0) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.d, self.b = np.array([1.3, 0.4, 2.0]) * DEG, np.array([0.2, -0.3, 0.0]) * DEG
+        self.fresh, self.blocked = 0.1 * DEG, np.zeros(3, bool)
+        self.a = np.zeros(3)
+
+    def reset(self, seed: int) -> Observation:
+        return self.observe()
+
+    def observe(self) -> Observation:
+        a = torch.from_numpy(self.a.copy())
+        return Observation(a, a, ORIGIN, EYE, a)
+
+    def command(self, delta_a: torch.Tensor) -> Observation:
+        reach = REACH
+        x = np.clip(self.a + delta_a.numpy(), -reach, reach) - self.a + self.b
+        x = x + self.fresh * self.rng.uniform(-1, 1, 3)
+        w = np.where(self.blocked, 0.0, x - np.clip(x, -self.d, self.d))
+        self.a = np.clip(self.a + w, -reach, reach)
+        return self.observe()
+
+    def close(self) -> None:
+        pass
+
+
+def moves(n: int, seed: int = 1, size: float = 2.0) -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return list(size * DEG * torch.randn(n, 3, generator=generator, dtype=torch.float64))
+
+
+def test_dead_zone_and_bias_are_found_within_their_standard_errors() -> None:
+    inner = Servos()
+    plant = ServoInverse(inner, HAND)
+    plant.reset(0)
+    for w in moves(40):
+        plant.command(w)
+    error = torch.stack([plant.servo.dead_zone, plant.servo.bias]) - torch.from_numpy(
+        np.stack([inner.d, inner.b])
+    )
+    assert float(error.abs().max()) < 0.08 * DEG
+    assert bool((error.abs() < 4 * plant.servo.standard_errors).all())
+    assert bool((plant.servo.standard_errors < 0.05 * DEG).all())
+    assert torch.allclose(plant.servo.noise_std, torch.full((3,), 0.1 * DEG / 3**0.5).double(), rtol=0.4)
+    assert "thumb: d=1.3" in repr(plant.servo)
+
+
+def test_the_encoders_then_do_what_is_wanted_in_both_directions() -> None:
+    plant = ServoInverse(Servos(), HAND)
+    seen = plant.reset(0)
+    for k, w in enumerate([*moves(30), *moves(60, seed=2, size=0.6)]):
+        after = plant.command(w)
+        if k >= 30:
+            wanted = torch.where(w.abs() > plant.servo.resolution, w, 0 * w)
+            assert float((after.a - seen.a - wanted).abs().max()) < 0.25 * DEG
+        seen = after
+
+
+def test_a_small_error_is_no_rest_point_and_nothing_winds_up_on_reversal() -> None:
+    """From nothing known: wishes of 0.3 deg soon move a servo with a dead zone of 1.3 deg, and back, too."""
+    plant = ServoInverse(Servos(), HAND)
+    seen = plant.reset(0)
+    wish = torch.tensor([0.3, 0.0, 0.0], dtype=torch.float64) * DEG
+    for _ in range(8):
+        after = plant.command(wish)
+        if after.a[0] != seen.a[0]:
+            break
+    assert after.a[0] > seen.a[0]
+    back = plant.command(-wish)
+    for _ in range(2):
+        if back.a[0] != after.a[0]:
+            break
+        back = plant.command(-wish)
+    assert -1.0 * DEG < back.a[0] - after.a[0] < 0
+
+
+def test_a_servo_that_never_moves_is_named_and_not_wound_up() -> None:
+    inner = Servos()
+    plant = ServoInverse(inner, HAND)
+    plant.reset(0)
+    for w in moves(30):
+        plant.command(w)
+    known = plant.servo.estimate.clone()
+    inner.blocked[1] = True
+    for k in range(15):
+        plant.command(torch.full((3,), (-1) ** k * 1.0 * DEG, dtype=torch.float64))
+    assert plant.stuck == ("index",)
+    assert float((plant.servo.estimate[1] - known[1]).abs().max()) == 0.0
+    inner.blocked[1] = False
+    before = plant.observe().a
+    after = plant.command(torch.full((3,), 1.0 * DEG, dtype=torch.float64))
+    assert plant.stuck == ()
+    assert float((after.a - before - DEG).abs().max()) < 0.25 * DEG
+
+
+def test_the_end_of_the_range_teaches_nothing() -> None:
+    plant = ServoInverse(Servos(), HAND)
+    plant.reset(0)
+    for w in moves(30):
+        plant.command(w)
+    known = plant.servo.estimate.clone()
+    up = torch.full((3,), 200 * DEG, dtype=torch.float64)
+    plant.command(up)
+    at_end = {k: v.clone() for k, v in plant.servo.state_dict().items()}
+    for _ in range(10):
+        plant.command(5 * DEG * torch.ones(3, dtype=torch.float64))
+    assert plant.stuck == ()
+    assert all(torch.equal(v, at_end[k]) for k, v in plant.servo.state_dict().items())
+    assert float((plant.servo.estimate - known).abs().max()) < 0.05 * DEG
+
+
+@pytest.mark.parametrize("scale", [0.2, 2.5])
+def test_a_repaired_servo_is_found_again(scale: float) -> None:
+    inner = Servos()
+    plant = ServoInverse(inner, HAND)
+    plant.reset(0)
+    for w in moves(60):
+        plant.command(w)
+    inner.d = scale * inner.d
+    for w in moves(12, seed=3):
+        plant.command(w)
+    assert float((plant.servo.dead_zone - torch.from_numpy(inner.d)).abs().max()) < 0.25 * DEG
+    assert plant.stuck == ()
+
+
+def test_bad_input_changes_nothing_and_a_state_dict_carries_all() -> None:
+    plant = ServoInverse(Servos(), HAND)
+    plant.reset(0)
+    for w in moves(5):
+        plant.command(w)
+    kept = {k: v.clone() for k, v in plant.servo.state_dict().items()}
+    with pytest.raises(ShapeError):
+        plant.servo.update(torch.zeros(2), torch.zeros(3))
+    with pytest.raises(NonFiniteError):
+        plant.servo.update(torch.zeros(3), torch.tensor([0.0, math.nan, 0.0]))
+    assert all(torch.equal(v, kept[k]) for k, v in plant.servo.state_dict().items())
+    with pytest.raises(ParameterError, match="forgetting"):
+        ServoModel(["a"], forgetting=1.1)
+    other = ServoModel(plant.servo.names)
+    other.load_state_dict(kept)
+    v, w = moves(2)
+    other.update(v, w)
+    plant.servo.update(v, w)
+    assert torch.equal(other.estimate, plant.servo.estimate)

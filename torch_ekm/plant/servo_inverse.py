@@ -1,0 +1,62 @@
+"""Commands through the inverse of the servos."""
+
+from __future__ import annotations
+
+import torch
+
+from ..description import HandDescription
+from ..typing import Float, Tensor
+from .observation import Observation
+from .plant import Plant
+from .servo_model import ServoModel
+from .wrapper import PlantWrapper
+
+
+class ServoInverse(PlantWrapper):
+    """A plant whose increments are what its encoders shall do: commands go through the inverse of the servos.
+
+    Dead zone and bias of each servo are learned from every motion (:class:`ServoModel`). What is learned of
+    the hand is then free of them::
+
+        plant = ServoInverse(SimulatedHand(hand, obj), hand)
+        plant.command(delta_a)      # the encoders move by delta_a, as nearly as the servos can
+        print(plant.servo)          # dead zones and biases with standard errors
+
+    Args:
+        plant: with encoders (``Observation.a``).
+        hand: gives names and ranges of the actuators.
+        servo: what is known of the servos; None: nothing yet. It belongs to the hand, not to an object: keep it
+            from trial to trial, and save its state dict with the learner's.
+    """
+
+    def __init__(self, plant: Plant, hand: HandDescription, servo: ServoModel | None = None) -> None:
+        super().__init__(plant)
+        self.servo = ServoModel(hand.actuator_names) if servo is None else servo
+        self._range = [torch.from_numpy(edge) for edge in (hand.actuator_lower, hand.actuator_upper)]
+        self._seen: Observation | None = None
+
+    @property
+    def stuck(self) -> tuple[str, ...]:
+        """Actuators that do not move however they are commanded."""
+        return tuple(n for n, s in zip(self.servo.names, self.servo.stuck.tolist(), strict=True) if s)
+
+    def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
+        """Move the encoders by ``delta_a`` [rad], wait, read the sensors, learn of the servos.
+
+        Raises:
+            ShapeError, NonFiniteError: the increment is no finite figure for each actuator.
+        """
+        seen = self.observe() if self._seen is None else self._seen
+        v = self.servo.command(delta_a)
+        after = super().command(v)
+        lower, upper = self._range
+        free = torch.ones_like(v, dtype=torch.bool)
+        for a in (seen.a + v, after.a):  # a stop of the range is not a dead zone
+            free &= (a > lower + self.servo.moved_from) & (a < upper - self.servo.moved_from)
+        self.servo.update(v, after.a - seen.a, free)
+        return after
+
+    def observation(self, seen: Observation) -> Observation:
+        """Remembered as the start of the next motion."""
+        self._seen = seen
+        return seen
