@@ -78,6 +78,9 @@ class ClosedLoop:
         controller: its :class:`~torch_ekm.enhanced.EnhancedModel`, if it has one, learns after every motion.
         rule: when to stop.
         learn: False leaves the learner as it is.
+        learn_from_commands: the learner's action is what was commanded, in place of what the encoders did.
+            For a plant without a :class:`~torch_ekm.plant.ServoInverse`, whose dead zone is then learned
+            together with the hand.
     """
 
     def __init__(
@@ -87,10 +90,11 @@ class ClosedLoop:
         rule: StoppingRule | None = None,
         *,
         learn: bool = True,
+        learn_from_commands: bool = False,
     ) -> None:
         self.plant, self.controller = plant, controller
         self.rule = StoppingRule() if rule is None else rule
-        self.learn = learn
+        self.learn, self.learn_from_commands = learn, learn_from_commands
 
     def run(self, target: PoseTarget, on_step: Callable[[Step], object] | None = None) -> Manipulation:
         """Drive the object to ``target``.
@@ -147,4 +151,8 @@ class ClosedLoop:
         enhanced = self.controller.enhanced
         if not self.learn or enhanced is None or after.status is not PlantStatus.HELD:
             return None
-        return enhanced.update(seen.state, decision.delta_a, increment, decision.nominal)
+        if self.learn_from_commands:
+            return enhanced.update(seen.state, decision.delta_a, increment, decision.nominal)
+        moved = after.a - seen.a
+        nominal = None if decision.linearization is None else decision.linearization.step(moved)
+        return enhanced.update(seen.state, moved, increment, nominal)

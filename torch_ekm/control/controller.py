@@ -153,13 +153,14 @@ class LookAndMoveController:
         seen = Situation(hand, self.focus, state, a, fingertip_force, error, desired)
         enhanced, J_m, da = self.enhanced, lin.manipulation_jacobian, a.new_zeros(hand.n_a)
         encoded = None if enhanced is None else enhanced.encode(state)
-        for _ in range(1 if enhanced is None else self.sqp_iterations):
+        linear = enhanced is None or enhanced.affine
+        for _ in range(1 if linear else self.sqp_iterations):
             model = LinearizedModel.about(da, lin, enhanced, encoded)
             problem = self.program(model, seen)
             solution = problem.solve(self.solver)
             best = torch.as_tensor(solution.u, dtype=a.dtype)
             change = best - da
-            done = enhanced is None or float(change.abs().max()) <= self.sqp_tolerance
+            done = linear or float(change.abs().max()) <= self.sqp_tolerance
             da = best if done else da + self.sqp_damping * change
             if done:
                 break

@@ -13,6 +13,7 @@ from torch.func import jacrev
 from ..exceptions import NonFiniteError, ShapeError
 from ..kinematics import GraspState
 from ..residual.base import ResidualLearner, UpdateReport
+from ..residual.kernels.action_linear import ActionLinearKernel
 from ..typing import Float, Tensor
 from .action_variance import Quadratic, action_variance
 from .encoding import GraspEncoding, GraspModel
@@ -102,6 +103,11 @@ class EnhancedModel(nn.Module):
         rows = list(range(n_q, n_q + 6))
         step = math.radians(2.0)
         return cls(model, learner, encode=encode, outputs=rows, action_scale=1 / step, output_scale=scale)
+
+    @property
+    def affine(self) -> bool:
+        """g is linear in the action, so one linearization says all about a state."""
+        return isinstance(getattr(self.learner, "kernel", None), ActionLinearKernel)
 
     def features(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_x"]:
         """``x = [encode(s); action_scale * da]``."""

@@ -39,6 +39,8 @@ class CameraOff(PlantWrapper):
         self.dark = False
         self._state: GraspState | None = None
         """Last passed on."""
+        self._a: Tensor | None = None
+        """Last encoders."""
 
     def reset(self, seed: int) -> Observation:
         """Grasp anew, camera on."""
@@ -47,12 +49,14 @@ class CameraOff(PlantWrapper):
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Move the actuators by ``delta_a`` [rad], wait, read the sensors that are on."""
-        if self.dark and self._state is not None:
-            self._state = self._state.plus(self.predict(self._state, delta_a))
-        return self.observation(self.plant.command(delta_a))
+        before, after = self._a, self.plant.command(delta_a)
+        if self.dark and self._state is not None and before is not None:
+            self._state = self._state.plus(self.predict(self._state, after.a - before))
+        return self.observation(after)
 
     def observation(self, seen: Observation) -> Observation:
         """``seen``, in the dark with the predicted pose."""
+        self._a = seen.a
         if not self.dark or self._state is None:
             self._state = seen.state
             error = self.target.error(seen.state)

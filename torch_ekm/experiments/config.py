@@ -35,8 +35,9 @@ from .learners import DEFAULT_LEARNER, LEARNERS, learner_figures
 _DEG = math.pi / 180
 
 #: The controllers that are compared on the same seeds, grasps, limits and stopping rule. "+I" is integral
-#: action: the increments accumulate on the set-point instead of the encoder, which learns nothing.
-CONTROLLERS = ("KM", "KM+I", "E-KM", "E-KM+I")
+#: action: the increments accumulate on the set-point instead of the encoder, which learns nothing. "+S" is
+#: the servo inverse, on which the E-KM stands, too: what it gains over KM+S it has learned of the hand.
+CONTROLLERS = ("KM", "KM+I", "KM+S", "E-KM")
 #: Seeds from here on are never used for tuning.
 FIRST_REPORTED = 1000
 
@@ -68,6 +69,8 @@ class Setting:
     """Changes of the controller's parts, ``{"OffAxisTask.rotation_weight": 0.1}``; one that is not among the
     defaults is added (:mod:`~torch_ekm.control.tasks`, :mod:`~torch_ekm.control.limits`, and the
     ``LimitingFunction``)."""
+    servo_inverse: bool = True
+    """The E-KM's plant has one; without it the dead zone is learned together with the hand."""
     learner: str = DEFAULT_LEARNER
     learner_options: Mapping[str, Any] = field(default_factory=dict)
     capacity: int = 60

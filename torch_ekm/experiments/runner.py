@@ -16,7 +16,7 @@ from ..enhanced import EnhancedModel, GraspEncoding
 from ..exceptions import EquilibriumError, GraspError
 from ..kinematics import GraspState
 from ..model import KinematicModel
-from ..plant import Plant
+from ..plant import Plant, ServoInverse, ServoModel
 from ..residual import ResidualLearner
 from ..simulation import Change, DisturbedPlant, SimulatedHand, Tug
 from .camera_off import CameraOff
@@ -57,6 +57,10 @@ class Bench:
         if setting.sensing:
             stuck = setting.parameters().stuck_joints
             self.plant = _sensed(self.disturbed, self.hand, stuck, keep_images)
+        inverse = controller == "KM+S" or (self.learns and setting.servo_inverse)
+        self.servo = ServoModel(self.hand.hand.actuator_names) if inverse else None
+        if inverse:
+            self.plant = ServoInverse(self.plant, self.hand.hand, self.servo)
         self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model_options())
         self.learner: ResidualLearner | None = None
         self.encoding: GraspEncoding | None = None
@@ -138,7 +142,9 @@ class Bench:
         if blind_deg:
             model = self.model if self.enhanced is None else self.enhanced
             plant = CameraOff(plant, model, target, axis, blind_deg * _DEG)
-        done = ClosedLoop(plant, controller, self.setting.stopping_rule(), learn=learn).run(target)
+        rule, commands = self.setting.stopping_rule(), self.servo is None
+        loop = ClosedLoop(plant, controller, rule, learn=learn, learn_from_commands=commands)
+        done = loop.run(target)
         return TrialRecord.of(about, done, axis, learns=self.learns, poses=poses)
 
     def long_step(self, seed: int, trial: int, step_deg: float) -> Record:

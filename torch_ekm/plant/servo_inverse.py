@@ -25,8 +25,8 @@ class ServoInverse(PlantWrapper):
     Args:
         plant: with encoders (``Observation.a``).
         hand: gives names and ranges of the actuators.
-        servo: what is known of the servos; None: nothing yet. It belongs to the hand, not to an object: keep it
-            from trial to trial, and save its state dict with the learner's.
+        servo: what is known of the servos; None: nothing yet. It belongs to the hand, not to an object: keep
+            it from trial to trial, and save its state dict with the learner's.
     """
 
     def __init__(self, plant: Plant, hand: HandDescription, servo: ServoModel | None = None) -> None:
