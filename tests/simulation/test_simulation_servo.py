@@ -71,15 +71,15 @@ def test_backlash_is_a_play_between_motor_and_tendon():
         np.testing.assert_allclose(servo.encoder, motor)
 
 
-def test_snapshot_brings_everything_back():
+def test_another_servo_goes_on_from_the_same_place():
     servo = make(backlash=0.02, relative_to="setpoint")
     command(servo, [0.1, 0.2, -0.1])
-    state = servo.snapshot()
+    other = make(dead_zone=0.1)
+    other.take_over(servo)
     command(servo, [0.1, 0.1, 0.1])
-    servo.restore(state)
-    np.testing.assert_allclose(servo.encoder, [0.6, 0.7, 0.4])
-    np.testing.assert_allclose(servo.output, [0.59, 0.69, 0.41])
-    np.testing.assert_allclose(servo.snapshot().setpoint, [0.6, 0.7, 0.4])
+    np.testing.assert_allclose(other.encoder, [0.6, 0.7, 0.4])
+    np.testing.assert_allclose(other.output, [0.59, 0.69, 0.41])
+    np.testing.assert_allclose(other.setpoint, [0.6, 0.7, 0.4])
 
 
 @pytest.mark.parametrize(("delta", "error"), [([0.1, 0.1], ShapeError), ([0.1, np.nan, 0.1], NonFiniteError)])
@@ -87,7 +87,7 @@ def test_bad_commands_change_nothing(delta, error):
     servo = make()
     with pytest.raises(error):
         command(servo, delta)
-    np.testing.assert_allclose(servo.snapshot().setpoint, 0.5)
+    np.testing.assert_allclose(servo.setpoint, 0.5)
     np.testing.assert_allclose(servo.encoder, 0.5)
 
 

@@ -1,6 +1,6 @@
 """From raw readings to joint angles and poses.
 
-Vision: an image source (any ``Iterable[Frame]``) gives frames, :class:`MarkerTracker` turns them into the object's pose in the hand
+Vision: :class:`MarkerTracker` turns images (of any ``Iterable[Frame]``) into the object's pose in the hand
 frame. Hall sensors: :class:`HallCalibration` turns counts into angles, :class:`JointEstimator` joins them
 with the encoders, :class:`ContactAligned` corrects the joints that no sensor reads. The same code serves
 simulated and real readings."""

@@ -78,11 +78,10 @@ class PinchProblem:
     rounded ends, joints away from their stops, tendons taut, the object where it is wanted.
 
     Args:
-        hand, obj: the bodies.
+        hand, obj: the bodies as they really are.
         transmission: moment arms, springs and stiffness of the plant that will hold the object.
         thumb, fingers: names of the pads that oppose each other.
         along: wanted direction of the object's long axis, in the hand frame.
-        mass_factor, com_shift, friction, object_scale: see :class:`PlantParameters`.
 
     Raises:
         UnknownNameError: there is no such pad; the message lists all.
@@ -95,11 +94,7 @@ class PinchProblem:
         transmission: Transmission,
         thumb: str,
         fingers: tuple[str, ...],
-        along: tuple[float, float, float] = (0.0, 1.0, 0.0),
-        mass_factor: float = 1.0,
-        com_shift: tuple[float, ...] = (0.0, 0.0, 0.0),
-        friction: float = 1.0,
-        object_scale: float = 1.0,
+        along: Array,
     ) -> None:
         by_name = {pad.name: pad for pad in hand.pads}
         for name in (thumb, *fingers):
@@ -107,7 +102,7 @@ class PinchProblem:
                 raise UnknownNameError("contact pad", name, by_name)
         self.hand, self.obj, self.transmission = hand, obj, transmission
         self.pads = tuple(by_name[name] for name in (thumb, *fingers))
-        self.along = np.array(along, dtype=np.float64)
+        self.along = along
         self.kinematics = HandKinematics(hand)
         self._links = [self.kinematics.link_index(pad.link) for pad in self.pads]
         self._upstream = self.kinematics.upstream.numpy()[self._links]  # (n_c, n_q)
@@ -122,10 +117,6 @@ class PinchProblem:
         self._radius = np.array([pad.radius for pad in self.pads])
         links, self._ball, self._ball_radius = obstacles(hand, self.pads)
         self._ball_link = [self.kinematics.link_index(name) for name in links]
-        self._mass = mass_factor * obj.mass
-        self._com = obj.com + np.array(com_shift)
-        self._mu = friction * obj.friction
-        self._shapes = tuple(shape.scaled(object_scale) for shape in obj.shapes)
         self._prepare_mechanism()
         self._axes = object_axes(obj)
         self.towards = self._direction_of_grasp()
@@ -189,11 +180,11 @@ class PinchProblem:
         turn, origin = links[..., :3, :3], links[..., :3, 3]
         centre = origin + np.einsum("bcij,cj->bci", turn, self._tip)
         local = np.einsum("bji,bcj->bci", R, centre - o[:, None])
-        distance, normal = signed_distance(self._shapes, local)
+        distance, normal = signed_distance(self.obj.shapes, local)
         n = np.einsum("bij,bcj->bci", R, normal)
         every = poses.transforms.numpy()[:, self._ball_link]
         ball = every[..., :3, 3] + np.einsum("bcij,cj->bci", every[..., :3, :3], self._ball)
-        clearance, _ = signed_distance(self._shapes, np.einsum("bji,bcj->bci", R, ball - o[:, None]))
+        clearance, _ = signed_distance(self.obj.shapes, np.einsum("bji,bcj->bci", R, ball - o[:, None]))
         point = centre - self._radius[:, None] * n
         return PinchGeometry(
             q=q,
@@ -222,9 +213,9 @@ class PinchProblem:
     def equations(self, x: Array, request: PinchRequest, g: PinchGeometry | None = None) -> Array:
         """What must vanish, in units of its tolerance."""
         g = self.geometry(x) if g is None else g
-        weight = self._mass * np.array(request.gravity)
+        weight = self.obj.mass * np.array(request.gravity)
         force = g.force.sum(axis=1) + weight
-        centre = g.rotation @ self._com
+        centre = g.rotation @ self.obj.com
         moment = np.cross(g.point - g.position[:, None], g.force).sum(axis=1) + np.cross(centre, weight)
         spring = self.transmission.spring_stiffness * (g.q - self.transmission.spring_rest)
         passive = (spring + g.torque)[:, self.moving] @ self._passive
@@ -238,7 +229,7 @@ class PinchProblem:
         g = self.geometry(x)
         f_n = -np.einsum("bci,bci->bc", g.force, g.normal)
         f_t = np.linalg.norm(g.force + f_n[..., None] * g.normal, axis=-1)
-        cone = np.maximum(0.0, f_t - 0.4 * self._mu * f_n) / 0.05
+        cone = np.maximum(0.0, f_t - 0.4 * self.obj.friction * f_n) / 0.05
         share = (f_n[:, 1:] - f_n[:, :1] / max(1, len(self.pads) - 1)) / 1.0
         cap = np.maximum(0.0, 0.3 + np.einsum("bci,bci->bc", g.normal, g.pad_axis)) / 0.1
         pad = np.maximum(0.0, 0.3 + np.einsum("bci,bci->bc", g.normal, g.pad_direction)) / 0.1

@@ -60,26 +60,9 @@ def make_servo(hand: HandDescription, config: PlantConfig, parameters: PlantPara
     )
 
 
-def true_descriptions(
-    hand: HandDescription, obj: ObjectDescription, parameters: PlantParameters
-) -> tuple[HandDescription, ObjectDescription]:
-    """Descriptions that say what the plant really is: the model that knows all but the servos' errors.
-
-    The offsets of the actuators stay nominal: a model of increments needs none.
-    """
-    transmission = make_transmission(hand, parameters)
-    actuators = tuple(
-        dataclasses.replace(actuator, stiffness=float(stiffness))
-        for actuator, stiffness in zip(hand.actuators, transmission.stiffness, strict=True)
-    )
-    true_hand = dataclasses.replace(
-        hand,
-        actuators=actuators,
-        actuation_jacobian=transmission.J_a,
-        spring_stiffness=transmission.spring_stiffness,
-        joint_friction=transmission.friction,
-    )
-    true_object = dataclasses.replace(
+def true_object(obj: ObjectDescription, parameters: PlantParameters) -> ObjectDescription:
+    """What the object really is."""
+    return dataclasses.replace(
         obj,
         mass=parameters.mass * obj.mass,
         com=obj.com + np.array(parameters.com_shift),
@@ -87,4 +70,20 @@ def true_descriptions(
         friction=parameters.friction * obj.friction,
         shapes=tuple(shape.scaled(parameters.object_scale) for shape in obj.shapes),
     )
-    return true_hand, true_object
+
+
+def true_hand(hand: HandDescription, parameters: PlantParameters) -> HandDescription:
+    """What the hand really is, but for the servos' errors and the offsets of the actuators: a model of
+    increments needs none."""
+    transmission = make_transmission(hand, parameters)
+    actuators = tuple(
+        dataclasses.replace(actuator, stiffness=float(stiffness))
+        for actuator, stiffness in zip(hand.actuators, transmission.stiffness, strict=True)
+    )
+    return dataclasses.replace(
+        hand,
+        actuators=actuators,
+        actuation_jacobian=transmission.J_a,
+        spring_stiffness=transmission.spring_stiffness,
+        joint_friction=transmission.friction,
+    )

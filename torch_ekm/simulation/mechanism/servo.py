@@ -2,20 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from ...exceptions import NonFiniteError, ParameterError, ShapeError
 from ...typing import Array
-
-
-class ServoState(NamedTuple):
-    """All that a :class:`Servo` remembers between commands."""
-
-    setpoint: Array
-    motor: Array
-    output: Array
 
 
 class Servo:
@@ -60,21 +50,13 @@ class Servo:
         self.relative_to = relative_to
         self.place(np.clip(np.zeros_like(self.lower), self.lower, self.upper))
 
-    @property
-    def encoder(self) -> Array:
-        """Position of the motors ``(n_a,)`` [rad]."""
-        return self._motor.copy()
-
-    @property
-    def output(self) -> Array:
-        """Position after the backlash, where the tendon is fixed ``(n_a,)`` [rad]."""
-        return self._output.copy()
-
     def place(self, motor: Array) -> None:
         """Stand at ``motor`` with the set-point there and the play in its middle."""
-        self._motor = np.array(motor, dtype=np.float64)
-        self._setpoint = self._motor.copy()
-        self._output = self._motor.copy()
+        self.encoder = np.array(motor, dtype=np.float64)
+        """Position of the motors ``(n_a,)`` [rad]. Like the others never changed in place."""
+        self.output = self.encoder
+        """Position after the backlash, where the tendon is fixed ``(n_a,)`` [rad]."""
+        self.setpoint = self.encoder
 
     def plan(self, delta: Array, generator: np.random.Generator) -> Array:
         """Where the motors will stop if told to move by ``delta`` ``(n_a,)`` [rad].
@@ -87,24 +69,22 @@ class Servo:
             raise ShapeError("delta_a", f"({len(self.lower)},)", delta.shape)
         if not np.all(np.isfinite(delta)):
             raise NonFiniteError("delta_a", np.flatnonzero(~np.isfinite(delta))[:3].tolist())
-        origin = self._motor if self.relative_to == "encoder" else self._setpoint
+        origin = self.encoder if self.relative_to == "encoder" else self.setpoint
         fresh = self.fresh_error * generator.uniform(-1.0, 1.0, size=delta.shape)
         setpoint = np.clip(origin + delta, self.lower, self.upper)
-        error = setpoint + self.bias + fresh - self._motor
+        error = setpoint + self.bias + fresh - self.encoder
         move = error - np.sign(error) * np.minimum(np.abs(error), self.dead_zone)
-        move = np.where(np.abs(setpoint - self._motor) < self.threshold, 0.0, move)
-        self._setpoint = setpoint
-        return np.clip(self._motor + move, self.lower, self.upper)
+        move = np.where(np.abs(setpoint - self.encoder) < self.threshold, 0.0, move)
+        self.setpoint = setpoint
+        return np.clip(self.encoder + move, self.lower, self.upper)
 
     def move_to(self, motor: Array) -> Array:
         """Turn the motors to ``motor``; returns where the tendons are then fixed (after the play)."""
-        self._motor = np.array(motor, dtype=np.float64)
+        self.encoder = np.array(motor, dtype=np.float64)
         play = self.backlash / 2
-        self._output = np.clip(self._output, self._motor - play, self._motor + play)
-        return self._output
+        self.output = np.clip(self.output, self.encoder - play, self.encoder + play)
+        return self.output
 
-    def snapshot(self) -> ServoState:
-        return ServoState(self._setpoint.copy(), self._motor.copy(), self._output.copy())
-
-    def restore(self, state: ServoState) -> None:
-        self._setpoint, self._motor, self._output = (part.copy() for part in state)
+    def take_over(self, other: Servo) -> None:
+        """Stand where another servo stands."""
+        self.setpoint, self.encoder, self.output = other.setpoint, other.encoder, other.output

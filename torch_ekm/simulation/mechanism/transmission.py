@@ -2,20 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from ...description.hand import HandDescription
 from ...exceptions import ParameterError
 from ...typing import Array
-
-
-class TransmissionState(NamedTuple):
-    """All that a :class:`Transmission` remembers between steps."""
-
-    anchor: Array
-    offset: Array
 
 
 class Transmission:
@@ -138,13 +129,7 @@ class Transmission:
         along = np.einsum("aq,aq->a", self._lead, other._lead) / np.einsum("aq,aq->a", self._lead, self._lead)
         stretch = other.stretch(q, motor) * along * other.stiffness / self.stiffness
         self.offset = motor - self._lead @ q - stretch
-        self._anchor = other._anchor.copy()
-
-    def snapshot(self) -> TransmissionState:
-        return TransmissionState(self._anchor.copy(), self.offset.copy())
-
-    def restore(self, state: TransmissionState) -> None:
-        self._anchor, self.offset = state.anchor.copy(), state.offset.copy()
+        self._anchor = other._anchor
 
 
 def coupled_posture(coupling: Array) -> Array:
