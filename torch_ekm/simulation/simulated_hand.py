@@ -17,7 +17,7 @@ from ..typing import Array, Float, Tensor
 from .config import PlantConfig
 from .grasp_planning.pinch import PinchPlan, pinch_problem, plan_pinch, turning_axis
 from .grasp_planning.pinch_problem import PinchRequest
-from .mechanism.assembly import moment_arms, true_hand, true_object
+from .mechanism.assembly import true_hand, true_object
 from .parameters import PlantParameters
 from .physics.rig import Gravity, Rig, RigState
 from .presets import preset as parameters_of
@@ -143,23 +143,13 @@ class SimulatedHand:
         force = self._sensors.forces(rig.normal, draw)
         if not seen and status is PlantStatus.HELD:
             status = PlantStatus.NOT_SEEN
-        truth = (
-            q,
-            position,
-            rotation,
-            rig.normal.copy(),
-            rig.transmission.actuator_torque(q, rig.servo.output),
-        )
+        torque = rig.transmission.actuator_torque(q, rig.servo.output)
         pictured = GraspState(*_tensors(picture.q, picture.position, picture.rotation))
         return Observation(
-            q=torch.from_numpy(joints),
-            a=torch.tensor(rig.servo.encoder),
-            position=torch.from_numpy(seen_position),
-            rotation=torch.from_numpy(seen_rotation),
-            fingertip_force=torch.from_numpy(force),
+            *_tensors(joints, rig.servo.encoder, seen_position, seen_rotation, force),
             time=rig.time,
             status=status,
-            truth=Truth(*_tensors(*truth), pictured=pictured),
+            truth=Truth(*_tensors(q, position, rotation, rig.normal, torque), pictured=pictured),
         )
 
     def close(self) -> None:
@@ -251,9 +241,6 @@ class SimulatedHand:
                 new.object_scale,
                 f"{self.parameters.object_scale:g} while it is held; close(), change it, then reset(seed)",
             )
-        moment_arms(self.hand, new)  # refuses before anything is touched
-        if self._rig is not None:
-            self._rig.change(new)
         self._adopt(new)
 
     def tug(self, force: Array, torque: Array, duration: float = 0.05) -> Observation:
@@ -271,9 +258,11 @@ class SimulatedHand:
         return self._rig
 
     def _adopt(self, parameters: PlantParameters) -> None:
+        self._problem = pinch_problem(self.hand, self.object, self.config, parameters)  # may refuse: first
         self.parameters = parameters
-        self._problem = pinch_problem(self.hand, self.object, self.config, parameters)
         self._sensors.set_parameters(parameters)
+        if self._rig is not None:
+            self._rig.change(parameters)
 
     def _request(self) -> PinchRequest:
         """Where to grasp, and which way is down."""
@@ -289,7 +278,7 @@ class SimulatedHand:
 
 
 def _tensors(*arrays: Array) -> list[Tensor]:
-    return [torch.from_numpy(np.asarray(value)) for value in arrays]
+    return [torch.tensor(value) for value in arrays]
 
 
 def _tilted(gravity: Gravity, angle: float, turn: float) -> Gravity:

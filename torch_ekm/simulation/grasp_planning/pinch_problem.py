@@ -136,10 +136,8 @@ class PinchProblem:
 
     def _unpack(self, x: Array) -> tuple[Array, Array, Array, Array]:
         n = len(self.moving)
-        q0 = self.transmission.spring_rest
-        q = q0 + (x[:, :n] - q0[self.moving]) @ self.follow.T
         rotation = exp(torch.from_numpy(x[:, n + 3 : n + 6])).numpy() @ self.nominal_rotation()
-        return q, x[:, n : n + 3], rotation, x[:, n + 6 :].reshape(len(x), -1, 3)
+        return self.posture(x[:, :n]), x[:, n : n + 3], rotation, x[:, n + 6 :].reshape(len(x), -1, 3)
 
     def nominal_rotation(self) -> Array:
         """Long axis along the hand's wanted direction, grasp axis from the thumb to the fingers."""
@@ -158,7 +156,7 @@ class PinchProblem:
         return np.einsum("cij,cj->ci", poses[:, :3, :3], self._tip) + poses[:, :3, 3]
 
     def posture(self, moving: Array) -> Array:
-        """All joints, coupled ones following, others at rest ``(n_q,)`` [rad]."""
+        """All joints, coupled ones following, others at rest ``(*batch, n_q)`` [rad]."""
         q0 = self.transmission.spring_rest
         return q0 + (moving - q0[self.moving]) @ self.follow.T
 
@@ -235,10 +233,9 @@ class PinchProblem:
         pad = np.maximum(0.0, 0.3 + np.einsum("bci,bci->bc", g.normal, g.pad_direction)) / 0.1
         along, across = g.local @ self._axes[:, 0], g.local @ self._axes[:, 2]
         place = [
-            (along[:, 0] - request.along) / 2e-3,
-            (along[:, 1:].mean(axis=1) - request.along) / 2e-3,
-            (across[:, 0] - request.across) / 2e-3,
-            (across[:, 1:].mean(axis=1) - request.across) / 2e-3,
+            (part - wanted) / 2e-3
+            for at, wanted in ((along, request.along), (across, request.across))
+            for part in (at[:, 0], at[:, 1:].mean(axis=1))
         ]
         long_axis = g.rotation @ self._axes[:, 0]
         wish = self._tilted(request)

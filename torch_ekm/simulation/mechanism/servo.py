@@ -6,6 +6,7 @@ import numpy as np
 
 from ...exceptions import NonFiniteError, ParameterError, ShapeError
 from ...typing import Array
+from ..parameters import PlantParameters
 
 
 class Servo:
@@ -22,33 +23,26 @@ class Servo:
 
     Args:
         lower, upper: range of each actuator ``(n_a,)`` [rad].
-        bias: constant error of each controller ``(n_a,)`` [rad].
-        fresh_error: bound of an error drawn anew at every command, uniform [rad].
-        dead_zone: Coulomb dead band [rad].
-        threshold: commands smaller than this do nothing [rad].
-        backlash: full width of the play, ``2 play`` [rad].
+        parameters: the faults; ``fresh`` is bounded by ``actuator_error``, ``backlash`` is ``2 play``.
         relative_to: "encoder" or "setpoint".
     """
 
     def __init__(
-        self,
-        lower: Array,
-        upper: Array,
-        bias: Array,
-        fresh_error: float = 0.0,
-        dead_zone: float = 0.0,
-        threshold: float = 0.0,
-        backlash: float = 0.0,
-        relative_to: str = "encoder",
+        self, lower: Array, upper: Array, parameters: PlantParameters, relative_to: str = "encoder"
     ) -> None:
         if relative_to not in ("encoder", "setpoint"):
             raise ParameterError("relative_to", relative_to, "'encoder' or 'setpoint'")
         self.lower, self.upper = np.array(lower), np.array(upper)
-        self.bias = np.broadcast_to(np.asarray(bias, dtype=np.float64), self.lower.shape).copy()
-        self.fresh_error, self.dead_zone = fresh_error, dead_zone
-        self.threshold, self.backlash = threshold, backlash
         self.relative_to = relative_to
+        self.set_parameters(parameters)
         self.place(np.clip(np.zeros_like(self.lower), self.lower, self.upper))
+
+    def set_parameters(self, parameters: PlantParameters) -> None:
+        """Other faults; the motors stay where they are."""
+        self._p = parameters
+        hardware_instance = np.random.default_rng([parameters.hardware_seed, 0])
+        self.bias = parameters.actuator_bias * hardware_instance.uniform(-1.0, 1.0, size=self.lower.shape)
+        """Constant error of each controller ``(n_a,)`` [rad]."""
 
     def place(self, motor: Array) -> None:
         """Stand at ``motor`` with the set-point there and the play in its middle."""
@@ -70,21 +64,17 @@ class Servo:
         if not np.all(np.isfinite(delta)):
             raise NonFiniteError("delta_a", np.flatnonzero(~np.isfinite(delta))[:3].tolist())
         origin = self.encoder if self.relative_to == "encoder" else self.setpoint
-        fresh = self.fresh_error * generator.uniform(-1.0, 1.0, size=delta.shape)
+        fresh = self._p.actuator_error * generator.uniform(-1.0, 1.0, size=delta.shape)
         setpoint = np.clip(origin + delta, self.lower, self.upper)
         error = setpoint + self.bias + fresh - self.encoder
-        move = error - np.sign(error) * np.minimum(np.abs(error), self.dead_zone)
-        move = np.where(np.abs(setpoint - self.encoder) < self.threshold, 0.0, move)
+        move = error - np.sign(error) * np.minimum(np.abs(error), self._p.dead_zone)
+        move = np.where(np.abs(setpoint - self.encoder) < self._p.threshold, 0.0, move)
         self.setpoint = setpoint
         return np.clip(self.encoder + move, self.lower, self.upper)
 
     def move_to(self, motor: Array) -> Array:
         """Turn the motors to ``motor``; returns where the tendons are then fixed (after the play)."""
         self.encoder = np.array(motor, dtype=np.float64)
-        play = self.backlash / 2
+        play = self._p.backlash / 2
         self.output = np.clip(self.output, self.encoder - play, self.encoder + play)
         return self.output
-
-    def take_over(self, other: Servo) -> None:
-        """Stand where another servo stands."""
-        self.setpoint, self.encoder, self.output = other.setpoint, other.encoder, other.output

@@ -13,7 +13,7 @@ from ...typing import Array
 from ..config import PlantConfig
 from ..grasp_planning.graspable import chain
 from ..grasp_planning.pinch import PinchPlan
-from ..mechanism.assembly import make_servo, make_transmission, true_object
+from ..mechanism.assembly import make_transmission, true_object
 from ..mechanism.servo import Servo
 from ..mechanism.transmission import Transmission
 from ..parameters import PlantParameters
@@ -61,7 +61,7 @@ class Rig:
         self.hand, self.obj, self.config, self.parameters = hand, obj, config, parameters
         self.remember = remember
         self.transmission = make_transmission(hand, parameters)
-        self.servo = make_servo(hand, config, parameters)
+        self.servo = Servo(hand.actuator_lower, hand.actuator_upper, parameters, config.relative_to)
         self.time = 0.0
         """[s] since the fingers closed."""
         self.normal = np.zeros(len(hand.pads))
@@ -157,11 +157,10 @@ class Rig:
         What does not differ is left alone: PhysX would not go on bit by bit from being told again.
         """
         old, self.parameters = self.parameters, new
-        previous, self.servo = self.servo, make_servo(self.hand, self.config, new)
-        self.servo.take_over(previous)
+        self.servo.set_parameters(new)
         if _differ(old, new, "moment_arm", "spring", "servo_stiffness", "joint_friction", "tendon_creep"):
-            worn, self.transmission = self.transmission, make_transmission(self.hand, new)
-            self.transmission.take_over(worn, self.scene.q, self.servo.output)
+            previous, self.transmission = self.transmission, make_transmission(self.hand, new)
+            self.transmission.take_over(previous, self.scene.q, self.servo.output)
             self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
         self.transmission.lengthen(new.tendon_elongation - old.tendon_elongation)
         obj = true_object(self.obj, new)
@@ -185,8 +184,7 @@ class Rig:
         )
 
     def restore(self, state: RigState) -> None:
-        if state.parameters != self.parameters:
-            self.change(state.parameters)
+        """Go back to ``state``, taken with the parameters that hold now."""
         if self._built != (state.gravity, state.parameters.object_scale):
             self._build(state.gravity)
         self.scene.restore(state.physics)
