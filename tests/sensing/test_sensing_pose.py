@@ -108,7 +108,7 @@ def test_edges_correct_a_rough_pose(pose_of, camera, rng):
     quality = ImageQuality(noise=1.0, vignette=0.0)
     image = SimulatedCamera(camera, quality).render(CardScene((PlacedCard(board, pose),)), rng)
     rough = exp(torch.tensor([0.01, -0.008, 0.005], dtype=torch.float64)).numpy() @ pose[:3, :3]
-    start = BoardPose(rough, pose[:3, 3] + [1e-4, -1e-4, 1e-3], np.eye(6), 0.0, 16, 0, False)
+    start = BoardPose(rough, pose[:3, 3] + [1e-4, -1e-4, 1e-3], np.eye(6), 0.0, 0, False)
     error = twist(refine_on_edges(image, camera, board, start), pose)
     assert np.abs(error[:2]).max() < 2e-5  # m
     assert abs(error[2]) < 3e-4
@@ -120,7 +120,7 @@ def test_edges_of_a_half_hidden_board_still_count(pose_of, rng, shade):
     camera, board, pose = PinholeCamera(), MarkerBoard(), pose_of(tilt_deg=30)
     finger = ConvexBody.capsule(np.array([-0.03, 0.012, 0.33]), np.array([0.04, 0.02, 0.33]), 0.007, shade)
     image = SimulatedCamera(camera).render(CardScene((PlacedCard(board, pose),), (finger,)), rng)
-    start = BoardPose(pose[:3, :3], pose[:3, 3], np.eye(6), 0.0, 16, 0, False)
+    start = BoardPose(pose[:3, :3], pose[:3, 3], np.eye(6), 0.0, 0, False)
     refined = refine_on_edges(image, camera, board, start)
     assert refined is not start
     error = twist(refined, pose)
@@ -130,14 +130,14 @@ def test_edges_of_a_half_hidden_board_still_count(pose_of, rng, shade):
 
 def test_no_edges_leave_the_pose_alone(pose_of):
     blank = np.full((480, 640), 128, dtype=np.uint8)
-    start = BoardPose(pose_of()[:3, :3], pose_of()[:3, 3], np.eye(6), 0.0, 16, 0, False)
+    start = BoardPose(pose_of()[:3, :3], pose_of()[:3, 3], np.eye(6), 0.0, 0, False)
     assert refine_on_edges(blank, PinholeCamera(), MarkerBoard(), start) is start
 
 
 def _look(pose, rng, std):
     step = std * rng.standard_normal(6)
     turned = exp(torch.from_numpy(step[3:])).numpy() @ pose[:3, :3]
-    return BoardPose(turned, pose[:3, 3] + step[:3], std**2 * np.eye(6), 0.0, 16, 0, False)
+    return BoardPose(turned, pose[:3, 3] + step[:3], std**2 * np.eye(6), 0.0, 0, False)
 
 
 def test_average_of_a_still_board_is_better_by_the_root(pose_of, rng):

@@ -1,4 +1,4 @@
-"""Image sources: one protocol, times, dropped frames, files."""
+"""Image sources: times, dropped frames, files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import pytest
 from torch_ekm.exceptions import DescriptionError, ParameterError
 from torch_ekm.sensing import (
     ImageFolder,
-    ImageSource,
     MarkerBoard,
     MarkerTracker,
     StreamOptions,
@@ -32,16 +31,13 @@ def moving(pose_of):
     )
 
 
-def test_latest_frame_shows_the_past(moving, simulated):
+def test_a_frame_shows_the_scene_of_its_time(moving, simulated):
     video = SimulatedVideo(simulated, moving, StreamOptions(rate=20, latency=0.12))
-    assert video.latest(0.1) is None  # nothing has arrived yet
-    frame = video.latest(1.0)
-    assert frame.index == 17  # exposed at 0.85 s, arrived at 0.97 s
+    frame = video.frame(17)
     assert (frame.time, frame.arrival) == pytest.approx((0.85, 0.97))
     tracker = MarkerTracker(simulated.camera, MarkerBoard(0), MarkerBoard(4))
     now, then = (tracker.track(video.frame(k).image).object.position[0] for k in (20, 17))
     assert now - then == pytest.approx(0.0015, abs=2e-4)
-    assert tracker.track(frame.image).object.position[0] == pytest.approx(then, abs=1e-12)
 
 
 def test_frames_do_not_depend_on_what_was_looked_at(moving, simulated):
@@ -61,8 +57,6 @@ def test_dropped_frames_come_at_the_stated_rate(simulated):
     small.render = lambda scene, generator: np.zeros((1, 1), np.uint8)
     dropped = np.array([video.frame(k).image is None for k in range(2000)])
     assert dropped.mean() == pytest.approx(0.25, abs=0.03)
-    first = int(np.flatnonzero(dropped & (np.arange(2000) > 0))[0])
-    assert video.latest(first / 20).index < first  # a dropped frame never arrives
 
 
 def test_hidden_frames_are_noticed(moving, simulated):
@@ -108,15 +102,9 @@ def test_a_video_file_is_tracked(moving, simulated, tmp_path):
         VideoCapture(str(tmp_path / "nothing.avi"))
 
 
-def test_one_protocol(moving, simulated, tmp_path):
-    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((480, 640), np.uint8))
-    for source in (SimulatedVideo(simulated, moving, n_frames=1), ImageFolder(tmp_path)):
-        assert isinstance(source, ImageSource)
-        assert next(source).index == 0
-        with pytest.raises(StopIteration):
-            next(source)
-        source.close()
-    assert issubclass(VideoCapture, ImageSource)
+def test_a_source_without_end_is_read_frame_by_frame(moving, simulated):
+    frames = iter(SimulatedVideo(simulated, moving))
+    assert [next(frames).index for _ in range(2)] == [0, 1]
 
 
 def test_impossible_streams_are_refused(moving, simulated):

@@ -12,7 +12,7 @@ from torch_ekm.description import list_objects, load_hand, load_object
 from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.simulation import PlantConfig, PlantParameters
-from torch_ekm.simulation.grasp_planning.pinch import make_planner
+from torch_ekm.simulation.grasp_planning.pinch import pinch_problem, plan_pinch
 from torch_ekm.simulation.grasp_planning.pinch_problem import PinchRequest
 from torch_ekm.simulation.mechanism.assembly import make_transmission
 
@@ -22,7 +22,8 @@ G = 9.81
 def plan_for(name, request=None, **changes):
     hand, obj = load_hand("icub_right"), load_object(name)
     parameters = PlantParameters(**changes)
-    plan = make_planner(hand, obj, PlantConfig(), parameters).plan(request or PinchRequest(hand.gravity))
+    problem = pinch_problem(hand, obj, PlantConfig(), parameters)
+    plan = plan_pinch(problem, request or PinchRequest(hand.gravity))
     return hand, obj, plan, make_transmission(hand, parameters)
 
 

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
+from torch_ekm.simulation import PlantParameters
 from torch_ekm.simulation.mechanism.servo import Servo
 
 
-def make(bias=0.0, **faults):
-    servo = Servo(np.zeros(3), np.full(3, 1.5), np.full(3, bias), **faults)
+def make(bias=0.0, relative_to="encoder", **faults):
+    servo = Servo(np.zeros(3), np.full(3, 1.5), PlantParameters(**faults), relative_to)
+    servo.bias = np.full(3, bias)
     servo.place(np.full(3, 0.5))
     return servo
 
@@ -37,7 +39,7 @@ def test_bias_drifts_relative_to_the_encoder_and_does_not_on_the_setpoint():
 
 
 def test_fresh_error_is_bounded_seeded_and_drawn_anew():
-    servo = make(fresh_error=0.01)
+    servo = make(actuator_error=0.01)
     first = command(servo, np.zeros(3), seed=1)
     assert 0 < np.abs(first - 0.5).max() <= 0.01
     servo.place(np.full(3, 0.5))
@@ -71,15 +73,13 @@ def test_backlash_is_a_play_between_motor_and_tendon():
         np.testing.assert_allclose(servo.encoder, motor)
 
 
-def test_snapshot_brings_everything_back():
+def test_other_faults_leave_the_motors_where_they_are():
     servo = make(backlash=0.02, relative_to="setpoint")
     command(servo, [0.1, 0.2, -0.1])
-    state = servo.snapshot()
-    command(servo, [0.1, 0.1, 0.1])
-    servo.restore(state)
+    servo.set_parameters(PlantParameters(dead_zone=0.1))
     np.testing.assert_allclose(servo.encoder, [0.6, 0.7, 0.4])
     np.testing.assert_allclose(servo.output, [0.59, 0.69, 0.41])
-    np.testing.assert_allclose(servo.snapshot().setpoint, [0.6, 0.7, 0.4])
+    np.testing.assert_allclose(servo.setpoint, [0.6, 0.7, 0.4])
 
 
 @pytest.mark.parametrize(("delta", "error"), [([0.1, 0.1], ShapeError), ([0.1, np.nan, 0.1], NonFiniteError)])
@@ -87,7 +87,7 @@ def test_bad_commands_change_nothing(delta, error):
     servo = make()
     with pytest.raises(error):
         command(servo, delta)
-    np.testing.assert_allclose(servo.snapshot().setpoint, 0.5)
+    np.testing.assert_allclose(servo.setpoint, 0.5)
     np.testing.assert_allclose(servo.encoder, 0.5)
 
 

@@ -12,15 +12,12 @@ from torch_ekm.exceptions import ParameterError
 from torch_ekm.simulation.mechanism.transmission import Transmission, coupled_posture
 
 
-def make(hand=None, friction=0.0, **changes):
+def make(hand=None, stiffness=4.0, friction=0.0, creep=0.0, **changes):
     hand = load_hand("icub_right") if hand is None else hand
-    figures = {
-        "actuation_jacobian": hand.actuation_jacobian,
-        "stiffness": np.full(hand.n_a, 4.0),
-        "spring_stiffness": hand.spring_stiffness,
-        "friction": np.full(hand.n_q, friction),
-    }
-    return hand, Transmission(hand, **{**figures, **changes})
+    actuators = tuple(dataclasses.replace(actuator, stiffness=stiffness) for actuator in hand.actuators)
+    friction = np.full(hand.n_q, friction)
+    real = dataclasses.replace(hand, actuators=actuators, joint_friction=friction, **changes)
+    return hand, Transmission(real, creep)
 
 
 def torque(transmission, q, motor):
@@ -148,7 +145,7 @@ def test_creep_follows_the_load():
 
 def test_a_new_tendon_takes_over_the_torque_of_the_old():
     hand, old = make()
-    _, new = make(actuation_jacobian=1.3 * hand.actuation_jacobian, stiffness=np.full(hand.n_a, 2.0))
+    _, new = make(actuation_jacobian=1.3 * hand.actuation_jacobian, stiffness=2.0)
     q = coupled_posture(hand.coupling) @ flexed(hand, np.random.default_rng(5))
     motor = hand.actuator_offset + hand.actuation_jacobian @ q + 0.1
     new.take_over(old, q, motor)
@@ -166,9 +163,8 @@ def test_a_hand_without_couplings():
 @pytest.mark.parametrize("bad", [-1.0, np.nan, np.inf])
 def test_impossible_stiffness_is_refused(name, bad):
     hand = load_hand("planar_two_finger")
-    size = hand.n_a if name == "stiffness" else hand.n_q
     with pytest.raises(ParameterError, match=name):
-        make(hand, **{name: np.full(size, bad)})
+        make(hand, **{name: bad if name == "stiffness" else np.full(hand.n_q, bad)})
 
 
 def test_description_is_not_changed():

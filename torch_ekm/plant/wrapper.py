@@ -25,11 +25,6 @@ class PlantWrapper:
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
         return getattr(self.plant, name)
 
-    @property
-    def unwrapped(self) -> Plant:
-        """The innermost plant."""
-        return self.plant.unwrapped if isinstance(self.plant, PlantWrapper) else self.plant
-
     def reset(self, seed: int) -> Observation:
         """Grasp the object anew."""
         return self.observation(self.plant.reset(seed))

@@ -1,6 +1,6 @@
 """From raw readings to joint angles and poses.
 
-Vision: an image source gives frames, :class:`MarkerTracker` turns them into the object's pose in the hand
+Vision: :class:`MarkerTracker` turns images (of any ``Iterable[Frame]``) into the object's pose in the hand
 frame. Hall sensors: :class:`HallCalibration` turns counts into angles, :class:`JointEstimator` joins them
 with the encoders, :class:`ContactAligned` corrects the joints that no sensor reads. The same code serves
 simulated and real readings."""
@@ -18,7 +18,7 @@ from .vision.camera import PinholeCamera
 from .vision.charuco import CharucoTarget
 from .vision.edge_refinement import refine_on_edges
 from .vision.image_folder import ImageFolder
-from .vision.sources import Frame, ImageSource, StreamOptions
+from .vision.sources import Frame, StreamOptions
 from .vision.track import Track, TrackStatus
 from .vision.tracker import MarkerTracker, TrackerOptions
 from .vision.video_capture import VideoCapture
@@ -32,7 +32,6 @@ __all__ = [
     "HallChannel",
     "HallEstimate",
     "ImageFolder",
-    "ImageSource",
     "JointEstimate",
     "JointEstimator",
     "MarkerBoard",

@@ -8,7 +8,6 @@ from .grasp_planning.pinch import PinchPlan
 from .hall_sensors import HallQuality, HallSensors, Stuck
 from .imaging.card_scene import CardScene, ConvexBody, PlacedCard
 from .imaging.grasp_view import GraspView
-from .imaging.sapien_camera import SapienCamera
 from .imaging.simulated_camera import ImageQuality, SimulatedCamera
 from .imaging.simulated_video import SimulatedVideo
 from .parameters import PlantParameters
@@ -32,7 +31,6 @@ __all__ = [
     "PlantParameters",
     "PlantSnapshot",
     "PRESETS",
-    "SapienCamera",
     "SensedPlant",
     "SimulatedCamera",
     "SimulatedHand",

@@ -102,16 +102,8 @@ class InHandRotation(gymnasium.Env):
         self._picture: Picture | None = None
         description = self.plant.hand
         n_a = description.n_a
-        high = np.concatenate(
-            [
-                np.full(description.n_q, math.pi),
-                np.full(n_a, 2 * math.pi),
-                np.full(3, 1.0),
-                np.full(3, math.pi),
-                np.full(len(description.pads), 100.0),
-                np.full(2, 2 * math.pi),
-            ]
-        )
+        bounds = (math.pi, 2 * math.pi, 1.0, math.pi, 100.0, 2 * math.pi)
+        high = np.repeat(bounds, (description.n_q, n_a, 3, 3, len(description.pads), 2))
         self.observation_space = gymnasium.spaces.Box(-high, high, dtype=np.float64)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n_a,), dtype=np.float32)
         self._start: Observation | None = None
@@ -198,14 +190,4 @@ class InHandRotation(gymnasium.Env):
         }
 
 
-def register() -> None:
-    """Make ``torch_ekm/InHandRotation-v0`` known to Gymnasium (once)."""
-    if "torch_ekm/InHandRotation-v0" not in gymnasium.registry:
-        gymnasium.register(
-            "torch_ekm/InHandRotation-v0",
-            entry_point="torch_ekm.simulation.env:InHandRotation",
-            max_episode_steps=40,
-        )
-
-
-register()
+gymnasium.register("torch_ekm/InHandRotation-v0", f"{__name__}:InHandRotation", max_episode_steps=40)

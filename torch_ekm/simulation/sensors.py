@@ -26,15 +26,6 @@ class TimedState(NamedTuple):
     """``(3, 3)``"""
 
 
-class SensorState(NamedTuple):
-    """All that :class:`Sensors` remembers between readings."""
-
-    frames: tuple[TimedState, ...]
-    seen: tuple[Array, Array] | None
-    felt: Array
-    stuck_at: Array | None
-
-
 class Sensors:
     """Joint angles, object pose and fingertip forces as a calibrated hand would report them.
 
@@ -68,11 +59,6 @@ class Sensors:
         self._felt = np.zeros(self.n_pads)
         self._stuck_at: Array | None = None
 
-    @property
-    def wants_history(self) -> bool:
-        """Whether old poses matter, so that :meth:`remember` must be called."""
-        return self._p.latency > 0
-
     def remember(self, frame: TimedState) -> None:
         """Keep a state for as long as the latency asks."""
         self._frames.append(frame)
@@ -81,7 +67,7 @@ class Sensors:
 
     def pictured(self, now: TimedState) -> TimedState:
         """What the camera's picture shows that is to be had now."""
-        return self._frames[0] if self.wants_history and self._frames else now
+        return self._frames[0] if self._p.latency > 0 and self._frames else now
 
     def joints(self, q: Array, generator: np.random.Generator) -> Array:
         """Estimated joint angles ``(n_q,)`` [rad]."""
@@ -116,10 +102,3 @@ class Sensors:
             unit = p.force_range / 255
             reading = unit * np.round(np.minimum(reading, p.force_range) / unit)
         return reading
-
-    def snapshot(self) -> SensorState:
-        return SensorState(tuple(self._frames), self._seen, self._felt.copy(), self._stuck_at)
-
-    def restore(self, state: SensorState) -> None:
-        self._frames = deque(state.frames)
-        self._seen, self._felt, self._stuck_at = state.seen, state.felt.copy(), state.stuck_at

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from typing import Any, NamedTuple
 
@@ -14,13 +15,13 @@ from ..kinematics import GraspState
 from ..plant import Observation, PlantStatus, Truth
 from ..typing import Array, Float, Tensor
 from .config import PlantConfig
-from .grasp_planning.pinch import PinchPlan, make_planner, turning_axis
+from .grasp_planning.pinch import PinchPlan, pinch_problem, plan_pinch, turning_axis
 from .grasp_planning.pinch_problem import PinchRequest
-from .mechanism.assembly import moment_arms, true_descriptions
+from .mechanism.assembly import true_hand, true_object
 from .parameters import PlantParameters
 from .physics.rig import Gravity, Rig, RigState
 from .presets import preset as parameters_of
-from .sensors import Sensors, SensorState, TimedState
+from .sensors import Sensors, TimedState
 
 _ATTEMPTS = 5
 _FAR = 0.05  # [m] from where it was grasped: out of the hand
@@ -30,7 +31,7 @@ class PlantSnapshot(NamedTuple):
     """Everything needed to go back to a moment; give it to :meth:`SimulatedHand.restore`."""
 
     rig: RigState
-    sensors: SensorState
+    sensors: Sensors
     generator: dict[str, Any]
     plan: PinchPlan
 
@@ -76,7 +77,7 @@ class SimulatedHand:
         if self.config.gravity is not None:
             self.hand = dataclasses.replace(self.hand, gravity=self.config.gravity)
         self.parameters = parameters_of(preset or "none") if parameters is None else parameters
-        self._planner = make_planner(self.hand, self.object, self.config, self.parameters)
+        self._problem = pinch_problem(self.hand, self.object, self.config, self.parameters)
         self._sensors = Sensors(self.parameters, self.hand.n_q, len(self.hand.pads), self.hand.joint_names)
         self._generator = np.random.default_rng(0)
         self._rig: Rig | None = None
@@ -93,12 +94,18 @@ class SimulatedHand:
         """
         self._generator = np.random.default_rng(seed)
         if self._rig is None:
-            self._rig = Rig(self.hand, self.object, self.config, self.parameters)
+            self._rig = Rig(
+                self.hand,
+                self.object,
+                self.config,
+                self.parameters,
+                lambda frame: self._sensors.remember(frame),  # a restored plant has other sensors
+            )
         unplanned = 0
         for _ in range(_ATTEMPTS):
             request = self._request()
             try:
-                plan = self._planner.plan(request)
+                plan = plan_pinch(self._problem, request)
             except EquilibriumError:
                 unplanned += 1
                 if unplanned == 2:
@@ -106,7 +113,6 @@ class SimulatedHand:
                 continue
             self._plan = plan
             self._sensors.forget()
-            self._watch()
             self._rig.grasp(plan, request.gravity)
             if self.status is PlantStatus.HELD:
                 return self.observe()
@@ -137,23 +143,13 @@ class SimulatedHand:
         force = self._sensors.forces(rig.normal, draw)
         if not seen and status is PlantStatus.HELD:
             status = PlantStatus.NOT_SEEN
-        truth = (
-            q,
-            position,
-            rotation,
-            rig.normal.copy(),
-            rig.transmission.actuator_torque(q, rig.servo.output),
-        )
+        torque = rig.transmission.actuator_torque(q, rig.servo.output)
         pictured = GraspState(*_tensors(picture.q, picture.position, picture.rotation))
         return Observation(
-            q=torch.from_numpy(joints),
-            a=torch.from_numpy(rig.servo.encoder),
-            position=torch.from_numpy(seen_position),
-            rotation=torch.from_numpy(seen_rotation),
-            fingertip_force=torch.from_numpy(force),
+            *_tensors(joints, rig.servo.encoder, seen_position, seen_rotation, force),
             time=rig.time,
             status=status,
-            truth=Truth(*_tensors(*truth), pictured=pictured),
+            truth=Truth(*_tensors(q, position, rotation, rig.normal, torque), pictured=pictured),
         )
 
     def close(self) -> None:
@@ -192,7 +188,7 @@ class SimulatedHand:
         points = self.plan.points
         across = points[1:].mean(axis=0) - points[0]
         across /= np.linalg.norm(across)
-        along = np.array(turning_axis(self.hand, self.config))
+        along = turning_axis(self.hand, self.config)
         axis = points[-1] - points[1] if len(points) > 2 else along
         axis = axis - across * (axis @ across)
         axis *= np.sign(axis @ along) / np.linalg.norm(axis)
@@ -200,7 +196,7 @@ class SimulatedHand:
 
     def true_descriptions(self) -> tuple[HandDescription, ObjectDescription]:
         """Hand and object as they really are, for a model without mismatch (an upper bound in reports)."""
-        return true_descriptions(self.hand, self.object, self.parameters)
+        return true_hand(self.hand, self.parameters), true_object(self.object, self.parameters)
 
     def hand_state(self) -> tuple[Array, Array, Array]:
         """True joint angles [rad], object position [m] and rotation, for pictures."""
@@ -210,7 +206,7 @@ class SimulatedHand:
     def snapshot(self) -> PlantSnapshot:
         """This moment, to come back to."""
         generator = dict(self._generator.bit_generator.state)
-        return PlantSnapshot(self._grasped().snapshot(), self._sensors.snapshot(), generator, self.plan)
+        return PlantSnapshot(self._grasped().snapshot(), copy.deepcopy(self._sensors), generator, self.plan)
 
     def restore(self, snapshot: PlantSnapshot) -> Observation:
         """Go back to ``snapshot``, noise included; two restored runs are alike bit by bit."""
@@ -218,7 +214,7 @@ class SimulatedHand:
         if snapshot.rig.parameters != self.parameters:
             self._adopt(snapshot.rig.parameters)
         rig.restore(snapshot.rig)
-        self._sensors.restore(snapshot.sensors)
+        self._sensors = copy.deepcopy(snapshot.sensors)
         self._generator.bit_generator.state = snapshot.generator
         self._plan = snapshot.plan
         return self.observe()
@@ -245,9 +241,6 @@ class SimulatedHand:
                 new.object_scale,
                 f"{self.parameters.object_scale:g} while it is held; close(), change it, then reset(seed)",
             )
-        moment_arms(self.hand, new)  # refuses before anything is touched
-        if self._rig is not None:
-            self._rig.change(new)
         self._adopt(new)
 
     def tug(self, force: Array, torque: Array, duration: float = 0.05) -> Observation:
@@ -265,18 +258,11 @@ class SimulatedHand:
         return self._rig
 
     def _adopt(self, parameters: PlantParameters) -> None:
+        self._problem = pinch_problem(self.hand, self.object, self.config, parameters)  # may refuse: first
         self.parameters = parameters
-        self._planner = make_planner(self.hand, self.object, self.config, parameters)
         self._sensors.set_parameters(parameters)
-        self._watch()
-
-    def _watch(self) -> None:
-        """Let the camera keep old poses if it is late."""
         if self._rig is not None:
-            remember = self._sensors.remember
-            self._rig.on_frame = (
-                (lambda *state: remember(TimedState(*state))) if self._sensors.wants_history else None
-            )
+            self._rig.change(parameters)
 
     def _request(self) -> PinchRequest:
         """Where to grasp, and which way is down."""
@@ -292,7 +278,7 @@ class SimulatedHand:
 
 
 def _tensors(*arrays: Array) -> list[Tensor]:
-    return [torch.from_numpy(np.asarray(value)) for value in arrays]
+    return [torch.tensor(value) for value in arrays]
 
 
 def _tilted(gravity: Gravity, angle: float, turn: float) -> Gravity:

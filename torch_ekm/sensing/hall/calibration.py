@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from ...exceptions import CalibrationError, DescriptionError, NonFiniteError, ParameterError, ShapeError
+from ...exceptions import DescriptionError, NonFiniteError, ParameterError, ShapeError
 from ...typing import Bool, Float, Tensor
 from .channel import FULL_SCALE, HallChannel, fit_channel
 
@@ -72,16 +72,16 @@ class HallCalibration:
         readings: Float[Tensor, "n n_channels"],
         angles: Float[Tensor, "n n_channels"],
         joints: Sequence[str],
-        stuck: str = "mark",
     ) -> HallCalibration:
         """Least squares on the samples of a sweep at which a channel is not saturated.
+
+        A channel that does not answer to its joint's motion is marked as ``stuck``: its estimates are never
+        valid.
 
         Args:
             readings: 0..255.
             angles: of the sensed joints, known from elsewhere [rad].
             joints: name of the joint of each channel.
-            stuck: what becomes of a channel that does not answer to its joint's motion: "mark" it (its
-                estimates are never valid), or "raise".
 
         Raises:
             ShapeError, NonFiniteError: samples that do not fit together, or NaN.
@@ -89,8 +89,6 @@ class HallCalibration:
             CalibrationError: a joint was not moved, or too few samples are unsaturated.
             NonMonotoneFitError: a fitted curve turns back within its range.
         """
-        if stuck not in ("mark", "raise"):
-            raise ParameterError("stuck", stuck, "'mark' or 'raise'")
         readings, angles = readings.to(torch.float64), angles.to(torch.float64)
         if readings.ndim != 2 or readings.shape[1] != len(joints):
             raise ShapeError("readings", f"(n, {len(joints)})", readings.shape)
@@ -102,12 +100,7 @@ class HallCalibration:
         if bool((readings < 0).any() or (readings > FULL_SCALE).any()):
             found = (float(readings.min()), float(readings.max()))
             raise ParameterError("readings", found, "within 0..255")
-        channels = [fit_channel(name, readings[:, k], angles[:, k]) for k, name in enumerate(joints)]
-        dead = [channel.joint for channel in channels if channel.stuck]
-        if dead and stuck == "raise":
-            problem = f"stuck ({len(dead)} in all: {', '.join(dead)}); mend it, or mark it"
-            raise CalibrationError(f"Hall channel of {dead[0]}", problem)
-        return cls(channels)
+        return cls([fit_channel(name, readings[:, k], angles[:, k]) for k, name in enumerate(joints)])
 
     def estimate(self, readings: Float[Tensor, "*batch n_channels"]) -> HallEstimate:
         """Angles, their deviations, and which of them to believe.

@@ -23,8 +23,6 @@ class BoardPose:
     """Of the twist ``(v; w)`` of the card about its centre, camera axes, ``(6, 6)`` [m, rad]."""
     rms: float
     """Root mean square distance of the corners from where the pose puts them [px]."""
-    n_corners: int
-    """Corners that were used."""
     n_rejected: int
     """Corners that disagreed with the others and were left out."""
     ambiguous: bool
@@ -128,7 +126,7 @@ def _choose(
     variance = max(corner_std**2, float(np.sum(residual**2)) / freedom)
     covariance = np.asarray(variance * np.linalg.inv(J.T @ J), dtype=np.float64)
     rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
-    return BoardPose(rotation, position, covariance, rms, len(X), n_rejected, ambiguous, mirror)
+    return BoardPose(rotation, position, covariance, rms, n_rejected, ambiguous, mirror)
 
 
 def projection_jacobian(camera: PinholeCamera, X: Array, rotation: Array, position: Array) -> Array:

@@ -25,8 +25,6 @@ class CameraCalibration:
     """Standard deviations of fx, fy, cx, cy [px] and k1, k2, p1, p2, k3, were all corners independent.
 
     They are not quite: with a dozen views, count on twice as much."""
-    view_rms: tuple[float, ...]
-    """Of each picture that was used [px]."""
     used: tuple[int, ...]
     """Numbers of the pictures that were used; the others showed too little of the target, or blurred."""
 
@@ -101,6 +99,5 @@ def calibrate_camera(
         camera,
         float(rms),
         {name: float(s) for name, s in zip(names, std.ravel(), strict=False)},
-        tuple(float(error) for error in errors.ravel()),
         tuple(view[0] for view in views),
     )

@@ -33,22 +33,13 @@ class ImageFolder:
         self.paths = sorted(self.folder.glob(pattern))
         if not self.paths:
             raise DescriptionError(folder, f"no file matches '{pattern}'")
-        self._next = 0
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def __iter__(self) -> Iterator[Frame]:
-        return self
-
-    def __next__(self) -> Frame:
-        if self._next >= len(self.paths):
-            raise StopIteration
-        index, self._next = self._next, self._next + 1
         cv2 = require("cv2")
-        image = cv2.imread(str(self.paths[index]), cv2.IMREAD_GRAYSCALE)  # None where it is no image
-        time = index / self.options.rate
-        return Frame(index, time, time + self.options.latency, image)
-
-    def close(self) -> None:
-        """Nothing to give back."""
+        for index, path in enumerate(self.paths):
+            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)  # None where it is no image
+            time = index / self.options.rate
+            yield Frame(index, time, time + self.options.latency, image)

@@ -1,10 +1,8 @@
-"""Images with their times, and what gives them."""
+"""Images with their times. A source of them is an ``Iterable[Frame]``."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,21 +55,3 @@ class StreamOptions:
     def generator(self, index: int) -> np.random.Generator:
         """Randomness of one frame: the same whatever frames were looked at before."""
         return np.random.default_rng([self.seed, index])
-
-
-@runtime_checkable
-class ImageSource(Protocol):
-    """A stream of frames: simulated, from a folder, from a camera.
-
-    ``for frame in source: track = tracker.track(frame.image)``
-    """
-
-    def __iter__(self) -> Iterator[Frame]: ...
-
-    def __next__(self) -> Frame:
-        """The next frame; StopIteration at the end of a stream that has one."""
-        ...
-
-    def close(self) -> None:
-        """Give back the camera or file."""
-        ...

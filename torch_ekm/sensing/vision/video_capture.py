@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterator
 
@@ -41,21 +42,19 @@ class VideoCapture:
             self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size.height)
             self._capture.set(cv2.CAP_PROP_FPS, self.options.rate)
             self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an old frame is worse than none
-        self._next, self._start = 0, time.monotonic()
+        self._numbers, self._start = itertools.count(), time.monotonic()
 
     def __iter__(self) -> Iterator[Frame]:
-        return self
-
-    def __next__(self) -> Frame:
-        there, image = self._capture.read()
-        if not there and not self._live:
-            raise StopIteration
-        index, self._next = self._next, self._next + 1
-        if self._live:
-            arrival = time.monotonic() - self._start
-            return Frame(index, arrival - self.options.latency, arrival, image if there else None)
-        exposed = index / self.options.rate
-        return Frame(index, exposed, exposed + self.options.latency, image)
+        for index in self._numbers:
+            there, image = self._capture.read()
+            if self._live:
+                arrival = time.monotonic() - self._start
+                yield Frame(index, arrival - self.options.latency, arrival, image if there else None)
+            elif there:
+                exposed = index / self.options.rate
+                yield Frame(index, exposed, exposed + self.options.latency, image)
+            else:
+                return
 
     def close(self) -> None:
         """Give the device back."""

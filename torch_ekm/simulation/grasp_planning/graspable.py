@@ -25,17 +25,11 @@ def obstacles(hand: HandDescription, pads: tuple[ContactPad, ...]) -> tuple[list
 
     Returns the link of each ball, its centre in that link ``(n, 3)`` [m] and its radius ``(n,)`` [m].
     """
-    links, centres, radii = [], [], []
-
-    def add(link: str, centre: Array, radius: float) -> None:
-        links.append(link)
-        centres.append(centre)
-        radii.append(radius)
-
+    balls: list[tuple[str, Array, float]] = []
     carrying = {pad.link: pad for pad in pads}
     for link in hand.urdf.links:
         if link.name in carrying:
-            add(link.name, np.array(carrying[link.name].start), carrying[link.name].radius)
+            balls.append((link.name, np.array(carrying[link.name].start), carrying[link.name].radius))
             continue
         for shape in link.collisions:
             rotation, origin = shape.transform[:3, :3], shape.transform[:3, 3]
@@ -43,13 +37,14 @@ def obstacles(hand: HandDescription, pads: tuple[ContactPad, ...]) -> tuple[list
                 half = np.array(shape.size) / 2
                 for corner in np.stack(np.meshgrid(*[np.linspace(-1, 1, 4)] * 3), axis=-1).reshape(-1, 3):
                     if np.abs(corner).max() == 1:
-                        add(link.name, origin + rotation @ (half * corner), 0.0)
+                        balls.append((link.name, origin + rotation @ (half * corner), 0.0))
             elif shape.kind == "sphere":
-                add(link.name, origin, shape.size[0])
+                balls.append((link.name, origin, shape.size[0]))
             else:
                 for part in (-0.5, 0.0, 0.5):
-                    add(link.name, origin + part * shape.size[1] * rotation[:, 2], shape.size[0])
-    return links, np.array(centres), np.array(radii)
+                    balls.append((link.name, origin + part * shape.size[1] * rotation[:, 2], shape.size[0]))
+    links, centres, radii = zip(*balls, strict=True)
+    return list(links), np.array(centres), np.array(radii)
 
 
 def object_axes(obj: ObjectDescription) -> Array:

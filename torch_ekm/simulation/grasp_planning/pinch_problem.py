@@ -78,11 +78,10 @@ class PinchProblem:
     rounded ends, joints away from their stops, tendons taut, the object where it is wanted.
 
     Args:
-        hand, obj: the bodies.
+        hand, obj: the bodies as they really are.
         transmission: moment arms, springs and stiffness of the plant that will hold the object.
         thumb, fingers: names of the pads that oppose each other.
         along: wanted direction of the object's long axis, in the hand frame.
-        mass_factor, com_shift, friction, object_scale: see :class:`PlantParameters`.
 
     Raises:
         UnknownNameError: there is no such pad; the message lists all.
@@ -95,11 +94,7 @@ class PinchProblem:
         transmission: Transmission,
         thumb: str,
         fingers: tuple[str, ...],
-        along: tuple[float, float, float] = (0.0, 1.0, 0.0),
-        mass_factor: float = 1.0,
-        com_shift: tuple[float, ...] = (0.0, 0.0, 0.0),
-        friction: float = 1.0,
-        object_scale: float = 1.0,
+        along: Array,
     ) -> None:
         by_name = {pad.name: pad for pad in hand.pads}
         for name in (thumb, *fingers):
@@ -107,7 +102,7 @@ class PinchProblem:
                 raise UnknownNameError("contact pad", name, by_name)
         self.hand, self.obj, self.transmission = hand, obj, transmission
         self.pads = tuple(by_name[name] for name in (thumb, *fingers))
-        self.along = np.array(along, dtype=np.float64)
+        self.along = along
         self.kinematics = HandKinematics(hand)
         self._links = [self.kinematics.link_index(pad.link) for pad in self.pads]
         self._upstream = self.kinematics.upstream.numpy()[self._links]  # (n_c, n_q)
@@ -122,10 +117,6 @@ class PinchProblem:
         self._radius = np.array([pad.radius for pad in self.pads])
         links, self._ball, self._ball_radius = obstacles(hand, self.pads)
         self._ball_link = [self.kinematics.link_index(name) for name in links]
-        self._mass = mass_factor * obj.mass
-        self._com = obj.com + np.array(com_shift)
-        self._mu = friction * obj.friction
-        self._shapes = tuple(shape.scaled(object_scale) for shape in obj.shapes)
         self._prepare_mechanism()
         self._axes = object_axes(obj)
         self.towards = self._direction_of_grasp()
@@ -145,10 +136,8 @@ class PinchProblem:
 
     def _unpack(self, x: Array) -> tuple[Array, Array, Array, Array]:
         n = len(self.moving)
-        q0 = self.transmission.spring_rest
-        q = q0 + (x[:, :n] - q0[self.moving]) @ self.follow.T
         rotation = exp(torch.from_numpy(x[:, n + 3 : n + 6])).numpy() @ self.nominal_rotation()
-        return q, x[:, n : n + 3], rotation, x[:, n + 6 :].reshape(len(x), -1, 3)
+        return self.posture(x[:, :n]), x[:, n : n + 3], rotation, x[:, n + 6 :].reshape(len(x), -1, 3)
 
     def nominal_rotation(self) -> Array:
         """Long axis along the hand's wanted direction, grasp axis from the thumb to the fingers."""
@@ -167,7 +156,7 @@ class PinchProblem:
         return np.einsum("cij,cj->ci", poses[:, :3, :3], self._tip) + poses[:, :3, 3]
 
     def posture(self, moving: Array) -> Array:
-        """All joints, coupled ones following, others at rest ``(n_q,)`` [rad]."""
+        """All joints, coupled ones following, others at rest ``(*batch, n_q)`` [rad]."""
         q0 = self.transmission.spring_rest
         return q0 + (moving - q0[self.moving]) @ self.follow.T
 
@@ -189,11 +178,11 @@ class PinchProblem:
         turn, origin = links[..., :3, :3], links[..., :3, 3]
         centre = origin + np.einsum("bcij,cj->bci", turn, self._tip)
         local = np.einsum("bji,bcj->bci", R, centre - o[:, None])
-        distance, normal = signed_distance(self._shapes, local)
+        distance, normal = signed_distance(self.obj.shapes, local)
         n = np.einsum("bij,bcj->bci", R, normal)
         every = poses.transforms.numpy()[:, self._ball_link]
         ball = every[..., :3, 3] + np.einsum("bcij,cj->bci", every[..., :3, :3], self._ball)
-        clearance, _ = signed_distance(self._shapes, np.einsum("bji,bcj->bci", R, ball - o[:, None]))
+        clearance, _ = signed_distance(self.obj.shapes, np.einsum("bji,bcj->bci", R, ball - o[:, None]))
         point = centre - self._radius[:, None] * n
         return PinchGeometry(
             q=q,
@@ -222,9 +211,9 @@ class PinchProblem:
     def equations(self, x: Array, request: PinchRequest, g: PinchGeometry | None = None) -> Array:
         """What must vanish, in units of its tolerance."""
         g = self.geometry(x) if g is None else g
-        weight = self._mass * np.array(request.gravity)
+        weight = self.obj.mass * np.array(request.gravity)
         force = g.force.sum(axis=1) + weight
-        centre = g.rotation @ self._com
+        centre = g.rotation @ self.obj.com
         moment = np.cross(g.point - g.position[:, None], g.force).sum(axis=1) + np.cross(centre, weight)
         spring = self.transmission.spring_stiffness * (g.q - self.transmission.spring_rest)
         passive = (spring + g.torque)[:, self.moving] @ self._passive
@@ -238,16 +227,15 @@ class PinchProblem:
         g = self.geometry(x)
         f_n = -np.einsum("bci,bci->bc", g.force, g.normal)
         f_t = np.linalg.norm(g.force + f_n[..., None] * g.normal, axis=-1)
-        cone = np.maximum(0.0, f_t - 0.4 * self._mu * f_n) / 0.05
+        cone = np.maximum(0.0, f_t - 0.4 * self.obj.friction * f_n) / 0.05
         share = (f_n[:, 1:] - f_n[:, :1] / max(1, len(self.pads) - 1)) / 1.0
         cap = np.maximum(0.0, 0.3 + np.einsum("bci,bci->bc", g.normal, g.pad_axis)) / 0.1
         pad = np.maximum(0.0, 0.3 + np.einsum("bci,bci->bc", g.normal, g.pad_direction)) / 0.1
         along, across = g.local @ self._axes[:, 0], g.local @ self._axes[:, 2]
         place = [
-            (along[:, 0] - request.along) / 2e-3,
-            (along[:, 1:].mean(axis=1) - request.along) / 2e-3,
-            (across[:, 0] - request.across) / 2e-3,
-            (across[:, 1:].mean(axis=1) - request.across) / 2e-3,
+            (part - wanted) / 2e-3
+            for at, wanted in ((along, request.along), (across, request.across))
+            for part in (at[:, 0], at[:, 1:].mean(axis=1))
         ]
         long_axis = g.rotation @ self._axes[:, 0]
         wish = self._tilted(request)

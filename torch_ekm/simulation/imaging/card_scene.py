@@ -14,6 +14,9 @@ from ...exceptions import ShapeError
 from ...sensing.vision.camera import PinholeCamera
 from ...typing import Array
 
+_SIDES = 32  # of the prism that stands for a cylinder
+_PER_BALL = 24  # points of the outline of a ball
+
 
 class Card(Protocol):
     """Anything printed on a plane: a marker board, a calibration target."""
@@ -56,37 +59,27 @@ class ConvexBody:
         return cls(np.stack([start, end]), np.full(2, radius), shade)
 
     @classmethod
-    def box(cls, size: tuple[float, float, float], shade: int = 140) -> ConvexBody:
-        """A box about the origin with edges ``size`` [m]."""
-        signs = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5]), axis=-1).reshape(-1, 3)
-        return cls(signs * np.asarray(size), np.zeros(8), shade)
-
-    @classmethod
-    def cylinder(cls, radius: float, length: float, shade: int = 140, sides: int = 32) -> ConvexBody:
-        """A cylinder along z about the origin."""
-        angle = 2 * np.pi * np.arange(sides) / sides
-        ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        ends = [np.c_[ring, np.full(sides, z)] for z in (-length / 2, length / 2)]
-        return cls(np.concatenate(ends), np.zeros(2 * sides), shade)
-
-    @classmethod
     def of_shape(cls, shape: Shape, shade: int = 90) -> ConvexBody:
         """A primitive of a hand's or object's description, in the frame of its link or object."""
+        radius, length = (*shape.size, 0.0)[:2]
         if shape.kind == "box":
-            body = cls.box(tuple(shape.size), shade)  # type: ignore[arg-type]
+            signs = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), axis=-1).reshape(-1, 3)
+            body = cls(signs * np.asarray(shape.size), np.zeros(8), shade)
         elif shape.kind == "cylinder":
-            body = cls.cylinder(*shape.size, shade)  # type: ignore[arg-type]
+            angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
+            ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+            ends = [np.c_[ring, np.full(_SIDES, z)] for z in (-length / 2, length / 2)]
+            body = cls(np.concatenate(ends), np.zeros(2 * _SIDES), shade)
         else:
-            half = shape.size[1] / 2 if shape.kind == "capsule" else 0.0
-            end = np.array([0, 0, half])
-            body = cls.capsule(-end, end, shape.size[0], shade)
+            end = np.array([0, 0, length / 2])
+            body = cls.capsule(-end, end, radius, shade)
         return body.moved(shape.transform)
 
     def moved(self, transform: Array) -> ConvexBody:
         """The body seen from another frame: ``x -> R x + t``."""
         return ConvexBody(self.centres @ transform[:3, :3].T + transform[:3, 3], self.radii, self.shade)
 
-    def outline(self, camera: PinholeCamera, per_ball: int = 24) -> Array | None:
+    def outline(self, camera: PinholeCamera) -> Array | None:
         """Convex outline in the image, ``(m, 2)`` [px]; None where the body is not before the camera.
 
         A ball of centre c and radius r shows its circle about ``c (1 - r^2/d^2)`` of radius
@@ -103,9 +96,9 @@ class ConvexBody:
             first = np.cross(axis, np.where(np.abs(axis[:, :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0]))
             first /= np.linalg.norm(first, axis=1, keepdims=True)
             second = np.cross(axis, first)
-            angle = 2 * np.pi * np.arange(per_ball) / per_ball
+            angle = 2 * np.pi * np.arange(_PER_BALL) / _PER_BALL
             circle = np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
-            radius = self.radii * np.sqrt(shrink) / np.cos(np.pi / per_ball)  # the polygon circumscribes
+            radius = self.radii * np.sqrt(shrink) / np.cos(np.pi / _PER_BALL)  # the polygon circumscribes
             points = self.centres[:, None] * shrink[:, None, None] + radius[:, None, None] * circle
         return _convex_hull(camera.project(points.reshape(-1, 3)))
 

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from ...description.hand import HandDescription
 from ...exceptions import ParameterError
 from ...typing import Array
 
-
-class TransmissionState(NamedTuple):
-    """All that a :class:`Transmission` remembers between steps."""
-
-    anchor: Array
-    offset: Array
+_COUPLING_STIFFNESS = 8.0  # k_c [N m/rad]
+_BRISTLE_STIFFNESS = 3.0  # k_f [N m/rad]
 
 
 class Transmission:
@@ -38,33 +32,18 @@ class Transmission:
     same drive. PhysX's own joint friction is a fraction of the momentum, not a torque: not used.
 
     Args:
-        hand: joints, springs, couplings.
-        actuation_jacobian: J_a of **this** plant ``(n_a, n_q)``; the model's may be another.
-        stiffness: k_a, tendon and servo in series ``(n_a,)`` [N m/rad].
-        spring_stiffness: diagonal of K_s ``(n_q,)`` [N m/rad].
-        friction: Coulomb torque of each joint ``(n_q,)`` [N m].
-        coupling_stiffness: k_c of the rigid couplings [N m/rad].
-        bristle_stiffness: k_f [N m/rad].
+        hand: as it really is; the model's may be another.
         creep: how fast a loaded tendon lengthens for good [rad/(N m s)].
     """
 
-    def __init__(
-        self,
-        hand: HandDescription,
-        actuation_jacobian: Array,
-        stiffness: Array,
-        spring_stiffness: Array,
-        friction: Array,
-        coupling_stiffness: float = 8.0,
-        bristle_stiffness: float = 3.0,
-        creep: float = 0.0,
-    ) -> None:
-        for name, value in (("stiffness", stiffness), ("spring_stiffness", spring_stiffness)):
+    def __init__(self, hand: HandDescription, creep: float = 0.0) -> None:
+        stiffness = np.array([actuator.stiffness for actuator in hand.actuators])
+        for name, value in (("stiffness", stiffness), ("spring_stiffness", hand.spring_stiffness)):
             if not np.all(np.isfinite(value)) or np.any(value < 0):
                 raise ParameterError(name, value, "finite and not negative in every entry [N m/rad]")
         self.n_a, self.n_q = hand.n_a, hand.n_q
-        self.J_a = np.array(actuation_jacobian, dtype=np.float64)
-        self.offset = hand.actuator_offset.copy()
+        self.J_a = hand.actuation_jacobian
+        self.offset = hand.actuator_offset
         """a0, which grows as a tendon lengthens ``(n_a,)`` [rad]."""
         self.creep = creep
         coupling = hand.coupling.reshape(-1, hand.n_q)
@@ -72,19 +51,18 @@ class Transmission:
         away = np.eye(hand.n_q) - S  # how far each follower is from where it should be
         self._lead = self.J_a @ S
         self._M = np.vstack([self._lead, away[np.abs(away).max(axis=1) > 0]])
-        self._k = np.concatenate([stiffness, np.full(len(coupling), coupling_stiffness)])
+        self._k = np.concatenate([stiffness, np.full(len(coupling), _COUPLING_STIFFNESS)])
         self._pulls_only = np.concatenate(
             [[actuator.tendon for actuator in hand.actuators], np.zeros(len(coupling), bool)]
         ).astype(bool)
         self._any_tendon = bool(self._pulls_only.any())
-        self.spring_stiffness = np.array(spring_stiffness, dtype=np.float64)
-        self.spring_rest = np.array(hand.spring_rest, dtype=np.float64)
-        self.friction = np.array(friction, dtype=np.float64)
-        self._k_f = np.where(self.friction > 0, bristle_stiffness, 0.0)
+        self.spring_stiffness, self.spring_rest = hand.spring_stiffness, hand.spring_rest
+        self.friction = hand.joint_friction
+        self._k_f = np.where(self.friction > 0, _BRISTLE_STIFFNESS, 0.0)
         self._reach = np.divide(
             self.friction, self._k_f, out=np.zeros_like(self.friction), where=self._k_f > 0
         )
-        self._anchor = self.spring_rest.copy()
+        self._anchor = self.spring_rest
         self._spring_torque = self.spring_stiffness * self.spring_rest
         self.drive_stiffness = self.spring_stiffness + self._k @ (self._M**2) + self._k_f
         """Stiffness of each joint's drive ``(n_q,)`` [N m/rad], while all tendons are taut."""
@@ -138,13 +116,7 @@ class Transmission:
         along = np.einsum("aq,aq->a", self._lead, other._lead) / np.einsum("aq,aq->a", self._lead, self._lead)
         stretch = other.stretch(q, motor) * along * other.stiffness / self.stiffness
         self.offset = motor - self._lead @ q - stretch
-        self._anchor = other._anchor.copy()
-
-    def snapshot(self) -> TransmissionState:
-        return TransmissionState(self._anchor.copy(), self.offset.copy())
-
-    def restore(self, state: TransmissionState) -> None:
-        self._anchor, self.offset = state.anchor.copy(), state.offset.copy()
+        self._anchor = other._anchor
 
 
 def coupled_posture(coupling: Array) -> Array:

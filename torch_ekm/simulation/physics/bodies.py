@@ -109,17 +109,13 @@ def _parents_first(urdf: UrdfModel) -> list[UrdfJoint]:
     return order
 
 
-def build_object(scene: Any, obj: ObjectDescription, material: Any, scale: float) -> Any:
-    """The object as one free rigid body; its entity frame is the object frame.
-
-    Its inertia is set by :func:`set_object_inertia`.
-    """
+def build_object(scene: Any, obj: ObjectDescription, material: Any) -> Any:
+    """The object as one free rigid body; its entity frame is the object frame."""
     entity = sapien().Entity()
     entity.name = obj.name
     body = sapien().physx.PhysxRigidDynamicComponent()
     for shape in obj.shapes:
-        sized = shape.scaled(scale)
-        _attach(body, sized, sized.transform, material, group=0)
+        _attach(body, shape, shape.transform, material, group=0)
     body.linear_damping = body.angular_damping = 0.0
     entity.add_component(body)
     scene.add_entity(entity)

@@ -21,10 +21,9 @@ class HandScene:
 
     Args:
         hand: the hand; its URDF gives links, inertias and shapes. Hand frame = world frame.
-        obj: the object.
+        obj: the object, as it really is.
         gravity: in the hand frame [m/s^2].
         time_step: [s].
-        object_scale: factor on the object's shapes.
     """
 
     def __init__(
@@ -32,16 +31,15 @@ class HandScene:
         hand: HandDescription,
         obj: ObjectDescription,
         gravity: tuple[float, float, float],
-        time_step: float = 1e-3,
-        object_scale: float = 1.0,
+        time_step: float,
     ) -> None:
-        self.obj, self.time_step = obj, time_step
+        self.time_step = time_step
         self._scene: Any = new_scene(gravity, time_step)
         self._system: Any = self._scene.physx_system
         self._material = sapien().physx.PhysxMaterial(obj.friction, obj.friction, 0.0)
         self._hand = build_hand(self._scene, hand, self._material)
-        self._object = build_object(self._scene, obj, self._material, object_scale)
-        self.set_object()
+        self._object = build_object(self._scene, obj, self._material)
+        self.set_object(obj)
         if hand.planar_normal is not None:
             self._keep_in_plane(np.array(hand.planar_normal))
         self._back = np.argsort(self._hand.order)
@@ -61,10 +59,9 @@ class HandScene:
 
     # -- properties that may change in mid-run ----------------------------------------------------
 
-    def set_object(self, mass: float = 1.0, com_shift: tuple[float, ...] = (0.0, 0.0, 0.0)) -> None:
-        """The object's mass by a factor, its centre of mass by a shift in the object frame [m]."""
-        obj = self.obj
-        set_inertia(self._object, mass * obj.mass, obj.com + np.array(com_shift), mass * obj.inertia)
+    def set_object(self, obj: ObjectDescription) -> None:
+        """Mass, centre of mass and inertia; the shapes stay."""
+        set_inertia(self._object, obj.mass, obj.com, obj.inertia)
 
     def set_friction(self, coefficient: float) -> None:
         self._material.static_friction = self._material.dynamic_friction = coefficient

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -12,10 +13,11 @@ from ...typing import Array
 from ..config import PlantConfig
 from ..grasp_planning.graspable import chain
 from ..grasp_planning.pinch import PinchPlan
-from ..mechanism.assembly import make_servo, make_transmission, moment_arms
-from ..mechanism.servo import ServoState
-from ..mechanism.transmission import TransmissionState
+from ..mechanism.assembly import make_transmission, true_object
+from ..mechanism.servo import Servo
+from ..mechanism.transmission import Transmission
 from ..parameters import PlantParameters
+from ..sensors import TimedState
 from .hand_scene import HandScene
 
 Gravity = tuple[float, float, float]
@@ -29,8 +31,8 @@ class RigState(NamedTuple):
     """A moment of a :class:`Rig`."""
 
     physics: bytes
-    transmission: TransmissionState
-    servo: ServoState
+    transmission: Transmission
+    servo: Servo
     parameters: PlantParameters
     gravity: Gravity
     normal: Array
@@ -45,22 +47,27 @@ class Rig:
         hand, obj: the bodies.
         config: time steps and rates.
         parameters: what they really are.
+        remember: called every 10 steps if the camera is late.
     """
 
     def __init__(
-        self, hand: HandDescription, obj: ObjectDescription, config: PlantConfig, parameters: PlantParameters
+        self,
+        hand: HandDescription,
+        obj: ObjectDescription,
+        config: PlantConfig,
+        parameters: PlantParameters,
+        remember: Callable[[TimedState], None],
     ) -> None:
         self.hand, self.obj, self.config, self.parameters = hand, obj, config, parameters
+        self.remember = remember
         self.transmission = make_transmission(hand, parameters)
-        self.servo = make_servo(hand, config, parameters)
+        self.servo = Servo(hand.actuator_lower, hand.actuator_upper, parameters, config.relative_to)
         self.time = 0.0
         """[s] since the fingers closed."""
         self.normal = np.zeros(len(hand.pads))
         """Normal force of each pad, mean of the last 10 steps [N]."""
         self.fingers = 0
         """How many fingers touched the object in these steps, with any of their links."""
-        self.on_frame: Callable[[float, Array, Array, Array], None] | None = None
-        """Called every 10 steps with the time, the joint angles and the object's pose."""
         self.gravity: Gravity = hand.gravity
         self._finger_of = {link: joints[-1] for link in hand.link_names if (joints := chain(hand, link))}
         self._build(hand.gravity)
@@ -68,11 +75,9 @@ class Rig:
     def _build(self, gravity: Gravity) -> None:
         p = self.parameters
         self.gravity = gravity
-        self.scene = HandScene(self.hand, self.obj, gravity, self.config.time_step, p.object_scale)
+        self.scene = HandScene(self.hand, true_object(self.obj, p), gravity, self.config.time_step)
         self.scene.set_link_weight(p.link_weight)
         self._built = (gravity, p.object_scale)
-        self.scene.set_object(p.mass, p.com_shift)
-        self.scene.set_friction(p.friction * self.obj.friction)
         self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
 
     def grasp(self, plan: PinchPlan, gravity: Gravity) -> None:
@@ -132,8 +137,9 @@ class Rig:
             if push is not None:
                 scene.push(*push)
             scene.step(transmission.drive_targets(q, output))
-            if self.on_frame is not None and k % _FORCE_WINDOW == 0:
-                self.on_frame(self.time + k * self.config.time_step, scene.q, *scene.object_pose)
+            if self.parameters.latency > 0 and k % _FORCE_WINDOW == 0:
+                time = self.time + k * self.config.time_step
+                self.remember(TimedState(time, scene.q, *scene.object_pose))
             if k > steps - window:
                 touches = scene.touches()
                 fingers |= {self._finger_of[link] for link in touches if link in self._finger_of}
@@ -149,33 +155,27 @@ class Rig:
         """Take on other parameters in mid-run, the motors staying where they are.
 
         What does not differ is left alone: PhysX would not go on bit by bit from being told again.
-
-        Raises:
-            ParameterError: moment arms for another number of actuators; nothing is changed.
         """
-        old = self.parameters
-        moment_arms(self.hand, new)
-        self.parameters = new
-        motors = self.servo.snapshot()
-        self.servo = make_servo(self.hand, self.config, new)
-        self.servo.restore(motors)
+        old, self.parameters = self.parameters, new
+        self.servo.set_parameters(new)
         if _differ(old, new, "moment_arm", "spring", "servo_stiffness", "joint_friction", "tendon_creep"):
             previous, self.transmission = self.transmission, make_transmission(self.hand, new)
             self.transmission.take_over(previous, self.scene.q, self.servo.output)
             self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
         self.transmission.lengthen(new.tendon_elongation - old.tendon_elongation)
+        obj = true_object(self.obj, new)
         if _differ(old, new, "mass", "com_shift"):
-            self.scene.set_object(new.mass, new.com_shift)
+            self.scene.set_object(obj)
         if _differ(old, new, "link_weight"):
             self.scene.set_link_weight(new.link_weight)
         if _differ(old, new, "friction"):
-            self.scene.set_friction(new.friction * self.obj.friction)
+            self.scene.set_friction(obj.friction)
 
     def snapshot(self) -> RigState:
         return RigState(
             self.scene.snapshot(),
-            self.transmission.snapshot(),
-            self.servo.snapshot(),
+            copy.deepcopy(self.transmission),
+            copy.deepcopy(self.servo),
             self.parameters,
             self.gravity,
             self.normal.copy(),
@@ -184,13 +184,11 @@ class Rig:
         )
 
     def restore(self, state: RigState) -> None:
-        if state.parameters != self.parameters:
-            self.change(state.parameters)
+        """Go back to ``state``, taken with the parameters that hold now."""
         if self._built != (state.gravity, state.parameters.object_scale):
             self._build(state.gravity)
         self.scene.restore(state.physics)
-        self.transmission.restore(state.transmission)
-        self.servo.restore(state.servo)
+        self.transmission, self.servo = copy.deepcopy((state.transmission, state.servo))
         self.normal, self.fingers, self.time = state.normal.copy(), state.fingers, state.time
 
 

@@ -7,51 +7,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..._extras import require
-from ...exceptions import ParameterError
-from ...sensing.vision.camera import PinholeCamera
-from .card_scene import Card, CardScene, ConvexBody, PlacedCard
-from .simulated_camera import ImageQuality
+from torch_ekm._extras import require
+from torch_ekm.sensing import PinholeCamera
+from torch_ekm.simulation import CardScene, ConvexBody, ImageQuality, PlacedCard
+from torch_ekm.simulation.imaging.card_scene import Card
 
 # SAPIEN's cameras look along x, with y to the left and z up
 _FROM_CAMERA = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
 class SapienCamera:
-    """A renderer with the interface of :class:`SimulatedCamera`, which it checks: no code is shared.
+    """An independent renderer with the interface of :class:`SimulatedCamera`: no code is shared.
 
-    Cards are textured rectangles, bodies their hulls; a z-buffer decides what hides what. Drawn
-    ``supersample`` times as large and averaged, then blurred and noisy as ``quality`` says. A
-    software device (Mesa's lavapipe 25 or newer) will do.
-
-    Args:
-        camera: an ideal lens; SAPIEN's has no distortion.
-        quality: blur, noise, light, background.
-        supersample: samples per pixel and direction.
-
-    Raises:
-        ParameterError: the lens has distortion, or there is no Vulkan device (see :meth:`available`).
+    Cards are textured rectangles, bodies their hulls; a z-buffer decides what hides what. Drawn twice as
+    large and averaged, then blurred and noisy as ``quality`` says. The lens is ideal. A software
+    device (Mesa's lavapipe 25 or newer) will do.
     """
 
-    def __init__(
-        self,
-        camera: PinholeCamera | None = None,
-        quality: ImageQuality | None = None,
-        supersample: int = 2,
-    ) -> None:
-        self.camera, self.quality = camera or PinholeCamera(), quality or ImageQuality()
-        self.supersample = supersample
-        if not self.camera.is_ideal:
-            raise ParameterError("camera.distortion", self.camera.distortion, "zero: SAPIEN's lens is ideal")
-        if not self.available():
-            valid = "present: a GPU's driver, or Mesa's lavapipe 25 or newer"
-            raise ParameterError("Vulkan device", None, valid)
+    def __init__(self, quality: ImageQuality) -> None:
+        self.camera, self.quality = PinholeCamera(), quality
         self._textures: dict[Card, Any] = {}
         sapien = require("sapien")
         sapien.render.set_camera_shader_dir("minimal")
         self._scene = sapien.Scene([sapien.render.RenderSystem()])
         self._scene.set_ambient_light([1.0, 1.0, 1.0])
-        k, lens = supersample, self.camera
+        k, lens = 2, self.camera
         entity = sapien.Entity()
         self._eye = sapien.render.RenderCameraComponent(k * lens.width, k * lens.height)
         # SAPIEN counts pixels from their corners, OpenCV from their centres
