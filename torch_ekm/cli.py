@@ -127,7 +127,7 @@ def reproduce(
         Option(help="Largest turn of one motion [deg]; 2.5 if left out (less where a contact goes 1.2 mm)."),
     ] = None,
     address: Annotated[
-        str | None, Option(help="A cluster instead of processes here: dask://HOST:PORT or ray://HOST:PORT.")
+        str | None, Option(help="A Dask cluster instead of processes here: dask://HOST:PORT.")
     ] = None,
 ) -> None:
     """Repeat the paper's experiments, and more, with every controller on the same seeds and grasps.

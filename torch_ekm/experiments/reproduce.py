@@ -100,7 +100,7 @@ def reproduce(
     Args:
         processes: how many at once.
         on_done: called with each finished job's name.
-        address: of a Dask or Ray cluster that does the work (``dask://HOST:PORT``, ``ray://HOST:PORT``).
+        address: of a Dask cluster that does the work (``dask://HOST:PORT``).
     """
     protocol, seeds = experiment.protocol, experiment.seeds
     kept = run_jobs(protocol.run, experiment.jobs, folder / "runs", processes, on_done, address)
