@@ -96,7 +96,7 @@ def demo(
     from .experiments.reproduce import Experiment
     from .experiments.reproduce import reproduce as run
 
-    protocol, chosen = Demo(Setting(hand=hand), object), parse_seeds(seeds)
+    protocol, chosen = Demo(Setting(hand=hand), (object,)), parse_seeds(seeds)
     planned = Experiment(protocol.quick(), chosen[:2]) if quick else Experiment(protocol, chosen)
     with _progress("manipulating", len(planned.jobs)) as advance:
         report = run(planned, out, jobs, advance)

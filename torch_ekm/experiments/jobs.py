@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from .._extras import require
 from ..exceptions import ParameterError
 
 Jobs = Mapping[str, tuple[Any, ...]]
-Outcomes = Iterator[tuple[str, Any]]
+Outcomes = Generator[tuple[str, Any], None, None]
 
 _PATIENCE = 10.0  # [s] for a scheduler to answer
 _one_at_a_time = threading.Lock()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from ..reporting.plots import save_figure
-from ..reporting.report import FigureFile, Report, Table
+from ..reporting.report import Report, Table
 from .plots import plot_cost, plot_learning_curves, plot_ranks, plot_scores
 from .scores import Comparison
 
@@ -22,30 +23,25 @@ class ComparisonReport(Comparison):
         return [overview_table(self), *tables] if len(tables) > 1 else tables
 
     def __str__(self) -> str:
-        table = self.tables()[0]
-        rows = [table.header, *table.text()]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
-        return "\n".join([table.caption, *lines, table.note, *self.verdicts()])
+        return "\n".join([str(self.tables()[0]), *self.verdicts()])
 
     def write(self, folder: str | Path) -> Report:
         """Tables as CSV, figures as SVG and PNG, and ``index.html`` with all of them, into ``folder``."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        drawn = {"scores": (plot_scores(self), "rms error over that of the model alone, 95 % intervals.")}
+        save = partial(save_figure, folder=Path(folder))
+        caption = "rms error over that of the model alone, 95 % intervals."
+        figures = [save(plot_scores(self), name="scores", caption=caption)]
         if len(self.streams) > 1:
-            drawn["ranks"] = (plot_ranks(self), "Mean ranks; overlapping bars cannot be told apart.")
-        drawn["cost"] = (plot_cost(self), "Accuracy against time.")
-        for stream in self.streams:
-            figure = plot_learning_curves(self, stream.name, curve_learners(self, stream.name))
-            drawn[f"curve_{stream.name}"] = (figure, f"Learning curves on {stream.name}.")
-        for name, (figure, _) in drawn.items():
-            save_figure(figure, folder, name)
+            caption = "Mean ranks; overlapping bars cannot be told apart."
+            figures.append(save(plot_ranks(self), name="ranks", caption=caption))
+        figures.append(save(plot_cost(self), name="cost", caption="Accuracy against time."))
+        for stream in (s.name for s in self.streams):
+            figure = plot_learning_curves(self, stream, curve_learners(self, stream))
+            figures.append(save(figure, name=f"curve_{stream}", caption=f"Learning curves on {stream}."))
         report = Report(
             title="Residual learners compared",
             summary=" ".join(self.verdicts()),
             tables=self.tables(),
-            figures=[FigureFile(f"{name}.svg", caption) for name, (_, caption) in drawn.items()],
+            figures=figures,
             configuration={
                 "learners": list(self.learners),
                 "streams": {
@@ -53,7 +49,7 @@ class ComparisonReport(Comparison):
                 },
             },
         )
-        report.write(folder)
+        report.write(Path(folder))
         return report
 
 

@@ -91,7 +91,7 @@ class Generalize(Protocol):
     def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[str, str, int]]:
         """One for each seed, object and controller."""
         # a job does not depend on which others there are
-        alone = dataclasses.replace(self, objects=("any",), controllers=CONTROLLERS)
+        alone = {**vars(self), "objects": ("any",), "controllers": CONTROLLERS}
         own = {item: digest(self.setting, (item,), alone, self.angles_of(item)) for item in self.objects}
         return {
             f"generalize_{own[item]}_{object_name(item)}_{name}_{seed}": (item, name, seed)

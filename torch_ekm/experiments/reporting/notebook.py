@@ -15,7 +15,6 @@ from typing import Any
 
 from ...exceptions import DescriptionError, MissingExtraError
 from ...rendering import Scene, save_animation, save_picture
-from .report import Table
 
 
 def smoke_mode() -> bool:
@@ -63,33 +62,6 @@ class HandView:
                 'style="border: 0"></iframe>'
             )
         return bundle
-
-
-class TableView:
-    """A table as the last line of a notebook cell; plain text elsewhere."""
-
-    def __init__(self, table: Table) -> None:
-        self.table = table
-
-    def _repr_html_(self) -> str:
-        head = "".join(f"<th>{html.escape(name)}</th>" for name in self.table.header)
-        body = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
-            for row in self.table.text()
-        )
-        caption, note = html.escape(self.table.caption), html.escape(self.table.note)
-        return (
-            f"<p><b>{caption}</b></p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-            f"<p><i>{note}</i></p>"
-        )
-
-    def __repr__(self) -> str:
-        rows = [self.table.header, *self.table.text()]
-        widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-        lines = [
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows
-        ]
-        return "\n".join([self.table.caption, *lines, self.table.note])
 
 
 def _silence() -> AbstractContextManager:

@@ -23,15 +23,16 @@ COLOURS = {"KM": "#7f7f7f", "KM+I": "#E69F00", "E-KM": "#0072B2", "E-KM+I": "#00
 _MARKERS = {"KM": "s", "KM+I": "D", "E-KM": "o", "E-KM+I": "^"}
 
 
-def _figure(width: float, height: float, columns: int = 1):
+def new_figure(width: float, height: float, columns: int = 1, rows: int = 1, sharey: bool = False):
+    """A figure of this size [inch], and its axes row by row."""
     # a Figure of its own: pyplot would keep it alive and touch the caller's backend
     figure = require("matplotlib.figure").Figure(figsize=(width, height), layout="constrained")
-    axes = figure.subplots(1, columns, squeeze=False)
-    for axis in axes[0]:
+    axes = figure.subplots(rows, columns, squeeze=False, sharey=sharey)
+    for axis in axes.flat:
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(axis="y", color="0.9", linewidth=0.8)
         axis.set_axisbelow(True)
-    return figure, axes[0]
+    return figure, axes.ravel().tolist()
 
 
 def save_figure(figure: Figure, folder: Path, name: str, caption: str = "") -> FigureFile:
@@ -52,7 +53,7 @@ def plot_prediction_error(ekm_deg: Array, km_deg: Array, xlabel: str = "trial") 
     ekm_deg, km_deg = np.atleast_2d(ekm_deg), np.atleast_2d(km_deg)
     if ekm_deg.shape != km_deg.shape:
         raise ShapeError("km_deg", f"{ekm_deg.shape}, that of ekm_deg", km_deg.shape)
-    figure, (axis,) = _figure(7.0, 3.4)
+    figure, (axis,) = new_figure(7.0, 3.4)
     k = np.arange(1, ekm_deg.shape[1] + 1)
     for name, values in (("KM", km_deg), ("E-KM", ekm_deg)):
         middle = np.nanmedian(values, axis=0)
@@ -77,7 +78,7 @@ def plot_learning_test(ekm_deg: Array, km_deg: Array) -> Figure:
     """
     curve = learning_curve(ekm_deg, km_deg)
     k = np.arange(1, len(curve.p) + 1)
-    figure, (left, right) = _figure(8.0, 3.2, columns=2)
+    figure, (left, right) = new_figure(8.0, 3.2, columns=2)
     left.plot(k, curve.p, color=COLOURS["E-KM"])
     left.axhline(ALPHA, color=COLOURS["limit"], linewidth=1, linestyle="--", label=f"{ALPHA:g}")
     left.set_yscale("log")
@@ -108,7 +109,7 @@ def plot_steady_state_error(errors_deg: dict[str, dict[str, Array]], what: str =
     top = 1.3 * float(np.percentile(everything, 95)) if everything.size else 1.0
     top = top if everything.size and everything.max() > 2 * top else np.inf
     targets = list(next(iter(errors_deg.values())))
-    figure, (axis,) = _figure(max(4.0, 1.3 * len(targets)), 3.4)
+    figure, (axis,) = new_figure(max(4.0, 1.3 * len(targets)), 3.4)
     width = 0.8 / len(errors_deg)
     for j, (name, by_target) in enumerate(errors_deg.items()):
         colour = COLOURS.get(name, f"C{j}")
@@ -143,7 +144,7 @@ def plot_convergence(histories_deg: dict[str, list[Array]], target: str = "") ->
     Args:
         histories_deg: controller -> list of ``(n_steps,)`` errors [deg].
     """
-    figure, (axis,) = _figure(6.0, 3.4)
+    figure, (axis,) = new_figure(6.0, 3.4)
     for j, (name, runs) in enumerate(histories_deg.items()):
         colour = COLOURS.get(name, f"C{j}")
         for i, run in enumerate(runs):
@@ -165,7 +166,7 @@ def plot_bank(
         posteriors: probabilities of the models at the end of each turn.
     """
     names = list(dict.fromkeys(objects))
-    figure, (axis,) = _figure(8.0, 3.2)
+    figure, (axis,) = new_figure(8.0, 3.2)
     palette = list(COLOURS.values())
     for k, (name, model, posterior) in enumerate(zip(objects, models, posteriors, strict=True), start=1):
         if model is None:
