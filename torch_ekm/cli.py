@@ -291,14 +291,10 @@ def _progress(what: str, total: int) -> Iterator[Callable[[object], None]]:
 
 
 def _print_report(report: Report, folder: Path, notes: bool = False) -> None:
-    _print_tables(report, notes)
-    console.print(report.summary)
-    console.print(f"Report:    {(folder / 'index.html').resolve()}", soft_wrap=True)
-
-
-def _print_tables(report: Report, notes: bool = False) -> None:
     for table in report.tables:
         _print_table(table.header, table.text(), table.caption, table.note if notes else None)
+    console.print(report.summary)
+    console.print(f"Report:    {(folder / 'index.html').resolve()}", soft_wrap=True)
 
 
 def _print_table(
@@ -318,13 +314,13 @@ def _print_table(
 
 def _numbers(name: str, text: str) -> tuple[float, ...]:
     try:
-        return tuple(float(part) for part in text.split(",") if part.strip())
+        return tuple(map(float, _names(text)))
     except ValueError:
         raise ParameterError(name, text, "numbers separated by commas, e.g. 10,20") from None
 
 
 def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+    return tuple(filter(None, map(str.strip, text.split(","))))
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:
