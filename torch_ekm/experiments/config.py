@@ -136,15 +136,14 @@ class Setting:
 
     def figures(self) -> dict[str, Any]:
         """All figures of plant, model, controller, stopping rule and learner, defaults included."""
-        parts = {
-            "plant": self.parameters(),
-            "plant_config": self.plant_config("KM"),
-            "model": self.model_options(),
-            "stopping_rule": self.stopping_rule(),
+        return {
+            "plant": dataclasses.asdict(self.parameters()),
+            "plant_config": dataclasses.asdict(self.plant_config("KM")),
+            "model": dataclasses.asdict(self.model_options()),
+            "stopping_rule": dataclasses.asdict(self.stopping_rule()),
+            "controller": {name: repr(parts) for name, parts in self.controller_parts().items()},
+            "learner": learner_figures(self.learner, self.capacity, **self.learner_options),
         }
-        figures: dict[str, Any] = {name: dataclasses.asdict(part) for name, part in parts.items()}
-        figures["controller"] = {name: repr(parts) for name, parts in self.controller_parts().items()}
-        return {**figures, "learner": learner_figures(self.learner, self.capacity, **self.learner_options)}
 
     def replace(self, **changes: Any) -> Setting:
         """A copy with some figures changed."""

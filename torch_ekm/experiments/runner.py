@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -134,11 +134,12 @@ class Bench:
         )
         axis = self.hand.rotation_axis
         target = PoseTarget.turned(start, axis, about.angle_deg * _DEG)
-        controller, plant = self._controller(axis), self.plant
+        plant = self.plant
         if blind_deg:
-            model = self.model if self.enhanced is None else self.enhanced
-            plant = CameraOff(plant, model, target, axis, blind_deg * _DEG)
-        done = ClosedLoop(plant, controller, self.setting.stopping_rule(), learn=learn).run(target)
+            plant = CameraOff(plant, self._predictor, target, axis, blind_deg * _DEG)
+        done = ClosedLoop(plant, self._controller(axis), self.setting.stopping_rule(), learn=learn).run(
+            target
+        )
         return TrialRecord.of(about, done, axis, learns=self.learns, poses=poses)
 
     def long_step(self, seed: int, trial: int, step_deg: float) -> Record:
@@ -158,7 +159,7 @@ class Bench:
             "ActuatorLimit.step": 20 * _DEG,
         }
         rule = dataclasses.replace(self.setting.stopping_rule(), max_steps=1, off_limit=math.inf)
-        loop = ClosedLoop(self.plant, self._controller(axis, wide), rule, learn=False)
+        loop = ClosedLoop(self.plant, self._controller(axis, **wide), rule, learn=False)
         done = loop.run(PoseTarget.turned(start, axis, step_deg * _DEG))
         before = true_state(done.steps[0].before if done.steps else done.stop.final)
         turned = true_state(done.stop.final).minus(before)[-3:] @ axis
@@ -169,12 +170,13 @@ class Bench:
         """Give back what the plant holds."""
         self.plant.close()
 
-    def _controller(
-        self, axis: torch.Tensor, changes: Mapping[str, Any] | None = None
-    ) -> LookAndMoveController:
-        setting = self.setting.replace(control={**self.setting.control, **(changes or {})})
-        model = self.enhanced if self.enhanced is not None else self.model
-        return LookAndMoveController(model, axis, **setting.controller_parts())
+    @property
+    def _predictor(self) -> KinematicModel | EnhancedModel:
+        return self.model if self.enhanced is None else self.enhanced
+
+    def _controller(self, axis: torch.Tensor, **changes: Any) -> LookAndMoveController:
+        setting = self.setting.replace(control={**self.setting.control, **changes})
+        return LookAndMoveController(self._predictor, axis, **setting.controller_parts())
 
     def _prepare_learner(self, start: GraspState) -> None:
         setting = self.setting

@@ -14,7 +14,7 @@ from ..typing import Array
 from .scene import Scene, shape_mesh
 
 
-def save_animation(scene: Scene, path: Path, frame_seconds: float = 0.25) -> Path:
+def save_animation(scene: Scene, path: Path) -> Path:
     """Write the frames as one stand-alone HTML page that can be turned and zoomed (viser)."""
     server = start_server("127.0.0.1", 0)
     try:
@@ -22,7 +22,7 @@ def save_animation(scene: Scene, path: Path, frame_seconds: float = 0.25) -> Pat
         nodes = draw(server, scene)
         for frame in scene.transforms:
             place(server, nodes, frame)
-            serializer.insert_sleep(frame_seconds)
+            serializer.insert_sleep(0.25)  # [s] for each frame
         path.write_text(serializer.as_html(), encoding="utf-8")
     finally:
         with contextlib.redirect_stdout(io.StringIO()):

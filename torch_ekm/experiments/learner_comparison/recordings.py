@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -73,17 +74,14 @@ def load_t42(root: Root = None) -> list[Stream]:
     joined = {
         name: [np.concatenate(part) for part in zip(*paths, strict=True)] for name, paths in samples.items()
     }
-    state, action, change = joined[_T42_NOMINAL]
+    _, action, change = joined[_T42_NOMINAL]
     jacobian = np.linalg.lstsq(action, change, rcond=None)[0]
-    inputs, residual = np.hstack([state, action]), change - action @ jacobian
+    pairs = {name: (np.hstack([s, a]), change - a @ jacobian) for name, (s, a, change) in joined.items()}
+    inputs, residual = pairs[_T42_NOMINAL]
     mean, deviation, unit = inputs.mean(0), inputs.std(0), residual.std(0)
     return [
-        Stream(
-            name,
-            torch.from_numpy((np.hstack([state, action]) - mean) / deviation),
-            torch.from_numpy((change - action @ jacobian) / unit),
-        )
-        for name, (state, action, change) in sorted(joined.items())
+        Stream(name, torch.from_numpy((x - mean) / deviation), torch.from_numpy(y / unit))
+        for name, (x, y) in sorted(pairs.items())
         if name not in (_T42_NOMINAL, _T42_SKIPPED)
     ]
 
@@ -110,12 +108,9 @@ def load_regression(name: str, root: Root = None) -> tuple[Array, Array]:
     return values[:, :-n_out], values[:, -n_out:]
 
 
-def _regression(name: str) -> Callable[[Root, int | None], Stream]:
-    def read(root: Root, limit: int | None) -> Stream:
-        x, y = load_regression(name, root)
-        return in_own_units(name, x[:limit], y[:limit], _REGRESSION[name][2])
-
-    return read
+def _regression(name: str, root: Root, limit: int | None) -> Stream:
+    x, y = load_regression(name, root)
+    return in_own_units(name, x[:limit], y[:limit], _REGRESSION[name][2])
 
 
 def _t42(root: Root, limit: int | None) -> Stream:
@@ -158,13 +153,11 @@ def _trial(path: Path) -> tuple[int, str]:
     return int(number), name
 
 
-def _series(path: str, name: str, lags: int, about: str) -> Callable[[Root, int | None], Stream]:
-    def read(root: Root, limit: int | None) -> Stream:
-        series = np.loadtxt(_need(root, path))[: None if limit is None else limit + lags]
-        x = np.lib.stride_tricks.sliding_window_view(series, lags)[:-1]
-        return in_own_units(name, x, series[lags:, None], f"{about}, next value; alone: the mean")
-
-    return read
+def _series(name: str, root: Root, limit: int | None) -> Stream:
+    path, lags, about = _SERIES[name]
+    series = np.loadtxt(_need(root, path))[: None if limit is None else limit + lags]
+    x = np.lib.stride_tricks.sliding_window_view(series, lags)[:-1]
+    return in_own_units(name, x, series[lags:, None], f"{about}, next value; alone: the mean")
 
 
 def _mimo(root: Root, limit: int | None) -> Stream:
@@ -191,12 +184,16 @@ _REGRESSION = {
     "kin40k": ("uci/kin40k/data.csv.gz", 1, "kinematics of an 8-link arm; alone: the mean"),
     "powerplant": ("uci/power-plant.csv", 1, "a power plant's output; alone: the mean"),
 }
+# name -> file, number of values from which the next one is predicted, and what it is
+_SERIES = {
+    "lorenz": ("streams/lorenz.dat", 6, "Lorenz attractor"),
+    "mackey_glass": ("streams/mg30.dat", 10, "Mackey-Glass"),
+    "santafe": ("streams/santafe.dat", 10, "Santa Fe laser"),
+}
 _READERS: dict[str, Callable[[Root, int | None], Stream]] = {
     "t42": _t42,
     "icub_grasp": _icub_grasp,
     "mimo": _mimo,
-    **{name: _regression(name) for name in _REGRESSION},
-    "lorenz": _series("streams/lorenz.dat", "lorenz", 6, "Lorenz attractor"),
-    "mackey_glass": _series("streams/mg30.dat", "mackey_glass", 10, "Mackey-Glass"),
-    "santafe": _series("streams/santafe.dat", "santafe", 10, "Santa Fe laser"),
+    **{name: partial(_regression, name) for name in _REGRESSION},
+    **{name: partial(_series, name) for name in _SERIES},
 }

@@ -23,9 +23,6 @@ class HandShow:
     """``q(a) = argmin 1/2 q^T K_s q  s.t.  J_a q = a - a_0,  C q = 0``: the hand that touches nothing.
 
     Joint stops are kept. One slider for each actuator; as a page, each closes and opens in turn.
-
-    Args:
-        hand: its description.
     """
 
     def __init__(self, hand: HandDescription) -> None:
@@ -48,17 +45,10 @@ class HandShow:
 
     def add_controls(self, gui: Any) -> None:
         """A slider for each actuator [deg]."""
+        ranges = np.degrees([self._lower, self._upper, self._a]).T.tolist()
         self._sliders = [
-            gui.add_slider(
-                f"{actuator.name} [deg]",
-                min=math.degrees(low),
-                max=math.degrees(high),
-                step=0.5,
-                initial_value=math.degrees(start),
-            )
-            for actuator, low, high, start in zip(
-                self.hand.actuators, self._lower, self._upper, self._a, strict=True
-            )
+            gui.add_slider(f"{name} [deg]", min=low, max=high, step=0.5, initial_value=start)
+            for name, (low, high, start) in zip(self.hand.actuator_names, ranges, strict=True)
         ]
 
     def update(self) -> Array | None:
