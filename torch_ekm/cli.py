@@ -169,9 +169,9 @@ def compare(
     santafe (steven2358/kafbox).
     """
     from .experiments import compare as run
-    from .experiments.learner_comparison.learners import DEFAULT
+    from .experiments.learners import COMPARED
 
-    chosen = _names(learners) or DEFAULT
+    chosen = _names(learners) or COMPARED
     with _progress("comparing", len(data) * len(chosen)) as advance:
         compared = run(
             data,

@@ -14,13 +14,12 @@ from torch_ekm.cli import _print_report, app
 from torch_ekm.exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.experiments import compare
 from torch_ekm.experiments.learner_comparison.compare import run_one
-from torch_ekm.experiments.learner_comparison.learners import DEFAULT, PEERS
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
 from torch_ekm.experiments.learner_comparison.report import ComparisonReport, overview_table, score_table
 from torch_ekm.experiments.learner_comparison.scores import Comparison, block_bootstrap
 from torch_ekm.experiments.learner_comparison.stream import Stream, in_own_units, load_table
 from torch_ekm.experiments.learner_comparison.table_file import read_table
-from torch_ekm.experiments.learners import LEARNERS, learner_factory
+from torch_ekm.experiments.learners import COMPARED, LEARNERS, PEERS, learner_factory
 from torch_ekm.experiments.reporting.report import Report, Table
 
 WEIGHTS = torch.tensor([[1.0, -0.5], [0.3, 0.8], [0.0, 0.4]], dtype=torch.float64)
@@ -134,7 +133,7 @@ def test_what_cannot_be_compared() -> None:
         Stream("uneven", torch.zeros(50, 2), torch.zeros(49, 1))
 
 
-@pytest.mark.parametrize("name", [*DEFAULT, "rbf"])
+@pytest.mark.parametrize("name", [*COMPARED, "rbf"])
 def test_every_contender_runs(name: str) -> None:
     result = run_one(linear(44), learner_factory(name))
     assert len(result["squared"]) == 24
@@ -152,7 +151,7 @@ def test_wide_tables_are_printed_whole_into_a_file(capsys: pytest.CaptureFixture
 def test_every_kind_of_learner_in_the_package_contends() -> None:
     import torch_ekm.residual as residual
 
-    kinds = tuple(type(make(2, 1)) for name, make in LEARNERS.items() if name in DEFAULT)
+    kinds = tuple(type(make(2, 1)) for name, make in LEARNERS.items() if name in COMPARED)
     peers = {"GPyTorchSVGP", "GPyTorchWindow", "RiverResidual"}  # need other libraries to be made
     assert len(PEERS) == len(peers)
     peers.add("LearnerFleet")  # holds others

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -137,7 +137,7 @@ class Bench:
         plant = self.plant
         if blind_deg:
             plant = CameraOff(plant, self._predictor, target, axis, blind_deg * _DEG)
-        done = ClosedLoop(plant, self._controller(axis), self.setting.stopping_rule(), learn=learn).run(
+        done = ClosedLoop(plant, self._controller(axis, {}), self.setting.stopping_rule(), learn=learn).run(
             target
         )
         return TrialRecord.of(about, done, axis, learns=self.learns, poses=poses)
@@ -159,7 +159,7 @@ class Bench:
             "ActuatorLimit.step": 20 * _DEG,
         }
         rule = dataclasses.replace(self.setting.stopping_rule(), max_steps=1, off_limit=math.inf)
-        loop = ClosedLoop(self.plant, self._controller(axis, **wide), rule, learn=False)
+        loop = ClosedLoop(self.plant, self._controller(axis, wide), rule, learn=False)
         done = loop.run(PoseTarget.turned(start, axis, step_deg * _DEG))
         before = true_state(done.steps[0].before if done.steps else done.stop.final)
         turned = true_state(done.stop.final).minus(before)[-3:] @ axis
@@ -174,7 +174,7 @@ class Bench:
     def _predictor(self) -> KinematicModel | EnhancedModel:
         return self.model if self.enhanced is None else self.enhanced
 
-    def _controller(self, axis: torch.Tensor, **changes: Any) -> LookAndMoveController:
+    def _controller(self, axis: torch.Tensor, changes: Mapping[str, Any]) -> LookAndMoveController:
         setting = self.setting.replace(control={**self.setting.control, **changes})
         return LookAndMoveController(self._predictor, axis, **setting.controller_parts())
 

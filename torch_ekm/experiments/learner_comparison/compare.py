@@ -15,9 +15,8 @@ from ...exceptions import MissingExtraError, ParameterError, ShapeError
 from ...residual import ResidualLearner
 from ...typing import Array
 from ..jobs import run_jobs
-from ..learners import learner_factory
+from ..learners import COMPARED, learner_factory
 from .fingerprint import fingerprint
-from .learners import DEFAULT
 from .prequential import Z90, run_prequential
 from .recordings import LIMIT, load_recording
 from .report import ComparisonReport
@@ -121,7 +120,7 @@ def run_one(stream: Stream, factory: Factory) -> dict[str, Any]:
 def _factories(learners: Mapping[str, Factory] | Sequence[str] | None) -> dict[str, Factory]:
     if isinstance(learners, Mapping):
         return dict(learners)
-    names = DEFAULT if learners is None else (learners,) if isinstance(learners, str) else learners
+    names = COMPARED if learners is None else (learners,) if isinstance(learners, str) else learners
     return {name: learner_factory(name) for name in names}
 
 

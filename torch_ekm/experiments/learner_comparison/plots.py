@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..._extras import require
+from ..learners import OURS
 from ..reporting.plots import new_figure
-from .learners import OURS
 from .scores import Comparison
 
 if TYPE_CHECKING:

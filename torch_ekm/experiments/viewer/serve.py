@@ -5,37 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
 
 from ...description import list_hands, load_hand
 from ...exceptions import DescriptionError, ParameterError, UnknownNameError
-from ...rendering import Scene, draw, place, save_animation, start_server
+from ...rendering import draw, place, save_animation, start_server
 from .hand import GraspShow, HandShow
 from .trial import LogShow
 
 _RATE = 30.0  # [Hz] at which controls are looked at
 
 
-class Show(Protocol):
-    """Something to look at, with controls."""
-
-    @property
-    def title(self) -> str: ...
-
-    def scene(self) -> Scene:
-        """All its frames, for a page; the first one is where serving begins."""
-        ...
-
-    def add_controls(self, gui: Any) -> None:
-        """Add sliders and buttons to viser's panel."""
-        ...
-
-    def update(self) -> NDArray[np.float64] | None:
-        """Do what the controls say; transforms ``(n_shapes, 4, 4)`` if anything moved."""
-        ...
+#: Something to look at, with controls.
+Show = HandShow | GraspShow | LogShow
 
 
 def choose_show(what: str, object: str | None = None, seed: int = 0) -> Show:
