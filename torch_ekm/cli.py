@@ -26,6 +26,7 @@ from typer import Argument, Option
 
 if TYPE_CHECKING:
     from .experiments.reporting.report import Report
+    from .experiments.reproduce import Experiment
     from .experiments.viewer.serve import Show
 
 app = typer.Typer(
@@ -94,14 +95,10 @@ def demo(
     from .experiments.config import Setting
     from .experiments.protocols.demo import Demo
     from .experiments.reproduce import Experiment
-    from .experiments.reproduce import reproduce as run
 
     protocol, chosen = Demo(Setting(hand=hand), (object,)), parse_seeds(seeds)
     planned = Experiment(protocol.quick(), chosen[:2]) if quick else Experiment(protocol, chosen)
-    with _progress("manipulating", len(planned.jobs)) as advance:
-        report = run(planned, out, jobs, advance)
-    _print_report(report, out)
-    for figure in report.figures:
+    for figure in _run("manipulating", planned, out, jobs).figures:
         console.print(f"           {(out / figure.path).resolve()}", soft_wrap=True)
 
 
@@ -136,7 +133,6 @@ def reproduce(
     """
     from .experiments.config import Setting
     from .experiments.reproduce import plan
-    from .experiments.reproduce import reproduce as run
 
     control = {} if step is None else {"LimitingFunction.step": math.radians(step)}
     setting = Setting(hand=hand, preset=preset, learner=learner, sensing=sensing, control=control)
@@ -144,10 +140,7 @@ def reproduce(
     planned = plan(
         experiment, parse_seeds(seeds), setting=setting, objects=objects, angles_deg=turns, quick=quick
     )
-    folder = out if out is not None else Path(f"reproduce_{experiment}")
-    with _progress(experiment, len(planned.jobs)) as advance:
-        report = run(planned, folder, jobs, advance, address)
-    _print_report(report, folder)
+    _run(experiment, planned, out or Path(f"reproduce_{experiment}"), jobs, address)
 
 
 @app.command()
@@ -269,6 +262,15 @@ def version() -> None:
 
     for package, number in versions().items():
         console.print(f"{package} {number}", highlight=False)
+
+
+def _run(what: str, planned: Experiment, folder: Path, jobs: int, address: str | None = None) -> Report:
+    from .experiments.reproduce import reproduce as run
+
+    with _progress(what, len(planned.jobs)) as advance:
+        report = run(planned, folder, jobs, advance, address)
+    _print_report(report, folder)
+    return report
 
 
 def _look(show: Show, html: Path | None, port: int) -> None:

@@ -274,11 +274,12 @@ def test_data_folder_must_be_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     monkeypatch.delenv("TORCH_EKM_DATA", raising=False)
     with pytest.raises(DescriptionError, match="TORCH_EKM_DATA"):
         load_recording("t42")
+    monkeypatch.setenv("TORCH_EKM_DATA", str(tmp_path))
     with pytest.raises(DescriptionError, match="not there"):
-        load_recording("t42", tmp_path)
+        load_recording("t42")
 
 
-def test_icub_grasp_reader(tmp_path: Path) -> None:
+def test_icub_grasp_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "icub_grasp" / "iCubGraspDataset"
     folder.mkdir(parents=True)
     for trial in (2, 1, 10):
@@ -287,7 +288,8 @@ def test_icub_grasp_reader(tmp_path: Path) -> None:
             slices += [" ".join([str(10.0 * t + trial)] * 9)]
             slices += [" ".join(["5.0"] * 5)] + [" ".join(["240"] * 12)] * 5
         (folder / f"book_{trial}.txt").write_text("-10000\n" + "\n".join(slices) + "\n")
-    recording = load_recording("icub_grasp", tmp_path, limit=None)
+    monkeypatch.setenv("TORCH_EKM_DATA", str(tmp_path))
+    recording = load_recording("icub_grasp", limit=None)
     assert recording.segments == (18, 18, 18)
     assert recording.x.shape == (54, 23)
     torch.testing.assert_close(recording.y, torch.ones(54, 9, dtype=torch.float64))  # 10 deg a step, unit 10

@@ -153,14 +153,9 @@ class Setting:
 def digest(setting: Setting, objects: Iterable[str | Path], *more: Any) -> str:
     """Ten letters that change with any figure of an experiment: results are kept under them.
 
-    The defaults of the classes that the setting changes count, too, and what is in the files of the
-    hand and the objects: neither a version of the package with other defaults nor an
-    object that was corrected takes up old results.
-
-    Args:
-        setting: of the experiment.
-        objects: names or paths of those that take part.
-        more: configurations and figures that decide the results as well.
+    The defaults of the classes that the setting changes count, too, and what is in the files of the hand and
+    the objects (names or paths): neither a version of the package with other defaults nor an object that was
+    corrected takes up old results. ``more`` decides the results as well.
     """
     files = [*hand_paths(setting.hand), *(path for item in objects for path in object_paths(item))]
     contents = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
@@ -169,13 +164,13 @@ def digest(setting: Setting, objects: Iterable[str | Path], *more: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 
+def _plain(item: Any) -> Any:
+    return vars(item) if dataclasses.is_dataclass(item) else str(item)
+
+
 def object_name(object: str) -> str:
     """Short name of an object given by name or path."""
     return Path(object).stem if object.endswith(".urdf") else object
-
-
-def _plain(item: Any) -> Any:
-    return vars(item) if dataclasses.is_dataclass(item) else str(item)
 
 
 def _changed(options: Any, name: str, changes: Mapping[str, Any]) -> Any:

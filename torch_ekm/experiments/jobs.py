@@ -42,7 +42,6 @@ def run_jobs(
 
     Args:
         function: with results that JSON can hold; on a cluster, importable there.
-        jobs: name -> arguments.
         processes: 1 runs in this process. PhysX steps hold the interpreter's lock: threads do not help.
         on_done: called with the name of each job that is done, those of an earlier run first.
         address: ``dask://HOST:PORT`` of a scheduler whose cluster does the work instead of processes here.

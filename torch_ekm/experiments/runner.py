@@ -92,17 +92,11 @@ class Bench:
         return None
 
     def adopt(self, learner: ResidualLearner, encoding: GraspEncoding) -> None:
-        """Learn with this learner (e.g. one that knows other objects) and what it sees of a state, instead
-        of a fresh one of the setting's kind."""
+        """Learn with this learner (e.g. one that knows other objects) instead of a fresh one."""
         self.learner, self.encoding, self.enhanced = learner, encoding, None
 
     def trial(self, seed: int, trial: int, angle_deg: float, kind: str = "turn", **options: Any) -> Record:
-        """Turn the object by ``angle_deg`` from a fresh grasp.
-
-        Args:
-            kind: what the record is called.
-            options: of :meth:`turn`.
-        """
+        """Turn the object by ``angle_deg`` from a fresh grasp, with the options of :meth:`turn`."""
         start = self.grasp(seed, trial)
         about = Trial(self.name, kind, self.controller, seed, trial, angle_deg)
         if start is None:
@@ -122,7 +116,6 @@ class Bench:
         """Turn the object that is held.
 
         Args:
-            about: what is to be done.
             start: from where, as measured.
             learn: train after every motion (an E-KM only).
             events: what happens on the way; ``at`` counts this trial's commands from 0.
@@ -137,9 +130,8 @@ class Bench:
         plant = self.plant
         if blind_deg:
             plant = CameraOff(plant, self._predictor, target, axis, blind_deg * _DEG)
-        done = ClosedLoop(plant, self._controller(axis, {}), self.setting.stopping_rule(), learn=learn).run(
-            target
-        )
+        loop = ClosedLoop(plant, self._controller(axis, {}), self.setting.stopping_rule(), learn=learn)
+        done = loop.run(target)
         return TrialRecord.of(about, done, axis, learns=self.learns, poses=poses)
 
     def long_step(self, seed: int, trial: int, step_deg: float) -> Record:

@@ -65,16 +65,13 @@ def compare(
     """
     factories = _factories(learners)
     data = [data] if isinstance(data, str | Path | Stream) else list(data)
-    streams = [
-        one if isinstance(one, Stream) else load_recording(one, None, limit, tuple(targets)) for one in data
-    ]
+    streams = [one if isinstance(one, Stream) else load_recording(one, limit, tuple(targets)) for one in data]
     names = [stream.name for stream in streams]
     if not names or not factories:
         raise ParameterError("data, learners", (names, list(factories)), "at least one of each")
     if len(set(names)) < len(names):
         raise ParameterError("data", names, "of different names")
-    jobs: dict[str, tuple[Stream, Factory]] = {}
-    keys: dict[str, tuple[Stream, str]] = {}
+    jobs, keys = {}, {}
     for stream in streams:
         if len(stream) < LEAST:
             raise ShapeError(f"stream '{stream.name}'", f"(n >= {LEAST}, ...)", stream.y.shape, "too short")
@@ -86,11 +83,10 @@ def compare(
     scores, errors = {}, {}
     for job, result in results.items():
         stream, name = keys[job]
-        squared, alone = np.array(result["squared"]), _squared(stream.y[stream.warm_up :])
+        squared, alone = np.array(result.pop("squared")), _squared(stream.y[stream.warm_up :])
         errors[stream.name, name] = squared
         rms = block_bootstrap(squared, alone, blocks_of(stream))
-        figures = {key: value for key, value in result.items() if key != "squared"}
-        scores[stream.name, name] = Score(stream.name, name, rms, **figures)
+        scores[stream.name, name] = Score(stream.name, name, rms, **result)
     return ComparisonReport(tuple(streams), tuple(factories), scores, errors)
 
 

@@ -86,6 +86,4 @@ def copy_notebooks(folder: Path, *, overwrite: bool = False) -> list[Path]:
     if folder.exists() and not folder.is_dir():
         raise DescriptionError(folder, "this is a file; name a folder")
     folder.mkdir(parents=True, exist_ok=True)
-    for source, copy in zip(sources, copies, strict=True):
-        shutil.copyfile(source, copy)
-    return copies
+    return [Path(shutil.copyfile(*pair)) for pair in zip(sources, copies, strict=True)]

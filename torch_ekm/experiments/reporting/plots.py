@@ -63,19 +63,14 @@ def plot_prediction_error(ekm_deg: Array, km_deg: Array, xlabel: str = "trial") 
         axis.plot(k, middle, color=COLOURS[name], marker=_MARKERS[name], markersize=3.5, label=name)
     axis.set(xlabel=xlabel, ylabel="prediction error [deg]", ylim=(0, None))
     axis.xaxis.get_major_locator().set_params(integer=True)
-    axis.set_title(
-        "One-step prediction error" + (" (median, quartiles)" if len(ekm_deg) > 1 else ""), loc="left"
-    )
+    quartiles = " (median, quartiles)" if len(ekm_deg) > 1 else ""
+    axis.set_title(f"One-step prediction error{quartiles}", loc="left")
     axis.legend(frameon=False)
     return figure
 
 
 def plot_learning_test(ekm_deg: Array, km_deg: Array) -> Figure:
-    """p(k) and b(k) of the first k trials (the paper's Fig. 5b).
-
-    Args:
-        ekm_deg, km_deg: ``(n_trials,)`` absolute errors [deg].
-    """
+    """p(k) and b(k) of the first k trials (the paper's Fig. 5b), of ``(n_trials,)`` errors [deg]."""
     curve = learning_curve(ekm_deg, km_deg)
     k = np.arange(1, len(curve.p) + 1)
     figure, (left, right) = new_figure(8.0, 3.2, columns=2)
@@ -120,30 +115,23 @@ def plot_steady_state_error(errors_deg: dict[str, dict[str, Array]], what: str =
             x = i + (j - (len(errors_deg) - 1) / 2) * width
             label = name if i == 0 else None
             axis.bar(x, values.mean(), width * 0.9, color=colour, alpha=0.45, label=label)
-            spread = np.linspace(-0.3, 0.3, len(values)) * width if len(values) > 1 else np.zeros(1)
+            at = x + (np.linspace(-0.3, 0.3, len(values)) * width if len(values) > 1 else np.zeros(1))
             inside = values <= top
-            axis.plot(
-                (x + spread)[inside], values[inside], _MARKERS.get(name, "o"), color=colour, markersize=3
-            )
-            axis.plot((x + spread)[~inside], [0.97 * top] * int((~inside).sum()), "x", color=colour)
+            axis.plot(at[inside], values[inside], _MARKERS.get(name, "o"), color=colour, markersize=3)
+            axis.plot(at[~inside], [0.97 * top] * int((~inside).sum()), "x", color=colour)
             if values.mean() > top:
                 note = {"xytext": (-9, 0), "textcoords": "offset points", "fontsize": 8, "ha": "right"}
                 axis.annotate(f"mean {values.mean():.1f}", (x, 0.9 * top), **note)
     axis.set_xticks(range(len(targets)), targets)
-    axis.set(
-        xlabel="target [deg]", ylabel="steady-state error [deg]", ylim=(0, top if np.isfinite(top) else None)
-    )
+    limits = (0, top if np.isfinite(top) else None)
+    axis.set(xlabel="target [deg]", ylabel="steady-state error [deg]", ylim=limits)
     axis.set_title(f"Steady-state error{', ' + what if what else ''}: each run, and the mean", loc="left")
     axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
 
 
 def plot_convergence(histories_deg: dict[str, list[Array]], target: str = "") -> Figure:
-    """|e| over the steps of each manipulation.
-
-    Args:
-        histories_deg: controller -> list of ``(n_steps,)`` errors [deg].
-    """
+    """|e| over the steps of each manipulation: controller -> list of ``(n_steps,)`` errors [deg]."""
     figure, (axis,) = new_figure(6.0, 3.4)
     for j, (name, runs) in enumerate(histories_deg.items()):
         colour = COLOURS.get(name, f"C{j}")
@@ -158,13 +146,8 @@ def plot_convergence(histories_deg: dict[str, list[Array]], target: str = "") ->
 def plot_bank(
     objects: Sequence[str], models: Sequence[int | None], posteriors: Sequence[Sequence[float]]
 ) -> Figure:
-    """Which model of an object memory each turn went to, and how sure it was.
-
-    Args:
-        objects: of the turns, in order.
-        models: that they went to, if any.
-        posteriors: probabilities of the models at the end of each turn.
-    """
+    """Which model of an object memory each turn went to (None: to none), and how sure it was: the
+    probabilities of the models at its end."""
     names = list(dict.fromkeys(objects))
     figure, (axis,) = new_figure(8.0, 3.2)
     palette = list(COLOURS.values())

@@ -27,9 +27,7 @@ class HandShow:
 
     def __init__(self, hand: HandDescription) -> None:
         self.hand, self._map = hand, ActuationMap(hand)
-        self._lower, self._upper = (
-            np.array([getattr(actuator, end) for actuator in hand.actuators]) for end in ("lower", "upper")
-        )
+        self._lower, self._upper = np.array([(part.lower, part.upper) for part in hand.actuators]).T
         self._a = np.clip(np.zeros(hand.n_a), self._lower, self._upper)
         self.title = hand.name
 
@@ -67,11 +65,6 @@ class HandShow:
 class GraspShow:
     """A pinch in the simulated hand. Served, its actuators can be moved; as a page, it is closed and held.
 
-    Args:
-        hand: name or path.
-        object: name or path.
-        seed: which grasp.
-
     Raises:
         EquilibriumError, GraspError: the object cannot be pinched by this hand.
     """
@@ -90,11 +83,9 @@ class GraspShow:
 
     def scene(self) -> Scene:
         """The grasp as it is now."""
-        q, position, rotation = self.plant.hand_state()
+        q, position, rotation = (part[None] for part in self.plant.hand_state())
         gravity = np.array(self.plant.gravity)
-        return make_scene(
-            self.plant.hand, self.plant.object, q[None], position[None], rotation[None], gravity
-        )
+        return make_scene(self.plant.hand, self.plant.object, q, position, rotation, gravity)
 
     def add_controls(self, gui: Any) -> None:
         """A slider for each actuator, increments since the grasp [deg], and a button to grasp anew."""
