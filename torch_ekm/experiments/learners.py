@@ -132,7 +132,6 @@ def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -
     """A fresh learner of ``[encode(s); da]``.
 
     Args:
-        name: a key of :data:`LEARNERS`.
         n_s, n_a: features of the state, actuators.
         capacity: basis points, window or random frequencies; networks and RLS have no such figure.
         options: instead of the factory's own choices.

@@ -120,10 +120,8 @@ class TrialRecord(Trial):
         """The figures of one manipulation in a simulated hand.
 
         Args:
-            trial: what was to be done.
             axis: about which the object was to turn, unit vector, hand frame.
             learns: the controller has predictions of its own.
-            poses: keep the true poses.
         """
         steps, focus, measured = done.steps, done.focus, done.errors
         asked = [float(torch.linalg.vector_norm(step.decision.desired)) for step in steps]

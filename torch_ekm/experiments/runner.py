@@ -33,7 +33,6 @@ class Bench:
     """Grasp, turn, release, again; the learner stays from trial to trial.
 
     Args:
-        setting: hand, plant, model, learner, rule.
         object: name, path or description.
         controller: one of ``CONTROLLERS``.
         keep_images: with sensing, the camera's last image stays in ``info["raw"]["image"]``.
@@ -175,13 +174,8 @@ class Bench:
         if self.encoding is None:
             self.encoding = GraspEncoding.of(self.model, start)
         if self.learner is None:
-            self.learner = make_learner(
-                setting.learner,
-                self.encoding.n_features,
-                self.model.hand.n_a,
-                setting.capacity,
-                **setting.learner_options,
-            )
+            sizes = self.encoding.n_features, self.model.hand.n_a, setting.capacity
+            self.learner = make_learner(setting.learner, *sizes, **setting.learner_options)
         self.enhanced = EnhancedModel.for_grasp(self.model, start, self.learner, self.encoding)
 
 

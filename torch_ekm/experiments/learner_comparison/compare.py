@@ -15,15 +15,13 @@ from ...exceptions import MissingExtraError, ParameterError, ShapeError
 from ...residual import ResidualLearner
 from ...typing import Array
 from ..jobs import run_jobs
-from ..learners import COMPARED, learner_factory
+from ..learners import COMPARED, Factory, learner_factory
 from .fingerprint import fingerprint
 from .prequential import Z90, run_prequential
 from .recordings import LIMIT, load_recording
 from .report import ComparisonReport
 from .scores import Score, block_bootstrap, blocks_of
 from .stream import LEAST, Stream
-
-Factory = Callable[[int, int], ResidualLearner]
 
 
 def compare(

@@ -49,9 +49,8 @@ def _csv(path: Path) -> tuple[tuple[str, ...], Array]:
     rows = [(reader.line_num, [field.strip() for field in row]) for row in reader if any(row)]
     number, names = rows[0]
     if all(_number(field) is not None for field in names):
-        raise DescriptionError(
-            path, f"line {number} holds numbers only; the first line must name the columns"
-        )
+        problem = "holds numbers only; the first line must name the columns"
+        raise DescriptionError(path, f"line {number} {problem}")
     values = np.empty((len(rows) - 1, len(names)))
     for i, (line, row) in enumerate(rows[1:]):
         if len(row) != len(names):
@@ -87,9 +86,8 @@ def _parquet(path: Path) -> tuple[tuple[str, ...], Array]:
     for name, column in zip(table.column_names, table.columns, strict=True):
         kind = column.type
         if not (pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind)):
-            raise DescriptionError(
-                path, f"column '{name}' holds {kind}, not numbers; leave it out or encode it"
-            )
+            problem = f"holds {kind}, not numbers; leave it out or encode it"
+            raise DescriptionError(path, f"column '{name}' {problem}")
         values = column.to_numpy().astype(np.float64)
         if column.null_count or not np.isfinite(values).all():
             row = int(np.flatnonzero(~np.isfinite(values))[0])

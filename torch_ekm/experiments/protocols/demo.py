@@ -54,9 +54,8 @@ class Demo(Generalize):
     def report(self, seeds: Sequence[int], results: Results[Record], folder: Path) -> Report:
         """That of the turns, each target on its own, the motions, and pictures."""
         report, records = super().report(seeds, results, folder), select(records_of(results))
-        report.title = (
-            f"Turning the {_spoken(self.object)} with the hand {_spoken(self.setting.hand)}: KM and E-KM"
-        )
+        what, hand = _spoken(self.object), _spoken(self.setting.hand)
+        report.title = f"Turning the {what} with the hand {hand}: KM and E-KM"
         shown = ("controllers", "comparison", "prediction", "stop_reasons", "timing")
         report.tables = [self.angle_table(records)] + [t for t in report.tables if t.name in shown]
         report.figures = [*self._pictures(records, folder), *self._motions(records, folder), *report.figures]
@@ -100,11 +99,9 @@ class Demo(Generalize):
             name: [np.array(r.errors_deg) for r in select(records, controller=name, angle_deg=last)]
             for name in self.controllers
         }
+        figure = plot_convergence(histories, f"{last:g} deg")
         caption = f"Error on the way to {last:g} deg, as measured."
-        return [
-            *figures,
-            save_figure(plot_convergence(histories, f"{last:g} deg"), folder, "convergence", caption),
-        ]
+        return [*figures, save_figure(figure, folder, "convergence", caption)]
 
     def _pictures(self, records: Sequence[TrialRecord], folder: Path) -> list[FigureFile]:
         """The E-KM's best long turn: before and after, and as an animation."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -234,8 +234,7 @@ class Memories(ModelBank):
         return super()._absorb(x, y, mask)
 
 
-@dataclass(frozen=True)
-class Assignment:
+class Assignment(NamedTuple):
     """How well a bank told objects apart, over one sequence."""
 
     right: int
@@ -304,10 +303,7 @@ def comparison_table(sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
 def recognition(sessions: Sequence[Sequence[MemoryTurn]]) -> str:
     """Share of judged turns that went to the right model, with its interval over sequences."""
     judged = [judge_assignment(records) for records in sessions]
-    right, of, models = (
-        np.array([getattr(one, name) for one in judged], dtype=float)
-        for name in ("right", "judged", "n_models")
-    )
+    right, of, models = np.array(judged, dtype=float).T
     if not of.sum():
         return "none judged"
     share = f"{right.sum():.0f} of {of.sum():.0f} turns, {100 * bootstrap_ratio(right, of):.0f} %"
@@ -315,8 +311,7 @@ def recognition(sessions: Sequence[Sequence[MemoryTurn]]) -> str:
 
 
 def _assignment_table(seeds: Sequence[int], sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
-    judged = [judge_assignment(records) for records in sessions]
-    rows = [[str(seed), one.right, one.judged, one.n_models] for seed, one in zip(seeds, judged, strict=True)]
+    rows = [[str(seed), *judge_assignment(mine)] for seed, mine in zip(seeds, sessions, strict=True)]
     note = "Turns after the first three of their object; a model belongs to the object of most of its turns."
     return Table("assignments", "Recognised objects", ["seed", "right", "of", "models"], rows, note)
 

@@ -217,7 +217,7 @@ def prediction_curves(records: Sequence[Record], trials: int, kind: str = "") ->
     """
     curves = []
     for seed in sorted({r.seed for r in records}):
-        ekm, km = np.full(trials, np.nan), np.full(trials, np.nan)
+        ekm, km = np.full((2, trials), np.nan)
         for r in select(records, controller="E-KM", seed=seed):
             if r.steps:
                 ekm[r.trial - 1] = np.mean(getattr(r, f"{kind}prediction_ekm_deg"))

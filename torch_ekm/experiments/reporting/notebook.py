@@ -80,9 +80,8 @@ def copy_notebooks(folder: Path, *, overwrite: bool = False) -> list[Path]:
     copies = [folder / source.name for source in sources]
     present = [copy.name for copy in copies if copy.exists()]
     if present and not overwrite:
-        raise DescriptionError(
-            folder, f"{', '.join(present)} would be overwritten; name another folder, or use --overwrite"
-        )
+        problem = "would be overwritten; name another folder, or use --overwrite"
+        raise DescriptionError(folder, f"{', '.join(present)} {problem}")
     if folder.exists() and not folder.is_dir():
         raise DescriptionError(folder, "this is a file; name a folder")
     folder.mkdir(parents=True, exist_ok=True)
