@@ -307,11 +307,8 @@ def _print_table(
         table.add_row(*map(str, row))
     for column in table.columns:
         column.overflow = "fold"  # figures are never cut short
-    if console.is_terminal:
-        console.print(table)
-    else:  # a file or a pipe has no width of its own
-        width = Console(width=1000, markup=False).measure(table).maximum
-        Console(width=width, markup=False).print(table)
+    # a file or a pipe has no width of its own
+    (console if console.is_terminal else Console(width=1000, markup=False)).print(table)
 
 
 def _numbers(name: str, text: str) -> tuple[float, ...]:
