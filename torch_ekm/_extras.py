@@ -32,7 +32,6 @@ _EXTRA_OF = {
     "gpytorch": "peers",
     "river": "peers",
     "distributed": "cluster",
-    "ray": "cluster",
 }
 
 
