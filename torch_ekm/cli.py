@@ -185,7 +185,7 @@ def record(
     hand: Hand = "icub_right",
     angles: Annotated[str, Option(help="Turns [deg], e.g. 10,20.")] = "10,20",
     seeds: Annotated[str, Option(help="FIRST:END; each angle is turned once for each seed.")] = "0:3",
-    controller: Annotated[str, Option(help="KM, KM+I, E-KM or E-KM+I.")] = "KM",
+    controller: Annotated[str, Option(help="KM, KM+I, KM+S or E-KM.")] = "KM",
     preset: Preset = "nominal",
     sensing: Sensing = True,
     images: Annotated[bool, Option(help="Keep the camera's images too.")] = False,

@@ -138,7 +138,8 @@ def test_an_enhanced_model_learns_unless_told_not_to(held) -> None:
     for learn in (True, False):
         ekm = EnhancedModel.for_grasp(loop.kinematic, seen.state)
         controller = LookAndMoveController(ekm, axis)
-        steps = ClosedLoop(FrozenPlant(seen), controller, RULE, learn=learn).run(target).steps
+        driven = ClosedLoop(FrozenPlant(seen), controller, RULE, learn=learn, learn_from_commands=True)
+        steps = driven.run(target).steps
         assert [step.report is not None for step in steps] == [learn] * 3
         untouched = torch.equal(ekm(seen.state, steps[0].decision.delta_a), steps[0].decision.nominal)
         assert untouched is not learn
@@ -152,3 +153,26 @@ def test_an_object_that_is_lost_teaches_nothing(held) -> None:
     plant = FrozenPlant(seen, lambda o: dataclasses.replace(o, status=PlantStatus.LOST))
     done = ClosedLoop(plant, controller, RULE).run(PoseTarget.turned(seen.state, axis, degrees=80))
     assert [step.report is not None for step in done.steps] == [True, False]
+
+
+def test_the_learner_is_told_what_the_encoders_did(held) -> None:
+    """Servos that go half of the way: the object's motion is learned for that half."""
+    seen, axis, loop = held
+    ekm = EnhancedModel.for_grasp(loop.kinematic, seen.state)
+    told = []
+    update = ekm.update
+    ekm.update = lambda s, da, ds, f: told.append((da, f)) or update(s, da, ds, f)  # type: ignore[method-assign]
+
+    class Half(FrozenPlant):
+        def command(self, delta_a: torch.Tensor) -> Observation:
+            self.commands += 1
+            self.observation = dataclasses.replace(self.observation, a=self.observation.a + 0.5 * delta_a)
+            return self.observation
+
+    controller = LookAndMoveController(ekm, axis)
+    steps = (
+        ClosedLoop(Half(seen), controller, RULE).run(PoseTarget.turned(seen.state, axis, degrees=80)).steps
+    )
+    for (da, nominal), step in zip(told, steps, strict=True):
+        torch.testing.assert_close(da, 0.5 * step.decision.delta_a)
+        torch.testing.assert_close(nominal, 0.5 * step.decision.nominal)

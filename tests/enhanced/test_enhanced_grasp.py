@@ -71,7 +71,7 @@ def test_it_learns_the_objects_motion_in_mm_and_deg(model: Held, state: GraspSta
     for _ in range(40):
         ekm.update(state, da, model(state, da) + missing)
     torch.testing.assert_close(seen[0], torch.tensor([1.0, 0, 0, 0, 0, -1.0], dtype=F64))
-    torch.testing.assert_close(ekm(state, da), model(state, da) + missing, atol=0.05e-3, rtol=0)
+    torch.testing.assert_close(ekm(state, da), model(state, da) + missing, atol=0.1e-3, rtol=0)
     joints = slice(0, model.hand.n_q)
     assert torch.equal(ekm(state, da)[joints], model(state, da)[joints])
 

@@ -30,11 +30,11 @@ def motion_left(name: str) -> float:
     return float(torch.stack(left).norm() / torch.stack([J @ a for a in inside]).norm())
 
 
-def test_default_learner_takes_up_a_dead_zone() -> None:
+def test_one_learner_takes_up_a_dead_zone_and_the_default_leaves_it_to_the_servo_inverse() -> None:
     assert motion_left("rbf") < 0.35
     assert motion_left("action-linear") > 0.5  # a mean that is linear in the action cannot
 
 
 def test_unknown_learner_is_answered_with_the_known_ones() -> None:
-    with pytest.raises(UnknownNameError, match="rbf, action-linear"):
+    with pytest.raises(UnknownNameError, match="action-linear, rbf"):
         make_learner("oracle", N_S, N_A, 20)

@@ -44,7 +44,7 @@ ONLINE = Online(trials=2, angle_range_deg=(4.0, 5.0), dislocations=(2,), tendons
 def test_controllers_differ_in_the_reference_of_their_increments() -> None:
     setting = Setting()
     assert {c: setting.plant_config(c).relative_to for c in CONTROLLERS} == {
-        "KM": "encoder", "KM+I": "setpoint", "E-KM": "encoder", "E-KM+I": "setpoint",
+        "KM": "encoder", "KM+I": "setpoint", "KM+S": "encoder", "E-KM": "encoder",
     }  # fmt: skip
 
 
@@ -79,7 +79,7 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
         patch.setattr("torch_ekm.experiments.config.DEFAULT_TASKS", other)
         assert of(Setting()) != unchanged
     with monkeypatch.context() as patch:  # and one whose learner has another kernel
-        patch.setitem(LEARNERS, "rbf", LEARNERS["SOGP plain"])
+        patch.setitem(LEARNERS, "action-linear", LEARNERS["SOGP plain"])
         assert of(Setting()) != unchanged
     assert of(Setting()) == unchanged
     assert of(Setting(capacity=59)) != unchanged

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import torch
-
-from ..residual import ForgettingFactor, RobustWeight, SparseOnlineGP, SquaredExponential
+from ..residual import (
+    ActionLinearKernel,
+    ForgettingFactor,
+    RobustWeight,
+    SparseOnlineGP,
+    SquaredExponential,
+)
 
 #: s2 of a motion in mm and deg: what camera, servo and play leave unexplained.
 NOISE_VARIANCE = 0.1
@@ -23,10 +27,11 @@ def grasp_learner(n_s: int, n_a: int, capacity: int = 60) -> SparseOnlineGP:
     return SparseOnlineGP(n_s + n_a, 6, **options, parts=parts)
 
 
-def grasp_kernel(n_s: int, n_a: int) -> SquaredExponential:
-    """Squared exponential, smooth over 15 mm and 15 deg of the state and 8 deg of an actuator.
+def grasp_kernel(n_s: int, n_a: int) -> ActionLinearKernel:
+    """``g(s, w) = G(s) w`` of what the encoders did, w: one decision is one convex program.
 
-    It takes up the dead zone, which no kernel that is linear in the action can.
+    Each entry of G has a standard deviation of 0.3 mm or deg for 2 deg of an actuator, and is smooth over
+    6 cm and 1.8 rad of the state. The dead zone of the servos, which no such g can say, is the servo inverse's.
     """
-    lengthscale = torch.tensor([15.0] * n_s + [4.0] * n_a, dtype=torch.float64)
-    return SquaredExponential(n_s + n_a, lengthscale=lengthscale, variance=4.0)
+    state = SquaredExponential(n_s, lengthscale=6.0)
+    return ActionLinearKernel(n_s + n_a, n_a, state_kernel=state, action_variance=0.1)

@@ -45,14 +45,15 @@ def _sogp(make: Factory = residual.SparseOnlineGP, **figures: Any) -> Factory:
 
 
 def _rbf(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearner:
-    """The learner of :meth:`EnhancedModel.for_grasp`."""
-    kernel = grasp_kernel(d - n_actions, n_actions)
+    """Takes up the dead zone, too: smooth over 15 mm and 15 deg of the state and 8 deg of an actuator."""
+    lengthscale = torch.tensor([15.0] * (d - n_actions) + [4.0] * n_actions, dtype=torch.float64)
+    kernel = residual.SquaredExponential(d, lengthscale=lengthscale, variance=4.0)
     return _sogp(robust=3.0, forgetting_factor=0.995, kernel=kernel)(d, m, **options)
 
 
 def _action_linear(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearner:
-    state = residual.SquaredExponential(d - n_actions, lengthscale=6.0)
-    kernel = residual.ActionLinearKernel(d, n_actions, state_kernel=state, action_variance=0.1)
+    """The learner of :meth:`EnhancedModel.for_grasp`."""
+    kernel = grasp_kernel(d - n_actions, n_actions)
     return _sogp(robust=3.0, forgetting_factor=0.995, kernel=kernel)(d, m, **options)
 
 
@@ -70,8 +71,8 @@ _LEARNING = [residual.LearnHyperparameters()]
 #: inputs are an action. Inputs and outputs are of the order of 1; all but the first two start from the same
 #: generic prior: lengthscale sqrt(d), unit variance, and about 100 of whatever they keep.
 LEARNERS: dict[str, Factory] = {
-    "rbf": _rbf,
     "action-linear": _action_linear,
+    "rbf": _rbf,
     "model alone": _kind(residual.ZeroResidual),
     "linear RLS": _kind(residual.RecursiveLeastSquares, **_FRESH),
     "random features": _kind(residual.RandomFeatureRLS, "n_frequencies", **_FRESH),
@@ -102,10 +103,10 @@ OURS = tuple(name for name in LEARNERS if name.startswith("SOGP"))
 #: What a comparison takes if nobody says otherwise: not those that want to know which inputs are an action.
 COMPARED = tuple(name for name in LEARNERS if name not in (*PEERS, "rbf", "action-linear"))
 #: What demo and experiments take unless told otherwise.
-DEFAULT_LEARNER = "rbf"
+DEFAULT_LEARNER = "action-linear"
 #: Those that the ablation of a hand compares.
 HAND_LEARNERS = (
-    "rbf", "action-linear", "SOGP plain", "SOGP deep", "linear RLS", "random features", "window GP", "MLP",
+    "action-linear", "rbf", "SOGP plain", "SOGP deep", "linear RLS", "random features", "window GP", "MLP",
     "model alone",
 )  # fmt: skip
 #: What a hand wants other than any stream: it wears slowly, and a motion says little of a slope.

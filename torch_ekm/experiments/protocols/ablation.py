@@ -21,7 +21,7 @@ from .protocol import Protocol, Results
 
 _DEG = math.pi / 180
 _BASE = "as it is"
-_LEARNING, _BOTH, _ALL = ("E-KM",), ("KM", "E-KM"), ("KM", "KM+I", "E-KM")
+_LEARNING, _BOTH, _ALL = ("E-KM",), ("KM", "E-KM"), ("KM", "KM+I", "KM+S", "E-KM")
 
 #: Disturbances of the nominal plant, each alone in a plant that is otherwise exact.
 DISTURBANCES: dict[str, tuple[str, ...]] = {
@@ -86,6 +86,7 @@ def variants(base: Setting) -> list[Variant]:
         *(Variant(group, _BASE) for group in ("learner", "online learning", "model", "controller")),
         Variant("preset", f"{base.preset}: {_BASE}"),
         *(Variant("learner", name, {"learner": name, "learner_options": {}}, _LEARNING) for name in others),
+        Variant("learner", "rbf over commands", {"learner": "rbf", "servo_inverse": False}, _LEARNING),
         *(
             Variant(group, name, {field: {**getattr(base, field), **option}}, controllers)
             for group, name, field, option, controllers in _OPTIONS
@@ -149,7 +150,7 @@ class Ablation(Protocol):
             lost = [turns.get(name, []) for name in ("KM", "E-KM")]
             rows.append(row + [rate(r.lost for r in mine) if mine else None for mine in lost])
         columns = [
-            group, "steady-state error KM", "KM+I", "E-KM", "prediction KM", "prediction E-KM",
+            group, "steady-state error KM", "KM+I", "KM+S", "E-KM", "prediction KM", "prediction E-KM",
             Column("E-KM:KM [%]", ".0f", percent=True), Column("E-KM:KM, true [%]", ".0f", percent=True),
             "lost: KM", "lost: E-KM",
         ]  # fmt: skip

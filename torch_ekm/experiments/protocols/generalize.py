@@ -130,11 +130,11 @@ class Generalize(Protocol):
             ("error of the first motion", 50, lambda r: r.first_step_deg),
         ]
         for what, aim, value in shares:
-            for name in ("E-KM", "E-KM+I"):
-                ours, theirs = tables.paired(records, name, "KM+I", value)
+            for name in ("KM+I", "KM+S"):
+                ours, theirs = tables.paired(records, "E-KM", name, value)
                 if len(ours) and theirs.mean() > 0:
                     ratio = 100 * stats.bootstrap_ratio(ours, theirs).mean
-                    found.append(Target(f"{what} {name} : KM+I [%]", ratio, most=aim))
+                    found.append(Target(f"{what} E-KM : {name} [%]", ratio, most=aim))
         turns = tables.by_controller(records)
         lost = {name: 100 * float(np.mean([r.lost for r in mine])) for name, mine in turns.items()}
         if "E-KM" in lost and "KM+I" in lost:

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 
 #: Okabe and Ito's palette, safe for colour-blind readers; grey for what is compared against.
-COLOURS = {"KM": "#7f7f7f", "KM+I": "#E69F00", "E-KM": "#0072B2", "E-KM+I": "#009E73", "limit": "#D55E00"}
-_MARKERS = {"KM": "s", "KM+I": "D", "E-KM": "o", "E-KM+I": "^"}
+COLOURS = {"KM": "#7f7f7f", "KM+I": "#E69F00", "KM+S": "#009E73", "E-KM": "#0072B2", "limit": "#D55E00"}
+_MARKERS = {"KM": "s", "KM+I": "D", "KM+S": "^", "E-KM": "o"}
 
 
 def new_figure(width: float, height: float, columns: int = 1, rows: int = 1, sharey: bool = False):

@@ -16,7 +16,7 @@ from .statistics import BAND_DEG, Array, Estimate, Value, bootstrap_ratio, stead
 
 Trials = Sequence[TrialRecord]
 
-_PAIRS = (("E-KM", "KM"), ("E-KM", "KM+I"), ("E-KM+I", "KM+I"))
+_PAIRS = (("E-KM", "KM"), ("E-KM", "KM+I"), ("E-KM", "KM+S"))
 
 
 @dataclass(frozen=True)
