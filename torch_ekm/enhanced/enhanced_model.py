@@ -51,8 +51,6 @@ class EnhancedModel(nn.Module):
     hides the dead zone, which is much of what there is to learn.
     """
 
-    output_scale: Tensor
-
     def __init__(
         self,
         model: Callable[[Any, Tensor], Tensor],
@@ -69,7 +67,7 @@ class EnhancedModel(nn.Module):
         self.encode: Callable[[Any], Tensor] = encode if encode is not None else _identity
         self.outputs = outputs
         self.action_scale = action_scale
-        self.register_buffer("output_scale", torch.as_tensor(output_scale))
+        self.output_scale = nn.Buffer(torch.as_tensor(output_scale))
 
     @classmethod
     def for_grasp(

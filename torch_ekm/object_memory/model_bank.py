@@ -77,15 +77,6 @@ class ModelBank(ResidualLearner):
         ParameterError: a figure outside its range, or the factory's learners are a fleet.
     """
 
-    episodes: Tensor
-    log_prior: Tensor
-    log_evidence: Tensor
-    seen: Tensor
-    leader: Tensor
-    scale: Tensor
-    signed: Tensor
-    lead: Tensor
-
     def __init__(
         self,
         factory: Callable[[], ResidualLearner],
@@ -122,19 +113,19 @@ class ModelBank(ResidualLearner):
         self.kept = nn.ModuleList(copy.deepcopy(first) for _ in range(models))
         hypotheses = models + len(self.common_weights)  # the last ones: "new"
         self.trial = nn.ModuleList(copy.deepcopy(first) for _ in range(hypotheses))
-        device = self.device
-        self.register_buffer("episodes", torch.zeros(models, dtype=torch.int64, device=device))
-        for name in ("log_prior", "log_evidence"):
-            self.register_buffer(name, torch.zeros(hypotheses, dtype=torch.float64, device=device))
-        for name in ("seen", "leader"):
-            self.register_buffer(name, torch.zeros((), dtype=torch.int64, device=device))
-        self.register_buffer("scale", self._like.new_ones(self.out_features))
-        self.register_buffer("lead", torch.zeros((), dtype=torch.float64, device=device))  # logit p
+        zeros = self._like.new_zeros
+        self.episodes = nn.Buffer(zeros(models, dtype=torch.int64))
+        self.log_prior = nn.Buffer(zeros(hypotheses, dtype=torch.float64))
+        self.log_evidence = nn.Buffer(zeros(hypotheses, dtype=torch.float64))
+        self.seen = nn.Buffer(zeros((), dtype=torch.int64))
+        self.leader = nn.Buffer(zeros((), dtype=torch.int64))
+        self.scale = nn.Buffer(self._like.new_ones(self.out_features))
+        self.lead = nn.Buffer(zeros((), dtype=torch.float64))  # logit p
         self.signatures = SignatureModel() if signatures is None else signatures
         self.memory: EpisodeMemory | None = None
         if signature_features:
             self.memory = EpisodeMemory(first, models, signature_features, remember, _SAMPLES)
-        self.register_buffer("signed", torch.zeros((), dtype=torch.bool, device=device))
+        self.signed = nn.Buffer(zeros((), dtype=torch.bool))
         self._open(None)
 
     # -- episodes -----------------------------------------------------------------------------------

@@ -38,9 +38,6 @@ class ResidualLearner(nn.Module, ABC):
         ParameterError: a size is not a positive integer, or ``on_invalid`` is unknown.
     """
 
-    n_refused: Tensor
-    _like: Tensor
-
     def __init__(
         self,
         in_features: int,
@@ -60,9 +57,9 @@ class ResidualLearner(nn.Module, ABC):
         if on_invalid not in ("raise", "skip"):
             raise ParameterError("on_invalid", on_invalid, "'raise' or 'skip'")
         self.on_invalid = on_invalid
-        self.register_buffer("n_refused", torch.zeros(self.batch_shape, dtype=torch.int64, device=device))
+        self.n_refused = nn.Buffer(torch.zeros(self.batch_shape, dtype=torch.int64, device=device))
         # An empty float tensor follows .to() and so remembers dtype and device for all subclasses.
-        self.register_buffer("_like", torch.empty(0, dtype=dtype, device=device), persistent=False)
+        self._like = nn.Buffer(torch.empty(0, dtype=dtype, device=device), persistent=False)
 
     # -- what a learner is ------------------------------------------------------------------
 

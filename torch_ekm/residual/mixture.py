@@ -53,17 +53,6 @@ class MixtureResidual(ResidualLearner):
         ParameterError: no learner, learners of different shapes, or an empty or impossible choice.
     """
 
-    prior: Tensor
-    evidence: Tensor
-    innovation: Tensor
-    level: Tensor
-    gain: Tensor
-    offset: Tensor
-    inflation: Tensor
-    count: Tensor
-    _experts: Tensor
-    _owner: Tensor
-
     def __init__(
         self,
         learners: ResidualLearner | Sequence[ResidualLearner],
@@ -86,22 +75,23 @@ class MixtureResidual(ResidualLearner):
             *itertools.product(range(len(members)), shares, carries, levels, caps), strict=True
         )
         factory = {"dtype": self.dtype, "device": self.device}
-        self.register_buffer("_experts", torch.tensor(values, **factory), persistent=False)
+        self._experts = nn.Buffer(torch.tensor(values, **factory), persistent=False)
         members_of = torch.nn.functional.one_hot(torch.tensor(owner), len(members))
-        self.register_buffer("_owner", members_of.to(self._like), persistent=False)
+        self._owner = nn.Buffer(members_of.to(self._like), persistent=False)
         # the belief of `shares` is split over what is not a share of 1, if 1 is among them
         plain = self._experts[0] == max(shares)
         others = max(len(set(shares)) - 1, 1)
         prior = torch.where(plain, _PRIOR, (1 - _PRIOR) / others).log()
-        self.register_buffer("prior", prior, persistent=False)
+        self.prior = nn.Buffer(prior, persistent=False)
         wide = (*self.batch_shape, self.out_features, len(owner))
-        for name in ("evidence", "innovation", "level"):
-            self.register_buffer(name, torch.zeros(wide, **factory))
+        self.evidence = nn.Buffer(torch.zeros(wide, **factory))
+        self.innovation = nn.Buffer(torch.zeros(wide, **factory))
+        self.level = nn.Buffer(torch.zeros(wide, **factory))
         # what a query needs of the weights: sum p h per learner, and sum p (l - kappa w)
-        self.register_buffer("gain", torch.zeros(*wide[:-1], len(members), **factory))
-        self.register_buffer("offset", torch.zeros(wide[:-1], **factory))
-        self.register_buffer("inflation", torch.ones(wide[:-1], **factory))
-        self.register_buffer("count", torch.zeros(self.batch_shape, **factory))
+        self.gain = nn.Buffer(torch.zeros(*wide[:-1], len(members), **factory))
+        self.offset = nn.Buffer(torch.zeros(wide[:-1], **factory))
+        self.inflation = nn.Buffer(torch.ones(wide[:-1], **factory))
+        self.count = nn.Buffer(torch.zeros(self.batch_shape, **factory))
         self.tails = ScaleMixture(
             self.out_features, memory=self.memory, batch_shape=tuple(self.batch_shape), **factory
         )

@@ -6,6 +6,7 @@ import io
 from typing import Any, ClassVar
 
 import torch
+from torch import nn
 from torch.distributions import Normal
 
 from ..._extras import require
@@ -29,8 +30,6 @@ class GPyTorchSVGP(Rebuilt):
     """
 
     _options: ClassVar[tuple[str, ...]] = ("inducing", "rate", "minibatch", "memory", "steps", "seed")
-    inputs: Tensor
-    targets: Tensor
     _model: Any
     _likelihood: Any
     _optimizer: Any
@@ -53,8 +52,8 @@ class GPyTorchSVGP(Rebuilt):
         self.inducing, self.seed = check_count("inducing", inducing), int(seed)
         self.rate, self.steps = check_positive("rate", rate), check_count("steps", steps)
         self.minibatch, self.memory = check_count("minibatch", minibatch), check_count("memory", memory)
-        self.register_buffer("inputs", self._like.new_zeros(self.memory, self.in_features))
-        self.register_buffer("targets", self._like.new_zeros(self.memory, self.out_features))
+        self.inputs = nn.Buffer(self._like.new_zeros(self.memory, self.in_features))
+        self.targets = nn.Buffer(self._like.new_zeros(self.memory, self.out_features))
         self.reset()
 
     def _build(self) -> None:

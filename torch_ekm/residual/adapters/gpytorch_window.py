@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import torch
+from torch import nn
 from torch.distributions import Normal
 
 from ..._extras import require
@@ -28,8 +29,6 @@ class GPyTorchWindow(Rebuilt):
     """
 
     _options: ClassVar[tuple[str, ...]] = ("window", "refit_every", "steps", "rate", "noise_variance")
-    inputs: Tensor
-    targets: Tensor
     _model: Any
     _likelihood: Any
 
@@ -51,8 +50,8 @@ class GPyTorchWindow(Rebuilt):
         self.refit_every = check_count("refit_every", refit_every)
         self.rate = check_positive("rate", rate)
         self.noise_variance = check_positive("noise_variance", noise_variance)
-        self.register_buffer("inputs", self._like.new_zeros(self.window, self.in_features))
-        self.register_buffer("targets", self._like.new_zeros(self.window, self.out_features))
+        self.inputs = nn.Buffer(self._like.new_zeros(self.window, self.in_features))
+        self.targets = nn.Buffer(self._like.new_zeros(self.window, self.out_features))
         self.reset()
 
     def _build(self) -> None:

@@ -6,6 +6,7 @@ import pickle
 from typing import Any
 
 import torch
+from torch import nn
 from torch.distributions import Normal
 
 from ..._extras import require
@@ -27,8 +28,6 @@ class RiverResidual(SingleLearner):
         options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
-    noise: Tensor
-
     def __init__(
         self,
         in_features: int,
@@ -46,7 +45,7 @@ class RiverResidual(SingleLearner):
         self._prototype = model
         self.step = check_positive("step", step)
         self.prior_variance = check_positive("prior_variance", prior_variance)
-        self.register_buffer("noise", self._like.new_full((self.out_features,), prior_variance))
+        self.noise = nn.Buffer(self._like.new_full((self.out_features,), prior_variance))
         self.reset()
 
     def reset(self) -> None:

@@ -7,6 +7,7 @@ from abc import abstractmethod
 from typing import Any
 
 import torch
+from torch import nn
 from torch.distributions import Normal
 
 from ...typing import Float, Tensor
@@ -34,12 +35,6 @@ class LinearInFeatures(ResidualLearner):
         options: see ResidualLearner.
     """
 
-    information: Tensor
-    target: Tensor
-    covariance: Tensor
-    weights: Tensor
-    pending: Tensor
-
     def __init__(
         self,
         in_features: int,
@@ -60,12 +55,12 @@ class LinearInFeatures(ResidualLearner):
         self.robust = None if robust is None else check_positive("robust", robust)
         self.refresh_every = check_count("refresh_every", refresh_every)
         f, zeros = n_phi, self._like.new_zeros
-        self.register_buffer("information", zeros(*self.batch_shape, f, f))
-        self.register_buffer("target", zeros(*self.batch_shape, f, self.out_features))
+        self.information = nn.Buffer(zeros(*self.batch_shape, f, f))
+        self.target = nn.Buffer(zeros(*self.batch_shape, f, self.out_features))
         prior = self.weight_variance * torch.eye(f, dtype=self.dtype, device=self.device)
-        self.register_buffer("covariance", prior.expand(*self.batch_shape, f, f).clone())
-        self.register_buffer("weights", zeros(*self.batch_shape, f, self.out_features))
-        self.register_buffer("pending", zeros(self.batch_shape))
+        self.covariance = nn.Buffer(prior.expand(*self.batch_shape, f, f).clone())
+        self.weights = nn.Buffer(zeros(*self.batch_shape, f, self.out_features))
+        self.pending = nn.Buffer(zeros(self.batch_shape))
         self._n_samples = 0
 
     @abstractmethod
@@ -180,8 +175,6 @@ class RandomFeatureRLS(LinearInFeatures):
         options: see LinearInFeatures.
     """
 
-    frequencies: Tensor
-
     def __init__(
         self,
         in_features: int,
@@ -199,7 +192,7 @@ class RandomFeatureRLS(LinearInFeatures):
         draws = torch.randn(n_frequencies, in_features, generator=generator, dtype=torch.float64)
         lengthscale = math.sqrt(in_features) if lengthscale is None else lengthscale
         scale = log_parameter("lengthscale", lengthscale, (self.in_features,), dtype=torch.float64).exp()
-        self.register_buffer("frequencies", (draws / scale).to(self._like))
+        self.frequencies = nn.Buffer((draws / scale).to(self._like))
 
     def features(self, x: Tensor) -> Tensor:
         """The random Fourier features."""

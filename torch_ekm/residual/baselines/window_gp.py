@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import nn
 from torch.distributions import Normal
 
 from ...typing import Tensor
@@ -28,13 +29,6 @@ class WindowGP(ResidualLearner):
         options: see ResidualLearner.
     """
 
-    inputs: Tensor
-    targets: Tensor
-    noise: Tensor
-    count: Tensor
-    solution: Tensor
-    inverse: Tensor
-
     def __init__(
         self,
         in_features: int,
@@ -53,12 +47,12 @@ class WindowGP(ResidualLearner):
         fleet = {"batch_shape": self.batch_shape, "device": self.device, "dtype": self.dtype}
         self.kernel = SquaredExponential(in_features, **fleet) if kernel is None else kernel.to(self._like)
         zeros, shape, n = self._like.new_zeros, self.batch_shape, self.window
-        self.register_buffer("inputs", zeros(*shape, n, self.in_features))
-        self.register_buffer("targets", zeros(*shape, n, self.out_features))
-        self.register_buffer("noise", zeros(*shape, n))  # 0 where there is no sample
-        self.register_buffer("count", torch.zeros(shape, dtype=torch.int64, device=self.device))
-        self.register_buffer("solution", zeros(*shape, n, self.out_features))
-        self.register_buffer("inverse", zeros(*shape, n, n))  # L^-1 of K + s2 I = LL'
+        self.inputs = nn.Buffer(zeros(*shape, n, self.in_features))
+        self.targets = nn.Buffer(zeros(*shape, n, self.out_features))
+        self.noise = nn.Buffer(zeros(*shape, n))  # 0 where there is no sample
+        self.count = nn.Buffer(torch.zeros(shape, dtype=torch.int64, device=self.device))
+        self.solution = nn.Buffer(zeros(*shape, n, self.out_features))
+        self.inverse = nn.Buffer(zeros(*shape, n, n))  # L^-1 of K + s2 I = LL'
 
     def forward(self, x: Tensor) -> Tensor:
         """``k'(K + s2 I)^-1 y``."""

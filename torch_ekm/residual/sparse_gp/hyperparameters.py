@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+from torch import nn
 
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
@@ -54,10 +55,6 @@ class LearnHyperparameters(Part):
     """
 
     stands_last = True
-    window_x: Tensor
-    window_y: Tensor
-    window_on: Tensor
-    n_steps: Tensor
 
     def __init__(
         self, *, rate: float = 0.03, steps: int = 1, memory: int = 0, network_rate: float = 0.015
@@ -79,10 +76,10 @@ class LearnHyperparameters(Part):
         posterior, like = learner.posterior, learner.posterior.basis
         fleet, self.window = posterior.batch_shape, learner.refresh_every
         self.shared_kernel = is_shared(learner.kernel, like.shape[-1])
-        self.register_buffer("window_x", like.new_zeros(*fleet, self.window, like.shape[-1]))
-        self.register_buffer("window_y", like.new_zeros(*fleet, self.window, posterior.out_features))
-        self.register_buffer("window_on", like.new_zeros(*fleet, self.window))
-        self.register_buffer("n_steps", like.new_zeros(fleet))
+        self.window_x = nn.Buffer(like.new_zeros(*fleet, self.window, like.shape[-1]))
+        self.window_y = nn.Buffer(like.new_zeros(*fleet, self.window, posterior.out_features))
+        self.window_on = nn.Buffer(like.new_zeros(*fleet, self.window))
+        self.n_steps = nn.Buffer(like.new_zeros(fleet))
         self.loss = PrequentialLoss(posterior, factor, None if weight is None else weight.threshold)
         self.adam = Adam([*learner.kernel.parameters(), learner.log_noise_variance], betas=(0.9, 0.99))
         horizon = math.inf if factor == 1.0 else 1.0 / (1.0 - factor)

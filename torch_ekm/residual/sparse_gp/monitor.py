@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import nn
 
 from ...typing import Bool, Tensor
 from ..checks import check_positive
@@ -28,8 +29,6 @@ class CalibrateNoise(Part):
         ParameterError: not positive.
     """
 
-    log_factor: Tensor
-
     def __init__(self, rate: float = 0.2) -> None:
         super().__init__()
         self.rate = check_positive("rate", rate)
@@ -38,7 +37,7 @@ class CalibrateNoise(Part):
         """c = 1 for each output."""
         like = learner.posterior.basis
         fleet = learner.posterior.batch_shape
-        self.register_buffer("log_factor", like.new_zeros(*fleet, learner.out_features))
+        self.log_factor = nn.Buffer(like.new_zeros(*fleet, learner.out_features))
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """One innovation."""
@@ -67,18 +66,13 @@ class DetectChanges(Part):
     It looks at the result of every update, so on a GPU the host waits for it.
     """
 
-    level: Tensor
-    inputs: Tensor
-    targets: Tensor
-    levels: Tensor
-
     def bind(self, learner: Host) -> None:
         """Room for the last samples, newest last; shifted rather than indexed: masks need no pointers."""
         zeros, fleet = learner.posterior.basis.new_zeros, learner.posterior.batch_shape
-        self.register_buffer("level", zeros(fleet))
-        self.register_buffer("inputs", zeros(_MEMORY, *fleet, learner.in_features))
-        self.register_buffer("targets", zeros(_MEMORY, *fleet, learner.out_features))
-        self.register_buffer("levels", zeros(_MEMORY, *fleet))
+        self.level = nn.Buffer(zeros(fleet))
+        self.inputs = nn.Buffer(zeros(_MEMORY, *fleet, learner.in_features))
+        self.targets = nn.Buffer(zeros(_MEMORY, *fleet, learner.out_features))
+        self.levels = nn.Buffer(zeros(_MEMORY, *fleet))
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Take a sample in; models that face another system start anew."""

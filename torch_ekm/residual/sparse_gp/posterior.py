@@ -22,15 +22,6 @@ class SparsePosterior(nn.Module):
     Always float64, see :class:`~torch_ekm.residual.SparseOnlineGP`. Arguments as there.
     """
 
-    basis: Tensor
-    active: Tensor
-    age: Tensor
-    count: Tensor
-    slot: Tensor
-    moments: Tensor
-    vectors: Tensor
-    slots: Tensor
-
     def __init__(
         self,
         in_features: int,
@@ -59,15 +50,15 @@ class SparsePosterior(nn.Module):
         # One slot more than the capacity: a new point moves in before another is pruned. What a
         # free slot holds in `basis` is meaningless; its rows and columns elsewhere are 0.
         M = capacity + 1
-        self.register_buffer("basis", torch.zeros(*batch_shape, M, in_features, **factory))
-        self.register_buffer("active", torch.zeros(*batch_shape, M, **factory))
-        self.register_buffer("age", torch.zeros(*batch_shape, M, **factory))  # sample number
-        self.register_buffer("count", torch.zeros(batch_shape, dtype=torch.int64, device=device))
-        self.register_buffer("slot", torch.zeros(batch_shape, dtype=torch.int64, device=device))
+        self.basis = nn.Buffer(torch.zeros(*batch_shape, M, in_features, **factory))
+        self.active = nn.Buffer(torch.zeros(*batch_shape, M, **factory))
+        self.age = nn.Buffer(torch.zeros(*batch_shape, M, **factory))  # sample number
+        self.count = nn.Buffer(torch.zeros(batch_shape, dtype=torch.int64, device=device))
+        self.slot = nn.Buffer(torch.zeros(batch_shape, dtype=torch.int64, device=device))
         # [C; Q; Omega] and [alpha; h] each in one buffer: one product, one rank update serves all.
-        self.register_buffer("moments", torch.zeros(*batch_shape, 3, M, M, **factory))
-        self.register_buffer("vectors", torch.zeros(*batch_shape, 2, M, out_features, **factory))
-        self.register_buffer("slots", torch.arange(M, device=device), persistent=False)
+        self.moments = nn.Buffer(torch.zeros(*batch_shape, 3, M, M, **factory))
+        self.vectors = nn.Buffer(torch.zeros(*batch_shape, 2, M, out_features, **factory))
+        self.slots = nn.Buffer(torch.arange(M, device=device), persistent=False)
 
     @property
     def alpha(self) -> Float[Tensor, "*batch slots out"]:

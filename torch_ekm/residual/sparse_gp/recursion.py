@@ -97,8 +97,8 @@ def absorb(
         posterior.age.scatter_(-1, where, torch.full_like(unit[..., :1], number))
     excess = novel & full
     grown = novel ^ excess
-    posterior.count += grown
-    posterior.slot += grown
+    posterior.count.add_(grown)
+    posterior.slot.add_(grown)
     if posterior.pruning != "freeze" and _any(excess):
         _add_and_prune(posterior, scaled, left, excess, s2)
     else:

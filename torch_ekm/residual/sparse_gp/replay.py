@@ -28,22 +28,16 @@ class ReplayMemory(nn.Module):
         horizon: samples that the learner remembers; infinite if it never forgets.
     """
 
-    x: Tensor
-    y: Tensor
-    weight: Tensor
-    absorbed: Tensor
-    number: Tensor
-
     def __init__(self, posterior: SparsePosterior, capacity: int, horizon: float = math.inf) -> None:
         super().__init__()
         self.capacity, self.horizon = max(math.ceil(min(capacity, horizon)), 1), horizon
         fleet, like = posterior.batch_shape, posterior.basis
         n = self.capacity
-        self.register_buffer("x", like.new_zeros(*fleet, n, like.shape[-1]))
-        self.register_buffer("y", like.new_zeros(*fleet, n, posterior.out_features))
-        self.register_buffer("weight", like.new_zeros(*fleet, n))
-        self.register_buffer("absorbed", like.new_zeros(n))
-        self.register_buffer("number", like.new_zeros(n))
+        self.x = nn.Buffer(like.new_zeros(*fleet, n, like.shape[-1]))
+        self.y = nn.Buffer(like.new_zeros(*fleet, n, posterior.out_features))
+        self.weight = nn.Buffer(like.new_zeros(*fleet, n))
+        self.absorbed = nn.Buffer(like.new_zeros(n))
+        self.number = nn.Buffer(like.new_zeros(n))
         self._n_offered = self._n_taken = 0  # on the host, as the places are
 
     def offer(

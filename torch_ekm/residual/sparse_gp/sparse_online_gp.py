@@ -75,7 +75,6 @@ class SparseOnlineGP(DoubleStateLearner):
         ParameterError: a parameter is outside its range, or parts do not go together.
     """
 
-    pending: Tensor
     units: Units
 
     def __init__(
@@ -128,7 +127,7 @@ class SparseOnlineGP(DoubleStateLearner):
             device=device,
         )
         # samples of each model since the caches were made
-        self.register_buffer("pending", torch.zeros(shape, dtype=double, device=device))
+        self.pending = nn.Buffer(torch.zeros(shape, dtype=double, device=device))
         self.n_samples = 0  # on the host, so that the rhythm of rebuilds never asks the GPU
         self._parts: tuple[Part, ...] = ()
         for part in copy_parts(parts):
