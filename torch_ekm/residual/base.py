@@ -24,8 +24,9 @@ class ResidualLearner(nn.Module, ABC):
     ``(*batch_shape, in_features)``, or a time-ordered block with the time first,
     ``(n, *batch_shape, in_features)``.
 
-    A subclass implements ``forward``, ``predict``, ``_absorb`` and ``reset``. It keeps all it has
-    learned in buffers of fixed size, so that ``state_dict``, ``deepcopy``, ``.to()`` move all of it.
+    A subclass implements ``forward``, ``predict``, ``_absorb`` and, unless all its buffers start at 0,
+    ``reset``. It keeps all it has learned in buffers of fixed size, so that ``state_dict``, ``deepcopy``,
+    ``.to()`` move all of it.
 
     Args:
         in_features: width of x.
@@ -78,9 +79,10 @@ class ResidualLearner(nn.Module, ABC):
         """
         return self.predict(x, observation=True)
 
-    @abstractmethod
     def reset(self) -> None:
         """Forget all samples; hyperparameters stay."""
+        for buffer in self.buffers(recurse=False):
+            buffer.zero_()
 
     @abstractmethod
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
@@ -145,6 +147,20 @@ class ResidualLearner(nn.Module, ABC):
         if mask is not None and not mask.is_cuda and not bool(mask.any()):
             return UpdateReport.of_nothing(mask, self.dtype)
         return self._absorb(x, y, mask)
+
+    def _report(
+        self,
+        nis: Tensor,
+        mask: Tensor | None = None,
+        *,
+        novelty: Tensor | None = None,
+        weight: Tensor | None = None,
+    ) -> UpdateReport:
+        """Of samples that were taken in; without a basis no novelty, and by default weight 1."""
+        one = torch.ones_like(nis)
+        event = (one if mask is None else mask).to(torch.int64)
+        novelty = 0.0 * one if novelty is None else novelty
+        return UpdateReport(event, novelty, nis, one if weight is None else weight)
 
     # -- checks ---------------------------------------------------------------------------------
 
@@ -246,8 +262,3 @@ class SingleLearner(ResidualLearner):
         if mask is not None and not bool(mask):
             return UpdateReport.of_nothing(mask, self.dtype)
         return self._absorb(x, y, None)
-
-    def _absorbed(self, nis: Tensor) -> UpdateReport:
-        """Report of a learner without a basis that trusts every sample alike."""
-        one = torch.ones_like(nis)
-        return UpdateReport(one.to(torch.int64), 0 * one, nis, one)

@@ -75,11 +75,6 @@ class KRLSTracker(SingleLearner, DoubleStateLearner):
         mean = (e @ self.mu).to(self.dtype)
         return Normal(mean, v.sqrt().unsqueeze(-1).expand_as(mean).to(self.dtype), validate_args=False)
 
-    def reset(self) -> None:
-        """Empty basis."""
-        for buffer in self.buffers(recurse=False):
-            buffer.zero_()
-
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         x, y, lam = x.double(), y.double(), self.forgetting_factor
         if lam < 1.0:

@@ -14,7 +14,7 @@ from ...typing import Float, Tensor
 from ..base import ResidualLearner
 from ..checks import check_count, check_factor, check_positive
 from ..kernels.kernel import log_parameter
-from ..report import UpdateEvent, UpdateReport
+from ..report import UpdateReport
 
 
 class LinearInFeatures(ResidualLearner):
@@ -109,8 +109,7 @@ class LinearInFeatures(ResidualLearner):
         self._n_samples += 1
         if self._n_samples % self.refresh_every == 0:
             self._rebuild()
-        event = torch.full_like(v, UpdateEvent.ABSORBED, dtype=torch.int64)
-        return UpdateReport(event if mask is None else event * mask, 0.0 * v, nis, weight)
+        return self._report(nis, mask, weight=weight)
 
     def _rebuild(self) -> None:
         """Forget what is due; (P, w) from (A, b) by Cholesky in double precision."""

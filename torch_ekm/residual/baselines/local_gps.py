@@ -76,11 +76,6 @@ class LocalGPs(SingleLearner):
         v = v + self.noise_variance if observation else v
         return Normal(mean, v.sqrt(), validate_args=False)
 
-    def reset(self) -> None:
-        """No experts."""
-        for buffer in self.buffers(recurse=False):
-            buffer.zero_()
-
     def _mixture(self, x: Tensor) -> tuple[Tensor, Tensor]:
         near = self.kernel(x.unsqueeze(-2), self.centres).squeeze(-2) * (self.count > 0)
         w, index = near.topk(self.neighbours, dim=-1)

@@ -13,7 +13,7 @@ from ..base import ResidualLearner
 from ..checks import check_count, check_positive
 from ..kernels.kernel import Kernel
 from ..kernels.stationary import SquaredExponential
-from ..report import UpdateEvent, UpdateReport
+from ..report import UpdateReport
 
 
 class WindowGP(ResidualLearner):
@@ -73,11 +73,6 @@ class WindowGP(ResidualLearner):
         k, dk = self.kernel.with_gradient(self._check_query(x), self.inputs)
         return (k.unsqueeze(-2) @ self.solution).squeeze(-2), self.solution.mT @ dk
 
-    def reset(self) -> None:
-        """Empty the window."""
-        for buffer in self.buffers(recurse=False):
-            buffer.zero_()
-
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         law = self.predict(x, observation=True)
         nis = ((y - law.mean) / law.stddev).square().mean(-1)
@@ -100,6 +95,5 @@ class WindowGP(ResidualLearner):
         inverse = inverse * on.mT.double()
         self.solution.copy_(inverse.mT @ (inverse @ self.targets.double()))
         self.inverse.copy_(inverse)
-        event = torch.full_like(self.count, UpdateEvent.ABSORBED)
         novelty = (law.variance[..., 0] - self.noise_variance) / self.kernel.diagonal(x)
-        return UpdateReport(event if mask is None else event * mask, novelty, nis, weight)
+        return self._report(nis, mask, novelty=novelty, weight=weight)
