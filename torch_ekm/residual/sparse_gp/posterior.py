@@ -8,8 +8,6 @@ from torch import nn
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..kernels.kernel import Kernel
-from .natural import posterior_from_natural
-from .pruning import PRUNING_SCORES
 
 
 class SparsePosterior(nn.Module):
@@ -41,8 +39,8 @@ class SparsePosterior(nn.Module):
                 raise ParameterError(name, value, "in [0, 1)")
         if projection not in ("kl", "fitc"):
             raise ParameterError("projection", projection, "'kl' or 'fitc'")
-        if pruning not in (*PRUNING_SCORES, "freeze"):
-            raise ParameterError("pruning", pruning, f"one of {(*PRUNING_SCORES, 'freeze')}")
+        if pruning not in ("kl", "mean", "freeze"):
+            raise ParameterError("pruning", pruning, "'kl', 'mean' or 'freeze'")
         self.capacity, self.batch_shape, self.out_features = capacity, batch_shape, out_features
         self.novelty_threshold, self.jitter = novelty_threshold, jitter
         self.projection, self.pruning = projection, pruning
@@ -52,7 +50,6 @@ class SparsePosterior(nn.Module):
         M = capacity + 1
         self.basis = nn.Buffer(torch.zeros(*batch_shape, M, in_features, **factory))
         self.active = nn.Buffer(torch.zeros(*batch_shape, M, **factory))
-        self.age = nn.Buffer(torch.zeros(*batch_shape, M, **factory))  # sample number
         self.count = nn.Buffer(torch.zeros(batch_shape, dtype=torch.int64, device=device))
         self.slot = nn.Buffer(torch.zeros(batch_shape, dtype=torch.int64, device=device))
         # [C; Q; Omega] and [alpha; h] each in one buffer: one product, one rank update serves all.
@@ -79,11 +76,6 @@ class SparsePosterior(nn.Module):
     def precision(self) -> Float[Tensor, "*batch slots slots"]:
         """Omega: how often, and with which weight, each direction of f was seen."""
         return self.moments[..., 2, :, :]
-
-    @property
-    def needs_age(self) -> bool:
-        """Whether the pruning score asks for sample numbers (a compiled step is cheaper without)."""
-        return self.pruning not in ("kl", "mean", "novelty", "freeze")
 
     def reset(self) -> None:
         """Back to the prior, no basis."""
@@ -136,3 +128,30 @@ def as_gram(K: Tensor, kernel: Kernel, basis: Tensor, active: Tensor, jitter: fl
     K = K * (on * on.mT)
     diagonal = torch.where(active > 0, kernel.diagonal_of_set(basis) * (1.0 + jitter), 1.0)
     return (0.5 * (K + K.mT)).diagonal_scatter(diagonal, dim1=-2, dim2=-1)
+
+
+def posterior_from_natural(
+    K: Float[Tensor, "*batch b b"], W: Float[Tensor, "*batch b b"], h: Float[Tensor, "*batch b m"]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """``p(f) ~ N(f; 0, K) exp(-1/2 f'W f + h'f)`` as ``(Q, C, alpha)``.
+
+    ``Q = K^-1``, ``C = -(K + W^-1)^-1``, ``alpha = K^-1 (K^-1 + W)^-1 h``, so that a query has mean
+    ``alpha'k`` and variance ``k** + k'Ck`` (Csato & Opper, Neural Computation 14, 2002). W may be
+    singular. With ``K = LL'``, ``A = I + L'WL``::
+
+        C = -(K^-1 - L^-T A^-1 L^-1),   alpha = L^-T A^-1 L'h
+
+    ``L^-T A^-1 L^-1`` is the posterior covariance of ``K^-1 f``: the difference keeps its relative
+    accuracy when W is large (many repeats), where ``T'T - W`` loses all of it. Factorised in double
+    precision whatever the dtype: a float32 state is limited by its storage, not by this step.
+    """
+    L = torch.linalg.cholesky_ex(K.double())[0]
+    W, h = W.double(), h.double()
+    eye = torch.eye(K.shape[-1], dtype=L.dtype, device=L.device)
+    A = eye + L.mT @ W @ L
+    La = torch.linalg.cholesky_ex(0.5 * (A + A.mT))[0]
+    L_inv = torch.linalg.solve_triangular(L, eye.expand_as(L), upper=False)
+    G = torch.linalg.solve_triangular(La, L_inv, upper=False)
+    Q = L_inv.mT @ L_inv
+    alpha = G.mT @ torch.linalg.solve_triangular(La, L.mT @ h, upper=False)
+    return Q.to(K.dtype), (G.mT @ G - Q).to(K.dtype), alpha.to(K.dtype)

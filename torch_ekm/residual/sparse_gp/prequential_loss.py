@@ -93,7 +93,7 @@ class PrequentialLoss(nn.Module):
             moved: whether kernel or noise changed since the old state's caches were made: they are
                 made anew then.
         """
-        with _differentiable(kernel) as parameters:
+        with _differentiable(kernel):
             K, k, prior = outcome = self._covariances(kernel, queries.x)
             K_, k_ = K.detach(), k.detach()
             if moved:
@@ -109,6 +109,7 @@ class PrequentialLoss(nn.Module):
             by_s2 = (by.mean * (mean + E.mT @ (K_ @ alpha))).sum((-1, -2))
             by_s2 = by_s2 + (E_g * (k_ + K_ @ E)).sum((-1, -2))
             by_noise = by.log_noise - by_s2.unsqueeze(-1) / log_noise.shape[-1]
+            parameters = list(kernel.parameters())
             by_kernel = torch.autograd.grad(outcome, parameters, [by_K, by_k, by.variance], allow_unused=True)
         return loss, [*by_kernel, by_noise]
 
@@ -152,14 +153,11 @@ class PrequentialLoss(nn.Module):
 
 
 @contextmanager
-def _differentiable(kernel: Kernel) -> Iterator[list[nn.Parameter]]:
+def _differentiable(kernel: Kernel) -> Iterator[None]:
     """Inside, the kernel's parameters carry a graph."""
-    parameters = list(kernel.parameters())
-    with torch.enable_grad():
-        try:
-            for p in parameters:
-                p.requires_grad_(True)
-            yield parameters
-        finally:
-            for p in parameters:
-                p.requires_grad_(False)
+    try:
+        kernel.requires_grad_(True)
+        with torch.enable_grad():
+            yield
+    finally:
+        kernel.requires_grad_(False)
