@@ -11,7 +11,6 @@ import torch
 from torch_ekm.residual import (
     ActionLinearKernel,
     ForgettingFactor,
-    LinearKernel,
     Matern32,
     Matern52,
     ProcessNoise,
@@ -340,9 +339,8 @@ KERNELS = {
     "se": lambda: SquaredExponential(D, lengthscale=[0.7, 1.0, 1.5, 2.0]),
     "matern32": lambda: Matern32(D),
     "matern52": lambda: Matern52(D),
-    "linear": lambda: LinearKernel(D, variance=[0.5, 1.0, 2.0, 0.1]),
-    "sum": lambda: SquaredExponential(D) + LinearKernel(D),
-    "product": lambda: Matern52(D) * (LinearKernel(D) + SquaredExponential(D)),
+    "sum": lambda: SquaredExponential(D) + ActionLinearKernel(D, 2),
+    "product": lambda: Matern52(D) * (ActionLinearKernel(D, 2) + SquaredExponential(D)),
     "action": lambda: ActionLinearKernel(D, 2, state_kernel=Matern52(2), action_variance=[0.5, 2.0]),
 }
 

@@ -16,7 +16,6 @@ from .fleet import LearnerFleet
 from .kernels.action_linear import ActionLinearKernel, action_covariance, action_jacobian
 from .kernels.deep import DeepKernel
 from .kernels.kernel import Kernel, ProductKernel, SumKernel
-from .kernels.linear import LinearKernel
 from .kernels.stationary import Matern32, Matern52, SquaredExponential
 from .mixture import MixtureResidual
 from .report import UpdateEvent, UpdateReport
@@ -32,7 +31,7 @@ from .sparse_gp.units import Standardize
 __all__ = [
     "ActionLinearKernel", "CalibrateNoise", "DeepKernel", "DeepKernelSOGP", "DetectChanges",
     "ForgettingFactor", "GPyTorchSVGP", "GPyTorchWindow", "KRLSTracker", "Kernel", "LearnHyperparameters",
-    "LearnerFleet", "LinearKernel", "LocalGPs", "Matern32", "Matern52", "MixtureResidual", "Part",
+    "LearnerFleet", "LocalGPs", "Matern32", "Matern52", "MixtureResidual", "Part",
     "Prediction", "ProcessNoise", "ProductKernel", "RandomFeatureRLS", "RecursiveLeastSquares", "ReplayMLP",
     "ResidualLearner", "RiverResidual", "RobustWeight", "SparseOnlineGP", "SquaredExponential", "Standardize",
     "SumKernel", "UpdateEvent", "UpdateReport", "WindowGP", "ZeroResidual", "action_covariance",

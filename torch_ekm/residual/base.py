@@ -97,12 +97,11 @@ class ResidualLearner(nn.Module, ABC):
             mean = self(x)
             # one backward pass per output; queries do not interact, so their sum separates them
             rows = [
-                torch.autograd.grad(mean[..., j].sum(), x, retain_graph=True, allow_unused=True)[0]
+                torch.autograd.grad(g.sum(), x, retain_graph=True, materialize_grads=True)[0]
                 if mean.requires_grad
-                else None
-                for j in range(self.out_features)
+                else torch.zeros_like(x)
+                for g in mean.unbind(-1)
             ]
-        rows = [torch.zeros_like(x) if row is None else row for row in rows]
         return mean.detach(), torch.stack(rows, dim=-2)
 
     # -- learning -----------------------------------------------------------------------------

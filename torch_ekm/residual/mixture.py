@@ -13,6 +13,7 @@ from torch.distributions import Distribution, Normal
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import ResidualLearner
+from .checks import check_factor
 from .report import UpdateReport
 from .tails import ScaleMixture
 
@@ -68,9 +69,12 @@ class MixtureResidual(ResidualLearner):
         first = _same_shapes(members)
         shape = {"batch_shape": tuple(first.batch_shape), "dtype": first.dtype, "device": first.device}
         super().__init__(first.in_features, first.out_features, **{**shape, **options})
-        _check_choices(shares, carries, levels, caps, memory)
+        choices = ("shares", shares, 0, 1), ("carries", carries, -1, 1), ("levels", levels, 0, 1)
+        for name, values, low, high in (*choices, ("caps", caps, 1e-3, 1e6)):
+            if not values or not all(low <= value <= high for value in values):
+                raise ParameterError(name, values, f"one or more numbers in [{low:g}, {high:g}]")
         self.learners = nn.ModuleList(members)
-        self.memory = float(memory)
+        self.memory = check_factor("memory", memory)
         owner, *values = zip(
             *itertools.product(range(len(members)), shares, carries, levels, caps), strict=True
         )
@@ -237,25 +241,6 @@ def _same_shapes(members: list[ResidualLearner]) -> ResidualLearner:
     if len(set(shapes)) > 1:
         raise ParameterError("learners", shapes, "of the same (in_features, out_features, batch_shape)")
     return members[0]
-
-
-def _check_choices(
-    shares: Sequence[float],
-    carries: Sequence[float],
-    levels: Sequence[float],
-    caps: Sequence[float],
-    memory: float,
-) -> None:
-    limits = {
-        "shares": (shares, 0.0, 1.0, "in [0, 1]"),
-        "carries": (carries, -1.0, 1.0, "in [-1, 1]"),
-        "levels": (levels, 0.0, 1.0, "in [0, 1]"),
-        "caps": (caps, 1e-3, 1e6, "positive"),
-        "memory": ((memory,), 1e-6, 1.0, "in (0, 1]"),
-    }
-    for name, (values, low, high, meaning) in limits.items():
-        if not values or not all(low <= value <= high for value in values):
-            raise ParameterError(name, values, f"one or more numbers {meaning}")
 
 
 def _trailing(mask: Tensor, like: Tensor) -> Tensor:

@@ -60,10 +60,8 @@ class LearnHyperparameters(Part):
         self, *, rate: float = 0.03, steps: int = 1, memory: int = 0, network_rate: float = 0.015
     ) -> None:
         super().__init__()
-        self.rate, self.network_rate = (
-            check_positive("rate", rate),
-            check_positive("network_rate", network_rate),
-        )
+        self.rate = check_positive("rate", rate)
+        self.network_rate = check_positive("network_rate", network_rate)
         self.steps, self.memory = check_count("steps", steps), check_count("memory", memory, least=0)
 
     def bind(self, learner: Host) -> None:
