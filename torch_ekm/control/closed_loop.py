@@ -56,7 +56,6 @@ class Manipulation:
 
     @property
     def reason(self) -> StopReason:
-        """Why it ended."""
         return self.stop.reason
 
     @property

@@ -62,10 +62,8 @@ class GraspSignature:
             if name not in hand.joint_names:
                 raise UnknownNameError("joint", name, hand.joint_names)
         width = check_positive("width_scatter", width_scatter)
-        load, force = (
-            check_positive("load_scatter", load_scatter),
-            check_positive("force_scatter", force_scatter),
-        )
+        load = check_positive("load_scatter", load_scatter)
+        force = check_positive("force_scatter", force_scatter)
         self.hand, self.kinematics = hand, HandKinematics(hand)
         self._pads = [by_name[name] for name in (thumb, *fingers)]
         pads = [hand.pads[i] for i in self._pads]

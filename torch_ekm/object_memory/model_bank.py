@@ -258,7 +258,6 @@ class ModelBank(SingleLearner):
         return Normal(self._mix(ours.mean, theirs.mean), variance.sqrt(), validate_args=False)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and slope."""
         ours, theirs = self.working.linearize(x), self.common.linearize(x)
         return self._mix(ours[0], theirs[0]), self._mix(ours[1], theirs[1])
 
@@ -316,7 +315,6 @@ class ModelBank(SingleLearner):
         return torch.nonzero(~dropped).flatten().tolist()
 
     def extra_repr(self) -> str:
-        """One line for ``print(bank)``."""
         return f"{super().extra_repr()}, models={self.models}, known={self.n_models}"
 
 

@@ -22,9 +22,8 @@ from .report import UpdateEvent, UpdateReport
 from .sparse_gp.deep import DeepKernelSOGP
 from .sparse_gp.forgetting import ForgettingFactor, ProcessNoise
 from .sparse_gp.hyperparameters import LearnHyperparameters
-from .sparse_gp.monitor import CalibrateNoise, DetectChanges
+from .sparse_gp.monitor import CalibrateNoise, DetectChanges, RobustWeight
 from .sparse_gp.part import Part
-from .sparse_gp.robust_weight import RobustWeight
 from .sparse_gp.sparse_online_gp import Prediction, SparseOnlineGP
 from .sparse_gp.units import Standardize
 

@@ -165,12 +165,10 @@ class ResidualLearner(nn.Module, ABC):
 
     @property
     def dtype(self) -> torch.dtype:
-        """Floating type of the state."""
         return self._like.dtype
 
     @property
     def device(self) -> torch.device:
-        """Device of the state."""
         return self._like.device
 
     def _cast(self, x: Tensor) -> Tensor:
@@ -223,7 +221,6 @@ class ResidualLearner(nn.Module, ABC):
         return mask
 
     def extra_repr(self) -> str:
-        """One line for ``print(model)``."""
         fleet = f", batch_shape={tuple(self.batch_shape)}" if self.batch_shape else ""
         return f"in_features={self.in_features}, out_features={self.out_features}{fleet}"
 

@@ -112,12 +112,11 @@ class MixtureResidual(ResidualLearner):
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """Moments of the mixture, or mean and running variance of y with ``observation=True``."""
         x = self._check_query(x)
-        mean, deviation = self._standard(x)
+        mean, deviation, means = self._standard(x)
         deviation = deviation * self.inflation.sqrt()
         if observation:
             return Normal(mean, deviation, validate_args=False)
         laws = [learner.predict(x) for learner in self.members]
-        means = torch.stack([law.mean for law in laws], dim=-1).to(x.dtype)
         variances = torch.stack([law.variance for law in laws], dim=-1).to(x.dtype)
         inside = self._experts[0].square() * (variances @ self._owner.mT)
         between = (self._means(means) - mean.unsqueeze(-1)).square()
@@ -127,8 +126,7 @@ class MixtureResidual(ResidualLearner):
 
     def predictive(self, x: Tensor) -> Distribution:
         """Mixture of Student t laws about the mean: what log densities should be taken of."""
-        mean, deviation = self._standard(self._check_query(x))
-        return self.tails.law(mean, deviation)
+        return self.tails.law(*self._standard(self._check_query(x))[:2])
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The learners' slopes, weighted; what is carried over does not depend on x."""
@@ -172,10 +170,7 @@ class MixtureResidual(ResidualLearner):
         self._settle()
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        laws = [learner.predict(x, observation=True) for learner in self.members]
-        means = torch.stack([law.mean for law in laws], dim=-1).to(x.dtype)
-        deviation = self._deviation(laws, x)
-        mean = (self.gain * means).sum(-1) + self.offset
+        mean, deviation, means = self._standard(x)
         scale = (deviation * self.tails.typical()).unsqueeze(-1)
         target = y - self.offset
 
@@ -221,15 +216,13 @@ class MixtureResidual(ResidualLearner):
         self.gain.copy_((p * self._experts[0]) @ self._owner)
         self.offset.copy_((p * self._carried()).sum(-1))
 
-    def _deviation(self, laws: list[Normal], x: Tensor) -> Tensor:
-        variances = torch.stack([law.variance for law in laws], dim=-1).to(x.dtype)
-        return (self.weights * variances).sum(-1).sqrt()
-
-    def _standard(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean, and the deviation by which innovations are standardised: the learners' own."""
+    def _standard(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean, the deviation by which innovations are standardised (the learners' own), their means."""
         laws = [learner.predict(x, observation=True) for learner in self.members]
         means = torch.stack([law.mean for law in laws], dim=-1).to(x.dtype)
-        return (self.gain * means).sum(-1) + self.offset, self._deviation(laws, x)
+        variances = torch.stack([law.variance for law in laws], dim=-1).to(x.dtype)
+        mean = (self.gain * means).sum(-1) + self.offset
+        return mean, (self.weights * variances).sum(-1).sqrt(), means
 
 
 def _same_shapes(members: list[ResidualLearner]) -> ResidualLearner:

@@ -90,7 +90,6 @@ class GPyTorchLearner(SingleLearner):
         return {"count": self._count, "peer": [part.state_dict() for part in self._peer]}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See get_extra_state."""
         self._count = int(state["count"])
         self._peer = self._build()
         for part, values in zip(self._peer, copy.deepcopy(state["peer"]), strict=True):

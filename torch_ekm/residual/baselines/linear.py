@@ -134,7 +134,6 @@ class LinearInFeatures(ResidualLearner):
         return {"n_samples": self._n_samples}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See get_extra_state."""
         self._n_samples = int(state["n_samples"])
 
 
@@ -151,7 +150,6 @@ class RecursiveLeastSquares(LinearInFeatures):
         self.bias = bool(bias)
 
     def features(self, x: Tensor) -> Tensor:
-        """``[x, 1]``."""
         return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1) if self.bias else x
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -194,7 +192,6 @@ class RandomFeatureRLS(LinearInFeatures):
         self.frequencies = nn.Buffer((draws / scale).to(self._like))
 
     def features(self, x: Tensor) -> Tensor:
-        """The random Fourier features."""
         angle = x @ self.frequencies.mT
         return torch.cat([angle.cos(), angle.sin()], dim=-1) / math.sqrt(len(self.frequencies))
 

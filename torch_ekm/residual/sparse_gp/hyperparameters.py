@@ -14,11 +14,10 @@ from ..adam import Adam
 from ..checks import check_count, check_positive
 from ..kernels.kernel import is_shared
 from .forgetting import ForgettingFactor, ProcessNoise
-from .monitor import DetectChanges
+from .monitor import DetectChanges, RobustWeight
 from .part import Host, Part, Sample
 from .prequential_loss import PrequentialLoss, Queries
 from .replay import ReplayMemory
-from .robust_weight import RobustWeight
 
 _REPLAYED = 4  # samples of the memory per sample of the window, in each step; at least as many as points
 

@@ -99,8 +99,18 @@ class SparsePosterior(nn.Module):
             block.mul_(keep)
 
     def gram(self, kernel: Kernel) -> Float[Tensor, "*batch slots slots"]:
-        """K(X, X) with the nugget; the identity at free slots."""
-        return basis_gram(kernel, self.basis, self.active, self.jitter)
+        """K(X, X) with ``jitter k**`` on the diagonal; the identity at free slots. Differentiable."""
+        return self.as_gram(kernel(self.basis, self.basis), kernel)
+
+    def as_gram(
+        self, K: Float[Tensor, "*batch slots slots"], kernel: Kernel
+    ) -> Float[Tensor, "*batch slots slots"]:
+        """See :meth:`gram`; K is the kernel between the basis and itself."""
+        on = self.active.unsqueeze(-1)
+        K = K * (on * on.mT)
+        diagonal = kernel.diagonal_of_set(self.basis) * (1.0 + self.jitter)
+        diagonal = torch.where(self.active > 0, diagonal, 1.0)
+        return (0.5 * (K + K.mT)).diagonal_scatter(diagonal, dim1=-2, dim2=-1)
 
     def rebuild(self, kernel: Kernel, s2: Float[Tensor, "*batch"]) -> None:
         """alpha, C, Q from the natural form by Cholesky."""
@@ -115,19 +125,6 @@ class SparsePosterior(nn.Module):
         self.covariance.copy_(C)
         self.moments[..., 1, :, :] = Q * (on * on.mT)
         self.alpha.copy_(alpha)
-
-
-def basis_gram(kernel: Kernel, basis: Tensor, active: Tensor, jitter: float) -> Tensor:
-    """K(X, X) with ``jitter k**`` on the diagonal; the identity at free slots. Differentiable."""
-    return as_gram(kernel(basis, basis), kernel, basis, active, jitter)
-
-
-def as_gram(K: Tensor, kernel: Kernel, basis: Tensor, active: Tensor, jitter: float) -> Tensor:
-    """See :func:`basis_gram`; K is the kernel between the basis and itself."""
-    on = active.unsqueeze(-1)
-    K = K * (on * on.mT)
-    diagonal = torch.where(active > 0, kernel.diagonal_of_set(basis) * (1.0 + jitter), 1.0)
-    return (0.5 * (K + K.mT)).diagonal_scatter(diagonal, dim1=-2, dim2=-1)
 
 
 def posterior_from_natural(

@@ -13,7 +13,7 @@ from torch import nn
 
 from ...typing import Float, Tensor
 from ..kernels.kernel import Kernel
-from .posterior import SparsePosterior, as_gram
+from .posterior import SparsePosterior
 
 
 class Queries(NamedTuple):
@@ -78,12 +78,7 @@ class PrequentialLoss(nn.Module):
             old.copy_(new)
 
     def with_gradients(
-        self,
-        kernel: Kernel,
-        log_noise: Tensor,
-        queries: Queries,
-        *,
-        moved: bool = True,
+        self, kernel: Kernel, log_noise: Tensor, queries: Queries, *, moved: bool = True
     ) -> tuple[Tensor, list[Tensor | None]]:
         """Loss of each model ``(*batch_shape)`` [nats per sample and output], derivatives of their sum.
 
@@ -115,20 +110,13 @@ class PrequentialLoss(nn.Module):
 
     def _covariances(self, kernel: Kernel, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """K at the old basis, k and k** of the queries, from one evaluation of the kernel."""
-        basis, active = self.state.basis, self.state.active
+        basis, M = self.state.basis, self.state.basis.shape[-2]
         both = kernel(basis, torch.cat([basis, x], dim=-2))
-        M = basis.shape[-2]
-        K = as_gram(both[..., :M], kernel, basis, active, self.state.jitter)
-        return K, both[..., M:] * active.unsqueeze(-1), kernel.diagonal_of_set(x)
+        k = both[..., M:] * self.state.active.unsqueeze(-1)
+        return self.state.as_gram(both[..., :M], kernel), k, kernel.diagonal_of_set(x)
 
     def _density(
-        self,
-        mean: Tensor,
-        v: Tensor,
-        p: Tensor,
-        u: Tensor,
-        log_noise: Tensor,
-        queries: Queries,
+        self, mean: Tensor, v: Tensor, p: Tensor, u: Tensor, log_noise: Tensor, queries: Queries
     ) -> tuple[Tensor, _Slopes]:
         """The loss from the state's predictions, and its derivatives by them."""
         leaves = [value.detach().requires_grad_(True) for value in (mean, v, p, u, log_noise)]

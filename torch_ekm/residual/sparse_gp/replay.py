@@ -81,7 +81,6 @@ class ReplayMemory(nn.Module):
         self.weight.masked_fill_(models.unsqueeze(-1), 0.0)
 
     def reset(self) -> None:
-        """Nothing seen."""
         for buffer in self.buffers():
             buffer.zero_()
         self._n_offered = self._n_taken = 0
@@ -91,7 +90,6 @@ class ReplayMemory(nn.Module):
         return {"n_offered": self._n_offered, "n_taken": self._n_taken}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See get_extra_state."""
         self._n_offered, self._n_taken = int(state["n_offered"]), int(state["n_taken"])
 
 

@@ -308,5 +308,4 @@ class SparseOnlineGP(DoubleStateLearner):
         return {"n_samples": self.n_samples}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See get_extra_state."""
         self.n_samples = int(state["n_samples"])

@@ -155,5 +155,4 @@ class RunningScale(nn.Module):
         self.scale.fill_(1.0)
 
     def extra_repr(self) -> str:
-        """Width and which columns are centred."""
         return f"features={self.scale.shape[-1]}, shifted={self.shifted.bool().tolist()}"
