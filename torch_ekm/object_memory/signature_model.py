@@ -79,20 +79,14 @@ class SignatureModel:
         )
 
     def log_posterior(
-        self,
-        new: Float[Tensor, " d"],
-        z: Float[Tensor, "n d"],
-        label: Int[Tensor, " n"],
-        groups: int,
+        self, new: Float[Tensor, " d"], z: Float[Tensor, "n d"], label: Int[Tensor, " n"], groups: int
     ) -> Float[Tensor, " groups"]:
         """Of a new signature belonging to each group, given the partition of the earlier ones.
 
         An empty group stands for "new"; of several only the first can be meant, the others have -inf.
         """
-        target = torch.arange(groups)
-        joint = self.log_joint(
-            torch.cat([z, new[None]]), torch.cat([label.expand(groups, -1), target[:, None]], 1), groups
-        )
+        labels = torch.cat([label.expand(groups, -1), torch.arange(groups)[:, None]], 1)
+        joint = self.log_joint(torch.cat([z, new[None]]), labels, groups)
         return joint.masked_fill(~_allowed(label, groups), -math.inf).log_softmax(0)
 
     def sort(

@@ -148,12 +148,7 @@ class ResidualLearner(nn.Module, ABC):
         return self._absorb(x, y, mask)
 
     def _report(
-        self,
-        nis: Tensor,
-        mask: Tensor | None = None,
-        *,
-        novelty: Tensor | None = None,
-        weight: Tensor | None = None,
+        self, nis: Tensor, mask: Tensor | None, novelty: Tensor | None = None, weight: Tensor | None = None
     ) -> UpdateReport:
         """Of samples that were taken in; without a basis no novelty, and by default weight 1."""
         one = torch.ones_like(nis)

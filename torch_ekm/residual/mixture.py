@@ -75,9 +75,8 @@ class MixtureResidual(ResidualLearner):
                 raise ParameterError(name, values, f"one or more numbers in [{low:g}, {high:g}]")
         self.learners = nn.ModuleList(members)
         self.memory = check_factor("memory", memory)
-        owner, *values = zip(
-            *itertools.product(range(len(members)), shares, carries, levels, caps), strict=True
-        )
+        experts = itertools.product(range(len(members)), shares, carries, levels, caps)
+        owner, *values = zip(*experts, strict=True)
         factory = {"dtype": self.dtype, "device": self.device}
         self._experts = nn.Buffer(torch.tensor(values, **factory), persistent=False)
         members_of = torch.nn.functional.one_hot(torch.tensor(owner), len(members))
@@ -96,9 +95,8 @@ class MixtureResidual(ResidualLearner):
         self.offset = nn.Buffer(torch.zeros(wide[:-1], **factory))
         self.inflation = nn.Buffer(torch.ones(wide[:-1], **factory))
         self.count = nn.Buffer(torch.zeros(self.batch_shape, **factory))
-        self.tails = ScaleMixture(
-            self.out_features, memory=self.memory, batch_shape=tuple(self.batch_shape), **factory
-        )
+        fleet = {"batch_shape": self.batch_shape, **factory}
+        self.tails = ScaleMixture(self.out_features, memory=self.memory, **fleet)
         self._settle()
 
     # -- predictions ----------------------------------------------------------------------------
@@ -189,7 +187,8 @@ class MixtureResidual(ResidualLearner):
         for name, value in news.items():
             buffer = self.get_buffer(name)
             if mask is not None:
-                value = torch.where(_trailing(mask, value), value, buffer)
+                on = mask[(..., *(None,) * (value.dim() - mask.dim()))]
+                value = torch.where(on, value, buffer)
             buffer.copy_(value)
         nis = (z.square() / self.inflation).mean(-1)
         self.tails.observe(z, self.count, mask)
@@ -234,7 +233,3 @@ def _same_shapes(members: list[ResidualLearner]) -> ResidualLearner:
     if len(set(shapes)) > 1:
         raise ParameterError("learners", shapes, "of the same (in_features, out_features, batch_shape)")
     return members[0]
-
-
-def _trailing(mask: Tensor, like: Tensor) -> Tensor:
-    return mask[(..., *(None,) * (like.dim() - mask.dim()))]

@@ -83,24 +83,24 @@ class GPyTorchLearner(SingleLearner):
         self.inputs[place], self.targets[place] = x, y
         self._count += 1
         self._learn(place)
-        return self._report(nis)
+        return self._report(nis, mask)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Sample count, and the state dicts of what GPyTorch made."""
-        return {"count": self._count, "peer": [part.state_dict() for part in self._peer]}
+        return {"count": self._count, **{type(part).__name__: part.state_dict() for part in self._peer}}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self._count = int(state["count"])
         self._peer = self._build()
-        for part, values in zip(self._peer, copy.deepcopy(state["peer"]), strict=True):
-            part.load_state_dict(values)
+        for part in self._peer:
+            part.load_state_dict(copy.deepcopy(state[type(part).__name__]))
         self._settle()
 
     def _apply(self, fn, recurse=True):
         super()._apply(fn, recurse)
         for part in self._peer:
             if isinstance(part, nn.Module):
-                part._apply(fn, recurse)
+                part._apply(fn)
         self._settle()
         return self
 

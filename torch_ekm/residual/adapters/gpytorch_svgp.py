@@ -55,11 +55,8 @@ class GPyTorchSVGP(GPyTorchLearner):
         class Model(gpytorch.models.ApproximateGP):
             def __init__(self) -> None:
                 v = gpytorch.variational
-                q = v.CholeskyVariationalDistribution(
-                    len(points),
-                    torch.Size([m]),
-                    mean_init_std=0.0,  # default: a random mean of 1e-3
-                )
+                # by default the mean starts at random, of the order of 1e-3
+                q = v.CholeskyVariationalDistribution(len(points), torch.Size([m]), mean_init_std=0.0)
                 inner = v.VariationalStrategy(self, points, q, learn_inducing_locations=True)
                 super().__init__(v.IndependentMultitaskVariationalStrategy(inner, num_tasks=m))
                 self.mean_module = gpytorch.means.ZeroMean()

@@ -85,7 +85,7 @@ class RiverResidual(SingleLearner):
             model.learn_one(row, target)
         self.noise.lerp_(error, max(0.02, 1.0 / (self._count + 2)))
         self._count += 1
-        return self._report((error / self.noise).mean(-1))
+        return self._report((error / self.noise).mean(-1), mask)
 
     def get_extra_state(self) -> Tensor:
         """The pickled regressors."""

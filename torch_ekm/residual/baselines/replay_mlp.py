@@ -136,4 +136,4 @@ class ReplayMLP(SingleLearner):
             rate = self.rate * self.adam.correction(n * self.steps + step + 1)
             for i, (p, gradient) in enumerate(zip(self.theta, gradients, strict=True)):
                 self.adam.move(i, p, gradient, rate)
-        return self._report(nis)
+        return self._report(nis, mask)

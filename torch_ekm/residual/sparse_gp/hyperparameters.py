@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import nn
@@ -133,19 +133,18 @@ class LearnHyperparameters(Part):
     def descend(self, learner: Host) -> None:
         """Adam on the loss, model by model; a model without samples or finite gradient stays as it is."""
         kernel, log_noise = learner.kernel, learner.log_noise_variance
-        parameters = [*kernel.parameters(), log_noise]
-        names = [name for name, _ in kernel.named_parameters()] + ["log_noise"]
+        parameters = {**dict(kernel.named_parameters()), "log_noise": log_noise}
         for step in range(self.steps):
             queries = self.queries(learner)
             _, gradients = self.loss.with_gradients(kernel, log_noise, queries, moved=step > 0)
-            self._move(parameters, names, gradients)
+            self._move(parameters, gradients)
 
-    def _move(self, parameters: Sequence, names: Sequence[str], gradients: Sequence[Tensor | None]) -> None:
+    def _move(self, parameters: Mapping[str, Tensor], gradients: Sequence[Tensor | None]) -> None:
         on = (self.window_on.sum(-1) > 0).to(self.n_steps.dtype)
         self.n_steps += on
         n = self.n_steps.clamp_min(1.0)
         correction = self.adam.correction(n) * _shrink(n)
-        for i, (p, name, gradient) in enumerate(zip(parameters, names, gradients, strict=True)):
+        for i, ((name, p), gradient) in enumerate(zip(parameters.items(), gradients, strict=True)):
             if gradient is None:
                 continue
             logarithm = name.split(".")[-1].startswith("log_")

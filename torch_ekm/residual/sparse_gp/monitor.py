@@ -57,9 +57,7 @@ class CalibrateNoise(Part):
 
     def bind(self, learner: Host) -> None:
         """c = 1 for each output."""
-        like = learner.posterior.basis
-        fleet = learner.posterior.batch_shape
-        self.log_factor = nn.Buffer(like.new_zeros(*fleet, learner.out_features))
+        self.log_factor = nn.Buffer(torch.zeros_like(learner.log_noise_variance))
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """One innovation."""

@@ -41,10 +41,7 @@ class ReplayMemory(nn.Module):
         self._n_offered = self._n_taken = 0  # on the host, as the places are
 
     def offer(
-        self,
-        x: Float[Tensor, "*batch in"],
-        y: Float[Tensor, "*batch out"],
-        weight: Float[Tensor, "*batch"],
+        self, x: Float[Tensor, "*batch in"], y: Float[Tensor, "*batch out"], weight: Float[Tensor, "*batch"]
     ) -> None:
         """A sample per model with its weight in the update, 0 where there was none."""
         n = self._n_offered
