@@ -31,7 +31,7 @@ def grasp_kernel(n_s: int, n_a: int) -> ActionLinearKernel:
     """``g(s, w) = G(s) w`` of what the encoders did, w: one decision is one convex program.
 
     Each entry of G has a standard deviation of 0.3 mm or deg for 2 deg of an actuator, and is smooth over
-    6 cm and 1.8 rad of the state. The dead zone of the servos, which no such g can say, is the servo inverse's.
+    6 cm and 1.8 rad of the state. The servos' dead zone, which no such g can say, is the servo inverse's.
     """
     state = SquaredExponential(n_s, lengthscale=6.0)
     return ActionLinearKernel(n_s + n_a, n_a, state_kernel=state, action_variance=0.1)

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
-from ..exceptions import NonFiniteError, ParameterError, ShapeError
+from ..exceptions import ParameterError, ShapeError
+from ..residual.checks import check_finite
 from ..typing import Bool, Float, Tensor
 
 _DEG = math.pi / 180
@@ -42,20 +43,6 @@ class ServoModel(nn.Module):
     of Systems with Actuator and Sensor Nonlinearities (1996).
     """
 
-    estimate: Float[Tensor, "n_a 2"]
-    """theta = (d, b) [rad]."""
-    covariance: Float[Tensor, "n_a 2 2"]
-    """Of theta, in units of the noise's variance."""
-    weight: Float[Tensor, " n_a"]
-    squares: Float[Tensor, " n_a"]
-    before: Float[Tensor, "n_a 2"]
-    """theta before the first of the failures in succession."""
-    before_covariance: Float[Tensor, "n_a 2 2"]
-    surprises: Tensor
-    failures: Tensor
-    """Commands in succession that moved nothing."""
-    stuck: Bool[Tensor, " n_a"]
-
     def __init__(
         self,
         names: Sequence[str],
@@ -80,19 +67,15 @@ class ServoModel(nn.Module):
         self.forgetting = forgetting
         self._prior = torch.diag(torch.tensor(prior_std, dtype=torch.float64).square()) / noise_std**2
         n = len(self.names)
-        state = {
-            "estimate": torch.zeros(n, 2),
-            "covariance": self._prior.expand(n, 2, 2),
-            "weight": torch.full((n,), 10.0),
-            "squares": torch.full((n,), 10.0 * noise_std**2),
-            "before": torch.zeros(n, 2),
-            "before_covariance": self._prior.expand(n, 2, 2),
-        }
-        for name, value in state.items():
-            self.register_buffer(name, value.double().clone())
-        self.register_buffer("failures", torch.zeros(n, dtype=torch.long))
-        self.register_buffer("surprises", torch.zeros(n, dtype=torch.long))
-        self.register_buffer("stuck", torch.zeros(n, dtype=torch.bool))
+        self.estimate = nn.Buffer(torch.zeros(n, 2).double())  # theta = (d, b) [rad]
+        self.covariance = nn.Buffer(self._prior.repeat(n, 1, 1))  # of theta, in units of the noise's variance
+        self.weight = nn.Buffer(torch.full((n,), 10.0).double())
+        self.squares = nn.Buffer(self.weight * noise_std**2)
+        self.before = nn.Buffer(self.estimate.clone())  # theta before the first failure in succession
+        self.before_covariance = nn.Buffer(self.covariance.clone())
+        self.failures = nn.Buffer(torch.zeros(n).long())  # commands in succession that moved nothing
+        self.surprises = nn.Buffer(torch.zeros(n).long())
+        self.stuck = nn.Buffer(torch.zeros(n).bool())
 
     @property
     def dead_zone(self) -> Float[Tensor, " n_a"]:
@@ -139,8 +122,7 @@ class ServoModel(nn.Module):
         for name, value in (("command", command), ("moved", moved)):
             if value.shape != self.stuck.shape:
                 raise ShapeError(name, f"({len(self.names)},)", value.shape)
-            if not bool(torch.isfinite(value).all()):
-                raise NonFiniteError(name, torch.nonzero(~torch.isfinite(value))[:3].tolist())
+            check_finite(name, value)
         free = torch.ones_like(self.stuck) if free is None else free
         v, w = command.double(), moved.double()
         went = free & (w.abs() > self.moved_from)
