@@ -9,7 +9,7 @@ import numpy as np
 
 from ..._extras import require
 from ...description import HandDescription, ObjectDescription
-from ...exceptions import EquilibriumError
+from ...exceptions import EquilibriumError, ParameterError
 from ...typing import Array
 from ..config import PlantConfig
 from ..mechanism.assembly import make_transmission, true_object
@@ -18,6 +18,7 @@ from .pinch_problem import PinchProblem, PinchRequest
 
 _FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
 _GUESSES = 4  # first guesses that are tried before giving up
+_STIFF_STEP = 0.002  # [s]; at 4 ms a hand with rigid actuators moves by 7 to 55 % another way
 _GOOD_COST = 20.0  # half a sum of squares; the wishes of a good pinch cost about 0.3
 
 
@@ -121,6 +122,9 @@ def pinch_problem(
         chosen = tuple(name for name in names if name.startswith(("index", "middle")))
         fingers = chosen or tuple(name for name in names if name != thumb)[:1]
     transmission = make_transmission(hand, parameters)
+    if transmission.stiff and config.time_step > _STIFF_STEP:
+        valid = f"at most {_STIFF_STEP} s: '{hand.name}' has rigid or very stiff actuators"
+        raise ParameterError("time_step", config.time_step, valid)
     along = turning_axis(hand, config)
     return PinchProblem(hand, true_object(obj, parameters), transmission, thumb, fingers, along)
 
