@@ -63,7 +63,7 @@ def test_manipulation_jacobian_is_what_the_simulator_does(grasp):
 
 
 def motion_error(plant, linear, actuators) -> float:
-    """``|measured - predicted| / |predicted|`` of the object's motion per increment, rotations times 30 mm."""
+    """``|measured - predicted| / |predicted|`` of the object's motion per increment, rotations x 30 mm."""
     snapshot, measured = plant.snapshot(), []
     for k in actuators:
         ends = []
@@ -107,7 +107,7 @@ def test_rigid_actuators_are_as_stiff_whatever_their_gear_and_need_small_steps()
         true = SimulatedHand(one, "box").true_descriptions()[0]
         at_joints.append(true.actuators[0].stiffness * np.square(true.actuation_jacobian[0]).max())
     assert at_joints == pytest.approx([100.0, 100.0])
-    with pytest.raises(ParameterError, match="time_step.*rigid"):
+    with pytest.raises(ParameterError, match=r"time_step.*rigid"):
         SimulatedHand(hand, "box", PlantConfig(time_step=0.004))
 
 

@@ -10,7 +10,7 @@ from ...typing import Array
 
 _COUPLING_STIFFNESS = 8.0  # k_c [N m/rad]
 _BRISTLE_STIFFNESS = 3.0  # k_f [N m/rad]
-_STIFF = 20.0  # [N m/rad] at a joint; what acts one step late damps the soft directions up to here only little
+_STIFF = 20.0  # [N m/rad] at a joint; up to here the late part damps little
 
 
 class Transmission:
