@@ -15,6 +15,7 @@ from ..config import PlantConfig
 from ..mechanism.assembly import make_transmission, true_object
 from ..parameters import PlantParameters
 from .pinch_problem import PinchProblem, PinchRequest
+from .requirements import require_two_pads_and_limits, unmet
 
 _FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
 _GUESSES = 4  # first guesses that are tried before giving up
@@ -72,7 +73,8 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
         raise EquilibriumError(
             "pinch planner",
             f"the best posture violates equilibrium by {violation:.2g} times its tolerance",
-            f"the object '{problem.obj.name}' may be too wide, or out of reach, for a force of "
+            pinch_hint(problem)
+            or f"the object '{problem.obj.name}' may be too wide, or out of reach, for a force of "
             f"{request.force} N at along = {request.along} m",
         )
     g = problem.geometry(best[None])
@@ -80,7 +82,8 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
         raise EquilibriumError(
             "pinch planner",
             "the only pinch found holds the object across another axis than its 'grasp_axis'",
-            f"'{problem.obj.name}' may be too wide along {problem.obj.grasp_axis.round(3).tolist()} "
+            pinch_hint(problem)
+            or f"'{problem.obj.name}' may be too wide along {problem.obj.grasp_axis.round(3).tolist()} "
             "for this hand: name the axis along which it is thin",
         )
     return PinchPlan(
@@ -94,6 +97,11 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
         pads=tuple(pad.name for pad in problem.pads),
         residual=violation,
     )
+
+
+def pinch_hint(problem: PinchProblem) -> str:
+    """What the hand lacks for any pinch; empty if nothing is known."""
+    return "; ".join(map(str, unmet(problem)))
 
 
 def _guesses(problem: PinchProblem, request: PinchRequest) -> Iterator[Array]:
@@ -114,7 +122,13 @@ def _guesses(problem: PinchProblem, request: PinchRequest) -> Iterator[Array]:
 def pinch_problem(
     hand: HandDescription, obj: ObjectDescription, config: PlantConfig, parameters: PlantParameters
 ) -> PinchProblem:
-    """The problem for the plant as it is: what closes the hand is not what is studied here."""
+    """The problem for the plant as it is: what closes the hand is not what is studied here.
+
+    Raises:
+        DescriptionError: fewer than two pads, or a joint that moves one has no limits.
+        ParameterError: a time step that rigid actuators do not bear.
+    """
+    require_two_pads_and_limits(hand)
     names = [pad.name for pad in hand.pads]
     thumb = config.thumb or next((name for name in names if name.startswith("thumb")), names[0])
     fingers = config.fingers
