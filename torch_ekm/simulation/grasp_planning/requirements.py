@@ -16,9 +16,7 @@ from .pinch_problem import PinchProblem
 
 _FACING = 0.3  # least cosine between a pad's direction and where it is to press; the planner wishes the same
 _SAMPLES = 2048
-_WIDEST = (
-    np.pi
-)  # [rad]; the planner starts from parts of each joint's range, as if it ran from open to closed
+_WIDEST = np.pi  # [rad]; the planner starts from parts of each range, as if it ran from open to closed
 _WIDER = np.pi / 2  # [rad] by which limits are moved to see which one is in the way
 
 
