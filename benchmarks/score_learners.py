@@ -18,6 +18,7 @@ from stream_scores import load_split, score_objects, score_split
 
 from torch_ekm.experiments.learner_comparison.recordings import load_t42
 from torch_ekm.experiments.learner_comparison.stream import Stream
+from torch_ekm.experiments.learners import LEARNERS, Factory
 from torch_ekm.residual import (
     CalibrateNoise,
     LearnHyperparameters,

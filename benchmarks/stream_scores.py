@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -83,9 +82,9 @@ class Split(NamedTuple):
     y_test: Tensor
 
 
-def load_split(name: str, seed: int, root: str | Path | None = None, limit: int = 8000) -> Split:
+def load_split(name: str, seed: int, limit: int = 8000) -> Split:
     """A regression set shuffled by ``seed``, cut to ``limit``, a tenth held out."""
-    x, y = load_regression(name, root)
+    x, y = load_regression(name)
     order = np.random.default_rng(seed).permutation(len(x))[:limit]
     test, train = order[: len(order) // 10], order[len(order) // 10 :]
 

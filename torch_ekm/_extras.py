@@ -7,33 +7,15 @@ from types import ModuleType
 
 from .exceptions import MissingExtraError
 
-_EXTRA_OF = {
-    "pytorch_kinematics": "robot",
-    "yourdfpy": "robot",
-    "trimesh": "robot",
-    "coal": "robot",
-    "qpsolvers": "robot",
-    "clarabel": "robot",
-    "scipy": "robot",
-    "sapien": "sim",
-    "cv2": "sim",
-    "gymnasium": "sim",
-    "h5py": "sim",
-    "joblib": "experiments",
-    "matplotlib": "experiments",
-    "mpl_toolkits": "experiments",
-    "jinja2": "experiments",
-    "pyvista": "experiments",
-    "viser": "experiments",
-    "typer": "experiments",
-    "rich": "experiments",
-    "IPython": "notebooks",
-    "pyarrow": "notebooks",
-    "gpytorch": "peers",
-    "river": "peers",
-    "distributed": "cluster",
-    "ray": "cluster",
+_BRINGS = {
+    "robot": ("pytorch_kinematics", "yourdfpy", "trimesh", "coal", "qpsolvers", "clarabel", "scipy"),
+    "sim": ("sapien", "cv2", "gymnasium", "h5py"),
+    "experiments": ("joblib", "matplotlib", "mpl_toolkits", "jinja2", "pyvista", "viser", "typer", "rich"),
+    "notebooks": ("IPython", "pyarrow"),
+    "peers": ("gpytorch", "river"),
+    "cluster": ("distributed",),
 }
+_EXTRA_OF = {module: extra for extra, modules in _BRINGS.items() for module in modules}
 
 
 def require(module: str) -> ModuleType:

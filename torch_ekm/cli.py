@@ -26,6 +26,7 @@ from typer import Argument, Option
 
 if TYPE_CHECKING:
     from .experiments.reporting.report import Report
+    from .experiments.reproduce import Experiment
     from .experiments.viewer.serve import Show
 
 app = typer.Typer(
@@ -112,14 +113,10 @@ def demo(
     from .experiments.config import Setting
     from .experiments.protocols.demo import Demo
     from .experiments.reproduce import Experiment
-    from .experiments.reproduce import reproduce as run
 
-    protocol, chosen = Demo(Setting(hand=hand), object), parse_seeds(seeds)
+    protocol, chosen = Demo(Setting(hand=hand), (object,)), parse_seeds(seeds)
     planned = Experiment(protocol.quick(), chosen[:2]) if quick else Experiment(protocol, chosen)
-    with _progress("manipulating", len(planned.jobs)) as advance:
-        report = run(planned, out, jobs, advance)
-    _print_report(report, out)
-    for figure in report.figures:
+    for figure in _run("manipulating", planned, out, jobs).figures:
         console.print(f"           {(out / figure.path).resolve()}", soft_wrap=True)
 
 
@@ -145,7 +142,7 @@ def reproduce(
         Option(help="Largest turn of one motion [deg]; 2.5 if left out (less where a contact goes 1.2 mm)."),
     ] = None,
     address: Annotated[
-        str | None, Option(help="A cluster instead of processes here: dask://HOST:PORT or ray://HOST:PORT.")
+        str | None, Option(help="A Dask cluster instead of processes here: dask://HOST:PORT.")
     ] = None,
 ) -> None:
     """Repeat the paper's experiments, and more, with every controller on the same seeds and grasps.
@@ -154,7 +151,6 @@ def reproduce(
     """
     from .experiments.config import Setting
     from .experiments.reproduce import plan
-    from .experiments.reproduce import reproduce as run
 
     control = {} if step is None else {"LimitingFunction.step": math.radians(step)}
     setting = Setting(hand=hand, preset=preset, learner=learner, sensing=sensing, control=control)
@@ -162,10 +158,7 @@ def reproduce(
     planned = plan(
         experiment, parse_seeds(seeds), setting=setting, objects=objects, angles_deg=turns, quick=quick
     )
-    folder = out if out is not None else Path(f"reproduce_{experiment}")
-    with _progress(experiment, len(planned.jobs)) as advance:
-        report = run(planned, folder, jobs, advance, address)
-    _print_report(report, folder)
+    _run(experiment, planned, out or Path(f"reproduce_{experiment}"), jobs, address)
 
 
 @app.command()
@@ -187,9 +180,9 @@ def compare(
     santafe (steven2358/kafbox).
     """
     from .experiments import compare as run
-    from .experiments.learner_comparison.learners import DEFAULT
+    from .experiments.learners import COMPARED
 
-    chosen = _names(learners) or DEFAULT
+    chosen = _names(learners) or COMPARED
     with _progress("comparing", len(data) * len(chosen)) as advance:
         compared = run(
             data,
@@ -289,6 +282,15 @@ def version() -> None:
         console.print(f"{package} {number}", highlight=False)
 
 
+def _run(what: str, planned: Experiment, folder: Path, jobs: int, address: str | None = None) -> Report:
+    from .experiments.reproduce import reproduce as run
+
+    with _progress(what, len(planned.jobs)) as advance:
+        report = run(planned, folder, jobs, advance, address)
+    _print_report(report, folder)
+    return report
+
+
 def _look(show: Show, html: Path | None, port: int) -> None:
     """Write a page, or serve until Ctrl-C."""
     from .experiments.viewer.serve import save_page, serve
@@ -309,14 +311,10 @@ def _progress(what: str, total: int) -> Iterator[Callable[[object], None]]:
 
 
 def _print_report(report: Report, folder: Path, notes: bool = False) -> None:
-    _print_tables(report, notes)
-    console.print(report.summary)
-    console.print(f"Report:    {(folder / 'index.html').resolve()}", soft_wrap=True)
-
-
-def _print_tables(report: Report, notes: bool = False) -> None:
     for table in report.tables:
         _print_table(table.header, table.text(), table.caption, table.note if notes else None)
+    console.print(report.summary)
+    console.print(f"Report:    {(folder / 'index.html').resolve()}", soft_wrap=True)
 
 
 def _print_table(
@@ -327,22 +325,19 @@ def _print_table(
         table.add_row(*map(str, row))
     for column in table.columns:
         column.overflow = "fold"  # figures are never cut short
-    if console.is_terminal:
-        console.print(table)
-    else:  # a file or a pipe has no width of its own
-        width = Console(width=1000, markup=False).measure(table).maximum
-        Console(width=width, markup=False).print(table)
+    # a file or a pipe has no width of its own
+    (console if console.is_terminal else Console(width=1000, markup=False)).print(table)
 
 
 def _numbers(name: str, text: str) -> tuple[float, ...]:
     try:
-        return tuple(float(part) for part in text.split(",") if part.strip())
+        return tuple(map(float, _names(text)))
     except ValueError:
         raise ParameterError(name, text, "numbers separated by commas, e.g. 10,20") from None
 
 
 def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+    return tuple(filter(None, map(str.strip, text.split(","))))
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
-from torch_ekm.cli import _print_tables, app
+from torch_ekm.cli import _print_report, app
 from torch_ekm.experiments.reporting.report import Report, Table
 
 COMMANDS = typer.main.get_command(app).commands
@@ -40,7 +41,7 @@ def test_units_of_a_table_are_printed(capsys: pytest.CaptureFixture[str]) -> Non
     table = Table(
         "errors", "Errors [deg]", ["case", "KM [deg]"], [["box", "0.5 [0.4, 0.6]"]], "per turn [deg]"
     )
-    _print_tables(Report(title="", summary="", tables=[table], figures=[], configuration={}), notes=True)
+    _print_report(Report("", "", [table]), Path(), notes=True)
     printed = capsys.readouterr().out
     for text in ("Errors [deg]", "KM [deg]", "0.5 [0.4, 0.6]", "per turn [deg]"):
         assert text in printed

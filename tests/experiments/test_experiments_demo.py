@@ -81,7 +81,7 @@ def test_report_is_complete_and_says_how_it_was_made(report: Report, folder: Pat
     assert "Development seeds" in page  # seeds below 1000 are not for claims
     configuration = json.loads((folder / "configuration.json").read_text())
     assert configuration["seeds"] == [0, 1]
-    assert configuration["experiment"]["object"] == "box"
+    assert configuration["experiment"]["objects"] == ["box"]
     assert configuration["versions"]["torch"]
     by_angle = next(table for table in report.tables if table.name == "by_angle")
     assert [row[0] for row in by_angle.rows] == [9.0, 14.0]
@@ -102,7 +102,7 @@ def test_same_seed_same_run_and_resume(records: list[TrialRecord], folder: Path)
 
 def test_the_demo_is_a_preset_of_generalize(records: list[TrialRecord]) -> None:
     """The same grasps, hardware and options: the first turn of an E-KM that had no warm-up."""
-    generalize = dataclasses.replace(EXPERIMENT.protocol.turns, poses=False, angles_deg=(9.0,))
+    generalize = dataclasses.replace(EXPERIMENT.protocol, poses=False, angles_deg=(9.0,))
     (turn,) = generalize.session("box", "E-KM", 1)
     ours = next(r for r in records if (r.controller, r.seed, r.trial) == ("E-KM", 1, 0))
     assert isinstance(turn, TrialRecord)
@@ -123,7 +123,7 @@ def test_results_are_named_by_the_model_that_is_run(monkeypatch: pytest.MonkeyPa
 
 def test_wrong_names_list_the_right_ones() -> None:
     with pytest.raises(UnknownNameError, match="weighted_box"):
-        Demo(object="spoon")
+        Demo(objects=("spoon",))
     with pytest.raises(UnknownNameError, match="icub_left"):
         Demo(Setting(hand="icub"))
     with pytest.raises(ParameterError, match="angles_deg"):
@@ -133,7 +133,7 @@ def test_wrong_names_list_the_right_ones() -> None:
 
 
 def test_small_version() -> None:
-    assert Demo(object="can").quick().angles_deg == (9, 13)
+    assert Demo(objects=("can",)).quick().angles_deg == (9, 13)
     assert np.all(np.array(Demo().quick().angles_deg) == (9, 14))
 
 

@@ -195,18 +195,6 @@ def test_worker_with_threads_runs_one_job_at_a_time(dask_address: str, tmp_path:
     assert {result["most"] for result in results.values()} == {1}
 
 
-@pytest.mark.slow
-def test_ray_cluster(tmp_path: Path) -> None:
-    ray = pytest.importorskip("ray")
-    # "local": its own cluster, whatever another one has left behind on this machine
-    ray.init("local", num_cpus=1, include_dashboard=False, log_to_driver=False)
-    try:
-        check_cluster("ray://auto", tmp_path)
-        assert ray.is_initialized()  # who found it running leaves it running
-    finally:
-        ray.shutdown()
-
-
 @pytest.mark.parametrize("address", ["host:8786", "slurm://host", "dask://", "ray:/host"])
 def test_wrong_addresses_say_what_would_be_right(address: str, tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match="dask://HOST:PORT"):

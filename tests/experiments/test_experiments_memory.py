@@ -88,11 +88,13 @@ def test_memory_passes_its_signature_on_and_answers_for_its_leader() -> None:
 def test_memories_speak_with_the_bank() -> None:
     from torch_ekm.object_memory import ModelBank
 
-    bank = ModelBank(lambda: make_learner("action-linear", 3, 2, 10), 2)
-    memories = Memories(bank)
-    memories.begin("box")
+    bank, memories = (
+        kind(lambda: make_learner("action-linear", 3, 2, 10), 2) for kind in (ModelBank, Memories)
+    )
+    bank.begin()
+    memories.grasp("box")
     x, y = torch.ones(5, dtype=torch.float64), torch.ones(6, dtype=torch.float64)
-    memories.update(x, y)
-    assert memories.working is bank.working
+    for one in (bank, memories):
+        one.update(x, y)
     assert torch.equal(memories(x), bank(x))
     assert set(memories.errors) == set(NAMES)

@@ -179,8 +179,6 @@ def test_paired_test_finds_a_known_difference() -> None:
     theirs = rng.normal(2.0, 0.5, 200)
     result = paired_test(theirs - 1.0 + rng.normal(0, 0.1, 200), theirs)
     assert result is not None
-    assert result.low < -1.0 < result.high
-    assert result.high - result.low < 0.05  # +- 1.96 * 0.1 / sqrt(200)
     assert result.paired_p < result.welch_p < 1e-10
     assert result.effect_size == pytest.approx(-10, rel=0.2)
 
@@ -191,7 +189,7 @@ def test_equal_samples_are_not_significant_and_one_unit_is_no_sample() -> None:
     assert same is not None
     assert same.paired_p == 1.0
     assert shifted is not None
-    assert (shifted.paired_p, shifted.difference) == (0.0, 1.0)
+    assert shifted.paired_p == 0.0
     assert paired_test(np.ones(1), np.ones(1)) is None
 
 

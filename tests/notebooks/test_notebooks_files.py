@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 from torch_ekm.cli import app
 from torch_ekm.exceptions import DescriptionError
 from torch_ekm.experiments.reporting.notebook import (
-    TableView,
     copy_notebooks,
     notebook_folder,
     smoke_mode,
@@ -75,7 +74,7 @@ def test_smoke_mode_is_switched_on_by_the_environment(monkeypatch: pytest.Monkey
 
 
 def test_tables_are_escaped() -> None:
-    page = TableView(Table("a", "x < y", ["<b>"], [["1 & 2"]]))._repr_html_()
+    page = Table("a", "x < y", ["<b>"], [["1 & 2"]])._repr_html_()
     assert "x &lt; y" in page
     assert "&lt;b&gt;" in page
     assert "1 &amp; 2" in page

@@ -24,7 +24,6 @@ from torch_ekm.residual import (
     SquaredExponential,
     Standardize,
 )
-from torch_ekm.residual.sparse_gp.posterior import basis_gram
 from torch_ekm.residual.sparse_gp.prequential_loss import Queries
 from torch_ekm.residual.sparse_gp.replay import ReplayMemory
 
@@ -54,7 +53,7 @@ def loss_by_dense_algebra(gp: SparseOnlineGP, queries: Queries, robust: float | 
     s2 = log_noise.mean(-1).exp()[..., None, None]
     loss = learning_of(gp).loss
     old = loss.state
-    K = basis_gram(kernel, old.basis, old.active, gp.posterior.jitter)
+    K = old.gram(kernel)
     k = kernel(old.basis, queries.x) * old.active.unsqueeze(-1)
     W, h = old.precision / s2, old.information / s2
     eye = torch.eye(K.shape[-1], dtype=K.dtype)

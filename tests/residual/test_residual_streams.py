@@ -82,14 +82,15 @@ def test_a_held_out_part_tells_learners_apart():
     assert score_split(RecursiveLeastSquares, split).rmse < 0.05 < score_split(ZeroResidual, split).rmse
 
 
-def test_a_regression_set_is_split_and_standardized(tmp_path):
+def test_a_regression_set_is_split_and_standardized(tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_EKM_DATA", str(tmp_path))
     (tmp_path / "uci").mkdir()
     values = np.random.default_rng(0).normal(3.0, 5.0, size=(400, 5))
     np.savetxt(tmp_path / "uci" / "power-plant.csv", values, delimiter=",", header="a,b,c,d,y", comments="")
-    split = load_split("powerplant", 0, tmp_path, limit=300)
+    split = load_split("powerplant", 0, limit=300)
     assert (split.x.shape, split.y.shape, split.x_test.shape) == ((270, 4), (270, 1), (30, 4))
     torch.testing.assert_close(split.y.var(0, correction=0), torch.ones(1, dtype=torch.float64))
-    assert not torch.equal(split.x[:5], load_split("powerplant", 1, tmp_path, limit=300).x[:5])
+    assert not torch.equal(split.x[:5], load_split("powerplant", 1, limit=300).x[:5])
 
 
 @needs_data

@@ -56,7 +56,6 @@ class Manipulation:
 
     @property
     def reason(self) -> StopReason:
-        """Why it ended."""
         return self.stop.reason
 
     @property
@@ -107,8 +106,7 @@ class ClosedLoop:
             try:
                 steps.append(next(motions))
             except StopIteration as end:
-                stop: Stop = end.value
-                return Manipulation(target, self.controller.focus, tuple(steps), stop)
+                return Manipulation(target, self.controller.focus, tuple(steps), end.value)
             if on_step is not None:
                 on_step(steps[-1])
 

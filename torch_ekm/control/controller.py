@@ -10,8 +10,9 @@ import numpy as np
 import torch
 
 from ..enhanced import EnhancedModel
-from ..exceptions import GraspError, NoContactError, NonFiniteError, ShapeError
+from ..exceptions import GraspError, NoContactError, ShapeError
 from ..kinematics import GraspState
+from ..residual.checks import check_finite
 from ..typing import Float, Tensor
 from .focus import FocusedPose, PoseTarget
 from .limiting import LimitingFunction, contact_travel
@@ -184,6 +185,4 @@ class LookAndMoveController:
 def _check(name: str, value: Tensor, size: int) -> None:
     if tuple(value.shape) != (size,):
         raise ShapeError(name, f"({size},)", value.shape)
-    finite = torch.isfinite(value)
-    if not bool(finite.all()):
-        raise NonFiniteError(name, torch.nonzero(~finite)[:3].tolist())
+    check_finite(name, value)

@@ -30,18 +30,6 @@ class Shape:
     transform: NDArray[np.float64]
     """Pose of the shape in the frame of its link or object, ``(4, 4)``."""
 
-    @property
-    def volume(self) -> float:
-        """[m^3]"""
-        if self.kind == "box":
-            return float(np.prod(self.size))
-        radius = self.size[0]
-        ball = 4 / 3 * np.pi * radius**3
-        if self.kind == "sphere":
-            return float(ball)
-        rod = np.pi * radius**2 * self.size[1]
-        return float(rod if self.kind == "cylinder" else rod + ball)
-
     def scaled(self, factor: float) -> Shape:
         """The shape with all lengths, its distance from the origin included, times ``factor``."""
         transform = self.transform.copy()

@@ -64,14 +64,13 @@ def _by_differentiation(learner: ResidualLearner, x: Tensor, n_a: int, weight: T
         if slope is None:
             name = type(learner).__name__
             raise ParameterError("learner", name, "one whose variance depends on the action, differentiably")
-        H = torch.stack([_derivative(entry, a) for entry in slope])
+        rows = [
+            torch.autograd.grad(d, a, retain_graph=True, materialize_grads=True)[0]
+            if d.requires_grad
+            else torch.zeros_like(a)
+            for d in slope
+        ]
+        H = torch.stack(rows).detach()
     value, vectors = torch.linalg.eigh(((H + H.mT) / 2).nan_to_num())
     H = (vectors * value.clamp_min(0.0)) @ vectors.mT
     return Quadratic(v.detach(), slope.detach().nan_to_num(), H)
-
-
-def _derivative(value: Tensor, a: Tensor) -> Tensor:
-    if not value.requires_grad:
-        return torch.zeros_like(a)
-    slope = torch.autograd.grad(value, a, retain_graph=True, allow_unused=True)[0]
-    return torch.zeros_like(a) if slope is None else slope

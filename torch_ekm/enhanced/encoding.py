@@ -2,29 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
 import torch
 
-from ..exceptions import ParameterError, UnknownNameError
+from ..exceptions import UnknownNameError
 from ..kinematics.grasp_state import GraspState
+from ..residual.checks import check_positive
 from ..typing import Float, Tensor
 
-
-class GraspModel(Protocol):
-    """What an encoding asks of a kinematic model."""
-
-    hand: Any
-    link_names: tuple[str, ...]
-    kinematics: Any
-
-    def contacts(self, state: GraspState) -> Any:
-        """Contacts at a state, with the name of each contact's ``link``."""
-        ...
-
-    def __call__(self, state: GraspState, delta_a: Tensor) -> Tensor:
-        """f(s, da)."""
-        ...
+if TYPE_CHECKING:
+    from ..model import KinematicModel
 
 
 class GraspEncoding:
@@ -49,22 +37,17 @@ class GraspEncoding:
         position_scale: float = 0.01,
         rotation_scale: float = 0.3,
     ) -> None:
-        for name, value in (
-            ("q_scale", q_scale),
-            ("position_scale", position_scale),
-            ("rotation_scale", rotation_scale),
-        ):
-            if not value > 0:
-                raise ParameterError(name, value, "a positive length or angle")
         n_q = reference.q.shape[-1]
         for joint in joints:
             if not 0 <= joint < n_q:
                 raise UnknownNameError("joint index", str(joint), [f"0..{n_q - 1}"])
         self.reference, self.joints = reference, joints
-        self.q_scale, self.position_scale, self.rotation_scale = q_scale, position_scale, rotation_scale
+        self.q_scale = check_positive("q_scale", q_scale)
+        self.position_scale = check_positive("position_scale", position_scale)
+        self.rotation_scale = check_positive("rotation_scale", rotation_scale)
 
     @classmethod
-    def of(cls, model: GraspModel, state: GraspState) -> GraspEncoding:
+    def of(cls, model: KinematicModel, state: GraspState) -> GraspEncoding:
         """About ``state``, with the joints that can move a finger which touches the object.
 
         Raises:
@@ -73,7 +56,7 @@ class GraspEncoding:
         hand = model.hand
         moved = torch.zeros(hand.n_q, dtype=torch.bool)
         for link in model.contacts(state).link:
-            moved |= model.kinematics.upstream[model.link_names.index(link)]
+            moved |= model.kinematics.upstream[model.link_names.index(link)]  # type: ignore[index]
         free = torch.from_numpy(hand.joint_upper > hand.joint_lower)
         return cls(state, torch.nonzero(moved & free).flatten().tolist())
 

@@ -4,28 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
 from torch.func import jacrev
 
-from ..exceptions import NonFiniteError, ShapeError
+from ..exceptions import ShapeError
 from ..kinematics import GraspState
 from ..residual.base import ResidualLearner, UpdateReport
+from ..residual.checks import check_finite
 from ..typing import Float, Tensor
 from .action_variance import Quadratic, action_variance
-from .encoding import GraspEncoding, GraspModel
+from .encoding import GraspEncoding
 from .grasp_learner import grasp_learner
 
-
-@runtime_checkable
-class LinearizableModel(Protocol):
-    """A model that knows its own derivative with respect to the action."""
-
-    def linearize(self, state: Any) -> Any:
-        """Return an object with ``manipulation_jacobian`` ``(n_out, n_action)``."""
-        ...
+if TYPE_CHECKING:
+    from ..model import KinematicModel
 
 
 class EnhancedModel(nn.Module):
@@ -37,7 +32,7 @@ class EnhancedModel(nn.Module):
 
     Args:
         model: any callable ``f(state, action) -> increment``. If it has ``linearize(state)``
-            with a ``manipulation_jacobian`` J_m, then ``f = J_m da`` and J_m is used
+            with a ``manipulation_jacobian`` J_m ``(n_s, n_a)``, then ``f = J_m da`` and J_m is used
             instead of automatic differentiation.
         learner: a residual learner (see :mod:`torch_ekm.residual`) with
             ``in_features = dim(encode(s)) + dim(a)``.
@@ -50,8 +45,6 @@ class EnhancedModel(nn.Module):
     The training increment is the one *commanded relative to the encoder*: the measured one
     hides the dead zone, which is much of what there is to learn.
     """
-
-    output_scale: Tensor
 
     def __init__(
         self,
@@ -66,15 +59,15 @@ class EnhancedModel(nn.Module):
         super().__init__()
         self.model: Any = model  # a Module is registered, any other callable is kept as it is
         self.learner: ResidualLearner = learner
-        self.encode: Callable[[Any], Tensor] = encode if encode is not None else _identity
+        self.encode: Callable[[Any], Tensor] = nn.Identity() if encode is None else encode
         self.outputs = outputs
         self.action_scale = action_scale
-        self.register_buffer("output_scale", torch.as_tensor(output_scale))
+        self.output_scale = nn.Buffer(torch.as_tensor(output_scale))
 
     @classmethod
     def for_grasp(
         cls,
-        model: GraspModel,
+        model: KinematicModel,
         state: GraspState,
         learner: ResidualLearner | Callable[[int, int], ResidualLearner] | None = None,
         encode: GraspEncoding | None = None,
@@ -142,9 +135,7 @@ class EnhancedModel(nn.Module):
                 "increment", f"{tuple(predicted.shape)}, that of the prediction", increment.shape
             )
         for name, value in (("action", action), ("increment", increment), ("prediction", predicted)):
-            finite = torch.isfinite(value)
-            if not bool(finite.all()):
-                raise NonFiniteError(name, torch.nonzero(~finite)[:3].tolist())
+            check_finite(name, value)
         residual = self._gather(increment - predicted) * self.output_scale
         return self.learner.update(self.features(state, action), residual)
 
@@ -162,7 +153,7 @@ class EnhancedModel(nn.Module):
             encoded: ``encode(state)`` if it is known already.
         """
         J = nominal_jacobian
-        if J is None and isinstance(self.model, LinearizableModel):
+        if J is None and hasattr(self.model, "linearize"):
             J = self.model.linearize(state).manipulation_jacobian
         if J is not None:
             nominal = J @ action
@@ -214,7 +205,3 @@ class EnhancedModel(nn.Module):
         out = torch.zeros_like(like)
         index = torch.tensor(self.outputs, device=like.device)
         return out.index_copy(-1, index, values.to(like.dtype))
-
-
-def _identity(state: Tensor) -> Tensor:
-    return state

@@ -136,15 +136,14 @@ class Setting:
 
     def figures(self) -> dict[str, Any]:
         """All figures of plant, model, controller, stopping rule and learner, defaults included."""
-        parts = {
-            "plant": self.parameters(),
-            "plant_config": self.plant_config("KM"),
-            "model": self.model_options(),
-            "stopping_rule": self.stopping_rule(),
+        return {
+            "plant": dataclasses.asdict(self.parameters()),
+            "plant_config": dataclasses.asdict(self.plant_config("KM")),
+            "model": dataclasses.asdict(self.model_options()),
+            "stopping_rule": dataclasses.asdict(self.stopping_rule()),
+            "controller": {name: repr(parts) for name, parts in self.controller_parts().items()},
+            "learner": learner_figures(self.learner, self.capacity, **self.learner_options),
         }
-        figures: dict[str, Any] = {name: dataclasses.asdict(part) for name, part in parts.items()}
-        figures["controller"] = {name: repr(parts) for name, parts in self.controller_parts().items()}
-        return {**figures, "learner": learner_figures(self.learner, self.capacity, **self.learner_options)}
 
     def replace(self, **changes: Any) -> Setting:
         """A copy with some figures changed."""
@@ -154,14 +153,9 @@ class Setting:
 def digest(setting: Setting, objects: Iterable[str | Path], *more: Any) -> str:
     """Ten letters that change with any figure of an experiment: results are kept under them.
 
-    The defaults of the classes that the setting changes count, too, and what is in the files of the
-    hand and the objects: neither a version of the package with other defaults nor an
-    object that was corrected takes up old results.
-
-    Args:
-        setting: of the experiment.
-        objects: names or paths of those that take part.
-        more: configurations and figures that decide the results as well.
+    The defaults of the classes that the setting changes count, too, and what is in the files of the hand and
+    the objects (names or paths): neither a version of the package with other defaults nor an object that was
+    corrected takes up old results. ``more`` decides the results as well.
     """
     files = [*hand_paths(setting.hand), *(path for item in objects for path in object_paths(item))]
     contents = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
@@ -170,13 +164,13 @@ def digest(setting: Setting, objects: Iterable[str | Path], *more: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 
+def _plain(item: Any) -> Any:
+    return vars(item) if dataclasses.is_dataclass(item) else str(item)
+
+
 def object_name(object: str) -> str:
     """Short name of an object given by name or path."""
     return Path(object).stem if object.endswith(".urdf") else object
-
-
-def _plain(item: Any) -> Any:
-    return vars(item) if dataclasses.is_dataclass(item) else str(item)
 
 
 def _changed(options: Any, name: str, changes: Mapping[str, Any]) -> Any:

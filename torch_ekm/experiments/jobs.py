@@ -2,7 +2,7 @@
 
 Processes are joblib's (loky): fresh ones, since a forked copy of PhysX or of a thread pool is not safe to
 use, and they take lambdas and classes of a notebook. A cluster is asked directly, because joblib's Dask
-backend waits for ever when a worker dies, and Ray's gives no result before the last job is done.
+backend waits for ever when a worker dies.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ from __future__ import annotations
 import json
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from .._extras import require
 from ..exceptions import ParameterError
 
 Jobs = Mapping[str, tuple[Any, ...]]
-Outcomes = Iterator[tuple[str, Any]]
+Outcomes = Generator[tuple[str, Any], None, None]
 
 _PATIENCE = 10.0  # [s] for a scheduler to answer
 _one_at_a_time = threading.Lock()
@@ -41,17 +42,15 @@ def run_jobs(
 
     Args:
         function: with results that JSON can hold; on a cluster, importable there.
-        jobs: name -> arguments.
         processes: 1 runs in this process. PhysX steps hold the interpreter's lock: threads do not help.
         on_done: called with the name of each job that is done, those of an earlier run first.
-        address: of a cluster that does the work instead of processes here: ``dask://HOST:PORT`` of a
-            scheduler, ``ray://HOST:PORT`` of a head's client server, or ``ray://auto`` on a machine of the
-            Ray cluster. torch_ekm must be installed on its workers, with the same versions, and files that
-            the arguments name must be found there under the same paths.
+        address: ``dask://HOST:PORT`` of a scheduler whose cluster does the work instead of processes here.
+            torch_ekm must be installed on its workers, with the same versions, and files that the arguments
+            name must be found there under the same paths.
 
     Raises:
-        ParameterError: ``address`` is none of these, or nobody answers there.
-        MissingExtraError: joblib, or the cluster's package, is not installed.
+        ParameterError: ``address`` is no such address, or nobody answers there.
+        MissingExtraError: joblib, or distributed, is not installed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     tell = on_done or (lambda name: None)
@@ -59,24 +58,16 @@ def run_jobs(
     for name in results:
         tell(name)
     waiting = {name: arguments for name, arguments in jobs.items() if name not in results}
-    with closing(_outcomes(function, waiting, processes, address)) as outcomes:
+    # either gives (name, result) in the order in which the jobs end
+    run = partial(_in_processes, processes) if address is None else partial(_on_dask, address)
+    with closing(run(function, waiting)) as outcomes:
         for name, result in outcomes:
             results[name] = _write(folder / f"{name}.json", result)
             tell(name)
     return {name: results[name] for name in jobs}
 
 
-def _outcomes(function: Callable[..., Any], jobs: Jobs, processes: int, address: str | None) -> Any:
-    """``(name, result)`` in the order in which the jobs end."""
-    if address is None:
-        return _in_processes(function, jobs, processes)
-    scheme, _, place = address.partition("://")
-    if scheme not in ("dask", "ray") or not place:
-        raise ParameterError("address", address, "dask://HOST:PORT, ray://HOST:PORT or ray://auto")
-    return (_on_dask if scheme == "dask" else _on_ray)(place, function, jobs)
-
-
-def _in_processes(function: Callable[..., Any], jobs: Jobs, processes: int) -> Outcomes:
+def _in_processes(processes: int, function: Callable[..., Any], jobs: Jobs) -> Outcomes:
     joblib, processes = require("joblib"), max(min(processes, len(jobs)), 1)
     run = joblib.Parallel(
         processes, backend="loky", return_as="generator_unordered", batch_size=1, max_nbytes=None
@@ -89,49 +80,20 @@ def _in_processes(function: Callable[..., Any], jobs: Jobs, processes: int) -> O
             require("joblib.externals.loky").get_reusable_executor(reuse=True).shutdown(kill_workers=True)
 
 
-def _on_dask(place: str, function: Callable[..., Any], jobs: Jobs) -> Outcomes:
+def _on_dask(address: str, function: Callable[..., Any], jobs: Jobs) -> Outcomes:
+    scheme, _, place = address.partition("://")
+    if scheme != "dask" or not place:
+        raise ParameterError("address", address, "dask://HOST:PORT")
     distributed = require("distributed")
     try:
         client = distributed.Client(f"tcp://{place}", timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise _silent("dask", place, error) from error
+        raise ParameterError("address", address, f"a scheduler that answers ({error})") from error
     with client:  # its end cancels what has not begun
         # pure=False: a name is what a job is known by, not a hash of its arguments
         futures = {client.submit(_alone, function, job, pure=False): name for name, job in jobs.items()}
         for future in distributed.as_completed(futures, loop=client.loop):
             yield futures[future], future.result()
-
-
-def _on_ray(place: str, function: Callable[..., Any], jobs: Jobs) -> Outcomes:
-    ray = require("ray")
-    mine = not ray.is_initialized()
-    if mine:
-        try:
-            ray.init("auto" if place == "auto" else f"ray://{place}", log_to_driver=False)
-        except (ConnectionError, ValueError) as error:
-            # a head that wants a token lets clients without one wait until they give up
-            hint = f"{error}; a recent Ray wants RAY_AUTH_MODE=token and the head's token on both sides"
-            raise _silent("ray", place, hint) from error
-    waiting = {}
-    try:
-        run = ray.remote(num_cpus=1, max_retries=0)(_alone)
-        waiting.update((run.remote(function, job), name) for name, job in jobs.items())
-        while waiting:
-            done, _ = ray.wait(list(waiting), num_returns=1)
-            try:
-                result = ray.get(done[0])
-            except ray.exceptions.RayTaskError as error:
-                raise error.cause from error  # the job's own error, as everywhere else
-            yield waiting.pop(done[0]), result
-    finally:
-        for task in waiting:
-            ray.cancel(task)
-        if mine:
-            ray.shutdown()
-
-
-def _silent(scheme: str, place: str, reason: object) -> ParameterError:
-    return ParameterError("address", f"{scheme}://{place}", f"a cluster that answers ({reason})")
 
 
 def _named(name: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[str, Any]:

@@ -7,32 +7,10 @@ from typing import Any
 
 import torch
 
+from .. import residual
 from ..enhanced.grasp_learner import NOISE_VARIANCE, grasp_kernel
 from ..exceptions import UnknownNameError
-from ..residual import (
-    ActionLinearKernel,
-    CalibrateNoise,
-    DeepKernelSOGP,
-    DetectChanges,
-    ForgettingFactor,
-    GPyTorchSVGP,
-    GPyTorchWindow,
-    KRLSTracker,
-    LearnHyperparameters,
-    LocalGPs,
-    MixtureResidual,
-    ProcessNoise,
-    RandomFeatureRLS,
-    RecursiveLeastSquares,
-    ReplayMLP,
-    ResidualLearner,
-    RiverResidual,
-    RobustWeight,
-    SparseOnlineGP,
-    SquaredExponential,
-    WindowGP,
-    ZeroResidual,
-)
+from ..residual import ResidualLearner
 
 #: Outputs: translation [mm] and rotation [deg] of the object in the hand frame.
 N_OUT = 6
@@ -52,15 +30,15 @@ def _kind(make: Factory, capacity_is: str = "", **figures: Any) -> Factory:
     return factory
 
 
-def _sogp(make: Factory = SparseOnlineGP, **figures: Any) -> Factory:
+def _sogp(make: Factory = residual.SparseOnlineGP, **figures: Any) -> Factory:
     """A sparse online GP that distrusts and forgets by two figures, and has other parts."""
 
     def factory(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearner:
         chosen = {"capacity": 100, "noise_variance": NOISE_VARIANCE, "robust": None, "forgetting_factor": 1.0}
         chosen |= {"parts": (), **figures, **options}
         robust, factor, parts = (chosen.pop(name) for name in ("robust", "forgetting_factor", "parts"))
-        weight = [] if robust is None else [RobustWeight(robust)]
-        fading = [] if factor == 1.0 else [ForgettingFactor(factor)]
+        weight = [] if robust is None else [residual.RobustWeight(robust)]
+        fading = [] if factor == 1.0 else [residual.ForgettingFactor(factor)]
         return make(d, m, parts=[*weight, *fading, *parts], **chosen)
 
     return factory
@@ -73,20 +51,20 @@ def _rbf(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearn
 
 
 def _action_linear(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearner:
-    state = SquaredExponential(d - n_actions, lengthscale=6.0)
-    kernel = ActionLinearKernel(d, n_actions, state_kernel=state, action_variance=0.1)
+    state = residual.SquaredExponential(d - n_actions, lengthscale=6.0)
+    kernel = residual.ActionLinearKernel(d, n_actions, state_kernel=state, action_variance=0.1)
     return _sogp(robust=3.0, forgetting_factor=0.995, kernel=kernel)(d, m, **options)
 
 
 def _mixture(d: int, m: int, **options: Any) -> ResidualLearner:
     """One that stands still and learns features, one that wanders: evidence decides."""
-    still = _sogp(DeepKernelSOGP, robust=3.0)
-    wandering = _sogp(robust=3.0, parts=[ProcessNoise(0.003), LearnHyperparameters()])
-    return MixtureResidual([still(d, m, **options), wandering(d, m, **options)])
+    still = _sogp(residual.DeepKernelSOGP, robust=3.0)
+    wandering = _sogp(robust=3.0, parts=[residual.ProcessNoise(0.003), residual.LearnHyperparameters()])
+    return residual.MixtureResidual([still(d, m, **options), wandering(d, m, **options)])
 
 
 _FRESH: dict[str, Any] = {"noise_variance": NOISE_VARIANCE, "forgetting_factor": 0.99, "robust": 3.0}
-_LEARNING = [LearnHyperparameters()]
+_LEARNING = [residual.LearnHyperparameters()]
 
 #: Name -> ``factory(in_features, out_features, n_actions=0, capacity=100, **options)``; the last n_actions
 #: inputs are an action. Inputs and outputs are of the order of 1; all but the first two start from the same
@@ -94,25 +72,35 @@ _LEARNING = [LearnHyperparameters()]
 LEARNERS: dict[str, Factory] = {
     "rbf": _rbf,
     "action-linear": _action_linear,
-    "model alone": _kind(ZeroResidual),
-    "linear RLS": _kind(RecursiveLeastSquares, **_FRESH),
-    "random features": _kind(RandomFeatureRLS, "n_frequencies", **_FRESH),
-    "window GP": _kind(WindowGP, "window", noise_variance=NOISE_VARIANCE, robust=3.0),
-    "local GPs": _kind(LocalGPs, "window", experts=40, noise_variance=NOISE_VARIANCE),
-    "KRLS-T": _kind(KRLSTracker, "capacity", noise_variance=NOISE_VARIANCE, forgetting_factor=0.99),
-    "MLP": _kind(ReplayMLP),
-    "MLP ensemble": _kind(ReplayMLP, members=3),
+    "model alone": _kind(residual.ZeroResidual),
+    "linear RLS": _kind(residual.RecursiveLeastSquares, **_FRESH),
+    "random features": _kind(residual.RandomFeatureRLS, "n_frequencies", **_FRESH),
+    "window GP": _kind(residual.WindowGP, "window", noise_variance=NOISE_VARIANCE, robust=3.0),
+    "local GPs": _kind(residual.LocalGPs, "window", experts=40, noise_variance=NOISE_VARIANCE),
+    "KRLS-T": _kind(residual.KRLSTracker, "capacity", noise_variance=NOISE_VARIANCE, forgetting_factor=0.99),
+    "MLP": _kind(residual.ReplayMLP),
+    "MLP ensemble": _kind(residual.ReplayMLP, members=3),
     "SOGP plain": _sogp(),  # as in the paper: nothing forgotten, every sample trusted
     "SOGP": _sogp(forgetting_factor=0.99, robust=3.0),
-    "SOGP adaptive": _sogp(forgetting_factor=0.99, robust=3.0, parts=[CalibrateNoise(), *_LEARNING]),
-    "SOGP detecting": _sogp(robust=3.0, parts=[CalibrateNoise(), DetectChanges(), *_LEARNING]),
+    "SOGP adaptive": _sogp(forgetting_factor=0.99, robust=3.0, parts=[residual.CalibrateNoise(), *_LEARNING]),
+    "SOGP detecting": _sogp(
+        robust=3.0, parts=[residual.CalibrateNoise(), residual.DetectChanges(), *_LEARNING]
+    ),
     # no forgetting: what features are learned from is the past
-    "SOGP deep": _sogp(DeepKernelSOGP, robust=3.0, parts=[CalibrateNoise(), DetectChanges()]),
+    "SOGP deep": _sogp(
+        residual.DeepKernelSOGP, robust=3.0, parts=[residual.CalibrateNoise(), residual.DetectChanges()]
+    ),
     "SOGP mixture": _mixture,
-    "river forest": _kind(RiverResidual),
-    "GPyTorch window": _kind(GPyTorchWindow, "window", noise_variance=NOISE_VARIANCE),
-    "GPyTorch SVGP": _kind(GPyTorchSVGP, "inducing", memory=500, minibatch=20),
+    "river forest": _kind(residual.RiverResidual),
+    "GPyTorch window": _kind(residual.GPyTorchWindow, "window", noise_variance=NOISE_VARIANCE),
+    "GPyTorch SVGP": _kind(residual.GPyTorchSVGP, "inducing", memory=500, minibatch=20),
 }
+#: Learners of other libraries: ten to a hundred times as slow, and in an extra of their own.
+PEERS = ("river forest", "GPyTorch window", "GPyTorch SVGP")
+#: The sparse online GP in its forms.
+OURS = tuple(name for name in LEARNERS if name.startswith("SOGP"))
+#: What a comparison takes if nobody says otherwise: not those that want to know which inputs are an action.
+COMPARED = tuple(name for name in LEARNERS if name not in (*PEERS, "rbf", "action-linear"))
 #: What demo and experiments take unless told otherwise.
 DEFAULT_LEARNER = "rbf"
 #: Those that the ablation of a hand compares.
@@ -144,7 +132,6 @@ def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -
     """A fresh learner of ``[encode(s); da]``.
 
     Args:
-        name: a key of :data:`LEARNERS`.
         n_s, n_a: features of the state, actuators.
         capacity: basis points, window or random frequencies; networks and RLS have no such figure.
         options: instead of the factory's own choices.

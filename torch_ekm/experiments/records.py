@@ -120,30 +120,28 @@ class TrialRecord(Trial):
         """The figures of one manipulation in a simulated hand.
 
         Args:
-            trial: what was to be done.
             axis: about which the object was to turn, unit vector, hand frame.
             learns: the controller has predictions of its own.
-            poses: keep the true poses.
         """
         steps, focus, measured = done.steps, done.focus, done.errors
         asked = [float(torch.linalg.vector_norm(step.decision.desired)) for step in steps]
         # how much of a step was missing: |e| should have fallen by what was asked for
-        short = [abs(measured[k + 1] - (measured[k] - asked[k])) for k in range(len(steps))]
-        moving = [s for s, a in zip(short, asked, strict=False) if a >= _MOVING]
+        short = [
+            abs(after - (before - a)) for (before, after), a in zip(pairwise(measured), asked, strict=True)
+        ]
+        moving = [s for s, a in zip(short, asked, strict=True) if a >= _MOVING]
         truth = [true_state(seen) for seen in (*(step.before for step in steps), done.stop.final)]
         turned = [axis @ after.minus(before)[-3:] for before, after in pairwise(truth)]
-        increments = [step.increment for step in steps]
-        nominal = [step.decision.nominal for step in steps]
-        ours = [step.decision.predicted for step in steps] if learns else []
 
-        def errors(predictions: list[Tensor]) -> tuple[float, ...]:
-            pairs = zip(increments, predictions, strict=False)
-            found = [prediction_error(increment, predicted, focus.matrix) for increment, predicted in pairs]
-            return tuple(float(torch.linalg.vector_norm(error)) / _DEG for error in found)
+        def errors(name: str) -> tuple[float, ...]:
+            wrong = (
+                prediction_error(step.increment, getattr(step.decision, name), focus.matrix) for step in steps
+            )
+            return tuple(float(torch.linalg.vector_norm(error)) / _DEG for error in wrong)
 
-        def true_errors(predictions: list[Tensor]) -> tuple[float, ...]:
-            pairs = zip(turned, predictions, strict=False)
-            return tuple(abs(float(real - axis @ predicted[-3:])) / _DEG for real, predicted in pairs)
+        def true_errors(name: str) -> tuple[float, ...]:
+            predicted = [axis @ getattr(step.decision, name)[-3:] for step in steps]
+            return tuple(abs(float(a - b)) / _DEG for a, b in zip(turned, predicted, strict=True))
 
         off = focus.off_rotation(done.stop.final.state.minus(steps[0].before.state)) if steps else 0.0
         return cls(
@@ -154,10 +152,10 @@ class TrialRecord(Trial):
             errors_deg=tuple(error / _DEG for error in measured),
             first_step_deg=short[0] / _DEG if short else None,
             step_error_deg=float(np.mean(moving)) / _DEG if moving else None,
-            prediction_km_deg=errors(nominal),
-            prediction_ekm_deg=errors(ours),
-            true_prediction_km_deg=true_errors(nominal),
-            true_prediction_ekm_deg=true_errors(ours),
+            prediction_km_deg=errors("nominal"),
+            prediction_ekm_deg=errors("predicted") if learns else (),
+            true_prediction_km_deg=true_errors("nominal"),
+            true_prediction_ekm_deg=true_errors("predicted") if learns else (),
             off_rotation_deg=off / _DEG,
             seconds=tuple(step.seconds for step in steps),
             poses=tuple([s.q.tolist(), s.position.tolist(), s.rotation.tolist()] for s in truth if poses),

@@ -56,7 +56,6 @@ def plan(
     Args:
         name: a key of :data:`PROTOCOLS`.
         seeds: each is an independent run; every controller gets the same ones.
-        setting: hand, plant, learner, sensing.
         objects: a folder with URDF files to be used instead of the objects that come with the package.
         angles_deg: turns to be made instead of the experiment's own.
         quick: two seeds and a few small turns: to see that it works, not to claim anything.
@@ -79,7 +78,7 @@ def plan(
     if angles_deg is not None:
         changes["angles_deg"] = angles_deg
     for key in changes:
-        takers = [name for name, kind in PROTOCOLS.items() if key in _fields(kind)]
+        takers = [name for name, kind in PROTOCOLS.items() if hasattr(kind(), key)]
         if name not in takers:
             raise ParameterError(key, changes[key], f"left out: only {' and '.join(takers)} take them")
     return Experiment(dataclasses.replace(protocol, **changes), seeds)  # pyright: ignore[reportArgumentType]
@@ -98,9 +97,7 @@ def reproduce(
     unbroken run: a job's result depends on nothing but its configuration and its seed.
 
     Args:
-        processes: how many at once.
-        on_done: called with each finished job's name.
-        address: of a Dask or Ray cluster that does the work (``dask://HOST:PORT``, ``ray://HOST:PORT``).
+        processes, on_done, address: of :func:`~torch_ekm.experiments.jobs.run_jobs`.
     """
     protocol, seeds = experiment.protocol, experiment.seeds
     kept = run_jobs(protocol.run, experiment.jobs, folder / "runs", processes, on_done, address)
@@ -131,7 +128,3 @@ def urdf_files(folder: Path) -> tuple[str, ...]:
     for path in found:  # what is wrong with one is said before anything runs
         load_object(path)
     return found
-
-
-def _fields(protocol: type) -> list[str]:
-    return [field.name for field in dataclasses.fields(protocol)]

@@ -33,7 +33,6 @@ class Bench:
     """Grasp, turn, release, again; the learner stays from trial to trial.
 
     Args:
-        setting: hand, plant, model, learner, rule.
         object: name, path or description.
         controller: one of ``CONTROLLERS``.
         keep_images: with sensing, the camera's last image stays in ``info["raw"]["image"]``.
@@ -92,17 +91,11 @@ class Bench:
         return None
 
     def adopt(self, learner: ResidualLearner, encoding: GraspEncoding) -> None:
-        """Learn with this learner (e.g. one that knows other objects) and what it sees of a state, instead
-        of a fresh one of the setting's kind."""
+        """Learn with this learner (e.g. one that knows other objects) instead of a fresh one."""
         self.learner, self.encoding, self.enhanced = learner, encoding, None
 
     def trial(self, seed: int, trial: int, angle_deg: float, kind: str = "turn", **options: Any) -> Record:
-        """Turn the object by ``angle_deg`` from a fresh grasp.
-
-        Args:
-            kind: what the record is called.
-            options: of :meth:`turn`.
-        """
+        """Turn the object by ``angle_deg`` from a fresh grasp, with the options of :meth:`turn`."""
         start = self.grasp(seed, trial)
         about = Trial(self.name, kind, self.controller, seed, trial, angle_deg)
         if start is None:
@@ -122,7 +115,6 @@ class Bench:
         """Turn the object that is held.
 
         Args:
-            about: what is to be done.
             start: from where, as measured.
             learn: train after every motion (an E-KM only).
             events: what happens on the way; ``at`` counts this trial's commands from 0.
@@ -134,11 +126,11 @@ class Bench:
         )
         axis = self.hand.rotation_axis
         target = PoseTarget.turned(start, axis, about.angle_deg * _DEG)
-        controller, plant = self._controller(axis), self.plant
+        plant = self.plant
         if blind_deg:
-            model = self.model if self.enhanced is None else self.enhanced
-            plant = CameraOff(plant, model, target, axis, blind_deg * _DEG)
-        done = ClosedLoop(plant, controller, self.setting.stopping_rule(), learn=learn).run(target)
+            plant = CameraOff(plant, self._predictor, target, axis, blind_deg * _DEG)
+        loop = ClosedLoop(plant, self._controller(axis, {}), self.setting.stopping_rule(), learn=learn)
+        done = loop.run(target)
         return TrialRecord.of(about, done, axis, learns=self.learns, poses=poses)
 
     def long_step(self, seed: int, trial: int, step_deg: float) -> Record:
@@ -169,25 +161,21 @@ class Bench:
         """Give back what the plant holds."""
         self.plant.close()
 
-    def _controller(
-        self, axis: torch.Tensor, changes: Mapping[str, Any] | None = None
-    ) -> LookAndMoveController:
-        setting = self.setting.replace(control={**self.setting.control, **(changes or {})})
-        model = self.enhanced if self.enhanced is not None else self.model
-        return LookAndMoveController(model, axis, **setting.controller_parts())
+    @property
+    def _predictor(self) -> KinematicModel | EnhancedModel:
+        return self.model if self.enhanced is None else self.enhanced
+
+    def _controller(self, axis: torch.Tensor, changes: Mapping[str, Any]) -> LookAndMoveController:
+        setting = self.setting.replace(control={**self.setting.control, **changes})
+        return LookAndMoveController(self._predictor, axis, **setting.controller_parts())
 
     def _prepare_learner(self, start: GraspState) -> None:
         setting = self.setting
         if self.encoding is None:
             self.encoding = GraspEncoding.of(self.model, start)
         if self.learner is None:
-            self.learner = make_learner(
-                setting.learner,
-                self.encoding.n_features,
-                self.model.hand.n_a,
-                setting.capacity,
-                **setting.learner_options,
-            )
+            sizes = self.encoding.n_features, self.model.hand.n_a, setting.capacity
+            self.learner = make_learner(setting.learner, *sizes, **setting.learner_options)
         self.enhanced = EnhancedModel.for_grasp(self.model, start, self.learner, self.encoding)
 
 

@@ -21,13 +21,6 @@ class LinkWeights(nn.Module):
         dtype: of the buffers.
     """
 
-    weights: Float[Tensor, "n_l 3"]
-    """m_l g [N]."""
-    com: Float[Tensor, "n_l 3"]
-    """Centres of mass in the links' frames [m]."""
-    upstream: Tensor
-    precedes: Tensor
-
     def __init__(
         self,
         hand: HandDescription,
@@ -41,13 +34,12 @@ class LinkWeights(nn.Module):
         links = [link for link in hand.urdf.links if link.mass > 0 and upstream[names.index(link.name)].any()]
         self._joint_axes, self._index = kinematics.joint_axes, [names.index(link.name) for link in links]
         mass = torch.tensor([link.mass for link in links], dtype=dtype)
-        for name, value in (
-            ("weights", mass[:, None] * torch.tensor(gravity, dtype=dtype)),
-            ("com", torch.stack([torch.as_tensor(link.com).to(dtype) for link in links])),
-            ("upstream", upstream[self._index]),
-            ("precedes", precedence(upstream)),
-        ):
-            self.register_buffer(name, value, persistent=False)
+        com = torch.stack([torch.as_tensor(link.com).to(dtype) for link in links])
+        g = torch.tensor(gravity, dtype=dtype)
+        self.weights = nn.Buffer(mass[:, None] * g, persistent=False)  # m_l g [N], (n_l, 3)
+        self.com = nn.Buffer(com, persistent=False)  # in the links' frames [m], (n_l, 3)
+        self.upstream = nn.Buffer(upstream[self._index], persistent=False)
+        self.precedes = nn.Buffer(precedence(upstream), persistent=False)
 
     def forward(self, poses) -> tuple[Float[Tensor, "*batch n_q"], Float[Tensor, "*batch n_q n_q"]]:
         """Gradient and Hessian at the link poses of a posture."""

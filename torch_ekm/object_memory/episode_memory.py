@@ -18,14 +18,6 @@ class EpisodeMemory(nn.Module):
     Where there is no room the oldest grasp of the model that has most is given up: what is rare is kept.
     """
 
-    signature: Tensor
-    label: Tensor
-    evidence: Tensor
-    age: Tensor
-    x: Tensor
-    y: Tensor
-    length: Tensor
-
     def __init__(
         self, like: ResidualLearner, models: int, features: int, episodes: int, samples: int
     ) -> None:
@@ -35,13 +27,13 @@ class EpisodeMemory(nn.Module):
         count = {"dtype": torch.int64, "device": like.device}
         own = {"dtype": like.dtype, "device": like.device}
         rows = episodes + 1
-        self.register_buffer("signature", torch.zeros(rows, features, **double))
-        self.register_buffer("label", torch.full((rows,), _FREE, **count))
-        self.register_buffer("evidence", torch.zeros(rows, models, **double))
-        self.register_buffer("age", torch.zeros(rows, **count))
-        self.register_buffer("x", torch.zeros(rows, samples, like.in_features, **own))
-        self.register_buffer("y", torch.zeros(rows, samples, like.out_features, **own))
-        self.register_buffer("length", torch.zeros(rows, **count))
+        self.signature = nn.Buffer(torch.zeros(rows, features, **double))
+        self.label = nn.Buffer(torch.full((rows,), _FREE, **count))
+        self.evidence = nn.Buffer(torch.zeros(rows, models, **double))
+        self.age = nn.Buffer(torch.zeros(rows, **count))
+        self.x = nn.Buffer(torch.zeros(rows, samples, like.in_features, **own))
+        self.y = nn.Buffer(torch.zeros(rows, samples, like.out_features, **own))
+        self.length = nn.Buffer(torch.zeros(rows, **count))
 
     @property
     def known(self) -> Int[Tensor, " n"]:

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import torch
 
 from ..description import HandDescription
-from ..exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
+from ..exceptions import ParameterError, ShapeError, UnknownNameError
 from ..kinematics import HandKinematics
 from ..kinematics.null_space import null_space
+from ..residual.checks import check_finite, check_positive
 from ..typing import Float, Tensor
 
 
@@ -60,10 +61,9 @@ class GraspSignature:
         for name in from_encoders:
             if name not in hand.joint_names:
                 raise UnknownNameError("joint", name, hand.joint_names)
-        scatter = {"width": width_scatter, "load": load_scatter, "force": force_scatter}
-        for name, value in scatter.items():
-            if not value > 0:
-                raise ParameterError(f"{name}_scatter", value, "positive")
+        width = check_positive("width_scatter", width_scatter)
+        load = check_positive("load_scatter", load_scatter)
+        force = check_positive("force_scatter", force_scatter)
         self.hand, self.kinematics = hand, HandKinematics(hand)
         self._pads = [by_name[name] for name in (thumb, *fingers)]
         pads = [hand.pads[i] for i in self._pads]
@@ -80,9 +80,7 @@ class GraspSignature:
         self._offset = torch.from_numpy(hand.actuator_offset)
         self._blind = [hand.joint_names.index(name) for name in from_encoders]
         n = self._passive.shape[1]
-        self._scatter = torch.tensor(
-            [width_scatter, *[load_scatter] * n, *[force_scatter] * len(pads)], dtype=torch.float64
-        )
+        self._scatter = torch.tensor([width, *[load] * n, *[force] * len(pads)], dtype=torch.float64)
 
     @property
     def n_features(self) -> int:
@@ -110,8 +108,7 @@ class GraspSignature:
         for name, (value, size) in sizes.items():
             if value.shape != (*q.shape[:-1], size):
                 raise ShapeError(name, f"(*batch, {size})", value.shape)
-            if not bool(torch.isfinite(value).all()):
-                raise NonFiniteError(name, torch.nonzero(~torch.isfinite(value))[:3].tolist())
+            check_finite(name, value)
         q = self._seen_by_encoders(q, a) if self._blind else q
         load = (self._stiffness * (q - self._rest)) @ self._passive
         features = [self._width(q)[..., None], load, fingertip_force[..., self._pads]]

@@ -11,8 +11,10 @@ import torch
 from torch import nn
 from torch.distributions import Normal, StudentT
 
-from ..exceptions import NonFiniteError, ParameterError, ShapeError
-from ..residual import ResidualLearner, SparseOnlineGP, UpdateEvent, UpdateReport
+from ..exceptions import ParameterError, ShapeError
+from ..residual import ResidualLearner, SparseOnlineGP, UpdateReport
+from ..residual.base import SingleLearner
+from ..residual.checks import check_count, check_factor, check_finite, check_positive
 from ..typing import Float, Tensor
 from .episode_memory import EpisodeMemory
 from .signature_model import SignatureModel
@@ -24,7 +26,7 @@ _TRUST, _FADE = 0.1, 0.9  # what one sample says of leader and common learner, a
 _SAMPLES = 64  # remembered of an episode
 
 
-class ModelBank(ResidualLearner):
+class ModelBank(SingleLearner):
     r"""Which of the known objects is this, or is it a new one?
 
     ::
@@ -77,15 +79,6 @@ class ModelBank(ResidualLearner):
         ParameterError: a figure outside its range, or the factory's learners are a fleet.
     """
 
-    episodes: Tensor
-    log_prior: Tensor
-    log_evidence: Tensor
-    seen: Tensor
-    leader: Tensor
-    scale: Tensor
-    signed: Tensor
-    lead: Tensor
-
     def __init__(
         self,
         factory: Callable[[], ResidualLearner],
@@ -100,41 +93,33 @@ class ModelBank(ResidualLearner):
         remember: int = 96,
     ) -> None:
         first = factory()
-        if first.batch_shape:
-            raise ParameterError("factory", tuple(first.batch_shape), "learners with batch_shape ()")
-        super().__init__(first.in_features, first.out_features, dtype=first.dtype, device=first.device)
-        for name, value in (("models", models), ("window", window)):
-            if value < 1:
-                raise ParameterError(name, value, "at least 1")
-        if remember <= models:  # else a model might lose the last grasp by which it is known
-            raise ParameterError("remember", remember, f"more than models = {models}")
-        if signature_features < 0:
-            raise ParameterError("signature_features", signature_features, "0 or more")
-        if not 0 < temperature <= 1:
-            raise ParameterError("temperature", temperature, "in (0, 1]")
+        like: dict[str, Any] = {"dtype": first.dtype, "device": first.device}
+        super().__init__(first.in_features, first.out_features, batch_shape=first.batch_shape, **like)
+        self.models, self.window = check_count("models", models), check_count("window", window)
+        # with fewer a model might lose the last grasp by which it is known
+        check_count("remember", remember, least=self.models + 1)
+        check_count("signature_features", signature_features, least=0)
         if not common_weights or not all(0 <= weight <= 1 for weight in common_weights):
             raise ParameterError("common_weights", common_weights, "one or more shares in [0, 1]")
-        if not new_prior > 0:
-            raise ParameterError("new_prior", new_prior, "positive")
-        self.models, self.window, self.new_prior = models, window, new_prior
-        self.temperature, self.common_weights = temperature, tuple(common_weights)
-        self.common = first
-        self.kept = nn.ModuleList(copy.deepcopy(first) for _ in range(models))
+        self.new_prior = check_positive("new_prior", new_prior)
+        self.temperature = check_factor("temperature", temperature)
+        self.common_weights, self.common = tuple(common_weights), first
+        self.kept: Any = nn.ModuleList(copy.deepcopy(first) for _ in range(models))
         hypotheses = models + len(self.common_weights)  # the last ones: "new"
-        self.trial = nn.ModuleList(copy.deepcopy(first) for _ in range(hypotheses))
-        device = self.device
-        self.register_buffer("episodes", torch.zeros(models, dtype=torch.int64, device=device))
-        for name in ("log_prior", "log_evidence"):
-            self.register_buffer(name, torch.zeros(hypotheses, dtype=torch.float64, device=device))
-        for name in ("seen", "leader"):
-            self.register_buffer(name, torch.zeros((), dtype=torch.int64, device=device))
-        self.register_buffer("scale", self._like.new_ones(self.out_features))
-        self.register_buffer("lead", torch.zeros((), dtype=torch.float64, device=device))  # logit p
+        self.trial: Any = nn.ModuleList(copy.deepcopy(first) for _ in range(hypotheses))
+        zeros = self._like.new_zeros
+        self.episodes = nn.Buffer(zeros(models, dtype=torch.int64))
+        self.log_prior = nn.Buffer(zeros(hypotheses, dtype=torch.float64))
+        self.log_evidence = nn.Buffer(zeros(hypotheses, dtype=torch.float64))
+        self.seen = nn.Buffer(zeros((), dtype=torch.int64))
+        self.leader = nn.Buffer(zeros((), dtype=torch.int64))
+        self.scale = nn.Buffer(self._like.new_ones(self.out_features))
+        self.lead = nn.Buffer(zeros((), dtype=torch.float64))  # logit p
         self.signatures = SignatureModel() if signatures is None else signatures
         self.memory: EpisodeMemory | None = None
         if signature_features:
             self.memory = EpisodeMemory(first, models, signature_features, remember, _SAMPLES)
-        self.register_buffer("signed", torch.zeros((), dtype=torch.bool, device=device))
+        self.signed = nn.Buffer(zeros((), dtype=torch.bool))
         self._open(None)
 
     # -- episodes -----------------------------------------------------------------------------------
@@ -186,8 +171,7 @@ class ModelBank(ResidualLearner):
             raise ParameterError("signature", None, f"a tensor of shape ({width},) for this bank")
         if signature.shape != (width,):
             raise ShapeError("signature", f"({width},)", signature.shape)
-        if not bool(torch.isfinite(signature).all()):
-            raise NonFiniteError("signature", torch.nonzero(~torch.isfinite(signature))[:3].tolist())
+        check_finite("signature", signature)
 
     def _open(self, signature: Tensor | None) -> None:
         new, known = self.models, self.episodes > 0
@@ -212,14 +196,14 @@ class ModelBank(ResidualLearner):
         self.log_evidence.zero_()
         self.seen.zero_()
         for i in torch.nonzero(known).flatten().tolist():
-            _copy(self.kept[i], self.trial[i])
+            self.trial[i].load_state_dict(self.kept[i].state_dict())
         for i, weight in enumerate(self.common_weights, start=new):
-            self._begin_new(self._trial(i), weight)
+            self._begin_new(self.trial[i], weight)
         self.leader.copy_(self.log_prior.argmax())
 
     def _begin_new(self, learner: ResidualLearner, weight: float) -> None:
         if weight > 0:
-            _copy(self.common, learner)
+            learner.load_state_dict(self.common.state_dict())
             discount(learner, weight)
         else:
             learner.reset()
@@ -230,7 +214,7 @@ class ModelBank(ResidualLearner):
         best = slot = int(self.leader)
         if best >= self.models:
             slot = int(torch.nonzero(self.episodes == 0)[0])  # "new" has no prior when none is free
-        _copy(self.trial[best], self.kept[slot])
+        self.kept[slot].load_state_dict(self.trial[best].state_dict())
         self.episodes[slot] += 1
         if self.memory is None:
             return slot
@@ -251,16 +235,15 @@ class ModelBank(ResidualLearner):
         memory.label[rows] = after
         for slot in set(before[moved].tolist()) | set(after[moved].tolist()):
             self.episodes[slot] += int((after == slot).sum() - (before == slot).sum())
-            learner = _learner(self.kept[slot])
-            self._begin_new(learner, min(self.common_weights))
-            memory.replay(slot, learner)
+            self._begin_new(self.kept[slot], min(self.common_weights))
+            memory.replay(slot, self.kept[slot])
 
     # -- a learner like any other ---------------------------------------------------------------------
 
     @property
     def working(self) -> ResidualLearner:
         """The hypothesis that leads."""
-        return self._trial(int(self.leader))
+        return self.trial[int(self.leader)]
 
     def forward(self, x: Tensor) -> Tensor:
         """Mean of the leading hypothesis and the common learner."""
@@ -275,7 +258,6 @@ class ModelBank(ResidualLearner):
         return Normal(self._mix(ours.mean, theirs.mean), variance.sqrt(), validate_args=False)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and slope."""
         ours, theirs = self.working.linearize(x), self.common.linearize(x)
         return self._mix(ours[0], theirs[0]), self._mix(ours[1], theirs[1])
 
@@ -286,27 +268,20 @@ class ModelBank(ResidualLearner):
     def reset(self) -> None:
         """Forget all objects."""
         for learner in (self.common, *self.kept, *self.trial):
-            _learner(learner).reset()
-        self.episodes.zero_()
-        self.lead.zero_()
+            learner.reset()
+        super().reset()
         self.scale.fill_(1.0)
-        self.n_refused.zero_()
         if self.memory is not None:
             self.memory.reset()
         self._open(None)
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        if mask is not None and not bool(mask):
-            zero = torch.zeros_like(y[..., 0])
-            return UpdateReport(
-                torch.full_like(mask, UpdateEvent.REFUSED, dtype=torch.int64), zero, zero, zero
-            )
         leader, choosing = int(self.leader), int(self.seen) < self.window
         reports: dict[int, UpdateReport] = {}
         density = torch.zeros_like(self.log_evidence)
         followed = self._candidates() if choosing else [leader]
         for i in followed:
-            hypothesis = self._trial(i)
+            hypothesis = self.trial[i]
             law = hypothesis.predict(x, observation=True)
             density[i] = self._log_density(law, y)
             if not choosing:
@@ -339,11 +314,7 @@ class ModelBank(ResidualLearner):
         self.log_prior[dropped] = -math.inf
         return torch.nonzero(~dropped).flatten().tolist()
 
-    def _trial(self, i: int) -> ResidualLearner:
-        return _learner(self.trial[i])
-
     def extra_repr(self) -> str:
-        """One line for ``print(bank)``."""
         return f"{super().extra_repr()}, models={self.models}, known={self.n_models}"
 
 
@@ -358,13 +329,3 @@ def discount(learner: ResidualLearner, share: float) -> None:
         learner.posterior.precision.mul_(share)
         learner.posterior.information.mul_(share)
         learner.refresh()
-
-
-def _copy(source: nn.Module, target: nn.Module) -> None:
-    state: dict[str, Any] = source.state_dict()
-    target.load_state_dict(state)
-
-
-def _learner(module: nn.Module) -> ResidualLearner:
-    assert isinstance(module, ResidualLearner)
-    return module

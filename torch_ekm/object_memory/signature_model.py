@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from ..exceptions import ParameterError
+from ..residual.checks import check_positive
 from ..typing import Float, Int, Tensor
 
 _MOST_MOVES = 64
@@ -41,14 +41,8 @@ class SignatureModel:
     """
 
     def __init__(self, spread: float = 4.0, strength: float = 30.0, concentration: float = 1.0) -> None:
-        for name, value in (
-            ("spread", spread),
-            ("strength", strength),
-            ("concentration", concentration),
-        ):
-            if not (math.isfinite(value) and value > 0):
-                raise ParameterError(name, value, "positive and finite")
-        self.spread, self.strength, self.concentration = spread, strength, concentration
+        self.spread, self.strength = check_positive("spread", spread), check_positive("strength", strength)
+        self.concentration = check_positive("concentration", concentration)
 
     def log_joint(
         self, z: Float[Tensor, "n d"], label: Int[Tensor, "*batch n"], groups: int
@@ -85,20 +79,14 @@ class SignatureModel:
         )
 
     def log_posterior(
-        self,
-        new: Float[Tensor, " d"],
-        z: Float[Tensor, "n d"],
-        label: Int[Tensor, " n"],
-        groups: int,
+        self, new: Float[Tensor, " d"], z: Float[Tensor, "n d"], label: Int[Tensor, " n"], groups: int
     ) -> Float[Tensor, " groups"]:
         """Of a new signature belonging to each group, given the partition of the earlier ones.
 
         An empty group stands for "new"; of several only the first can be meant, the others have -inf.
         """
-        target = torch.arange(groups)
-        joint = self.log_joint(
-            torch.cat([z, new[None]]), torch.cat([label.expand(groups, -1), target[:, None]], 1), groups
-        )
+        labels = torch.cat([label.expand(groups, -1), torch.arange(groups)[:, None]], 1)
+        joint = self.log_joint(torch.cat([z, new[None]]), labels, groups)
         return joint.masked_fill(~_allowed(label, groups), -math.inf).log_softmax(0)
 
     def sort(

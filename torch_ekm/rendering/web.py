@@ -14,15 +14,15 @@ from ..typing import Array
 from .scene import Scene, shape_mesh
 
 
-def save_animation(scene: Scene, path: Path, frame_seconds: float = 0.25) -> Path:
+def save_animation(scene: Scene, path: Path) -> Path:
     """Write the frames as one stand-alone HTML page that can be turned and zoomed (viser)."""
-    server = start_server("127.0.0.1", 0)
+    server = start_server()
     try:
         serializer = server.get_scene_serializer()
         nodes = draw(server, scene)
         for frame in scene.transforms:
             place(server, nodes, frame)
-            serializer.insert_sleep(frame_seconds)
+            serializer.insert_sleep(0.25)  # [s] for each frame
         path.write_text(serializer.as_html(), encoding="utf-8")
     finally:
         with contextlib.redirect_stdout(io.StringIO()):
@@ -30,15 +30,15 @@ def save_animation(scene: Scene, path: Path, frame_seconds: float = 0.25) -> Pat
     return path
 
 
-def start_server(host: str, port: int) -> Any:
-    """A viser server that keeps quiet: what address is to be opened, if any, is the caller's to say.
+def start_server(port: int = 0) -> Any:
+    """A viser server for this machine that keeps quiet: the caller says what address is to be opened.
 
     Raises:
         MissingExtraError: viser is not installed.
     """
     viser = require("viser")
     with contextlib.redirect_stdout(io.StringIO()):
-        return viser.ViserServer(host=host, port=port, verbose=False)
+        return viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
 
 
 def draw(server: Any, scene: Scene) -> list[Any]:

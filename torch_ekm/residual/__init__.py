@@ -16,23 +16,21 @@ from .fleet import LearnerFleet
 from .kernels.action_linear import ActionLinearKernel, action_covariance, action_jacobian
 from .kernels.deep import DeepKernel
 from .kernels.kernel import Kernel, ProductKernel, SumKernel
-from .kernels.linear import LinearKernel
 from .kernels.stationary import Matern32, Matern52, SquaredExponential
 from .mixture import MixtureResidual
 from .report import UpdateEvent, UpdateReport
 from .sparse_gp.deep import DeepKernelSOGP
 from .sparse_gp.forgetting import ForgettingFactor, ProcessNoise
 from .sparse_gp.hyperparameters import LearnHyperparameters
-from .sparse_gp.monitor import CalibrateNoise, DetectChanges
+from .sparse_gp.monitor import CalibrateNoise, DetectChanges, RobustWeight
 from .sparse_gp.part import Part
-from .sparse_gp.robust_weight import RobustWeight
 from .sparse_gp.sparse_online_gp import Prediction, SparseOnlineGP
 from .sparse_gp.units import Standardize
 
 __all__ = [
     "ActionLinearKernel", "CalibrateNoise", "DeepKernel", "DeepKernelSOGP", "DetectChanges",
     "ForgettingFactor", "GPyTorchSVGP", "GPyTorchWindow", "KRLSTracker", "Kernel", "LearnHyperparameters",
-    "LearnerFleet", "LinearKernel", "LocalGPs", "Matern32", "Matern52", "MixtureResidual", "Part",
+    "LearnerFleet", "LocalGPs", "Matern32", "Matern52", "MixtureResidual", "Part",
     "Prediction", "ProcessNoise", "ProductKernel", "RandomFeatureRLS", "RecursiveLeastSquares", "ReplayMLP",
     "ResidualLearner", "RiverResidual", "RobustWeight", "SparseOnlineGP", "SquaredExponential", "Standardize",
     "SumKernel", "UpdateEvent", "UpdateReport", "WindowGP", "ZeroResidual", "action_covariance",

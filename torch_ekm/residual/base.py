@@ -24,8 +24,9 @@ class ResidualLearner(nn.Module, ABC):
     ``(*batch_shape, in_features)``, or a time-ordered block with the time first,
     ``(n, *batch_shape, in_features)``.
 
-    A subclass implements ``forward``, ``predict``, ``_absorb`` and ``reset``. It keeps all it has
-    learned in buffers of fixed size, so that ``state_dict``, ``deepcopy``, ``.to()`` move all of it.
+    A subclass implements ``forward``, ``predict``, ``_absorb`` and, unless all its buffers start at 0,
+    ``reset``. It keeps all it has learned in buffers of fixed size, so that ``state_dict``, ``deepcopy``,
+    ``.to()`` move all of it.
 
     Args:
         in_features: width of x.
@@ -37,9 +38,6 @@ class ResidualLearner(nn.Module, ABC):
     Raises:
         ParameterError: a size is not a positive integer, or ``on_invalid`` is unknown.
     """
-
-    n_refused: Tensor
-    _like: Tensor
 
     def __init__(
         self,
@@ -60,9 +58,9 @@ class ResidualLearner(nn.Module, ABC):
         if on_invalid not in ("raise", "skip"):
             raise ParameterError("on_invalid", on_invalid, "'raise' or 'skip'")
         self.on_invalid = on_invalid
-        self.register_buffer("n_refused", torch.zeros(self.batch_shape, dtype=torch.int64, device=device))
+        self.n_refused = nn.Buffer(torch.zeros(self.batch_shape, dtype=torch.int64, device=device))
         # An empty float tensor follows .to() and so remembers dtype and device for all subclasses.
-        self.register_buffer("_like", torch.empty(0, dtype=dtype, device=device), persistent=False)
+        self._like = nn.Buffer(torch.empty(0, dtype=dtype, device=device), persistent=False)
 
     # -- what a learner is ------------------------------------------------------------------
 
@@ -81,9 +79,10 @@ class ResidualLearner(nn.Module, ABC):
         """
         return self.predict(x, observation=True)
 
-    @abstractmethod
     def reset(self) -> None:
         """Forget all samples; hyperparameters stay."""
+        for buffer in self.buffers(recurse=False):
+            buffer.zero_()
 
     @abstractmethod
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
@@ -98,12 +97,11 @@ class ResidualLearner(nn.Module, ABC):
             mean = self(x)
             # one backward pass per output; queries do not interact, so their sum separates them
             rows = [
-                torch.autograd.grad(mean[..., j].sum(), x, retain_graph=True, allow_unused=True)[0]
+                torch.autograd.grad(g.sum(), x, retain_graph=True, materialize_grads=True)[0]
                 if mean.requires_grad
-                else None
-                for j in range(self.out_features)
+                else torch.zeros_like(x)
+                for g in mean.unbind(-1)
             ]
-        rows = [torch.zeros_like(x) if row is None else row for row in rows]
         return mean.detach(), torch.stack(rows, dim=-2)
 
     # -- learning -----------------------------------------------------------------------------
@@ -149,16 +147,23 @@ class ResidualLearner(nn.Module, ABC):
             return UpdateReport.of_nothing(mask, self.dtype)
         return self._absorb(x, y, mask)
 
+    def _report(
+        self, nis: Tensor, mask: Tensor | None, novelty: Tensor | None = None, weight: Tensor | None = None
+    ) -> UpdateReport:
+        """Of samples that were taken in; without a basis no novelty, and by default weight 1."""
+        one = torch.ones_like(nis)
+        event = (one if mask is None else mask).to(torch.int64)
+        novelty = 0.0 * one if novelty is None else novelty
+        return UpdateReport(event, novelty, nis, one if weight is None else weight)
+
     # -- checks ---------------------------------------------------------------------------------
 
     @property
     def dtype(self) -> torch.dtype:
-        """Floating type of the state."""
         return self._like.dtype
 
     @property
     def device(self) -> torch.device:
-        """Device of the state."""
         return self._like.device
 
     def _cast(self, x: Tensor) -> Tensor:
@@ -211,7 +216,6 @@ class ResidualLearner(nn.Module, ABC):
         return mask
 
     def extra_repr(self) -> str:
-        """One line for ``print(model)``."""
         fleet = f", batch_shape={tuple(self.batch_shape)}" if self.batch_shape else ""
         return f"in_features={self.in_features}, out_features={self.out_features}{fleet}"
 
@@ -249,8 +253,3 @@ class SingleLearner(ResidualLearner):
         if mask is not None and not bool(mask):
             return UpdateReport.of_nothing(mask, self.dtype)
         return self._absorb(x, y, None)
-
-    def _absorbed(self, nis: Tensor) -> UpdateReport:
-        """Report of a learner without a basis that trusts every sample alike."""
-        one = torch.ones_like(nis)
-        return UpdateReport(one.to(torch.int64), 0 * one, nis, one)

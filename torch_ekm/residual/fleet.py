@@ -70,11 +70,9 @@ class LearnerFleet(ResidualLearner):
         return self._all()[int(places[place])]
 
     def forward(self, x: Tensor) -> Tensor:
-        """Each learner's mean."""
         return self._stack([g(z) for g, z in self._each(self._check_query(x))], 1)
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
-        """Each learner's law."""
         each = self._each(self._check_query(x))
         return self._normal([g.predict(z, observation=observation) for g, z in each])
 
@@ -91,7 +89,6 @@ class LearnerFleet(ResidualLearner):
         return self._stack([p[0] for p in parts], 1), self._stack([p[1] for p in parts], 2)
 
     def reset(self) -> None:
-        """Reset each."""
         self.n_refused.zero_()
         for g in self._all():
             g.reset()

@@ -13,6 +13,7 @@ from torch.distributions import Distribution, Normal
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import ResidualLearner
+from .checks import check_factor
 from .report import UpdateReport
 from .tails import ScaleMixture
 
@@ -53,17 +54,6 @@ class MixtureResidual(ResidualLearner):
         ParameterError: no learner, learners of different shapes, or an empty or impossible choice.
     """
 
-    prior: Tensor
-    evidence: Tensor
-    innovation: Tensor
-    level: Tensor
-    gain: Tensor
-    offset: Tensor
-    inflation: Tensor
-    count: Tensor
-    _experts: Tensor
-    _owner: Tensor
-
     def __init__(
         self,
         learners: ResidualLearner | Sequence[ResidualLearner],
@@ -79,32 +69,34 @@ class MixtureResidual(ResidualLearner):
         first = _same_shapes(members)
         shape = {"batch_shape": tuple(first.batch_shape), "dtype": first.dtype, "device": first.device}
         super().__init__(first.in_features, first.out_features, **{**shape, **options})
-        _check_choices(shares, carries, levels, caps, memory)
+        choices = ("shares", shares, 0, 1), ("carries", carries, -1, 1), ("levels", levels, 0, 1)
+        for name, values, low, high in (*choices, ("caps", caps, 1e-3, 1e6)):
+            if not values or not all(low <= value <= high for value in values):
+                raise ParameterError(name, values, f"one or more numbers in [{low:g}, {high:g}]")
         self.learners = nn.ModuleList(members)
-        self.memory = float(memory)
-        owner, *values = zip(
-            *itertools.product(range(len(members)), shares, carries, levels, caps), strict=True
-        )
+        self.memory = check_factor("memory", memory)
+        experts = itertools.product(range(len(members)), shares, carries, levels, caps)
+        owner, *values = zip(*experts, strict=True)
         factory = {"dtype": self.dtype, "device": self.device}
-        self.register_buffer("_experts", torch.tensor(values, **factory), persistent=False)
+        self._experts = nn.Buffer(torch.tensor(values, **factory), persistent=False)
         members_of = torch.nn.functional.one_hot(torch.tensor(owner), len(members))
-        self.register_buffer("_owner", members_of.to(self._like), persistent=False)
+        self._owner = nn.Buffer(members_of.to(self._like), persistent=False)
         # the belief of `shares` is split over what is not a share of 1, if 1 is among them
         plain = self._experts[0] == max(shares)
         others = max(len(set(shares)) - 1, 1)
         prior = torch.where(plain, _PRIOR, (1 - _PRIOR) / others).log()
-        self.register_buffer("prior", prior, persistent=False)
+        self.prior = nn.Buffer(prior, persistent=False)
         wide = (*self.batch_shape, self.out_features, len(owner))
-        for name in ("evidence", "innovation", "level"):
-            self.register_buffer(name, torch.zeros(wide, **factory))
+        self.evidence = nn.Buffer(torch.zeros(wide, **factory))
+        self.innovation = nn.Buffer(torch.zeros(wide, **factory))
+        self.level = nn.Buffer(torch.zeros(wide, **factory))
         # what a query needs of the weights: sum p h per learner, and sum p (l - kappa w)
-        self.register_buffer("gain", torch.zeros(*wide[:-1], len(members), **factory))
-        self.register_buffer("offset", torch.zeros(wide[:-1], **factory))
-        self.register_buffer("inflation", torch.ones(wide[:-1], **factory))
-        self.register_buffer("count", torch.zeros(self.batch_shape, **factory))
-        self.tails = ScaleMixture(
-            self.out_features, memory=self.memory, batch_shape=tuple(self.batch_shape), **factory
-        )
+        self.gain = nn.Buffer(torch.zeros(*wide[:-1], len(members), **factory))
+        self.offset = nn.Buffer(torch.zeros(wide[:-1], **factory))
+        self.inflation = nn.Buffer(torch.ones(wide[:-1], **factory))
+        self.count = nn.Buffer(torch.zeros(self.batch_shape, **factory))
+        fleet = {"batch_shape": self.batch_shape, **factory}
+        self.tails = ScaleMixture(self.out_features, memory=self.memory, **fleet)
         self._settle()
 
     # -- predictions ----------------------------------------------------------------------------
@@ -118,12 +110,11 @@ class MixtureResidual(ResidualLearner):
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """Moments of the mixture, or mean and running variance of y with ``observation=True``."""
         x = self._check_query(x)
-        mean, deviation = self._standard(x)
+        mean, deviation, means = self._standard(x)
         deviation = deviation * self.inflation.sqrt()
         if observation:
             return Normal(mean, deviation, validate_args=False)
         laws = [learner.predict(x) for learner in self.members]
-        means = torch.stack([law.mean for law in laws], dim=-1).to(x.dtype)
         variances = torch.stack([law.variance for law in laws], dim=-1).to(x.dtype)
         inside = self._experts[0].square() * (variances @ self._owner.mT)
         between = (self._means(means) - mean.unsqueeze(-1)).square()
@@ -133,8 +124,7 @@ class MixtureResidual(ResidualLearner):
 
     def predictive(self, x: Tensor) -> Distribution:
         """Mixture of Student t laws about the mean: what log densities should be taken of."""
-        mean, deviation = self._standard(self._check_query(x))
-        return self.tails.law(mean, deviation)
+        return self.tails.law(*self._standard(self._check_query(x))[:2])
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The learners' slopes, weighted; what is carried over does not depend on x."""
@@ -178,10 +168,7 @@ class MixtureResidual(ResidualLearner):
         self._settle()
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        laws = [learner.predict(x, observation=True) for learner in self.members]
-        means = torch.stack([law.mean for law in laws], dim=-1).to(x.dtype)
-        deviation = self._deviation(laws, x)
-        mean = (self.gain * means).sum(-1) + self.offset
+        mean, deviation, means = self._standard(x)
         scale = (deviation * self.tails.typical()).unsqueeze(-1)
         target = y - self.offset
 
@@ -200,7 +187,8 @@ class MixtureResidual(ResidualLearner):
         for name, value in news.items():
             buffer = self.get_buffer(name)
             if mask is not None:
-                value = torch.where(_trailing(mask, value), value, buffer)
+                on = mask[(..., *(None,) * (value.dim() - mask.dim()))]
+                value = torch.where(on, value, buffer)
             buffer.copy_(value)
         nis = (z.square() / self.inflation).mean(-1)
         self.tails.observe(z, self.count, mask)
@@ -227,15 +215,13 @@ class MixtureResidual(ResidualLearner):
         self.gain.copy_((p * self._experts[0]) @ self._owner)
         self.offset.copy_((p * self._carried()).sum(-1))
 
-    def _deviation(self, laws: list[Normal], x: Tensor) -> Tensor:
-        variances = torch.stack([law.variance for law in laws], dim=-1).to(x.dtype)
-        return (self.weights * variances).sum(-1).sqrt()
-
-    def _standard(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean, and the deviation by which innovations are standardised: the learners' own."""
+    def _standard(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean, the deviation by which innovations are standardised (the learners' own), their means."""
         laws = [learner.predict(x, observation=True) for learner in self.members]
         means = torch.stack([law.mean for law in laws], dim=-1).to(x.dtype)
-        return (self.gain * means).sum(-1) + self.offset, self._deviation(laws, x)
+        variances = torch.stack([law.variance for law in laws], dim=-1).to(x.dtype)
+        mean = (self.gain * means).sum(-1) + self.offset
+        return mean, (self.weights * variances).sum(-1).sqrt(), means
 
 
 def _same_shapes(members: list[ResidualLearner]) -> ResidualLearner:
@@ -247,26 +233,3 @@ def _same_shapes(members: list[ResidualLearner]) -> ResidualLearner:
     if len(set(shapes)) > 1:
         raise ParameterError("learners", shapes, "of the same (in_features, out_features, batch_shape)")
     return members[0]
-
-
-def _check_choices(
-    shares: Sequence[float],
-    carries: Sequence[float],
-    levels: Sequence[float],
-    caps: Sequence[float],
-    memory: float,
-) -> None:
-    limits = {
-        "shares": (shares, 0.0, 1.0, "in [0, 1]"),
-        "carries": (carries, -1.0, 1.0, "in [-1, 1]"),
-        "levels": (levels, 0.0, 1.0, "in [0, 1]"),
-        "caps": (caps, 1e-3, 1e6, "positive"),
-        "memory": ((memory,), 1e-6, 1.0, "in (0, 1]"),
-    }
-    for name, (values, low, high, meaning) in limits.items():
-        if not values or not all(low <= value <= high for value in values):
-            raise ParameterError(name, values, f"one or more numbers {meaning}")
-
-
-def _trailing(mask: Tensor, like: Tensor) -> Tensor:
-    return mask[(..., *(None,) * (like.dim() - mask.dim()))]

@@ -30,11 +30,6 @@ class ScaleMixture(nn.Module):
         batch_shape: shape of the fleet.
     """
 
-    log_scale: Tensor
-    evidence: Tensor
-    rates: Tensor
-    freedoms: Tensor
-
     def __init__(
         self,
         out_features: int,
@@ -48,11 +43,11 @@ class ScaleMixture(nn.Module):
         self.memory = memory
         factory = {"dtype": dtype, "device": device}
         rates, freedoms = zip(*itertools.product(_RATES, _FREEDOMS), strict=True)
-        self.register_buffer("rates", torch.tensor(rates, **factory), persistent=False)
-        self.register_buffer("freedoms", torch.tensor(freedoms, **factory), persistent=False)
+        self.rates = nn.Buffer(torch.tensor(rates, **factory), persistent=False)
+        self.freedoms = nn.Buffer(torch.tensor(freedoms, **factory), persistent=False)
         shape = (*batch_shape, out_features, len(rates))
-        self.register_buffer("log_scale", torch.zeros(shape, **factory))
-        self.register_buffer("evidence", torch.zeros(shape, **factory))
+        self.log_scale = nn.Buffer(torch.zeros(shape, **factory))
+        self.evidence = nn.Buffer(torch.zeros(shape, **factory))
 
     def law(self, mean: Float[Tensor, "*any out"], deviation: Float[Tensor, "*any out"]) -> MixtureSameFamily:
         """The law of y = mean + deviation z. Its variance is infinite (one expert has nu = 2)."""

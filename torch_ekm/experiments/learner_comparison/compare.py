@@ -15,16 +15,13 @@ from ...exceptions import MissingExtraError, ParameterError, ShapeError
 from ...residual import ResidualLearner
 from ...typing import Array
 from ..jobs import run_jobs
-from ..learners import learner_factory
+from ..learners import COMPARED, Factory, learner_factory
 from .fingerprint import fingerprint
-from .learners import DEFAULT
 from .prequential import Z90, run_prequential
 from .recordings import LIMIT, load_recording
 from .report import ComparisonReport
 from .scores import Score, block_bootstrap, blocks_of
 from .stream import LEAST, Stream
-
-Factory = Callable[[int, int], ResidualLearner]
 
 
 def compare(
@@ -66,16 +63,13 @@ def compare(
     """
     factories = _factories(learners)
     data = [data] if isinstance(data, str | Path | Stream) else list(data)
-    streams = [
-        one if isinstance(one, Stream) else load_recording(one, None, limit, tuple(targets)) for one in data
-    ]
+    streams = [one if isinstance(one, Stream) else load_recording(one, limit, tuple(targets)) for one in data]
     names = [stream.name for stream in streams]
     if not names or not factories:
         raise ParameterError("data, learners", (names, list(factories)), "at least one of each")
     if len(set(names)) < len(names):
         raise ParameterError("data", names, "of different names")
-    jobs: dict[str, tuple[Stream, Factory]] = {}
-    keys: dict[str, tuple[Stream, str]] = {}
+    jobs, keys = {}, {}
     for stream in streams:
         if len(stream) < LEAST:
             raise ShapeError(f"stream '{stream.name}'", f"(n >= {LEAST}, ...)", stream.y.shape, "too short")
@@ -87,11 +81,10 @@ def compare(
     scores, errors = {}, {}
     for job, result in results.items():
         stream, name = keys[job]
-        squared, alone = np.array(result["squared"]), _squared(stream.y[stream.warm_up :])
+        squared, alone = np.array(result.pop("squared")), _squared(stream.y[stream.warm_up :])
         errors[stream.name, name] = squared
         rms = block_bootstrap(squared, alone, blocks_of(stream))
-        figures = {key: value for key, value in result.items() if key != "squared"}
-        scores[stream.name, name] = Score(stream.name, name, rms, **figures)
+        scores[stream.name, name] = Score(stream.name, name, rms, **result)
     return ComparisonReport(tuple(streams), tuple(factories), scores, errors)
 
 
@@ -121,7 +114,7 @@ def run_one(stream: Stream, factory: Factory) -> dict[str, Any]:
 def _factories(learners: Mapping[str, Factory] | Sequence[str] | None) -> dict[str, Factory]:
     if isinstance(learners, Mapping):
         return dict(learners)
-    names = DEFAULT if learners is None else (learners,) if isinstance(learners, str) else learners
+    names = COMPARED if learners is None else (learners,) if isinstance(learners, str) else learners
     return {name: learner_factory(name) for name in names}
 
 

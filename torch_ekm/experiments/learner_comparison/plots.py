@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..._extras import require
-from .learners import OURS
+from ..learners import OURS
+from ..reporting.plots import new_figure
 from .scores import Comparison
 
 if TYPE_CHECKING:
@@ -28,10 +29,10 @@ def plot_scores(comparison: Comparison) -> Figure:
     n = len(comparison.streams)
     columns = min(n, 3)
     rows = -(-n // columns)
-    size = (3.2 * columns + 1.2, (0.22 * len(comparison.learners) + 0.8) * rows)
-    figure, axes = _figure(size, rows, columns)
+    width, height = 3.2 * columns + 1.2, (0.22 * len(comparison.learners) + 0.8) * rows
+    figure, axes = new_figure(width, height, columns, rows, sharey=True)
     y = np.arange(len(comparison.learners))
-    for axis, stream in zip(axes.flat, comparison.streams, strict=False):
+    for axis, stream in zip(axes, comparison.streams, strict=False):
         scores, best = comparison.row(stream.name), comparison.best(stream.name)
         for i, score in enumerate(scores):
             colour = colour_of(score.learner)
@@ -43,10 +44,10 @@ def plot_scores(comparison: Comparison) -> Figure:
         axis.set_xlim(0, min(max(1.15, 1.1 * max(score.rms.mean for score in scores)), 2.0))
         axis.grid(axis="y", visible=False)
         axis.grid(axis="x", color="0.9", linewidth=0.8)
-    for axis in axes[:, 0]:
+    for axis in axes[::columns]:
         axis.set_yticks(y, comparison.learners, fontsize=8)
-    axes[0, 0].invert_yaxis()  # shared by all panels
-    for axis in list(axes.flat)[n:]:
+    axes[0].invert_yaxis()  # shared by all panels
+    for axis in axes[n:]:
         axis.set_visible(False)
     figure.supxlabel("rms error / that of the model alone (95 % interval); filled: best", fontsize=9)
     return figure
@@ -60,7 +61,7 @@ def plot_learning_curves(
     windows: int = 25,
 ) -> Figure:
     """rms error over the time of one stream, in windows; ``mark``: sample -> what happened there."""
-    figure, ((axis,),) = _figure((7.5, 3.4), 1, 1)
+    figure, (axis,) = new_figure(7.5, 3.4)
     one = comparison.stream(stream)
     n = len(one) - one.warm_up
     edges = np.linspace(0, n, min(windows, n // 5) + 1).astype(int)
@@ -82,7 +83,7 @@ def plot_ranks(comparison: Comparison) -> Figure:
     """Mean rank on the streams, +- half the critical difference: what overlaps cannot be told apart."""
     ranks, difference = comparison.ranks().mean(0), comparison.critical_difference()
     order = np.argsort(ranks)
-    figure, ((axis,),) = _figure((6.5, 0.26 * len(ranks) + 0.9), 1, 1)
+    figure, (axis,) = new_figure(6.5, 0.26 * len(ranks) + 0.9)
     for place, i in enumerate(order):
         colour = colour_of(comparison.learners[i])
         if np.isfinite(difference):
@@ -98,7 +99,7 @@ def plot_ranks(comparison: Comparison) -> Figure:
 
 def plot_cost(comparison: Comparison) -> Figure:
     """Time for one sample against the geometric mean of the error ratios; the model alone is 1."""
-    figure, ((axis,),) = _figure((7.5, 3.8), 1, 1)
+    figure, (axis,) = new_figure(7.5, 3.8)
     points = []
     for name in comparison.learners:
         scores = [comparison.scores[stream.name, name] for stream in comparison.streams]
@@ -120,14 +121,3 @@ def plot_cost(comparison: Comparison) -> Figure:
     axis.margins(x=0.1, y=0.08)
     axis.set(xlabel="one prediction and one update [µs]", ylabel="rms error / model alone (geometric mean)")
     return figure
-
-
-def _figure(size: tuple[float, float], rows: int, columns: int):
-    """A figure of its own, without pyplot: a notebook shows it once, a script needs no display."""
-    figure = require("matplotlib.figure").Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, sharey=True)
-    for axis in axes.flat:
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.grid(axis="y", color="0.9", linewidth=0.8)
-        axis.set_axisbelow(True)
-    return figure, axes

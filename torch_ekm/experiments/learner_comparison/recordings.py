@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,6 @@ from ...exceptions import DescriptionError, UnknownNameError
 from ...typing import Array
 from .stream import Stream, in_own_units, load_table
 
-Root = str | Path | None
 LIMIT = 1500  #: samples of a recording that are used if nobody says otherwise
 
 _T42 = "t42_hand/t42_testpaths.npz"
@@ -22,14 +22,12 @@ _T42_NOMINAL, _T42_SKIPPED = "cyl45_d_v0", "str40_d_v1"
 _T42_HORIZON = 10  # [steps] of the log in one sample
 
 
-def load_recording(
-    name: str | Path, root: Root = None, limit: int | None = LIMIT, targets: Sequence[str] = ()
-) -> Stream:
+def load_recording(name: str | Path, limit: int | None = LIMIT, targets: Sequence[str] = ()) -> Stream:
     """A public recording by name, or a file of one's own by path.
 
     Args:
-        name: ``simulated_hand``, a recording in the data folder (the error lists them), or a path.
-        root: the data folder; ``TORCH_EKM_DATA`` by default.
+        name: ``simulated_hand``, a recording in the folder ``TORCH_EKM_DATA`` (the error lists them), or a
+            path.
         limit: only the first so many samples (of each object alike, where there are many); None: all.
         targets: columns to predict, in a file of one's own.
 
@@ -42,14 +40,14 @@ def load_recording(
 
         return record_simulated_hand(min(limit or 400, 400))
     if name in _READERS:
-        return _READERS[str(name)](root, limit)
+        return _READERS[str(name)](limit)
     if Path(name).suffix:
         return load_table(name, targets, limit)
     known = ("simulated_hand", *_READERS, "a path to a .csv or .parquet file")
     raise UnknownNameError("recording", str(name), known)
 
 
-def load_t42(root: Root = None) -> list[Stream]:
+def load_t42() -> list[Stream]:
     """The Yale T42 hand (Sintov et al.), a stream for each object; a constant Jacobian is the nominal model.
 
     ``t42_hand/t42_testpaths.npz`` holds, for each object and path, states ``(n, 13)`` and actions
@@ -60,7 +58,7 @@ def load_t42(root: Root = None) -> list[Stream]:
     Raises:
         DescriptionError: there is no such file.
     """
-    file = np.load(_need(root, _T42))
+    file = np.load(_need(_T42))
     samples: dict[str, list[tuple[Array, Array, Array]]] = {}
     for key in sorted(k[:-2] for k in file.files if k.endswith("/S")):
         states, actions = file[key + "/S"], file[key + "/A"]
@@ -73,22 +71,19 @@ def load_t42(root: Root = None) -> list[Stream]:
     joined = {
         name: [np.concatenate(part) for part in zip(*paths, strict=True)] for name, paths in samples.items()
     }
-    state, action, change = joined[_T42_NOMINAL]
+    _, action, change = joined[_T42_NOMINAL]
     jacobian = np.linalg.lstsq(action, change, rcond=None)[0]
-    inputs, residual = np.hstack([state, action]), change - action @ jacobian
+    pairs = {name: (np.hstack([s, a]), change - a @ jacobian) for name, (s, a, change) in joined.items()}
+    inputs, residual = pairs[_T42_NOMINAL]
     mean, deviation, unit = inputs.mean(0), inputs.std(0), residual.std(0)
     return [
-        Stream(
-            name,
-            torch.from_numpy((np.hstack([state, action]) - mean) / deviation),
-            torch.from_numpy((change - action @ jacobian) / unit),
-        )
-        for name, (state, action, change) in sorted(joined.items())
+        Stream(name, torch.from_numpy((x - mean) / deviation), torch.from_numpy(y / unit))
+        for name, (x, y) in sorted(pairs.items())
         if name not in (_T42_NOMINAL, _T42_SKIPPED)
     ]
 
 
-def load_regression(name: str, root: Root = None) -> tuple[Array, Array]:
+def load_regression(name: str) -> tuple[Array, Array]:
     """Inputs ``(n, d)`` and outputs ``(n, m)`` of a regression set in the order of its file, in its units.
 
     Args:
@@ -102,7 +97,7 @@ def load_regression(name: str, root: Root = None) -> tuple[Array, Array]:
     if name not in _REGRESSION:
         raise UnknownNameError("regression set", name, _REGRESSION)
     path, n_out, _ = _REGRESSION[name]
-    file = _need(root, path)
+    file = _need(path)
     if file.suffix == ".mat":
         values = next(v for k, v in require("scipy.io").loadmat(str(file)).items() if not k.startswith("__"))
     else:
@@ -110,25 +105,22 @@ def load_regression(name: str, root: Root = None) -> tuple[Array, Array]:
     return values[:, :-n_out], values[:, -n_out:]
 
 
-def _regression(name: str) -> Callable[[Root, int | None], Stream]:
-    def read(root: Root, limit: int | None) -> Stream:
-        x, y = load_regression(name, root)
-        return in_own_units(name, x[:limit], y[:limit], _REGRESSION[name][2])
-
-    return read
+def _regression(name: str, limit: int | None) -> Stream:
+    x, y = load_regression(name)
+    return in_own_units(name, x[:limit], y[:limit], _REGRESSION[name][2])
 
 
-def _t42(root: Root, limit: int | None) -> Stream:
-    objects = load_t42(root)
+def _t42(limit: int | None) -> Stream:
+    objects = load_t42()
     share = None if limit is None else max(limit // len(objects), 1)  # of each object, its first samples
     x, y = (torch.cat([getattr(one, part)[:share] for one in objects]).double() for part in "xy")
     about = f"Yale T42 hand moving {len(objects)} objects (Sintov et al.); alone: one constant Jacobian"
     return Stream("t42", x, y, 0, tuple(len(one.x[:share]) for one in objects), about)
 
 
-def _icub_grasp(root: Root, limit: int | None) -> Stream:
+def _icub_grasp(limit: int | None) -> Stream:
     """Next increment of the 9 encoders from encoders, last increment and the 5 fingers' touch."""
-    folder = _need(root, "icub_grasp/iCubGraspDataset")
+    folder = _need("icub_grasp/iCubGraspDataset")
     x, y, segments = [], [], []
     for path in sorted(folder.glob("*.txt"), key=_trial):
         if path.name.startswith("full_coke"):  # its authors say not to trust it
@@ -158,25 +150,23 @@ def _trial(path: Path) -> tuple[int, str]:
     return int(number), name
 
 
-def _series(path: str, name: str, lags: int, about: str) -> Callable[[Root, int | None], Stream]:
-    def read(root: Root, limit: int | None) -> Stream:
-        series = np.loadtxt(_need(root, path))[: None if limit is None else limit + lags]
-        x = np.lib.stride_tricks.sliding_window_view(series, lags)[:-1]
-        return in_own_units(name, x, series[lags:, None], f"{about}, next value; alone: the mean")
-
-    return read
+def _series(name: str, limit: int | None) -> Stream:
+    path, lags, about = _SERIES[name]
+    series = np.loadtxt(_need(path))[: None if limit is None else limit + lags]
+    x = np.lib.stride_tricks.sliding_window_view(series, lags)[:-1]
+    return in_own_units(name, x, series[lags:, None], f"{about}, next value; alone: the mean")
 
 
-def _mimo(root: Root, limit: int | None) -> Stream:
+def _mimo(limit: int | None) -> Stream:
     """Received signal from the last four sent ones, as in the Kernel Adaptive Filtering Toolbox."""
-    sent, received = np.loadtxt(_need(root, "streams/mimotestbed8K.dat"), delimiter=",").T
+    sent, received = np.loadtxt(_need("streams/mimotestbed8K.dat"), delimiter=",").T
     x = np.lib.stride_tricks.sliding_window_view(sent, 4)[:limit]
     about = "a real 2x2 radio channel that changes (kafbox); alone: the mean"
     return in_own_units("mimo", x, received[3:, None][:limit], about)
 
 
-def _need(root: Root, path: str) -> Path:
-    root = root or os.environ.get("TORCH_EKM_DATA")
+def _need(path: str) -> Path:
+    root = os.environ.get("TORCH_EKM_DATA")
     if not root or not Path(root).is_dir():
         raise DescriptionError(root or "TORCH_EKM_DATA", "name a folder with the recordings here")
     full = Path(root) / path
@@ -191,12 +181,16 @@ _REGRESSION = {
     "kin40k": ("uci/kin40k/data.csv.gz", 1, "kinematics of an 8-link arm; alone: the mean"),
     "powerplant": ("uci/power-plant.csv", 1, "a power plant's output; alone: the mean"),
 }
-_READERS: dict[str, Callable[[Root, int | None], Stream]] = {
+# name -> file, number of values from which the next one is predicted, and what it is
+_SERIES = {
+    "lorenz": ("streams/lorenz.dat", 6, "Lorenz attractor"),
+    "mackey_glass": ("streams/mg30.dat", 10, "Mackey-Glass"),
+    "santafe": ("streams/santafe.dat", 10, "Santa Fe laser"),
+}
+_READERS: dict[str, Callable[[int | None], Stream]] = {
     "t42": _t42,
     "icub_grasp": _icub_grasp,
     "mimo": _mimo,
-    **{name: _regression(name) for name in _REGRESSION},
-    "lorenz": _series("streams/lorenz.dat", "lorenz", 6, "Lorenz attractor"),
-    "mackey_glass": _series("streams/mg30.dat", "mackey_glass", 10, "Mackey-Glass"),
-    "santafe": _series("streams/santafe.dat", "santafe", 10, "Santa Fe laser"),
+    **{name: partial(_regression, name) for name in _REGRESSION},
+    **{name: partial(_series, name) for name in _SERIES},
 }

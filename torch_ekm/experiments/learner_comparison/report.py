@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from ..reporting.plots import save_figure
-from ..reporting.report import FigureFile, Report, Table
+from ..reporting.report import Cell, Column, Report, Table
 from .plots import plot_cost, plot_learning_curves, plot_ranks, plot_scores
-from .scores import Comparison
+from .scores import Comparison, Score
 
 
 class ComparisonReport(Comparison):
@@ -22,30 +23,25 @@ class ComparisonReport(Comparison):
         return [overview_table(self), *tables] if len(tables) > 1 else tables
 
     def __str__(self) -> str:
-        table = self.tables()[0]
-        rows = [table.header, *table.text()]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
-        return "\n".join([table.caption, *lines, table.note, *self.verdicts()])
+        return "\n".join([str(self.tables()[0]), *self.verdicts()])
 
     def write(self, folder: str | Path) -> Report:
         """Tables as CSV, figures as SVG and PNG, and ``index.html`` with all of them, into ``folder``."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        drawn = {"scores": (plot_scores(self), "rms error over that of the model alone, 95 % intervals.")}
+        save = partial(save_figure, folder=Path(folder))
+        caption = "rms error over that of the model alone, 95 % intervals."
+        figures = [save(plot_scores(self), name="scores", caption=caption)]
         if len(self.streams) > 1:
-            drawn["ranks"] = (plot_ranks(self), "Mean ranks; overlapping bars cannot be told apart.")
-        drawn["cost"] = (plot_cost(self), "Accuracy against time.")
-        for stream in self.streams:
-            figure = plot_learning_curves(self, stream.name, curve_learners(self, stream.name))
-            drawn[f"curve_{stream.name}"] = (figure, f"Learning curves on {stream.name}.")
-        for name, (figure, _) in drawn.items():
-            save_figure(figure, folder, name)
+            caption = "Mean ranks; overlapping bars cannot be told apart."
+            figures.append(save(plot_ranks(self), name="ranks", caption=caption))
+        figures.append(save(plot_cost(self), name="cost", caption="Accuracy against time."))
+        for stream in (s.name for s in self.streams):
+            figure = plot_learning_curves(self, stream, curve_learners(self, stream))
+            figures.append(save(figure, name=f"curve_{stream}", caption=f"Learning curves on {stream}."))
         report = Report(
             title="Residual learners compared",
             summary=" ".join(self.verdicts()),
             tables=self.tables(),
-            figures=[FigureFile(f"{name}.svg", caption) for name, (_, caption) in drawn.items()],
+            figures=figures,
             configuration={
                 "learners": list(self.learners),
                 "streams": {
@@ -53,32 +49,28 @@ class ComparisonReport(Comparison):
                 },
             },
         )
-        report.write(folder)
+        report.write(Path(folder))
         return report
 
 
 def score_table(comparison: Comparison, stream: str) -> Table:
     """Every learner on one stream."""
-    header = ["learner", "rms / model", "95 % interval", "median / model", "NLL", "90 % coverage", "µs", "kB"]
+    columns: dict[Column, Callable[[Score], Cell]] = {
+        Column("rms / model", ".3f"): lambda score: score.rms.mean,
+        Column("95 % interval"): lambda score: f"{score.rms.low:.3f} to {score.rms.high:.3f}",
+        Column("median / model", ".3f"): lambda score: score.median if np.isfinite(score.median) else None,
+        Column("NLL"): lambda score: f"{score.nll:.2f}" if score.nll < 1e3 else f"{score.nll:.1e}",
+        Column("90 % coverage"): lambda score: f"{100 * score.coverage:.0f} %",
+        Column("µs", ".0f"): lambda score: score.microseconds,
+        Column("kB", ".0f"): lambda score: score.kilobytes,
+    }
     best = comparison.best(stream)
-    rows = [
-        [
-            score.learner + (" *" if score is best else ""),
-            f"{score.rms.mean:.3f}",
-            f"{score.rms.low:.3f} to {score.rms.high:.3f}",
-            f"{score.median:.3f}" if np.isfinite(score.median) else "-",
-            f"{score.nll:.2f}" if score.nll < 1e3 else f"{score.nll:.1e}",
-            f"{100 * score.coverage:.0f} %",
-            f"{score.microseconds:.0f}",
-            f"{score.kilobytes:.0f}",
-        ]
-        for score in comparison.row(stream)
-    ]
+    items = {score.learner + (" *" if score is best else ""): score for score in comparison.row(stream)}
     one = comparison.stream(stream)
     n, parts = len(one) - one.warm_up, len(one.segments)
     note = f"{n} samples scored{f' in {parts} parts' if parts else ''}, "
     note += f"{one.x.shape[1]} inputs, {one.y.shape[1]} outputs."
-    return Table(f"scores_{stream}", f"{stream}: {one.about}", header, rows, note)
+    return Table.of(f"scores_{stream}", f"{stream}: {one.about}", "learner", items, columns, note)
 
 
 def overview_table(comparison: Comparison) -> Table:
@@ -86,24 +78,18 @@ def overview_table(comparison: Comparison) -> Table:
     names = [stream.name for stream in comparison.streams]
     ranks = comparison.ranks().mean(0)
     best = {name: comparison.best(name).learner for name in names}
-    rows = [
-        [
-            learner,
-            *(
-                f"{comparison.scores[name, learner].rms.mean:.3f}{' *' if best[name] == learner else ''}"
-                for name in names
-            ),
-            f"{rank:.1f}",
-        ]
-        for learner, rank in sorted(zip(comparison.learners, ranks, strict=True), key=lambda pair: pair[1])
-    ]
+    rows: list[list[Cell]] = []
+    for learner, rank in sorted(zip(comparison.learners, ranks, strict=True), key=lambda pair: pair[1]):
+        figures = ((comparison.scores[name, learner].rms.mean, best[name] == learner) for name in names)
+        rows.append(
+            [learner, *(f"{mean:.3f}{' *' if first else ''}" for mean, first in figures), float(rank)]
+        )
     difference = comparison.critical_difference()
     note = "* best of its column."
     if np.isfinite(difference):
         note += f" Mean ranks closer than {difference:.1f} cannot be told apart (Nemenyi, 5 %)."
-    return Table(
-        "overview", "rms error / that of the model alone", ["learner", *names, "mean rank"], rows, note
-    )
+    columns = ["learner", *names, Column("mean rank", ".1f")]
+    return Table("overview", "rms error / that of the model alone", columns, rows, note)
 
 
 def curve_learners(comparison: Comparison, stream: str, most: int = 6) -> Sequence[str]:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..._extras import require
 from ...typing import Array
+from ..learners import OURS
 from ..reporting.statistics import Estimate
-from .learners import OURS
 from .stream import Stream
 
 _BLOCKS = 20

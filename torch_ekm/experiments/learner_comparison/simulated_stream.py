@@ -16,23 +16,22 @@ from .stream import Stream
 _DEG = math.pi / 180
 
 
-def record_simulated_hand(n: int = 400, seed: int = 1000, *, new_moment_arm: float | None = 0.85) -> Stream:
+def record_simulated_hand(n: int = 400, seed: int = 1000) -> Stream:
     """``y = ds - J_m da`` [mm, deg] of ``n`` motions with the nominal mismatch of the plant.
 
     The kinematic model turns the object towards targets drawn from 5 to 20 deg, at most ten motions each,
-    then grasps anew. Before motion ``n // 2`` all tendons are replaced.
+    then grasps anew. Before motion ``n // 2`` all tendons are replaced, with pulleys of 0.85 instead of 1.3
+    times their nominal radius.
 
     Args:
         seed: of grasps and targets; the recording repeats bit by bit.
-        new_moment_arm: factor of the new tendons' pulleys (1.3 before); None: no change.
 
     Raises:
         GraspError, EquilibriumError: the object could not be grasped.
     """
     draw = np.random.default_rng(seed)
     plant = SimulatedHand("icub_right", "box", preset="nominal")
-    events = [] if new_moment_arm is None else [Change.new_tendons(n // 2, new_moment_arm)]
-    disturbed = DisturbedPlant(plant, events)
+    disturbed = DisturbedPlant(plant, [Change.new_tendons(n // 2, 0.85)])
     model = KinematicModel(plant.hand, plant.object)
     rule = StoppingRule(max_steps=10)
     enhanced, x, y, segments = None, [], [], []

@@ -22,15 +22,12 @@ def read_table(path: Path) -> tuple[tuple[str, ...], Array]:
     Raises:
         DescriptionError: the file cannot be used; the message names line (row) and column.
     """
-    path = Path(path)
+    readers = {".csv": _csv, ".tsv": _csv, ".txt": _csv, ".parquet": _parquet, ".pq": _parquet}
     if not path.is_file():
         raise DescriptionError(path, "there is no such file")
-    if path.suffix.lower() in (".parquet", ".pq"):
-        names, values = _parquet(path)
-    elif path.suffix.lower() in (".csv", ".tsv", ".txt"):
-        names, values = _csv(path)
-    else:
+    if path.suffix.lower() not in readers:
         raise DescriptionError(path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet")
+    names, values = readers[path.suffix.lower()](path)
     for i, name in enumerate(names):
         if not name:
             raise DescriptionError(path, f"column {i + 1} has no name in the header")
@@ -52,29 +49,24 @@ def _csv(path: Path) -> tuple[tuple[str, ...], Array]:
     rows = [(reader.line_num, [field.strip() for field in row]) for row in reader if any(row)]
     number, names = rows[0]
     if all(_number(field) is not None for field in names):
-        raise DescriptionError(
-            path, f"line {number} holds numbers only; the first line must name the columns"
-        )
-    for line, row in rows[1:]:
-        if problem := _problem(names, row):
-            raise DescriptionError(path, f"line {line}{problem}")
-    values = np.array([row for _, row in rows[1:]], dtype=np.float64)
-    return tuple(names), values.reshape(-1, len(names))
-
-
-def _problem(names: list[str], row: list[str]) -> str | None:
-    """What is wrong with a line, to follow its number."""
-    if len(row) != len(names):
-        return f" has {len(row)} fields, but the header names {len(names)} columns"
-    for name, field in zip(names, row, strict=True):
-        value = _number(field)
-        if field == "":
-            return f", column '{name}' is empty; fill it in, or leave the whole line out"
-        if value is None:
-            return f", column '{name}': '{field}' is no number; leave the column out or encode it"
-        if not np.isfinite(value):
-            return f", column '{name}': '{field}' is not finite"
-    return None
+        problem = "holds numbers only; the first line must name the columns"
+        raise DescriptionError(path, f"line {number} {problem}")
+    values = np.empty((len(rows) - 1, len(names)))
+    for i, (line, row) in enumerate(rows[1:]):
+        if len(row) != len(names):
+            problem = f"has {len(row)} fields, but the header names {len(names)} columns"
+            raise DescriptionError(path, f"line {line} {problem}")
+        for j, field in enumerate(row):
+            value = _number(field)
+            if value is None or not np.isfinite(value):
+                problem = f": '{field}' is not finite"
+                if value is None:
+                    problem = f": '{field}' is no number; leave the column out or encode it"
+                if not field:
+                    problem = " is empty; fill it in, or leave the whole line out"
+                raise DescriptionError(path, f"line {line}, column '{names[j]}'{problem}")
+            values[i, j] = value
+    return tuple(names), values
 
 
 def _number(field: str) -> float | None:
@@ -94,9 +86,8 @@ def _parquet(path: Path) -> tuple[tuple[str, ...], Array]:
     for name, column in zip(table.column_names, table.columns, strict=True):
         kind = column.type
         if not (pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind)):
-            raise DescriptionError(
-                path, f"column '{name}' holds {kind}, not numbers; leave it out or encode it"
-            )
+            problem = f"holds {kind}, not numbers; leave it out or encode it"
+            raise DescriptionError(path, f"column '{name}' {problem}")
         values = column.to_numpy().astype(np.float64)
         if column.null_count or not np.isfinite(values).all():
             row = int(np.flatnonzero(~np.isfinite(values))[0])

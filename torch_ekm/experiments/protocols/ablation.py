@@ -21,7 +21,7 @@ from .protocol import Protocol, Results
 
 _DEG = math.pi / 180
 _BASE = "as it is"
-_ALL = ("KM", "KM+I", "E-KM")
+_LEARNING, _BOTH, _ALL = ("E-KM",), ("KM", "E-KM"), ("KM", "KM+I", "E-KM")
 
 #: Disturbances of the nominal plant, each alone in a plant that is otherwise exact.
 DISTURBANCES: dict[str, tuple[str, ...]] = {
@@ -50,62 +50,56 @@ class Variant:
     name: str
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Of the :class:`Setting`."""
-    controllers: tuple[str, ...] = ("KM", "E-KM")
+    controllers: tuple[str, ...] = _BOTH
+
+
+#: Group, name, field of the setting, what is changed in it, and the controllers that it concerns.
+_OPTIONS: list[tuple[str, str, str, dict[str, Any], tuple[str, ...]]] = [
+    ("online learning", "no robust update", "learner_options", {"robust": None}, _LEARNING),
+    ("online learning", "no forgetting", "learner_options", {"forgetting_factor": 1.0}, _LEARNING),
+    ("model", "no geometric stiffness", "model", {"hand_stiffness": False, "object_stiffness": False}, _BOTH),
+    ("model", "no rolling", "model", {"rolling": False}, _BOTH),
+    ("model", "rigid actuators", "model", {"actuator_compliance": False}, _BOTH),
+    ("controller", "gain 1 near the goal", "control", {"LimitingFunction.gain": 1.0}, _ALL),
+    ("controller", "gain 0.6 near the goal", "control", {"LimitingFunction.gain": 0.6}, _ALL),
+    ("controller", "steps of 1.5 deg", "control", {"LimitingFunction.step": 1.5 * _DEG}, _ALL),
+    (
+        "controller", "steps of 6 deg, 2 mm", "control",
+        {"LimitingFunction.step": 6 * _DEG, "LimitingFunction.contact_travel": 2e-3}, _ALL,
+    ),
+    (
+        "controller", "actuators cut at 6 deg", "control",
+        {"ActuatorLimit.step": 6 * _DEG, "JointLimit.horizon": 6 * _DEG}, _ALL,
+    ),
+    ("controller", "uncertainty in the cost", "control", {"UncertaintyTask.weight": 1.0}, _LEARNING),
+    ("controller", "rows for the friction margin", "control", {"FrictionMarginLimit.minimum": 0.5}, _ALL),
+    *(("dead zone", f"{x:g} deg", "plant", {"dead_zone": x * _DEG}, _ALL) for x in (0, 0.5, 0.9, 1.3, 1.7)),
+]  # fmt: skip
 
 
 def variants(base: Setting) -> list[Variant]:
-    """All variants of a setting; each group begins with the unchanged one."""
-    found = [Variant("learner", _BASE)]
-    found += [
-        Variant("learner", name, {"learner": name, "learner_options": {}}, ("E-KM",))
-        for name in HAND_LEARNERS
-        if name != base.learner
-    ]
-    found.append(Variant("online learning", _BASE))
-    for name, option in (
-        ("no robust update", {"robust": None}),
-        ("no forgetting", {"forgetting_factor": 1.0}),
-    ):
-        options = {**base.learner_options, **option}
-        found.append(Variant("online learning", name, {"learner_options": options}, ("E-KM",)))
-    for capacity in (15, 30, 120):
-        name = f"{capacity} basis points"
-        found.append(Variant("online learning", name, {"capacity": capacity}, ("E-KM",)))
-    found.append(Variant("model", _BASE))
-    for name, option in (
-        ("no geometric stiffness", {"hand_stiffness": False, "object_stiffness": False}),
-        ("no rolling", {"rolling": False}),
-        ("rigid actuators", {"actuator_compliance": False}),
-    ):
-        found.append(Variant("model", name, {"model": {**base.model, **option}}))
-    found.append(Variant("controller", _BASE))
-    for name, option, who in (
-        ("gain 1 near the goal", {"LimitingFunction.gain": 1.0}, _ALL),
-        ("gain 0.6 near the goal", {"LimitingFunction.gain": 0.6}, _ALL),
-        ("steps of 1.5 deg", {"LimitingFunction.step": 1.5 * _DEG}, _ALL),
-        (
-            "steps of 6 deg, 2 mm",
-            {"LimitingFunction.step": 6 * _DEG, "LimitingFunction.contact_travel": 2e-3},
-            _ALL,
-        ),
-        ("actuators cut at 6 deg", {"ActuatorLimit.step": 6 * _DEG, "JointLimit.horizon": 6 * _DEG}, _ALL),
-        ("uncertainty in the cost", {"UncertaintyTask.weight": 1.0}, ("E-KM",)),
-        ("rows for the friction margin", {"FrictionMarginLimit.minimum": 0.5}, _ALL),
-    ):
-        found.append(Variant("controller", name, {"control": {**base.control, **option}}, who))
-    found.append(Variant("preset", f"{base.preset}: {_BASE}"))
-    for preset in PRESETS:
-        if preset != base.preset:
-            found.append(Variant("preset", preset, {"preset": preset}, _ALL))
+    """All variants of a setting; most groups begin with the unchanged one."""
     nominal = dataclasses.asdict(PRESETS["nominal"])
-    for name, fields in DISTURBANCES.items():
-        plant = {key: nominal[key] for key in fields}
-        changes = {"preset": "none", "plant": plant}
-        found.append(Variant("disturbance", name, changes, _ALL))
-    for size in (0.0, 0.5, 0.9, 1.3, 1.7):
-        plant = {**base.plant, "dead_zone": size * _DEG}
-        found.append(Variant("dead zone", f"{size:g} deg", {"plant": plant}, _ALL))
-    return found
+    others = [name for name in HAND_LEARNERS if name != base.learner]
+    plants = {name: {key: nominal[key] for key in keys} for name, keys in DISTURBANCES.items()}
+    return [
+        *(Variant(group, _BASE) for group in ("learner", "online learning", "model", "controller")),
+        Variant("preset", f"{base.preset}: {_BASE}"),
+        *(Variant("learner", name, {"learner": name, "learner_options": {}}, _LEARNING) for name in others),
+        *(
+            Variant(group, name, {field: {**getattr(base, field), **option}}, controllers)
+            for group, name, field, option, controllers in _OPTIONS
+        ),
+        *(
+            Variant("online learning", f"{capacity} basis points", {"capacity": capacity}, _LEARNING)
+            for capacity in (15, 30, 120)
+        ),
+        *(Variant("preset", name, {"preset": name}, _ALL) for name in PRESETS if name != base.preset),
+        *(
+            Variant("disturbance", name, {"preset": "none", "plant": plant}, _ALL)
+            for name, plant in plants.items()
+        ),
+    ]
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
@@ -12,19 +12,16 @@ import numpy as np
 
 from ...description import load_hand, load_object
 from ...rendering import make_scene, save_animation, save_picture
-from ..config import Setting
 from ..records import Record, TrialRecord
 from ..reporting.plots import plot_convergence, plot_prediction_error, save_figure
 from ..reporting.report import Cell, Column, FigureFile, Report, Table
 from ..reporting.statistics import Array, select, steady_state_error
 from .generalize import Generalize
-from .protocol import Protocol, Results, records_of
-
-CONTROLLERS = ("KM", "E-KM")
+from .protocol import Results, records_of
 
 
 @dataclass(frozen=True)
-class Demo(Protocol):
+class Demo(Generalize):
     """One object of :class:`Generalize` with the KM and with an E-KM that starts empty, without the probes
     and with pictures.
 
@@ -34,47 +31,31 @@ class Demo(Protocol):
         ParameterError: an angle that is no rotation.
     """
 
-    setting: Setting = field(default_factory=Setting)
-    object: str = "box"
-    angles_deg: tuple[float, ...] | None = None
-    """None: those of :class:`Generalize`."""
+    objects: tuple[str, ...] = ("box",)
+    warm_up: int = 0
+    long_step_deg: float = 0.0
+    blind_deg: float = 0.0
+    controllers: tuple[str, ...] = ("KM", "E-KM")
+    poses: bool = True
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         load_object(self.object)
-        assert self.turns  # its angles are checked
 
     @property
-    def turns(self) -> Generalize:
-        """What is run."""
-        return Generalize(
-            self.setting,
-            objects=(self.object,),
-            angles_deg=self.angles_deg,
-            warm_up=0,
-            long_step_deg=0.0,
-            blind_deg=0.0,
-            controllers=CONTROLLERS,
-            poses=True,
-        )
+    def object(self) -> str:
+        """The one that is turned."""
+        return self.objects[0]
 
     def quick(self) -> Self:
         """The first two angles."""
-        return dataclasses.replace(self, angles_deg=self.turns.angles_of(self.object)[:2])
-
-    def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[str, str, int]]:
-        """One for each seed and controller."""
-        return self.turns.jobs(seeds)
-
-    def session(self, object: str, controller: str, seed: int) -> list[Record]:
-        """All angles, each from a new grasp; the E-KM learns from angle to angle."""
-        return self.turns.session(object, controller, seed)
+        return dataclasses.replace(self, angles_deg=self.angles_of(self.object)[:2])
 
     def report(self, seeds: Sequence[int], results: Results[Record], folder: Path) -> Report:
         """That of the turns, each target on its own, the motions, and pictures."""
-        report, records = self.turns.report(seeds, results, folder), select(records_of(results))
-        report.title = (
-            f"Turning the {_spoken(self.object)} with the hand {_spoken(self.setting.hand)}: KM and E-KM"
-        )
+        report, records = super().report(seeds, results, folder), select(records_of(results))
+        what, hand = _spoken(self.object), _spoken(self.setting.hand)
+        report.title = f"Turning the {what} with the hand {hand}: KM and E-KM"
         shown = ("controllers", "comparison", "prediction", "stop_reasons", "timing")
         report.tables = [self.angle_table(records)] + [t for t in report.tables if t.name in shown]
         report.figures = [*self._pictures(records, folder), *self._motions(records, folder), *report.figures]
@@ -83,12 +64,12 @@ class Demo(Protocol):
     def angle_table(self, records: Sequence[TrialRecord]) -> Table:
         """Each target on its own."""
         columns: list[Column | str] = [Column("target", "g")]
-        for name in CONTROLLERS:
+        for name in self.controllers:
             columns += [f"{name}: error", Column(f"{name}: motions", ".1f"), f"{name}: lost"]
         rows: list[list[Cell]] = []
-        for angle in self.turns.angles_of(self.object):
+        for angle in self.angles_of(self.object):
             row: list[Cell] = [float(angle)]
-            for name in CONTROLLERS:
+            for name in self.controllers:
                 mine = select(records, controller=name, angle_deg=angle)
                 figures = np.array([(steady_state_error(r), r.steps, r.lost) for r in mine])
                 row += [*map(float, figures.mean(0)[:2]), int(figures[:, 2].sum())] if mine else [None] * 3
@@ -113,16 +94,14 @@ class Demo(Protocol):
             curves = (np.stack([curve[:shortest] for curve in found]) for found in (ekm, km))
             figure = plot_prediction_error(*curves, xlabel="motion")
             figures.append(save_figure(figure, folder, "prediction_error", caption))
-        last = self.turns.angles_of(self.object)[-1]
+        last = self.angles_of(self.object)[-1]
         histories = {
             name: [np.array(r.errors_deg) for r in select(records, controller=name, angle_deg=last)]
-            for name in CONTROLLERS
+            for name in self.controllers
         }
+        figure = plot_convergence(histories, f"{last:g} deg")
         caption = f"Error on the way to {last:g} deg, as measured."
-        return [
-            *figures,
-            save_figure(plot_convergence(histories, f"{last:g} deg"), folder, "convergence", caption),
-        ]
+        return [*figures, save_figure(figure, folder, "convergence", caption)]
 
     def _pictures(self, records: Sequence[TrialRecord], folder: Path) -> list[FigureFile]:
         """The E-KM's best long turn: before and after, and as an animation."""

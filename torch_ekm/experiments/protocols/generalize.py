@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import Self
 
@@ -18,7 +19,7 @@ from ..reporting import statistics as stats
 from ..reporting import tables
 from ..reporting.plots import plot_steady_state_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from ..reporting.statistics import Array, Value, steady_state_error
+from ..reporting.statistics import Value, steady_state_error
 from ..reporting.tables import Target
 from ..runner import Bench
 from .protocol import Protocol, Results, records_of
@@ -79,19 +80,13 @@ class Generalize(Protocol):
 
     def quick(self) -> Self:
         """Two objects, two turns, one probe."""
-        return dataclasses.replace(
-            self,
-            objects=("box", "can"),
-            angles_deg=(5.0, 9.0),
-            warm_up=1,
-            long_step_deg=3.0,
-            blind_deg=0.0,
-        )
+        small = {"angles_deg": (5.0, 9.0), "warm_up": 1, "long_step_deg": 3.0, "blind_deg": 0.0}
+        return dataclasses.replace(self, objects=("box", "can"), **small)
 
     def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[str, str, int]]:
         """One for each seed, object and controller."""
         # a job does not depend on which others there are
-        alone = dataclasses.replace(self, objects=("any",), controllers=CONTROLLERS)
+        alone = {**vars(self), "objects": ("any",), "controllers": CONTROLLERS}
         own = {item: digest(self.setting, (item,), alone, self.angles_of(item)) for item in self.objects}
         return {
             f"generalize_{own[item]}_{object_name(item)}_{name}_{seed}": (item, name, seed)
@@ -122,11 +117,11 @@ class Generalize(Protocol):
         records, limit = records_of(results), self.setting.max_steps
         found = []
         for item, mine in tables.by_object(records).items():
-            ours, theirs = _pair(mine, "E-KM", "KM", steady_state_error)
+            ours, theirs = tables.paired(mine, "E-KM", "KM", steady_state_error)
             if item != "all" and len(ours):
                 ratio = 100 * stats.bootstrap_ratio(ours, theirs).mean
                 found.append(Target(f"steady-state error E-KM : KM, {item} [%]", ratio, most=25))
-        tests = stats.paired_test(*_pair(records, "E-KM", "KM", steady_state_error))
+        tests = stats.paired_test(*tables.paired(records, "E-KM", "KM", steady_state_error))
         if tests is not None:
             found.append(Target("Welch p over all objects", tests.welch_p, most=1e-6))
         shares: list[tuple[str, float, Value]] = [
@@ -136,7 +131,7 @@ class Generalize(Protocol):
         ]
         for what, aim, value in shares:
             for name in ("E-KM", "E-KM+I"):
-                ours, theirs = _pair(records, name, "KM+I", value)
+                ours, theirs = tables.paired(records, name, "KM+I", value)
                 if len(ours) and theirs.mean() > 0:
                     ratio = 100 * stats.bootstrap_ratio(ours, theirs).mean
                     found.append(Target(f"{what} {name} : KM+I [%]", ratio, most=aim))
@@ -165,10 +160,8 @@ class Generalize(Protocol):
                 }
                 for controller, mine in turns.items()
             }
+            caption = f"Steady-state error with the {name} (Fig. 6). Crosses: lost objects, off the scale."
             if errors:
-                caption = (
-                    f"Steady-state error with the {name} (Fig. 6). Crosses: lost objects, off the scale."
-                )
                 plot = plot_steady_state_error(errors, name.replace("_", " "))
                 figures.append(save_figure(plot, folder, f"steady_state_error_{name}", caption))
         shown = [
@@ -188,27 +181,17 @@ class Generalize(Protocol):
 
     def angles_table(self) -> Table:
         """The rotations that were asked for (Table I)."""
-        angles = {object_name(item): self.angles_of(item) for item in self.objects}
-        longest = max(len(values) for values in angles.values())
-        rows = [
-            [k + 1, *(float(values[k]) if k < len(values) else None for values in angles.values())]
-            for k in range(longest)
-        ]
+        angles = {object_name(item): map(float, self.angles_of(item)) for item in self.objects}
+        rows = [[k + 1, *row] for k, row in enumerate(zip_longest(*angles.values()))]
         columns = ["trial", *(Column(name, "g") for name in angles)]
         return Table("angles", "Rotations [deg] (Table I)", columns, rows)
-
-
-def _pair(records: Sequence[Record], ours: str, theirs: str, value: Value) -> tuple[Array, Array]:
-    turns = tables.by_controller(records)
-    return stats.paired_means(turns.get(ours, []), turns.get(theirs, []), value)
 
 
 def object_table(records: Sequence[Record]) -> Table:
     """Steady-state error of each object, paired (the paper's Table II)."""
     rows: list[list[Cell]] = []
     for item, chosen in tables.by_object(records).items():
-        turns = tables.by_controller(chosen)
-        by = {name: turns.get(name, []) for name in CONTROLLERS}
+        by = {name: stats.select(chosen, controller=name, kind="turn") for name in CONTROLLERS}
         if not by["KM"] or not by["E-KM"]:
             continue
         ours, theirs = stats.paired_means(by["E-KM"], by["KM"], steady_state_error)

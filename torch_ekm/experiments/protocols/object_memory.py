@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import torch
-from torch.distributions import Normal
 
 from ...description import list_objects
 from ...enhanced import GraspEncoding
@@ -110,7 +111,7 @@ class ObjectMemory(Protocol):
                     continue
                 encoding = bench.encoding
                 signature = self.make_signature(bench) if self.readings else None
-                memories = Memories(self._make_bank(encoding.n_features, bench.model.hand.n_a, signature))
+                memories = self._make_memories(encoding.n_features, bench.model.hand.n_a, signature)
                 bench.adopt(memories, encoding)
             angle = float(generator.uniform(0.4, 1.0) * max(TABLE_I.get(item, OTHER_ANGLES)))
             start = bench.grasp(seed, trial)
@@ -118,7 +119,7 @@ class ObjectMemory(Protocol):
                 continue
             # the object is at rest: feel it, and ask the bank what it is
             felt = None if signature is None else _feel(bench, signature, self.readings)
-            slot = memories.begin(item, felt)
+            slot = memories.grasp(item, felt)
             if records:
                 records[-1] = dataclasses.replace(records[-1], model=slot)
             memories.axis.copy_(bench.hand.rotation_axis)
@@ -126,14 +127,14 @@ class ObjectMemory(Protocol):
             records.append(
                 MemoryTurn(
                     **vars(turn),
-                    posterior=tuple(memories.bank.posterior.tolist()),
-                    n_models=memories.bank.n_models,
+                    posterior=tuple(memories.posterior.tolist()),
+                    n_models=memories.n_models,
                     memory_errors_deg={name: tuple(errors) for name, errors in memories.errors.items()},
                 )
             )
         if memories is not None and records:
-            slot = memories.bank.end()
-            records[-1] = dataclasses.replace(records[-1], model=slot, n_models=memories.bank.n_models)
+            slot = memories.end()
+            records[-1] = dataclasses.replace(records[-1], model=slot, n_models=memories.n_models)
         for bench in benches.values():
             bench.close()
         return records
@@ -167,7 +168,7 @@ class ObjectMemory(Protocol):
             targets_table(self.targets(results)),
             _memory_table(sessions),
             comparison_table(sessions),
-            _assignment_table(dict(zip(map(str, seeds), sessions, strict=True))),
+            _assignment_table(seeds, sessions),
         ]
         lost = rate(r.lost for s in sessions for r in s)
         summary = (
@@ -184,33 +185,29 @@ class ObjectMemory(Protocol):
         if self.setting.sensing and hand.hall_sensors:
             # what the sensed plant says of these joints was made with the shape of the labelled object
             sensed = {sensor.joint for sensor in hand.hall_sensors}
-            movable = hand.joint_upper > hand.joint_lower
-            blind = [name for name, moves in zip(hand.joint_names, movable, strict=True) if moves]
-            blind = [name for name in blind if name not in sensed]
+            movable = zip(hand.joint_names, hand.joint_upper > hand.joint_lower, strict=True)
+            blind = [name for name, moves in movable if moves and name not in sensed]
         return GraspSignature(hand, thumb, fingers, from_encoders=blind)
 
-    def _make_bank(self, n_s: int, n_a: int, signature: GraspSignature | None) -> ModelBank:
-        setting = self.setting
-
-        def factory() -> ResidualLearner:
-            return make_learner(setting.learner, n_s, n_a, setting.capacity, **setting.learner_options)
-
-        options: dict[str, Any] = {}
+    def _make_memories(self, n_s: int, n_a: int, signature: GraspSignature | None) -> Memories:
+        setting, options = self.setting, {}
         if signature is not None:
             options = {"temperature": _TEMPERATURE, "signature_features": signature.n_features}
-        return ModelBank(factory, self.models, **options)
+        factory = partial(
+            make_learner, setting.learner, n_s, n_a, setting.capacity, **setting.learner_options
+        )
+        return Memories(factory, self.models, **options)
 
 
-class Memories(ResidualLearner):
-    """The bank drives; the other memories see the same motions, each predicting before it learns.
+class Memories(ModelBank):
+    """A bank that drives; the other memories see the same motions, each predicting before it learns.
 
-    To :class:`~torch_ekm.enhanced.EnhancedModel` it is the bank. Labels go to "labelled" only.
+    Labels go to "labelled" only.
     """
 
-    def __init__(self, bank: ModelBank) -> None:
-        super().__init__(bank.in_features, bank.out_features)
-        self.bank = bank
-        self.empty = copy.deepcopy(bank.common)
+    def __init__(self, factory: Callable[[], ResidualLearner], models: int, **options: Any) -> None:
+        super().__init__(factory, models, **options)
+        self.empty: ResidualLearner = copy.deepcopy(self.common)
         self.one: ResidualLearner = copy.deepcopy(self.empty)
         self.fresh: ResidualLearner = copy.deepcopy(self.empty)
         self.labelled: dict[str, ResidualLearner] = {}
@@ -218,50 +215,26 @@ class Memories(ResidualLearner):
         self.axis = torch.zeros(3, dtype=torch.float64)
         self.errors: dict[str, list[float]] = {}
 
-    def begin(self, label: str, signature: Tensor | None = None) -> int | None:
+    def grasp(self, label: str, signature: Tensor | None = None) -> int | None:
         """A new grasp; returns where the bank put the last one."""
-        kept = self.bank.begin(signature)
         self.label = label
         self.labelled.setdefault(label, copy.deepcopy(self.empty))
         self.fresh.reset()
         self.errors = {name: [] for name in (*MEMORIES, "none")}
-        return kept
-
-    def forward(self, x: Tensor) -> Tensor:
-        """The bank's."""
-        return self.bank(x)
-
-    @property
-    def working(self) -> ResidualLearner:
-        """The hypothesis of the bank that leads."""
-        return self.bank.working
-
-    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
-        """The bank's."""
-        return self.bank.predict(x, observation=observation)
-
-    def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The bank's."""
-        return self.bank.linearize(x)
-
-    def reset(self) -> None:
-        """Forget everything."""
-        for learner in (self.bank, self.one, self.fresh, *self.labelled.values()):
-            learner.reset()
+        return self.begin(signature)
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         """One motion: note every memory's one-step error about the axis [deg], then train all."""
-        learners = {"labelled": self.labelled[self.label], "one model": self.one, "fresh": self.fresh}
+        others = {"labelled": self.labelled[self.label], "one model": self.one, "fresh": self.fresh}
         self.errors["none"].append(abs(float(self.axis @ y[3:6])))
-        for name, learner in (("bank", self.bank), *learners.items()):
+        for name, learner in {"bank": self, **others}.items():
             self.errors[name].append(abs(float(self.axis @ (y - learner(x))[3:6])))
-        for learner in learners.values():
+        for learner in others.values():
             learner.update(x, y, mask)
-        return self.bank.update(x, y, mask)
+        return super()._absorb(x, y, mask)
 
 
-@dataclass(frozen=True)
-class Assignment:
+class Assignment(NamedTuple):
     """How well a bank told objects apart, over one sequence."""
 
     right: int
@@ -273,21 +246,17 @@ class Assignment:
 def judge_assignment(records: Sequence[MemoryTurn]) -> Assignment:
     """A model belongs to the object that most of its turns were of; each object owns one model at most."""
     placed = [(r.object, r.model) for r in records if r.model is not None]
-    counts: dict[tuple[str, int], int] = {}
-    for pair in placed:
-        counts[pair] = counts.get(pair, 0) + 1
     owner: dict[int, str] = {}
-    home: dict[str, int] = {}
-    for (item, model), _ in sorted(counts.items(), key=lambda entry: -entry[1]):
-        if model not in owner and item not in home:  # most turns first
-            owner[model], home[item] = item, model
-    seen: dict[str, int] = {}
+    for (item, model), _ in Counter(placed).most_common():
+        if model not in owner and item not in owner.values():
+            owner[model] = item
+    seen: Counter[str] = Counter()
     right = judged = 0
     for item, model in placed:
-        seen[item] = seen.get(item, 0) + 1
+        seen[item] += 1
         if seen[item] > _LEARNING_TURNS:
             judged += 1
-            right += home.get(item) == model
+            right += owner.get(model) == item
     return Assignment(right, judged, len({model for _, model in placed}))
 
 
@@ -298,11 +267,10 @@ def _feel(bench: Bench, signature: GraspSignature, readings: int) -> Tensor:
 
 
 def _memory_table(sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
+    turns = [r for s in sessions for r in s]
     columns: dict[Column, Callable[[str], Cell]] = {
         Column("all", ".3f"): lambda name: bootstrap_mean(_means(sessions, name)),
-        Column("first motions", ".3f"): lambda name: float(
-            np.mean(_errors([r for s in sessions for r in s], name, _FIRST))
-        ),
+        Column("first motions", ".3f"): lambda name: float(np.mean(_errors(turns, name, _FIRST))),
     }
     note = (
         "Mean over all motions [deg], 95 % bootstrap interval over sequences; and over the first five "
@@ -335,25 +303,17 @@ def comparison_table(sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
 def recognition(sessions: Sequence[Sequence[MemoryTurn]]) -> str:
     """Share of judged turns that went to the right model, with its interval over sequences."""
     judged = [judge_assignment(records) for records in sessions]
-    right, of, models = (
-        np.array([getattr(one, name) for one in judged], dtype=float)
-        for name in ("right", "judged", "n_models")
-    )
+    right, of, models = np.array(judged, dtype=float).T
     if not of.sum():
         return "none judged"
     share = f"{right.sum():.0f} of {of.sum():.0f} turns, {100 * bootstrap_ratio(right, of):.0f} %"
     return f"{share}; models {bootstrap_mean(models):.1f}, at most {models.max():.0f}"
 
 
-def _assignment_table(sessions: Mapping[str, Sequence[MemoryTurn]]) -> Table:
-    columns: dict[Column, Callable[[Assignment], Cell]] = {
-        Column("right"): lambda one: one.right,
-        Column("of"): lambda one: one.judged,
-        Column("models"): lambda one: one.n_models,
-    }
-    items = {seed: judge_assignment(records) for seed, records in sessions.items()}
+def _assignment_table(seeds: Sequence[int], sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
+    rows = [[str(seed), *judge_assignment(mine)] for seed, mine in zip(seeds, sessions, strict=True)]
     note = "Turns after the first three of their object; a model belongs to the object of most of its turns."
-    return Table.of("assignments", "Recognised objects", "seed", items, columns, note)
+    return Table("assignments", "Recognised objects", ["seed", "right", "of", "models"], rows, note)
 
 
 def _errors(turns: Sequence[MemoryTurn], memory: str, first: int | None = None) -> list[float]:

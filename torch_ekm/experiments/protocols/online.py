@@ -126,10 +126,10 @@ class Online(Protocol):
             caption = f"One-step prediction error in each trial (Fig. 5a). Events in trials {events}."
             figure = plot_prediction_error(ekm[:, some], km[:, some])
             figures.append(save_figure(figure, folder, "prediction_error", caption))
-        both = np.isfinite(ekm[0])
-        if both.sum() > 1:
+        some = np.isfinite(ekm[0])
+        if some.sum() > 1:
             caption = f"p(k) and b(k) of the first k trials, seed {min(seeds)} (Fig. 5b)."
-            figure = plot_learning_test(ekm[0][both], km[0][both])
+            figure = plot_learning_test(ekm[0][some], km[0][some])
             figures.append(save_figure(figure, folder, "learning_test", caption))
         shown = [
             tables.targets_table(self.targets(results)),
@@ -188,15 +188,15 @@ class Learning:
     def of(cls, ekm: Array, km: Array, events: Sequence[int]) -> Learning:
         """From per-trial prediction errors ``(trials,)`` [deg], NaN where nothing moved."""
         some = np.isfinite(ekm)
-        curve = learning_curve(ekm[some], km[some]) if some.sum() > 1 else None
         calm = some.copy()
         calm[[event - 1 for event in events]] = False
         calm[:_LEARNED] = False
         late = float(ekm[calm].mean() / km[calm].mean()) if calm.any() else None
-        known = np.nan_to_num(ekm, nan=np.inf)
-        recovery = tuple(recovery_trials(known, km, event) if event < len(km) else 0 for event in events)
-        if curve is None:
+        # NaN: nothing moved, and nothing was recovered
+        recovery = tuple(recovery_trials(ekm, km, event) if event < len(km) else 0 for event in events)
+        if some.sum() < 2:
             return cls(None, None, late, recovery)
+        curve = learning_curve(ekm[some], km[some])
         return cls(curve.last_negative, curve.last_upper, late, recovery)
 
 
@@ -217,7 +217,7 @@ def prediction_curves(records: Sequence[Record], trials: int, kind: str = "") ->
     """
     curves = []
     for seed in sorted({r.seed for r in records}):
-        ekm, km = np.full(trials, np.nan), np.full(trials, np.nan)
+        ekm, km = np.full((2, trials), np.nan)
         for r in select(records, controller="E-KM", seed=seed):
             if r.steps:
                 ekm[r.trial - 1] = np.mean(getattr(r, f"{kind}prediction_ekm_deg"))

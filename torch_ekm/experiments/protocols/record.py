@@ -70,7 +70,10 @@ def record(
     for seed in seeds:
         trials = range(seed * n, seed * n + n)
         missing = log.missing(trials)
-        bench = _bench(config) if missing else None
+        bench = None
+        if missing:
+            bench = Bench(config.setting, config.object, config.controller, keep_images=config.images)
+            bench.plant = RecordingPlant(bench.plant)
         for trial, angle in zip(trials, config.angles_deg, strict=True):
             if bench is not None and (trial in missing or bench.learns):
                 _turn(bench, log, seed, trial, angle)
@@ -79,12 +82,6 @@ def record(
         if bench is not None:
             bench.close()
     return log
-
-
-def _bench(config: RecordConfig) -> Bench:
-    bench = Bench(config.setting, config.object, config.controller, keep_images=config.images)
-    bench.plant = RecordingPlant(bench.plant)
-    return bench
 
 
 def _turn(bench: Bench, log: TrialLog, seed: int, trial: int, angle: float) -> None:

@@ -8,14 +8,13 @@ import os
 import shutil
 import sys
 import tempfile
-from contextlib import AbstractContextManager, nullcontext
-from functools import cached_property
+from contextlib import AbstractContextManager, nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ...exceptions import DescriptionError, MissingExtraError
 from ...rendering import Scene, save_animation, save_picture
-from .report import Table
 
 
 def smoke_mode() -> bool:
@@ -23,73 +22,30 @@ def smoke_mode() -> bool:
     return os.environ.get("TORCH_EKM_SMOKE", "0") not in ("", "0")
 
 
+@dataclass
 class HandView:
-    """A scene as the last line of a notebook cell: to turn and zoom where that works, a picture elsewhere.
+    """A scene as the last line of a notebook cell: to turn and zoom where that works, a picture elsewhere."""
 
-    Args:
-        scene: see :func:`~torch_ekm.rendering.make_scene`.
-        frames: of the picture, side by side.
-        interactive: also offer the page with all frames (viser). Without viser: the picture only.
-        height: of the page [pixels].
-    """
-
-    def __init__(
-        self, scene: Scene, frames: tuple[int, ...] = (0,), interactive: bool = True, height: int = 420
-    ) -> None:
-        self.scene, self.frames, self.interactive, self.height = scene, frames, interactive, height
-
-    @cached_property
-    def picture(self) -> bytes:
-        """PNG."""
-        with tempfile.TemporaryDirectory() as folder:
-            return save_picture(self.scene, Path(folder) / "hand.png", frames=self.frames).read_bytes()
-
-    @cached_property
-    def page(self) -> str | None:
-        """A stand-alone HTML page, or None without viser."""
-        if not self.interactive:
-            return None
-        try:
-            with tempfile.TemporaryDirectory() as folder, _silence():
-                return save_animation(self.scene, Path(folder) / "hand.html").read_text(encoding="utf-8")
-        except MissingExtraError:
-            return None
+    scene: Scene
+    """See :func:`~torch_ekm.rendering.make_scene`."""
+    frames: tuple[int, ...] = (0,)
+    """Of the picture, side by side."""
+    interactive: bool = True
+    """Also offer the page with all frames (viser). Without viser: the picture only."""
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
-        bundle = {"text/plain": "HandView", "image/png": base64.b64encode(self.picture).decode()}
-        if self.page is not None:
-            bundle["text/html"] = (
-                f'<iframe srcdoc="{html.escape(self.page)}" width="100%" height="{self.height}" '
-                'style="border: 0"></iframe>'
-            )
+        bundle = {"text/plain": "HandView"}
+        with tempfile.TemporaryDirectory() as folder:
+            picture = save_picture(self.scene, Path(folder) / "hand.png", frames=self.frames)
+            bundle["image/png"] = base64.b64encode(picture.read_bytes()).decode()
+            if self.interactive:
+                with suppress(MissingExtraError), _silence():
+                    page = save_animation(self.scene, Path(folder) / "hand.html").read_text(encoding="utf-8")
+                    bundle["text/html"] = (
+                        f'<iframe srcdoc="{html.escape(page)}" width="100%" height="420" '
+                        'style="border: 0"></iframe>'
+                    )
         return bundle
-
-
-class TableView:
-    """A table as the last line of a notebook cell; plain text elsewhere."""
-
-    def __init__(self, table: Table) -> None:
-        self.table = table
-
-    def _repr_html_(self) -> str:
-        head = "".join(f"<th>{html.escape(name)}</th>" for name in self.table.header)
-        body = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
-            for row in self.table.text()
-        )
-        caption, note = html.escape(self.table.caption), html.escape(self.table.note)
-        return (
-            f"<p><b>{caption}</b></p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-            f"<p><i>{note}</i></p>"
-        )
-
-    def __repr__(self) -> str:
-        rows = [self.table.header, *self.table.text()]
-        widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-        lines = [
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows
-        ]
-        return "\n".join([self.table.caption, *lines, self.table.note])
 
 
 def _silence() -> AbstractContextManager:
@@ -124,12 +80,9 @@ def copy_notebooks(folder: Path, *, overwrite: bool = False) -> list[Path]:
     copies = [folder / source.name for source in sources]
     present = [copy.name for copy in copies if copy.exists()]
     if present and not overwrite:
-        raise DescriptionError(
-            folder, f"{', '.join(present)} would be overwritten; name another folder, or use --overwrite"
-        )
+        problem = "would be overwritten; name another folder, or use --overwrite"
+        raise DescriptionError(folder, f"{', '.join(present)} {problem}")
     if folder.exists() and not folder.is_dir():
         raise DescriptionError(folder, "this is a file; name a folder")
     folder.mkdir(parents=True, exist_ok=True)
-    for source, copy in zip(sources, copies, strict=True):
-        shutil.copyfile(source, copy)
-    return copies
+    return [Path(shutil.copyfile(*pair)) for pair in zip(sources, copies, strict=True)]

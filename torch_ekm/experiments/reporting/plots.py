@@ -23,15 +23,16 @@ COLOURS = {"KM": "#7f7f7f", "KM+I": "#E69F00", "E-KM": "#0072B2", "E-KM+I": "#00
 _MARKERS = {"KM": "s", "KM+I": "D", "E-KM": "o", "E-KM+I": "^"}
 
 
-def _figure(width: float, height: float, columns: int = 1):
+def new_figure(width: float, height: float, columns: int = 1, rows: int = 1, sharey: bool = False):
+    """A figure of this size [inch], and its axes row by row."""
     # a Figure of its own: pyplot would keep it alive and touch the caller's backend
     figure = require("matplotlib.figure").Figure(figsize=(width, height), layout="constrained")
-    axes = figure.subplots(1, columns, squeeze=False)
-    for axis in axes[0]:
+    axes = figure.subplots(rows, columns, squeeze=False, sharey=sharey)
+    for axis in axes.flat:
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(axis="y", color="0.9", linewidth=0.8)
         axis.set_axisbelow(True)
-    return figure, axes[0]
+    return figure, axes.ravel().tolist()
 
 
 def save_figure(figure: Figure, folder: Path, name: str, caption: str = "") -> FigureFile:
@@ -52,7 +53,7 @@ def plot_prediction_error(ekm_deg: Array, km_deg: Array, xlabel: str = "trial") 
     ekm_deg, km_deg = np.atleast_2d(ekm_deg), np.atleast_2d(km_deg)
     if ekm_deg.shape != km_deg.shape:
         raise ShapeError("km_deg", f"{ekm_deg.shape}, that of ekm_deg", km_deg.shape)
-    figure, (axis,) = _figure(7.0, 3.4)
+    figure, (axis,) = new_figure(7.0, 3.4)
     k = np.arange(1, ekm_deg.shape[1] + 1)
     for name, values in (("KM", km_deg), ("E-KM", ekm_deg)):
         middle = np.nanmedian(values, axis=0)
@@ -62,22 +63,17 @@ def plot_prediction_error(ekm_deg: Array, km_deg: Array, xlabel: str = "trial") 
         axis.plot(k, middle, color=COLOURS[name], marker=_MARKERS[name], markersize=3.5, label=name)
     axis.set(xlabel=xlabel, ylabel="prediction error [deg]", ylim=(0, None))
     axis.xaxis.get_major_locator().set_params(integer=True)
-    axis.set_title(
-        "One-step prediction error" + (" (median, quartiles)" if len(ekm_deg) > 1 else ""), loc="left"
-    )
+    quartiles = " (median, quartiles)" if len(ekm_deg) > 1 else ""
+    axis.set_title(f"One-step prediction error{quartiles}", loc="left")
     axis.legend(frameon=False)
     return figure
 
 
 def plot_learning_test(ekm_deg: Array, km_deg: Array) -> Figure:
-    """p(k) and b(k) of the first k trials (the paper's Fig. 5b).
-
-    Args:
-        ekm_deg, km_deg: ``(n_trials,)`` absolute errors [deg].
-    """
+    """p(k) and b(k) of the first k trials (the paper's Fig. 5b), of ``(n_trials,)`` errors [deg]."""
     curve = learning_curve(ekm_deg, km_deg)
     k = np.arange(1, len(curve.p) + 1)
-    figure, (left, right) = _figure(8.0, 3.2, columns=2)
+    figure, (left, right) = new_figure(8.0, 3.2, columns=2)
     left.plot(k, curve.p, color=COLOURS["E-KM"])
     left.axhline(ALPHA, color=COLOURS["limit"], linewidth=1, linestyle="--", label=f"{ALPHA:g}")
     left.set_yscale("log")
@@ -108,7 +104,7 @@ def plot_steady_state_error(errors_deg: dict[str, dict[str, Array]], what: str =
     top = 1.3 * float(np.percentile(everything, 95)) if everything.size else 1.0
     top = top if everything.size and everything.max() > 2 * top else np.inf
     targets = list(next(iter(errors_deg.values())))
-    figure, (axis,) = _figure(max(4.0, 1.3 * len(targets)), 3.4)
+    figure, (axis,) = new_figure(max(4.0, 1.3 * len(targets)), 3.4)
     width = 0.8 / len(errors_deg)
     for j, (name, by_target) in enumerate(errors_deg.items()):
         colour = COLOURS.get(name, f"C{j}")
@@ -119,31 +115,24 @@ def plot_steady_state_error(errors_deg: dict[str, dict[str, Array]], what: str =
             x = i + (j - (len(errors_deg) - 1) / 2) * width
             label = name if i == 0 else None
             axis.bar(x, values.mean(), width * 0.9, color=colour, alpha=0.45, label=label)
-            spread = np.linspace(-0.3, 0.3, len(values)) * width if len(values) > 1 else np.zeros(1)
+            at = x + (np.linspace(-0.3, 0.3, len(values)) * width if len(values) > 1 else np.zeros(1))
             inside = values <= top
-            axis.plot(
-                (x + spread)[inside], values[inside], _MARKERS.get(name, "o"), color=colour, markersize=3
-            )
-            axis.plot((x + spread)[~inside], [0.97 * top] * int((~inside).sum()), "x", color=colour)
+            axis.plot(at[inside], values[inside], _MARKERS.get(name, "o"), color=colour, markersize=3)
+            axis.plot(at[~inside], [0.97 * top] * int((~inside).sum()), "x", color=colour)
             if values.mean() > top:
                 note = {"xytext": (-9, 0), "textcoords": "offset points", "fontsize": 8, "ha": "right"}
                 axis.annotate(f"mean {values.mean():.1f}", (x, 0.9 * top), **note)
     axis.set_xticks(range(len(targets)), targets)
-    axis.set(
-        xlabel="target [deg]", ylabel="steady-state error [deg]", ylim=(0, top if np.isfinite(top) else None)
-    )
+    limits = (0, top if np.isfinite(top) else None)
+    axis.set(xlabel="target [deg]", ylabel="steady-state error [deg]", ylim=limits)
     axis.set_title(f"Steady-state error{', ' + what if what else ''}: each run, and the mean", loc="left")
     axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
 
 
 def plot_convergence(histories_deg: dict[str, list[Array]], target: str = "") -> Figure:
-    """|e| over the steps of each manipulation.
-
-    Args:
-        histories_deg: controller -> list of ``(n_steps,)`` errors [deg].
-    """
-    figure, (axis,) = _figure(6.0, 3.4)
+    """|e| over the steps of each manipulation: controller -> list of ``(n_steps,)`` errors [deg]."""
+    figure, (axis,) = new_figure(6.0, 3.4)
     for j, (name, runs) in enumerate(histories_deg.items()):
         colour = COLOURS.get(name, f"C{j}")
         for i, run in enumerate(runs):
@@ -157,15 +146,10 @@ def plot_convergence(histories_deg: dict[str, list[Array]], target: str = "") ->
 def plot_bank(
     objects: Sequence[str], models: Sequence[int | None], posteriors: Sequence[Sequence[float]]
 ) -> Figure:
-    """Which model of an object memory each turn went to, and how sure it was.
-
-    Args:
-        objects: of the turns, in order.
-        models: that they went to, if any.
-        posteriors: probabilities of the models at the end of each turn.
-    """
+    """Which model of an object memory each turn went to (None: to none), and how sure it was: the
+    probabilities of the models at its end."""
     names = list(dict.fromkeys(objects))
-    figure, (axis,) = _figure(8.0, 3.2)
+    figure, (axis,) = new_figure(8.0, 3.2)
     palette = list(COLOURS.values())
     for k, (name, model, posterior) in enumerate(zip(objects, models, posteriors, strict=True), start=1):
         if model is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import html
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -43,7 +44,7 @@ class Column:
         return str(cell)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Table:
     """Numbers with their intervals, formatted when they are written."""
 
@@ -82,6 +83,22 @@ class Table:
         return [
             [column.text(cell) for column, cell in zip(self._columns, row, strict=True)] for row in self.rows
         ]
+
+    def __repr__(self) -> str:
+        rows = [self.header, *self.text()]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+        return "\n".join([self.caption, *lines, self.note])
+
+    def _repr_html_(self) -> str:
+        """As the last line of a notebook cell."""
+        head = "".join(f"<th>{html.escape(name)}</th>" for name in self.header)
+        body = ("".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in self.text())
+        rows = "".join(f"<tr>{cells}</tr>" for cells in body)
+        return (
+            f"<p><b>{html.escape(self.caption)}</b></p><table><thead><tr>{head}</tr></thead>"
+            f"<tbody>{rows}</tbody></table><p><i>{html.escape(self.note)}</i></p>"
+        )
 
     @property
     def _columns(self) -> list[Column]:

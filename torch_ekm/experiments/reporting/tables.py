@@ -116,20 +116,24 @@ def comparison_table(records: Sequence[Record], limit: int) -> Table:
         if kind != "turn" and not any(r.kind == kind for r in records):
             continue
         row: list[Cell] = [what]
-        for ours_name, theirs_name in pairs:
-            ours, theirs = (stats.select(records, controller=n, kind=kind) for n in (ours_name, theirs_name))
-            row += ratio_and_p(*stats.paired_means(ours, theirs, value))
+        for ours, theirs in pairs:
+            row += ratio_and_p(*paired(records, ours, theirs, value, kind))
         rows.append(row)
     columns: list[Column | str] = [""]
-    for ours_name, theirs_name in pairs:
-        columns += [
-            Column(f"{ours_name} : {theirs_name} [%]", ".0f", percent=True),
-            Column(f"p, {ours_name} : {theirs_name}", ".1g"),
-        ]
+    for pair in map(" : ".join, pairs):
+        columns += [Column(f"{pair} [%]", ".0f", percent=True), Column(f"p, {pair}", ".1g")]
     note = (
         "Ratio of means over the same objects and seeds, 95 % bootstrap over pairs, p of the paired t-test."
     )
     return Table("comparison", "Paired ratios", columns, rows, note)
+
+
+def paired(
+    records: Sequence[Record], ours: str, theirs: str, value: Value, kind: str = "turn"
+) -> tuple[Array, Array]:
+    """Unit means of two controllers over trials of one kind, for the units that both have."""
+    mine, others = (stats.select(records, controller=name, kind=kind) for name in (ours, theirs))
+    return stats.paired_means(mine, others, value)
 
 
 def ratio_and_p(ours: Array, theirs: Array) -> tuple[Estimate | None, float | None]:
@@ -197,8 +201,7 @@ def timing_table(records: Sequence[Record]) -> Table:
 
 def verdict(records: Sequence[Record], seeds: Sequence[int]) -> str:
     """What the E-KM is worth beside the KM, in one sentence."""
-    turns = by_controller(records)
-    ours, theirs = stats.paired_means(turns.get("E-KM", []), turns.get("KM", []), steady_state_error)
+    ours, theirs = paired(records, "E-KM", "KM", steady_state_error)
     parts = []
     if len(ours) and theirs.mean() > 0:
         parts.append(f"Steady-state error E-KM : KM {100 * bootstrap_ratio(ours, theirs):.0f} %")

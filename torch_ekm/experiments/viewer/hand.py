@@ -23,16 +23,11 @@ class HandShow:
     """``q(a) = argmin 1/2 q^T K_s q  s.t.  J_a q = a - a_0,  C q = 0``: the hand that touches nothing.
 
     Joint stops are kept. One slider for each actuator; as a page, each closes and opens in turn.
-
-    Args:
-        hand: its description.
     """
 
     def __init__(self, hand: HandDescription) -> None:
         self.hand, self._map = hand, ActuationMap(hand)
-        self._lower, self._upper = (
-            np.array([getattr(actuator, end) for actuator in hand.actuators]) for end in ("lower", "upper")
-        )
+        self._lower, self._upper = np.array([(part.lower, part.upper) for part in hand.actuators]).T
         self._a = np.clip(np.zeros(hand.n_a), self._lower, self._upper)
         self.title = hand.name
 
@@ -48,17 +43,10 @@ class HandShow:
 
     def add_controls(self, gui: Any) -> None:
         """A slider for each actuator [deg]."""
+        ranges = np.degrees([self._lower, self._upper, self._a]).T.tolist()
         self._sliders = [
-            gui.add_slider(
-                f"{actuator.name} [deg]",
-                min=math.degrees(low),
-                max=math.degrees(high),
-                step=0.5,
-                initial_value=math.degrees(start),
-            )
-            for actuator, low, high, start in zip(
-                self.hand.actuators, self._lower, self._upper, self._a, strict=True
-            )
+            gui.add_slider(f"{name} [deg]", min=low, max=high, step=0.5, initial_value=start)
+            for name, (low, high, start) in zip(self.hand.actuator_names, ranges, strict=True)
         ]
 
     def update(self) -> Array | None:
@@ -76,11 +64,6 @@ class HandShow:
 
 class GraspShow:
     """A pinch in the simulated hand. Served, its actuators can be moved; as a page, it is closed and held.
-
-    Args:
-        hand: name or path.
-        object: name or path.
-        seed: which grasp.
 
     Raises:
         EquilibriumError, GraspError: the object cannot be pinched by this hand.
@@ -100,11 +83,9 @@ class GraspShow:
 
     def scene(self) -> Scene:
         """The grasp as it is now."""
-        q, position, rotation = self.plant.hand_state()
+        q, position, rotation = (part[None] for part in self.plant.hand_state())
         gravity = np.array(self.plant.gravity)
-        return make_scene(
-            self.plant.hand, self.plant.object, q[None], position[None], rotation[None], gravity
-        )
+        return make_scene(self.plant.hand, self.plant.object, q, position, rotation, gravity)
 
     def add_controls(self, gui: Any) -> None:
         """A slider for each actuator, increments since the grasp [deg], and a button to grasp anew."""

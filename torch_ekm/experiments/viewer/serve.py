@@ -5,46 +5,26 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
 
 from ...description import list_hands, load_hand
 from ...exceptions import DescriptionError, ParameterError, UnknownNameError
-from ...rendering import Scene, draw, place, save_animation, start_server
+from ...rendering import draw, place, save_animation, start_server
 from .hand import GraspShow, HandShow
 from .trial import LogShow
 
 _RATE = 30.0  # [Hz] at which controls are looked at
 
 
-class Show(Protocol):
-    """Something to look at, with controls."""
-
-    @property
-    def title(self) -> str: ...
-
-    def scene(self) -> Scene:
-        """All its frames, for a page; the first one is where serving begins."""
-        ...
-
-    def add_controls(self, gui: Any) -> None:
-        """Add sliders and buttons to viser's panel."""
-        ...
-
-    def update(self) -> NDArray[np.float64] | None:
-        """Do what the controls say; transforms ``(n_shapes, 4, 4)`` if anything moved."""
-        ...
+#: Something to look at, with controls.
+Show = HandShow | GraspShow | LogShow
 
 
 def choose_show(what: str, object: str | None = None, seed: int = 0) -> Show:
-    """What there is to show under a name.
+    """A hand (name or URDF), alone or holding an object, or a log (folder, or one trial's file).
 
     Args:
-        what: a hand's name or URDF, a log's folder, or one trial's file.
-        object: an object's name or URDF for the hand to hold.
-        seed: which grasp.
+        object: name or URDF.
+        seed: which grasp of it.
 
     Raises:
         UnknownNameError: no such hand, and no log of that name; the message lists the hands.
@@ -74,20 +54,18 @@ def save_page(show: Show, path: Path) -> Path:
 
 def serve(
     show: Show,
-    host: str = "127.0.0.1",
     port: int = 8080,
     on_ready: Callable[[str], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Serve an interactive view until ``stop()`` or an interrupt.
+    """Serve an interactive view to this machine until ``stop()`` or an interrupt.
 
     Args:
-        host: only this machine by default; "0.0.0.0" for all that can reach it.
         port: the next free one is taken if it is not.
         on_ready: called with the address to be opened.
         stop: asked 30 times a second.
     """
-    server = start_server(host, port)
+    server = start_server(port)
     try:
         scene = show.scene()
         nodes = draw(server, scene)
@@ -95,7 +73,7 @@ def serve(
         server.gui.set_panel_label(show.title)
         show.add_controls(server.gui)
         if on_ready is not None:
-            on_ready(f"http://{host}:{server.get_port()}")
+            on_ready(f"http://{server.get_host()}:{server.get_port()}")
         while not stop():
             moved = show.update()
             if moved is not None:

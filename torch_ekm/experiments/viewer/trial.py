@@ -58,9 +58,7 @@ class LogShow:
         configuration = trajectory.about.get("configuration", {})
         for name in ("hand", "object"):
             if not isinstance(configuration.get(name), str):
-                raise DescriptionError(
-                    source, f"its configuration names no {name}, which is needed to draw it"
-                )
+                raise DescriptionError(source, f"its configuration names no {name}, needed to draw it")
         if self._bodies is None:
             self._bodies = load_hand(configuration["hand"]), load_object(configuration["object"])
         gravity = configuration.get("gravity", self._bodies[0].gravity)

@@ -5,16 +5,14 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import torch
-from torch.distributions import Normal
 
 from ..._extras import require
 from ...typing import Tensor
 from ..checks import check_count, check_positive
-from ..report import UpdateReport
-from .rebuilt import Rebuilt
+from .gpytorch_learner import GPyTorchLearner
 
 
-class GPyTorchWindow(Rebuilt):
+class GPyTorchWindow(GPyTorchLearner):
     """An exact GP of GPyTorch on the last ``window`` samples, its hyperparameters refitted now and then.
 
     Outputs share kernel and noise. Every ``refit_every`` samples ``steps`` Adam steps climb the marginal
@@ -28,10 +26,6 @@ class GPyTorchWindow(Rebuilt):
     """
 
     _options: ClassVar[tuple[str, ...]] = ("window", "refit_every", "steps", "rate", "noise_variance")
-    inputs: Tensor
-    targets: Tensor
-    _model: Any
-    _likelihood: Any
 
     def __init__(
         self,
@@ -46,16 +40,13 @@ class GPyTorchWindow(Rebuilt):
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        require("gpytorch")
         self.window, self.steps = check_count("window", window), check_count("steps", steps)
         self.refit_every = check_count("refit_every", refit_every)
         self.rate = check_positive("rate", rate)
         self.noise_variance = check_positive("noise_variance", noise_variance)
-        self.register_buffer("inputs", self._like.new_zeros(self.window, self.in_features))
-        self.register_buffer("targets", self._like.new_zeros(self.window, self.out_features))
-        self.reset()
+        self._start(self.window)
 
-    def _build(self) -> None:
+    def _build(self) -> tuple[Any, ...]:
         gpytorch = require("gpytorch")
         d, tasks = self.in_features, torch.Size([self.out_features])
 
@@ -72,94 +63,41 @@ class GPyTorchWindow(Rebuilt):
 
         likelihood = gpytorch.likelihoods.GaussianLikelihood().to(self._like)
         likelihood.noise = self.noise_variance
-        # plain attributes: an exact GP keeps its data outside its state dict
-        object.__setattr__(self, "_likelihood", likelihood)
-        object.__setattr__(self, "_model", Model(likelihood).to(self._like))
-        self._condition()
+        return (Model(likelihood).to(self._like),)
 
-    def _condition(self) -> None:
-        n = min(self._count, self.window)
+    def _settle(self) -> None:
+        """Condition the model on the window."""
+        (model,), n = self._peer, min(self._count, self.window)
         if n:
             data = self.inputs[:n].expand(self.out_features, n, -1), self.targets[:n].mT.contiguous()
-            self._model.set_train_data(*data, strict=False)
-        self._model.eval()
-        self._likelihood.eval()
+            model.set_train_data(*data, strict=False)
+        model.eval()
 
-    def reset(self) -> None:
-        """An empty window and hyperparameters as at the start."""
-        self._count = 0
-        self.inputs.zero_()
-        self.targets.zero_()
-        self.n_refused.zero_()
-        self._build()
-
-    def _law(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        flat = x.reshape(-1, self.in_features)
+    def _moments(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        (model,) = self._peer
         if self._count == 0:
-            mean = (0.0 * flat[:, :1]).expand(-1, self.out_features)
-            variance = self._model.kernel(flat, diag=True).unsqueeze(-1).expand_as(mean)
-        else:
-            law = self._model(flat.expand(self.out_features, *flat.shape))
-            mean, variance = law.mean.mT, law.variance.mT
-        shape = (*x.shape[:-1], self.out_features)
-        return mean.reshape(shape), variance.reshape(shape).clamp_min(1e-12)
+            mean = (0.0 * x[:, :1]).expand(-1, self.out_features)
+            return mean, model.kernel(x, diag=True).unsqueeze(-1).expand_as(mean)
+        law = model(x.expand(self.out_features, *x.shape))
+        return law.mean.mT, law.variance.mT
 
-    def forward(self, x: Tensor) -> Tensor:
-        """The exact posterior mean."""
-        return self._law(self._check_query(x))[0]
+    def _noise(self) -> Tensor:
+        return self._peer[0].likelihood.noise
 
-    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
-        """The exact posterior law."""
-        with torch.no_grad():
-            mean, variance = self._law(self._check_query(x))
-            variance = variance + self._likelihood.noise if observation else variance
-        return Normal(mean, variance.sqrt(), validate_args=False)
-
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        law = self.predict(x, observation=True)
-        nis = ((y - law.mean) / law.stddev).square().mean(-1)
-        place = self._count % self.window
-        self.inputs[place], self.targets[place] = x, y
-        self._count += 1
-        self._condition()
+    def _learn(self, place: int) -> None:
+        self._settle()
         if self._count % self.refit_every == 0:
             self._refit()
-        return self._absorbed(nis)
 
     def _refit(self) -> None:
-        gpytorch = require("gpytorch")
-        self._model.train()
-        self._likelihood.train()
-        optimizer = torch.optim.Adam(self._model.parameters(), lr=self.rate)
-        objective = gpytorch.mlls.ExactMarginalLogLikelihood(self._likelihood, self._model)
+        (model,) = self._peer
+        model.train()
+        optimizer = torch.optim.Adam(model.parameters(), lr=self.rate)
+        objective = require("gpytorch").mlls.ExactMarginalLogLikelihood(model.likelihood, model)
         for _ in range(self.steps):
             with torch.enable_grad():
                 optimizer.zero_grad()
-                law = self._model(*self._model.train_inputs)
-                loss = -objective(law, self._model.train_targets).sum()
+                loss = -objective(model(*model.train_inputs), model.train_targets).sum()
                 loss.backward()
             optimizer.step()
-        self._condition()
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Sample count and hyperparameters; the window is in buffers."""
-        return {"count": self._count, "model": self._model.state_dict()}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See get_extra_state."""
-        self._count = int(state["count"])
-        self._build()
-        self._model.load_state_dict(state["model"])
-
-    def load_state_dict(self, state_dict, strict: bool = True, assign: bool = False):
-        """As usual; then the model is conditioned on the loaded window."""
-        result = super().load_state_dict(state_dict, strict, assign)
-        self._condition()
-        return result
-
-    def _apply(self, fn, recurse=True):
-        super()._apply(fn, recurse)
-        if "_model" in self.__dict__:
-            self._model._apply(fn)
-            self._condition()
-        return self
+        self._settle()

@@ -6,6 +6,7 @@ import pickle
 from typing import Any
 
 import torch
+from torch import nn
 from torch.distributions import Normal
 
 from ..._extras import require
@@ -27,8 +28,6 @@ class RiverResidual(SingleLearner):
         options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
-    noise: Tensor
-
     def __init__(
         self,
         in_features: int,
@@ -46,7 +45,7 @@ class RiverResidual(SingleLearner):
         self._prototype = model
         self.step = check_positive("step", step)
         self.prior_variance = check_positive("prior_variance", prior_variance)
-        self.register_buffer("noise", self._like.new_full((self.out_features,), prior_variance))
+        self.noise = nn.Buffer(self._like.new_full((self.out_features,), prior_variance))
         self.reset()
 
     def reset(self) -> None:
@@ -86,7 +85,7 @@ class RiverResidual(SingleLearner):
             model.learn_one(row, target)
         self.noise.lerp_(error, max(0.02, 1.0 / (self._count + 2)))
         self._count += 1
-        return self._absorbed((error / self.noise).mean(-1))
+        return self._report((error / self.noise).mean(-1), mask)
 
     def get_extra_state(self) -> Tensor:
         """The pickled regressors."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import nn
 from torch.distributions import Normal
 
 from ...typing import Tensor
@@ -33,12 +34,6 @@ class KRLSTracker(SingleLearner, DoubleStateLearner):
         options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
-    basis: Tensor
-    mu: Tensor
-    Sigma: Tensor
-    Q: Tensor
-    active: Tensor
-
     def __init__(
         self,
         in_features: int,
@@ -59,11 +54,11 @@ class KRLSTracker(SingleLearner, DoubleStateLearner):
         factory = {"dtype": torch.float64, "device": self.device}
         self.kernel = SquaredExponential(in_features, **factory) if kernel is None else kernel.double()
         M = self.capacity + 1
-        self.register_buffer("basis", torch.zeros(M, self.in_features, **factory))
-        self.register_buffer("mu", torch.zeros(M, self.out_features, **factory))
-        self.register_buffer("Sigma", torch.zeros(M, M, **factory))
-        self.register_buffer("Q", torch.zeros(M, M, **factory))
-        self.register_buffer("active", torch.zeros(M, dtype=torch.bool, device=self.device))
+        self.basis = nn.Buffer(torch.zeros(M, self.in_features, **factory))
+        self.mu = nn.Buffer(torch.zeros(M, self.out_features, **factory))
+        self.Sigma = nn.Buffer(torch.zeros(M, M, **factory))
+        self.Q = nn.Buffer(torch.zeros(M, M, **factory))
+        self.active = nn.Buffer(torch.zeros(M, dtype=torch.bool, device=self.device))
 
     def forward(self, x: Tensor) -> Tensor:
         """``k'Q mu``."""
@@ -79,11 +74,6 @@ class KRLSTracker(SingleLearner, DoubleStateLearner):
         v = v + self.noise_variance if observation else v.clamp_min(torch.finfo(v.dtype).eps)
         mean = (e @ self.mu).to(self.dtype)
         return Normal(mean, v.sqrt().unsqueeze(-1).expand_as(mean).to(self.dtype), validate_args=False)
-
-    def reset(self) -> None:
-        """Empty basis."""
-        for buffer in self.buffers(recurse=False):
-            buffer.zero_()
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         x, y, lam = x.double(), y.double(), self.forgetting_factor

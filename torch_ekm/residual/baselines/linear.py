@@ -7,13 +7,14 @@ from abc import abstractmethod
 from typing import Any
 
 import torch
+from torch import nn
 from torch.distributions import Normal
 
 from ...typing import Float, Tensor
 from ..base import ResidualLearner
 from ..checks import check_count, check_factor, check_positive
 from ..kernels.kernel import log_parameter
-from ..report import UpdateEvent, UpdateReport
+from ..report import UpdateReport
 
 
 class LinearInFeatures(ResidualLearner):
@@ -33,12 +34,6 @@ class LinearInFeatures(ResidualLearner):
         robust: c of the weight ``1 / (1 + z2/c^2)`` on a sample's noise; None: weight 1.
         options: see ResidualLearner.
     """
-
-    information: Tensor
-    target: Tensor
-    covariance: Tensor
-    weights: Tensor
-    pending: Tensor
 
     def __init__(
         self,
@@ -60,12 +55,12 @@ class LinearInFeatures(ResidualLearner):
         self.robust = None if robust is None else check_positive("robust", robust)
         self.refresh_every = check_count("refresh_every", refresh_every)
         f, zeros = n_phi, self._like.new_zeros
-        self.register_buffer("information", zeros(*self.batch_shape, f, f))
-        self.register_buffer("target", zeros(*self.batch_shape, f, self.out_features))
+        self.information = nn.Buffer(zeros(*self.batch_shape, f, f))
+        self.target = nn.Buffer(zeros(*self.batch_shape, f, self.out_features))
         prior = self.weight_variance * torch.eye(f, dtype=self.dtype, device=self.device)
-        self.register_buffer("covariance", prior.expand(*self.batch_shape, f, f).clone())
-        self.register_buffer("weights", zeros(*self.batch_shape, f, self.out_features))
-        self.register_buffer("pending", zeros(self.batch_shape))
+        self.covariance = nn.Buffer(prior.expand(*self.batch_shape, f, f).clone())
+        self.weights = nn.Buffer(zeros(*self.batch_shape, f, self.out_features))
+        self.pending = nn.Buffer(zeros(self.batch_shape))
         self._n_samples = 0
 
     @abstractmethod
@@ -114,8 +109,7 @@ class LinearInFeatures(ResidualLearner):
         self._n_samples += 1
         if self._n_samples % self.refresh_every == 0:
             self._rebuild()
-        event = torch.full_like(v, UpdateEvent.ABSORBED, dtype=torch.int64)
-        return UpdateReport(event if mask is None else event * mask, 0.0 * v, nis, weight)
+        return self._report(nis, mask, weight=weight)
 
     def _rebuild(self) -> None:
         """Forget what is due; (P, w) from (A, b) by Cholesky in double precision."""
@@ -140,7 +134,6 @@ class LinearInFeatures(ResidualLearner):
         return {"n_samples": self._n_samples}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See get_extra_state."""
         self._n_samples = int(state["n_samples"])
 
 
@@ -157,7 +150,6 @@ class RecursiveLeastSquares(LinearInFeatures):
         self.bias = bool(bias)
 
     def features(self, x: Tensor) -> Tensor:
-        """``[x, 1]``."""
         return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1) if self.bias else x
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -180,8 +172,6 @@ class RandomFeatureRLS(LinearInFeatures):
         options: see LinearInFeatures.
     """
 
-    frequencies: Tensor
-
     def __init__(
         self,
         in_features: int,
@@ -199,10 +189,9 @@ class RandomFeatureRLS(LinearInFeatures):
         draws = torch.randn(n_frequencies, in_features, generator=generator, dtype=torch.float64)
         lengthscale = math.sqrt(in_features) if lengthscale is None else lengthscale
         scale = log_parameter("lengthscale", lengthscale, (self.in_features,), dtype=torch.float64).exp()
-        self.register_buffer("frequencies", (draws / scale).to(self._like))
+        self.frequencies = nn.Buffer((draws / scale).to(self._like))
 
     def features(self, x: Tensor) -> Tensor:
-        """The random Fourier features."""
         angle = x @ self.frequencies.mT
         return torch.cat([angle.cos(), angle.sin()], dim=-1) / math.sqrt(len(self.frequencies))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import nn
 from torch.distributions import Normal
 
 from ...exceptions import ParameterError
@@ -35,13 +36,6 @@ class LocalGPs(SingleLearner):
         options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
-    centres: Tensor
-    inputs: Tensor
-    targets: Tensor
-    count: Tensor
-    solution: Tensor
-    inverse: Tensor
-
     def __init__(
         self,
         in_features: int,
@@ -65,12 +59,12 @@ class LocalGPs(SingleLearner):
         factory = {"dtype": self.dtype, "device": self.device}
         self.kernel = SquaredExponential(in_features, **factory) if kernel is None else kernel.to(self._like)
         zeros = self._like.new_zeros
-        self.register_buffer("centres", zeros(E, self.in_features))
-        self.register_buffer("inputs", zeros(E, n, self.in_features))
-        self.register_buffer("targets", zeros(E, n, self.out_features))
-        self.register_buffer("count", torch.zeros(E, dtype=torch.int64, device=self.device))
-        self.register_buffer("solution", zeros(E, n, self.out_features))
-        self.register_buffer("inverse", zeros(E, n, n))
+        self.centres = nn.Buffer(zeros(E, self.in_features))
+        self.inputs = nn.Buffer(zeros(E, n, self.in_features))
+        self.targets = nn.Buffer(zeros(E, n, self.out_features))
+        self.count = nn.Buffer(torch.zeros(E, dtype=torch.int64, device=self.device))
+        self.solution = nn.Buffer(zeros(E, n, self.out_features))
+        self.inverse = nn.Buffer(zeros(E, n, n))
 
     def forward(self, x: Tensor) -> Tensor:
         """Mean of the nearest experts' means."""
@@ -81,11 +75,6 @@ class LocalGPs(SingleLearner):
         mean, v = self._mixture(self._check_query(x))
         v = v + self.noise_variance if observation else v
         return Normal(mean, v.sqrt(), validate_args=False)
-
-    def reset(self) -> None:
-        """No experts."""
-        for buffer in self.buffers(recurse=False):
-            buffer.zero_()
 
     def _mixture(self, x: Tensor) -> tuple[Tensor, Tensor]:
         near = self.kernel(x.unsqueeze(-2), self.centres).squeeze(-2) * (self.count > 0)

@@ -35,11 +35,6 @@ class ReplayMLP(SingleLearner):
         options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
-    inputs: Tensor
-    targets: Tensor
-    count: Tensor
-    noise: Tensor
-
     def __init__(
         self,
         in_features: int,
@@ -62,10 +57,10 @@ class ReplayMLP(SingleLearner):
         self.prior_variance = check_positive("prior_variance", prior_variance)
         self.hidden = check_counts("hidden", hidden)
         zeros = self._like.new_zeros
-        self.register_buffer("inputs", zeros(self.memory, self.in_features))
-        self.register_buffer("targets", zeros(self.memory, self.out_features))
-        self.register_buffer("count", torch.zeros((), dtype=torch.int64, device=self.device))
-        self.register_buffer("noise", zeros(self.out_features))
+        self.inputs = nn.Buffer(zeros(self.memory, self.in_features))
+        self.targets = nn.Buffer(zeros(self.memory, self.out_features))
+        self.count = nn.Buffer(torch.zeros((), dtype=torch.int64, device=self.device))
+        self.noise = nn.Buffer(zeros(self.out_features))
         self.theta = nn.ParameterList()
         widths = [self.in_features, *self.hidden, self.out_features]
         for n_in, n_out in itertools.pairwise(widths):
@@ -141,4 +136,4 @@ class ReplayMLP(SingleLearner):
             rate = self.rate * self.adam.correction(n * self.steps + step + 1)
             for i, (p, gradient) in enumerate(zip(self.theta, gradients, strict=True)):
                 self.adam.move(i, p, gradient, rate)
-        return self._absorbed(nis)
+        return self._report(nis, mask)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import nn
 from torch.distributions import Normal
 
 from ...typing import Tensor
@@ -12,7 +13,7 @@ from ..base import ResidualLearner
 from ..checks import check_count, check_positive
 from ..kernels.kernel import Kernel
 from ..kernels.stationary import SquaredExponential
-from ..report import UpdateEvent, UpdateReport
+from ..report import UpdateReport
 
 
 class WindowGP(ResidualLearner):
@@ -27,13 +28,6 @@ class WindowGP(ResidualLearner):
         robust: c; a surprising sample gets the noise ``s2 (1 + z2/c^2)``.
         options: see ResidualLearner.
     """
-
-    inputs: Tensor
-    targets: Tensor
-    noise: Tensor
-    count: Tensor
-    solution: Tensor
-    inverse: Tensor
 
     def __init__(
         self,
@@ -53,12 +47,12 @@ class WindowGP(ResidualLearner):
         fleet = {"batch_shape": self.batch_shape, "device": self.device, "dtype": self.dtype}
         self.kernel = SquaredExponential(in_features, **fleet) if kernel is None else kernel.to(self._like)
         zeros, shape, n = self._like.new_zeros, self.batch_shape, self.window
-        self.register_buffer("inputs", zeros(*shape, n, self.in_features))
-        self.register_buffer("targets", zeros(*shape, n, self.out_features))
-        self.register_buffer("noise", zeros(*shape, n))  # 0 where there is no sample
-        self.register_buffer("count", torch.zeros(shape, dtype=torch.int64, device=self.device))
-        self.register_buffer("solution", zeros(*shape, n, self.out_features))
-        self.register_buffer("inverse", zeros(*shape, n, n))  # L^-1 of K + s2 I = LL'
+        self.inputs = nn.Buffer(zeros(*shape, n, self.in_features))
+        self.targets = nn.Buffer(zeros(*shape, n, self.out_features))
+        self.noise = nn.Buffer(zeros(*shape, n))  # 0 where there is no sample
+        self.count = nn.Buffer(torch.zeros(shape, dtype=torch.int64, device=self.device))
+        self.solution = nn.Buffer(zeros(*shape, n, self.out_features))
+        self.inverse = nn.Buffer(zeros(*shape, n, n))  # L^-1 of K + s2 I = LL'
 
     def forward(self, x: Tensor) -> Tensor:
         """``k'(K + s2 I)^-1 y``."""
@@ -78,11 +72,6 @@ class WindowGP(ResidualLearner):
         """``dk/dx'(K + s2 I)^-1 y``."""
         k, dk = self.kernel.with_gradient(self._check_query(x), self.inputs)
         return (k.unsqueeze(-2) @ self.solution).squeeze(-2), self.solution.mT @ dk
-
-    def reset(self) -> None:
-        """Empty the window."""
-        for buffer in self.buffers(recurse=False):
-            buffer.zero_()
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         law = self.predict(x, observation=True)
@@ -106,6 +95,5 @@ class WindowGP(ResidualLearner):
         inverse = inverse * on.mT.double()
         self.solution.copy_(inverse.mT @ (inverse @ self.targets.double()))
         self.inverse.copy_(inverse)
-        event = torch.full_like(self.count, UpdateEvent.ABSORBED)
         novelty = (law.variance[..., 0] - self.noise_variance) / self.kernel.diagonal(x)
-        return UpdateReport(event if mask is None else event * mask, novelty, nis, weight)
+        return self._report(nis, mask, novelty=novelty, weight=weight)

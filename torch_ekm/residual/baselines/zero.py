@@ -8,7 +8,7 @@ from torch.distributions import Normal
 from ...typing import Tensor
 from ..base import ResidualLearner
 from ..checks import check_positive
-from ..report import UpdateEvent, UpdateReport
+from ..report import UpdateReport
 
 
 class ZeroResidual(ResidualLearner):
@@ -37,12 +37,5 @@ class ZeroResidual(ResidualLearner):
         deviation = self.noise_variance**0.5 if observation else floor
         return Normal(mean, torch.full_like(mean, deviation), validate_args=False)
 
-    def reset(self) -> None:
-        """Only the count of refused samples is state."""
-        self.n_refused.zero_()
-
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        one = torch.ones_like(y[..., 0])
-        event = torch.full_like(one, UpdateEvent.ABSORBED, dtype=torch.int64)
-        nis = y.square().mean(-1) / self.noise_variance
-        return UpdateReport(event if mask is None else event * mask, 0.0 * one, nis, one)
+        return self._report(y.square().mean(-1) / self.noise_variance, mask)

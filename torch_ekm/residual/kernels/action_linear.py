@@ -104,10 +104,6 @@ class ActionLinearKernel(Kernel):
         sz, az = self.split(z)
         return self.state_kernel.vector(s, sz).unsqueeze(-1) * (az * self.action_variance.unsqueeze(-2))
 
-    def action_prior(self, s: Float[Tensor, "*batch n_s"]) -> Float[Tensor, "*batch n_a n_a"]:
-        """``k_s(s, s) Lambda``: prior covariance of a row of G(s)."""
-        return torch.diag_embed(self.state_kernel.diagonal(s).unsqueeze(-1) * self.action_variance)
-
 
 def action_jacobian(learner: Any, s: Float[Tensor, "*any n_s"]) -> Float[Tensor, "*any out n_a"]:
     """G(s) with ``mean(s, a) = G(s) a`` exactly: ``G = sum_i alpha_i k_s(s, s_i) (Lambda a_i)'``.
@@ -129,7 +125,8 @@ def action_covariance(learner: Any, s: Float[Tensor, "*any n_s"]) -> Float[Tenso
     Arguments and errors as of :func:`action_jacobian`.
     """
     kernel, z, B = _action_features(learner, s)
-    V = kernel.action_prior(z) + B.mT @ (learner.posterior.covariance @ B)
+    prior = torch.diag_embed(kernel.state_kernel.diagonal(z).unsqueeze(-1) * kernel.action_variance)
+    V = prior + B.mT @ (learner.posterior.covariance @ B)
     V = learner.units.curvature(V.unsqueeze(-3))
     return V.expand(*V.shape[:-3], learner.out_features, *V.shape[-2:]).to(learner.dtype)
 

@@ -50,11 +50,7 @@ class DeepKernel(Kernel):
         self.base = base
         like = base.log_lengthscale
         fleet, generator = like.shape[:-1], torch.Generator().manual_seed(seed)
-        widths = [
-            like.shape[-1],
-            *check_counts("hidden", hidden),
-            check_count("features", features),
-        ]
+        widths = [like.shape[-1], *check_counts("hidden", hidden), check_count("features", features)]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for layer, (n_in, n_out) in enumerate(itertools.pairwise(widths)):
             scale = (initial_scale if layer == len(widths) - 2 else 1.0) / n_in**0.5

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
+from torch import nn
 
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
@@ -13,11 +14,10 @@ from ..adam import Adam
 from ..checks import check_count, check_positive
 from ..kernels.kernel import is_shared
 from .forgetting import ForgettingFactor, ProcessNoise
-from .monitor import DetectChanges
+from .monitor import DetectChanges, RobustWeight
 from .part import Host, Part, Sample
 from .prequential_loss import PrequentialLoss, Queries
 from .replay import ReplayMemory
-from .robust_weight import RobustWeight
 
 _REPLAYED = 4  # samples of the memory per sample of the window, in each step; at least as many as points
 
@@ -54,19 +54,13 @@ class LearnHyperparameters(Part):
     """
 
     stands_last = True
-    window_x: Tensor
-    window_y: Tensor
-    window_on: Tensor
-    n_steps: Tensor
 
     def __init__(
         self, *, rate: float = 0.03, steps: int = 1, memory: int = 0, network_rate: float = 0.015
     ) -> None:
         super().__init__()
-        self.rate, self.network_rate = (
-            check_positive("rate", rate),
-            check_positive("network_rate", network_rate),
-        )
+        self.rate = check_positive("rate", rate)
+        self.network_rate = check_positive("network_rate", network_rate)
         self.steps, self.memory = check_count("steps", steps), check_count("memory", memory, least=0)
 
     def bind(self, learner: Host) -> None:
@@ -79,10 +73,10 @@ class LearnHyperparameters(Part):
         posterior, like = learner.posterior, learner.posterior.basis
         fleet, self.window = posterior.batch_shape, learner.refresh_every
         self.shared_kernel = is_shared(learner.kernel, like.shape[-1])
-        self.register_buffer("window_x", like.new_zeros(*fleet, self.window, like.shape[-1]))
-        self.register_buffer("window_y", like.new_zeros(*fleet, self.window, posterior.out_features))
-        self.register_buffer("window_on", like.new_zeros(*fleet, self.window))
-        self.register_buffer("n_steps", like.new_zeros(fleet))
+        self.window_x = nn.Buffer(like.new_zeros(*fleet, self.window, like.shape[-1]))
+        self.window_y = nn.Buffer(like.new_zeros(*fleet, self.window, posterior.out_features))
+        self.window_on = nn.Buffer(like.new_zeros(*fleet, self.window))
+        self.n_steps = nn.Buffer(like.new_zeros(fleet))
         self.loss = PrequentialLoss(posterior, factor, None if weight is None else weight.threshold)
         self.adam = Adam([*learner.kernel.parameters(), learner.log_noise_variance], betas=(0.9, 0.99))
         horizon = math.inf if factor == 1.0 else 1.0 / (1.0 - factor)
@@ -139,19 +133,18 @@ class LearnHyperparameters(Part):
     def descend(self, learner: Host) -> None:
         """Adam on the loss, model by model; a model without samples or finite gradient stays as it is."""
         kernel, log_noise = learner.kernel, learner.log_noise_variance
-        parameters = [*kernel.parameters(), log_noise]
-        names = [name for name, _ in kernel.named_parameters()] + ["log_noise"]
+        parameters = {**dict(kernel.named_parameters()), "log_noise": log_noise}
         for step in range(self.steps):
             queries = self.queries(learner)
             _, gradients = self.loss.with_gradients(kernel, log_noise, queries, moved=step > 0)
-            self._move(parameters, names, gradients)
+            self._move(parameters, gradients)
 
-    def _move(self, parameters: Sequence, names: Sequence[str], gradients: Sequence[Tensor | None]) -> None:
+    def _move(self, parameters: Mapping[str, Tensor], gradients: Sequence[Tensor | None]) -> None:
         on = (self.window_on.sum(-1) > 0).to(self.n_steps.dtype)
         self.n_steps += on
         n = self.n_steps.clamp_min(1.0)
         correction = self.adam.correction(n) * _shrink(n)
-        for i, (p, name, gradient) in enumerate(zip(parameters, names, gradients, strict=True)):
+        for i, ((name, p), gradient) in enumerate(zip(parameters.items(), gradients, strict=True)):
             if gradient is None:
                 continue
             logarithm = name.split(".")[-1].startswith("log_")

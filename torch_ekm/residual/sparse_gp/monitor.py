@@ -1,16 +1,39 @@
-"""What a learner's innovations say about itself: is its noise right, is the system still the same?"""
+"""What innovations say: can this sample be believed, is the noise right, is the system still the same?"""
 
 from __future__ import annotations
 
 import torch
+from torch import nn
 
-from ...typing import Bool, Tensor
+from ...typing import Bool, Float, Tensor
 from ..checks import check_positive
 from .part import Host, Part, Sample
 
 _Z90_SQUARED = 1.6448536269514722**2
 _RATE, _MEMORY = 1 / 8, 24  # of the alarm; samples kept, of which those since the change are replayed
 _ALARM, _LARGE, _ONSET, _COOL = 0.6, 5.0, 0.12, -2.0
+
+
+class RobustWeight(Part):
+    """Weight ``min(1, c^2/z2)`` on a sample's gain, z2 its normalised innovation squared.
+
+    After Altamirano et al., ICML 2024, centred on the prediction. The gain itself is weighted,
+    ``v/(s2 + v)``: where v is large, a larger s2 alone would let outliers in.
+
+    Args:
+        threshold: c [standard deviations], 2 to 3.
+
+    Raises:
+        ParameterError: not positive.
+    """
+
+    def __init__(self, threshold: float) -> None:
+        super().__init__()
+        self.threshold = check_positive("threshold", threshold)
+
+    def weigh(self, nis: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """``min(1, c^2/z2)``."""
+        return (self.threshold**2 / nis).clamp_max(1.0)
 
 
 class CalibrateNoise(Part):
@@ -28,17 +51,13 @@ class CalibrateNoise(Part):
         ParameterError: not positive.
     """
 
-    log_factor: Tensor
-
     def __init__(self, rate: float = 0.2) -> None:
         super().__init__()
         self.rate = check_positive("rate", rate)
 
     def bind(self, learner: Host) -> None:
         """c = 1 for each output."""
-        like = learner.posterior.basis
-        fleet = learner.posterior.batch_shape
-        self.register_buffer("log_factor", like.new_zeros(*fleet, learner.out_features))
+        self.log_factor = nn.Buffer(torch.zeros_like(learner.log_noise_variance))
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """One innovation."""
@@ -67,18 +86,13 @@ class DetectChanges(Part):
     It looks at the result of every update, so on a GPU the host waits for it.
     """
 
-    level: Tensor
-    inputs: Tensor
-    targets: Tensor
-    levels: Tensor
-
     def bind(self, learner: Host) -> None:
         """Room for the last samples, newest last; shifted rather than indexed: masks need no pointers."""
         zeros, fleet = learner.posterior.basis.new_zeros, learner.posterior.batch_shape
-        self.register_buffer("level", zeros(fleet))
-        self.register_buffer("inputs", zeros(_MEMORY, *fleet, learner.in_features))
-        self.register_buffer("targets", zeros(_MEMORY, *fleet, learner.out_features))
-        self.register_buffer("levels", zeros(_MEMORY, *fleet))
+        self.level = nn.Buffer(zeros(fleet))
+        self.inputs = nn.Buffer(zeros(_MEMORY, *fleet, learner.in_features))
+        self.targets = nn.Buffer(zeros(_MEMORY, *fleet, learner.out_features))
+        self.levels = nn.Buffer(zeros(_MEMORY, *fleet))
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Take a sample in; models that face another system start anew."""

@@ -137,7 +137,6 @@ class Part(nn.Module):
             buffer.zero_()
 
     def extra_repr(self) -> str:
-        """Its figures."""
         figures = {name: value for name, value in vars(self).items() if not name.startswith("_")}
         plain = {name: value for name, value in figures.items() if type(value) in (int, float)}
         return ", ".join(f"{name}={value}" for name, value in plain.items())

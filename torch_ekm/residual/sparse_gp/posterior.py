@@ -8,8 +8,6 @@ from torch import nn
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..kernels.kernel import Kernel
-from .natural import posterior_from_natural
-from .pruning import PRUNING_SCORES
 
 
 class SparsePosterior(nn.Module):
@@ -21,15 +19,6 @@ class SparsePosterior(nn.Module):
     :meth:`rebuild` makes them anew.
     Always float64, see :class:`~torch_ekm.residual.SparseOnlineGP`. Arguments as there.
     """
-
-    basis: Tensor
-    active: Tensor
-    age: Tensor
-    count: Tensor
-    slot: Tensor
-    moments: Tensor
-    vectors: Tensor
-    slots: Tensor
 
     def __init__(
         self,
@@ -50,8 +39,8 @@ class SparsePosterior(nn.Module):
                 raise ParameterError(name, value, "in [0, 1)")
         if projection not in ("kl", "fitc"):
             raise ParameterError("projection", projection, "'kl' or 'fitc'")
-        if pruning not in (*PRUNING_SCORES, "freeze"):
-            raise ParameterError("pruning", pruning, f"one of {(*PRUNING_SCORES, 'freeze')}")
+        if pruning not in ("kl", "mean", "freeze"):
+            raise ParameterError("pruning", pruning, "'kl', 'mean' or 'freeze'")
         self.capacity, self.batch_shape, self.out_features = capacity, batch_shape, out_features
         self.novelty_threshold, self.jitter = novelty_threshold, jitter
         self.projection, self.pruning = projection, pruning
@@ -59,15 +48,14 @@ class SparsePosterior(nn.Module):
         # One slot more than the capacity: a new point moves in before another is pruned. What a
         # free slot holds in `basis` is meaningless; its rows and columns elsewhere are 0.
         M = capacity + 1
-        self.register_buffer("basis", torch.zeros(*batch_shape, M, in_features, **factory))
-        self.register_buffer("active", torch.zeros(*batch_shape, M, **factory))
-        self.register_buffer("age", torch.zeros(*batch_shape, M, **factory))  # sample number
-        self.register_buffer("count", torch.zeros(batch_shape, dtype=torch.int64, device=device))
-        self.register_buffer("slot", torch.zeros(batch_shape, dtype=torch.int64, device=device))
+        self.basis = nn.Buffer(torch.zeros(*batch_shape, M, in_features, **factory))
+        self.active = nn.Buffer(torch.zeros(*batch_shape, M, **factory))
+        self.count = nn.Buffer(torch.zeros(batch_shape, dtype=torch.int64, device=device))
+        self.slot = nn.Buffer(torch.zeros(batch_shape, dtype=torch.int64, device=device))
         # [C; Q; Omega] and [alpha; h] each in one buffer: one product, one rank update serves all.
-        self.register_buffer("moments", torch.zeros(*batch_shape, 3, M, M, **factory))
-        self.register_buffer("vectors", torch.zeros(*batch_shape, 2, M, out_features, **factory))
-        self.register_buffer("slots", torch.arange(M, device=device), persistent=False)
+        self.moments = nn.Buffer(torch.zeros(*batch_shape, 3, M, M, **factory))
+        self.vectors = nn.Buffer(torch.zeros(*batch_shape, 2, M, out_features, **factory))
+        self.slots = nn.Buffer(torch.arange(M, device=device), persistent=False)
 
     @property
     def alpha(self) -> Float[Tensor, "*batch slots out"]:
@@ -88,11 +76,6 @@ class SparsePosterior(nn.Module):
     def precision(self) -> Float[Tensor, "*batch slots slots"]:
         """Omega: how often, and with which weight, each direction of f was seen."""
         return self.moments[..., 2, :, :]
-
-    @property
-    def needs_age(self) -> bool:
-        """Whether the pruning score asks for sample numbers (a compiled step is cheaper without)."""
-        return self.pruning not in ("kl", "mean", "novelty", "freeze")
 
     def reset(self) -> None:
         """Back to the prior, no basis."""
@@ -116,8 +99,18 @@ class SparsePosterior(nn.Module):
             block.mul_(keep)
 
     def gram(self, kernel: Kernel) -> Float[Tensor, "*batch slots slots"]:
-        """K(X, X) with the nugget; the identity at free slots."""
-        return basis_gram(kernel, self.basis, self.active, self.jitter)
+        """K(X, X) with ``jitter k**`` on the diagonal; the identity at free slots. Differentiable."""
+        return self.as_gram(kernel(self.basis, self.basis), kernel)
+
+    def as_gram(
+        self, K: Float[Tensor, "*batch slots slots"], kernel: Kernel
+    ) -> Float[Tensor, "*batch slots slots"]:
+        """See :meth:`gram`; K is the kernel between the basis and itself."""
+        on = self.active.unsqueeze(-1)
+        K = K * (on * on.mT)
+        diagonal = kernel.diagonal_of_set(self.basis) * (1.0 + self.jitter)
+        diagonal = torch.where(self.active > 0, diagonal, 1.0)
+        return (0.5 * (K + K.mT)).diagonal_scatter(diagonal, dim1=-2, dim2=-1)
 
     def rebuild(self, kernel: Kernel, s2: Float[Tensor, "*batch"]) -> None:
         """alpha, C, Q from the natural form by Cholesky."""
@@ -134,14 +127,28 @@ class SparsePosterior(nn.Module):
         self.alpha.copy_(alpha)
 
 
-def basis_gram(kernel: Kernel, basis: Tensor, active: Tensor, jitter: float) -> Tensor:
-    """K(X, X) with ``jitter k**`` on the diagonal; the identity at free slots. Differentiable."""
-    return as_gram(kernel(basis, basis), kernel, basis, active, jitter)
+def posterior_from_natural(
+    K: Float[Tensor, "*batch b b"], W: Float[Tensor, "*batch b b"], h: Float[Tensor, "*batch b m"]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """``p(f) ~ N(f; 0, K) exp(-1/2 f'W f + h'f)`` as ``(Q, C, alpha)``.
 
+    ``Q = K^-1``, ``C = -(K + W^-1)^-1``, ``alpha = K^-1 (K^-1 + W)^-1 h``, so that a query has mean
+    ``alpha'k`` and variance ``k** + k'Ck`` (Csato & Opper, Neural Computation 14, 2002). W may be
+    singular. With ``K = LL'``, ``A = I + L'WL``::
 
-def as_gram(K: Tensor, kernel: Kernel, basis: Tensor, active: Tensor, jitter: float) -> Tensor:
-    """See :func:`basis_gram`; K is the kernel between the basis and itself."""
-    on = active.unsqueeze(-1)
-    K = K * (on * on.mT)
-    diagonal = torch.where(active > 0, kernel.diagonal_of_set(basis) * (1.0 + jitter), 1.0)
-    return (0.5 * (K + K.mT)).diagonal_scatter(diagonal, dim1=-2, dim2=-1)
+        C = -(K^-1 - L^-T A^-1 L^-1),   alpha = L^-T A^-1 L'h
+
+    ``L^-T A^-1 L^-1`` is the posterior covariance of ``K^-1 f``: the difference keeps its relative
+    accuracy when W is large (many repeats), where ``T'T - W`` loses all of it. Factorised in double
+    precision whatever the dtype: a float32 state is limited by its storage, not by this step.
+    """
+    L = torch.linalg.cholesky_ex(K.double())[0]
+    W, h = W.double(), h.double()
+    eye = torch.eye(K.shape[-1], dtype=L.dtype, device=L.device)
+    A = eye + L.mT @ W @ L
+    La = torch.linalg.cholesky_ex(0.5 * (A + A.mT))[0]
+    L_inv = torch.linalg.solve_triangular(L, eye.expand_as(L), upper=False)
+    G = torch.linalg.solve_triangular(La, L_inv, upper=False)
+    Q = L_inv.mT @ L_inv
+    alpha = G.mT @ torch.linalg.solve_triangular(La, L.mT @ h, upper=False)
+    return Q.to(K.dtype), (G.mT @ G - Q).to(K.dtype), alpha.to(K.dtype)

@@ -13,7 +13,7 @@ from torch import nn
 
 from ...typing import Float, Tensor
 from ..kernels.kernel import Kernel
-from .posterior import SparsePosterior, as_gram
+from .posterior import SparsePosterior
 
 
 class Queries(NamedTuple):
@@ -78,12 +78,7 @@ class PrequentialLoss(nn.Module):
             old.copy_(new)
 
     def with_gradients(
-        self,
-        kernel: Kernel,
-        log_noise: Tensor,
-        queries: Queries,
-        *,
-        moved: bool = True,
+        self, kernel: Kernel, log_noise: Tensor, queries: Queries, *, moved: bool = True
     ) -> tuple[Tensor, list[Tensor | None]]:
         """Loss of each model ``(*batch_shape)`` [nats per sample and output], derivatives of their sum.
 
@@ -93,7 +88,7 @@ class PrequentialLoss(nn.Module):
             moved: whether kernel or noise changed since the old state's caches were made: they are
                 made anew then.
         """
-        with _differentiable(kernel) as parameters:
+        with _differentiable(kernel):
             K, k, prior = outcome = self._covariances(kernel, queries.x)
             K_, k_ = K.detach(), k.detach()
             if moved:
@@ -109,25 +104,19 @@ class PrequentialLoss(nn.Module):
             by_s2 = (by.mean * (mean + E.mT @ (K_ @ alpha))).sum((-1, -2))
             by_s2 = by_s2 + (E_g * (k_ + K_ @ E)).sum((-1, -2))
             by_noise = by.log_noise - by_s2.unsqueeze(-1) / log_noise.shape[-1]
+            parameters = list(kernel.parameters())
             by_kernel = torch.autograd.grad(outcome, parameters, [by_K, by_k, by.variance], allow_unused=True)
         return loss, [*by_kernel, by_noise]
 
     def _covariances(self, kernel: Kernel, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """K at the old basis, k and k** of the queries, from one evaluation of the kernel."""
-        basis, active = self.state.basis, self.state.active
+        basis, M = self.state.basis, self.state.basis.shape[-2]
         both = kernel(basis, torch.cat([basis, x], dim=-2))
-        M = basis.shape[-2]
-        K = as_gram(both[..., :M], kernel, basis, active, self.state.jitter)
-        return K, both[..., M:] * active.unsqueeze(-1), kernel.diagonal_of_set(x)
+        k = both[..., M:] * self.state.active.unsqueeze(-1)
+        return self.state.as_gram(both[..., :M], kernel), k, kernel.diagonal_of_set(x)
 
     def _density(
-        self,
-        mean: Tensor,
-        v: Tensor,
-        p: Tensor,
-        u: Tensor,
-        log_noise: Tensor,
-        queries: Queries,
+        self, mean: Tensor, v: Tensor, p: Tensor, u: Tensor, log_noise: Tensor, queries: Queries
     ) -> tuple[Tensor, _Slopes]:
         """The loss from the state's predictions, and its derivatives by them."""
         leaves = [value.detach().requires_grad_(True) for value in (mean, v, p, u, log_noise)]
@@ -152,14 +141,11 @@ class PrequentialLoss(nn.Module):
 
 
 @contextmanager
-def _differentiable(kernel: Kernel) -> Iterator[list[nn.Parameter]]:
+def _differentiable(kernel: Kernel) -> Iterator[None]:
     """Inside, the kernel's parameters carry a graph."""
-    parameters = list(kernel.parameters())
-    with torch.enable_grad():
-        try:
-            for p in parameters:
-                p.requires_grad_(True)
-            yield parameters
-        finally:
-            for p in parameters:
-                p.requires_grad_(False)
+    try:
+        kernel.requires_grad_(True)
+        with torch.enable_grad():
+            yield
+    finally:
+        kernel.requires_grad_(False)

@@ -13,7 +13,6 @@ from ..kernels.kernel import Kernel
 from ..report import UpdateEvent, UpdateReport
 from .part import Part
 from .posterior import SparsePosterior
-from .pruning import PRUNING_SCORES
 
 
 def absorb(
@@ -23,7 +22,6 @@ def absorb(
     kernel: Kernel,
     s2: Float[Tensor, "*batch"],
     mask: Float[Tensor, "*batch"] | None,
-    number: int,
     weighing: Sequence[Part] = (),
 ) -> tuple[UpdateReport, Float[Tensor, "*batch out"], Float[Tensor, "*batch"]]:
     """One sample per model, without a branch on data (a mask multiplies every change by 0)::
@@ -41,7 +39,6 @@ def absorb(
     Args:
         s2: noise variance of the gain.
         mask: 1 where a model has a sample, 0 elsewhere.
-        number: of the sample.
         weighing: parts whose weights multiply on the gain.
 
     Returns:
@@ -93,12 +90,10 @@ def absorb(
         used = (here & (mask > 0).unsqueeze(-1)).unsqueeze(-1)
         posterior.basis.copy_(torch.where(used, x.unsqueeze(-2), posterior.basis))
     posterior.active.scatter_(-1, where, novel.to(e.dtype).unsqueeze(-1))
-    if posterior.needs_age:
-        posterior.age.scatter_(-1, where, torch.full_like(unit[..., :1], number))
     excess = novel & full
     grown = novel ^ excess
-    posterior.count += grown
-    posterior.slot += grown
+    posterior.count.add_(grown)
+    posterior.slot.add_(grown)
     if posterior.pruning != "freeze" and _any(excess):
         _add_and_prune(posterior, scaled, left, excess, s2)
     else:
@@ -114,7 +109,7 @@ def absorb(
 def _add_and_prune(
     posterior: SparsePosterior, scaled: Tensor, added: Tensor, excess: Tensor, s2: Tensor
 ) -> None:
-    """Add ``scaled added'`` to (C, Q, Omega), then prune the lowest-scored point where ``excess``.
+    """Add ``scaled added'`` to (C, Q, Omega), then prune the point that loses least where ``excess``.
 
     Pruning is the KL projection onto the other points. Large fleets are limited by memory, so
     addition and pruning share one pass: what the pruning needs of the sum follows from vectors.
@@ -126,10 +121,8 @@ def _add_and_prune(
     M, m, fleet = posterior.capacity + 1, posterior.out_features, posterior.batch_shape
     diagonal = posterior.moments.diagonal(dim1=-2, dim2=-1) + scaled * added
     c_diag, q_diag, w_diag = diagonal.unbind(-2)
-    score = PRUNING_SCORES[posterior.pruning](
-        posterior.alpha, c_diag, q_diag, w_diag / s2.unsqueeze(-1), posterior.age
-    )
-    i = score.where(posterior.active > 0, torch.inf).argmin(-1, keepdim=True)
+    loss = pruning_loss(posterior, c_diag, q_diag, w_diag / s2.unsqueeze(-1))
+    i = loss.where(posterior.active > 0, torch.inf).argmin(-1, keepdim=True)
     # rows, which lie together in memory, stand for columns
     columns = posterior.moments.gather(-2, i[..., None, None].expand(*fleet, 3, 1, M)).squeeze(-2)
     columns = columns + scaled * added.gather(-1, i.unsqueeze(-2).expand(*fleet, 3, 1))
@@ -138,8 +131,7 @@ def _add_and_prune(
     on = excess.to(q.dtype).unsqueeze(-1)
     q = q.where(excess.unsqueeze(-1), 1.0)  # an empty basis has nothing to divide by
     q_inv = on / q
-    # c + q >= 0 is the point's remaining uncertainty; rounding must not turn it negative.
-    cq_inv = on / torch.maximum(c + q, 100 * torch.finfo(q.dtype).eps * q)
+    cq_inv = on / _remaining(c, q)
     CQ, Qq = C + Q, Q * q_inv
     e, CQc = -Qq, CQ * -cq_inv
     u = Om * on + 0.5 * w * e
@@ -159,6 +151,27 @@ def _add_and_prune(
     posterior.vectors.scatter_(-2, at.expand(*fleet, 2, 1, m), 0.0)
     posterior.active.scatter_(-1, free, 0.0)
     posterior.slot.copy_(free.squeeze(-1))
+
+
+def pruning_loss(
+    posterior: SparsePosterior,
+    c: Float[Tensor, "*batch slots"],
+    q: Float[Tensor, "*batch slots"],
+    w: Float[Tensor, "*batch slots"],
+) -> Float[Tensor, "*batch slots"]:
+    """``2 KL = |a|^2/(c+q) + m (w/q + ln(1 + c/q))``: exact loss of pruning each point (Csato's thesis).
+
+    a, c, q, w are a point's entries in alpha and on the diagonals of C, Q and W. The first term is the
+    loss in the mean (Csato & Opper 2002), which is all that counts with ``pruning="mean"``.
+    """
+    rest = _remaining(c, q)
+    loss = posterior.alpha.square().sum(-1) / rest
+    return loss if posterior.pruning == "mean" else loss + posterior.out_features * (w / q + (rest / q).log())
+
+
+def _remaining(c: Tensor, q: Tensor) -> Tensor:
+    """c + q >= 0, a point's remaining uncertainty; rounding must not turn it negative."""
+    return torch.maximum(c + q, 100 * torch.finfo(q.dtype).eps * q)
 
 
 def _add_products(target: Tensor, left: Tensor, right: Tensor) -> None:

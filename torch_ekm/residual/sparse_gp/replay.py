@@ -28,29 +28,20 @@ class ReplayMemory(nn.Module):
         horizon: samples that the learner remembers; infinite if it never forgets.
     """
 
-    x: Tensor
-    y: Tensor
-    weight: Tensor
-    absorbed: Tensor
-    number: Tensor
-
     def __init__(self, posterior: SparsePosterior, capacity: int, horizon: float = math.inf) -> None:
         super().__init__()
         self.capacity, self.horizon = max(math.ceil(min(capacity, horizon)), 1), horizon
         fleet, like = posterior.batch_shape, posterior.basis
         n = self.capacity
-        self.register_buffer("x", like.new_zeros(*fleet, n, like.shape[-1]))
-        self.register_buffer("y", like.new_zeros(*fleet, n, posterior.out_features))
-        self.register_buffer("weight", like.new_zeros(*fleet, n))
-        self.register_buffer("absorbed", like.new_zeros(n))
-        self.register_buffer("number", like.new_zeros(n))
+        self.x = nn.Buffer(like.new_zeros(*fleet, n, like.shape[-1]))
+        self.y = nn.Buffer(like.new_zeros(*fleet, n, posterior.out_features))
+        self.weight = nn.Buffer(like.new_zeros(*fleet, n))
+        self.absorbed = nn.Buffer(like.new_zeros(n))
+        self.number = nn.Buffer(like.new_zeros(n))
         self._n_offered = self._n_taken = 0  # on the host, as the places are
 
     def offer(
-        self,
-        x: Float[Tensor, "*batch in"],
-        y: Float[Tensor, "*batch out"],
-        weight: Float[Tensor, "*batch"],
+        self, x: Float[Tensor, "*batch in"], y: Float[Tensor, "*batch out"], weight: Float[Tensor, "*batch"]
     ) -> None:
         """A sample per model with its weight in the update, 0 where there was none."""
         n = self._n_offered
@@ -87,7 +78,6 @@ class ReplayMemory(nn.Module):
         self.weight.masked_fill_(models.unsqueeze(-1), 0.0)
 
     def reset(self) -> None:
-        """Nothing seen."""
         for buffer in self.buffers():
             buffer.zero_()
         self._n_offered = self._n_taken = 0
@@ -97,7 +87,6 @@ class ReplayMemory(nn.Module):
         return {"n_offered": self._n_offered, "n_taken": self._n_taken}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See get_extra_state."""
         self._n_offered, self._n_taken = int(state["n_offered"]), int(state["n_taken"])
 
 

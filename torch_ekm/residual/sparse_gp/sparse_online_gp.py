@@ -57,7 +57,6 @@ class SparseOnlineGP(DoubleStateLearner):
     after the other at each rebuild.
 
     Args:
-        in_features, out_features, batch_shape, on_invalid, dtype, device: see ResidualLearner.
         capacity: largest number of basis points b.
         kernel: covariance function in the learner's (standardised) units; default squared exponential
             with lengthscale sqrt(in_features) and unit variance.
@@ -65,17 +64,17 @@ class SparseOnlineGP(DoubleStateLearner):
         novelty_threshold: smallest ``gamma / k**`` of a new basis point.
         jitter: nugget on k(x, x) at basis points, relative to k**.
         projection: ``"kl"``, or ``"fitc"``: novelty of a projected sample counts as noise.
-        pruning: score by which a point goes: ``"kl"`` exact loss, ``"mean"`` its first term,
-            ``"novelty"`` best explained by the others, ``"oldest"``; ``"freeze"``: a full basis stays.
+        pruning: the point goes that loses least: ``"kl"`` exact loss, ``"mean"`` its first term;
+            ``"freeze"``: a full basis stays.
         parts: what it does beside; copied.
         refresh_every: samples between two rebuilds of the caches.
         compile_step: updates through torch.compile: needs a C++ compiler and a minute at the first one.
+        options: see ResidualLearner.
 
     Raises:
         ParameterError: a parameter is outside its range, or parts do not go together.
     """
 
-    pending: Tensor
     units: Units
 
     def __init__(
@@ -89,33 +88,22 @@ class SparseOnlineGP(DoubleStateLearner):
         novelty_threshold: float = 1e-4,
         jitter: float = 1e-6,
         projection: Literal["kl", "fitc"] = "kl",
-        pruning: Literal["kl", "mean", "novelty", "oldest", "freeze"] = "kl",
+        pruning: Literal["kl", "mean", "freeze"] = "kl",
         parts: Iterable[nn.Module] = (),
         refresh_every: int = 32,
         compile_step: bool = False,
-        batch_shape: tuple[int, ...] = (),
-        on_invalid: Literal["raise", "skip"] = "raise",
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
+        **options: Any,
     ) -> None:
-        super().__init__(
-            in_features,
-            out_features,
-            batch_shape=batch_shape,
-            on_invalid=on_invalid,
-            dtype=dtype,
-            device=device,
-        )
+        super().__init__(in_features, out_features, **options)
         self.capacity = check_count("capacity", capacity)
         self.refresh_every = check_count("refresh_every", refresh_every)
         self.compile_step = bool(compile_step)
-        shape, double = self.batch_shape, torch.float64
+        shape, double = self.batch_shape, {"dtype": torch.float64, "device": self.device}
         if kernel is None:
-            kernel = SquaredExponential(self.in_features, batch_shape=shape, dtype=double, device=device)
-        self.kernel = check_kernel(kernel, self.in_features, shape).to(dtype=double, device=device)
-        self.log_noise_variance = log_parameter(
-            "noise_variance", noise_variance, (*shape, self.out_features), dtype=double, device=device
-        )
+            kernel = SquaredExponential(self.in_features, batch_shape=shape, **double)
+        self.kernel = check_kernel(kernel, self.in_features, shape).to(**double)
+        noise_shape = (*shape, self.out_features)
+        self.log_noise_variance = log_parameter("noise_variance", noise_variance, noise_shape, **double)
         self.posterior = SparsePosterior(
             self.in_features,
             self.out_features,
@@ -125,10 +113,10 @@ class SparseOnlineGP(DoubleStateLearner):
             projection=projection,
             pruning=pruning,
             batch_shape=shape,
-            device=device,
+            device=self.device,
         )
         # samples of each model since the caches were made
-        self.register_buffer("pending", torch.zeros(shape, dtype=double, device=device))
+        self.pending = nn.Buffer(torch.zeros(shape, **double))
         self.n_samples = 0  # on the host, so that the rhythm of rebuilds never asks the GPU
         self._parts: tuple[Part, ...] = ()
         for part in copy_parts(parts):
@@ -163,7 +151,8 @@ class SparseOnlineGP(DoubleStateLearner):
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """``(alpha'k, alpha' dk/dx)`` in closed form."""
-        k, dk = self._cross_with_gradient(self.units.inputs(self._check_query(x)))
+        # free slots need no mask here: their rows in alpha and C are 0
+        k, dk = self.kernel.with_gradient(self.units.inputs(self._check_query(x)), self.posterior.basis)
         coefficients = self.posterior.alpha.mT
         mean, jacobian = (coefficients @ k.unsqueeze(-1)).squeeze(-1), coefficients @ dk
         return self._out(mean, 1), self._out_slope(jacobian, 1)
@@ -174,7 +163,7 @@ class SparseOnlineGP(DoubleStateLearner):
         d mean/dx = alpha' dk/dx,   d var/dx = dk(x,x)/dx + 2 (Ck)' dk/dx
         """
         z = self.units.inputs(self._check_query(x))
-        k, dk = self._cross_with_gradient(z)
+        k, dk = self.kernel.with_gradient(z, self.posterior.basis)
         column = k.unsqueeze(-1)
         Ck = self.posterior.covariance @ column
         alpha = self.posterior.alpha
@@ -275,8 +264,7 @@ class SparseOnlineGP(DoubleStateLearner):
         self, x: Tensor, y: Tensor, on: Tensor | None, step: Callable = absorb
     ) -> tuple[UpdateReport, Tensor, Tensor]:
         z, t = self.units.inputs(x), self.units.targets(y)
-        number = self.n_samples if self.posterior.needs_age else 0
-        return step(self.posterior, z, t, self.kernel, self.shared_noise(), on, number, self._weighing)
+        return step(self.posterior, z, t, self.kernel, self.shared_noise(), on, self._weighing)
 
     def start_anew(
         self,
@@ -312,10 +300,6 @@ class SparseOnlineGP(DoubleStateLearner):
     def _cross(self, z: Tensor) -> Tensor:
         return self.kernel.vector(z, self.posterior.basis) * self.posterior.active
 
-    def _cross_with_gradient(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        # free slots need no mask here: their rows in alpha and C are 0
-        return self.kernel.with_gradient(z, self.posterior.basis)
-
     def _cast(self, x: Tensor) -> Tensor:
         return torch.as_tensor(x, dtype=torch.float64, device=self.device)
 
@@ -324,5 +308,4 @@ class SparseOnlineGP(DoubleStateLearner):
         return {"n_samples": self.n_samples}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See get_extra_state."""
         self.n_samples = int(state["n_samples"])

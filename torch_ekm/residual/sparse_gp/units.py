@@ -102,13 +102,6 @@ class RunningScale(nn.Module):
         batch_shape: shape of the fleet.
     """
 
-    shift: Tensor
-    scale: Tensor
-    total: Tensor
-    mean: Tensor
-    spread: Tensor
-    shifted: Tensor
-
     def __init__(
         self,
         features: int,
@@ -121,13 +114,13 @@ class RunningScale(nn.Module):
         super().__init__()
         shape = (*batch_shape, features)
         factory = {"dtype": dtype, "device": device}
-        self.register_buffer("shift", torch.zeros(shape, **factory))
-        self.register_buffer("scale", torch.ones(shape, **factory))
-        self.register_buffer("total", torch.zeros(*batch_shape, 1, **factory))
-        self.register_buffer("mean", torch.zeros(shape, **factory))
-        self.register_buffer("spread", torch.zeros(shape, **factory))  # weighted sum of squares
+        self.shift = nn.Buffer(torch.zeros(shape, **factory))
+        self.scale = nn.Buffer(torch.ones(shape, **factory))
+        self.total = nn.Buffer(torch.zeros(*batch_shape, 1, **factory))
+        self.mean = nn.Buffer(torch.zeros(shape, **factory))
+        self.spread = nn.Buffer(torch.zeros(shape, **factory))  # weighted sum of squares
         columns = torch.tensor(shifted or [False] * features, dtype=dtype, device=device)
-        self.register_buffer("shifted", columns)
+        self.shifted = nn.Buffer(columns)
 
     def forward(self, x: Float[Tensor, "*batch features"]) -> Float[Tensor, "*batch features"]:
         """x, or its first columns, in the learner's units."""
@@ -162,5 +155,4 @@ class RunningScale(nn.Module):
         self.scale.fill_(1.0)
 
     def extra_repr(self) -> str:
-        """Width and which columns are centred."""
         return f"features={self.scale.shape[-1]}, shifted={self.shifted.bool().tolist()}"

@@ -1,0 +1,118 @@
+"""What the adapters of GPyTorch's models share."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import torch
+from torch import nn
+from torch.distributions import Normal
+
+from ...typing import Float, Tensor
+from ..base import SingleLearner
+from ..report import UpdateReport
+
+
+class GPyTorchLearner(SingleLearner):
+    """A model of GPyTorch and the last samples.
+
+    GPyTorch's state lies partly outside of state dicts, so the model is no submodule: a copy is made anew
+    and loads its state. A subclass names its own arguments in ``_options`` and calls :meth:`_start` last.
+    """
+
+    _options: ClassVar[tuple[str, ...]]
+    _peer: tuple[Any, ...]  # what _build made
+
+    def _start(self, memory: int) -> None:
+        """Room for the last ``memory`` samples, and a new model."""
+        self.inputs = nn.Buffer(self._like.new_zeros(memory, self.in_features))
+        self.targets = nn.Buffer(self._like.new_zeros(memory, self.out_features))
+        self.reset()
+
+    @abstractmethod
+    def _build(self) -> tuple[Any, ...]:
+        """All that has a state dict, the model first."""
+
+    @abstractmethod
+    def _moments(self, x: Float[Tensor, "n in"]) -> tuple[Float[Tensor, "n out"], Float[Tensor, "n out"]]:
+        """Mean and variance of g."""
+
+    @abstractmethod
+    def _noise(self) -> Tensor:
+        """Variance of the observation noise."""
+
+    @abstractmethod
+    def _learn(self, place: int) -> None:
+        """The sample at this place of the memory is new."""
+
+    @abstractmethod
+    def _settle(self) -> None:
+        """Memory, model or their dtype changed."""
+
+    def reset(self) -> None:
+        """An empty memory and a new model."""
+        super().reset()
+        self._count = 0
+        self._peer = self._build()
+        self._settle()
+
+    def _law(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        x = self._check_query(x)
+        mean, variance = self._moments(x.reshape(-1, self.in_features))
+        shape = (*x.shape[:-1], self.out_features)
+        return mean.reshape(shape), variance.clamp_min(1e-12).reshape(shape)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The posterior mean; 0 before the first sample."""
+        return self._law(x)[0]
+
+    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+        """The posterior law, plus the likelihood's noise on request."""
+        with torch.no_grad():
+            mean, variance = self._law(x)
+            variance = variance + self._noise() if observation else variance
+        return Normal(mean, variance.sqrt(), validate_args=False)
+
+    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        law = self.predict(x, observation=True)
+        nis = ((y - law.mean) / law.stddev).square().mean(-1)
+        place = self._count % len(self.inputs)
+        self.inputs[place], self.targets[place] = x, y
+        self._count += 1
+        self._learn(place)
+        return self._report(nis, mask)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Sample count, and the state dicts of what GPyTorch made."""
+        return {"count": self._count, **{type(part).__name__: part.state_dict() for part in self._peer}}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self._count = int(state["count"])
+        self._peer = self._build()
+        for part in self._peer:
+            part.load_state_dict(copy.deepcopy(state[type(part).__name__]))
+        self._settle()
+
+    def _apply(self, fn, recurse=True):
+        super()._apply(fn, recurse)
+        for part in self._peer:
+            if isinstance(part, nn.Module):
+                part._apply(fn)
+        self._settle()
+        return self
+
+    def __deepcopy__(self, memo: dict) -> GPyTorchLearner:
+        return pickle.loads(pickle.dumps(self))
+
+    def __reduce__(self):
+        options = {name: getattr(self, name) for name in (*self._options, "on_invalid", "dtype")}
+        return _rebuild, (type(self), self.in_features, self.out_features, options, self.state_dict())
+
+
+def _rebuild(kind: type[SingleLearner], n_in: int, n_out: int, options: dict[str, Any], state: dict) -> Any:
+    learner = kind(n_in, n_out, **options)
+    learner.load_state_dict(state)
+    return learner
