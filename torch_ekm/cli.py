@@ -80,6 +80,24 @@ def objects() -> None:
 
 
 @app.command()
+def check(
+    hand: Annotated[str, Argument(help="A hand (see 'torch-ekm hands') or a path to a URDF.")],
+    object: Annotated[str, Argument(help=_AN_OBJECT)] = "box",
+    picture: Annotated[Path, Option(help="Picture of pads and contact frames.")] = Path("check.png"),
+) -> None:
+    """Check a hand: files, pads, axes, limits, tendons, and a pinch of the object in simulation and model.
+
+    Each row says what was found and what to mend. Ends with 1 if there is an error, with 0 if not.
+    """
+    from .experiments.check import Check, check_hand
+
+    rows = check_hand(hand, object, picture)
+    _print_table(Check._fields, rows, hand)
+    if any(row.state == "error" for row in rows):
+        raise typer.Exit(1)
+
+
+@app.command()
 def demo(
     object: Annotated[str, Argument(help=_AN_OBJECT)] = "box",
     out: Annotated[Path, Option(help="Folder for the report.")] = Path("demo_output"),

@@ -22,7 +22,7 @@ class PlantConfig:
     """In the hand frame [m/s^2]; None: the hand's. It stays fixed during a manipulation, as the paper
     assumes (section II.A), and the plant's ``hand`` carries it to the model."""
     time_step: float = 1e-3
-    """[s]; 2 ms is fine for long runs, 4 ms the most that the stiffest tendons bear."""
+    """[s]; 2 ms is fine for long runs and the most with rigid actuators, 4 ms the most with soft ones."""
     ramp_time: float = 0.2
     """Time in which a command is carried out [s]."""
     rate_limit: float = 100 * _DEG

@@ -15,7 +15,7 @@ from ..kinematics import GraspState
 from ..plant import Observation, PlantStatus, Truth
 from ..typing import Array, Float, Tensor
 from .config import PlantConfig
-from .grasp_planning.pinch import PinchPlan, pinch_problem, plan_pinch, turning_axis
+from .grasp_planning.pinch import PinchPlan, pinch_hint, pinch_problem, plan_pinch, turning_axis
 from .grasp_planning.pinch_problem import PinchRequest
 from .mechanism.assembly import true_hand, true_object
 from .parameters import PlantParameters
@@ -118,7 +118,7 @@ class SimulatedHand:
                 return self.observe()
         raise GraspError(
             f"none of {_ATTEMPTS} planned pinches of '{self.object.name}' held it (seed {seed}); "
-            "a higher pinch_force, friction or another gravity direction may help"
+            + (pinch_hint(self._problem) or "a higher pinch_force, friction or another gravity may help")
         )
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:

@@ -9,15 +9,17 @@ import numpy as np
 
 from ..._extras import require
 from ...description import HandDescription, ObjectDescription
-from ...exceptions import EquilibriumError
+from ...exceptions import EquilibriumError, ParameterError
 from ...typing import Array
 from ..config import PlantConfig
 from ..mechanism.assembly import make_transmission, true_object
 from ..parameters import PlantParameters
 from .pinch_problem import PinchProblem, PinchRequest
+from .requirements import require_two_pads_and_limits, unmet
 
 _FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
 _GUESSES = 4  # first guesses that are tried before giving up
+_STIFF_STEP = 0.002  # [s]; at 4 ms a hand with rigid actuators moves by 7 to 55 % another way
 _GOOD_COST = 20.0  # half a sum of squares; the wishes of a good pinch cost about 0.3
 
 
@@ -71,7 +73,8 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
         raise EquilibriumError(
             "pinch planner",
             f"the best posture violates equilibrium by {violation:.2g} times its tolerance",
-            f"the object '{problem.obj.name}' may be too wide, or out of reach, for a force of "
+            pinch_hint(problem)
+            or f"the object '{problem.obj.name}' may be too wide, or out of reach, for a force of "
             f"{request.force} N at along = {request.along} m",
         )
     g = problem.geometry(best[None])
@@ -79,7 +82,8 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
         raise EquilibriumError(
             "pinch planner",
             "the only pinch found holds the object across another axis than its 'grasp_axis'",
-            f"'{problem.obj.name}' may be too wide along {problem.obj.grasp_axis.round(3).tolist()} "
+            pinch_hint(problem)
+            or f"'{problem.obj.name}' may be too wide along {problem.obj.grasp_axis.round(3).tolist()} "
             "for this hand: name the axis along which it is thin",
         )
     return PinchPlan(
@@ -93,6 +97,11 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
         pads=tuple(pad.name for pad in problem.pads),
         residual=violation,
     )
+
+
+def pinch_hint(problem: PinchProblem) -> str:
+    """What the hand lacks for any pinch; empty if nothing is known."""
+    return "; ".join(map(str, unmet(problem)))
 
 
 def _guesses(problem: PinchProblem, request: PinchRequest) -> Iterator[Array]:
@@ -113,7 +122,13 @@ def _guesses(problem: PinchProblem, request: PinchRequest) -> Iterator[Array]:
 def pinch_problem(
     hand: HandDescription, obj: ObjectDescription, config: PlantConfig, parameters: PlantParameters
 ) -> PinchProblem:
-    """The problem for the plant as it is: what closes the hand is not what is studied here."""
+    """The problem for the plant as it is: what closes the hand is not what is studied here.
+
+    Raises:
+        DescriptionError: fewer than two pads, or a joint that moves one has no limits.
+        ParameterError: a time step that rigid actuators do not bear.
+    """
+    require_two_pads_and_limits(hand)
     names = [pad.name for pad in hand.pads]
     thumb = config.thumb or next((name for name in names if name.startswith("thumb")), names[0])
     fingers = config.fingers
@@ -121,6 +136,9 @@ def pinch_problem(
         chosen = tuple(name for name in names if name.startswith(("index", "middle")))
         fingers = chosen or tuple(name for name in names if name != thumb)[:1]
     transmission = make_transmission(hand, parameters)
+    if transmission.stiff and config.time_step > _STIFF_STEP:
+        valid = f"at most {_STIFF_STEP} s: '{hand.name}' has rigid or very stiff actuators"
+        raise ParameterError("time_step", config.time_step, valid)
     along = turning_axis(hand, config)
     return PinchProblem(hand, true_object(obj, parameters), transmission, thumb, fingers, along)
 

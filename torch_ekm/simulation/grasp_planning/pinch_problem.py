@@ -151,9 +151,17 @@ class PinchProblem:
         return across / np.linalg.norm(across)
 
     def tips(self, moving: Array) -> Array:
-        """Centres of the pads' rounded ends ``(c, 3)`` [m]."""
-        poses = self.kinematics(torch.from_numpy(self.posture(moving))).transforms.numpy()[self._links]
-        return np.einsum("cij,cj->ci", poses[:, :3, :3], self._tip) + poses[:, :3, 3]
+        """Centres of the pads' rounded ends ``(*batch, c, 3)`` [m]."""
+        poses = self._pad_poses(moving)
+        return np.einsum("...cij,cj->...ci", poses[..., :3, :3], self._tip) + poses[..., :3, 3]
+
+    def directions(self, moving: Array) -> Array:
+        """Outward directions of the pads' middles, hand frame ``(*batch, c, 3)``."""
+        return np.einsum("...cij,cj->...ci", self._pad_poses(moving)[..., :3, :3], self._palmar)
+
+    def _pad_poses(self, moving: Array) -> Array:
+        poses = self.kinematics(torch.from_numpy(self.posture(moving))).transforms.numpy()
+        return poses[..., self._links, :, :]
 
     def posture(self, moving: Array) -> Array:
         """All joints, coupled ones following, others at rest ``(*batch, n_q)`` [rad]."""

@@ -88,6 +88,11 @@ class HandScene:
         self._hand.articulation.qvel = np.zeros(len(value), dtype=np.float32)
 
     @property
+    def next_q(self) -> Array:
+        """Joint angles after the next step, if they keep their speed ``(n_q,)`` [rad]."""
+        return self.q + self.time_step * self._hand.articulation.qvel.astype(np.float64)[self._hand.order]
+
+    @property
     def object_pose(self) -> tuple[Array, Array]:
         """The object frame in the hand frame: ``(3,)`` [m] and ``(3, 3)``, orthogonal to float64."""
         matrix = self._object.entity_pose.to_transformation_matrix().astype(np.float64)

@@ -133,7 +133,8 @@ class Rig:
         fingers: set[int] = set()
         window = min(_FORCE_WINDOW, steps)
         for k in range(1, steps + 1):
-            output, q = servo.move_to(motor_at(k / steps)), scene.q
+            output = servo.move_to(motor_at(k / steps))
+            q = scene.next_q if transmission.stiff else scene.q
             if push is not None:
                 scene.push(*push)
             scene.step(transmission.drive_targets(q, output))

@@ -1,0 +1,125 @@
+"""A hand that is fit passes; each fault ends in a row that names the part."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from torch_ekm.cli import app
+from torch_ekm.description import list_hands, load_hand, load_object
+from torch_ekm.exceptions import DescriptionError, EquilibriumError, GraspError
+from torch_ekm.experiments.check import check_hand
+from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
+from torch_ekm.simulation.grasp_planning.pinch import pinch_problem
+from torch_ekm.simulation.grasp_planning.requirements import unmet
+
+pytest.importorskip("sapien")
+
+HAND = load_hand("planar_two_finger")
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path]:
+    urdf, transmission = tmp_path / "my.urdf", tmp_path / "my.transmission.toml"
+    urdf.write_text(HAND.urdf_path.read_text())
+    transmission.write_text(HAND.transmission_path.read_text())
+    return urdf, transmission
+
+
+@pytest.mark.parametrize("name", list_hands())
+def test_the_hands_of_the_package_pass(name, tmp_path):
+    rows = check_hand(name, picture=tmp_path / "check.png")
+    assert [row for row in rows if row.state != "ok"] == []
+    assert (tmp_path / "check.png").stat().st_size > 5000
+    assert sum(row.name.startswith("pad ") for row in rows) == len(load_hand(name).pads)
+    assert {"tendon", "limits", "pinch", "stability"} <= {row.name.split()[0] for row in rows}
+
+
+SPRING = "spring = 0.2, rest_deg = "
+FAULTS = {  # what is changed (0: URDF, 1: transmission file); name, state and text of a row
+    "pad away": (1, "[0.0, -1.0, 0.0]", "[0.0, 1.0, 0.0]", "pad 'left'", "error", "away.*'left_1' closes"),
+    "pad sideways": (1, "[0.0, -1.0, 0.0]", "[0.0, 0.0, 1.0]", "pad 'left'", "error", "no joint moves it"),
+    "pad off its link": (1, "radius = 0.006", "radius = 0.009", "pad 'left'", "warning", "not the <"),
+    "limits": (0, 'upper="1.5"', 'upper="0.02"', "limits", "error", "joint '.*_[01]': no posture within"),
+    "no limits": (0, 'left_0" type="revolute"', 'left_0" type="continuous"', "limits", "error", "left_0"),
+    "wide limits": (0, '"-0.5" upper="1.5"', '"-3" upper="3"', "limits", "warning", "left_0.*344 deg"),
+    "axis": (0, '<axis xyz="0 0 -1"/>', '<axis xyz="0 0.1 -1"/>', "planar axes", "error", r"_0 \(5.7 deg"),
+    "never taut": (1, SPRING + "0", SPRING + "160", "tendon 'left'", "error", "slack"),
+    "late": (1, SPRING + "0", SPRING + "100", "tendon 'left'", "warning", "from 105 deg"),
+    "one pad": (1, '[[pads]]\nname = "left"', '[[pads]]\nname = "left"', "limits", "error", "two"),
+    "unreadable": (0, "<robot", "<robot <", "hand's files", "error", "not well-formed XML"),
+    "rigid": (1, "stiffness = 10.0", "", "actuators", "ok", "left 100"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", list(FAULTS))
+def test_each_fault_has_its_row(fault, files):
+    which, old, new, name, state, text = FAULTS[fault]
+    content = files[which].read_text()
+    assert old in content
+    content = content.replace(old, new, -1 if fault == "limits" else 1)
+    if fault == "one pad":
+        content = content[: content.rindex("[[pads]]")]
+    files[which].write_text(content)
+    rows = [row for row in check_hand(str(files[0])) if row.name == name]
+    assert [row.state for row in rows] == [state]
+    assert re.search(text, rows[0].found)
+    assert bool(rows[0].mend) == (state != "ok")
+
+
+def test_a_planner_that_fails_names_the_joint_and_not_the_object():
+    narrow = HAND.joint_upper.copy()
+    narrow[HAND.joint_names.index("left_0")] = narrow[HAND.joint_names.index("right_0")] = -0.3
+    narrow[HAND.joint_names.index("left_1")] = narrow[HAND.joint_names.index("right_1")] = 0.2
+    hand = dataclasses.replace(HAND, joint_upper=narrow)
+    with pytest.raises((EquilibriumError, GraspError), match=r"joint '(left|right)_0': no posture"):
+        SimulatedHand(hand, "box").reset(0)
+    with pytest.raises(DescriptionError, match=r"two .*pads"):
+        SimulatedHand(dataclasses.replace(HAND, pads=HAND.pads[:1]), "box")
+
+
+def test_the_joint_in_the_way_is_the_one_that_was_narrowed():
+    hand = load_hand("icub_right")
+    upper = hand.joint_upper.copy()
+    place = hand.joint_names.index("thumb_0")
+    upper[place] = hand.joint_lower[place] + 0.02
+    found = unmet(pinch_problem(dataclasses.replace(hand, joint_upper=upper), load_object("box"),
+                                PlantConfig(), PlantParameters()))  # fmt: skip
+    assert all(["thumb_0" in lack.part for lack in found])
+
+
+def test_a_pad_that_holds_with_its_back_is_told(monkeypatch):
+    lower, upper = HAND.joint_lower.copy(), HAND.joint_upper.copy()
+    lower[0], upper[0], upper[1] = -0.5, 0.0, 0.2
+    hand = dataclasses.replace(HAND, joint_lower=lower, joint_upper=upper)
+    monkeypatch.setattr("torch_ekm.experiments.check.load_hand", lambda _: hand)
+    rows = {row.name: row for row in check_hand("mine")}
+    assert rows["contact sides"].state == rows["stability"].state == "error"
+    assert "'right'" in rows["contact sides"].found
+
+
+def test_rigid_actuators_that_contradict_each_other_are_told(monkeypatch):
+    hand = load_hand("icub_right")
+    rigid = tuple(dataclasses.replace(actuator, stiffness=float("inf")) for actuator in hand.actuators)
+    hand = dataclasses.replace(hand, actuators=rigid)
+    monkeypatch.setattr("torch_ekm.experiments.check.load_hand", lambda _: hand)
+    rows = {row.name: row for row in check_hand("mine")}
+    assert "thumb_distal 100" in rows["actuators"].found
+    assert rows["actuators in the pinch"].state == "warning"
+
+
+def test_command_line(files, tmp_path):
+    runner = CliRunner()
+    picture = ["--picture", str(tmp_path / "check.png")]
+    done = runner.invoke(app, ["check", "planar_two_finger", "can", *picture])
+    assert done.exit_code == 0, done.output
+    assert "friction margins" in done.output
+    files[0].write_text("nothing")
+    for arguments in ([str(files[0])], ["planar_two_finger", "banana"], ["banana"]):
+        done = runner.invoke(app, ["check", *arguments, *picture])
+        assert done.exit_code == 1
+        assert "error" in done.output

@@ -1,0 +1,251 @@
+"""Whether a hand is fit to be modelled and simulated: one row for each thing that can be wrong with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+
+from ..contact.contact_kinematics import contact_frames
+from ..contact.signed_distance import signed_distance
+from ..description import HandDescription, ObjectDescription, Shape, load_hand, load_object
+from ..exceptions import EKMError, MissingExtraError
+from ..kinematics import ActuationMap, HandKinematics
+from ..model import KinematicModel, Linearization, ModelOptions, ModelStatus
+from ..rendering import make_scene, save_picture
+from ..simulation import PlantConfig, SimulatedHand
+from ..simulation.grasp_planning.pinch import pinch_problem
+from ..simulation.grasp_planning.requirements import direction_unmet, unmet
+from ..simulation.parameters import PlantParameters
+from ..simulation.physics.bodies import x_axis_to
+
+_PARALLEL = 1e-3  # [rad] between a planar hand's joints and its normal
+_SURFACE = 2e-4  # [m] between a pad and its link's collision shape
+_LOW_MARGIN = 0.1  # of the friction cone
+_CONTRADICT = 1e4  # [N/rad]: 100 N for 0.6 deg; soft actuators have some hundreds
+_STABLE = 1e-6  # [N m/rad]; less is none
+_FRACTIONS = np.linspace(0.0, 1.0, 21)  # of an actuator's range
+
+State = Literal["ok", "warning", "error"]
+
+
+class Check(NamedTuple):
+    """One row of the table."""
+
+    name: str
+    state: State
+    found: str
+    mend: str = ""
+
+
+def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> list[Check]:
+    """Check a hand, and the pinch of an object (seed 0), from the files to the model's margins.
+
+    Args:
+        hand: name or path, as :func:`load_hand` takes it.
+        object: name or path, as :func:`load_object` takes it.
+        picture: file for a picture of the hand in the pinch, or open if there is none, with the pads'
+            directions (black) and the contact frames (red along the inward normal, tangents green and blue);
+            the object, which hides them, is left out.
+
+    Returns:
+        The checks in the order in which they are best mended. A fault ends in a row, never in an error.
+    """
+    try:
+        description = load_hand(hand)
+    except (EKMError, OSError) as error:
+        return [Check("hand's files", "error", str(error), "see docs/your_own_hand.md")]
+    rows = [Check("hand's files", "ok", f"{description.n_q} joints, {description.n_a} actuators")]
+    rows += [*_pads(description), *_plane(description), *_tensions(description)]
+    try:
+        obj = load_object(object)
+    except (EKMError, OSError) as error:
+        return [*rows, Check("object's files", "error", str(error), "see docs/your_own_hand.md")]
+    rows += [*_rigid(description), *_reach(description, obj), *_pinch(description, obj, picture)]
+    return rows
+
+
+def _pads(hand: HandDescription) -> Iterator[Check]:
+    """Link, position [mm], direction and radius of each pad; its capsule is a collision shape of the link."""
+    for pad in hand.pads:
+        place = f"on {pad.link}, end {_vector(np.array(pad.end) * 1e3)} mm, "
+        found = place + f"direction {_vector(pad.direction)}, radius {1e3 * pad.radius:g} mm"
+        shapes, lack = hand.urdf.link(pad.link).collisions, direction_unmet(hand, pad)
+        depth = -signed_distance(shapes, np.array([pad.start, pad.end]))[0] if shapes else np.zeros(2)
+        name = f"pad '{pad.name}'"
+        if lack is not None:
+            yield Check(name, "error", f"{found}; {lack.problem}", lack.remedy)
+        elif not shapes:
+            yield Check(name, "error", f"{found}; its link has no primitive <collision>", "write its capsule")
+        elif np.abs(depth - pad.radius).max() > _SURFACE:
+            yield Check(name, "warning", f"{found}; not the <collision> of its link", "make both the same")
+        else:
+            yield Check(name, "ok", found)
+
+
+def _plane(hand: HandDescription) -> Iterator[Check]:
+    if hand.planar_normal is None:
+        return
+    normal = np.array(hand.planar_normal)
+    kinematics = HandKinematics(hand)
+    axes = kinematics.joint_axes(kinematics(torch.from_numpy(hand.spring_rest)))[0].numpy()
+    sine = np.linalg.norm(np.cross(axes, normal / max(np.linalg.norm(normal), 1e-300)), axis=1)
+    askew = [
+        f"{joint} ({np.degrees(np.arcsin(min(1.0, value))):.1f} deg)"
+        for joint, value in zip(hand.joint_names, sine, strict=True)
+        if value > _PARALLEL
+    ]
+    if not normal.any() or askew:
+        found = f"not parallel to planar_normal {_vector(normal)}: {', '.join(askew) or 'any joint'}"
+        yield Check("planar axes", "error", found, "turn <axis> or <origin>, or leave planar_normal out")
+    else:
+        yield Check("planar axes", "ok", f"all parallel to {_vector(normal)}")
+
+
+def _tensions(hand: HandDescription) -> Iterator[Check]:
+    """``K_s (q - q0) = J_a^T t + C^T c`` in the hand that touches nothing, over the actuators' range."""
+    lower, upper = hand.actuator_lower, hand.actuator_upper
+    a = lower + _FRACTIONS[:, None] * (upper - lower)
+    q = ActuationMap(hand).joints(torch.from_numpy(a)).numpy()
+    rows = np.vstack([hand.actuation_jacobian, hand.coupling.reshape(-1, hand.n_q)])
+    tension = ((q - hand.spring_rest) * hand.spring_stiffness) @ np.linalg.pinv(rows)[:, : hand.n_a]
+    for k, actuator in enumerate(hand.actuators):
+        if not actuator.tendon:
+            continue
+        taut = tension[:, k] > 1e-6
+        first, most = (_FRACTIONS[taut][0] if taut.any() else 1.0), tension[:, k].max()
+        name, mend = (
+            f"tendon '{actuator.name}'",
+            "check its springs' stiffness and rest angles, and its range",
+        )
+        if not taut.any():
+            yield Check(name, "error", "slack over its whole range: no spring opposes it", mend)
+        else:
+            at = f"{np.degrees(lower[k] + first * (upper[k] - lower[k])):.0f} deg"
+            rest = "slack at rest, " if not taut[0] else ""
+            state: State = "warning" if first > 0.5 else "ok"
+            found = f"{rest}taut from {at}, up to {most:.2g} N m in free motion"
+            yield Check(name, state, found, mend if state == "warning" else "")
+
+
+def _rigid(hand: HandDescription) -> Iterator[Check]:
+    try:
+        true = SimulatedHand(hand).true_descriptions()[0]
+    except EKMError:
+        return  # the same error is the pinch's
+    pairs = zip(hand.actuators, true.actuators, strict=True)
+    capped = [f"{was.name} {now.stiffness:g}" for was, now in pairs if was.stiffness != now.stiffness]
+    found = f"rigid, in simulation [N m/rad]: {', '.join(capped)}" if capped else "of finite stiffness"
+    yield Check("actuators", "ok", found)
+
+
+def _reach(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
+    try:
+        problem = pinch_problem(hand, obj, PlantConfig(), PlantParameters())
+    except EKMError as error:
+        yield Check("limits", "error", str(error), "as the message says")
+        return
+    lacks = [lack for lack in unmet(problem) if not lack.part.startswith("pad '")]  # those have rows
+    for lack in lacks:
+        state: State = "error" if lack.certain else "warning"
+        yield Check("limits", state, f"{lack.part}: {lack.problem}", lack.remedy)
+    if not lacks:
+        names = " and ".join(pad.name for pad in problem.pads)
+        yield Check("limits", "ok", f"pads {names} come face to face, {1e3 * obj.grasp_width:.0f} mm apart")
+
+
+def _pinch(hand: HandDescription, obj: ObjectDescription, picture: Path | None) -> Iterator[Check]:
+    plant = lin = None
+    try:
+        plant = SimulatedHand(hand, obj)
+        seen = plant.reset(0)  # as it is: the sensors have no noise
+        felt = zip(hand.pads, seen.fingertip_force.tolist(), strict=True)
+        forces = ", ".join(f"{pad.name} {force:.1f}" for pad, force in felt if force > 0)
+        yield Check("pinch", "ok", f"'{obj.name}' is held in simulation; forces [N]: {forces}")
+        model = KinematicModel(plant.hand, obj, ModelOptions(gravity=plant.gravity, on_unstable="flag"))
+        lin = model.linearize(seen.state, fingertip_force=seen.fingertip_force)
+        yield from _grasp(hand, lin)
+    except MissingExtraError as error:
+        yield Check("pinch", "warning", f"not tried: {error}")
+    except EKMError as error:
+        what = "pinch" if plant is None or lin is None else "model"
+        yield Check(what, "error", str(error), "mend the rows above first, or give another object")
+    if picture is not None:
+        try:
+            yield Check("picture", "ok", str(_draw(hand, lin, picture).resolve()))
+        except (MissingExtraError, OSError, ValueError) as error:
+            yield Check("picture", "warning", f"not drawn: {error}")
+
+
+def _grasp(hand: HandDescription, lin: Linearization) -> Iterator[Check]:
+    """What the kinematic model says of the pinch."""
+    stability, good = float(lin.stability), lin.status is ModelStatus.OK
+    found = f"{stability:.2g} N m/rad with locked actuators; the model's status: {lin.status.value}"
+    few = len(lin.contacts.finger) < 2  # the simulation lets any link hold, the model pads alone
+    state: State = "error" if few or stability < _STABLE else "ok" if good else "warning"
+    yield Check(
+        "stability", state, found, "" if state == "ok" else "stiffer springs, less force, pads that touch"
+    )
+    answer = float(lin.normal_force_sensitivity.abs().max())
+    if answer > _CONTRADICT:
+        found = f"rigid actuators contradict each other: {answer:.1g} N/rad"
+        yield Check("actuators in the pinch", "warning", found, "give them their true 'stiffness'")
+    relative = lin.forces.relative_margin
+    found = ", ".join(f"{n} {v:.2f}" for n, v in zip(lin.contacts.finger, relative.tolist(), strict=True))
+    low = bool(relative.min() < _LOW_MARGIN)
+    mend = "a higher friction, or wider pads" if low else ""
+    yield Check("friction margins", "warning" if low else "ok", f"{found} (1: no tangential load)", mend)
+    poses = HandKinematics(hand)(lin.state.q)
+    pads = {pad.name: pad for pad in hand.pads}
+    for finger, normal in zip(lin.contacts.finger, lin.contacts.normal.numpy(), strict=True):
+        pad = pads[finger]
+        if float(normal @ poses.of(pad.link)[:3, :3].numpy() @ pad.direction) > 0:
+            mend = f"'direction' of pad '{finger}', or the limits of its joints"
+            yield Check("contact sides", "error", f"'{finger}' touches with its back", mend)
+    stopped = [name for name, held in zip(hand.joint_names, lin.held_joints, strict=True) if held]
+    if stopped:
+        yield Check(
+            "stops", "warning", f"a stop holds: {', '.join(stopped)}", "wider limits, stiffer springs"
+        )
+    upstream = HandKinematics(hand).upstream.numpy()
+    used = upstream[[hand.link_names.index(link) for link in lin.contacts.link]].any(axis=0)
+    slack = [
+        actuator.name
+        for actuator, arms, lam in zip(hand.actuators, hand.actuation_jacobian, lin.forces.lam, strict=True)
+        if actuator.tendon and arms[used].any() and -float(lam) <= 1e-4
+    ]
+    if slack:
+        mend = "stiffer springs or other rest angles"
+        yield Check("tendons in the pinch", "warning", f"slack: {', '.join(slack)}", mend)
+
+
+def _draw(hand: HandDescription, lin: Linearization | None, path: Path) -> Path:
+    """The hand with a rod along each pad's direction and the axes of each contact frame."""
+    rest = torch.from_numpy(hand.spring_rest.clip(hand.joint_lower, hand.joint_upper))
+    q = rest if lin is None else lin.state.q
+    scene = make_scene(hand, None, q[None].numpy(), None, None, np.array(hand.gravity))
+    poses, rods = HandKinematics(hand)(q), []
+    for pad in hand.pads:
+        T = poses.of(pad.link).numpy()
+        along = T[:3, :3] @ pad.direction
+        rods.append((T[:3, :3] @ pad.end + T[:3, 3] + pad.radius * along, along, 0.01, (0.1, 0.1, 0.1)))
+    if lin is not None:
+        plane = None if hand.planar_normal is None else torch.tensor(hand.planar_normal, dtype=q.dtype)
+        frames = contact_frames(lin.contacts.normal, plane).numpy()
+        for point, frame in zip(lin.contacts.point.numpy(), frames, strict=True):
+            rods += [(point, frame[:, k], 0.02, tuple(np.eye(3)[k].tolist())) for k in range(3)]
+    shapes, transforms = list(scene.shapes), [scene.transforms]
+    for start, along, length, colour in rods:
+        T = x_axis_to(along)[:, [1, 2, 0, 3]]  # a cylinder lies along z
+        T[:3, 3] = start + length / 2 * along
+        shapes.append((Shape("cylinder", (0.0008, length), np.eye(4)), colour))
+        transforms.append(T[None, None])
+    return save_picture(replace(scene, shapes=shapes, transforms=np.concatenate(transforms, axis=1)), path)
+
+
+def _vector(values: object) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in np.asarray(values, dtype=np.float64) + 0.0) + ")"

@@ -1,0 +1,156 @@
+"""What the pinch planner needs of a hand, told by the pad or joint that lacks it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ...description import ContactPad, HandDescription
+from ...exceptions import DescriptionError
+from ...kinematics import HandKinematics
+from ...typing import Array
+from .graspable import chain
+from .pinch_problem import PinchProblem
+
+_FACING = 0.3  # least cosine between a pad's direction and where it is to press; the planner wishes the same
+_SAMPLES = 2048
+_WIDEST = np.pi  # [rad]; the planner starts from parts of each range, as if it ran from open to closed
+_WIDER = np.pi / 2  # [rad] by which limits are moved to see which one is in the way
+
+
+class Unmet(NamedTuple):
+    """A need of the planner that a hand does not meet."""
+
+    part: str
+    """Pad or joint, by name."""
+    problem: str
+    remedy: str
+    certain: bool = True
+    """False: a pinch may be found all the same."""
+
+    def __str__(self) -> str:
+        return f"{self.part}: {self.problem}; {self.remedy}"
+
+
+def require_two_pads_and_limits(hand: HandDescription) -> None:
+    """A pinch has two sides, and the planner draws postures from the range of each joint.
+
+    Raises:
+        DescriptionError: fewer than two pads, or a joint that moves a pad and has no limits.
+    """
+    if len(hand.pads) < 2:
+        raise DescriptionError(
+            hand.transmission_path, f"a pinch needs two [[pads]] or more, found {len(hand.pads)}"
+        )
+    joints = {joint for pad in hand.pads for joint in chain(hand, pad.link)}
+    free = [joint for joint in sorted(joints) if not np.isfinite(hand.joint_upper - hand.joint_lower)[joint]]
+    if free:
+        names = ", ".join(hand.joint_names[joint] for joint in free)
+        raise DescriptionError(
+            hand.urdf_path, f"a pinch needs a <limit> at each joint that moves a pad, none at: {names}"
+        )
+
+
+def direction_unmet(hand: HandDescription, pad: ContactPad) -> Unmet | None:
+    """Closing the hand must move a pad towards its ``direction``: ``d . (z_j x (x - o_j)) > 0``.
+
+    Of the joints that move the pad, the one nearest to it that moves it along ``d`` decides. It closes the
+    way a tendon pulls it; without a tendon towards its larger limit; else either way will do.
+    """
+    joints = chain(hand, pad.link)
+    if not joints:
+        return None  # part of the palm
+    kinematics = HandKinematics(hand)
+    poses = kinematics(torch.from_numpy(hand.spring_rest))
+    T = poses.of(pad.link).numpy()
+    axis, origin = (part.numpy() for part in kinematics.joint_axes(poses))
+    towards, tip = T[:3, :3] @ pad.direction, T[:3, :3] @ pad.end + T[:3, 3]
+    for joint in joints:
+        velocity = np.cross(axis[joint], tip - origin[joint])
+        along = float(towards @ velocity / max(np.linalg.norm(velocity), 1e-9))
+        if abs(along) < _FACING:
+            continue
+        if _closing(hand, joint) * along >= 0:
+            return None
+        name, closes = hand.joint_names[joint], (T[:3, :3].T @ (-np.sign(along) * velocity)).round(4)
+        return Unmet(
+            f"pad '{pad.name}'",
+            f"its direction {_text(pad.direction)} points away from where joint '{name}' closes it",
+            f"write 'direction' along {_text(closes / np.abs(closes).max())}, in the frame of '{pad.link}'",
+        )
+    return Unmet(
+        f"pad '{pad.name}'",
+        f"no joint moves it along its direction {_text(pad.direction)}",
+        f"'direction' is the palmar side, in the frame of '{pad.link}'",
+    )
+
+
+def unmet(problem: PinchProblem) -> list[Unmet]:
+    """Everything that the pads and joints of a pinch lack, whatever the object's shape is.
+
+    Pads must face what they press on, and some posture within the limits must bring them face to face, about
+    the object's ``grasp_width`` apart. Where none does, the joint whose limits are in the way is the one that
+    with wider limits lets most postures do so.
+    """
+    found = [lack for pad in problem.pads if (lack := direction_unmet(problem.hand, pad)) is not None]
+    low, high = problem.joint_range
+    if found or _opposing(problem, low, high):
+        return [*found, *_too_wide(problem)]
+    names = " and ".join(f"'{pad.name}'" for pad in problem.pads)
+    width = f"{1e3 * problem.obj.grasp_width:.0f} mm apart, the object's grasp_width"
+    wider = [_opposing(problem, low - _WIDER * at, high + _WIDER * at) for at in np.eye(len(low))]
+    if not any(wider):
+        return [Unmet(f"pads {names}", f"no posture brings them face to face, {width}", "move the fingers")]
+    best = int(np.argmax(wider))
+    limits = f"{np.degrees(low[best]):.0f} to {np.degrees(high[best]):.0f} deg"
+    return [
+        Unmet(
+            f"joint '{problem.hand.joint_names[problem.moving[best]]}'",
+            f"no posture within the limits brings pads {names} face to face, {width}",
+            f"its limits, {limits}, are the first to be looked at",
+        )
+    ]
+
+
+def _too_wide(problem: PinchProblem) -> list[Unmet]:
+    low, high = np.degrees(problem.joint_range)
+    remedy = "let its limits run from open to closed: the planner starts within 13 to 65 % of them"
+    return [
+        Unmet(f"joint '{problem.hand.joint_names[joint]}'", f"its range is {b - a:.0f} deg", remedy, False)
+        for joint, a, b in zip(problem.moving, low, high, strict=True)
+        if b - a > np.degrees(_WIDEST)
+    ]
+
+
+def _closing(hand: HandDescription, joint: int) -> int:
+    """Sign of the joint's motion when the hand closes; 0: not known."""
+    arms = [
+        arm
+        for actuator, arm in zip(hand.actuators, hand.actuation_jacobian[:, joint], strict=True)
+        if actuator.tendon and arm
+    ]
+    if arms:
+        return int(np.sign(sum(arms)))
+    low, high = hand.joint_lower[joint], hand.joint_upper[joint]
+    return int(np.sign(low + high)) if abs(low + high) > 0.2 * (high - low) else 0
+
+
+def _opposing(problem: PinchProblem, low: Array, high: Array) -> int:
+    """How many of the sampled postures have the pads face to face, about a grasp width apart."""
+    moving = low + np.random.default_rng(0).uniform(size=(_SAMPLES, len(low))) * (high - low)
+    tips, directions = problem.tips(moving), problem.directions(moving)
+    across = tips[:, 1:].mean(axis=1) - tips[:, 0]
+    distance = np.linalg.norm(across, axis=1)
+    across /= distance[:, None]
+    facing = np.einsum("bci,bi->bc", directions, across)
+    facing[:, 1:] *= -1.0
+    radius = np.array([pad.radius for pad in problem.pads])
+    opening = distance - radius[0] - radius[1:].mean()
+    width = problem.obj.grasp_width
+    return int(((facing.min(axis=1) > _FACING) & (np.abs(opening - width) < 0.5 * width)).sum())
+
+
+def _text(vector: object) -> str:
+    return "[" + ", ".join(f"{value:.2g}" for value in np.asarray(vector, dtype=np.float64) + 0.0) + "]"
