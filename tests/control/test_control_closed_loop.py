@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import threading
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ from torch_ekm.control import (
 )
 from torch_ekm.control import StopReason as Reason
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.exceptions import NonFiniteError
+from torch_ekm.exceptions import NonFiniteError, ParameterError
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, Plant, PlantStatus
@@ -176,3 +177,74 @@ def test_the_learner_is_told_what_the_encoders_did(held) -> None:
     for (da, nominal), step in zip(told, steps, strict=True):
         torch.testing.assert_close(da, 0.5 * step.decision.delta_a)
         torch.testing.assert_close(nominal, 0.5 * step.decision.nominal)
+
+
+# -- the hand holds whatever ends the loop ------------------------------------------------------------
+
+
+class Noted(FrozenPlant):
+    """Notes its commands; the second one fails with ``error``, if there is one."""
+
+    def __init__(self, observation: Observation, error: BaseException | None = None) -> None:
+        super().__init__(observation)
+        self.given, self.error = [], error
+
+    def command(self, delta_a: torch.Tensor) -> Observation:
+        self.given.append(delta_a)
+        if self.error is not None and len(self.given) == 2:
+            raise self.error
+        return super().command(delta_a)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("bus is down")])
+def test_the_hand_holds_after_an_error_of_the_driver_and_after_ctrl_c(held, error) -> None:
+    seen, axis, controller = held
+    plant = Noted(seen, error)
+    with pytest.raises(type(error)):
+        ClosedLoop(plant, controller, RULE).run(PoseTarget.turned(seen.state, axis, degrees=80))
+    assert [bool(da.any()) for da in plant.given] == [True, True, False]
+
+
+def test_the_hand_holds_after_an_error_of_the_caller_and_after_a_break(held) -> None:
+    seen, axis, controller = held
+    target = PoseTarget.turned(seen.state, axis, degrees=80)
+
+    def fail(step) -> None:
+        raise ValueError
+
+    for on_step in (None, fail):
+        plant = Noted(seen)
+        with pytest.raises(ValueError), ClosedLoop(plant, controller, RULE) as loop:  # noqa: PT011
+            loop.run(target, on_step) if on_step else [fail(step) for step in loop.steps(target)]
+        assert bool(plant.given[0].any())
+        assert not bool(plant.given[-1].any())
+    plant = Noted(seen)
+    motions = ClosedLoop(plant, controller, RULE).steps(target)
+    next(motions)
+    motions.close()
+    assert not bool(plant.given[-1].any())
+    plant = Noted(seen)
+    ClosedLoop(plant, controller, RULE).run(target)  # an end of its own: the motors stand where they are
+    assert all(bool(da.any()) for da in plant.given)
+
+
+def test_another_thread_stops_it_after_the_motion_under_way(held) -> None:
+    seen, axis, controller = held
+    plant = Noted(seen)
+    loop = ClosedLoop(plant, controller, RULE)
+    worker = threading.Thread(target=loop.stop)
+    done = loop.run(PoseTarget.turned(seen.state, axis, degrees=80), lambda step: worker.start())
+    worker.join()
+    assert done.reason is Reason.STOPPED
+    assert len(done.steps) <= 2
+    assert loop.run(PoseTarget.turned(seen.state, axis, degrees=80)).reason is Reason.STALLED  # and again
+
+
+def test_a_time_out_is_a_reason_of_its_own(held) -> None:
+    seen, axis, controller = held
+    rule = dataclasses.replace(RULE, max_seconds=1e-9)
+    done = ClosedLoop(Noted(seen), controller, rule).run(PoseTarget.turned(seen.state, axis, degrees=80))
+    assert done.reason is Reason.TIME_OUT
+    assert not done.steps
+    with pytest.raises(ParameterError, match="max_seconds"):
+        dataclasses.replace(RULE, max_seconds=0)

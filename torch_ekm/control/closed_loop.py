@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 import time
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
+
+import torch
 
 from ..plant import Observation, Plant, PlantStatus
 from ..residual import UpdateReport
@@ -69,8 +73,12 @@ class ClosedLoop:
 
     ``steps`` is a generator of motions; metrics and pictures are its consumers::
 
-        for step in ClosedLoop(plant, controller).steps(target):
-            print(step.increment)
+        with ClosedLoop(plant, controller) as loop:
+            for step in loop.steps(target):
+                print(step.increment)
+
+    Whatever ends the manipulation early (an exception, Ctrl-C, a ``break``), the hand is told to hold its
+    position, and what was raised goes on. In a ``with`` block that is so for errors of the block, too.
 
     Args:
         plant: with a grasped object (already reset).
@@ -94,6 +102,24 @@ class ClosedLoop:
         self.plant, self.controller = plant, controller
         self.rule = StoppingRule() if rule is None else rule
         self.learn, self.learn_from_commands = learn, learn_from_commands
+        self._stop = threading.Event()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        if kind is not None:
+            self.hold()
+
+    def stop(self) -> None:
+        """End the manipulation after the motion under way; from any thread."""
+        self._stop.set()
+
+    def hold(self) -> None:
+        """Tell the hand to stay where it is; a plant that fails at this, too, is not heard."""
+        still = torch.zeros(self.controller.kinematic.hand.n_a, dtype=torch.float64)
+        with contextlib.suppress(Exception):
+            self.plant.command(still)
 
     def run(self, target: PoseTarget, on_step: Callable[[Step], object] | None = None) -> Manipulation:
         """Drive the object to ``target``.
@@ -105,17 +131,26 @@ class ClosedLoop:
             EKMError: see :meth:`LookAndMoveController.decide`, and what the plant raises.
         """
         steps: list[Step] = []
-        motions = self.steps(target)
-        while True:
-            try:
-                steps.append(next(motions))
-            except StopIteration as end:
-                return Manipulation(target, self.controller.focus, tuple(steps), end.value)
-            if on_step is not None:
-                on_step(steps[-1])
+        with contextlib.closing(self.steps(target)) as motions:
+            while True:
+                try:
+                    steps.append(next(motions))
+                except StopIteration as end:
+                    return Manipulation(target, self.controller.focus, tuple(steps), end.value)
+                if on_step is not None:
+                    on_step(steps[-1])
 
     def steps(self, target: PoseTarget) -> Generator[Step, None, Stop]:
         """The motions one by one; the generator's return value is the :class:`Stop`."""
+        self._stop.clear()
+        try:
+            return (yield from self._motions(target))
+        except BaseException:  # Ctrl-C and a closed generator as well: the hand must not go on
+            self.hold()
+            raise
+
+    def _motions(self, target: PoseTarget) -> Generator[Step, None, Stop]:
+        started = time.monotonic()
         seen = self.plant.observe()
         self.controller.reset()
         start, focus = seen.state, self.controller.focus
@@ -125,6 +160,10 @@ class ClosedLoop:
                 return Stop(StopReason.OBJECT_LOST, seen)
             if off_rotation > self.rule.off_limit:
                 return Stop(StopReason.OBJECT_LOST, seen, "dislocated off the focused axis")
+            if self._stop.is_set():
+                return Stop(StopReason.STOPPED, seen)
+            if time.monotonic() - started > self.rule.max_seconds:
+                return Stop(StopReason.TIME_OUT, seen)
             reason = self.rule.judge(errors, limited)
             if reason is not StopReason.RUNNING:
                 return Stop(reason, seen)

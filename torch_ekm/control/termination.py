@@ -19,6 +19,9 @@ class StopReason(Enum):
     ACTUATOR_LIMITS = "actuator limits"
     UNSTABLE_GRASP = "unstable grasp"
     OBJECT_LOST = "object lost"
+    TIME_OUT = "time-out"
+    STOPPED = "stopped"
+    """By :meth:`ClosedLoop.stop`."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class StoppingRule:
     * stalled: within the last ``stall_window`` steps the smallest ``|e|`` fell by less than
       ``stall_progress``;
     * actuator limits: as stalled, while some actuator that matters stood at its limit;
-    * step limit: ``max_steps`` commands were given;
+    * step limit: ``max_steps`` commands were given; time-out: ``max_seconds`` are over;
     * object lost: the plant says so, or the object turned off the focus by more than
       ``off_limit`` [rad]: it is dislocated, and no small step brings it back.
     """
@@ -42,9 +45,11 @@ class StoppingRule:
     """[same unit]"""
     max_steps: int = 60
     off_limit: float = math.radians(30.0)
+    max_seconds: float = math.inf
+    """From the first observation on; a motion under way is finished [s]."""
 
     def __post_init__(self) -> None:
-        for name in ("tolerance", "settle_steps", "stall_window", "max_steps", "off_limit"):
+        for name in ("tolerance", "settle_steps", "stall_window", "max_steps", "off_limit", "max_seconds"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
 
