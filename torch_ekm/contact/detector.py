@@ -13,7 +13,7 @@ import torch
 
 from .._extras import require
 from ..description import HandDescription, ObjectDescription
-from ..exceptions import NonFiniteError, ParameterError, ShapeError
+from ..exceptions import DescriptionError, NonFiniteError, ParameterError, ShapeError
 from ..kinematics import HandKinematics, LinkPoses
 from ..typing import Array, Float, Tensor
 from .contact_set import ContactSet
@@ -46,6 +46,7 @@ class ContactDetector:
     Raises:
         MissingExtraError: coal is not installed.
         ParameterError: ``margin`` or ``crown_radius`` is out of range.
+        DescriptionError: the hand has no pads.
     """
 
     def __init__(
@@ -60,6 +61,9 @@ class ContactDetector:
             raise ParameterError("margin", margin, "at least 0 [m]")
         if not 0 < crown_radius < math.inf:
             raise ParameterError("crown_radius", crown_radius, "positive and finite [m]")
+        if not hand.pads:
+            problem = "the hand has no [[pads]], so nothing of it can touch an object"
+            raise DescriptionError(hand.transmission_path, problem)
         self.hand, self.obj, self.margin, self.crown_radius = hand, obj, margin, crown_radius
         self.kinematics = kinematics if kinematics is not None else HandKinematics(hand)
         self._coal = require("coal")

@@ -32,6 +32,9 @@ class ForceBalance:
         self.pose_basis = reduction.pose_basis.double().numpy()
         self.actuation = (reduction.actuation.double().numpy() @ self.joint_basis).T
         self.tendon = torch.tensor([actuator.tendon for actuator in hand.actuators])
+        # beside torques known to 0.02 N m: what the weight of the forces leaves where a tendon pulls nothing
+        arm = np.linalg.norm(self.actuation, axis=0)
+        self.no_pull = torch.from_numpy(1e-3 * options.length / np.where(arm > 0, arm, 1.0))
         # a joint beyond one of these touches its stop
         stops = (np.abs(self.joint_basis) > 1e-9).any(1)
         self.low = np.where(stops, hand.joint_lower + options.stop_tolerance, -np.inf)
@@ -49,6 +52,15 @@ class ForceBalance:
         """Joints near a stop that bears more than the threshold."""
         low, high = (torch.as_tensor(stop, device=q.device) for stop in (self.low, self.high))
         return (torque.abs() > self.options.stop_torque) & ((q <= low) | (q >= high))
+
+    def slack(self, forces: GraspForces) -> Bool[Tensor, "*batch n_a"]:
+        """Tendons that pull with no more than ``slack_tension``, where forces were found."""
+        limit, lam = self.options.slack_tension, forces.lam.detach()
+        found = torch.tensor([status is ForceStatus.SOLVED for status in forces.status], device=lam.device)
+        if limit is None or not self.tendon.any():
+            return torch.zeros_like(lam, dtype=torch.bool)
+        tendon, no_pull = self.tendon.to(lam.device), self.no_pull.to(lam)
+        return tendon & (-lam <= limit + no_pull) & found.reshape(*lam.shape[:-1], 1)
 
     def __call__(
         self,
