@@ -15,8 +15,8 @@ from ..typing import Float, Tensor
 from .se3 import exp, log
 from .tensors import as_tensors
 
-_ORTHONORMAL = 1e-4
-"""Largest entry of ``R^T R - I`` of a rotation: four digits are enough, a scale or a shear is not."""
+_ROUNDED = 1e-4
+"""What a rotation matrix may be off by, entry by entry: four digits are enough, a scale or a shear is not."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ class GraspState:
             raise ShapeError("position", f"{(*batch, 3)} to go with q", self.position.shape)
         if self.rotation.shape != (*batch, 3, 3):
             raise ShapeError("rotation", f"{(*batch, 3, 3)} to go with q", self.rotation.shape)
-        for name in ("q", "position", "rotation"):
-            value = getattr(self, name)
-            finite = torch.isfinite(value)
-            if not bool(finite.all()):
-                raise NonFiniteError(name, torch.nonzero(~finite)[:3].tolist())
-        _check_rotation(self.rotation.detach())
+        if not bool(torch.isfinite(torch.cat([getattr(self, name).flatten() for name in given])).all()):
+            for name in given:
+                finite = torch.isfinite(getattr(self, name))
+                if not bool(finite.all()):
+                    raise NonFiniteError(name, torch.nonzero(~finite)[:3].tolist())
+        _check_rotation(self.rotation)
 
     @property
     def n_s(self) -> int:
@@ -78,10 +78,11 @@ class GraspState:
 
 
 def _check_rotation(R: Tensor) -> None:
-    """``R^T R = I`` and ``det R = 1``."""
-    off = (R.mT @ R - torch.eye(3, dtype=R.dtype, device=R.device)).abs()
-    reflected = torch.linalg.det(R) < 0
-    if bool((off > _ORTHONORMAL).any()) or bool(reflected.any()):
-        found = "a reflection, det R = -1" if bool(reflected.any()) else f"R^T R - I up to {float(off.max()):.2g}"
-        valid = f"a rotation matrix, R^T R = I and det R = 1 (found {found})"
+    """``cof R = R``: every column is the cross product of the other two, which holds for rotations only."""
+    x, y, z = R.detach().unbind(-1)
+    cofactors = torch.linalg.cross(torch.stack([y, z, x], -1), torch.stack([z, x, y], -1), dim=-2)
+    off = (cofactors - R.detach()).abs()
+    if bool((off > _ROUNDED).any()):
+        what = "a reflection" if bool((torch.linalg.det(R) < 0).any()) else "scaled or sheared"
+        valid = f"a rotation matrix, R^T R = I and det R = 1 (it is {what}, off by {float(off.max()):.2g})"
         raise ParameterError("rotation", R.tolist() if R.dim() == 2 else tuple(R.shape), valid)

@@ -32,9 +32,11 @@ class ForceBalance:
         self.pose_basis = reduction.pose_basis.double().numpy()
         self.actuation = (reduction.actuation.double().numpy() @ self.joint_basis).T
         self.tendon = torch.tensor([actuator.tendon for actuator in hand.actuators])
-        # beside torques known to 0.02 N m: what the weight of the forces leaves where a tendon pulls nothing
-        arm = np.linalg.norm(self.actuation, axis=0)
-        self.no_pull = torch.from_numpy(1e-3 * options.length / np.where(arm > 0, arm, 1.0))
+        # joint torque [N m] that the weight of the forces may leave where a tendon pulls nothing
+        arm, limit = np.linalg.norm(self.actuation, axis=0), options.slack_tension
+        no_pull = 1e-3 * options.length / np.where(arm > 0, arm, 1.0) + (0.0 if limit is None else limit)
+        pulls = self.tendon.numpy() & (limit is not None)
+        self.slack_above = torch.from_numpy(np.where(pulls, -no_pull, np.inf))
         # a joint beyond one of these touches its stop
         stops = (np.abs(self.joint_basis) > 1e-9).any(1)
         self.low = np.where(stops, hand.joint_lower + options.stop_tolerance, -np.inf)
@@ -55,12 +57,12 @@ class ForceBalance:
 
     def slack(self, forces: GraspForces) -> Bool[Tensor, "*batch n_a"]:
         """Tendons that pull with no more than ``slack_tension``, where forces were found."""
-        limit, lam = self.options.slack_tension, forces.lam.detach()
-        found = torch.tensor([status is ForceStatus.SOLVED for status in forces.status], device=lam.device)
-        if limit is None or not self.tendon.any():
-            return torch.zeros_like(lam, dtype=torch.bool)
-        tendon, no_pull = self.tendon.to(lam.device), self.no_pull.to(lam)
-        return tendon & (-lam <= limit + no_pull) & found.reshape(*lam.shape[:-1], 1)
+        lam = forces.lam.detach()
+        slack = lam >= self.slack_above.to(lam)
+        if not forces.solved:
+            found = torch.tensor([status is ForceStatus.SOLVED for status in forces.status], device=lam.device)
+            slack = slack & found.reshape(*lam.shape[:-1], 1)
+        return slack
 
     def __call__(
         self,
