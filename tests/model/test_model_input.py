@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 import torch
 from model_icub import gripped
-from model_toys import F64, build, planar_two_finger, relative_error, select, three_finger, toy_hand, transform
+from model_toys import (
+    F64,
+    build,
+    planar_two_finger,
+    relative_error,
+    select,
+    three_finger,
+    toy_hand,
+    transform,
+)
 
 from torch_ekm.contact import ContactDetector, ContactSet, ferrari_canny
 from torch_ekm.description import load_hand, load_object
@@ -50,7 +59,11 @@ def _pad(name):
 
 
 WRONG = {
-    "reflection": (lambda: state(torch.diag(torch.tensor([1.0, 1, -1], dtype=F64))), ParameterError, "reflec"),
+    "reflection": (
+        lambda: state(torch.diag(torch.tensor([1.0, 1, -1], dtype=F64))),
+        ParameterError,
+        "reflec",
+    ),
     "rotation scaled": (lambda: state(2 * EYE), ParameterError, "rotation matrix"),
     "rotation sheared": (lambda: state(EYE + 0.01 * EYE.roll(1, 0)), ParameterError, "rotation matrix"),
     "rotation of a batch": (
@@ -88,7 +101,11 @@ WRONG = {
     "NaN step": (lambda: MODEL.linearize(STATE).step([0.1, NAN, 0.0]), NonFiniteError, "delta_a"),
     "negative fingertip force": (lambda: felt([1.0, -2.0, 1.0]), ParameterError, "fingertip_force"),
     "infinite fingertip force": (lambda: felt([1.0, math.inf, 1.0]), ParameterError, "fingertip_force"),
-    "zero planar normal": (lambda: dataclasses.replace(HAND, planar_normal=(0, 0, 0)), DescriptionError, "zero"),
+    "zero planar normal": (
+        lambda: dataclasses.replace(HAND, planar_normal=(0, 0, 0)),
+        DescriptionError,
+        "zero",
+    ),
     "planar normal across the axes": (
         lambda: dataclasses.replace(HAND, planar_normal=(0.0, 0.1, 1.0)),
         DescriptionError,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -105,6 +106,16 @@ class ContactSet:
     @property
     def batch_shape(self) -> torch.Size:
         return self.gap.shape[:-1]
+
+    def select(self, index: Sequence[int]) -> ContactSet:
+        """Some of the contacts, in the order of ``index``."""
+        at = list(index)
+        parts = {
+            name: getattr(self, name).movedim(-1 - len(tail), 0)[at].movedim(0, -1 - len(tail))
+            for name, tail in _TAILS.items()
+        }
+        names = {name: tuple(getattr(self, name)[i] for i in at) for name in ("finger", "link", "pinned")}
+        return self.replace(**parts, **names)
 
     def replace(self, **changes: object) -> ContactSet:
         """A copy with some fields changed."""

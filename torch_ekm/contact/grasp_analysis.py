@@ -81,9 +81,7 @@ def analyse(
     )
 
 
-def ferrari_canny(
-    kin: ContactKinematics, *, length: float = CHARACTERISTIC_LENGTH, faces: int = 64
-) -> float:
+def ferrari_canny(kin: ContactKinematics, *, length: float = CHARACTERISTIC_LENGTH, faces: int = 64) -> float:
     """epsilon [N]: the smallest wrench, in any direction, that 1 N of normal forces in all cannot resist.
 
     Radius of the largest ball about 0 in the convex hull of the wrenches ``(f; m/L)`` of a unit normal force

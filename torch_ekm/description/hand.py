@@ -127,7 +127,9 @@ class HandDescription:
             if lean > 1e-3:
                 degrees = np.degrees(np.arcsin(min(lean, 1.0)))
                 problem = f"the axis of joint '{joint.name}' is {degrees:.3g} deg off planar_normal"
-                raise DescriptionError(self.transmission_path, f"{problem}; a planar hand turns about it alone")
+                raise DescriptionError(
+                    self.transmission_path, f"{problem}; a planar hand turns about it alone"
+                )
 
     @property
     def urdf_path(self) -> Path:

@@ -60,7 +60,9 @@ class ForceBalance:
         lam = forces.lam.detach()
         slack = lam >= self.slack_above.to(lam)
         if not forces.solved:
-            found = torch.tensor([status is ForceStatus.SOLVED for status in forces.status], device=lam.device)
+            found = torch.tensor(
+                [status is ForceStatus.SOLVED for status in forces.status], device=lam.device
+            )
             slack = slack & found.reshape(*lam.shape[:-1], 1)
         return slack
 

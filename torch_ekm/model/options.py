@@ -36,8 +36,8 @@ class ModelOptions:
     contact_stiffness: float = math.inf
     """K_c of every force row of a contact [N/m], and K_c L^2 of a spin row [N m/rad]; infinite: rigid."""
     slack_tension: float | None = 0.0
-    """A tendon that pulls with at most this much [N, or N m for a in rad] is slack: it moves nothing. None: all
-    stay taut, as rods do, whatever the forces say."""
+    """A tendon that pulls with at most this much [N, or N m for a in rad] is slack: it moves nothing. None:
+    all stay taut, as rods do, whatever the forces say."""
     stiffness_floor: float = 0.0
     """Added to every joint's stiffness [N m/rad]: a floor for springless free joints, e.g. 1e-4."""
     contact_margin: float = 0.002

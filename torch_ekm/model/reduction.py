@@ -85,7 +85,7 @@ class Reduction(nn.Module):
         ```
         D' = Z^T D Z + B_c^T K_a B_c          compliant actuators stand in the stiffness
         E  = [A Z; B_r Z; e_j^T Z]            rigid rows: contacts, rigid actuators, held joints
-        D' = blkdiag(D', I), A Z = [A Z, I/sqrt(K_c L^2)]        compliant contacts, deformed by u/sqrt(K_c L^2)
+        D' = blkdiag(D', I), A Z = [A Z, I/sqrt(K_c L^2)]     compliant contacts, deformed by u/sqrt(K_c L^2)
         ```
 
         Args:
