@@ -72,8 +72,8 @@ class KinematicModel(nn.Module):
         if detector is None:
             from ..contact.detector import ContactDetector
 
-            margin = self.options.contact_margin
-            detector = ContactDetector(hand, obj, margin, kinematics=kinematics)  # type: ignore[arg-type]
+            margin, crown = self.options.contact_margin, self.options.crown_radius
+            detector = ContactDetector(hand, obj, margin, crown, kinematics=kinematics)  # type: ignore[arg-type]
             self._detector_takes_poses = True
         self.kinematics, self.detector = kinematics, detector
         self.link_names: tuple[str, ...] = tuple(kinematics.link_names)  # type: ignore[arg-type]

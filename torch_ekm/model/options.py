@@ -42,6 +42,9 @@ class ModelOptions:
     """Added to every joint's stiffness [N m/rad]: a floor for springless free joints, e.g. 1e-4."""
     contact_margin: float = 0.002
     """Gap up to which the detector takes a pad for touching [m]; more for noisy poses."""
+    crown_radius: float = 0.5
+    """Of the slight crown along a pad where it lies flat on a flat face [m], which gives that line of contact
+    a point; infinite: none, and the point jumps from end to end as the finger tilts."""
     max_overlap: float = 0.005
     """Deepest penetration of finger and object that is still modelled [m]."""
     stop_tolerance: float = math.radians(0.1)
@@ -56,7 +59,7 @@ class ModelOptions:
     def __post_init__(self) -> None:
         if self.on_unstable not in ("raise", "flag"):
             raise ParameterError("on_unstable", self.on_unstable, "'raise' or 'flag'")
-        for name in ("length", "max_overlap", "contact_stiffness"):
+        for name in ("length", "max_overlap", "contact_stiffness", "crown_radius"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
         for name in ("stiffness_floor", "stop_tolerance", "stop_torque", "contact_margin"):

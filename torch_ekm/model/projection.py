@@ -34,8 +34,8 @@ class Projection:
     gap: Float[Tensor, " n_c"]
     """What the gaps of ``contacts`` were in the measured state [m]."""
     chi2: float
-    """``|Sigma^-1/2 ds|^2``: about ``n_c`` where the standard deviations are right; far more: they are not, or
-    a pad that was said to touch does not."""
+    """``|Sigma^-1/2 ds|^2``: about ``n_c`` where the standard deviations are right; far more: they are
+    not, or a pad that was said to touch does not."""
 
 
 @torch.no_grad()
@@ -50,7 +50,7 @@ def project_onto_contacts(
     fingertip_force: Float[Tensor, " n_pads"] | None = None,
     least_force: float = 0.2,
 ) -> Projection:
-    """``min_ds |Sigma^-1/2 ds|^2  s.t.  gap_i(s + ds) = 0``, i the pads that touch, ``gap_j >= 0`` for others.
+    """``min_ds |Sigma^-1/2 ds|^2  s.t.  gap_i(s + ds) = 0``, i the pads that touch, ``gap_j >= 0``, j others.
 
     Gauss-Newton on the signed distances, whose derivative is minus the normal row of the constraint matrix
     A: ``ds = Sigma A_n^T (A_n Sigma A_n^T)^+ (gap + A_n ds)``, among the motions that rigid couplings and the
