@@ -158,7 +158,9 @@ def test_arrays_lists_and_both_precisions_are_read():
         assert torch.equal(MODEL.linearize(STATE, contacts).manipulation_jacobian, expected)
     mixed = GraspState(STATE.q, STATE.position.float(), np.eye(3, dtype=np.float32))
     assert mixed.position.dtype == mixed.rotation.dtype == F64
-    assert GraspState([0, 1], [0, 0, 0], EYE.float()).q.dtype == torch.float32
+    assert GraspState([0, 1], [0, 0, 0], torch.eye(3)).rotation.dtype == F64  # lists count as float64
+    single = GraspState(torch.zeros(2), np.zeros(3, dtype=np.float32), torch.eye(3))
+    assert single.position.dtype == torch.float32
     step = MODEL.linearize(STATE).step([0.01, 0, 0])
     assert torch.equal(step, MODEL.linearize(STATE).step(np.array([0.01, 0, 0])))
     assert torch.allclose(step, MODEL.linearize(STATE).step(torch.tensor([0.01, 0, 0])), rtol=1e-6)

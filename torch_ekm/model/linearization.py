@@ -114,10 +114,10 @@ class Linearization:
             ShapeError: ``delta_a`` does not have one entry per actuator.
             NonFiniteError: an entry is NaN or infinite.
         """
-        delta_a, _ = as_tensors(delta_a=delta_a, J_m=self.manipulation_jacobian)
+        delta_a = as_tensors(delta_a=delta_a)[0].to(self.manipulation_jacobian)
         if not bool(torch.isfinite(delta_a).all()):
             raise NonFiniteError("delta_a", torch.nonzero(~torch.isfinite(delta_a))[:3].tolist())
         n_a = self.manipulation_jacobian.shape[-1]
         if delta_a.shape[-1:] != (n_a,):
             raise ShapeError("delta_a", f"(*batch, {n_a})", delta_a.shape, "one entry per actuator")
-        return (self.manipulation_jacobian.to(delta_a) @ delta_a[..., None])[..., 0]
+        return (self.manipulation_jacobian @ delta_a[..., None])[..., 0]
