@@ -1,8 +1,8 @@
 """What the terms S, T and rolling of the stiffness are worth in the grasps of the demo, at 5 N.
 
-``python benchmarks/geometric_terms.py`` grasps with the simulated iCub hand (seeds 0 to 9, nominal parameters,
-true states) and prints by how much ``J_m`` changes when a term is left out, relative, translations in units of
-30 mm: of all rows, and of the object's alone. Median and range over the grasps.
+``python benchmarks/geometric_terms.py`` grasps with the simulated iCub hand (seeds 0 to 9, nominal
+parameters, true states) and prints by how much ``J_m`` changes when a term is left out, relative, translations
+in units of 30 mm: of all rows, and of the object's alone. Median and range over the grasps.
 """
 
 from __future__ import annotations
