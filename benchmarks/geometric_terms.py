@@ -1,7 +1,7 @@
 """What the terms S, T and rolling of the stiffness are worth in the grasps of the demo, at 5 N.
 
 ``python benchmarks/geometric_terms.py`` grasps with the simulated iCub hand (seeds 0 to 9, nominal
-parameters, true states) and prints by how much ``J_m`` changes when a term is left out, relative, translations
+parameters, true states) and prints by how much ``J_m`` changes when a term is left out, translations
 in units of 30 mm: of all rows, and of the object's alone. Median and range over the grasps.
 """
 
