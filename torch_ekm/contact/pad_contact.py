@@ -88,6 +88,8 @@ def _along(solid: Solid, m: tuple, t: tuple, half: float, most: float) -> tuple[
     curvature ``d2/ds2 d(m + s t)`` that it has is taken off the crown's.
     """
     s = _closest(solid, m, t, half, most)
+    if abs(s) >= half:  # at a round end, crown or not
+        return s, most
     step = 1e-6
     ahead, behind = (
         solid.distance(m[0] + x * t[0], m[1] + x * t[1], m[2] + x * t[2])[1] for x in (s + step, s - step)

@@ -94,6 +94,8 @@ class Reduction(nn.Module):
             held: joints that do not move.
             slack: tendons that pull nothing.
         """
+        if held.dim() == 1:
+            return self._solve(D, A, rows, held, slack)
         n_q = held.shape[-1]
         pattern = torch.cat([held, slack], dim=-1).reshape(-1, n_q + slack.shape[-1])
         if len(pattern) == 1 or bool((pattern == pattern[0]).all()):
@@ -119,7 +121,8 @@ class Reduction(nn.Module):
         A = row_scale[:, None] * (A @ S)
         B = self.actuation @ S[:n_q]
         finite = torch.isfinite(self.stiffness)
-        rigid, soft = (~finite & ~slack).nonzero()[:, 0], (finite & ~slack).nonzero()[:, 0]
+        taut = ~slack
+        rigid, soft = (taut & ~finite).nonzero()[:, 0], (taut & finite).nonzero()[:, 0]
         eye = torch.eye(n_a, dtype=D.dtype, device=D.device)
         F = None
         if len(soft):
