@@ -5,11 +5,8 @@ from __future__ import annotations
 import clarabel
 import numpy as np
 from scipy import sparse
-from scipy.spatial import ConvexHull
 
-from torch_ekm.contact.contact_kinematics import ContactKinematics, grasp_matrix
 from torch_ekm.contact.forces.balance import BalanceEquations
-from torch_ekm.contact.forces.friction import friction_cones
 from torch_ekm.contact.forces.options import ForceOptions
 from torch_ekm.contact.forces.problem import force_problem
 
@@ -38,23 +35,3 @@ def cone_program(eq: BalanceEquations, options: ForceOptions | None = None) -> n
     solution = clarabel.DefaultSolver(P, problem.q, A, np.concatenate(rhs), cones, settings).solve()
     found = solution.status in (clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved)
     return scale * np.asarray(solution.x) if found else None
-
-
-def ferrari_canny(kin: ContactKinematics, length: float = 0.03, faces: int = 64) -> float:
-    """Radius of the largest ball about 0 in the hull of the wrenches of unit normal forces; 0: no closure.
-
-    Ferrari and Canny, Planning optimal grasps, ICRA 1992, L1 version; moments divided by ``length``. Points
-    with friction only.
-    """
-    scale = np.array([1.0, 1.0, 1.0, 1 / length, 1 / length, 1 / length])
-    G = scale[:, None] * grasp_matrix(kin).numpy()
-    angle = 2 * np.pi * np.arange(faces) / faces
-    wrenches = []
-    for cone in friction_cones(kin.models, kin.contacts.friction.tolist(), [0.0] * kin.contacts.n_c):
-        normal, first, second = G[:, cone.start : cone.start + 3].T
-        edge = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
-        wrenches.append(normal + cone.mu_s * edge)
-    points = np.concatenate(wrenches)
-    if np.linalg.matrix_rank(points, 1e-9) < 6:
-        return 0.0
-    return max(0.0, float((-ConvexHull(points).equations[:, -1]).min()))

@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 import torch
 from contact_samples import F64, THREE, held
-from force_oracles import cone_program, ferrari_canny
+from force_oracles import cone_program
 
-from torch_ekm.contact import ForceOptions, ForceStatus, contact_forces, grasp_matrix, hand_jacobian
+from torch_ekm.contact import (
+    ForceOptions,
+    ForceStatus,
+    contact_forces,
+    ferrari_canny,
+    grasp_matrix,
+    hand_jacobian,
+)
 from torch_ekm.contact.forces.balance import BalanceEquations
 from torch_ekm.contact.forces.friction import friction_cones, margins, outer_directions
 from torch_ekm.exceptions import ParameterError

@@ -15,7 +15,7 @@ from .detector import ContactDetector
 from .forces.balance import ForceStatus
 from .forces.options import ForceOptions
 from .forces.solve import contact_forces
-from .grasp_analysis import GraspAnalysis, analyse
+from .grasp_analysis import GraspAnalysis, analyse, ferrari_canny
 from .signed_distance import signed_distance
 from .surface import TrackedContacts
 
@@ -32,6 +32,7 @@ __all__ = [
     "constraint_matrix",
     "contact_forces",
     "contact_kinematics",
+    "ferrari_canny",
     "grasp_matrix",
     "hand_jacobian",
     "signed_distance",

@@ -13,7 +13,7 @@ import torch
 
 from .._extras import require
 from ..description import HandDescription, ObjectDescription
-from ..exceptions import NonFiniteError, ParameterError, ShapeError
+from ..exceptions import DescriptionError, NonFiniteError, ParameterError, ShapeError
 from ..kinematics import HandKinematics, LinkPoses
 from ..typing import Array, Float, Tensor
 from .contact_set import ContactSet
@@ -28,11 +28,12 @@ class ContactDetector:
     convex primitive, also inside it, so deep overlaps need no other method. The second term gives the pad a
     slight crown (radius ``R`` along its axis): without it a capsule lying on a flat face has no single
     contact point, and the point would jump from one end to the other as the finger tilts. With it, ``s*`` is
-    a continuous function of the state, ``|ds*/dtilt| <= R``. Where the pad touches with a round end, and
-    for balls, the crown plays no part.
+    a continuous function of the state, ``|ds*/dtilt| <= R``. Where the object is curved along the pad by k,
+    the crown is ``max(0, 1/R - k)``: none where it is curved at all. Where the pad touches with a round end,
+    and for balls, the crown plays no part.
 
     The contact point lies midway between the two surfaces. Curvatures: pad ``1/rho`` across and
-    ``1/R`` along its axis on the side, ``1/rho`` all around on a round end; object from the feature
+    the crown along its axis on the side, ``1/rho`` all around on a round end; object from the feature
     that is touched (face 0, cylinder ``1/radius`` across, ...), an edge or corner is ``pinned``.
     Of an object made of several primitives the nearest one counts.
 
@@ -40,12 +41,13 @@ class ContactDetector:
         hand: its pads are tested; other parts of the links are not.
         obj: the object.
         margin: pads farther away than this [m] are left out; ``math.inf`` keeps them all.
-        crown_radius: R [m].
+        crown_radius: R [m]; infinite: none.
         kinematics: of the same hand, to share one; made here if None.
 
     Raises:
         MissingExtraError: coal is not installed.
         ParameterError: ``margin`` or ``crown_radius`` is out of range.
+        DescriptionError: the hand has no pads.
     """
 
     def __init__(
@@ -58,8 +60,11 @@ class ContactDetector:
     ) -> None:
         if not margin >= 0:
             raise ParameterError("margin", margin, "at least 0 [m]")
-        if not 0 < crown_radius < math.inf:
-            raise ParameterError("crown_radius", crown_radius, "positive and finite [m]")
+        if not crown_radius > 0:
+            raise ParameterError("crown_radius", crown_radius, "positive [m]; infinite: no crown")
+        if not hand.pads:
+            problem = "the hand has no [[pads]], so nothing of it can touch an object"
+            raise DescriptionError(hand.transmission_path, problem)
         self.hand, self.obj, self.margin, self.crown_radius = hand, obj, margin, crown_radius
         self.kinematics = kinematics if kinematics is not None else HandKinematics(hand)
         self._coal = require("coal")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from .kinematic_model import KinematicModel
 from .linearization import GraspForces, Linearization, ModelStatus
 from .options import ModelOptions
+from .projection import Projection, project_onto_contacts
 
 __all__ = [
     "GraspForces",
@@ -12,4 +13,6 @@ __all__ = [
     "Linearization",
     "ModelOptions",
     "ModelStatus",
+    "Projection",
+    "project_onto_contacts",
 ]

@@ -32,6 +32,11 @@ class ForceBalance:
         self.pose_basis = reduction.pose_basis.double().numpy()
         self.actuation = (reduction.actuation.double().numpy() @ self.joint_basis).T
         self.tendon = torch.tensor([actuator.tendon for actuator in hand.actuators])
+        # joint torque [N m] that the weight of the forces may leave where a tendon pulls nothing
+        arm, limit = np.linalg.norm(self.actuation, axis=0), options.slack_tension
+        no_pull = 1e-3 * options.length / np.where(arm > 0, arm, 1.0) + (0.0 if limit is None else limit)
+        pulls = self.tendon.numpy() & (limit is not None)
+        self.slack_above = torch.from_numpy(np.where(pulls, -no_pull, np.inf))
         # a joint beyond one of these touches its stop
         stops = (np.abs(self.joint_basis) > 1e-9).any(1)
         self.low = np.where(stops, hand.joint_lower + options.stop_tolerance, -np.inf)
@@ -49,6 +54,17 @@ class ForceBalance:
         """Joints near a stop that bears more than the threshold."""
         low, high = (torch.as_tensor(stop, device=q.device) for stop in (self.low, self.high))
         return (torque.abs() > self.options.stop_torque) & ((q <= low) | (q >= high))
+
+    def slack(self, forces: GraspForces) -> Bool[Tensor, "*batch n_a"]:
+        """Tendons that pull with no more than ``slack_tension``, where forces were found."""
+        lam = forces.lam.detach()
+        slack = lam >= self.slack_above.to(lam)
+        if not forces.solved:
+            found = torch.tensor(
+                [status is ForceStatus.SOLVED for status in forces.status], device=lam.device
+            )
+            slack = slack & found.reshape(*lam.shape[:-1], 1)
+        return slack
 
     def __call__(
         self,

@@ -13,7 +13,7 @@ from ..description.hand import HandDescription
 from ..exceptions import NoContactError
 from ..kinematics.grasp_state import GraspState
 from ..typing import Float, Tensor
-from .checks import at_contacts, check_contacts, check_state, joint_index
+from .checks import at_contacts, check_contacts, check_inertia, check_state, joint_index
 from .force_balance import ForceBalance
 from .linearization import GraspForces, Linearization, ModelStatus
 from .link_weights import LinkWeights
@@ -45,6 +45,10 @@ class KinematicModel(nn.Module):
         kinematics: in place of :class:`~torch_ekm.kinematics.HandKinematics`.
         detector: ``(q, position, rotation) -> ContactSet`` in place of the collision detector.
         dtype: float64 (default) or float32.
+
+    Raises:
+        ParameterError: the object's mass or centre of mass is no number, or the mass negative.
+        DescriptionError: the hand has no pads for the detector.
     """
 
     def __init__(
@@ -58,6 +62,7 @@ class KinematicModel(nn.Module):
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
+        check_inertia(obj)
         self._detector_takes_poses = False
         self.hand, self.obj, self.options = hand, obj, options or ModelOptions()
         if kinematics is None:
@@ -67,8 +72,8 @@ class KinematicModel(nn.Module):
         if detector is None:
             from ..contact.detector import ContactDetector
 
-            margin = self.options.contact_margin
-            detector = ContactDetector(hand, obj, margin, kinematics=kinematics)  # type: ignore[arg-type]
+            margin, crown = self.options.contact_margin, self.options.crown_radius
+            detector = ContactDetector(hand, obj, margin, crown, kinematics=kinematics)  # type: ignore[arg-type]
             self._detector_takes_poses = True
         self.kinematics, self.detector = kinematics, detector
         self.link_names: tuple[str, ...] = tuple(kinematics.link_names)  # type: ignore[arg-type]
@@ -174,7 +179,7 @@ class KinematicModel(nn.Module):
             UnstableGraspError: the grasp buckles (unless ``on_unstable="flag"``).
             NonFiniteError, ShapeError, UnknownNameError: bad input.
         """
-        check_state(self.hand, state, contacts)
+        check_state(self.hand, state, contacts, self.weight.dtype)  # type: ignore[arg-type]
         poses = self.kinematics(state.q)
         contacts = self._detect(state, poses) if contacts is None else contacts
         check_contacts(state, contacts, self.link_names, self.options.max_overlap)
@@ -215,7 +220,7 @@ class KinematicModel(nn.Module):
 
         held = self.balance.held_by_stops(state.q, forces.stop_torque)
         held[..., lock] = True
-        J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held)
+        J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held, self.balance.slack(forces))
         if o.on_unstable == "flag" and bool((stability <= 0).any()):
             status = ModelStatus.UNSTABLE
         df, dn = force_change(kin, dmu), normal_motion(kin, J)

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+import torch
+
 from ..contact.contact_set import ContactSet
 from ..contact.forces.balance import ForceStatus
-from ..exceptions import ShapeError
+from ..exceptions import NonFiniteError, ShapeError
 from ..kinematics.grasp_state import GraspState
+from ..kinematics.tensors import as_tensors
 from ..typing import Bool, Float, Tensor
 
 
@@ -109,7 +112,11 @@ class Linearization:
 
         Raises:
             ShapeError: ``delta_a`` does not have one entry per actuator.
+            NonFiniteError: an entry is NaN or infinite.
         """
+        delta_a = as_tensors(delta_a=delta_a)[0].to(self.manipulation_jacobian)
+        if not bool(torch.isfinite(delta_a).all()):
+            raise NonFiniteError("delta_a", torch.nonzero(~torch.isfinite(delta_a))[:3].tolist())
         n_a = self.manipulation_jacobian.shape[-1]
         if delta_a.shape[-1:] != (n_a,):
             raise ShapeError("delta_a", f"(*batch, {n_a})", delta_a.shape, "one entry per actuator")
