@@ -55,7 +55,7 @@ def make_servo(hand: HandDescription, config: PlantConfig, parameters: PlantPara
         fresh_error=parameters.actuator_error,
         dead_zone=parameters.dead_zone,
         threshold=parameters.threshold,
-        backlash=parameters.backlash,
+        backlash=parameters.backlash + hand.actuator_backlash,
         relative_to=config.relative_to,
     )
 
@@ -69,7 +69,9 @@ def true_descriptions(
     """
     transmission = make_transmission(hand, parameters)
     actuators = tuple(
-        dataclasses.replace(actuator, stiffness=float(stiffness))
+        dataclasses.replace(
+            actuator, stiffness=float(stiffness), backlash=actuator.backlash + parameters.backlash
+        )
         for actuator, stiffness in zip(hand.actuators, transmission.stiffness, strict=True)
     )
     true_hand = dataclasses.replace(

@@ -36,7 +36,7 @@ class Servo:
         fresh_error: bound of an error drawn anew at every command, uniform [rad].
         dead_zone: Coulomb dead band [rad].
         threshold: commands smaller than this do nothing [rad].
-        backlash: full width of the play, ``2 play`` [rad].
+        backlash: full width of the play, ``2 play``; one for all, or one per actuator [rad].
         relative_to: "encoder" or "setpoint".
     """
 
@@ -48,7 +48,7 @@ class Servo:
         fresh_error: float = 0.0,
         dead_zone: float = 0.0,
         threshold: float = 0.0,
-        backlash: float = 0.0,
+        backlash: float | Array = 0.0,
         relative_to: str = "encoder",
     ) -> None:
         if relative_to not in ("encoder", "setpoint"):
