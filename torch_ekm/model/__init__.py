@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from .calibration import Calibration, calibrate
 from .kinematic_model import KinematicModel
 from .linearization import GraspForces, Linearization, ModelStatus
 from .options import ModelOptions
 
 __all__ = [
+    "Calibration",
     "GraspForces",
     "KinematicModel",
     "Linearization",
     "ModelOptions",
     "ModelStatus",
+    "calibrate",
 ]
