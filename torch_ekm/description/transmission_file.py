@@ -16,7 +16,7 @@ _ENDING = ".transmission.toml"
 
 
 def write_transmission(hand: HandDescription, path: str | Path) -> Path:
-    """Write springs, rest angles, friction, moment arms, stiffness and play of ``hand`` to ``path``.
+    """Write springs, rest angles, friction, moment arms, offsets, stiffness and play of ``hand`` to ``path``.
 
     Everything else (ranges, couplings, pads, sensors, notes) is that of ``hand.transmission_path``; comments
     are lost. The URDF is copied beside it if there is none, so that ``load_hand`` reads the hand back.
@@ -44,12 +44,13 @@ def write_transmission(hand: HandDescription, path: str | Path) -> Path:
         table["moment_arms"] = {
             name: float(arm) for name, arm in zip(hand.joint_names, arms, strict=True) if arm != 0
         }
-        for key in ("stiffness", "backlash", "backlash_deg"):
+        for key in ("stiffness", "offset", "offset_deg", "backlash", "backlash_deg"):
             table.pop(key, None)
         if math.isfinite(actuator.stiffness):
             table["stiffness"] = float(actuator.stiffness)
-        if actuator.backlash:
-            table["backlash"] = float(actuator.backlash)
+        for key in ("offset", "backlash"):
+            if getattr(actuator, key):
+                table[key] = float(getattr(actuator, key))
     path.write_text(_document(data), encoding="utf-8")
     urdf = path.with_name(path.name.removesuffix(_ENDING) + ".urdf")
     if not urdf.exists():

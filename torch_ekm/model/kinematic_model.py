@@ -121,7 +121,8 @@ class KinematicModel(nn.Module):
 
     def _detect(self, state: GraspState, poses: object | None) -> ContactSet:
         posture = poses if self._detector_takes_poses and poses is not None else state.q
-        contacts = self.detector(posture, state.position, state.rotation)  # type: ignore[arg-type]
+        with torch.no_grad():
+            contacts = self.detector(posture, state.position, state.rotation)  # type: ignore[arg-type]
         if contacts.n_c == 0:
             raise NoContactError("no finger touches the object, so no actuator can move it")
         return following(contacts, self.contacts, state) if torch.is_grad_enabled() else contacts

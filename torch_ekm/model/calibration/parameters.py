@@ -20,6 +20,7 @@ PRIORS = {
     "rest": math.radians(10),
     "moment_arms": 0.3,
     "stiffness": 0.7,
+    "offset": math.radians(5),
     "backlash": math.radians(1),
     "object_position": 0.002,
     "object_rotation": math.radians(2),
@@ -27,7 +28,7 @@ PRIORS = {
 """Kinds of parameters, and how far off each may well be (one standard deviation): of the logarithm for
 springs, moment arms and stiffness, else [rad] or [m]."""
 _LOGARITHMIC = ("springs", "moment_arms", "stiffness")
-_WORDS = {"springs": "spring", "rest": "rest angle", "stiffness": "stiffness", "backlash": "backlash"}
+_WORDS = {"springs": "spring", "rest": "rest angle", "stiffness": "stiffness", "offset": "offset", "backlash": "backlash"}
 _FURTHEST = 5.0  # priors: bounds of the search
 
 
@@ -73,6 +74,7 @@ class Figures(NamedTuple):
     rest: Float[Tensor, " n_q"]
     moment_arms: Float[Tensor, "n_a n_q"]
     stiffness: Float[Tensor, " n_a"]
+    offset: Float[Tensor, " n_a"]
     backlash: Float[Tensor, " n_a"]
     object_position: Float[Tensor, " 3"]
     object_rotation: Float[Tensor, " 3"]
@@ -83,7 +85,7 @@ class Figures(NamedTuple):
         zero = np.zeros(3)
         stiffness = [actuator.stiffness for actuator in hand.actuators]
         arrays = (hand.spring_stiffness, hand.spring_rest, hand.actuation_jacobian, stiffness)
-        parts = (*arrays, hand.actuator_backlash, zero, zero)
+        parts = (*arrays, hand.actuator_offset, hand.actuator_backlash, zero, zero)
         return cls(*(torch.as_tensor(np.array(part), dtype=torch.float64) for part in parts))
 
 
@@ -93,6 +95,7 @@ class Unknowns:
     Args:
         hand: its figures are the start.
         chosen: kinds, or "kind:name" for one of them (all pulleys of an actuator: "moment_arms:actuator").
+            Kinds leave out actuators that only shape the hand (``posture``): they rest while an object moves.
         priors: in place of :data:`PRIORS`, by kind.
 
     Raises:
@@ -115,7 +118,7 @@ class Unknowns:
             kind, _, one = choice.partition(":")
             if kind not in PRIORS:
                 raise UnknownNameError("kind of parameter", kind, PRIORS)
-            candidates = self._all(kind, scale[kind])
+            candidates = self._all(kind, scale[kind], with_posture=bool(one))
             names = list(dict.fromkeys(part for p in candidates for part in p.name.split(" at ")[:1]))
             if one and one not in names:
                 raise UnknownNameError(f"one of the {kind}", one, names)
@@ -126,16 +129,19 @@ class Unknowns:
         if not self.parameters:
             raise ParameterError("parameters", list(chosen), f"some of {', '.join(PRIORS)}")
 
-    def _all(self, kind: str, prior: float) -> list[Parameter]:
+    def _all(self, kind: str, prior: float, with_posture: bool) -> list[Parameter]:
         hand, values = self.hand, getattr(self.nominal, kind)
+        motors = [k for k, a in enumerate(hand.actuators) if with_posture or not a.posture]
         if kind.startswith("object"):
             names = {(k,): axis for k, axis in enumerate("xyz")}
         elif kind == "moment_arms":
             at = np.argwhere(hand.actuation_jacobian != 0).tolist()
             names = {(a, j): f"{hand.actuator_names[a]} at {hand.joint_names[j]}" for a, j in at}
+            names = {index: name for index, name in names.items() if index[0] in motors}
         else:
-            of = hand.joint_names if kind in ("springs", "rest") else hand.actuator_names
-            names = {(k,): name for k, name in enumerate(of)}
+            by_joint = kind in ("springs", "rest")
+            of = hand.joint_names if by_joint else hand.actuator_names
+            names = {(k,): name for k, name in enumerate(of) if by_joint or k in motors}
         entries = [Parameter(kind, name, at, float(values[at]), prior) for at, name in names.items()]
         # a spring that is not there and an actuator that is rigid have no logarithm to search
         return [p for p in entries if not p.logarithmic or (p.nominal != 0 and math.isfinite(p.nominal))]
@@ -166,10 +172,10 @@ class Unknowns:
     def described(self, x: Array) -> HandDescription:
         """The hand with these figures."""
         figures = self.figures(torch.from_numpy(x))
-        springs, rest, J_a, stiffness, backlash = (part.numpy() for part in figures[:5])
+        springs, rest, J_a, stiffness, offset, backlash = (part.numpy() for part in figures[:6])
         actuators = tuple(
-            dataclasses.replace(actuator, stiffness=float(k), backlash=float(w))
-            for actuator, k, w in zip(self.hand.actuators, stiffness, backlash, strict=True)
+            dataclasses.replace(actuator, stiffness=float(k), offset=float(a), backlash=float(w))
+            for actuator, k, a, w in zip(self.hand.actuators, stiffness, offset, backlash, strict=True)
         )
         return dataclasses.replace(
             self.hand,

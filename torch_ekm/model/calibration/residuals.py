@@ -23,11 +23,17 @@ GROUPS = {
     "joints": math.radians(0.3),
     "position": 0.0002,
     "rotation": math.radians(0.15),
-    "torque": 0.01,
-    "force": 0.2,
+    "encoder": math.radians(0.5),
+    "equilibrium": 1.0,
 }
-"""Standard deviations at the start: of a measured motion [rad], [m], [rad], of the joint torques that the
-equilibrium leaves [N m], of a fingertip force [N]. They are estimated anew from the residuals."""
+"""Standard deviations at the start: of a measured motion [rad], [m], [rad], of an encoder against joints and
+tension [rad]; of joint torques and fingertip forces in units of those by which the force problem weighs them
+(it trades one for the other, so that neither can be estimated by itself). They are estimated anew from the residuals."""
+
+
+FORCE = 0.3
+"""[N] by which the force problem weighs fingertip forces."""
+_SLACK = 1e-3  # [N m] a tendon with less has no length to compare
 
 
 class Residuals(NamedTuple):
@@ -49,6 +55,7 @@ class Evidence:
     ```
     ds - 1/2 (J_m(s) + J_m(s+)) dx,  dx = play(da)     motion; the mean of both ends is exact to second order
     e(s),  f_n(s) - measured                           equilibrium: from the force problem of the model
+    a + z - a0 - J_a q + lam/K_a                       encoders of the actuators whose offset is an unknown
     ```
 
     States at which the description finds no forces, and motions from or to them, are left out for good.
@@ -66,8 +73,19 @@ class Evidence:
         )
         self.model._detector_takes_poses = model._detector_takes_poses
         self.grasps, self.unknowns = grasps, unknowns
+        self.with_offset = [p.index[0] for p in unknowns.parameters if p.kind == "offset"]
         self._set(unknowns.nominal)
         self.usable = [[self._found(rest) for rest in grasp] for grasp in grasps]
+
+    @property
+    def sensors(self) -> int:
+        """How many fingertip forces were measured, in all usable states."""
+        return sum(
+            int(torch.isfinite(rest.force).sum())
+            for grasp, usable in zip(self.grasps, self.usable, strict=True)
+            for rest, one in zip(grasp, usable, strict=True)
+            if one and rest.force is not None
+        )
 
     def __call__(self, x: Array, *, jacobian: bool = True) -> Residuals:
         """Residuals at x.
@@ -106,6 +124,8 @@ class Evidence:
                 parts, motion = {}, None
                 if lin is not None:
                     parts = self._equilibrium(lin, rest)
+                    if self.with_offset:
+                        parts |= self._encoders(lin, rest, state.position, figures)
                     if last is not None:
                         motion = self._motion(last, lin, grasp[k - 1], rest, dx, figures)
                         moving = motion[: self.model.hand.n_q][self._moving(lin)]
@@ -116,13 +136,20 @@ class Evidence:
                 last = lin
 
     def _equilibrium(self, lin: Linearization, rest: Rest) -> dict[str, Tensor]:
-        parts = {"torque": lin.forces.residual[self._moving(lin)]}
+        parts = [lin.forces.residual[self._moving(lin)] / self.model.options.forces.torque_std]
         if rest.force is not None:
             pads = [pad.name for pad in self.model.hand.pads]
             measured = rest.force[[pads.index(name) for name in lin.contacts.finger]]
             known = torch.isfinite(measured)
-            parts["force"] = (lin.forces.normal - measured)[known]
-        return _scaled(**parts)
+            parts.append((lin.forces.normal - measured)[known] / FORCE)
+        return {"equilibrium": torch.cat(parts)}
+
+    def _encoders(self, lin: Linearization, rest: Rest, z: Tensor, at: Figures) -> dict[str, Tensor]:
+        lam, actuators = lin.forces.lam, self.model.hand.actuators
+        taut = torch.tensor([not actuator.tendon for actuator in actuators]) | (lam < -_SLACK)
+        stretch = rest.a + z - at.offset - at.moment_arms @ rest.state.q
+        unexplained = taut * (stretch + lam / self.model.reduction.stiffness)
+        return _scaled(encoder=unexplained[self.with_offset])
 
     def _motion(
         self, last: Linearization, lin: Linearization, before: Rest, after: Rest, dx: Tensor, at: Figures
@@ -167,6 +194,8 @@ def _scaled(**parts: Tensor) -> dict[str, Tensor]:
 
 
 def _jacobian(r: Tensor, x: Tensor) -> Array:
+    if not r.requires_grad:
+        return np.zeros((len(r), len(x)))
     eye = torch.eye(len(r), dtype=r.dtype)
     (slope,) = torch.autograd.grad(r, x, eye, retain_graph=True, is_grads_batched=True, allow_unused=True)
     return slope.numpy()
