@@ -81,7 +81,9 @@ def test_derivative_by_the_figures_of_the_hand(name):
         buffer.requires_grad_(True)
         graph = outputs(model, state, measured)
         gradients = [
-            torch.autograd.grad(y, buffer, retain_graph=True, allow_unused=True)[0] if y.requires_grad else None
+            torch.autograd.grad(y, buffer, retain_graph=True, allow_unused=True)[0]
+            if y.requires_grad
+            else None
             for y in graph
         ]
         gradients = [torch.zeros_like(buffer) if g is None else g for g in gradients]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ def turned(plant, seed=0):
     states = [first.truth.state]
     states += [plant.command(delta).truth.state for delta in wanted(5)]
     plant.close()
-    return torch.stack([after.minus(before) for before, after in zip(states, states[1:], strict=False)])
+    return torch.stack([after.minus(before) for before, after in pairwise(states)])
 
 
 def test_compensated_play_moves_the_object_as_no_play_does():

@@ -38,9 +38,7 @@ def write_transmission(hand: HandDescription, path: str | Path) -> Path:
             "rest": float(hand.spring_rest[j]),
             "friction": float(hand.joint_friction[j]),
         }
-    for actuator, table, arms in zip(
-        hand.actuators, data["actuators"], hand.actuation_jacobian, strict=True
-    ):
+    for actuator, table, arms in zip(hand.actuators, data["actuators"], hand.actuation_jacobian, strict=True):
         table["moment_arms"] = {
             name: float(arm) for name, arm in zip(hand.joint_names, arms, strict=True) if arm != 0
         }

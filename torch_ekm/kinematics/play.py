@@ -76,9 +76,7 @@ class Play:
         after = PlayState(self.at(state.low - delta_a).low, self.at(state.high - delta_a).low)
         return delta_a + after.position - state.position, after
 
-    def command(
-        self, state: PlayState, wanted: Float[Tensor, "*batch n_a"]
-    ) -> Float[Tensor, "*batch n_a"]:
+    def command(self, state: PlayState, wanted: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
         """``da = dx + sign(dx) (w/2 + sign(dx) z)``: the motion of the motors that transmits ``wanted``.
 
         Nothing where nothing is wanted.

@@ -151,7 +151,9 @@ class ForceBalance:
                 forces = (*forces, lift @ e)
             results.append(forces)
         stacked = (torch.stack(part) for part in zip(*results, strict=True))
-        first, second, third = (x.reshape(old.shape) for x, old in zip(stacked, (mu, lam, residual), strict=True))
+        first, second, third = (
+            x.reshape(old.shape) for x, old in zip(stacked, (mu, lam, residual), strict=True)
+        )
         return first, second, third
 
     def _bounded(self, q: np.ndarray, locked: list[int]) -> tuple[list[int], np.ndarray, np.ndarray]:

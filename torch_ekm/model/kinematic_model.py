@@ -159,9 +159,9 @@ class KinematicModel(nn.Module):
         """Contacts, forces, ``J_m`` and the force sensitivities at a state.
 
         Differentiable: with respect to the state, and to the buffers ``spring_stiffness``, ``spring_rest``,
-        ``reduction.actuation``, ``reduction.stiffness``, ``weight`` and ``com`` (``requires_grad_()`` asks for
-        it). Forces and contacts move along (:mod:`~torch_ekm.model.gradients`), once, not twice. Which joints
-        are held and ``stability``, margins, residual and stop torques in ``forces`` are constants.
+        ``reduction.actuation``, ``reduction.stiffness``, ``weight`` and ``com`` (``requires_grad_()`` asks
+        for it). Forces and detected contacts move along (:mod:`~torch_ekm.model.gradients`). First
+        derivatives only; stability, margins, stop torques, and which joints are held, are constants.
 
         Args:
             state: one state, or a batch together with batched ``contacts``.

@@ -46,8 +46,9 @@ def calibrate(
         model: of the hand as described and of the object that was moved.
         recordings: trajectories of it, say 30 motions of 1 to 3 deg in several grasps. The encoders' readings
             give the increments, so the faults of a position controller do no harm.
-        parameters: kinds ("springs", "rest", "moment_arms", "stiffness", "offset", "backlash", "object_position",
-            "object_rotation"), or one of a kind: "springs:thumb_2", "moment_arms:thumb_distal".
+        parameters: kinds ("springs", "rest", "moment_arms", "stiffness", "offset", "backlash",
+            "object_position", "object_rotation"), or one of a kind: "springs:thumb_2",
+            "moment_arms:thumb_distal".
         priors: standard deviations in place of
             :data:`~torch_ekm.model.calibration.parameters.PRIORS`, by kind.
         loss: of scipy's ``least_squares``: "soft_l1" bears motions in which a contact slipped, "linear" is a
@@ -68,7 +69,14 @@ def calibrate(
     problem, x = _Problem(evidence, before), start
     for _ in range(_ROUNDS):
         at = require("scipy.optimize").least_squares(
-            problem.residuals, x, problem.jacobian, unknowns.bounds, loss=loss, xtol=1e-3, ftol=1e-3, max_nfev=12
+            problem.residuals,
+            x,
+            problem.jacobian,
+            unknowns.bounds,
+            loss=loss,
+            xtol=1e-3,
+            ftol=1e-3,
+            max_nfev=12,
         )
         x, last = at.x, problem.noise.copy()
         problem.estimate_noise(x)
@@ -76,7 +84,7 @@ def calibrate(
             break
     after = problem.at(x)
     information = problem.information(x)
-    covariance = np.linalg.inv(information + np.eye(len(x)))
+    covariance: Array = np.linalg.inv(information + np.eye(len(x))).astype(np.float64)
     return Calibration(
         model=model,
         unknowns=unknowns,

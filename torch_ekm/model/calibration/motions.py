@@ -33,7 +33,7 @@ class Rest:
     force: Float[Tensor, " n_pads"] | None
 
     def shifted(self, position: Float[Tensor, " 3"], rotation: Float[Tensor, " 3"]) -> GraspState:
-        """``o' = o + R t``, ``R' = R exp([phi]x)``: where the object is if its pose was read with an offset."""
+        """``o' = o + R t``, ``R' = R exp([phi]x)``: where an object read with an offset is."""
         R, o = self.state.rotation, self.state.position
         return GraspState(self.state.q, o + R @ position, R @ exp(rotation))
 
@@ -48,9 +48,10 @@ def rests(recordings: Iterable[Recording]) -> list[list[Rest]]:
                 grasps.append(grasp)
                 grasp = []
                 continue
-            force = seen.fingertip_force
-            known = force is not None and bool(torch.isfinite(force).any())
+            force = None if seen.fingertip_force is None else seen.fingertip_force.double()
+            if force is not None and not bool(torch.isfinite(force).any()):
+                force = None
             state = GraspState(*(part.double() for part in (seen.q, seen.position, seen.rotation)))
-            grasp.append(Rest(state, seen.a.double(), force.double() if known else None))
+            grasp.append(Rest(state, seen.a.double(), force))
         grasps.append(grasp)
     return [grasp for grasp in grasps if len(grasp) > 1]

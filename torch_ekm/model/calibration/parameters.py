@@ -28,7 +28,13 @@ PRIORS = {
 """Kinds of parameters, and how far off each may well be (one standard deviation): of the logarithm for
 springs, moment arms and stiffness, else [rad] or [m]."""
 _LOGARITHMIC = ("springs", "moment_arms", "stiffness")
-_WORDS = {"springs": "spring", "rest": "rest angle", "stiffness": "stiffness", "offset": "offset", "backlash": "backlash"}
+_WORDS = {
+    "springs": "spring",
+    "rest": "rest angle",
+    "stiffness": "stiffness",
+    "offset": "offset",
+    "backlash": "backlash",
+}
 _FURTHEST = 5.0  # priors: bounds of the search
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ...exceptions import GraspError
 from ...kinematics.play import Play
@@ -28,7 +29,8 @@ GROUPS = {
 }
 """Standard deviations at the start: of a measured motion [rad], [m], [rad], of an encoder against joints and
 tension [rad]; of joint torques and fingertip forces in units of those by which the force problem weighs them
-(it trades one for the other, so that neither can be estimated by itself). They are estimated anew from the residuals."""
+(it trades one for the other, so that neither can be estimated by itself). They are estimated
+anew from the residuals."""
 
 
 FORCE = 0.3
@@ -43,7 +45,7 @@ class Residuals(NamedTuple):
     """``(n_r,)``, in units of :data:`GROUPS`."""
     jacobian: Array
     """By x, ``(n_r, n)``; empty if not asked for."""
-    group: Array
+    group: NDArray[np.intp]
     """Index into :data:`GROUPS`, ``(n_r,)``."""
     motion: Array
     """Errors of predicted increments ``[dq; do; dphi]``, ``(n_motions, n_s)`` [rad, m, rad]."""
@@ -108,9 +110,7 @@ class Evidence:
                     motions.append(motion.detach().numpy())
         slope = np.concatenate(slopes) if jacobian else np.zeros((0, len(x)))
         n_s = self.model.hand.n_q + 6
-        return Residuals(
-            np.concatenate(values), slope, np.array(groups), np.array(motions).reshape(-1, n_s)
-        )
+        return Residuals(np.concatenate(values), slope, np.array(groups), np.array(motions).reshape(-1, n_s))
 
     def _rows(self, figures: Figures) -> Iterator[tuple[dict[str, Tensor], Tensor | None]]:
         play = Play(figures.backlash)

@@ -101,5 +101,7 @@ class Calibration:
                 scale * float(np.sqrt(np.mean(np.sum(errors[:, rows] ** 2, axis=1))))
                 for errors in (self.errors_before, self.errors_after)
             ]
-            lines.append(f"error of a motion's {name}: {sizes[0]:.3g} {unit} before, {sizes[1]:.3g} after (rms)")
+            lines.append(
+                f"error of a motion's {name}: {sizes[0]:.3g} {unit} before, {sizes[1]:.3g} after (rms)"
+            )
         return "\n".join([*lines, *self.unidentified])
