@@ -197,9 +197,7 @@ def main() -> None:
                 within = f"{100 * np.mean(every <= 0.05):.0f} % of {every.size} within 5 %"
                 print(f"{kind}, {name}: median {100 * np.median(every):.1f} %, {within}")
     ratios = [outcome.ratio for outcome in outcomes]
-    print(
-        f"step error, after / before: median {np.median(ratios):.2f}, worst {max(ratios):.2f}, n = {len(ratios)}"
-    )
+    print(f"step error, after / before: median {np.median(ratios):.2f}, worst {max(ratios):.2f}")
 
 
 if __name__ == "__main__":

@@ -116,7 +116,8 @@ class ForceBalance:
             return value.reshape(*batch, *value.shape[1:])
 
         mu, lam, residual = stack(0), stack(1), stack(2)
-        if torch.is_grad_enabled():  # a derivative is asked for: see KinematicModel.linearize
+        inputs = (A, V_q, V_p, self.reduction.actuation)
+        if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
             problems = [(r[7], r[6]) for r in results]
             mu, lam, residual = self._with_graph(problems, A, V_q, V_p, mu, lam, residual)
         violation = torch.tensor([r[6].violation for r in results], dtype=q.dtype, device=q.device)
