@@ -31,6 +31,9 @@ class Actuator:
     """True: it can only pull (tension ``-lam >= 0``); False: a looped cable, both directions."""
     stiffness: float = np.inf
     """Series stiffness of tendon and servo [N m/rad]; infinite: rigid."""
+    backlash: float = 0.0
+    """Play of the drive, from one end to the other [rad]: a reversal of the motor smaller than that moves
+    nothing (:class:`~torch_ekm.kinematics.Play`)."""
     posture: bool = False
     """True: it shapes the hand before a grasp; a controller leaves it alone while something is held."""
 
@@ -158,3 +161,7 @@ class HandDescription:
     @property
     def actuator_offset(self) -> Array:
         return np.array([actuator.offset for actuator in self.actuators])
+
+    @property
+    def actuator_backlash(self) -> Array:
+        return np.array([actuator.backlash for actuator in self.actuators])

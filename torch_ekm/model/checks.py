@@ -53,9 +53,10 @@ def check_contacts(
     for name in contacts.link:
         if name not in link_names:
             raise UnknownNameError("link", name, link_names)
-    deepest = float(contacts.gap.amin())
+    gap = contacts.gap.detach()
+    deepest = float(gap.amin())
     if deepest < -max_overlap:
-        which = contacts.finger[int(contacts.gap.reshape(-1, contacts.n_c).amin(0).argmin())]
+        which = contacts.finger[int(gap.reshape(-1, contacts.n_c).amin(0).argmin())]
         raise PenetrationError(which, -deepest, max_overlap)
 
 

@@ -12,6 +12,7 @@ from ..contact.forces.friction import friction_cones, margins
 from ..contact.forces.solve import contact_forces
 from ..description.hand import HandDescription
 from ..typing import Bool, Float, Tensor
+from .gradients import differentiable_forces
 from .linearization import GraspForces
 from .options import ModelOptions
 from .reduction import Reduction
@@ -27,13 +28,13 @@ class ForceBalance:
     """
 
     def __init__(self, hand: HandDescription, options: ModelOptions, reduction: Reduction) -> None:
-        self.options = options
+        self.options, self.reduction = options, reduction
         self.joint_basis = reduction.joint_basis.double().numpy()
         self.pose_basis = reduction.pose_basis.double().numpy()
-        self.actuation = (reduction.actuation.double().numpy() @ self.joint_basis).T
         self.tendon = torch.tensor([actuator.tendon for actuator in hand.actuators])
         # joint torque [N m] that the weight of the forces may leave where a tendon pulls nothing
-        arm, limit = np.linalg.norm(self.actuation, axis=0), options.slack_tension
+        pull = reduction.actuation.detach().double().cpu().numpy() @ self.joint_basis
+        arm, limit = np.linalg.norm(pull, axis=1), options.slack_tension
         no_pull = 1e-3 * options.length / np.where(arm > 0, arm, 1.0) + (0.0 if limit is None else limit)
         pulls = self.tendon.numpy() & (limit is not None)
         self.slack_above = torch.from_numpy(np.where(pulls, -no_pull, np.inf))
@@ -90,6 +91,7 @@ class ForceBalance:
             kin.models, kin.contacts.friction.tolist(), kin.contacts.torsional_friction.tolist()
         )
         spins = tuple(at for at, row in enumerate(kin.rows) if row % 6 >= 3)
+        actuation = (self.reduction.actuation.detach().double().cpu().numpy() @ self.joint_basis).T
         results = []
         for k in range(len(flat[0])):
             q_k, A_k, V_q_k, V_p_k = (x[k] for x in flat)
@@ -98,7 +100,7 @@ class ForceBalance:
                 object_matrix=-self.pose_basis.T @ A_k[:, n_q:].T,
                 object_load=self.pose_basis.T @ V_p_k,
                 hand_matrix=self.joint_basis.T @ A_k[:, :n_q].T,
-                actuator_matrix=self.actuation,
+                actuator_matrix=actuation,
                 hand_load=self.joint_basis.T @ V_q_k,
                 cones=cones,
                 length=self.options.length,
@@ -124,24 +126,53 @@ class ForceBalance:
             else:
                 mu, lam = np.zeros_like(mu), np.zeros_like(lam)
             slack, relative = margins(cones, mu)
-            results.append((mu, lam, residual, torque, slack, relative, solution))
+            results.append((mu, lam, residual, torque, slack, relative, solution, eq))
 
         def stack(i: int) -> Tensor:
             value = torch.from_numpy(np.stack([r[i] for r in results])).to(q)
             return value.reshape(*batch, *value.shape[1:])
 
+        mu, lam, residual = stack(0), stack(1), stack(2)
+        inputs = (A, V_q, V_p, self.reduction.actuation)
+        if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
+            problems = [(r[7], r[6]) for r in results]
+            mu, lam, residual = self._with_graph(problems, A, V_q, V_p, mu, lam, residual)
         violation = torch.tensor([r[6].violation for r in results], dtype=q.dtype, device=q.device)
         return pack_forces(
             kin,
-            stack(0),
-            stack(1),
-            residual=stack(2),
+            mu,
+            lam,
+            residual=residual,
             stop_torque=stack(3),
             margin=stack(4),
             relative_margin=stack(5),
             status=tuple(r[6].status for r in results),
             violation=violation.reshape(batch),
         )
+
+    def _with_graph(
+        self, problems: list, A: Tensor, V_q: Tensor, V_p: Tensor, mu: Tensor, lam: Tensor, residual: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """``mu``, ``lam`` and e with their derivative; those of an unsolved problem are constants."""
+        n_q, batch = V_q.shape[-1], mu.dim() - 1
+        Z, Z_p, lift = (torch.from_numpy(x).to(A) for x in (self.joint_basis, self.pose_basis, self.lift))
+        J_a = (self.reduction.actuation @ Z).mT
+        G, load, hand, V_z = -Z_p.mT @ A[..., n_q:].mT, V_p @ Z_p, Z.mT @ A[..., :n_q].mT, V_q @ Z
+        results = []
+        for k, (eq, solution) in enumerate(problems):
+            at = [x.reshape(-1, *x.shape[batch:])[k] for x in (mu, lam, residual, G, load, hand, V_z)]
+            forces = tuple(at[:3])
+            if solution.status is ForceStatus.SOLVED:
+                *forces, e = differentiable_forces(
+                    eq, self.options.forces, solution, *at[3:6], actuator_matrix=J_a, hand_load=at[6]
+                )
+                forces = (*forces, lift @ e)
+            results.append(forces)
+        stacked = (torch.stack(part) for part in zip(*results, strict=True))
+        first, second, third = (
+            x.reshape(old.shape) for x, old in zip(stacked, (mu, lam, residual), strict=True)
+        )
+        return first, second, third
 
     def _bounded(self, q: np.ndarray, locked: list[int]) -> tuple[list[int], np.ndarray, np.ndarray]:
         """Joints with a torque of their own, and its bounds: stops push inwards, locks both ways."""

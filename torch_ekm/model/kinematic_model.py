@@ -15,6 +15,7 @@ from ..kinematics.grasp_state import GraspState
 from ..typing import Float, Tensor
 from .checks import at_contacts, check_contacts, check_inertia, check_state, joint_index
 from .force_balance import ForceBalance
+from .gradients import following, only_if_asked
 from .linearization import GraspForces, Linearization, ModelStatus
 from .link_weights import LinkWeights
 from .options import ModelOptions
@@ -125,12 +126,12 @@ class KinematicModel(nn.Module):
 
     def _detect(self, state: GraspState, poses: object | None) -> ContactSet:
         posture = poses if self._detector_takes_poses and poses is not None else state.q
-        contacts = self.detector(posture, state.position, state.rotation)  # type: ignore[arg-type]
+        with torch.no_grad():
+            contacts = self.detector(posture, state.position, state.rotation)  # type: ignore[arg-type]
         if contacts.n_c == 0:
             raise NoContactError("no finger touches the object, so no actuator can move it")
-        return contacts
+        return following(contacts, self.contacts, state) if torch.is_grad_enabled() else contacts
 
-    @torch.no_grad()
     def contact_kinematics(
         self,
         state: GraspState,
@@ -149,7 +150,7 @@ class KinematicModel(nn.Module):
             contacts, state.position, axis, origin, upstream, plane=self.plane, rolling=rolling
         )
 
-    @torch.no_grad()
+    @only_if_asked
     def linearize(
         self,
         state: GraspState,
@@ -161,6 +162,11 @@ class KinematicModel(nn.Module):
         locked: Sequence[str] = (),
     ) -> Linearization:
         """Contacts, forces, ``J_m`` and the force sensitivities at a state.
+
+        Differentiable: with respect to the state, and to the buffers ``spring_stiffness``, ``spring_rest``,
+        ``reduction.actuation``, ``reduction.stiffness``, ``weight`` and ``com`` (``requires_grad_()`` asks
+        for it). Forces and detected contacts move along (:mod:`~torch_ekm.model.gradients`). First
+        derivatives only; stability, margins, stop torques, and which joints are held, are constants.
 
         Args:
             state: one state, or a batch together with batched ``contacts``.

@@ -11,6 +11,7 @@ E ds           = R da        R = [0; I]
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import torch
@@ -60,12 +61,14 @@ def two_stage(
             contradict each other; the direction comes along.
         UnstableGraspError: N^T D N has a negative eigenvalue: the grasp buckles.
     """
+    if D.requires_grad or E.requires_grad:
+        return _differentiable(D, E, R, F, rank_tolerance, stiffness_tolerance, on_unstable)
     eps = torch.finfo(D.dtype).eps
     rank_tolerance, stiffness_tolerance = max(rank_tolerance, 10 * eps), max(stiffness_tolerance, 10 * eps)
     pinv, N = _range_and_null(E, rank_tolerance)
     P = pinv @ R
-    lost = E @ P - R
-    if lost.numel() and float(lost.abs().max()) > 10 * eps**0.5 * float(R.abs().max()):
+    lost = (E @ P - R).detach()
+    if lost.numel() and float(lost.abs().max()) > 10 * eps**0.5 * float(R.detach().abs().max()):
         _raise_contradiction(lost, P)
     load = D @ P if F is None else D @ P - F
     stability = torch.full(D.shape[:-2], torch.inf, dtype=D.dtype, device=D.device)
@@ -80,6 +83,23 @@ def two_stage(
         J = P - N @ torch.linalg.solve(K, N.mT @ load)
     unbalanced = D @ J if F is None else D @ J - F
     return KKTSolution(J, -(pinv.mT @ unbalanced), stability)
+
+
+def _differentiable(
+    D: Tensor, E: Tensor, R: Tensor, F: Tensor | None, rank: float, stiffness: float, on_unstable: str
+) -> KKTSolution:
+    """The same, with the derivative by the implicit function theorem: that of a null space is not defined.
+
+    A second solve has the residual of both equations on its right-hand side, which is 0 and has a derivative.
+    """
+    D0, E0 = D.detach(), E.detach()
+    load = R.new_zeros(D.shape[-1], R.shape[-1]) if F is None else F
+    solve = functools.partial(two_stage, D0, E0, rank_tolerance=rank, stiffness_tolerance=stiffness)
+    at = solve(R.detach(), load.detach(), on_unstable=on_unstable)
+    J, nu = at.motion, at.reaction
+    moved, loaded = R - E @ J, load - D @ J - E.mT @ nu
+    change = solve(moved - moved.detach(), loaded - loaded.detach(), on_unstable="flag")
+    return KKTSolution(J + change.motion, nu + change.reaction, at.stability)
 
 
 def _range_and_null(E: Tensor, rank_tolerance: float) -> tuple[Tensor, Tensor]:
