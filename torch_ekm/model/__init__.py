@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from .kinematic_model import KinematicModel
-from .linearization import GraspForces, Linearization, ModelStatus
+from .linearization import GraspForces, Linearization
 from .options import ModelOptions
+from .validity import Doubt, ModelStatus
 
 __all__ = [
+    "Doubt",
     "GraspForces",
     "KinematicModel",
     "Linearization",

@@ -60,7 +60,7 @@ class ForceBalance:
         locked: list[int],
         measured_normal: Tensor | None,
         last: GraspForces | None,
-        normal_std: float = 0.3,
+        normal_std: float | None = None,
     ) -> GraspForces:
         """Solve every state; where there is no answer use the forces of ``last`` or zeros."""
         batch, n_q = q.shape[:-1], q.shape[-1]
@@ -94,7 +94,7 @@ class ForceBalance:
                 bound_upper=upper,
                 weight=self.weight,
                 measured_normal=None if measured is None else measured[k],
-                normal_std=normal_std,
+                normal_std=self.options.forces.normal_std if normal_std is None else normal_std,
             )
             solution = contact_forces(eq, self.options.forces)
             mu, lam = solution.mu, solution.lam

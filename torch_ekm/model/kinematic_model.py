@@ -13,15 +13,16 @@ from ..description.hand import HandDescription
 from ..exceptions import NoContactError
 from ..kinematics.grasp_state import GraspState
 from ..typing import Float, Tensor
-from .checks import at_contacts, check_contacts, check_state, joint_index
+from .checks import at_pads, check_contacts, check_state, joint_index
 from .force_balance import ForceBalance
-from .linearization import GraspForces, Linearization, ModelStatus
+from .linearization import GraspForces, Linearization
 from .link_weights import LinkWeights
 from .options import ModelOptions
 from .potential import gravity_gradient, gravity_hessian, spring_torque
 from .reduction import Reduction
 from .sensitivity import force_change, margin_sensitivity, normal_motion, normal_sensitivity
 from .stiffness import geometric_stiffness, precedence
+from .validity import find_doubts
 
 
 class KinematicModel(nn.Module):
@@ -67,8 +68,10 @@ class KinematicModel(nn.Module):
         if detector is None:
             from ..contact.detector import ContactDetector
 
-            margin = self.options.contact_margin
-            detector = ContactDetector(hand, obj, margin, kinematics=kinematics)  # type: ignore[arg-type]
+            o = self.options
+            detector = ContactDetector(
+                hand, obj, o.contact_margin, kinematics=kinematics, link_margin=o.link_margin
+            )
             self._detector_takes_poses = True
         self.kinematics, self.detector = kinematics, detector
         self.link_names: tuple[str, ...] = tuple(kinematics.link_names)  # type: ignore[arg-type]
@@ -155,7 +158,7 @@ class KinematicModel(nn.Module):
         previous: Linearization | None = None,
         locked: Sequence[str] = (),
     ) -> Linearization:
-        """Contacts, forces, ``J_m`` and the force sensitivities at a state.
+        """Contacts, forces, ``J_m``, the force sensitivities and what speaks against them, at a state.
 
         Args:
             state: one state, or a batch together with batched ``contacts``.
@@ -164,7 +167,8 @@ class KinematicModel(nn.Module):
             fingertip_force: measured normal forces [N] in the order of ``hand.pads``, NaN where unknown, to
                 be respected in that problem. Worth giving where joints are at their stops.
             previous: the last linearization of this grasp whose forces were found. Where that problem has
-                no answer, its forces stand in, if the same fingers touch.
+                no answer, its forces stand in, if the same fingers touch. A pad that touched then and is
+                left out now is a doubt.
             locked: joints that stick, by name.
 
         Raises:
@@ -184,19 +188,18 @@ class KinematicModel(nn.Module):
         V_s, V_ss = self.potential(state, poses)
         V_q, V_p = V_s[..., :n_q], V_s[..., n_q:]
         lock = [joint_index(self.hand, name) for name in locked]
-        status = ModelStatus.OK
+        last, measured = None, None
+        if fingertip_force is not None:
+            measured = at_pads(self.hand, contacts, fingertip_force)
         if forces is None:
-            last = None
             if (
                 previous is not None
                 and previous.forces.solved
                 and previous.contacts.finger == contacts.finger
             ):
                 last = previous.forces
-            measured = None if fingertip_force is None else at_contacts(self.hand, contacts, fingertip_force)
-            forces = self.balance(state.q, kin, A, V_q, V_p, lock, measured, last)
-            if not forces.solved:
-                status = ModelStatus.NO_FORCES if last is None else ModelStatus.REUSED_FORCES
+            felt = None if measured is None else torch.stack([measured[f] for f in contacts.finger], dim=-1)
+            forces = self.balance(state.q, kin, A, V_q, V_p, lock, felt, last)
 
         o = self.options
         D = geometric_stiffness(
@@ -216,8 +219,6 @@ class KinematicModel(nn.Module):
         held = self.balance.held_by_stops(state.q, forces.stop_torque)
         held[..., lock] = True
         J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held)
-        if o.on_unstable == "flag" and bool((stability <= 0).any()):
-            status = ModelStatus.UNSTABLE
         df, dn = force_change(kin, dmu), normal_motion(kin, J)
         normal = normal_sensitivity(kin, forces, df, dn)
         return Linearization(
@@ -229,10 +230,21 @@ class KinematicModel(nn.Module):
             actuator_force_sensitivity=dlam,
             normal_force_sensitivity=normal,
             margin_sensitivity=margin_sensitivity(kin, forces, dmu, df, dn, normal),
+            force_vector_sensitivity=df,
+            normal_motion=dn,
             normal_rows=tuple(kin.normal_rows),
             held_joints=held,
             stability=stability,
-            status=status,
+            doubts=find_doubts(
+                o,
+                self.hand.joint_names,
+                contacts,
+                forces,
+                stability,
+                reused=last is not None,
+                measured=measured,
+                before=() if previous is None else previous.contacts.finger,
+            ),
         )
 
     def potential(

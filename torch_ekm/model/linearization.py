@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
+
+import torch
 
 from ..contact.contact_set import ContactSet
 from ..contact.forces.balance import ForceStatus
-from ..exceptions import ShapeError
+from ..exceptions import NonFiniteError, ShapeError
 from ..kinematics.grasp_state import GraspState
 from ..typing import Bool, Float, Tensor
-
-
-class ModelStatus(Enum):
-    """How far a linearization can be trusted."""
-
-    OK = "ok"
-    REUSED_FORCES = "reused_forces"
-    """The force problem had no answer; D uses the forces of the previous step."""
-    NO_FORCES = "no_forces"
-    """The force problem had no answer; D leaves out S, T and rolling."""
-    UNSTABLE = "unstable"
-    """The grasp buckles; the Jacobian is formal (only with ``on_unstable="flag"``)."""
+from .expected_forces import ExpectedForces, expected_forces
+from .validity import Doubt, ModelStatus
 
 
 @dataclass(frozen=True)
@@ -77,13 +68,23 @@ class Linearization:
     """d f_n/da [N/rad], the turning of the normals included: rows for regulating the grip."""
     margin_sensitivity: Float[Tensor, "*batch n_c n_a"]
     """d margin/da [N/rad]."""
+    force_vector_sensitivity: Float[Tensor, "*batch n_c 3 n_a"]
+    """df/da [N/rad]: change of the force vectors in hand axes."""
+    normal_motion: Float[Tensor, "*batch n_c 3 n_a"]
+    """dn/da [1/rad]: turning of the object's outward normals at the contacts."""
     normal_rows: tuple[int, ...]
     """Position of each contact's normal force in ``mu``."""
     held_joints: Bool[Tensor, "*batch n_q"]
     """Joints that a stop or a lock holds."""
     stability: Float[Tensor, "*batch"]
     """Smallest eigenvalue of the stiffness with locked actuators, translations in units of L [N m/rad]."""
-    status: ModelStatus
+    doubts: tuple[Doubt, ...] = ()
+    """What speaks against this linearization, worst first."""
+
+    @property
+    def status(self) -> ModelStatus:
+        """The kind of the worst doubt, or OK."""
+        return self.doubts[0].kind if self.doubts else ModelStatus.OK
 
     @property
     def n_q(self) -> int:
@@ -109,8 +110,53 @@ class Linearization:
 
         Raises:
             ShapeError: ``delta_a`` does not have one entry per actuator.
+            NonFiniteError: an entry is NaN or infinite.
         """
+        return _times(self.manipulation_jacobian, self._increment(delta_a))
+
+    def forces_after(self, delta_a: Float[Tensor, "*batch n_a"]) -> ExpectedForces:
+        """What the contacts bear after an increment, as long as they stick: forces to first order.
+
+        Raises:
+            ShapeError: ``delta_a`` does not have one entry per actuator.
+            NonFiniteError: an entry is NaN or infinite.
+        """
+        da = self._increment(delta_a)
+        dmu = _times(self.contact_force_sensitivity, da)
+        ends = (*self.normal_rows[1:], dmu.shape[-1])
+        dspin = dmu.new_zeros(*dmu.shape[:-1], self.contacts.n_c)
+        for i, (row, end) in enumerate(zip(self.normal_rows, ends, strict=True)):
+            if end - row == 4:  # a soft finger
+                dspin[..., i] = dmu[..., row + 3]
+        return expected_forces(
+            self.contacts,
+            self.forces,
+            dspin,
+            _times(self.force_vector_sensitivity, da[..., None, :]),
+            _times(self.normal_motion, da[..., None, :]),
+            _times(self.actuator_force_sensitivity, da),
+        )
+
+    def margins_after(self, delta_a: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_c"]:
+        """``mu_s f_n' - |u'|`` of each contact [N], f' from :meth:`forces_after`; below 0 it will have slipped.
+
+        ``margins + margin_sensitivity da`` to first order, but exact in the cone.
+
+        Raises:
+            ShapeError: ``delta_a`` does not have one entry per actuator.
+            NonFiniteError: an entry is NaN or infinite.
+        """
+        return self.forces_after(delta_a).margin
+
+    def _increment(self, delta_a: Tensor) -> Tensor:
         n_a = self.manipulation_jacobian.shape[-1]
         if delta_a.shape[-1:] != (n_a,):
             raise ShapeError("delta_a", f"(*batch, {n_a})", delta_a.shape, "one entry per actuator")
-        return (self.manipulation_jacobian @ delta_a[..., None])[..., 0]
+        finite = torch.isfinite(delta_a)
+        if not bool(finite.all()):
+            raise NonFiniteError("delta_a", torch.nonzero(~finite)[:3].tolist())
+        return delta_a
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    return (matrix @ vector[..., None])[..., 0]

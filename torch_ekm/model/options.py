@@ -37,6 +37,8 @@ class ModelOptions:
     """Added to every joint's stiffness [N m/rad]: a floor for springless free joints, e.g. 1e-4."""
     contact_margin: float = 0.002
     """Gap up to which the detector takes a pad for touching [m]; more for noisy poses."""
+    link_margin: float = 0.001
+    """Gap up to which a link that is no pad is reported as touching [m]."""
     max_overlap: float = 0.005
     """Deepest penetration of finger and object that is still modelled [m]."""
     stop_tolerance: float = math.radians(0.1)
@@ -54,7 +56,7 @@ class ModelOptions:
         for name in ("length", "max_overlap"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
-        for name in ("stiffness_floor", "stop_tolerance", "stop_torque", "contact_margin"):
+        for name in ("stiffness_floor", "stop_tolerance", "stop_torque", "contact_margin", "link_margin"):
             if not getattr(self, name) >= 0:
                 raise ParameterError(name, getattr(self, name), "not negative")
         if self.gravity is not None and (len(self.gravity) != 3 or not all(map(math.isfinite, self.gravity))):

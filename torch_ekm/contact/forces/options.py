@@ -21,12 +21,14 @@ class ForceOptions:
     """k: weight of |lam r/L|^2 relative to |mu|^2, r the norm of the actuator's moment arms."""
     torque_std: float = 0.02
     """Standard deviation of unmodelled joint torque, Sigma_tau^(1/2) [N m]."""
+    normal_std: float = 0.3
+    """Standard deviation of a measured normal force [N]."""
     min_normal: float = 0.0
     """Lower bound of every normal force [N]."""
     max_normal: float = 1e3
     """Upper bound of every normal force [N]."""
 
     def __post_init__(self) -> None:
-        for name in ("force_weight", "torque_std"):
+        for name in ("force_weight", "torque_std", "normal_std"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
