@@ -11,13 +11,15 @@ from torch_ekm.contact.contact_kinematics import ContactKinematics, grasp_matrix
 from torch_ekm.contact.forces.balance import BalanceEquations
 from torch_ekm.contact.forces.friction import friction_cones
 from torch_ekm.contact.forces.options import ForceOptions
-from torch_ekm.contact.forces.problem import force_problem
+from torch_ekm.contact.forces.problem import force_cost, force_problem
 
 
 def cone_program(eq: BalanceEquations, options: ForceOptions | None = None) -> np.ndarray | None:
     """``[mu; lam; tau]`` with exact second-order cones in place of polyhedra and cuts; None: infeasible."""
     n_h = eq.object_matrix.shape[1]
-    problem, scale = force_problem(eq, options or ForceOptions(), np.zeros((0, n_h)))
+    options = options or ForceOptions()
+    cost = force_cost(eq, options)
+    problem, scale = force_problem(eq, options, cost, np.zeros((0, n_h))), cost.scale
     n = len(problem.q)
     up, low = np.isfinite(problem.ub), np.isfinite(problem.lb)
     eye = np.eye(n)

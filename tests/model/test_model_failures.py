@@ -46,12 +46,12 @@ def test_no_contacts():
 
 
 @pytest.mark.parametrize("on_unstable", ["raise", "flag"])
-def test_nothing_resists_the_spin_about_one_point_contact_whatever_the_option_says(on_unstable):
+def test_a_motion_that_nothing_resists_is_an_error_whatever_the_option_says(on_unstable):
     toy = three_finger()
     options = dataclasses.replace(toy.model.options, on_unstable=on_unstable)
     with pytest.raises(SingularGraspError, match="a motion of the object") as caught:
         rebuilt(toy, contacts=select(toy.contacts, [0]), options=options).linearize(toy.state)
-    assert (caught.value.direction[-3:] @ toy.contacts.normal[0]).abs() > 0.9
+    assert caught.value.direction[-3:].norm() > 0.1
 
 
 def test_one_soft_contact_cannot_hold_but_the_answer_is_finite():

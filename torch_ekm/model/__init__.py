@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from .expected_forces import ExpectedForces
 from .kinematic_model import KinematicModel
 from .linearization import GraspForces, Linearization
 from .options import ModelOptions
@@ -9,6 +10,7 @@ from .validity import Doubt, ModelStatus
 
 __all__ = [
     "Doubt",
+    "ExpectedForces",
     "GraspForces",
     "KinematicModel",
     "Linearization",

@@ -1,17 +1,18 @@
-"""Contact forces after an increment: what the next measurement is held against."""
+"""Contact forces after an increment, and how sure they are: what the next measurement is weighed against.
+
+Contact forces are stacked as ``[f_1; m_1; f_2; m_2; ..]``, f_i in hand axes [N], m_i the spin moment [N m]:
+``4 n_c`` entries, which do not depend on contact frames.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 
-from ..contact.contact_set import ContactSet
+from ..contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
+from ..contact.forces.options import ForceOptions
 from ..typing import Float, Tensor
-
-if TYPE_CHECKING:
-    from .linearization import GraspForces
 
 
 @dataclass(frozen=True)
@@ -30,18 +31,50 @@ class ExpectedForces:
     """``mu_s f_n' - |u'|``, u' = f_t' (soft fingers: with the scaled spin moment) [N]."""
     actuator: Float[Tensor, "*batch n_a"]
     """``-(lam + dlam)``, force of each actuator along +a [N m]."""
+    covariance: Float[Tensor, "*batch m m"]
+    """Of the stacked contact forces, m = 4 n_c: that before the increment and what the increment adds."""
+    margin_std: Float[Tensor, "*batch n_c"]
+    """Standard deviation of ``margin`` [N]."""
 
 
-def expected_forces(
-    contacts: ContactSet, forces: GraspForces, dspin: Tensor, df: Tensor, dn: Tensor, dlam: Tensor
-) -> ExpectedForces:
-    """Add first-order changes to the forces and read them against the turned normals."""
-    force, spin = forces.force + df, forces.spin_moment + dspin
-    n_in = -(contacts.normal + dn)
-    n_in = n_in / torch.linalg.vector_norm(n_in, dim=-1, keepdim=True)
-    normal = (force * n_in).sum(-1)
-    f_t = force - normal[..., None] * n_in
-    scale = contacts.friction / contacts.torsional_friction.clamp_min(1e-9)
-    used = (f_t.square().sum(-1) + (scale * spin).square()).sqrt()
-    margin = contacts.friction * normal - used
-    return ExpectedForces(contacts.finger, force, spin, normal, margin, -(forces.lam + dlam))
+def friction_use(
+    contacts: ContactSet, force: Tensor, spin: Tensor, normal: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """``f_n``, ``mu_s f_n - |u|`` [N] and the margin's gradient ``(*batch, n_c, 4)`` in ``[f; m]``.
+
+    Args:
+        normal: outward normals of the object.
+    """
+    n_in, mu_s = -normal, contacts.friction
+    f_n = (force * n_in).sum(-1)
+    f_t = force - f_n[..., None] * n_in
+    scale = mu_s / contacts.torsional_friction.clamp_min(1e-9) * (contacts.torsional_friction > 0)
+    u = torch.cat([f_t, (scale * spin)[..., None]], dim=-1)
+    size = torch.linalg.vector_norm(u, dim=-1)
+    direction = u / size.clamp_min(1e-9)[..., None]
+    gradient = torch.cat(
+        [mu_s[:, None] * n_in - direction[..., :3], -(scale * direction[..., 3])[..., None]], dim=-1
+    )
+    return f_n, mu_s * f_n - size, gradient
+
+
+def margin_std(
+    contacts: ContactSet, normal_force: Tensor, gradient: Tensor, covariance: Tensor, options: ForceOptions
+) -> Float[Tensor, "*batch n_c"]:
+    """``sqrt(g^T Sigma g + (s mu_s f_n)^2)``, g the margin's gradient, s of the friction coefficient [N]."""
+    blocks = covariance.unflatten(-1, (-1, 4)).unflatten(-3, (-1, 4))
+    own = torch.einsum("...ijik->...ijk", blocks)
+    variance = (gradient[..., None, :] @ own @ gradient[..., None])[..., 0, 0]
+    return (variance.clamp_min(0.0) + (options.friction_std * contacts.friction * normal_force) ** 2).sqrt()
+
+
+def start_variance(force: Float[Tensor, "*batch n_c 3"], std: float) -> Float[Tensor, "*batch m"]:
+    """``std^2`` for each force of the stack, ``(std L)^2`` for each moment."""
+    one = torch.tensor([1.0, 1.0, 1.0, CHARACTERISTIC_LENGTH**2], dtype=force.dtype, device=force.device)
+    return (std**2 * one).expand(*force.shape[:-1], 4).flatten(-2)
+
+
+def drift(df: Float[Tensor, "*batch n_c 3"], dspin: Tensor, options: ForceOptions) -> Float[Tensor, "*batch m"]:
+    """Variance that an increment adds: ``drift_std^2 + (change_std |df_i|)^2``, moments likewise."""
+    change = torch.cat([df.norm(dim=-1, keepdim=True).expand_as(df), dspin[..., None]], dim=-1)
+    return start_variance(df, options.drift_std) + (options.change_std * change.flatten(-2)).square()

@@ -14,6 +14,7 @@ from ..exceptions import NoContactError
 from ..kinematics.grasp_state import GraspState
 from ..typing import Float, Tensor
 from .checks import at_pads, check_contacts, check_state, joint_index
+from .expected_forces import ExpectedForces
 from .force_balance import ForceBalance
 from .linearization import GraspForces, Linearization
 from .link_weights import LinkWeights
@@ -155,6 +156,8 @@ class KinematicModel(nn.Module):
         *,
         forces: GraspForces | None = None,
         fingertip_force: Float[Tensor, "*batch n_pads"] | None = None,
+        actuator_load: Float[Tensor, "*batch n_a"] | None = None,
+        expected: ExpectedForces | None = None,
         previous: Linearization | None = None,
         locked: Sequence[str] = (),
     ) -> Linearization:
@@ -163,9 +166,13 @@ class KinematicModel(nn.Module):
         Args:
             state: one state, or a batch together with batched ``contacts``.
             contacts: by default from the detector (single state).
-            forces: known forces; by default from the relaxed minimal-force problem.
+            forces: known forces; by default from the relaxed force problem, whose answer is the smallest
+                where nothing more is known.
             fingertip_force: measured normal forces [N] in the order of ``hand.pads``, NaN where unknown, to
                 be respected in that problem. Worth giving where joints are at their stops.
+            actuator_load: measured force of each actuator along +a [N m], NaN where unknown, likewise.
+            expected: ``previous.forces_after(da)``, da what the encoders moved since: the forces then change
+                least from these, as far as balance and measurements leave them open.
             previous: the last linearization of this grasp whose forces were found. Where that problem has
                 no answer, its forces stand in, if the same fingers touch. A pad that touched then and is
                 left out now is a doubt.
@@ -199,7 +206,9 @@ class KinematicModel(nn.Module):
             ):
                 last = previous.forces
             felt = None if measured is None else torch.stack([measured[f] for f in contacts.finger], dim=-1)
-            forces = self.balance(state.q, kin, A, V_q, V_p, lock, felt, last)
+            forces = self.balance(
+                state.q, kin, A, V_q, V_p, lock, felt, last, actuator_load=actuator_load, expected=expected
+            )
 
         o = self.options
         D = geometric_stiffness(
@@ -235,6 +244,7 @@ class KinematicModel(nn.Module):
             normal_rows=tuple(kin.normal_rows),
             held_joints=held,
             stability=stability,
+            options=o,
             doubts=find_doubts(
                 o,
                 self.hand.joint_names,

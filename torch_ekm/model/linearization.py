@@ -11,7 +11,8 @@ from ..contact.forces.balance import ForceStatus
 from ..exceptions import NonFiniteError, ShapeError
 from ..kinematics.grasp_state import GraspState
 from ..typing import Bool, Float, Tensor
-from .expected_forces import ExpectedForces, expected_forces
+from .expected_forces import ExpectedForces, drift, friction_use, margin_std, start_variance
+from .options import ModelOptions
 from .validity import Doubt, ModelStatus
 
 
@@ -41,6 +42,11 @@ class GraspForces:
     """One per state of the batch."""
     violation: Float[Tensor, "*batch"]
     """Smallest norm of the unbalanced object wrench, moments divided by L [N]."""
+    covariance: Float[Tensor, "*batch m m"] | None = None
+    """Of the contact forces ``[f_1; m_1; ..]``, hand axes, m = 4 n_c. None where nothing was measured or
+    expected: the smallest forces are a choice, not an estimate."""
+    margin_std: Float[Tensor, "*batch n_c"] | None = None
+    """Standard deviation of ``margin`` [N]; None likewise."""
 
     @property
     def solved(self) -> bool:
@@ -78,6 +84,8 @@ class Linearization:
     """Joints that a stop or a lock holds."""
     stability: Float[Tensor, "*batch"]
     """Smallest eigenvalue of the stiffness with locked actuators, translations in units of L [N m/rad]."""
+    options: ModelOptions
+    """Those of the model."""
     doubts: tuple[Doubt, ...] = ()
     """What speaks against this linearization, worst first."""
 
@@ -128,13 +136,24 @@ class Linearization:
         for i, (row, end) in enumerate(zip(self.normal_rows, ends, strict=True)):
             if end - row == 4:  # a soft finger
                 dspin[..., i] = dmu[..., row + 3]
-        return expected_forces(
-            self.contacts,
-            self.forces,
-            dspin,
-            _times(self.force_vector_sensitivity, da[..., None, :]),
-            _times(self.normal_motion, da[..., None, :]),
-            _times(self.actuator_force_sensitivity, da),
+        df = _times(self.force_vector_sensitivity, da[..., None, :])
+        force, spin = self.forces.force + df, self.forces.spin_moment + dspin
+        normal = self.contacts.normal + _times(self.normal_motion, da[..., None, :])
+        normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+        f_n, margin, gradient = friction_use(self.contacts, force, spin, normal)
+        options, covariance = self.options.forces, self.forces.covariance
+        if covariance is None:
+            covariance = torch.diag_embed(start_variance(force, options.start_std))
+        covariance = covariance + torch.diag_embed(drift(df, dspin, options))
+        return ExpectedForces(
+            finger=self.contacts.finger,
+            force=force,
+            spin_moment=spin,
+            normal=f_n,
+            margin=margin,
+            actuator=-(self.forces.lam + _times(self.actuator_force_sensitivity, da)),
+            covariance=covariance,
+            margin_std=margin_std(self.contacts, f_n, gradient, covariance, options),
         )
 
     def margins_after(self, delta_a: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_c"]:
