@@ -35,7 +35,7 @@ class ModelStatus(Enum):
     LINK_TOUCHES = "link_touches"
     """A link that is no pad touches the object: the model knows nothing of its force."""
     UNEXPLAINED_TORQUE = "unexplained_torque"
-    """Springs, weight and contacts do not explain the torque at a joint."""
+    """Springs, weight and contacts do not explain the torques at the joints."""
     CONTACT_DROPPED = "contact_dropped"
     """A pad that touched, presses or nearly touches is farther away than the contact margin."""
     SENSORS_DISAGREE = "sensors_disagree"
@@ -116,18 +116,18 @@ def _of_missing_forces(forces: GraspForces, reused: bool) -> Doubt:
 
 def _of_torque(joint_names: Sequence[str], forces: GraspForces, options: ModelOptions) -> list[Doubt]:
     std = options.forces.torque_std
-    torque = forces.residual.abs()
-    if float(torque.max()) <= SIGMA * std:
+    residual = forces.residual.reshape(-1, len(joint_names))
+    size = torch.linalg.vector_norm(residual, dim=-1)
+    value = float(size.max())
+    if value <= SIGMA * std:
         return []
-    worst = torque.reshape(-1, len(joint_names)).amax(0)
-    at = int(worst.argmax())
-    value = float(worst[at])
+    joint = joint_names[int(residual[int(size.argmax())].abs().argmax())]
     message = (
-        f"joint '{joint_names[at]}' bears {value:.3f} N m that springs, weight and contacts do not explain "
-        f"({value / std:.0f} standard deviations): mass of the object, a spring, its rest angle or the contacts "
+        f"springs, weight and contacts leave joint torques of {value:.3f} N m unexplained ({value / std:.0f} "
+        f"standard deviations), most at '{joint}': the object's mass, a spring, its rest angle or the contacts "
         "are not as described"
     )
-    return [Doubt(ModelStatus.UNEXPLAINED_TORQUE, joint_names[at], value, SIGMA * std, "N m", message)]
+    return [Doubt(ModelStatus.UNEXPLAINED_TORQUE, joint, value, SIGMA * std, "N m", message)]
 
 
 def _of_friction(contacts: ContactSet, forces: GraspForces) -> list[Doubt]:
