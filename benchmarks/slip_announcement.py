@@ -59,12 +59,14 @@ class Motion:
 
     seen: Observation
     delta_a: torch.Tensor
+    """Commanded [rad]."""
+    moved: torch.Tensor
+    """By the encoders [rad]."""
     margin_before: dict[str, float]
     """True friction margin before [N]."""
     margin_after: dict[str, float]
     slip: dict[str, float]
     """[m]"""
-    held: bool
 
     @property
     def slips(self) -> bool:
@@ -192,7 +194,7 @@ def record(obj: ObjectDescription, seed: int, name: str, motions: int = 25) -> l
         after = plant.command(decision.delta_a)
         slip = witness.slips()
         margins = witness.margins()
-        done.append(Motion(seen, decision.delta_a, before, margins, slip, after.status is PlantStatus.HELD))
+        done.append(Motion(seen, decision.delta_a, after.a - seen.a, before, margins, slip))
         slipped += done[-1].slips
         turned = torch.linalg.vector_norm(after.truth.state.minus(seen.truth.state)[-3:])
         still = still + 1 if float(turned) < np.radians(0.1) else 0

@@ -14,6 +14,8 @@ from ..contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
 from ..contact.forces.options import ForceOptions
 from ..typing import Float, Tensor
 
+_ANY_FORCE = 10.0  # [N] standard deviation of a normal force of which nothing is known
+
 
 @dataclass(frozen=True)
 class ExpectedForces:
@@ -68,13 +70,22 @@ def margin_std(
     return (variance.clamp_min(0.0) + (options.friction_std * contacts.friction * normal_force) ** 2).sqrt()
 
 
-def start_variance(force: Float[Tensor, "*batch n_c 3"], std: float) -> Float[Tensor, "*batch m"]:
-    """``std^2`` for each force of the stack, ``(std L)^2`` for each moment."""
-    one = torch.tensor([1.0, 1.0, 1.0, CHARACTERISTIC_LENGTH**2], dtype=force.dtype, device=force.device)
-    return (std**2 * one).expand(*force.shape[:-1], 4).flatten(-2)
+def start_covariance(normal: Float[Tensor, "*batch n_c 3"], options: ForceOptions) -> Float[Tensor, "*batch m m"]:
+    """``start_std^2`` across the normals and ``(start_std L)^2`` for spin moments; along the normals next to nothing
+    is known."""
+    eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
+    along = normal[..., None] * normal[..., None, :]
+    blocks = normal.new_zeros(*normal.shape[:-1], 4, 4)
+    blocks[..., :3, :3] = options.start_std**2 * (eye - along) + _ANY_FORCE**2 * along
+    blocks[..., 3, 3] = (options.start_std * CHARACTERISTIC_LENGTH) ** 2
+    m = 4 * normal.shape[-2]
+    spread = torch.eye(normal.shape[-2], dtype=normal.dtype, device=normal.device)
+    return torch.einsum("...iab,ij->...iajb", blocks, spread).reshape(*normal.shape[:-2], m, m)
 
 
 def drift(df: Float[Tensor, "*batch n_c 3"], dspin: Tensor, options: ForceOptions) -> Float[Tensor, "*batch m"]:
     """Variance that an increment adds: ``drift_std^2 + (change_std |df_i|)^2``, moments likewise."""
     change = torch.cat([df.norm(dim=-1, keepdim=True).expand_as(df), dspin[..., None]], dim=-1)
-    return start_variance(df, options.drift_std) + (options.change_std * change.flatten(-2)).square()
+    one = torch.tensor([1.0, 1.0, 1.0, CHARACTERISTIC_LENGTH], dtype=df.dtype, device=df.device)
+    least = (options.drift_std * one).expand(*df.shape[:-1], 4).flatten(-2)
+    return least.square() + (options.change_std * change.flatten(-2)).square()

@@ -12,14 +12,13 @@ from ..contact.forces.balance import BalanceEquations
 from ..contact.forces.options import ForceOptions
 from ..exceptions import ShapeError
 from ..typing import Array
-from .expected_forces import ExpectedForces, start_variance
+from .expected_forces import ExpectedForces, start_covariance
 
 
 class ForcePrior:
     """``N(x^, Sigma)`` of the stacked contact forces, read in the contact frames of the present state.
 
-    Contacts that were not expected begin at 0 with ``start_std``. Where nothing is expected at all only the
-    variance is used, to say how sure the answer is.
+    Contacts that were not expected begin at 0, with ``start_std`` across the normal and any force along it.
 
     Args:
         kin: the contacts.
@@ -34,7 +33,7 @@ class ForcePrior:
         contacts = kin.contacts
         batch, n_c = contacts.batch_shape, contacts.n_c
         mean = contacts.point.new_zeros(*batch, n_c, 4)
-        covariance = torch.diag_embed(start_variance(contacts.point, options.start_std))
+        covariance = start_covariance(contacts.normal, options)
         if expected is not None:
             if expected.force.shape[:-2] not in (batch, ()):
                 raise ShapeError("expected.force", f"{(*batch, n_c, 3)}", expected.force.shape)
@@ -44,7 +43,6 @@ class ForcePrior:
             mean[..., now, 3] = expected.spin_moment[..., then]
             row, column = _stacked(now), _stacked(then)
             covariance[..., row[:, None], row] = expected.covariance[..., column[:, None], column]
-        self.expecting = expected is not None
         self._rows = np.array(kin.rows)
         m = 4 * n_c
         self._mean, self._covariance, self._frame = (
@@ -57,7 +55,7 @@ class ForcePrior:
         T = self._selection(k)
         return dataclasses.replace(
             eq,
-            expected=T @ self._mean[k] if self.expecting else None,
+            expected=T @ self._mean[k],
             expected_covariance=T @ self._covariance[k] @ T.T,
         )
 

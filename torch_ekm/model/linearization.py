@@ -11,7 +11,7 @@ from ..contact.forces.balance import ForceStatus
 from ..exceptions import NonFiniteError, ShapeError
 from ..kinematics.grasp_state import GraspState
 from ..typing import Bool, Float, Tensor
-from .expected_forces import ExpectedForces, drift, friction_use, margin_std, start_variance
+from .expected_forces import ExpectedForces, drift, friction_use, margin_std, start_covariance
 from .options import ModelOptions
 from .validity import Doubt, ModelStatus
 
@@ -143,7 +143,7 @@ class Linearization:
         f_n, margin, gradient = friction_use(self.contacts, force, spin, normal)
         options, covariance = self.options.forces, self.forces.covariance
         if covariance is None:
-            covariance = torch.diag_embed(start_variance(force, options.start_std))
+            covariance = start_covariance(self.contacts.normal, options)
         covariance = covariance + torch.diag_embed(drift(df, dspin, options))
         return ExpectedForces(
             finger=self.contacts.finger,

@@ -70,7 +70,7 @@ class BalanceEquations:
     expected: Array | None = None
     """Forces ``mu`` to stay near, ``(n_h,)``."""
     expected_covariance: Array | None = None
-    """Of ``expected``, or of what is known of ``mu`` before, for the covariance alone, ``(n_h, n_h)``."""
+    """Of ``expected``, ``(n_h, n_h)``."""
 
     @property
     def row_scale(self) -> Array:

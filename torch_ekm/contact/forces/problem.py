@@ -29,19 +29,12 @@ class ForceCost(NamedTuple):
         kkt[:n, :n], kkt[:n, n:], kkt[n:, :n] = self.P, self.balance.T, self.balance
         return self.scale * np.linalg.solve(kkt, np.concatenate([-self.q, self.load]))[:n]
 
-    def covariance(self, n_h: int, prior: Array | None = None) -> Array:
-        """``N (N^T P N)^-1 N^T`` of ``mu``, N the null space of the balance: P read as information.
-
-        Args:
-            prior: covariance of ``mu`` to be counted beside P.
-        """
+    def covariance(self, n_h: int) -> Array:
+        """``N (N^T P N)^-1 N^T`` of ``mu``, N the null space of the balance: P read as information."""
         _, sigma, Vh = np.linalg.svd(self.balance)
         N = Vh[int((sigma > 1e-9 * sigma[0]).sum()) :].T
         half = (self.scale[:, None] * N)[:n_h]
-        information = N.T @ self.P @ N
-        if prior is not None:
-            information = information + half.T @ np.linalg.solve(prior, half)
-        return half @ np.linalg.solve(information, half.T)
+        return half @ np.linalg.solve(N.T @ self.P @ N, half.T)
 
 
 def force_cost(eq: BalanceEquations, options: ForceOptions) -> ForceCost:

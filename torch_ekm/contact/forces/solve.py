@@ -32,7 +32,7 @@ def contact_forces(eq: BalanceEquations, options: ForceOptions | None = None) ->
     cost, cuts = force_cost(eq, options), np.zeros((0, n_h))
     covariance = None
     if eq.expected_covariance is not None:
-        covariance = cost.covariance(n_h, eq.expected_covariance if eq.expected is None else None)
+        covariance = cost.covariance(n_h)
     unknowns = _inside(eq, options, cost)
     if unknowns is not None:
         return _unpack(eq, unknowns, 0, covariance)
