@@ -42,6 +42,30 @@ def cone_program(eq: BalanceEquations, options: ForceOptions | None = None) -> n
     return scale * np.asarray(solution.x) if found else None
 
 
+def gaussian_posterior(eq: BalanceEquations, options: ForceOptions) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of ``[mu; lam]`` by Kalman's gain; balance, joints and sensors are measurements."""
+    n_h, n_a = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1]
+    S = np.zeros((n_h + n_a, n_h + n_a))
+    S[:n_h, :n_h], S[n_h:, n_h:] = eq.expected_covariance, 1e4 * np.eye(n_a)
+    x = np.concatenate([eq.expected, np.zeros(n_a)])
+    eye = np.eye(n_h + n_a)
+    measured = [  # rows, value, variance
+        (np.hstack([eq.hand_matrix, eq.actuator_matrix]), -eq.hand_load, options.torque_std**2),
+        (np.hstack([eq.object_matrix, np.zeros((len(eq.object_load), n_a))]), eq.object_load, 0.0),
+    ]
+    if eq.measured_normal is not None:
+        starts = [cone.start for cone in eq.cones]
+        known = np.isfinite(eq.measured_normal)
+        measured.append((eye[starts][known], eq.measured_normal[known], eq.normal_std**2))
+    if eq.measured_actuator is not None:
+        known = np.isfinite(eq.measured_actuator)
+        measured.append((-eye[n_h:][known], eq.measured_actuator[known], eq.actuator_std**2))
+    for H, value, variance in measured:
+        gain = S @ H.T @ np.linalg.inv(H @ S @ H.T + variance * np.eye(len(H)))
+        x, S = x + gain @ (value - H @ x), S - gain @ H @ S
+    return x, S
+
+
 def ferrari_canny(kin: ContactKinematics, length: float = 0.03, faces: int = 64) -> float:
     """Radius of the largest ball about 0 in the hull of the wrenches of unit normal forces; 0: no closure.
 

@@ -70,9 +70,10 @@ def margin_std(
     return (variance.clamp_min(0.0) + (options.friction_std * contacts.friction * normal_force) ** 2).sqrt()
 
 
-def start_covariance(normal: Float[Tensor, "*batch n_c 3"], options: ForceOptions) -> Float[Tensor, "*batch m m"]:
-    """``start_std^2`` across the normals and ``(start_std L)^2`` for spin moments; along the normals next to nothing
-    is known."""
+def start_covariance(
+    normal: Float[Tensor, "*batch n_c 3"], options: ForceOptions
+) -> Float[Tensor, "*batch m m"]:
+    """``start_std^2`` across the normals, any force along them; ``(start_std L)^2`` for spin moments."""
     eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
     along = normal[..., None] * normal[..., None, :]
     blocks = normal.new_zeros(*normal.shape[:-1], 4, 4)
@@ -83,7 +84,9 @@ def start_covariance(normal: Float[Tensor, "*batch n_c 3"], options: ForceOption
     return torch.einsum("...iab,ij->...iajb", blocks, spread).reshape(*normal.shape[:-2], m, m)
 
 
-def drift(df: Float[Tensor, "*batch n_c 3"], dspin: Tensor, options: ForceOptions) -> Float[Tensor, "*batch m"]:
+def drift(
+    df: Float[Tensor, "*batch n_c 3"], dspin: Tensor, options: ForceOptions
+) -> Float[Tensor, "*batch m"]:
     """Variance that an increment adds: ``drift_std^2 + (change_std |df_i|)^2``, moments likewise."""
     change = torch.cat([df.norm(dim=-1, keepdim=True).expand_as(df), dspin[..., None]], dim=-1)
     one = torch.tensor([1.0, 1.0, 1.0, CHARACTERISTIC_LENGTH], dtype=df.dtype, device=df.device)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import torch
 
 from ..contact.contact_kinematics import ContactKinematics
 from ..contact.forces.balance import BalanceEquations
@@ -29,7 +28,9 @@ class ForcePrior:
         ShapeError: ``expected`` has another batch.
     """
 
-    def __init__(self, kin: ContactKinematics, expected: ExpectedForces | None, options: ForceOptions) -> None:
+    def __init__(
+        self, kin: ContactKinematics, expected: ExpectedForces | None, options: ForceOptions
+    ) -> None:
         contacts = kin.contacts
         batch, n_c = contacts.batch_shape, contacts.n_c
         mean = contacts.point.new_zeros(*batch, n_c, 4)

@@ -157,7 +157,7 @@ class Linearization:
         )
 
     def margins_after(self, delta_a: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_c"]:
-        """``mu_s f_n' - |u'|`` of each contact [N], f' from :meth:`forces_after`; below 0 it will have slipped.
+        """``mu_s f_n' - |u'|`` of each contact [N], f' from :meth:`forces_after`; below 0 it will slip.
 
         ``margins + margin_sensitivity da`` to first order, but exact in the cone.
 

@@ -108,8 +108,8 @@ def _of_missing_forces(forces: GraspForces, reused: bool) -> Doubt:
     kind = ModelStatus.REUSED_FORCES if reused else ModelStatus.NO_FORCES
     stand_in = "those of the step before stand in" if reused else "the step leaves out their stiffness"
     message = (
-        f"no forces inside the friction cones balance the object, {missing:.2g} N are missing: {stand_in}; check "
-        "mass, friction and pose of the object, and contact_margin if a pad is missing"
+        f"no forces inside the friction cones balance the object, {missing:.2g} N are missing: {stand_in}; "
+        "check mass, friction and pose of the object, and contact_margin if a pad is missing"
     )
     return Doubt(kind, "grasp", missing, 0.0, "N", message)
 
@@ -124,8 +124,8 @@ def _of_torque(joint_names: Sequence[str], forces: GraspForces, options: ModelOp
     joint = joint_names[int(residual[int(size.argmax())].abs().argmax())]
     message = (
         f"springs, weight and contacts leave joint torques of {value:.3f} N m unexplained ({value / std:.0f} "
-        f"standard deviations), most at '{joint}': the object's mass, a spring, its rest angle or the contacts "
-        "are not as described"
+        f"standard deviations), most at '{joint}': the object's mass, a spring, its rest angle or the "
+        "contacts are not as described"
     )
     return [Doubt(ModelStatus.UNEXPLAINED_TORQUE, joint, value, SIGMA * std, "N m", message)]
 
@@ -139,8 +139,8 @@ def _of_friction(contacts: ContactSet, forces: GraspForces) -> list[Doubt]:
     for i, pad in enumerate(contacts.finger):
         if float(least[i]) <= AT_LIMIT and float(contacts.friction[i]) > 0:
             message = (
-                f"pad '{pad}' is at its friction limit ({float(margin[i]):.2f} N to spare) and may slip; grip "
-                "harder or turn less, or give fingertip_force and expected if these forces are but the smallest"
+                f"pad '{pad}' is at its friction limit ({float(margin[i]):.2f} N to spare) and may slip; "
+                "grip harder or turn less; with fingertip_force and expected the forces are estimated"
             )
             value = float(least[i])
             doubts.append(Doubt(ModelStatus.FRICTION_LIMIT, pad, value, AT_LIMIT, "mu_s f_n", message))
@@ -158,8 +158,8 @@ def _of_sensors(
         value = float(miss.max())
         if value > limit:
             message = (
-                f"pad '{pad}' measures a normal force {value:.2f} N off the one that balances object and joints; "
-                "check its calibration, the object's mass and whether something else touches"
+                f"pad '{pad}' measures a normal force {value:.2f} N off the one that balances object and "
+                "joints; check its calibration, the object's mass and whether something else touches"
             )
             doubts.append(Doubt(ModelStatus.SENSORS_DISAGREE, pad, value, limit, "N", message))
     return doubts
@@ -173,8 +173,8 @@ def _of_links(contacts: ContactSet, options: ModelOptions) -> list[Doubt]:
             near.gap,
             options.link_margin,
             "m",
-            f"link '{near.link}' carries no pad and touches the object (gap {1e3 * near.gap:.1f} mm): the model "
-            "leaves its force out; grasp elsewhere, or give the link a pad in the transmission file",
+            f"link '{near.link}' carries no pad and touches the object (gap {1e3 * near.gap:.1f} mm): its "
+            "force is left out; grasp elsewhere, or give the link a pad in the transmission file",
         )
         for near in contacts.near_misses
         if near.pad is None
@@ -191,7 +191,13 @@ def _of_dropped_contacts(
         pressed = near.pad in measured and float(measured[near.pad].max()) > SIGMA * options.forces.normal_std
         if not (near.gap <= 1.5 * margin or near.pad in before or pressed):
             continue
-        why = "measures a force" if pressed else "touched a step before" if near.pad in before else "nearly touches"
+        why = (
+            "measures a force"
+            if pressed
+            else "touched a step before"
+            if near.pad in before
+            else "nearly touches"
+        )
         message = (
             f"pad '{near.pad}' {why} but is {1e3 * near.gap:.1f} mm from the object and left out; "
             f"ModelOptions(contact_margin={near.gap + 1e-4:.4f}) takes it in, if the poses are that inexact"

@@ -41,7 +41,8 @@ def force_cost(eq: BalanceEquations, options: ForceOptions) -> ForceCost:
     """What the forces should be, in ``x = [mu; lam; tau]``, all scaled to newtons.
 
     ```
-    min  p(mu) + eps k |lam r/L|^2 + |r|^2/sigma^2 + sum (f_n - measured)^2/sigma_n^2 + sum (lam - measured)^2/sigma_a^2
+    min  p(mu) + eps k |lam r/L|^2 + |r|^2/sigma^2
+         + sum (f_n - measured)^2/sigma_n^2 + sum (lam + measured)^2/sigma_a^2
     s.t. G mu = V_p
     p(mu) = eps |mu|^2, or (mu - expected)^T Sigma^-1 (mu - expected) where forces are expected
     ```
@@ -85,7 +86,9 @@ def force_cost(eq: BalanceEquations, options: ForceOptions) -> ForceCost:
     return ForceCost(P, q, balance, eq.object_load * eq.row_scale, scale)
 
 
-def force_problem(eq: BalanceEquations, options: ForceOptions, cost: ForceCost, cuts: Array, *, soft: bool = False):
+def force_problem(
+    eq: BalanceEquations, options: ForceOptions, cost: ForceCost, cuts: Array, *, soft: bool = False
+):
     """Add the inequalities to the cost: a ``qpsolvers.Problem``.
 
     ```
