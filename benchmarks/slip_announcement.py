@@ -20,6 +20,7 @@ import argparse
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -93,7 +94,7 @@ class Witness:
             gravity=plant.gravity, link_weights=p.link_weight, on_unstable="flag", max_overlap=0.02
         )
         self.model = KinematicModel(hand, obj, options)
-        self._rig = plant._rig
+        self._rig: Any = plant._rig
         self._remember, self.frames = self._rig.on_frame, []
         self._rig.on_frame = self._frame
 
@@ -210,6 +211,8 @@ def record(obj: ObjectDescription, seed: int, name: str, motions: int = 25) -> l
         margins = witness.margins()
         done.append(Motion(seen, decision.delta_a, after.a - seen.a, before, margins, slip))
         slipped += done[-1].slips
+        assert seen.truth is not None
+        assert after.truth is not None
         turned = torch.linalg.vector_norm(after.truth.state.minus(seen.truth.state)[-3:])
         still = still + 1 if float(turned) < np.radians(0.1) else 0
         seen, before = after, margins
@@ -271,7 +274,7 @@ class Score:
             return f"{100 * alarms[of].mean():.0f} % of {of.sum()}" if of.any() else "-"
 
         def rms(x: np.ndarray) -> float:
-            return float(np.sqrt(np.mean(np.square(x)))) if len(x) else float("nan")
+            return float(np.sqrt(np.nanmean(np.square(x)))) if np.isfinite(x).any() else float("nan")
 
         cells = [share(slips), share(first), share(~slips), share(still)]
         cells += [f"{rms(now[:, 0]):.2f}", f"{rms(now[:, 0] / now[:, 1]):.1f}", f"{rms(after):.2f}"]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from .expected_forces import ExpectedForces
+from .grasp_forces import ExpectedForces, GraspForces
 from .kinematic_model import KinematicModel
-from .linearization import GraspForces, Linearization
+from .linearization import Linearization
 from .options import ModelOptions
 from .validity import Doubt, ModelStatus
 

@@ -16,9 +16,7 @@ from ..contact.forces.options import ForceOptions
 from ..contact.forces.solve import contact_forces
 from ..description.hand import HandDescription
 from ..typing import Array, Bool, Float, Tensor
-from .expected_forces import ExpectedForces, friction_use, margin_std
-from .force_prior import ForcePrior
-from .linearization import GraspForces
+from .grasp_forces import ExpectedForces, ForcePrior, GraspForces, friction_use, margin_std
 from .options import ModelOptions
 from .reduction import Reduction
 

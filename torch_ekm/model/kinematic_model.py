@@ -14,9 +14,9 @@ from ..exceptions import NoContactError
 from ..kinematics.grasp_state import GraspState
 from ..typing import Float, Tensor
 from .checks import at_pads, check_contacts, check_state, joint_index
-from .expected_forces import ExpectedForces
 from .force_balance import ForceBalance
-from .linearization import GraspForces, Linearization
+from .grasp_forces import ExpectedForces, GraspForces
+from .linearization import Linearization
 from .link_weights import LinkWeights
 from .options import ModelOptions
 from .potential import gravity_gradient, gravity_hessian, spring_torque
@@ -71,7 +71,11 @@ class KinematicModel(nn.Module):
 
             o = self.options
             detector = ContactDetector(
-                hand, obj, o.contact_margin, kinematics=kinematics, link_margin=o.link_margin
+                hand,
+                obj,
+                o.contact_margin,
+                kinematics=kinematics,  # type: ignore[arg-type]
+                link_margin=o.link_margin,
             )
             self._detector_takes_poses = True
         self.kinematics, self.detector = kinematics, detector

@@ -7,51 +7,12 @@ from dataclasses import dataclass
 import torch
 
 from ..contact.contact_set import ContactSet
-from ..contact.forces.balance import ForceStatus
 from ..exceptions import NonFiniteError, ShapeError
 from ..kinematics.grasp_state import GraspState
 from ..typing import Bool, Float, Tensor
-from .expected_forces import ExpectedForces, drift, friction_use, margin_std, start_covariance
+from .grasp_forces import ExpectedForces, GraspForces, drift, friction_use, margin_std, start_covariance
 from .options import ModelOptions
 from .validity import Doubt, ModelStatus
-
-
-@dataclass(frozen=True)
-class GraspForces:
-    """Forces at one state, hand frame. Where ``status`` is not SOLVED: those used in their stead."""
-
-    mu: Float[Tensor, "*batch n_h"]
-    """Finger on object, contact frames ``[n_in, t1, t2]`` [N], spin moments [N m]."""
-    lam: Float[Tensor, "*batch n_a"]
-    """Minus the actuator force along +a [N m]; a tendon's tension is ``-lam``."""
-    force: Float[Tensor, "*batch n_c 3"]
-    """f_i in hand axes [N]."""
-    spin_moment: Float[Tensor, "*batch n_c"]
-    """About the inward normal [N m]."""
-    normal: Float[Tensor, "*batch n_c"]
-    """f_n [N]."""
-    residual: Float[Tensor, "*batch n_q"]
-    """e, unexplained joint torque [N m]: large means a wrong spring, a wrong rest angle, or slipping."""
-    stop_torque: Float[Tensor, "*batch n_q"]
-    """Torque of joint stops and locks on the joint [N m]."""
-    margin: Float[Tensor, "*batch n_c"]
-    """``mu_s f_n - |f_t|`` [N] (soft fingers: with the scaled spin moment): 0 at the friction cone."""
-    relative_margin: Float[Tensor, "*batch n_c"]
-    """``margin / (mu_s f_n)``: 1 without tangential load, 0 at the friction cone."""
-    status: tuple[ForceStatus, ...]
-    """One per state of the batch."""
-    violation: Float[Tensor, "*batch"]
-    """Smallest norm of the unbalanced object wrench, moments divided by L [N]."""
-    covariance: Float[Tensor, "*batch m m"] | None = None
-    """Of the contact forces ``[f_1; m_1; ..]``, hand axes, m = 4 n_c. None where nothing was measured or
-    expected: the smallest forces are a choice, not an estimate."""
-    margin_std: Float[Tensor, "*batch n_c"] | None = None
-    """Standard deviation of ``margin`` [N]; None likewise."""
-
-    @property
-    def solved(self) -> bool:
-        """Every state of the batch was solved."""
-        return all(status is ForceStatus.SOLVED for status in self.status)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import torch
 from ..contact.contact_kinematics import ContactKinematics
 from ..contact.contact_model import ContactModel
 from ..typing import Float, Tensor
-from .linearization import GraspForces
+from .grasp_forces import GraspForces
 
 
 def normal_motion(

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING
 
 import torch
 
 from ..contact.contact_set import ContactSet
 from ..typing import Float, Tensor
+from .grasp_forces import GraspForces
 from .options import ModelOptions
-
-if TYPE_CHECKING:
-    from .linearization import GraspForces
 
 SIGMA = 3.0
 """Standard deviations of joint torque and fingertip force above which they count as unexplained."""

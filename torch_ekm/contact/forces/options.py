@@ -19,7 +19,7 @@ class ForceOptions:
     """eps: weight of |mu|^2 against the squared, whitened joint residual [1/N^2]."""
     actuator_weight: float = 1.0
     """k: weight of |lam r/L|^2 relative to |mu|^2, r the norm of the actuator's moment arms."""
-    torque_std: float = 0.02
+    torque_std: float = 0.01
     """Standard deviation of unmodelled joint torque, Sigma_tau^(1/2) [N m]."""
     normal_std: float = 0.3
     """Standard deviation of a measured normal force [N]."""

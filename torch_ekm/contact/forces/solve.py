@@ -33,9 +33,9 @@ def contact_forces(eq: BalanceEquations, options: ForceOptions | None = None) ->
     covariance = None
     if eq.expected_covariance is not None:
         covariance = cost.covariance(n_h)
-    unknowns = _inside(eq, options, cost)
-    if unknowns is not None:
-        return _unpack(eq, unknowns, 0, covariance)
+    inside = _inside(eq, options, cost)
+    if inside is not None:
+        return _unpack(eq, inside, 0, covariance)
     problem = force_problem(eq, options, cost, cuts)
     for solves in range(1, _MAX_CUTS + 1):
         solution = _solve(problem)
