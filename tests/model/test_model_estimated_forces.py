@@ -9,9 +9,10 @@ import torch
 from model_icub import gripped
 from model_toys import F64, select, soft_two_finger, three_finger
 
+from torch_ekm.contact import ForceOptions
 from torch_ekm.exceptions import ShapeError
 from torch_ekm.kinematics import GraspState
-from torch_ekm.model import KinematicModel
+from torch_ekm.model.grasp_forces import friction_use, margin_std
 
 
 def noisy(state: GraspState, seed: int, std: float = 0.005) -> GraspState:
@@ -60,32 +61,27 @@ def test_forces_follow_the_prediction_over_a_motion():
 @pytest.mark.parametrize("make", [three_finger, soft_two_finger])
 def test_the_margins_deviation_is_that_of_forces_drawn_from_the_covariance(make):
     toy = make()
-    lin = toy.model.linearize(toy.state, forces=toy.forces())
-    expected = lin.forces_after(torch.zeros(lin.manipulation_jacobian.shape[-1], dtype=F64))
-    expected = dataclasses.replace(
-        expected, covariance=1e-5 * expected.covariance
-    )  # the cone is linear there
-    options = dataclasses.replace(
-        toy.model.options, forces=dataclasses.replace(toy.model.options.forces, friction_std=0.0)
-    )
-    args = {"kinematics": toy.model.kinematics, "detector": toy.model.detector}
-    model = KinematicModel(toy.model.hand, toy.model.obj, options, **args)
-    forces = model.linearize(toy.state, expected=expected).forces
-    n_c = forces.normal.shape[-1]
-    draw = torch.distributions.MultivariateNormal(
-        torch.cat([forces.force, forces.spin_moment[:, None]], -1).flatten(),
-        forces.covariance + 1e-16 * torch.eye(4 * n_c, dtype=F64),
-    )
-    torch.manual_seed(0)
-    drawn = draw.sample((4000,)).unflatten(-1, (n_c, 4))
-    n_in, mu_s = -toy.contacts.normal, toy.contacts.friction
+    n_c = toy.contacts.n_c
+    contacts = toy.contacts.replace(friction=torch.full((n_c,), 0.3, dtype=F64))  # friction counts, too
+    forces, draw = toy.forces(), torch.Generator().manual_seed(0)
+    half = 1e-3 * torch.randn(4 * n_c, 4 * n_c, generator=draw, dtype=F64)
+    half[3::4] *= 0.03  # moments
+    mean = torch.cat([forces.force, forces.spin_moment[:, None]], -1).flatten()
+    drawn = mean + torch.randn(8000, 4 * n_c, generator=draw, dtype=F64) @ half.mT
+    drawn = drawn.unflatten(-1, (n_c, 4))
+    n_in, mu_s = -contacts.normal, contacts.friction
     normal = (drawn[..., :3] * n_in).sum(-1)
     across = drawn[..., :3] - normal[..., None] * n_in
     spin = torch.zeros_like(normal)
     if make is soft_two_finger:
-        spin = drawn[..., 3] * mu_s / toy.contacts.torsional_friction
+        spin = drawn[..., 3] * mu_s / contacts.torsional_friction
     margin = mu_s * normal - (across.square().sum(-1) + spin.square()).sqrt()
-    assert torch.allclose(margin.std(0), forces.margin_std, rtol=0.08)
+    f_n, now, gradient = friction_use(contacts, forces.force, forces.spin_moment, contacts.normal)
+    std = margin_std(contacts, f_n, gradient, half @ half.mT, ForceOptions(friction_std=0.0))
+    assert torch.allclose(margin.mean(0), now, atol=1e-3)
+    assert torch.allclose(margin.std(0), std, rtol=0.05)
+    wider = margin_std(contacts, f_n, gradient, half @ half.mT, ForceOptions(friction_std=0.1))
+    assert torch.allclose(wider.square(), std.square() + (0.1 * 0.3 * f_n).square())
 
 
 def test_fingertips_and_motor_loads_make_the_margins_surer():
