@@ -8,13 +8,15 @@ from scipy import sparse
 
 from torch_ekm.contact.forces.balance import BalanceEquations
 from torch_ekm.contact.forces.options import ForceOptions
-from torch_ekm.contact.forces.problem import force_problem
+from torch_ekm.contact.forces.problem import force_cost, force_problem
 
 
 def cone_program(eq: BalanceEquations, options: ForceOptions | None = None) -> np.ndarray | None:
     """``[mu; lam; tau]`` with exact second-order cones in place of polyhedra and cuts; None: infeasible."""
     n_h = eq.object_matrix.shape[1]
-    problem, scale = force_problem(eq, options or ForceOptions(), np.zeros((0, n_h)))
+    options = options or ForceOptions()
+    cost = force_cost(eq, options)
+    problem, scale = force_problem(eq, options, cost, np.zeros((0, n_h))), cost.scale
     n = len(problem.q)
     up, low = np.isfinite(problem.ub), np.isfinite(problem.lb)
     eye = np.eye(n)
@@ -35,3 +37,27 @@ def cone_program(eq: BalanceEquations, options: ForceOptions | None = None) -> n
     solution = clarabel.DefaultSolver(P, problem.q, A, np.concatenate(rhs), cones, settings).solve()
     found = solution.status in (clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved)
     return scale * np.asarray(solution.x) if found else None
+
+
+def gaussian_posterior(eq: BalanceEquations, options: ForceOptions) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of ``[mu; lam]`` by Kalman's gain; balance, joints and sensors are measurements."""
+    n_h, n_a = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1]
+    S = np.zeros((n_h + n_a, n_h + n_a))
+    S[:n_h, :n_h], S[n_h:, n_h:] = eq.expected_covariance, 1e4 * np.eye(n_a)
+    x = np.concatenate([eq.expected, np.zeros(n_a)])
+    eye = np.eye(n_h + n_a)
+    measured = [  # rows, value, variance
+        (np.hstack([eq.hand_matrix, eq.actuator_matrix]), -eq.hand_load, options.torque_std**2),
+        (np.hstack([eq.object_matrix, np.zeros((len(eq.object_load), n_a))]), eq.object_load, 0.0),
+    ]
+    if eq.measured_normal is not None:
+        starts = [cone.start for cone in eq.cones]
+        known = np.isfinite(eq.measured_normal)
+        measured.append((eye[starts][known], eq.measured_normal[known], eq.normal_std**2))
+    if eq.measured_actuator is not None:
+        known = np.isfinite(eq.measured_actuator)
+        measured.append((-eye[n_h:][known], eq.measured_actuator[known], eq.actuator_std**2))
+    for H, value, variance in measured:
+        gain = S @ H.T @ np.linalg.inv(H @ S @ H.T + variance * np.eye(len(H)))
+        x, S = x + gain @ (value - H @ x), S - gain @ H @ S
+    return x, S

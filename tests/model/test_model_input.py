@@ -283,7 +283,7 @@ def test_states_of_a_batch_have_their_own_slack_tendons():
     wide = {
         f.name: getattr(forces, f.name).expand(2, *getattr(forces, f.name).shape)
         for f in dataclasses.fields(forces)
-        if f.name not in ("status", "lam")
+        if f.name not in ("status", "lam", "covariance", "margin_std")
     }
     both = dataclasses.replace(forces, lam=lam, status=forces.status * 2, **wide)
     fields = ("point", "normal", "gap", "finger_curvature", "object_curvature")

@@ -10,7 +10,7 @@ from .contact_kinematics import (
     hand_jacobian,
 )
 from .contact_model import ContactModel
-from .contact_set import ContactSet
+from .contact_set import ContactSet, NearMiss
 from .detector import ContactDetector
 from .forces.balance import ForceStatus
 from .forces.options import ForceOptions
@@ -27,6 +27,7 @@ __all__ = [
     "ForceOptions",
     "ForceStatus",
     "GraspAnalysis",
+    "NearMiss",
     "TrackedContacts",
     "analyse",
     "constraint_matrix",

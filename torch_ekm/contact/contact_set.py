@@ -29,6 +29,17 @@ _TAILS: dict[str, tuple[int, ...]] = {
 
 
 @dataclass(frozen=True)
+class NearMiss:
+    """What is near the object and counts as no contact: a pad beyond the margin, or a link that is no pad."""
+
+    link: str
+    pad: str | None
+    """None: a link, with which the model does not reckon."""
+    gap: float
+    """Signed distance to the object [m]."""
+
+
+@dataclass(frozen=True)
 class ContactSet:
     """``n_c`` contacts between finger links and the object, in the hand frame.
 
@@ -62,6 +73,8 @@ class ContactSet:
     """Soft-finger coefficient gamma [m]; 0: a point contact with friction."""
     pinned: tuple[bool, ...] = ()
     """Contact is a material point of both bodies (sharp tip or edge): no rolling term."""
+    near_misses: tuple[NearMiss, ...] = ()
+    """What the detector left out."""
 
     def __post_init__(self) -> None:
         n_c = len(self.finger)

@@ -60,10 +60,10 @@ def check_contacts(
         raise PenetrationError(which, -deepest, max_overlap)
 
 
-def at_contacts(
+def at_pads(
     hand: HandDescription, contacts: ContactSet, fingertip_force: Float[Tensor, "*batch n_pads"]
-) -> Float[Tensor, "*batch n_c"]:
-    """What the pads measure, in the order of the contacts [N]."""
+) -> dict[str, Float[Tensor, "*batch"]]:
+    """What the pads measure, by name [N]."""
     (fingertip_force,) = as_tensors(fingertip_force=fingertip_force)
     if bool(((fingertip_force < _LOWEST) | torch.isinf(fingertip_force)).any()):
         valid = f"finite or NaN, and above {_LOWEST} N: a pad cannot pull (is its zero or its sign wrong?)"
@@ -76,7 +76,7 @@ def at_contacts(
     for name in contacts.finger:
         if name not in pads:
             raise UnknownNameError("pad", name, pads)
-    return fingertip_force[..., [pads.index(name) for name in contacts.finger]]
+    return dict(zip(pads, fingertip_force.unbind(-1), strict=True))
 
 
 def joint_index(hand: HandDescription, name: str) -> int:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ..contact.contact_kinematics import ContactKinematics
+from ..contact.contact_set import ContactSet
 from ..contact.forces.balance import BalanceEquations, ForceStatus
 from ..contact.forces.friction import friction_cones, margins
+from ..contact.forces.options import ForceOptions
 from ..contact.forces.solve import contact_forces
 from ..description.hand import HandDescription
-from ..typing import Bool, Float, Tensor
+from ..typing import Array, Bool, Float, Tensor
 from .gradients import differentiable_forces
-from .linearization import GraspForces
+from .grasp_forces import ExpectedForces, ForcePrior, GraspForces, friction_use, margin_std
 from .options import ModelOptions
 from .reduction import Reduction
 
@@ -31,12 +35,12 @@ class ForceBalance:
         self.options, self.reduction = options, reduction
         self.joint_basis = reduction.joint_basis.double().numpy()
         self.pose_basis = reduction.pose_basis.double().numpy()
-        self.tendon = torch.tensor([actuator.tendon for actuator in hand.actuators])
+        self.tendon = np.array([actuator.tendon for actuator in hand.actuators])
         # joint torque [N m] that the weight of the forces may leave where a tendon pulls nothing
         pull = reduction.actuation.detach().double().cpu().numpy() @ self.joint_basis
         arm, limit = np.linalg.norm(pull, axis=1), options.slack_tension
         no_pull = 1e-3 * options.length / np.where(arm > 0, arm, 1.0) + (0.0 if limit is None else limit)
-        pulls = self.tendon.numpy() & (limit is not None)
+        pulls = self.tendon & (limit is not None)
         self.slack_above = torch.from_numpy(np.where(pulls, -no_pull, np.inf))
         # a joint beyond one of these touches its stop
         stops = (np.abs(self.joint_basis) > 1e-9).any(1)
@@ -77,24 +81,32 @@ class ForceBalance:
         locked: list[int],
         measured_normal: Tensor | None,
         last: GraspForces | None,
-        normal_std: float = 0.3,
+        normal_std: float | None = None,
+        actuator_load: Tensor | None = None,
+        expected: ExpectedForces | None = None,
     ) -> GraspForces:
-        """Solve every state; where there is no answer use the forces of ``last`` or zeros."""
+        """Solve every state; where there is no answer use the forces of ``last`` or zeros.
+
+        Measured normal forces ``(*batch, n_c)``, actuator loads and expected forces take part where given.
+        """
         batch, n_q = q.shape[:-1], q.shape[-1]
-        flat = [
-            x.detach().reshape(-1, *x.shape[len(batch) :]).double().cpu().numpy() for x in (q, A, V_q, V_p)
-        ]
-        measured = None
-        if measured_normal is not None:
-            measured = measured_normal.detach().reshape(-1, kin.contacts.n_c).double().cpu().numpy()
+        options = self.options.forces
+
+        def rows(x: Tensor) -> Array:
+            return x.detach().reshape(-1, *x.shape[len(batch) :]).double().cpu().numpy()
+
+        states = zip(*(rows(x) for x in (q, A, V_q, V_p)), strict=True)
+        measured = None if measured_normal is None else rows(measured_normal)
+        load = None if actuator_load is None else rows(actuator_load)
+        estimating = not (measured is None and load is None and expected is None)
+        prior = ForcePrior(kin, expected, options) if estimating else None
         cones = friction_cones(
             kin.models, kin.contacts.friction.tolist(), kin.contacts.torsional_friction.tolist()
         )
         spins = tuple(at for at, row in enumerate(kin.rows) if row % 6 >= 3)
         actuation = (self.reduction.actuation.detach().double().cpu().numpy() @ self.joint_basis).T
         results = []
-        for k in range(len(flat[0])):
-            q_k, A_k, V_q_k, V_p_k = (x[k] for x in flat)
+        for k, (q_k, A_k, V_q_k, V_p_k) in enumerate(states):
             joints, lower, upper = self._bounded(q_k, locked)
             eq = BalanceEquations(
                 object_matrix=-self.pose_basis.T @ A_k[:, n_q:].T,
@@ -105,16 +117,20 @@ class ForceBalance:
                 cones=cones,
                 length=self.options.length,
                 moment_rows=self.moment_rows,
-                tendon=self.tendon.numpy(),
+                tendon=self.tendon,
                 spin_columns=spins,
                 bound_matrix=-self.joint_basis[joints].T,
                 bound_lower=lower,
                 bound_upper=upper,
                 weight=self.weight,
                 measured_normal=None if measured is None else measured[k],
-                normal_std=normal_std,
+                normal_std=options.normal_std if normal_std is None else normal_std,
+                measured_actuator=None if load is None else load[k],
+                actuator_std=options.actuator_std,
             )
-            solution = contact_forces(eq, self.options.forces)
+            if prior is not None:
+                eq = prior.into(eq, k)
+            solution = contact_forces(eq, options)
             mu, lam = solution.mu, solution.lam
             residual, torque = np.zeros(n_q), np.zeros(n_q)
             if solution.status is ForceStatus.SOLVED:
@@ -125,30 +141,24 @@ class ForceBalance:
                 mu, lam = (x.detach().double().cpu().numpy() for x in (mu, lam))
             else:
                 mu, lam = np.zeros_like(mu), np.zeros_like(lam)
-            slack, relative = margins(cones, mu)
-            results.append((mu, lam, residual, torque, slack, relative, solution, eq))
+            kept = (*margins(cones, mu), [solution.violation], solution, eq)
+            results.append((mu, lam, residual, torque, *kept))
 
-        def stack(i: int) -> Tensor:
-            value = torch.from_numpy(np.stack([r[i] for r in results])).to(q)
-            return value.reshape(*batch, *value.shape[1:])
-
-        mu, lam, residual = stack(0), stack(1), stack(2)
+        names = ("mu", "lam", "residual", "stop_torque", "margin", "relative_margin", "violation")
+        sizes = [len(part) for part in results[0][:7]]
+        table = torch.from_numpy(np.stack([np.concatenate(r[:7]) for r in results])).to(q)
+        parts = dict(zip(names, table.reshape(*batch, -1).split(sizes, dim=-1), strict=True))
+        parts["violation"] = parts["violation"][..., 0]
         inputs = (A, V_q, V_p, self.reduction.actuation)
         if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
-            problems = [(r[7], r[6]) for r in results]
-            mu, lam, residual = self._with_graph(problems, A, V_q, V_p, mu, lam, residual)
-        violation = torch.tensor([r[6].violation for r in results], dtype=q.dtype, device=q.device)
-        return pack_forces(
-            kin,
-            mu,
-            lam,
-            residual=residual,
-            stop_torque=stack(3),
-            margin=stack(4),
-            relative_margin=stack(5),
-            status=tuple(r[6].status for r in results),
-            violation=violation.reshape(batch),
-        )
+            known = [parts[name] for name in names[:3]]
+            moving = self._with_graph([(r[8], r[7]) for r in results], A, V_q, V_p, *known)
+            parts.update(zip(names, moving, strict=False))
+        forces = pack_forces(kin, **parts, status=tuple(r[7].status for r in results))
+        if prior is None or not forces.solved:
+            return forces
+        sure = [prior.stacked(r[7].covariance, k) for k, r in enumerate(results)]
+        return with_covariance(kin.contacts, forces, torch.from_numpy(np.stack(sure)).to(q), options)
 
     def _with_graph(
         self, problems: list, A: Tensor, V_q: Tensor, V_p: Tensor, mu: Tensor, lam: Tensor, residual: Tensor
@@ -186,12 +196,20 @@ class ForceBalance:
 def pack_forces(kin: ContactKinematics, mu: Tensor, lam: Tensor, **rest) -> GraspForces:
     """Forces in hand axes from components in contact frames."""
     n_c = kin.contacts.n_c
-    full = mu.new_zeros(*mu.shape[:-1], 6 * n_c)
-    full[..., kin.rows] = mu
-    full = full.unflatten(-1, (n_c, 6))
+    full = mu.new_zeros(*mu.shape[:-1], 6 * n_c).index_copy(-1, kin.row_index, mu).unflatten(-1, (n_c, 6))
     spin = full[..., 3]
     force = (kin.frame @ full[..., :3, None])[..., 0]
     return GraspForces(mu=mu, lam=lam, force=force, spin_moment=spin, normal=full[..., 0], **rest)
+
+
+def with_covariance(
+    contacts: ContactSet, forces: GraspForces, covariance: Tensor, options: ForceOptions
+) -> GraspForces:
+    """The forces with how sure they are; ``covariance`` of the stack, one for each state ``(-1, m, m)``."""
+    covariance = covariance.reshape(*forces.normal.shape[:-1], *covariance.shape[-2:])
+    normal, _, gradient = friction_use(contacts, forces.force, forces.spin_moment, contacts.normal)
+    std = margin_std(contacts, normal, gradient, covariance, options)
+    return dataclasses.replace(forces, covariance=covariance, margin_std=std)
 
 
 def known_forces(kin: ContactKinematics, mu: Tensor, lam: Tensor) -> GraspForces:

@@ -21,7 +21,7 @@ from .._extras import require
 from ..contact.contact_set import ContactSet
 from ..contact.forces.balance import BalanceEquations, ForceSolution
 from ..contact.forces.options import ForceOptions
-from ..contact.forces.problem import force_problem
+from ..contact.forces.problem import force_cost, force_problem
 from ..exceptions import NoContactError
 from ..kinematics.grasp_state import GraspState
 from ..typing import Float, Tensor
@@ -119,11 +119,12 @@ def differentiable_forces(
         eq, options, solution: the problem and its answer.
         object_matrix, object_load, hand_matrix, actuator_matrix, hand_load: as in ``eq``, with a graph.
     """
-    problem, scale = force_problem(eq, options, np.zeros((0, len(solution.mu))))
+    cost = force_cost(eq, options)
+    problem, scale = force_problem(eq, options, cost, np.zeros((0, len(solution.mu)))), cost.scale
     n_h, n_a, n = len(solution.mu), len(solution.lam), len(scale)
     x = np.concatenate([solution.mu, solution.lam, solution.bound]) / scale
-    P, A = np.array(problem.P), np.asarray(problem.A)
-    slope = P @ x + problem.q
+    P, A = cost.P, cost.balance
+    slope = P @ x + cost.q
     rows, curvature = _active(eq, solution.mu, x, scale, problem.lb, problem.ub)
     n_e = len(A)
     # inequalities push one way only

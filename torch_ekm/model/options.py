@@ -45,6 +45,8 @@ class ModelOptions:
     crown_radius: float = 0.5
     """Of the slight crown along a pad where it lies flat on a flat face [m], which gives that line of contact
     a point; infinite: none, and the point jumps from end to end as the finger tilts."""
+    link_margin: float = 0.001
+    """Gap up to which a link that is no pad is reported as touching [m]."""
     max_overlap: float = 0.005
     """Deepest penetration of finger and object that is still modelled [m]."""
     stop_tolerance: float = math.radians(0.1)
@@ -62,7 +64,7 @@ class ModelOptions:
         for name in ("length", "max_overlap", "contact_stiffness", "crown_radius"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
-        for name in ("stiffness_floor", "stop_tolerance", "stop_torque", "contact_margin"):
+        for name in ("stiffness_floor", "stop_tolerance", "stop_torque", "contact_margin", "link_margin"):
             if not getattr(self, name) >= 0:
                 raise ParameterError(name, getattr(self, name), "not negative")
         if self.slack_tension is not None and not self.slack_tension >= 0:

@@ -45,7 +45,7 @@ class Reduction(nn.Module):
 
     def __init__(self, hand: HandDescription, options: ModelOptions, dtype: torch.dtype) -> None:
         super().__init__()
-        self.options = options
+        self.options, self.actuators = options, hand.actuator_names
         joint = joint_basis(hand).to(dtype)
         pose = torch.eye(6, dtype=dtype)
         if hand.planar_normal is not None:
@@ -145,7 +145,7 @@ class Reduction(nn.Module):
         R = D.new_zeros(E.shape[-2], n_a)
         R[n_h : n_h + len(rigid)] = eye[rigid] / arm
         try:
-            step = two_stage(D, E, R, F, on_unstable=self.options.on_unstable)
+            step = two_stage(D, E, R, F, on_unstable=self.options.on_unstable, actuators=self.actuators)
         except (SingularGraspError, UnstableGraspError) as error:
             if error.direction is not None:  # into state coordinates
                 direction = S @ error.direction[:n_z]

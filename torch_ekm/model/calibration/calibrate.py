@@ -14,7 +14,7 @@ from ..kinematic_model import KinematicModel
 from .identifiability import unidentified
 from .motions import Recording, rests
 from .parameters import Unknowns
-from .residuals import FORCE, GROUPS, Evidence, Residuals
+from .residuals import GROUPS, Evidence, Residuals
 from .result import Calibration
 
 _SMALLEST_NOISE = 1e-3  # of the standard deviations at the start: below, the model's own error is left
@@ -132,8 +132,8 @@ class _Problem:
         """Estimated standard deviations [rad, m, N m, N]."""
         found = {name: float(s * self.noise[k]) for k, (name, s) in enumerate(GROUPS.items())}
         scale = found.pop("equilibrium")
-        torque = self.evidence.model.options.forces.torque_std
-        return {**found, "torque": scale * torque, "force": scale * FORCE}
+        options = self.evidence.model.options.forces
+        return {**found, "torque": scale * options.torque_std, "force": scale * options.normal_std}
 
     def estimate_noise(self, x: Array) -> None:
         """Standard deviation of each kind of residual; those of motions by the median, since contacts slip.

@@ -33,8 +33,6 @@ tension [rad]; of joint torques and fingertip forces in units of those by which 
 anew from the residuals."""
 
 
-FORCE = 0.3
-"""[N] by which the force problem weighs fingertip forces."""
 _SLACK = 1e-3  # [N m] a tendon with less has no length to compare
 
 
@@ -69,7 +67,9 @@ class Evidence:
     """
 
     def __init__(self, model: KinematicModel, grasps: list[list[Rest]], unknowns: Unknowns) -> None:
-        options = dataclasses.replace(model.options, on_unstable="flag")
+        # a guess of the tangential forces would pull at the figures
+        forces = dataclasses.replace(model.options.forces, start_std=100.0)
+        options = dataclasses.replace(model.options, on_unstable="flag", forces=forces)
         self.model = KinematicModel(
             model.hand, model.obj, options, kinematics=model.kinematics, detector=model.detector
         )
@@ -141,7 +141,7 @@ class Evidence:
             pads = [pad.name for pad in self.model.hand.pads]
             measured = rest.force[[pads.index(name) for name in lin.contacts.finger]]
             known = torch.isfinite(measured)
-            parts.append((lin.forces.normal - measured)[known] / FORCE)
+            parts.append((lin.forces.normal - measured)[known] / self.model.options.forces.normal_std)
         return {"equilibrium": torch.cat(parts)}
 
     def _encoders(self, lin: Linearization, rest: Rest, z: Tensor, at: Figures) -> dict[str, Tensor]:
