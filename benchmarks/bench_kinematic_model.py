@@ -96,7 +96,11 @@ def test_batch_with_known_contacts_and_forces(benchmark, grasp):
     state = GraspState(many(at.state.q), many(at.state.position), many(at.state.rotation))
     names = ("point", "normal", "gap", "finger_curvature", "object_curvature")
     contacts = at.contacts.replace(**{name: many(getattr(at.contacts, name)) for name in names})
-    fields = {f.name: many(getattr(forces, f.name)) for f in dataclasses.fields(forces) if f.name != "status"}
+    fields = {
+        f.name: many(getattr(forces, f.name))
+        for f in dataclasses.fields(forces)
+        if f.name != "status" and getattr(forces, f.name) is not None
+    }
     batch = dataclasses.replace(forces, status=forces.status * BATCH, **fields)
     lin = benchmark.pedantic(
         model.linearize, args=(state, contacts), kwargs={"forces": batch}, rounds=5, warmup_rounds=1

@@ -5,19 +5,18 @@ from __future__ import annotations
 import clarabel
 import numpy as np
 from scipy import sparse
-from scipy.spatial import ConvexHull
 
-from torch_ekm.contact.contact_kinematics import ContactKinematics, grasp_matrix
 from torch_ekm.contact.forces.balance import BalanceEquations
-from torch_ekm.contact.forces.friction import friction_cones
 from torch_ekm.contact.forces.options import ForceOptions
-from torch_ekm.contact.forces.problem import force_problem
+from torch_ekm.contact.forces.problem import force_cost, force_problem
 
 
 def cone_program(eq: BalanceEquations, options: ForceOptions | None = None) -> np.ndarray | None:
     """``[mu; lam; tau]`` with exact second-order cones in place of polyhedra and cuts; None: infeasible."""
     n_h = eq.object_matrix.shape[1]
-    problem, scale = force_problem(eq, options or ForceOptions(), np.zeros((0, n_h)))
+    options = options or ForceOptions()
+    cost = force_cost(eq, options)
+    problem, scale = force_problem(eq, options, cost, np.zeros((0, n_h))), cost.scale
     n = len(problem.q)
     up, low = np.isfinite(problem.ub), np.isfinite(problem.lb)
     eye = np.eye(n)
@@ -40,21 +39,25 @@ def cone_program(eq: BalanceEquations, options: ForceOptions | None = None) -> n
     return scale * np.asarray(solution.x) if found else None
 
 
-def ferrari_canny(kin: ContactKinematics, length: float = 0.03, faces: int = 64) -> float:
-    """Radius of the largest ball about 0 in the hull of the wrenches of unit normal forces; 0: no closure.
-
-    Ferrari and Canny, Planning optimal grasps, ICRA 1992, L1 version; moments divided by ``length``. Points
-    with friction only.
-    """
-    scale = np.array([1.0, 1.0, 1.0, 1 / length, 1 / length, 1 / length])
-    G = scale[:, None] * grasp_matrix(kin).numpy()
-    angle = 2 * np.pi * np.arange(faces) / faces
-    wrenches = []
-    for cone in friction_cones(kin.models, kin.contacts.friction.tolist(), [0.0] * kin.contacts.n_c):
-        normal, first, second = G[:, cone.start : cone.start + 3].T
-        edge = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
-        wrenches.append(normal + cone.mu_s * edge)
-    points = np.concatenate(wrenches)
-    if np.linalg.matrix_rank(points, 1e-9) < 6:
-        return 0.0
-    return max(0.0, float((-ConvexHull(points).equations[:, -1]).min()))
+def gaussian_posterior(eq: BalanceEquations, options: ForceOptions) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of ``[mu; lam]`` by Kalman's gain; balance, joints and sensors are measurements."""
+    n_h, n_a = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1]
+    S = np.zeros((n_h + n_a, n_h + n_a))
+    S[:n_h, :n_h], S[n_h:, n_h:] = eq.expected_covariance, 1e4 * np.eye(n_a)
+    x = np.concatenate([eq.expected, np.zeros(n_a)])
+    eye = np.eye(n_h + n_a)
+    measured = [  # rows, value, variance
+        (np.hstack([eq.hand_matrix, eq.actuator_matrix]), -eq.hand_load, options.torque_std**2),
+        (np.hstack([eq.object_matrix, np.zeros((len(eq.object_load), n_a))]), eq.object_load, 0.0),
+    ]
+    if eq.measured_normal is not None:
+        starts = [cone.start for cone in eq.cones]
+        known = np.isfinite(eq.measured_normal)
+        measured.append((eye[starts][known], eq.measured_normal[known], eq.normal_std**2))
+    if eq.measured_actuator is not None:
+        known = np.isfinite(eq.measured_actuator)
+        measured.append((-eye[n_h:][known], eq.measured_actuator[known], eq.actuator_std**2))
+    for H, value, variance in measured:
+        gain = S @ H.T @ np.linalg.inv(H @ S @ H.T + variance * np.eye(len(H)))
+        x, S = x + gain @ (value - H @ x), S - gain @ H @ S
+    return x, S

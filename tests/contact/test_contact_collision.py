@@ -106,6 +106,37 @@ def test_cylinder_side_is_anisotropic() -> None:
     assert float(contacts.gap) == pytest.approx(0.0, abs=1e-15)
 
 
+@pytest.mark.parametrize("kind", ["cylinder", "sphere", "capsule"])
+def test_a_curved_object_has_its_own_contact_point_and_no_crown(kind: str) -> None:
+    """Closest points of two lines (or a line and a point) in closed form; off the pad's middle by 4 mm."""
+    rng = np.random.default_rng(4)
+    radius = SHAPES[kind][0]
+    for _ in range(20):
+        rotation = turned(*rng.uniform(-0.5, 0.5, 3))
+        axis, along = rotation[:, 2], torch.tensor([1.0, 0.0, 0.0], dtype=F64)
+        side = torch.linalg.cross(along, axis)
+        side = side / side.norm() if kind != "sphere" else torch.tensor([0.0, -0.6, 0.8], dtype=F64)
+        at = torch.tensor([0.004, 0.0, 0.0], dtype=F64)
+        contacts = touch(probe(thing(kind)), at + (radius + RADIUS) * side, rotation)
+        expected = at + RADIUS * side
+        torch.testing.assert_close(contacts.point[0], expected, atol=1e-9, rtol=0)
+        across = torch.linalg.cross(along, contacts.normal[0])
+        expected_K = torch.outer(across, across) / RADIUS  # a cylinder's: flat along its axis
+        torch.testing.assert_close(contacts.finger_curvature[0], expected_K, atol=1e-5, rtol=0)
+
+
+def test_a_crown_makes_up_what_the_object_lacks_and_may_be_left_out() -> None:
+    turn = turned(0.0, math.pi / 2 - 0.1, 0.0)  # a cylinder nearly along the pad: curved by 50 sin^2(0.1) / m
+    lying = touch(probe(thing("cylinder")), [0.0, 0.02 + RADIUS, 0.0], turn)
+    k = math.sin(0.1) ** 2 / (0.02 + RADIUS)  # of the level set at the pad's axis
+    assert float(lying.finger_curvature[0, 0, 0]) == pytest.approx(2.0 - k, abs=1e-3)
+    flat = touch(probe(thing("box"), crown_radius=math.inf), [0.0, 0.015 + RADIUS, 0.0])
+    torch.testing.assert_close(flat.point[0], torch.tensor([0.0, RADIUS, 0.0], dtype=F64))
+    assert float(flat.finger_curvature[0, 0, 0]) == pytest.approx(0.0, abs=1e-9)
+    tilted = touch(probe(thing("box"), crown_radius=math.inf), [0.0, 0.0216, 0.0], turned(0, 0, 0.003))
+    assert abs(float(tilted.point[0, 0])) == pytest.approx(HALF, abs=1e-4)  # at an end at once
+
+
 def test_edges_and_corners_are_pinned() -> None:
     edge = touch(probe(thing("box"), ball=True), [0.0, 0.015 + 0.004, 0.02 + 0.004])
     corner = touch(probe(thing("box"), ball=True), [0.045 + 0.003, 0.015 + 0.003, 0.02 + 0.003])
@@ -370,7 +401,7 @@ def test_errors() -> None:
         detector(q, position, rotation[None])
     with pytest.raises(NonFiniteError, match="position"):
         detector(q, position * math.nan, rotation)
-    for bad in ({"margin": -1.0}, {"margin": math.nan}, {"crown_radius": 0.0}, {"crown_radius": math.inf}):
+    for bad in ({"margin": -1.0}, {"margin": math.nan}, {"crown_radius": 0.0}, {"crown_radius": math.nan}):
         with pytest.raises(ParameterError):
             ContactDetector(detector.hand, detector.obj, **bad)
     assert "box" in repr(detector)

@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 import torch
 from contact_samples import F64, THREE, held
-from force_oracles import cone_program, ferrari_canny
+from force_oracles import cone_program, gaussian_posterior
 
-from torch_ekm.contact import ForceOptions, ForceStatus, contact_forces, grasp_matrix, hand_jacobian
+from torch_ekm.contact import (
+    ForceOptions,
+    ForceStatus,
+    contact_forces,
+    ferrari_canny,
+    grasp_matrix,
+    hand_jacobian,
+)
 from torch_ekm.contact.forces.balance import BalanceEquations
 from torch_ekm.contact.forces.friction import friction_cones, margins, outer_directions
 from torch_ekm.exceptions import ParameterError
@@ -212,3 +219,54 @@ def test_soft_finger_bears_spin_up_to_its_coefficient():
     assert solve(0.039, 4.0).status is ForceStatus.SOLVED
     assert solve(0.041, 4.0).status is ForceStatus.NOT_GRASPABLE
     assert torch.tensor(solve(0.039, 4.0).mu, dtype=F64)[[0, 4]].max() <= 4.0 + 1e-9
+
+
+def expecting(eq: BalanceEquations, seed=0, size=0.3) -> BalanceEquations:
+    """Forces near the truth are expected, with a full covariance."""
+    draw = np.random.default_rng(seed)
+    mu, _ = eq.__dict__["truth"]
+    half = draw.standard_normal((len(mu), len(mu)))
+    covariance = size**2 * (half @ half.T / len(mu) + 0.1 * np.eye(len(mu)))
+    for column in eq.spin_columns:
+        covariance[column], covariance[:, column] = 0.03 * covariance[column], 0.03 * covariance[:, column]
+    expected = draw.multivariate_normal(mu, covariance)
+    return dataclasses.replace(eq, expected=expected, expected_covariance=covariance)
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.01])
+@pytest.mark.parametrize(
+    "measured",
+    [
+        {},
+        {"measured_normal": np.array([3.1, np.nan, 2.7])},
+        {"measured_actuator": np.array([0.1, 0.06, np.nan])},
+    ],
+)
+def test_expected_forces_and_measurements_give_the_gaussian_posterior(gamma, measured):
+    eq, options = expecting(equations(friction=3.0, gamma=gamma, **measured)), ForceOptions()
+    solution = contact_forces(eq, options)
+    mean, covariance = gaussian_posterior(eq, options)
+    n_h = len(solution.mu)
+    assert solution.solves == 0  # no inequality acts
+    assert np.abs(solution.mu - mean[:n_h]).max() < 1e-4
+    assert np.abs(solution.covariance - covariance[:n_h, :n_h]).max() < 2e-4 * covariance.max()
+    assert solution.violation < 1e-9
+
+
+def test_forces_stay_in_balance_and_in_the_cones_whatever_is_expected():
+    eq = expecting(equations(friction=0.5, grip=1.5), size=0.3)
+    eq = dataclasses.replace(eq, expected=eq.expected + np.tile([-1.0, 2.0, -1.5], 3))
+    solution = contact_forces(eq)
+    assert solution.status is ForceStatus.SOLVED
+    assert solution.solves > 0
+    assert margins(eq.cones, solution.mu)[0].min() > -1e-6
+    assert solution.violation < 1e-8
+
+
+def test_the_answer_without_inequalities_is_taken_only_where_it_keeps_them():
+    free = equations(friction=3.0)
+    assert contact_forces(free).solves == 0
+    starts = [cone.start for cone in free.cones]
+    low = contact_forces(free, ForceOptions(max_normal=2.5)).mu[starts]
+    assert contact_forces(free).mu[starts].max() > 2.6
+    assert low.max() < 2.5 + 1e-6

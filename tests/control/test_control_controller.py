@@ -98,6 +98,23 @@ def test_where_no_forces_are_found_those_of_the_same_grasp_stand_in(grasp) -> No
     assert status() is ModelStatus.NO_FORCES
 
 
+def test_forces_are_those_that_fingertips_and_the_last_decision_speak_for(grasp) -> None:
+    plant, model, seen, state = grasp
+    loop = controller(grasp)
+    target = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG)
+    first = loop.decide(state, seen.a, target, seen.fingertip_force)
+    moved = seen.a + 0.5 * first.delta_a
+    second = loop.decide(state, moved, target, seen.fingertip_force).linearization
+    expected = first.linearization.forces_after(moved - seen.a)
+    alone = model.linearize(state, fingertip_force=seen.fingertip_force, expected=expected)
+    assert torch.equal(second.forces.mu, alone.forces.mu)
+    assert torch.equal(second.forces.margin_std, alone.forces.margin_std)
+    assert not torch.allclose(second.forces.mu, first.linearization.forces.mu, atol=1e-3)
+    loop.reset()
+    again = loop.decide(state, seen.a, target, seen.fingertip_force).linearization
+    assert torch.equal(again.forces.mu, first.linearization.forces.mu)
+
+
 def test_limits_are_kept_and_told(grasp) -> None:
     plant, _, seen, state = grasp
     small = ActuatorLimit(0.05 * DEG, fixed=("thumb_oppose",))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -21,8 +22,9 @@ def page() -> str:
     return PAGE.read_text(encoding="utf-8")
 
 
-def block(page: str, language: str) -> str:
-    found = re.search(rf"```{language}\n(.*?)```", page, re.DOTALL)
+def block(page: str, language: str, containing: str = "") -> str:
+    blocks = re.finditer(rf"```{language}\n(.*?)```", page, re.DOTALL)
+    found = next((match for match in blocks if containing in match.group(1)), None)
     assert found is not None
     return found.group(1)
 
@@ -47,3 +49,31 @@ def test_every_key_is_documented(page: str) -> None:
     assert not missing
     for table in transmission.TABLES:
         assert re.search(rf"`\[+{table}\]+`", page), table
+
+
+def test_the_printed_calibration_runs(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    pytest.importorskip("sapien")
+    from torch_ekm.description import write_transmission
+    from torch_ekm.plant import RecordingPlant, TrialLog
+    from torch_ekm.simulation import SimulatedHand
+
+    monkeypatch.chdir(tmp_path)
+    described = load_hand("planar_two_finger")
+    springs = described.spring_stiffness * [1.3, 0.8, 0.75, 1.25]
+    write_transmission(dataclasses.replace(described, spring_stiffness=springs), "my_hand.transmission.toml")
+    plant = RecordingPlant(SimulatedHand("planar_two_finger", "can"))
+    log = TrialLog("recordings", {})
+    draw = torch.Generator().manual_seed(0)
+    for trial in range(2):
+        plant.reset(trial)
+        for _ in range(3):
+            plant.command(0.06 * torch.rand(2, generator=draw, dtype=torch.float64) - 0.03)
+        log.write(trial, plant.trajectory)
+    plant.close()
+    names: dict = {}
+    exec(block(page, "python", "calibrate"), names)
+    assert "spring of left_0" in capsys.readouterr().out
+    found = names["hand"].spring_stiffness
+    assert (abs(found / described.spring_stiffness - 1) < 0.1).all()

@@ -250,7 +250,7 @@ def build(
     Zp = model.reduction.pose_basis
     mu = wish + torch.linalg.pinv(Zp.T @ G) @ (Zp.T @ (V_p - G @ wish))
     assert float((Zp.T @ (G @ mu - V_p)).abs().max()) < 1e-10
-    lam = torch.full((len(np.atleast_2d(J_a)),), float(lam), dtype=F64)
+    lam = torch.as_tensor(lam, dtype=F64).expand(len(np.atleast_2d(J_a))).clone()
     torque = A[:, :n_q].T @ mu + model.reduction.actuation.T @ lam
     rest = q + torque / torch.as_tensor(np.asarray(springs, dtype=float))
     model = make(rest.numpy())

@@ -45,13 +45,23 @@ def test_no_contacts():
         rebuilt(toy, contacts=select(toy.contacts, [])).linearize(toy.state)
 
 
-def test_one_contact_cannot_hold_but_the_answer_is_finite():
+@pytest.mark.parametrize("on_unstable", ["raise", "flag"])
+def test_a_motion_that_nothing_resists_is_an_error_whatever_the_option_says(on_unstable):
     toy = three_finger()
-    with pytest.raises((SingularGraspError, UnstableGraspError)) as caught:  # the object topples
-        rebuilt(toy, contacts=select(toy.contacts, [0])).linearize(toy.state)
+    options = dataclasses.replace(toy.model.options, on_unstable=on_unstable)
+    with pytest.raises(SingularGraspError, match="a motion of the object") as caught:
+        rebuilt(toy, contacts=select(toy.contacts, [0]), options=options).linearize(toy.state)
+    assert caught.value.direction[-3:].norm() > 0.1
+
+
+def test_one_soft_contact_cannot_hold_but_the_answer_is_finite():
+    toy = three_finger()
+    soft = select(toy.contacts, [0]).replace(torsional_friction=torch.full((1,), 0.005, dtype=F64))
+    with pytest.raises(UnstableGraspError) as caught:  # the object topples
+        rebuilt(toy, contacts=soft).linearize(toy.state)
     assert caught.value.direction[-3:].norm() > 0.1
     flag = dataclasses.replace(toy.model.options, on_unstable="flag")
-    lin = rebuilt(toy, contacts=select(toy.contacts, [0]), options=flag).linearize(toy.state)
+    lin = rebuilt(toy, contacts=soft, options=flag).linearize(toy.state)
     assert lin.status is ModelStatus.UNSTABLE
     assert lin.forces.status == (ForceStatus.NOT_GRASPABLE,)
     assert torch.isfinite(lin.manipulation_jacobian).all()

@@ -10,12 +10,12 @@ from .contact_kinematics import (
     hand_jacobian,
 )
 from .contact_model import ContactModel
-from .contact_set import ContactSet
+from .contact_set import ContactSet, NearMiss
 from .detector import ContactDetector
 from .forces.balance import ForceStatus
 from .forces.options import ForceOptions
 from .forces.solve import contact_forces
-from .grasp_analysis import GraspAnalysis, analyse
+from .grasp_analysis import GraspAnalysis, analyse, ferrari_canny
 from .signed_distance import signed_distance
 from .surface import TrackedContacts
 
@@ -27,11 +27,13 @@ __all__ = [
     "ForceOptions",
     "ForceStatus",
     "GraspAnalysis",
+    "NearMiss",
     "TrackedContacts",
     "analyse",
     "constraint_matrix",
     "contact_forces",
     "contact_kinematics",
+    "ferrari_canny",
     "grasp_matrix",
     "hand_jacobian",
     "signed_distance",

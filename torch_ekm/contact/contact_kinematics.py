@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 
@@ -35,17 +36,32 @@ class ContactKinematics:
     mobility: Float[Tensor, "*batch n_c 3 3"]
     """(K_f + K_o)^+ in the tangent plane [m]: how far a contact point runs per radian of rolling."""
 
-    @property
+    @cached_property
     def rows(self) -> list[int]:
         """Rows of the ``6 n_c`` components that the contact models transmit."""
         return selected_rows(self.models)
 
-    @property
+    @cached_property
     def normal_rows(self) -> list[int]:
         """Position of each contact's normal force in ``mu``."""
         return normal_rows(self.models)
 
-    @property
+    @cached_property
+    def row_index(self) -> Tensor:
+        """:attr:`rows` as an index."""
+        return torch.tensor(self.rows, dtype=torch.int64, device=self.frame.device)
+
+    @cached_property
+    def normal_hat(self) -> Float[Tensor, "*batch n_c 3 3"]:
+        """``[n_i]x``."""
+        return hat(self.contacts.normal)
+
+    @cached_property
+    def roll(self) -> Float[Tensor, "*batch n_c 3 3"]:
+        """``M_i [n_i]x``: the contact point runs ``-M_i [n_i]x w_rel``."""
+        return self.mobility @ self.normal_hat
+
+    @cached_property
     def relative_spin(self) -> Float[Tensor, "*batch n_c 3 n_s"]:
         """Omega_i ds = w_finger - w_object: ``[J_w,i, 0, -I]``."""
         J_w = self.spin_jacobian
@@ -68,35 +84,34 @@ def contact_frames(
         t1 = torch.linalg.cross(plane.expand_as(n_in), n_in)
         t1 = t1 / torch.linalg.vector_norm(t1, dim=-1, keepdim=True).clamp_min(1e-12)
         return torch.stack([n_in, t1, torch.linalg.cross(n_in, t1)], dim=-1)
-    x, y, z = n_in.unbind(-1)
-    sign = torch.where(z >= 0, 1.0, -1.0).to(z.dtype)
-    a = -1 / (sign + z)
-    b = x * y * a
-    t1 = torch.stack([1 + sign * x * x * a, sign * b, -sign * x], dim=-1)
-    t2 = torch.stack([b, sign + y * y * a, -y], dim=-1)
-    return torch.stack([n_in, t1, t2], dim=-1)
+    # a reflection takes -+e_z to n_in, and e_x and e_y to the tangents
+    eye = torch.eye(3, dtype=n_in.dtype, device=n_in.device)
+    sign = torch.copysign(torch.ones_like(n_in[..., 2:]), n_in[..., 2:])
+    across = n_in[..., :2] / (1 + sign * n_in[..., 2:])
+    tangent = eye[:, :2] - (n_in + sign * eye[2])[..., None] * across[..., None, :]
+    t1, t2 = tangent.split(1, dim=-1)
+    return torch.cat([n_in[..., None], t1, sign[..., None] * t2], dim=-1)
 
 
-def rolling_mobility(
-    contacts: ContactSet, frame: Float[Tensor, "*batch n_c 3 3"]
-) -> Float[Tensor, "*batch n_c 3 3"]:
+def rolling_mobility(contacts: ContactSet) -> Float[Tensor, "*batch n_c 3 3"]:
     """``(K_f + K_o)^+`` in the tangent plane [m]; 0 where pinned or along directions in which both are flat.
 
-    The 2x2 pseudo-inverse is taken in closed form: the inverse for rank two,
+    In closed form, with the plane's projection P: ``(tr(K) P - K) / det(K)`` for rank two,
     ``K / tr(K)^2`` for rank one (a cylinder on a plane), 0 for rank nought.
     """
-    tangent = frame[..., 1:]
-    k = tangent.mT @ (contacts.finger_curvature + contacts.object_curvature) @ tangent
-    a, b, c = k[..., 0, 0], 0.5 * (k[..., 0, 1] + k[..., 1, 0]), k[..., 1, 1]
-    trace, det = a + c, a * c - b * b
-    small = 0.5 * (trace - torch.sqrt((a - c) ** 2 + 4 * b * b))  # the smaller eigenvalue
+    n = contacts.normal
+    P = torch.eye(3, dtype=n.dtype, device=n.device) - n[..., None] * n[..., None, :]
+    K = P @ (contacts.finger_curvature + contacts.object_curvature) @ P
+    trace, square = K.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None], (K * K).sum((-2, -1), keepdim=True)
+    det = 0.5 * (trace * trace - square)
+    small = 0.5 * (trace - (2 * square - trace * trace).clamp_min(0).sqrt())  # the smaller eigenvalue
+    # 1 in place of a divisor that is not used: no NaN in a gradient
     full = small > FLAT
-    inverse = torch.stack([c, -b, -b, a], dim=-1) / torch.where(full, det, torch.ones_like(det))[..., None]
-    single = torch.stack([a, b, b, c], dim=-1) / torch.where(trace > FLAT, trace, torch.inf)[..., None] ** 2
-    m = torch.where(full[..., None], inverse, single).unflatten(-1, (2, 2))
+    inverse = (trace * P - K) / torch.where(full, det, 1.0)
+    m = torch.where(full, inverse, K / torch.where(trace > FLAT, trace, torch.inf).square())
     if any(contacts.pinned):
         m = m * torch.tensor([not p for p in contacts.pinned], dtype=m.dtype, device=m.device)[:, None, None]
-    return tangent @ m @ tangent.mT
+    return m
 
 
 def contact_kinematics(
@@ -137,7 +152,7 @@ def contact_kinematics(
         axis=axis,
         point_jacobian=velocity.mT,
         spin_jacobian=spin.mT,
-        mobility=rolling_mobility(contacts, frame) if rolling else torch.zeros_like(frame),
+        mobility=rolling_mobility(contacts) if rolling else torch.zeros_like(frame),
     )
 
 
@@ -159,12 +174,12 @@ def full_grasp_matrix(kin: ContactKinematics) -> Float[Tensor, "*batch 6 6*n_c"]
 
 def hand_jacobian(kin: ContactKinematics) -> Float[Tensor, "*batch n_h n_q"]:
     """``J_h = H J~_h``."""
-    return full_hand_jacobian(kin)[..., kin.rows, :]
+    return full_hand_jacobian(kin).index_select(-2, kin.row_index)
 
 
 def grasp_matrix(kin: ContactKinematics) -> Float[Tensor, "*batch 6 n_h"]:
     """``G = G~ H^T``."""
-    return full_grasp_matrix(kin)[..., kin.rows]
+    return full_grasp_matrix(kin).index_select(-1, kin.row_index)
 
 
 def constraint_matrix(kin: ContactKinematics) -> Float[Tensor, "*batch n_h n_s"]:

@@ -3,15 +3,40 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 
-from ..exceptions import ShapeError
+from ..exceptions import NonFiniteError, ParameterError, ShapeError
+from ..kinematics.tensors import as_tensors
 from ..typing import Float, Tensor
 
 CHARACTERISTIC_LENGTH = 0.03
 """L [m], size of a held object: what makes lengths comparable with angles, and moments with forces."""
+
+_UNIT = 1e-4
+"""How far the length of a normal may be from 1."""
+_TAILS: dict[str, tuple[int, ...]] = {
+    "point": (3,),
+    "normal": (3,),
+    "gap": (),
+    "finger_curvature": (3, 3),
+    "object_curvature": (3, 3),
+    "friction": (),
+    "torsional_friction": (),
+}
+
+
+@dataclass(frozen=True)
+class NearMiss:
+    """What is near the object and counts as no contact: a pad beyond the margin, or a link that is no pad."""
+
+    link: str
+    pad: str | None
+    """None: a link, with which the model does not reckon."""
+    gap: float
+    """Signed distance to the object [m]."""
 
 
 @dataclass(frozen=True)
@@ -21,6 +46,11 @@ class ContactSet:
     The same links touch over a whole batch; only numbers vary along ``*batch``.
     Curvature tensors live in the tangent plane (``K n = 0``) and are positive for convex
     bodies; 0 is flat, and an infinitely sharp (pinned) contact is said by ``pinned``.
+    Arrays and nested lists are converted, and all fields get the widest of their precisions.
+
+    Raises:
+        ShapeError: the fields do not belong together.
+        ParameterError: a field that is not made of numbers.
     """
 
     finger: tuple[str, ...]
@@ -43,16 +73,43 @@ class ContactSet:
     """Soft-finger coefficient gamma [m]; 0: a point contact with friction."""
     pinned: tuple[bool, ...] = ()
     """Contact is a material point of both bodies (sharp tip or edge): no rolling term."""
+    near_misses: tuple[NearMiss, ...] = ()
+    """What the detector left out."""
 
     def __post_init__(self) -> None:
         n_c = len(self.finger)
+        given = {name: getattr(self, name) for name in _TAILS}
+        for name, value in zip(given, as_tensors(**given), strict=True):
+            object.__setattr__(self, name, value)  # the dataclass is frozen
         if not self.pinned:
             object.__setattr__(self, "pinned", (False,) * n_c)
-        for name, tail in (("point", (n_c, 3)), ("normal", (n_c, 3)), ("gap", (n_c,))):
-            shape = tuple(getattr(self, name).shape)
-            if shape[len(shape) - len(tail) :] != tail:
-                expected = "(*batch, " + ", ".join(str(k) for k in tail) + ")"
-                raise ShapeError(f"ContactSet.{name}", expected, shape)
+        for name, tail in _TAILS.items():
+            shape, expected = tuple(getattr(self, name).shape), (n_c, *tail)
+            if shape[-len(expected) :] != expected:
+                raise ShapeError(f"ContactSet.{name}", f"(*batch, {', '.join(map(str, expected))})", shape)
+        for name in ("link", "pinned"):
+            if len(getattr(self, name)) != n_c:
+                raise ShapeError(f"ContactSet.{name}", f"{n_c} entries", (len(getattr(self, name)),))
+
+    def check(self) -> None:
+        """The numbers must make sense; apart from the constructor, which also runs where tensors have none.
+
+        Raises:
+            NonFiniteError: a NaN or an infinity; ``pinned`` says that a contact is infinitely sharp.
+            ParameterError: a normal that is no unit vector, or a negative coefficient of friction.
+        """
+        if not bool(torch.isfinite(torch.cat([getattr(self, name).flatten() for name in _TAILS])).all()):
+            name = next(name for name in _TAILS if not bool(torch.isfinite(getattr(self, name)).all()))
+            raise NonFiniteError(f"contacts.{name}")
+        size = torch.linalg.vector_norm(self.normal, dim=-1).flatten().tolist()
+        if size and not (min(size) > 1 - _UNIT and max(size) < 1 + _UNIT):
+            worst = max(range(len(size)), key=lambda k: abs(size[k] - 1))
+            where = f"contacts.normal of '{self.finger[worst % self.n_c]}'"
+            raise ParameterError(where, f"a vector of length {size[worst]:.4g}", "of unit length")
+        for name in ("friction", "torsional_friction"):
+            for finger, value in zip(self.finger, getattr(self, name).tolist(), strict=True):
+                if value < 0:
+                    raise ParameterError(f"contacts.{name} of '{finger}'", value, "not negative")
 
     @property
     def n_c(self) -> int:
@@ -62,6 +119,16 @@ class ContactSet:
     @property
     def batch_shape(self) -> torch.Size:
         return self.gap.shape[:-1]
+
+    def select(self, index: Sequence[int]) -> ContactSet:
+        """Some of the contacts, in the order of ``index``."""
+        at = list(index)
+        parts = {
+            name: getattr(self, name).movedim(-1 - len(tail), 0)[at].movedim(0, -1 - len(tail))
+            for name, tail in _TAILS.items()
+        }
+        names = {name: tuple(getattr(self, name)[i] for i in at) for name in ("finger", "link", "pinned")}
+        return self.replace(**parts, **names)
 
     def replace(self, **changes: object) -> ContactSet:
         """A copy with some fields changed."""

@@ -13,10 +13,11 @@ import torch
 
 from .._extras import require
 from ..description import HandDescription, ObjectDescription
-from ..exceptions import NonFiniteError, ParameterError, ShapeError
+from ..exceptions import DescriptionError, NonFiniteError, ParameterError, ShapeError
 from ..kinematics import HandKinematics, LinkPoses
 from ..typing import Array, Float, Tensor
-from .contact_set import ContactSet
+from .contact_set import ContactSet, NearMiss
+from .link_contact import LinkShapes
 from .pad_contact import Pad, PadContact, Solid, pad_contact
 
 
@@ -28,24 +29,27 @@ class ContactDetector:
     convex primitive, also inside it, so deep overlaps need no other method. The second term gives the pad a
     slight crown (radius ``R`` along its axis): without it a capsule lying on a flat face has no single
     contact point, and the point would jump from one end to the other as the finger tilts. With it, ``s*`` is
-    a continuous function of the state, ``|ds*/dtilt| <= R``. Where the pad touches with a round end, and
-    for balls, the crown plays no part.
+    a continuous function of the state, ``|ds*/dtilt| <= R``. Where the object is curved along the pad by k,
+    the crown is ``max(0, 1/R - k)``: none where it is curved at all. Where the pad touches with a round end,
+    and for balls, the crown plays no part.
 
     The contact point lies midway between the two surfaces. Curvatures: pad ``1/rho`` across and
-    ``1/R`` along its axis on the side, ``1/rho`` all around on a round end; object from the feature
+    the crown along its axis on the side, ``1/rho`` all around on a round end; object from the feature
     that is touched (face 0, cylinder ``1/radius`` across, ...), an edge or corner is ``pinned``.
     Of an object made of several primitives the nearest one counts.
 
     Args:
-        hand: its pads are tested; other parts of the links are not.
+        hand: its pads make contacts; of its other links those that touch are reported as near misses.
         obj: the object.
-        margin: pads farther away than this [m] are left out; ``math.inf`` keeps them all.
-        crown_radius: R [m].
+        margin: pads farther away than this [m] are left out, and reported so; ``math.inf`` keeps them all.
+        crown_radius: R [m]; infinite: none.
         kinematics: of the same hand, to share one; made here if None.
+        link_margin: links that are no pads are reported up to this gap [m].
 
     Raises:
         MissingExtraError: coal is not installed.
         ParameterError: ``margin`` or ``crown_radius`` is out of range.
+        DescriptionError: the hand has no pads.
     """
 
     def __init__(
@@ -55,17 +59,22 @@ class ContactDetector:
         margin: float = 0.002,
         crown_radius: float = 0.5,
         kinematics: HandKinematics | None = None,
+        link_margin: float = 0.001,
     ) -> None:
         if not margin >= 0:
             raise ParameterError("margin", margin, "at least 0 [m]")
-        if not 0 < crown_radius < math.inf:
-            raise ParameterError("crown_radius", crown_radius, "positive and finite [m]")
+        if not crown_radius > 0:
+            raise ParameterError("crown_radius", crown_radius, "positive [m]; infinite: no crown")
+        if not hand.pads:
+            problem = "the hand has no [[pads]], so nothing of it can touch an object"
+            raise DescriptionError(hand.transmission_path, problem)
         self.hand, self.obj, self.margin, self.crown_radius = hand, obj, margin, crown_radius
         self.kinematics = kinematics if kinematics is not None else HandKinematics(hand)
         self._coal = require("coal")
         self._links = [hand.link_names.index(pad.link) for pad in hand.pads]
         self._pads = [Pad(self._coal, pad) for pad in hand.pads]
         self._shapes = [Solid(self._coal, shape) for shape in obj.shapes]
+        self._other_links = LinkShapes(self._coal, hand, link_margin, self._coarse_distance)
         self._request = self._coal.DistanceRequest()
         self._result = self._coal.DistanceResult()
 
@@ -96,32 +105,41 @@ class ContactDetector:
                 poses = self.kinematics(q.to(self.kinematics.dtype))
         if poses.transforms.dim() != 3:
             raise ShapeError("poses", "(n_link, 4, 4)", poses.transforms.shape, "one posture at a time")
-        frames = poses.transforms[self._links].detach().to("cpu", torch.float64).numpy()
+        frames = poses.transforms.detach().to("cpu", torch.float64).numpy()
         T_object = np.eye(4)
         T_object[:3, :3] = rotation.detach().to("cpu", torch.float64).numpy()
         T_object[:3, 3] = position.detach().to("cpu", torch.float64).numpy()
         solids = [(solid, T_object @ solid.shape.transform) for solid in self._shapes]
 
         found: list[tuple[int, PadContact]] = []
-        for k, (pad, T_link) in enumerate(zip(self._pads, frames, strict=True)):
-            contact = self._nearest(pad, T_link, solids)
-            if contact is not None:
+        missed: list[NearMiss] = []
+        for k, (pad, link) in enumerate(zip(self._pads, self._links, strict=True)):
+            contact = self._nearest(pad, frames[link], solids)
+            if isinstance(contact, PadContact):
                 found.append((k, contact))
-        return self._contact_set(found, position.dtype, position.device)
+            else:
+                missed.append(NearMiss(self.hand.pads[k].link, self.hand.pads[k].name, contact))
+        missed += self._other_links.touching(frames, solids)
+        return self._contact_set(found, missed, position.dtype, position.device)
 
-    def _nearest(self, pad: Pad, T_link: Array, solids: list[tuple[Solid, Array]]) -> PadContact | None:
-        """The contact with the smallest gap over the object's primitives (the first one of equals)."""
+    def _nearest(self, pad: Pad, T_link: Array, solids: list[tuple[Solid, Array]]) -> PadContact | float:
+        """The contact with the smallest gap over the object's primitives (the first one of equals), or else
+        that gap."""
         T_pad = T_link @ pad.transform
         best: PadContact | None = None
+        least = math.inf
         for solid, T_solid in solids:
-            if math.isfinite(self.margin) and self._coarse_distance(pad, T_pad, solid, T_solid) > self.margin:
-                continue
+            if math.isfinite(self.margin):
+                coarse = self._coarse_distance(pad, T_pad, solid, T_solid)
+                least = min(least, coarse)
+                if coarse > self.margin:
+                    continue
             contact = pad_contact(pad, T_pad, solid, T_solid, self.crown_radius)
             if contact.gap <= self.margin and (best is None or contact.gap < best.gap):
                 best = contact
-        return best
+        return least if best is None else best
 
-    def _coarse_distance(self, pad: Pad, T_pad: Array, solid: Solid, T_solid: Array) -> float:
+    def _coarse_distance(self, pad: Pad | Solid, T_pad: Array, solid: Solid, T_solid: Array) -> float:
         """coal's signed distance [m]: the gap without the crown, to its tolerance of 1e-6."""
         place = self._coal.Transform3s
         self._result.clear()
@@ -135,7 +153,11 @@ class ContactDetector:
         )
 
     def _contact_set(
-        self, found: list[tuple[int, PadContact]], dtype: torch.dtype, device: torch.device
+        self,
+        found: list[tuple[int, PadContact]],
+        missed: list[NearMiss],
+        dtype: torch.dtype,
+        device: torch.device,
     ) -> ContactSet:
         pads = [self.hand.pads[k] for k, _ in found]
         contacts = [contact for _, contact in found]
@@ -158,6 +180,7 @@ class ContactDetector:
                 [max(pad.torsional_friction, self.obj.torsional_friction) for pad in pads]
             ),
             pinned=tuple(c.pinned for c in contacts),
+            near_misses=tuple(missed),
         )
 
     def __repr__(self) -> str:

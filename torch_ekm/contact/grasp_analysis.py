@@ -1,14 +1,18 @@
-"""What a grasp can do: ranks and the classes that follow from them."""
+"""What a grasp can do: ranks, the classes that follow from them, and how much wrench it resists."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
+from .._extras import require
 from ..typing import Float, Tensor
-from .contact_kinematics import ContactKinematics, constraint_matrix
+from .contact_kinematics import ContactKinematics, constraint_matrix, grasp_matrix
+from .contact_model import ContactModel
 from .contact_set import CHARACTERISTIC_LENGTH
+from .forces.friction import friction_cones, outer_directions
 
 
 @dataclass(frozen=True)
@@ -75,3 +79,34 @@ def analyse(
         defective=rank_J < n_h,
         smallest_singular_value=float(torch.linalg.svdvals(G_s)[n_p - 1]) if n_h >= n_p else 0.0,
     )
+
+
+def ferrari_canny(kin: ContactKinematics, *, length: float = CHARACTERISTIC_LENGTH, faces: int = 64) -> float:
+    """epsilon [N]: the smallest wrench, in any direction, that 1 N of normal forces in all cannot resist.
+
+    Radius of the largest ball about 0 in the convex hull of the wrenches ``(f; m/L)`` of a unit normal force
+    with friction at its limit (Ferrari and Canny, Planning optimal grasps, ICRA 1992, L1 version). 0: no
+    force closure, as of nothing. In a planar hand: of wrenches in the plane.
+
+    Args:
+        kin: the contacts of one grasp.
+        length: L, by which moments are divided [m].
+        faces: of the polyhedron inside a friction cone (a soft finger's has 26).
+    """
+    scale = np.array([1.0, 1.0, 1.0, *[1 / length] * 3])
+    G = scale[:, None] * grasp_matrix(kin).detach().double().cpu().numpy()
+    contacts = kin.contacts
+    cones = friction_cones(kin.models, contacts.friction.tolist(), contacts.torsional_friction.tolist())
+    angle = 2 * np.pi * np.arange(faces) / faces
+    wrenches = [np.zeros((0, 6))]
+    for cone in cones:
+        u = np.stack([np.cos(angle), np.sin(angle)], -1) if cone.dim == 2 else outer_directions(cone.dim)
+        u = u if cone.dim else np.zeros((1, 0))
+        tangential = G[:, cone.start + 1 : cone.start + 1 + cone.dim]
+        wrenches.append(G[:, cone.start] + cone.mu_s * (u / cone.scale) @ tangential.T)
+    points = np.concatenate(wrenches)
+    if kin.models and all(model is ContactModel.PLANAR_POINT_WITH_FRICTION for model in kin.models):
+        points = points @ np.linalg.svd(points)[2][:3].T
+    if len(points) <= points.shape[1] or np.linalg.matrix_rank(points, 1e-9) < points.shape[1]:
+        return 0.0
+    return max(0.0, float((-require("scipy.spatial").ConvexHull(points).equations[:, -1]).min()))

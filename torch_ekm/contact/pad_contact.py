@@ -51,12 +51,14 @@ def pad_contact(pad: Pad, T_pad: Array, solid: Solid, T_solid: Array, R: float) 
 
     Args:
         T_pad, T_solid: poses in the hand frame, ``(4, 4)``.
-        R: crown radius of the pad [m].
+        R: crown radius of the pad [m]; infinite: no crown.
     """
     rotation = T_solid[:3, :3]
     m = tuple((rotation.T @ (T_pad[:3, 3] - T_solid[:3, 3])).tolist())
     t = tuple((rotation.T @ T_pad[:3, 2]).tolist())
-    s = _closest(solid, m, t, pad.half, 1 / R) if pad.half > 0 else 0.0
+    s = crown = 0.0
+    if pad.half > 0:
+        s, crown = _along(solid, m, t, pad.half, 1 / R)
     c = (m[0] + s * t[0], m[1] + s * t[1], m[2] + s * t[2])
     d, n_local = solid.distance(*c)
     gap = d - pad.radius
@@ -69,20 +71,39 @@ def pad_contact(pad: Pad, T_pad: Array, solid: Solid, T_solid: Array, R: float) 
         K_o += curvature * np.outer(e, e)
     K_f = (np.eye(3) - np.outer(n, n)) / pad.radius
     lean = float(n @ T_pad[:3, 2])
-    # On the side: 1/R instead of 1/rho along the axis. There |lean| <= half/R, except deep inside a body
-    # on a ridge of d, where no side is touched.
-    if abs(s) < pad.half and abs(lean) < 2 * pad.half / R:
+    # On the side: the crown instead of 1/rho along the axis. There |lean| <= half crown, except deep inside a
+    # body on a ridge of d, where no side is touched.
+    if abs(s) < pad.half and abs(lean) < 2 * pad.half * crown + 1e-6:
         e = T_pad[:3, 2] - n * lean
         e /= np.linalg.norm(e)
-        K_f += (1 / R - 1 / pad.radius) * np.outer(e, e)
+        K_f += (crown - 1 / pad.radius) * np.outer(e, e)
     point = T_pad[:3, 3] + s * T_pad[:3, 2] - (pad.radius + gap / 2) * n
     return PadContact(point, n, gap, K_f, K_o, sharp)
+
+
+def _along(solid: Solid, m: tuple, t: tuple, half: float, most: float) -> tuple[float, float]:
+    """Where the side touches, and the crown there [1/m]: what a flat object lacks to ``most``.
+
+    A body curved along the pad has a contact point of its own, from which a crown would lead away: the
+    curvature ``d2/ds2 d(m + s t)`` that it has is taken off the crown's.
+    """
+    s = _closest(solid, m, t, half, most)
+    if abs(s) >= half:  # at a round end, crown or not
+        return s, most
+    step = 1e-6
+    ahead, behind = (
+        solid.distance(m[0] + x * t[0], m[1] + x * t[1], m[2] + x * t[2])[1] for x in (s + step, s - step)
+    )
+    curved = sum((a - b) * axis for a, b, axis in zip(ahead, behind, t, strict=True)) / (2 * step)
+    crown = min(most, max(0.0, most - curved))
+    return (_closest(solid, m, t, half, crown) if crown < most else s), crown
 
 
 def _closest(solid: Solid, m: tuple, t: tuple, half: float, epsilon: float) -> float:
     """``argmin d(m + s t) + epsilon s^2/2`` over ``|s| <= half``: the zero of an increasing function.
 
-    Its slope is at least ``epsilon``, so a value below 1e-12 leaves less than ``1e-12/epsilon`` [m].
+    Its slope is at least ``epsilon``, so a value below 1e-12 leaves less than ``1e-12/epsilon`` [m]. Without
+    crown a line of contact has no such zero: its middle is taken.
     Regula falsi (Illinois) with a bisection every third step, for the steps that the function has at the
     edges and inside of a body.
     """
@@ -93,6 +114,8 @@ def _closest(solid: Solid, m: tuple, t: tuple, half: float, epsilon: float) -> f
 
     a, b = -half, half
     fa, fb = slope(a), slope(b)
+    if epsilon == 0 and max(abs(fa), abs(fb)) < 1e-12:
+        return 0.0
     if fa >= 0:
         return a
     if fb <= 0:

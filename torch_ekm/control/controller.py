@@ -101,11 +101,24 @@ class LookAndMoveController:
         self.limiting = LimitingFunction() if limiting is None else limiting
         self.sqp_iterations, self.sqp_damping, self.sqp_tolerance = sqp_iterations, sqp_damping, sqp_tolerance
         self.solver = solver
-        self._previous: Linearization | None = None
+        self._previous: tuple[Linearization, Tensor] | None = None
 
     def reset(self) -> None:
         """Forget the contact forces of the last grasp; a :class:`ClosedLoop` does so when it begins."""
         self._previous = None
+
+    def _linearize(self, state: GraspState, a: Tensor, fingertip_force: Tensor | None) -> Linearization:
+        """The kinematic model with the forces that the fingertips and the last forces speak for."""
+        last, expected = None, None
+        if self._previous is not None:
+            last, then = self._previous
+            expected = last.forces_after(a - then)
+        lin = self.kinematic.linearize(
+            state, fingertip_force=fingertip_force, expected=expected, previous=last
+        )
+        if lin.forces.solved:
+            self._previous = lin, a
+        return lin
 
     def decide(
         self,
@@ -140,15 +153,13 @@ class LookAndMoveController:
         _check("target", error, 6)
         focused = self.focus.matrix @ error
         try:
-            lin = self.kinematic.linearize(state, previous=self._previous)
+            lin = self._linearize(state, a, fingertip_force)
         except GraspError as failure:
             lost = isinstance(failure, NoContactError)
             status = StopReason.OBJECT_LOST if lost else StopReason.UNSTABLE_GRASP
             zero, still = a.new_zeros(hand.n_a), a.new_zeros(hand.n_q + 6)
             return Decision(zero, status, self.limiting(focused), still, still, message=str(failure))
 
-        if lin.forces.solved:
-            self._previous = lin
         travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
         desired = self.limiting(focused, travel)
         seen = Situation(hand, self.focus, state, a, fingertip_force, error, desired)

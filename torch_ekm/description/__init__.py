@@ -6,6 +6,7 @@ from .hand import Actuator, ContactPad, HallSensor, HandDescription
 from .objects import ObjectDescription
 from .registry import hand_paths, list_hands, list_objects, load_hand, load_object, object_paths, urdf_folder
 from .shape import Shape
+from .transmission_file import write_transmission
 from .urdf import UrdfJoint, UrdfLink, UrdfModel, read_urdf
 
 __all__ = [
@@ -26,4 +27,5 @@ __all__ = [
     "load_object",
     "object_paths",
     "read_urdf",
+    "write_transmission",
 ]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..exceptions import DescriptionError
 from ..typing import Array
 from .urdf import UrdfModel
 
@@ -30,6 +31,9 @@ class Actuator:
     """True: it can only pull (tension ``-lam >= 0``); False: a looped cable, both directions."""
     stiffness: float = np.inf
     """Series stiffness of tendon and servo [N m/rad]; infinite: rigid."""
+    backlash: float = 0.0
+    """Play of the drive, from one end to the other [rad]: a reversal of the motor smaller than that moves
+    nothing (:class:`~torch_ekm.kinematics.Play`)."""
     posture: bool = False
     """True: it shapes the hand before a grasp; a controller leaves it alone while something is held."""
 
@@ -69,6 +73,9 @@ class HandDescription:
 
     Shapes: ``n_q`` joints, ``n_a`` actuators, ``n_k`` rigid couplings. Angles [rad],
     lengths [m], torques [N m]. Vectors over joints are in the order of ``joint_names``.
+
+    Raises:
+        DescriptionError: ``planar_normal`` is zero, or not along the axes of all joints.
     """
 
     name: str
@@ -101,6 +108,32 @@ class HandDescription:
     iCub's palm faces down: its fingers hang, and the line of a pinch is level."""
     notes: dict[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if self.planar_normal is not None:
+            self._check_plane(np.array(self.planar_normal, dtype=float))
+
+    def _check_plane(self, normal: Array) -> None:
+        """Joints that turn about the normal turn no axis away from it: one posture tells."""
+        size = float(np.linalg.norm(normal))
+        if not 1e-9 < size < np.inf:
+            problem = f"planar_normal must not be zero, and finite, got {self.planar_normal}"
+            raise DescriptionError(self.transmission_path, problem)
+        carried_by = {joint.child: joint for joint in self.urdf.joints}
+
+        def rotation(link: str) -> Array:
+            joint = carried_by.get(link)
+            return np.eye(3) if joint is None else rotation(joint.parent) @ joint.transform[:3, :3]
+
+        normal = rotation(self.base_link) @ normal / size
+        for joint in self.urdf.moving_joints:
+            lean = float(np.linalg.norm(np.cross(rotation(joint.child) @ joint.axis, normal)))
+            if lean > 1e-3:
+                degrees = np.degrees(np.arcsin(min(lean, 1.0)))
+                problem = f"the axis of joint '{joint.name}' is {degrees:.3g} deg off planar_normal"
+                raise DescriptionError(
+                    self.transmission_path, f"{problem}; a planar hand turns about it alone"
+                )
+
     @property
     def urdf_path(self) -> Path:
         return self.urdf.path
@@ -128,3 +161,7 @@ class HandDescription:
     @property
     def actuator_offset(self) -> Array:
         return np.array([actuator.offset for actuator in self.actuators])
+
+    @property
+    def actuator_backlash(self) -> Array:
+        return np.array([actuator.backlash for actuator in self.actuators])

@@ -12,12 +12,17 @@ from ..exceptions import DescriptionError
 from ..typing import Array
 from ._toml import TomlTable, read_toml
 from .shape import Shape
-from .urdf import UrdfModel
+from .urdf import UrdfModel, inertia_problem
 
 
 @dataclass(frozen=True)
 class ObjectDescription:
-    """A rigid object. Lengths [m], masses [kg]; everything in the object's own frame."""
+    """A rigid object. Lengths [m], masses [kg]; everything in the object's own frame.
+
+    Raises:
+        DescriptionError: mass and inertia of no solid body, a centre of mass that is no point, or a negative
+            coefficient of friction.
+    """
 
     name: str
     urdf_path: Path
@@ -38,6 +43,16 @@ class ObjectDescription:
     grasp_width: float
     """Thickness between the fingers at the origin, along ``grasp_axis`` [m]."""
     notes: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        problem = inertia_problem(self.mass, self.inertia)
+        if np.shape(self.com) != (3,) or not np.isfinite(self.com).all():
+            problem = f"the centre of mass must be three finite numbers [m], got {self.com}"
+        for name in ("friction", "torsional_friction"):
+            if not 0 <= getattr(self, name) < np.inf:
+                problem = f"'{name}' must be finite and not negative, got {getattr(self, name)}"
+        if problem:
+            raise DescriptionError(self.urdf_path, problem)
 
 
 def read_object(path: Path, urdf: UrdfModel) -> ObjectDescription:

@@ -29,6 +29,8 @@ ACTUATOR = (
     "moment_arms",
     "tendon",
     "stiffness",
+    "backlash",
+    "backlash_deg",
     "posture",
 )
 COUPLING = ("name", "joints")
@@ -108,6 +110,9 @@ def _actuator(path: Path, place: str, data: Any) -> tuple[Actuator, dict[str, fl
     lower, upper = table.angles("range", 2)
     if lower >= upper:
         raise table.error(f"range reversed or empty: {lower:g} to {upper:g} rad")
+    backlash = table.angle("backlash", 0.0)
+    if backlash < 0:
+        raise table.error(f"'backlash' must be at least 0, got {backlash:g} rad")
     actuator = Actuator(
         name=table.text("name"),
         lower=lower,
@@ -115,6 +120,7 @@ def _actuator(path: Path, place: str, data: Any) -> tuple[Actuator, dict[str, fl
         offset=table.angle("offset", 0.0),
         tendon=table.flag("tendon", False),
         stiffness=table.number("stiffness", np.inf, positive=True),
+        backlash=backlash,
         posture=table.flag("posture", False),
     )
     return actuator, table.weights("moment_arms")

@@ -193,11 +193,25 @@ def _link(path: Path, link: Any) -> UrdfLink:
         frame = _pose(link.inertial.origin)
         mass, com = link.inertial.mass, frame[:3, 3]
         inertia = frame[:3, :3] @ link.inertial.inertia @ frame[:3, :3].T
-        if mass <= 0 or np.linalg.eigvalsh(inertia).min() <= 0:
-            raise DescriptionError(path, f"link '{link.name}': mass and principal inertias must be positive")
+        problem = inertia_problem(mass, inertia)
+        if problem:
+            raise DescriptionError(path, f"link '{link.name}': {problem}")
     shapes = [_shape(path, link.name, found) for found in link.collisions if found.name != "mesh"]
     has_mesh = len(shapes) < len(link.collisions)
     return UrdfLink(link.name, mass, com, inertia, merge_capsules(tuple(shapes)), has_mesh)
+
+
+def inertia_problem(mass: float, inertia: Array) -> str:
+    """What no solid body can have; empty: nothing. No principal inertia exceeds the sum of the others."""
+    if not 0 < mass < math.inf or not np.isfinite(inertia).all():
+        return f"mass and principal inertias must be positive and finite, got a mass of {mass} kg"
+    small, middle, large = np.linalg.eigvalsh(inertia)
+    if small <= 0:
+        return "mass and principal inertias must be positive"
+    if large > (1 + 1e-3) * (small + middle):  # a thin plate has equality, written with few digits
+        figures = f"{small:.3g}, {middle:.3g}, {large:.3g} kg m^2"
+        return f"the largest principal inertia must not exceed the sum of the others, got {figures}"
+    return ""
 
 
 def _shape(path: Path, link: str, collision: Any) -> Shape:

@@ -6,10 +6,13 @@ from .actuation import ActuationMap
 from .grasp_state import GraspState
 from .hand_kinematics import HandKinematics
 from .link_poses import LinkPoses
+from .play import Play, PlayState
 
 __all__ = [
     "ActuationMap",
     "GraspState",
     "HandKinematics",
     "LinkPoses",
+    "Play",
+    "PlayState",
 ]

@@ -10,18 +10,25 @@ from dataclasses import dataclass
 
 import torch
 
-from ..exceptions import NonFiniteError, ShapeError
+from ..exceptions import NonFiniteError, ParameterError, ShapeError
 from ..typing import Float, Tensor
 from .se3 import exp, log
+from .tensors import as_tensors
+
+_ROUNDED = 1e-4
+"""What a rotation matrix may be off by, entry by entry: four digits are enough, a scale or a shear is not."""
 
 
 @dataclass(frozen=True)
 class GraspState:
     """Joint angles ``q`` [rad] and object pose: point ``o`` [m] and rotation ``R``, in the hand frame.
 
+    Arrays and nested lists are converted, and all three get the widest of their precisions.
+
     Raises:
         ShapeError: the three do not belong together.
         NonFiniteError: any entry is NaN or infinite.
+        ParameterError: ``rotation`` is none (scaled, sheared, a reflection), or there are no numbers.
     """
 
     q: Float[Tensor, "*batch n_q"]
@@ -29,16 +36,22 @@ class GraspState:
     rotation: Float[Tensor, "*batch 3 3"]
 
     def __post_init__(self) -> None:
+        given = {name: getattr(self, name) for name in ("q", "position", "rotation")}
+        for name, value in zip(given, as_tensors(**given), strict=True):
+            object.__setattr__(self, name, value)  # the dataclass is frozen
+        if self.q.dim() == 0:
+            raise ShapeError("q", "(*batch, n_q)", self.q.shape)
         batch = self.q.shape[:-1]
         if self.position.shape != (*batch, 3):
             raise ShapeError("position", f"{(*batch, 3)} to go with q", self.position.shape)
         if self.rotation.shape != (*batch, 3, 3):
             raise ShapeError("rotation", f"{(*batch, 3, 3)} to go with q", self.rotation.shape)
-        for name in ("q", "position", "rotation"):
-            value = getattr(self, name)
-            finite = torch.isfinite(value)
-            if not bool(finite.all()):
-                raise NonFiniteError(name, torch.nonzero(~finite)[:3].tolist())
+        if not bool(torch.isfinite(torch.cat([getattr(self, name).flatten() for name in given])).all()):
+            for name in given:
+                finite = torch.isfinite(getattr(self, name))
+                if not bool(finite.all()):
+                    raise NonFiniteError(name, torch.nonzero(~finite)[:3].tolist())
+        _check_rotation(self.rotation)
 
     @property
     def n_s(self) -> int:
@@ -62,3 +75,14 @@ class GraspState:
         """Inputs for a learner: ``[q; o - o_ref; Log(R R_ref^T)]``."""
         dphi = log(self.rotation @ reference.rotation.mT)
         return torch.cat([self.q, self.position - reference.position, dphi], dim=-1)
+
+
+def _check_rotation(R: Tensor) -> None:
+    """``cof R = R``: every column is the cross product of the other two, which holds for rotations only."""
+    x, y, z = R.detach().unbind(-1)
+    cofactors = torch.linalg.cross(torch.stack([y, z, x], -1), torch.stack([z, x, y], -1), dim=-2)
+    off = (cofactors - R.detach()).abs()
+    if bool((off > _ROUNDED).any()):
+        what = "a reflection" if bool((torch.linalg.det(R) < 0).any()) else "scaled or sheared"
+        valid = f"a rotation matrix, R^T R = I and det R = 1 (it is {what}, off by {float(off.max()):.2g})"
+        raise ParameterError("rotation", R.tolist() if R.dim() == 2 else tuple(R.shape), valid)

@@ -6,16 +6,26 @@ rotation increments are ``dphi = Log(R+ R^T)``, so ``R+ = exp([dphi]x) R``.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 
 from ..typing import Float, Tensor
 
 
+@lru_cache
+def _generators(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "3 9"]:
+    """Rows: the skew matrices of the three axes, row by row."""
+    with torch.inference_mode(False):
+        E = torch.zeros(3, 3, 3, dtype=dtype, device=device)
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            E[i, k, j], E[i, j, k] = 1.0, -1.0
+        return E.flatten(1)
+
+
 def hat(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Skew matrix ``[v]x`` with ``[v]x w = v x w``."""
-    x, y, z = v.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    return (v @ _generators(v.dtype, v.device)).unflatten(-1, (3, 3))
 
 
 def exp(phi: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -2,22 +2,43 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from ..contact.contact_set import ContactSet
 from ..description.hand import HandDescription
-from ..exceptions import NoContactError, NonFiniteError, PenetrationError, ShapeError, UnknownNameError
+from ..exceptions import NoContactError, ParameterError, PenetrationError, ShapeError, UnknownNameError
 from ..kinematics.grasp_state import GraspState
+from ..kinematics.tensors import as_tensors
 from ..typing import Float, Tensor
 
+_LOWEST = -0.9
+"""Readings below this [N] are no noise about zero: three standard deviations of a fingertip sensor."""
 
-def check_state(hand: HandDescription, state: GraspState, contacts: ContactSet | None) -> None:
-    """One entry for each joint, and contacts with a batch of states."""
+
+def check_inertia(obj) -> None:
+    """Of anything with a mass [kg], which may be 0, and a centre of mass [m]."""
+    mass, com = float(obj.mass), [float(x) for x in obj.com]
+    if not 0 <= mass < math.inf:
+        raise ParameterError("mass of the object", mass, "finite and not negative [kg]")
+    if len(com) != 3 or not all(map(math.isfinite, com)):
+        raise ParameterError("com of the object", com, "three finite numbers [m]")
+
+
+def check_state(
+    hand: HandDescription, state: GraspState, contacts: ContactSet | None, dtype: torch.dtype
+) -> None:
+    """One entry for each joint, contacts with a batch of states, everything in the model's precision."""
     if state.q.shape[-1] != hand.n_q:
         names = ", ".join(hand.joint_names)
         raise ShapeError("q", f"(*batch, {hand.n_q})", state.q.shape, f"the joints are: {names}")
     if contacts is None and state.q.dim() > 1:
         raise ShapeError("q", f"({hand.n_q},)", state.q.shape, "for a batch give the contacts too")
+    for name, given in (("state", state.q), ("contacts", None if contacts is None else contacts.gap)):
+        if given is not None and given.dtype != dtype:
+            valid = f"{dtype}, that of the model (KinematicModel(..., dtype=), or its .to())"
+            raise ParameterError(f"dtype of the {name}", given.dtype, valid)
 
 
 def check_contacts(
@@ -28,31 +49,34 @@ def check_contacts(
         raise NoContactError("no finger touches the object, so no actuator can move it")
     if contacts.batch_shape != state.q.shape[:-1]:
         raise ShapeError("contacts.gap", f"{(*state.q.shape[:-1], contacts.n_c)}", contacts.gap.shape)
-    for name in ("point", "normal", "gap"):
-        if not bool(torch.isfinite(getattr(contacts, name)).all()):
-            raise NonFiniteError(f"contacts.{name}")
+    contacts.check()
     for name in contacts.link:
         if name not in link_names:
             raise UnknownNameError("link", name, link_names)
-    deepest = float(contacts.gap.amin())
+    gap = contacts.gap.detach()
+    deepest = float(gap.amin())
     if deepest < -max_overlap:
-        which = contacts.finger[int(contacts.gap.reshape(-1, contacts.n_c).amin(0).argmin())]
+        which = contacts.finger[int(gap.reshape(-1, contacts.n_c).amin(0).argmin())]
         raise PenetrationError(which, -deepest, max_overlap)
 
 
-def at_contacts(
+def at_pads(
     hand: HandDescription, contacts: ContactSet, fingertip_force: Float[Tensor, "*batch n_pads"]
-) -> Float[Tensor, "*batch n_c"]:
-    """What the pads measure, in the order of the contacts [N]."""
+) -> dict[str, Float[Tensor, "*batch"]]:
+    """What the pads measure, by name [N]."""
+    (fingertip_force,) = as_tensors(fingertip_force=fingertip_force)
+    if bool(((fingertip_force < _LOWEST) | torch.isinf(fingertip_force)).any()):
+        valid = f"finite or NaN, and above {_LOWEST} N: a pad cannot pull (is its zero or its sign wrong?)"
+        raise ParameterError("fingertip_force", fingertip_force.tolist(), valid)
     pads = [pad.name for pad in hand.pads]
-    if fingertip_force.shape[-1] != len(pads):
+    if fingertip_force.shape[-1:] != (len(pads),):
         raise ShapeError(
             "fingertip_force", f"(*batch, {len(pads)})", fingertip_force.shape, f"pads: {', '.join(pads)}"
         )
     for name in contacts.finger:
         if name not in pads:
             raise UnknownNameError("pad", name, pads)
-    return fingertip_force[..., [pads.index(name) for name in contacts.finger]]
+    return dict(zip(pads, fingertip_force.unbind(-1), strict=True))
 
 
 def joint_index(hand: HandDescription, name: str) -> int:

@@ -14,8 +14,8 @@ from ..exceptions import EquilibriumError
 from ..kinematics.grasp_state import GraspState
 from ..typing import Float, Tensor
 from .force_balance import known_forces
+from .grasp_forces import GraspForces
 from .kinematic_model import KinematicModel
-from .linearization import GraspForces
 from .stiffness import geometric_stiffness
 
 

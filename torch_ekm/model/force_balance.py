@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ..contact.contact_kinematics import ContactKinematics
+from ..contact.contact_set import ContactSet
 from ..contact.forces.balance import BalanceEquations, ForceStatus
 from ..contact.forces.friction import friction_cones, margins
+from ..contact.forces.options import ForceOptions
 from ..contact.forces.solve import contact_forces
 from ..description.hand import HandDescription
-from ..typing import Bool, Float, Tensor
-from .linearization import GraspForces
+from ..typing import Array, Bool, Float, Tensor
+from .gradients import differentiable_forces
+from .grasp_forces import ExpectedForces, ForcePrior, GraspForces, friction_use, margin_std
 from .options import ModelOptions
 from .reduction import Reduction
 
@@ -27,11 +32,16 @@ class ForceBalance:
     """
 
     def __init__(self, hand: HandDescription, options: ModelOptions, reduction: Reduction) -> None:
-        self.options = options
+        self.options, self.reduction = options, reduction
         self.joint_basis = reduction.joint_basis.double().numpy()
         self.pose_basis = reduction.pose_basis.double().numpy()
-        self.actuation = (reduction.actuation.double().numpy() @ self.joint_basis).T
-        self.tendon = torch.tensor([actuator.tendon for actuator in hand.actuators])
+        self.tendon = np.array([actuator.tendon for actuator in hand.actuators])
+        # joint torque [N m] that the weight of the forces may leave where a tendon pulls nothing
+        pull = reduction.actuation.detach().double().cpu().numpy() @ self.joint_basis
+        arm, limit = np.linalg.norm(pull, axis=1), options.slack_tension
+        no_pull = 1e-3 * options.length / np.where(arm > 0, arm, 1.0) + (0.0 if limit is None else limit)
+        pulls = self.tendon & (limit is not None)
+        self.slack_above = torch.from_numpy(np.where(pulls, -no_pull, np.inf))
         # a joint beyond one of these touches its stop
         stops = (np.abs(self.joint_basis) > 1e-9).any(1)
         self.low = np.where(stops, hand.joint_lower + options.stop_tolerance, -np.inf)
@@ -50,6 +60,17 @@ class ForceBalance:
         low, high = (torch.as_tensor(stop, device=q.device) for stop in (self.low, self.high))
         return (torque.abs() > self.options.stop_torque) & ((q <= low) | (q >= high))
 
+    def slack(self, forces: GraspForces) -> Bool[Tensor, "*batch n_a"]:
+        """Tendons that pull with no more than ``slack_tension``, where forces were found."""
+        lam = forces.lam.detach()
+        slack = lam >= self.slack_above.to(lam)
+        if not forces.solved:
+            found = torch.tensor(
+                [status is ForceStatus.SOLVED for status in forces.status], device=lam.device
+            )
+            slack = slack & found.reshape(*lam.shape[:-1], 1)
+        return slack
+
     def __call__(
         self,
         q: Tensor,
@@ -60,43 +81,56 @@ class ForceBalance:
         locked: list[int],
         measured_normal: Tensor | None,
         last: GraspForces | None,
-        normal_std: float = 0.3,
+        normal_std: float | None = None,
+        actuator_load: Tensor | None = None,
+        expected: ExpectedForces | None = None,
     ) -> GraspForces:
-        """Solve every state; where there is no answer use the forces of ``last`` or zeros."""
+        """Solve every state; where there is no answer use the forces of ``last`` or zeros.
+
+        Measured normal forces ``(*batch, n_c)``, actuator loads and expected forces take part where given.
+        """
         batch, n_q = q.shape[:-1], q.shape[-1]
-        flat = [
-            x.detach().reshape(-1, *x.shape[len(batch) :]).double().cpu().numpy() for x in (q, A, V_q, V_p)
-        ]
-        measured = None
-        if measured_normal is not None:
-            measured = measured_normal.detach().reshape(-1, kin.contacts.n_c).double().cpu().numpy()
+        options = self.options.forces
+
+        def rows(x: Tensor) -> Array:
+            return x.detach().reshape(-1, *x.shape[len(batch) :]).double().cpu().numpy()
+
+        states = zip(*(rows(x) for x in (q, A, V_q, V_p)), strict=True)
+        measured = None if measured_normal is None else rows(measured_normal)
+        load = None if actuator_load is None else rows(actuator_load)
+        estimating = not (measured is None and load is None and expected is None)
+        prior = ForcePrior(kin, expected, options) if estimating else None
         cones = friction_cones(
             kin.models, kin.contacts.friction.tolist(), kin.contacts.torsional_friction.tolist()
         )
         spins = tuple(at for at, row in enumerate(kin.rows) if row % 6 >= 3)
+        actuation = (self.reduction.actuation.detach().double().cpu().numpy() @ self.joint_basis).T
         results = []
-        for k in range(len(flat[0])):
-            q_k, A_k, V_q_k, V_p_k = (x[k] for x in flat)
+        for k, (q_k, A_k, V_q_k, V_p_k) in enumerate(states):
             joints, lower, upper = self._bounded(q_k, locked)
             eq = BalanceEquations(
                 object_matrix=-self.pose_basis.T @ A_k[:, n_q:].T,
                 object_load=self.pose_basis.T @ V_p_k,
                 hand_matrix=self.joint_basis.T @ A_k[:, :n_q].T,
-                actuator_matrix=self.actuation,
+                actuator_matrix=actuation,
                 hand_load=self.joint_basis.T @ V_q_k,
                 cones=cones,
                 length=self.options.length,
                 moment_rows=self.moment_rows,
-                tendon=self.tendon.numpy(),
+                tendon=self.tendon,
                 spin_columns=spins,
                 bound_matrix=-self.joint_basis[joints].T,
                 bound_lower=lower,
                 bound_upper=upper,
                 weight=self.weight,
                 measured_normal=None if measured is None else measured[k],
-                normal_std=normal_std,
+                normal_std=options.normal_std if normal_std is None else normal_std,
+                measured_actuator=None if load is None else load[k],
+                actuator_std=options.actuator_std,
             )
-            solution = contact_forces(eq, self.options.forces)
+            if prior is not None:
+                eq = prior.into(eq, k)
+            solution = contact_forces(eq, options)
             mu, lam = solution.mu, solution.lam
             residual, torque = np.zeros(n_q), np.zeros(n_q)
             if solution.status is ForceStatus.SOLVED:
@@ -107,25 +141,48 @@ class ForceBalance:
                 mu, lam = (x.detach().double().cpu().numpy() for x in (mu, lam))
             else:
                 mu, lam = np.zeros_like(mu), np.zeros_like(lam)
-            slack, relative = margins(cones, mu)
-            results.append((mu, lam, residual, torque, slack, relative, solution))
+            kept = (*margins(cones, mu), [solution.violation], solution, eq)
+            results.append((mu, lam, residual, torque, *kept))
 
-        def stack(i: int) -> Tensor:
-            value = torch.from_numpy(np.stack([r[i] for r in results])).to(q)
-            return value.reshape(*batch, *value.shape[1:])
+        names = ("mu", "lam", "residual", "stop_torque", "margin", "relative_margin", "violation")
+        sizes = [len(part) for part in results[0][:7]]
+        table = torch.from_numpy(np.stack([np.concatenate(r[:7]) for r in results])).to(q)
+        parts = dict(zip(names, table.reshape(*batch, -1).split(sizes, dim=-1), strict=True))
+        parts["violation"] = parts["violation"][..., 0]
+        inputs = (A, V_q, V_p, self.reduction.actuation)
+        if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
+            known = [parts[name] for name in names[:3]]
+            moving = self._with_graph([(r[8], r[7]) for r in results], A, V_q, V_p, *known)
+            parts.update(zip(names, moving, strict=False))
+        forces = pack_forces(kin, **parts, status=tuple(r[7].status for r in results))
+        if prior is None or not forces.solved:
+            return forces
+        sure = [prior.stacked(r[7].covariance, k) for k, r in enumerate(results)]
+        return with_covariance(kin.contacts, forces, torch.from_numpy(np.stack(sure)).to(q), options)
 
-        violation = torch.tensor([r[6].violation for r in results], dtype=q.dtype, device=q.device)
-        return pack_forces(
-            kin,
-            stack(0),
-            stack(1),
-            residual=stack(2),
-            stop_torque=stack(3),
-            margin=stack(4),
-            relative_margin=stack(5),
-            status=tuple(r[6].status for r in results),
-            violation=violation.reshape(batch),
+    def _with_graph(
+        self, problems: list, A: Tensor, V_q: Tensor, V_p: Tensor, mu: Tensor, lam: Tensor, residual: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """``mu``, ``lam`` and e with their derivative; those of an unsolved problem are constants."""
+        n_q, batch = V_q.shape[-1], mu.dim() - 1
+        Z, Z_p, lift = (torch.from_numpy(x).to(A) for x in (self.joint_basis, self.pose_basis, self.lift))
+        J_a = (self.reduction.actuation @ Z).mT
+        G, load, hand, V_z = -Z_p.mT @ A[..., n_q:].mT, V_p @ Z_p, Z.mT @ A[..., :n_q].mT, V_q @ Z
+        results = []
+        for k, (eq, solution) in enumerate(problems):
+            at = [x.reshape(-1, *x.shape[batch:])[k] for x in (mu, lam, residual, G, load, hand, V_z)]
+            forces = tuple(at[:3])
+            if solution.status is ForceStatus.SOLVED:
+                *forces, e = differentiable_forces(
+                    eq, self.options.forces, solution, *at[3:6], actuator_matrix=J_a, hand_load=at[6]
+                )
+                forces = (*forces, lift @ e)
+            results.append(forces)
+        stacked = (torch.stack(part) for part in zip(*results, strict=True))
+        first, second, third = (
+            x.reshape(old.shape) for x, old in zip(stacked, (mu, lam, residual), strict=True)
         )
+        return first, second, third
 
     def _bounded(self, q: np.ndarray, locked: list[int]) -> tuple[list[int], np.ndarray, np.ndarray]:
         """Joints with a torque of their own, and its bounds: stops push inwards, locks both ways."""
@@ -139,12 +196,20 @@ class ForceBalance:
 def pack_forces(kin: ContactKinematics, mu: Tensor, lam: Tensor, **rest) -> GraspForces:
     """Forces in hand axes from components in contact frames."""
     n_c = kin.contacts.n_c
-    full = mu.new_zeros(*mu.shape[:-1], 6 * n_c)
-    full[..., kin.rows] = mu
-    full = full.unflatten(-1, (n_c, 6))
+    full = mu.new_zeros(*mu.shape[:-1], 6 * n_c).index_copy(-1, kin.row_index, mu).unflatten(-1, (n_c, 6))
     spin = full[..., 3]
     force = (kin.frame @ full[..., :3, None])[..., 0]
     return GraspForces(mu=mu, lam=lam, force=force, spin_moment=spin, normal=full[..., 0], **rest)
+
+
+def with_covariance(
+    contacts: ContactSet, forces: GraspForces, covariance: Tensor, options: ForceOptions
+) -> GraspForces:
+    """The forces with how sure they are; ``covariance`` of the stack, one for each state ``(-1, m, m)``."""
+    covariance = covariance.reshape(*forces.normal.shape[:-1], *covariance.shape[-2:])
+    normal, _, gradient = friction_use(contacts, forces.force, forces.spin_moment, contacts.normal)
+    std = margin_std(contacts, normal, gradient, covariance, options)
+    return dataclasses.replace(forces, covariance=covariance, margin_std=std)
 
 
 def known_forces(kin: ContactKinematics, mu: Tensor, lam: Tensor) -> GraspForces:

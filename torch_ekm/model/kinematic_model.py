@@ -13,15 +13,18 @@ from ..description.hand import HandDescription
 from ..exceptions import NoContactError
 from ..kinematics.grasp_state import GraspState
 from ..typing import Float, Tensor
-from .checks import at_contacts, check_contacts, check_state, joint_index
+from .checks import at_pads, check_contacts, check_inertia, check_state, joint_index
 from .force_balance import ForceBalance
-from .linearization import GraspForces, Linearization, ModelStatus
+from .gradients import following, only_if_asked
+from .grasp_forces import ExpectedForces, GraspForces
+from .linearization import Linearization
 from .link_weights import LinkWeights
 from .options import ModelOptions
 from .potential import gravity_gradient, gravity_hessian, spring_torque
 from .reduction import Reduction
 from .sensitivity import force_change, margin_sensitivity, normal_motion, normal_sensitivity
 from .stiffness import geometric_stiffness, precedence
+from .validity import find_doubts
 
 
 class KinematicModel(nn.Module):
@@ -45,6 +48,10 @@ class KinematicModel(nn.Module):
         kinematics: in place of :class:`~torch_ekm.kinematics.HandKinematics`.
         detector: ``(q, position, rotation) -> ContactSet`` in place of the collision detector.
         dtype: float64 (default) or float32.
+
+    Raises:
+        ParameterError: the object's mass or centre of mass is no number, or the mass negative.
+        DescriptionError: the hand has no pads for the detector.
     """
 
     def __init__(
@@ -58,6 +65,7 @@ class KinematicModel(nn.Module):
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
+        check_inertia(obj)
         self._detector_takes_poses = False
         self.hand, self.obj, self.options = hand, obj, options or ModelOptions()
         if kinematics is None:
@@ -67,8 +75,15 @@ class KinematicModel(nn.Module):
         if detector is None:
             from ..contact.detector import ContactDetector
 
-            margin = self.options.contact_margin
-            detector = ContactDetector(hand, obj, margin, kinematics=kinematics)  # type: ignore[arg-type]
+            o = self.options
+            detector = ContactDetector(
+                hand,
+                obj,
+                o.contact_margin,
+                o.crown_radius,
+                kinematics=kinematics,  # type: ignore[arg-type]
+                link_margin=o.link_margin,
+            )
             self._detector_takes_poses = True
         self.kinematics, self.detector = kinematics, detector
         self.link_names: tuple[str, ...] = tuple(kinematics.link_names)  # type: ignore[arg-type]
@@ -120,12 +135,12 @@ class KinematicModel(nn.Module):
 
     def _detect(self, state: GraspState, poses: object | None) -> ContactSet:
         posture = poses if self._detector_takes_poses and poses is not None else state.q
-        contacts = self.detector(posture, state.position, state.rotation)  # type: ignore[arg-type]
+        with torch.no_grad():
+            contacts = self.detector(posture, state.position, state.rotation)  # type: ignore[arg-type]
         if contacts.n_c == 0:
             raise NoContactError("no finger touches the object, so no actuator can move it")
-        return contacts
+        return following(contacts, self.contacts, state) if torch.is_grad_enabled() else contacts
 
-    @torch.no_grad()
     def contact_kinematics(
         self,
         state: GraspState,
@@ -144,7 +159,7 @@ class KinematicModel(nn.Module):
             contacts, state.position, axis, origin, upstream, plane=self.plane, rolling=rolling
         )
 
-    @torch.no_grad()
+    @only_if_asked
     def linearize(
         self,
         state: GraspState,
@@ -152,19 +167,31 @@ class KinematicModel(nn.Module):
         *,
         forces: GraspForces | None = None,
         fingertip_force: Float[Tensor, "*batch n_pads"] | None = None,
+        actuator_load: Float[Tensor, "*batch n_a"] | None = None,
+        expected: ExpectedForces | None = None,
         previous: Linearization | None = None,
         locked: Sequence[str] = (),
     ) -> Linearization:
-        """Contacts, forces, ``J_m`` and the force sensitivities at a state.
+        """Contacts, forces, ``J_m``, the force sensitivities and what speaks against them, at a state.
+
+        Differentiable: with respect to the state, and to the buffers ``spring_stiffness``, ``spring_rest``,
+        ``reduction.actuation``, ``reduction.stiffness``, ``weight`` and ``com`` (``requires_grad_()`` asks
+        for it). Forces and detected contacts move along (:mod:`~torch_ekm.model.gradients`). First
+        derivatives only; stability, margins, stop torques, and which joints are held, are constants.
 
         Args:
             state: one state, or a batch together with batched ``contacts``.
             contacts: by default from the detector (single state).
-            forces: known forces; by default from the relaxed minimal-force problem.
+            forces: known forces; by default from the relaxed force problem, whose answer is the smallest
+                where nothing more is known.
             fingertip_force: measured normal forces [N] in the order of ``hand.pads``, NaN where unknown, to
                 be respected in that problem. Worth giving where joints are at their stops.
+            actuator_load: measured force of each actuator along +a [N m], NaN where unknown, likewise.
+            expected: ``previous.forces_after(da)``, da what the encoders moved since: the forces then change
+                least from these, as far as balance and measurements leave them open.
             previous: the last linearization of this grasp whose forces were found. Where that problem has
-                no answer, its forces stand in, if the same fingers touch.
+                no answer, its forces stand in, if the same fingers touch. A pad that touched then and is
+                left out now is a doubt.
             locked: joints that stick, by name.
 
         Raises:
@@ -174,7 +201,7 @@ class KinematicModel(nn.Module):
             UnstableGraspError: the grasp buckles (unless ``on_unstable="flag"``).
             NonFiniteError, ShapeError, UnknownNameError: bad input.
         """
-        check_state(self.hand, state, contacts)
+        check_state(self.hand, state, contacts, self.weight.dtype)  # type: ignore[arg-type]
         poses = self.kinematics(state.q)
         contacts = self._detect(state, poses) if contacts is None else contacts
         check_contacts(state, contacts, self.link_names, self.options.max_overlap)
@@ -184,19 +211,20 @@ class KinematicModel(nn.Module):
         V_s, V_ss = self.potential(state, poses)
         V_q, V_p = V_s[..., :n_q], V_s[..., n_q:]
         lock = [joint_index(self.hand, name) for name in locked]
-        status = ModelStatus.OK
+        last, measured = None, None
+        if fingertip_force is not None:
+            measured = at_pads(self.hand, contacts, fingertip_force)
         if forces is None:
-            last = None
             if (
                 previous is not None
                 and previous.forces.solved
                 and previous.contacts.finger == contacts.finger
             ):
                 last = previous.forces
-            measured = None if fingertip_force is None else at_contacts(self.hand, contacts, fingertip_force)
-            forces = self.balance(state.q, kin, A, V_q, V_p, lock, measured, last)
-            if not forces.solved:
-                status = ModelStatus.NO_FORCES if last is None else ModelStatus.REUSED_FORCES
+            felt = None if measured is None else torch.stack([measured[f] for f in contacts.finger], dim=-1)
+            forces = self.balance(
+                state.q, kin, A, V_q, V_p, lock, felt, last, actuator_load=actuator_load, expected=expected
+            )
 
         o = self.options
         D = geometric_stiffness(
@@ -215,9 +243,7 @@ class KinematicModel(nn.Module):
 
         held = self.balance.held_by_stops(state.q, forces.stop_torque)
         held[..., lock] = True
-        J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held)
-        if o.on_unstable == "flag" and bool((stability <= 0).any()):
-            status = ModelStatus.UNSTABLE
+        J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held, self.balance.slack(forces))
         df, dn = force_change(kin, dmu), normal_motion(kin, J)
         normal = normal_sensitivity(kin, forces, df, dn)
         return Linearization(
@@ -229,10 +255,22 @@ class KinematicModel(nn.Module):
             actuator_force_sensitivity=dlam,
             normal_force_sensitivity=normal,
             margin_sensitivity=margin_sensitivity(kin, forces, dmu, df, dn, normal),
+            force_vector_sensitivity=df,
+            normal_motion=dn,
             normal_rows=tuple(kin.normal_rows),
             held_joints=held,
             stability=stability,
-            status=status,
+            options=o,
+            doubts=find_doubts(
+                o,
+                self.hand.joint_names,
+                contacts,
+                forces,
+                stability,
+                reused=last is not None,
+                measured=measured,
+                before=() if previous is None else previous.contacts.finger,
+            ),
         )
 
     def potential(

@@ -11,6 +11,8 @@ E ds           = R da        R = [0; I]
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -40,6 +42,7 @@ def two_stage(
     rank_tolerance: float = 1e-8,
     stiffness_tolerance: float = 1e-9,
     on_unstable: str = "raise",
+    actuators: Sequence[str] = (),
 ) -> KKTSolution:
     """``J = P - N (N^T D N)^-1 N^T (D P - F)``, ``P = E^+ R``, ``N = null(E)``.
 
@@ -54,19 +57,22 @@ def two_stage(
         rank_tolerance: singular values of E below this share of the largest are zero.
         stiffness_tolerance: eigenvalues of N^T D N within this share of |D| are zero.
         on_unstable: "raise", or "flag" (return the formal answer; read ``stability``).
+        actuators: their names, for messages.
 
     Raises:
         SingularGraspError: a motion without stiffness and constraint, or rigid actuators that
-            contradict each other; the direction comes along.
+            contradict each other; the direction comes along. Whatever ``on_unstable`` says.
         UnstableGraspError: N^T D N has a negative eigenvalue: the grasp buckles.
     """
+    if D.requires_grad or E.requires_grad:
+        return _differentiable(D, E, R, F, rank_tolerance, stiffness_tolerance, on_unstable)
     eps = torch.finfo(D.dtype).eps
     rank_tolerance, stiffness_tolerance = max(rank_tolerance, 10 * eps), max(stiffness_tolerance, 10 * eps)
     pinv, N = _range_and_null(E, rank_tolerance)
     P = pinv @ R
-    lost = E @ P - R
-    if lost.numel() and float(lost.abs().max()) > 10 * eps**0.5 * float(R.abs().max()):
-        _raise_contradiction(lost, P)
+    lost = (E @ P - R).detach()
+    if lost.numel() and float(lost.abs().max()) > 10 * eps**0.5 * float(R.detach().abs().max()):
+        _raise_contradiction(lost, P, actuators)
     load = D @ P if F is None else D @ P - F
     stability = torch.full(D.shape[:-2], torch.inf, dtype=D.dtype, device=D.device)
     J = P
@@ -80,6 +86,23 @@ def two_stage(
         J = P - N @ torch.linalg.solve(K, N.mT @ load)
     unbalanced = D @ J if F is None else D @ J - F
     return KKTSolution(J, -(pinv.mT @ unbalanced), stability)
+
+
+def _differentiable(
+    D: Tensor, E: Tensor, R: Tensor, F: Tensor | None, rank: float, stiffness: float, on_unstable: str
+) -> KKTSolution:
+    """The same, with the derivative by the implicit function theorem: that of a null space is not defined.
+
+    A second solve has the residual of both equations on its right-hand side, which is 0 and has a derivative.
+    """
+    D0, E0 = D.detach(), E.detach()
+    load = R.new_zeros(D.shape[-1], R.shape[-1]) if F is None else F
+    solve = functools.partial(two_stage, D0, E0, rank_tolerance=rank, stiffness_tolerance=stiffness)
+    at = solve(R.detach(), load.detach(), on_unstable=on_unstable)
+    J, nu = at.motion, at.reaction
+    moved, loaded = R - E @ J, load - D @ J - E.mT @ nu
+    change = solve(moved - moved.detach(), loaded - loaded.detach(), on_unstable="flag")
+    return KKTSolution(J + change.motion, nu + change.reaction, at.stability)
 
 
 def _range_and_null(E: Tensor, rank_tolerance: float) -> tuple[Tensor, Tensor]:
@@ -109,11 +132,12 @@ def _range_and_null(E: Tensor, rank_tolerance: float) -> tuple[Tensor, Tensor]:
     return pinv, Vh[..., r:, :].mT
 
 
-def _raise_contradiction(lost: Tensor, P: Tensor) -> None:
-    worst = lost.abs().flatten(0, -2).amax(0).argmax()
+def _raise_contradiction(lost: Tensor, P: Tensor, actuators: Sequence[str]) -> None:
+    worst = int(lost.abs().flatten(0, -2).amax(0).argmax())
+    name = f"'{actuators[worst]}'" if actuators else str(worst)
     direction = P.flatten(0, -3)[0][:, worst] if P.dim() > 2 else P[:, worst]
     raise SingularGraspError(
-        f"actuator {int(worst)} cannot move alone: contacts, couplings and the other rigid actuators forbid "
+        f"actuator {name} cannot move alone: contacts, couplings and the other rigid actuators forbid "
         f"it (rows violated by {float(lost.abs().max()):.2g}); there are more rigid actuators than mobility. "
         "Give the actuators a finite stiffness",
         direction=(direction / torch.linalg.vector_norm(direction).clamp_min(1e-300)).detach(),
@@ -123,13 +147,18 @@ def _raise_contradiction(lost: Tensor, P: Tensor) -> None:
 def _judge(K: Tensor, N: Tensor, stability: Tensor, tolerance: Tensor, on_unstable: str) -> None:
     """Name the worst direction of the worst state of a batch."""
     flat_K, flat_N = K.reshape(-1, *K.shape[-2:]), N.reshape(-1, *N.shape[-2:])
-    at = int(stability.reshape(-1).argmin())
+    spare = torch.linalg.svdvals(flat_K)[:, -1] - tolerance.reshape(-1)
+    singular = float(spare.min()) <= 0
+    if on_unstable == "flag" and not singular:
+        return
+    at = int((spare if singular else stability.reshape(-1)).argmin())
     value = float(stability.reshape(-1)[at])
-    _, vectors = torch.linalg.eigh(0.5 * (flat_K[at] + flat_K[at].mT))
-    direction = (flat_N[at] @ vectors[:, 0]).detach()
-    if abs(value) <= float(tolerance.reshape(-1)[at]):
-        if on_unstable == "flag" and float(torch.linalg.det(flat_K[at]).abs()) > 0:
-            return
+    if singular:
+        direction = (flat_N[at] @ torch.linalg.svd(flat_K[at])[2][-1]).detach()
+    else:
+        _, vectors = torch.linalg.eigh(0.5 * (flat_K[at] + flat_K[at].mT))
+        direction = (flat_N[at] @ vectors[:, 0]).detach()
+    if singular or abs(value) <= float(tolerance.reshape(-1)[at]):
         whose, remedy = "the joints", "give them a spring, a stiffness floor, or a lock"
         if float(direction[-6:].square().sum()) > 0.5:  # a unit vector: mostly of the object's twist
             whose = "the object"
@@ -138,10 +167,9 @@ def _judge(K: Tensor, N: Tensor, stability: Tensor, tolerance: Tensor, on_unstab
             f"a motion of {whose} meets neither stiffness nor constraint (eigenvalue {value:.2g}); {remedy}",
             direction=direction,
         )
-    if on_unstable == "raise":
-        raise UnstableGraspError(
-            f"the stiffness with locked actuators has the eigenvalue {value:.3g} <= 0: the grasp buckles "
-            "along the direction given; grip less hard or place the fingers wider",
-            stiffness=value,
-            direction=direction,
-        )
+    raise UnstableGraspError(
+        f"the stiffness with locked actuators has the eigenvalue {value:.3g} <= 0: the grasp buckles "
+        "along the direction given; grip less hard or place the fingers wider",
+        stiffness=value,
+        direction=direction,
+    )

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import nn
+from torch.nn.functional import pad
 
 from ..description.hand import HandDescription
 from ..exceptions import SingularGraspError, UnstableGraspError
@@ -43,7 +45,7 @@ class Reduction(nn.Module):
 
     def __init__(self, hand: HandDescription, options: ModelOptions, dtype: torch.dtype) -> None:
         super().__init__()
-        self.options = options
+        self.options, self.actuators = options, hand.actuator_names
         joint = joint_basis(hand).to(dtype)
         pose = torch.eye(6, dtype=dtype)
         if hand.planar_normal is not None:
@@ -63,8 +65,11 @@ class Reduction(nn.Module):
         J_a = torch.as_tensor(hand.actuation_jacobian).to(dtype)
         self.register_buffer("actuation", J_a, persistent=False)
         stiffness = torch.tensor([actuator.stiffness for actuator in hand.actuators], dtype=dtype)
+        # beside a spring of 1 N m/rad a million is rigid to 1e-6, but drowns it in the tests of rank
+        rigid = stiffness * J_a.square().sum(-1) > 1e6
         if not options.actuator_compliance:
-            stiffness = torch.full_like(stiffness, torch.inf)
+            rigid = torch.ones_like(rigid)
+        stiffness = torch.where(rigid, torch.inf, stiffness)
         self.register_buffer("stiffness", stiffness, persistent=False)
 
     def solve(
@@ -73,34 +78,40 @@ class Reduction(nn.Module):
         A: Float[Tensor, "*batch n_h n_s"],
         rows: list[int],
         held: Bool[Tensor, "*batch n_q"],
+        slack: Bool[Tensor, "*batch n_a"],
     ) -> GraspResponse:
         """J_m, dmu/da and dlam/da in full coordinates; states that differ in what is held are grouped.
 
         ```
         D' = Z^T D Z + B_c^T K_a B_c          compliant actuators stand in the stiffness
         E  = [A Z; B_r Z; e_j^T Z]            rigid rows: contacts, rigid actuators, held joints
+        D' = blkdiag(D', I), A Z = [A Z, I/sqrt(K_c L^2)]     compliant contacts, deformed by u/sqrt(K_c L^2)
         ```
 
         Args:
             D, A: stiffness and constraint matrix.
             rows: which of the 6 n_c contact components are the rows of A.
             held: joints that do not move.
+            slack: tendons that pull nothing.
         """
-        pattern = held.reshape(-1, held.shape[-1])
+        if held.dim() == 1:
+            return self._solve(D, A, rows, held, slack)
+        n_q = held.shape[-1]
+        pattern = torch.cat([held, slack], dim=-1).reshape(-1, n_q + slack.shape[-1])
         if len(pattern) == 1 or bool((pattern == pattern[0]).all()):
-            return self._solve(D, A, rows, pattern[0])
+            return self._solve(D, A, rows, pattern[0, :n_q], pattern[0, n_q:])
         batch = held.shape[:-1]
         flat_D, flat_A = D.reshape(-1, *D.shape[-2:]), A.reshape(-1, *A.shape[-2:])
         parts: list[Tensor] = []
         for unique in torch.unique(pattern, dim=0):
             at = (pattern == unique).all(-1)
-            group = self._solve(flat_D[at], flat_A[at], rows, unique)
+            group = self._solve(flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:])
             parts = parts or [part.new_empty(len(pattern), *part.shape[1:]) for part in group]
             for whole, part in zip(parts, group, strict=True):
                 whole[at] = part
         return GraspResponse(*(part.reshape(*batch, *part.shape[1:]) for part in parts))
 
-    def _solve(self, D: Tensor, A: Tensor, rows: list[int], held: Tensor) -> GraspResponse:
+    def _solve(self, D: Tensor, A: Tensor, rows: list[int], held: Tensor, slack: Tensor) -> GraspResponse:
         n_q, n_a, n_h, L = self.joint_basis.shape[0], self.actuation.shape[0], len(rows), self.options.length
         S = self.scaled_basis
         D = _left(S, D @ S)
@@ -110,7 +121,8 @@ class Reduction(nn.Module):
         A = row_scale[:, None] * (A @ S)
         B = self.actuation @ S[:n_q]
         finite = torch.isfinite(self.stiffness)
-        rigid, soft = (~finite).nonzero()[:, 0], finite.nonzero()[:, 0]
+        taut = ~slack
+        rigid, soft = (taut & ~finite).nonzero()[:, 0], (taut & finite).nonzero()[:, 0]
         eye = torch.eye(n_a, dtype=D.dtype, device=D.device)
         F = None
         if len(soft):
@@ -120,22 +132,32 @@ class Reduction(nn.Module):
         batch = D.shape[:-2]
         arm = torch.linalg.vector_norm(B[rigid], dim=-1, keepdim=True).clamp_min(1e-12)
         fixed = [B[rigid] / arm, S[:n_q][held]]
+        n_z = S.shape[1]
+        if math.isfinite(self.options.contact_stiffness):
+            # coordinates of their own: with K_c in D, a stiff contact would drown the springs
+            eye_h = torch.eye(n_h, dtype=D.dtype, device=D.device)
+            give = eye_h / (L * self.options.contact_stiffness**0.5)
+            D = pad(D, (0, n_h, 0, n_h)) + pad(eye_h, (n_z, 0, n_z, 0))
+            A = torch.cat([A, give.expand(*batch, n_h, n_h)], dim=-1)
+            fixed = [pad(part, (0, n_h)) for part in fixed]
+            F = None if F is None else pad(F, (0, 0, 0, n_h))
         E = torch.cat([A, *(part.expand(*batch, *part.shape) for part in fixed if len(part))], dim=-2)
         R = D.new_zeros(E.shape[-2], n_a)
         R[n_h : n_h + len(rigid)] = eye[rigid] / arm
         try:
-            step = two_stage(D, E, R, F, on_unstable=self.options.on_unstable)
+            step = two_stage(D, E, R, F, on_unstable=self.options.on_unstable, actuators=self.actuators)
         except (SingularGraspError, UnstableGraspError) as error:
             if error.direction is not None:  # into state coordinates
-                direction = S @ error.direction
+                direction = S @ error.direction[:n_z]
                 error.direction = direction / torch.linalg.vector_norm(direction).clamp_min(1e-300)
             raise
+        motion = step.motion[..., :n_z, :]
         dlam = D.new_zeros(*batch, n_a, n_a)
         dlam[..., rigid, :] = step.reaction[..., n_h : n_h + len(rigid), :] / arm
         if len(soft):
-            dlam[..., soft, :] = self.stiffness[soft, None] * (_left(B[soft].mT, step.motion) - eye[soft])
+            dlam[..., soft, :] = self.stiffness[soft, None] * (_left(B[soft].mT, motion) - eye[soft])
         dmu = row_scale[:, None] * step.reaction[..., :n_h, :]
-        return GraspResponse(_left(S.mT, step.motion), dmu, dlam, step.stability)
+        return GraspResponse(_left(S.mT, motion), dmu, dlam, step.stability)
 
 
 def _left(S: Tensor, X: Tensor) -> Tensor:

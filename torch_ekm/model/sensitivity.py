@@ -6,20 +6,17 @@ import torch
 
 from ..contact.contact_kinematics import ContactKinematics
 from ..contact.contact_model import ContactModel
-from ..kinematics.se3 import hat
 from ..typing import Float, Tensor
-from .linearization import GraspForces
+from .grasp_forces import GraspForces
 
 
 def normal_motion(
     kin: ContactKinematics, J: Float[Tensor, "*batch n_s n_a"]
 ) -> Float[Tensor, "*batch n_c 3 n_a"]:
     """``d n_i/da = w_o x n_i + K_o sdot_i``, ``sdot_i = M_i (w_rel x n_i)``: turning of the normals."""
-    normal = kin.contacts.normal
     w_o = J[..., None, -3:, :]
     w_rel = kin.relative_spin @ J[..., None, :, :]
-    sdot = -(kin.mobility @ hat(normal)) @ w_rel
-    return -hat(normal) @ w_o + kin.contacts.object_curvature @ sdot
+    return -(kin.normal_hat @ w_o) - (kin.contacts.object_curvature @ kin.roll) @ w_rel
 
 
 def force_change(
@@ -27,7 +24,7 @@ def force_change(
 ) -> Float[Tensor, "*batch n_c 3 n_a"]:
     """``C_i dmu_i``: change of the force vectors in hand axes."""
     full = dmu.new_zeros(*dmu.shape[:-2], 6 * kin.contacts.n_c, dmu.shape[-1])
-    full[..., kin.rows, :] = dmu
+    full = full.index_copy(-2, kin.row_index, dmu)
     return kin.frame @ full.unflatten(-2, (kin.contacts.n_c, 6))[..., :3, :]
 
 

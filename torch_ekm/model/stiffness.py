@@ -57,9 +57,7 @@ def geometric_stiffness(
         D[..., :n_q, :n_q] = posture_stiffness(force, kin.point_jacobian.mT, kin.axis, precedes)
     if obj:
         D[..., n_q + 3 :, n_q + 3 :] = -(f_hat @ hat(kin.lever)).sum(-3)
-    Omega = kin.relative_spin
-    normal = kin.contacts.normal
-    roll = kin.mobility @ hat(normal)  # -M (w x n): the contact point runs M (w_rel x n)
+    Omega, roll = kin.relative_spin, kin.roll
     if rolling:
         D = D + _over_contacts(Omega, (f_hat @ roll) @ Omega)
     if bool((spin_moment != 0).any()):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from .observation import Observation, PlantStatus, Truth
 from .plant import Plant
+from .play_compensation import PlayCompensation
 from .recording_plant import RecordingPlant
 from .replayed_plant import ReplayedPlant
 from .servo_inverse import ServoInverse
@@ -17,6 +18,7 @@ __all__ = [
     "Plant",
     "PlantStatus",
     "PlantWrapper",
+    "PlayCompensation",
     "RecordingPlant",
     "ReplayedPlant",
     "ServoInverse",

@@ -2,12 +2,13 @@
 
 Vision: :class:`MarkerTracker` turns images (of any ``Iterable[Frame]``) into the object's pose in the hand
 frame. Hall sensors: :class:`HallCalibration` turns counts into angles, :class:`JointEstimator` joins them
-with the encoders, :class:`ContactAligned` corrects the joints that no sensor reads. The same code serves
-simulated and real readings."""
+with the encoders, :class:`ContactAligned` corrects the joints that no sensor reads, :class:`FingerMarkers`
+reads angles from markers on the links. The same code serves simulated and real readings."""
 
 from __future__ import annotations
 
 from .contact_alignment import ContactAligned
+from .finger_markers import FingerMarkers, calibrate_markers
 from .hall.calibration import HallCalibration, HallEstimate
 from .hall.channel import HallChannel
 from .joint_estimator import JointEstimate, JointEstimator
@@ -27,6 +28,7 @@ __all__ = [
     "BoardPose",
     "CameraCalibration",
     "CharucoTarget",
+    "FingerMarkers",
     "Frame",
     "HallCalibration",
     "HallChannel",
@@ -44,6 +46,7 @@ __all__ = [
     "TrackerOptions",
     "VideoCapture",
     "calibrate_camera",
+    "calibrate_markers",
     "estimate_board_pose",
     "refine_on_edges",
 ]

@@ -56,7 +56,7 @@ class PlantParameters:
     threshold: float = 0.0
     """Commands smaller than this do nothing [rad]."""
     backlash: float = 0.0
-    """Full width of the play between motor and tendon [rad]."""
+    """Full width of the play between motor and tendon [rad], beside that of the description."""
 
     # -- the sensors
     joint_noise: float = 0.0

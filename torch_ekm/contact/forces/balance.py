@@ -63,6 +63,14 @@ class BalanceEquations:
     """Measured normal forces [N], NaN where there is none."""
     normal_std: float = 0.3
     """Their standard deviation [N]."""
+    measured_actuator: Array | None = None
+    """Measured ``-lam``, force of each actuator along +a ``(n_a,)`` [N or N m], NaN where there is none."""
+    actuator_std: float = 0.05
+    """Their standard deviation."""
+    expected: Array | None = None
+    """Forces ``mu`` to stay near, ``(n_h,)``."""
+    expected_covariance: Array | None = None
+    """Of ``expected``, ``(n_h, n_h)``."""
 
     @property
     def row_scale(self) -> Array:
@@ -86,4 +94,6 @@ class ForceSolution:
     violation: float
     """Smallest norm of the unbalanced object wrench (moments divided by L) [N]; about 0 when solved."""
     solves: int
-    """Number of QPs."""
+    """Number of QPs; 0: the answer without inequalities keeps them all."""
+    covariance: Array | None = None
+    """Of ``mu`` about the answer, ``(n_h, n_h)``; None without ``expected_covariance``."""

@@ -1,6 +1,8 @@
-"""The relaxed minimal-force problem as a quadratic program."""
+"""The relaxed force problem as a quadratic program."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,26 +13,42 @@ from .friction import outer_directions
 from .options import ForceOptions
 
 
-def force_problem(eq: BalanceEquations, options: ForceOptions, cuts: Array, *, soft: bool = False):
-    """Build the QP in ``x = [mu; lam; tau]``, all scaled to newtons.
+class ForceCost(NamedTuple):
+    """``1/2 x^T P x + q^T x`` subject to ``balance x = load``, with ``[mu; lam; tau] = scale * x``."""
+
+    P: Array
+    q: Array
+    balance: Array
+    load: Array
+    scale: Array
+
+    def solve(self) -> Array:
+        """``[mu; lam; tau]`` without the inequalities."""
+        n, m = len(self.q), len(self.load)
+        kkt = np.zeros((n + m, n + m))
+        kkt[:n, :n], kkt[:n, n:], kkt[n:, :n] = self.P, self.balance.T, self.balance
+        return self.scale * np.linalg.solve(kkt, np.concatenate([-self.q, self.load]))[:n]
+
+    def covariance(self, n_h: int) -> Array:
+        """``N (N^T P N)^-1 N^T`` of ``mu``, N the null space of the balance: P read as information."""
+        _, sigma, Vh = np.linalg.svd(self.balance)
+        N = Vh[int((sigma > 1e-9 * sigma[0]).sum()) :].T
+        half = (self.scale[:, None] * N)[:n_h]
+        return half @ np.linalg.solve(N.T @ self.P @ N, half.T)
+
+
+def force_cost(eq: BalanceEquations, options: ForceOptions) -> ForceCost:
+    """What the forces should be, in ``x = [mu; lam; tau]``, all scaled to newtons.
 
     ```
-    min  eps (|mu|^2 + k |lam r/L|^2) + |r|^2 / sigma^2 + sum (f_n - measured)^2 / sigma_n^2
-    s.t. G mu = V_p,  f_min <= f_n <= f_max,  |u_i| <= mu_s f_n,i,  -lam >= 0 for tendons,  bounds
+    min  p(mu) + eps k |lam r/L|^2 + |r|^2/sigma^2
+         + sum (f_n - measured)^2/sigma_n^2 + sum (lam + measured)^2/sigma_a^2
+    s.t. G mu = V_p
+    p(mu) = eps |mu|^2, or (mu - expected)^T Sigma^-1 (mu - expected) where forces are expected
     ```
 
-    The friction cones stand in it as polyhedra around them; ``cuts`` carve those down to the cones.
-
-    Args:
-        eq: the balance.
-        options: weights and bounds.
-        cuts: more rows ``g mu <= 0``, ``(k, n_h)``.
-        soft: put the object balance into the cost, to measure how far it is from possible.
-
-    Returns:
-        ``qpsolvers.Problem`` and the scale of the unknowns, ``unknowns = scale * x``.
+    With expected forces it is the negative logarithm of a posterior density (times two).
     """
-    qpsolvers = require("qpsolvers")
     L = eq.length
     n_h, n_a, n_t = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1], len(eq.bound_lower)
     n = n_h + n_a + n_t
@@ -38,38 +56,67 @@ def force_problem(eq: BalanceEquations, options: ForceOptions, cuts: Array, *, s
     scale[list(eq.spin_columns)] = L
     scale[n_h:] = L
     # typical moment arm: 1 for motors in rad, a radius for cables in m
-    arm = np.linalg.norm(eq.actuator_matrix, axis=0)
+    arm = np.sqrt((eq.actuator_matrix * eq.actuator_matrix).sum(0))
     scale[n_h : n_h + n_a] /= np.where(arm > 0, arm, 1.0)
     balance = np.zeros((len(eq.object_load), n))
     balance[:, :n_h] = eq.object_matrix * eq.row_scale[:, None] * scale[:n_h]
-    load = eq.object_load * eq.row_scale
     bound = eq.bound_matrix.reshape(len(eq.hand_load), n_t)
     joint = np.concatenate([eq.hand_matrix, eq.actuator_matrix, bound], axis=1) * scale
+    WJ = joint / options.torque_std**2 if eq.weight is None else eq.weight @ joint / options.torque_std**2
+    P, q = joint.T @ WJ, WJ.T @ eq.hand_load
+    diagonal = np.full(n, options.force_weight)
+    diagonal[n_h : n_h + n_a] *= options.actuator_weight
+    diagonal[n_h + n_a :] *= 1e-2
+    if eq.expected is not None and eq.expected_covariance is not None:
+        diagonal[:n_h] = 0.0
+        W = np.linalg.inv(eq.expected_covariance) * scale[:n_h, None] * scale[:n_h]  # Sigma^-1 in x
+        P[:n_h, :n_h] += W
+        q[:n_h] -= W @ (eq.expected / scale[:n_h])
+    for columns, value, std in (
+        ([cone.start for cone in eq.cones], eq.measured_normal, eq.normal_std),
+        (range(n_h, n_h + n_a), eq.measured_actuator, eq.actuator_std),
+    ):
+        if value is not None:
+            known = np.isfinite(value)
+            at = np.array(columns)[known]
+            sign = np.where(at < n_h, 1.0, -1.0)  # lam is minus the force along +a
+            diagonal[at] += (scale[at] / std) ** 2
+            q[at] -= scale[at] * sign * value[known] / std**2
+    P[np.diag_indices(n)] += diagonal
+    return ForceCost(P, q, balance, eq.object_load * eq.row_scale, scale)
 
-    P = np.diag(np.concatenate([np.ones(n_h), np.full(n_a, options.actuator_weight), np.full(n_t, 1e-2)]))
-    P *= options.force_weight
-    W = 1 / options.torque_std**2 if eq.weight is None else eq.weight / options.torque_std**2
-    WJ = W * joint if eq.weight is None else W @ joint
-    P += joint.T @ WJ
-    q = WJ.T @ eq.hand_load
+
+def force_problem(
+    eq: BalanceEquations, options: ForceOptions, cost: ForceCost, cuts: Array, *, soft: bool = False
+):
+    """Add the inequalities to the cost: a ``qpsolvers.Problem``.
+
+    ```
+    f_min <= f_n <= f_max,  |u_i| <= mu_s f_n,i,  -lam >= 0 for tendons,  bounds of stops and locks
+    ```
+
+    The friction cones stand in it as polyhedra around them; ``cuts`` carve those down to the cones.
+
+    Args:
+        eq: the balance.
+        options: weights and bounds.
+        cost: of :func:`force_cost`.
+        cuts: more rows ``g mu <= 0``, ``(k, n_h)``.
+        soft: put the object balance into the cost, to measure how far it is from possible.
+    """
+    qpsolvers = require("qpsolvers")
+    P, q, balance, load, scale = cost
+    n_h, n_a, n = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1], len(q)
     if soft:
         P = P * 1e-9 + balance.T @ balance
         q = q * 1e-9 - balance.T @ load
     normals = [cone.start for cone in eq.cones]
-    if eq.measured_normal is not None:
-        known = np.isfinite(eq.measured_normal)
-        for i, column in enumerate(normals):
-            if known[i]:
-                P[column, column] += 1 / eq.normal_std**2
-                q[column] -= eq.measured_normal[i] / eq.normal_std**2
-
     rows = np.concatenate([*(cone.rows(outer_directions(cone.dim), n_h) for cone in eq.cones), cuts])
     inequality = np.zeros((len(rows), n))
     inequality[:, :n_h] = rows * scale[:n_h]
     lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
     lower[normals], upper[normals] = options.min_normal, options.max_normal
     upper[n_h : n_h + n_a] = np.where(eq.tendon, 0.0, np.inf)
-    if n_t:
-        lower[n_h + n_a :], upper[n_h + n_a :] = eq.bound_lower / L, eq.bound_upper / L
+    lower[n_h + n_a :], upper[n_h + n_a :] = eq.bound_lower / eq.length, eq.bound_upper / eq.length
     hard, rhs = (None, None) if soft else (balance, load)
-    return qpsolvers.Problem(P, q, inequality, np.zeros(len(rows)), hard, rhs, lower, upper), scale
+    return qpsolvers.Problem(P, q, inequality, np.zeros(len(rows)), hard, rhs, lower, upper)

@@ -12,7 +12,7 @@ from ...typing import Array
 from .balance import BalanceEquations, ForceSolution, ForceStatus
 from .friction import cutting_planes
 from .options import ForceOptions
-from .problem import force_problem
+from .problem import ForceCost, force_cost, force_problem
 
 _TOLERANCE = 2e-7  # [N] largest friction violation left by the cutting planes
 _MAX_CUTS = 30
@@ -29,21 +29,49 @@ def contact_forces(eq: BalanceEquations, options: ForceOptions | None = None) ->
     """
     options = options or ForceOptions()
     n_h = eq.object_matrix.shape[1]
-    cuts = np.zeros((0, n_h))
-    problem, scale = force_problem(eq, options, cuts)
+    cost, cuts = force_cost(eq, options), np.zeros((0, n_h))
+    covariance = None
+    if eq.expected_covariance is not None:
+        covariance = cost.covariance(n_h)
+    inside = _inside(eq, options, cost)
+    if inside is not None:
+        return _unpack(eq, inside, 0, covariance)
+    problem = force_problem(eq, options, cost, cuts)
     for solves in range(1, _MAX_CUTS + 1):
         solution = _solve(problem)
         if not solution.found:
-            return _classify_failure(eq, options, cuts, solves)
-        unknowns = scale * solution.x
+            return _classify_failure(eq, options, cost, cuts, solves)
+        unknowns = cost.scale * solution.x
         new = cutting_planes(eq.cones, unknowns[:n_h], _TOLERANCE)
         if not len(new):
             break
         cuts = np.concatenate([cuts, new])
-        rows = np.zeros((len(new), len(scale)))
-        rows[:, :n_h] = new * scale[:n_h]
+        rows = np.zeros((len(new), len(cost.scale)))
+        rows[:, :n_h] = new * cost.scale[:n_h]
         problem.G, problem.h = np.concatenate([problem.G, rows]), np.append(problem.h, np.zeros(len(new)))
-    return _unpack(eq, unknowns, solves)
+    return _unpack(eq, unknowns, solves, covariance)
+
+
+def _inside(eq: BalanceEquations, options: ForceOptions, cost: ForceCost) -> Array | None:
+    """The answer without inequalities where it keeps them all, as it mostly does; it is then the optimum."""
+    n_h, n_a = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1]
+    try:
+        unknowns = cost.solve()
+    except np.linalg.LinAlgError:  # redundant rows of the balance, as of two point contacts
+        return None
+    mu, lam, bound = np.split(unknowns, [n_h, n_h + n_a])
+    normal = mu[[cone.start for cone in eq.cones]]
+    unbalanced = (eq.object_matrix @ mu - eq.object_load) * eq.row_scale
+    kept = (
+        all(cone.slack(mu) >= 0 for cone in eq.cones)
+        and (normal >= options.min_normal).all()
+        and (normal <= options.max_normal).all()
+        and not (lam[eq.tendon] > 0).any()
+        and (bound >= eq.bound_lower).all()
+        and (bound <= eq.bound_upper).all()
+        and np.abs(unbalanced).max() < _TOLERANCE
+    )
+    return unknowns if kept else None
 
 
 def _solve(problem):
@@ -68,7 +96,9 @@ def _solve(problem):
         return qpsolvers.solve_problem(sparse, "clarabel")
 
 
-def _unpack(eq: BalanceEquations, unknowns: Array, solves: int) -> ForceSolution:
+def _unpack(
+    eq: BalanceEquations, unknowns: Array, solves: int, covariance: Array | None = None
+) -> ForceSolution:
     """Split ``[mu; lam; tau]`` and certify it: joint residual and object violation from the equations."""
     n_h, n_a = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1]
     mu, lam, bound = np.split(unknowns, [n_h, n_h + n_a])
@@ -77,17 +107,18 @@ def _unpack(eq: BalanceEquations, unknowns: Array, solves: int) -> ForceSolution
         residual = residual + eq.bound_matrix @ bound
     unbalanced = (eq.object_matrix @ mu - eq.object_load) * eq.row_scale
     return ForceSolution(
-        ForceStatus.SOLVED, mu, lam, bound, residual, float(np.linalg.norm(unbalanced)), solves
+        ForceStatus.SOLVED, mu, lam, bound, residual, float(np.linalg.norm(unbalanced)), solves, covariance
     )
 
 
-def _classify_failure(eq: BalanceEquations, options: ForceOptions, cuts: Array, solves: int) -> ForceSolution:
+def _classify_failure(
+    eq: BalanceEquations, options: ForceOptions, cost: ForceCost, cuts: Array, solves: int
+) -> ForceSolution:
     """Find out whether the balance is impossible or the solver failed."""
-    problem, scale = force_problem(eq, options, cuts, soft=True)
-    solution = _solve(problem)
+    solution = _solve(force_problem(eq, options, cost, cuts, soft=True))
     status, violation = ForceStatus.FAILED, math.nan
     if solution.found:
-        violation = _unpack(eq, scale * solution.x, solves).violation
+        violation = _unpack(eq, cost.scale * solution.x, solves).violation
         if violation > 1e-6:  # else the balance is possible after all, and only the solver failed
             status = ForceStatus.NOT_GRASPABLE
     n_h, n_a = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1]

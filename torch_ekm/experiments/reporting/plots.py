@@ -17,6 +17,8 @@ from .statistics import ALPHA, learning_curve
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from ...model import Calibration
+
 
 #: Okabe and Ito's palette, safe for colour-blind readers; grey for what is compared against.
 COLOURS = {"KM": "#7f7f7f", "KM+I": "#E69F00", "KM+S": "#009E73", "E-KM": "#0072B2", "limit": "#D55E00"}
@@ -165,4 +167,30 @@ def plot_bank(
     axis.set_title("Which model took the turn (pale: unsure)", loc="left")
     if used:
         axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
+    return figure
+
+
+def plot_calibration(calibration: Calibration) -> Figure:
+    """What a calibration of a hand found, and the errors of its motions before and after.
+
+    Left: each figure that the data tell, with its standard error, in units of its prior (0: as described).
+    Right: errors of the object's rotation.
+    """
+    told = np.array(list(calibration.identifiable.values()), dtype=bool)
+    rows = [row for row in calibration.parameters if row.identifiable]
+    x, error = calibration.x[told], np.sqrt(np.diag(calibration.covariance))[told]
+    figure, (left, right) = new_figure(9.0, max(3.0, 0.22 * len(rows)), columns=2)
+    left.errorbar(x, np.arange(len(rows)), xerr=error, fmt="o", color=COLOURS["E-KM"], markersize=4)
+    left.axvline(0, color=COLOURS["KM"], linewidth=1)
+    left.set_yticks(range(len(rows)), [row.label for row in rows], fontsize=7)
+    left.invert_yaxis()
+    left.set(xlabel="from the description, in standard deviations of the prior")
+    for errors, name, colour in (
+        (calibration.errors_before, "before", COLOURS["KM"]),
+        (calibration.errors_after, "after", COLOURS["E-KM"]),
+    ):
+        degrees = np.degrees(np.linalg.norm(errors[:, -3:], axis=1))
+        right.plot(np.arange(1, len(degrees) + 1), degrees, "o-", color=colour, markersize=3.5, label=name)
+    right.set(xlabel="motion", ylabel="error of the predicted rotation [deg]", ylim=(0, None))
+    right.legend(frameon=False)
     return figure

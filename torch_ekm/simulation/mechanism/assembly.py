@@ -27,7 +27,11 @@ def true_hand(hand: HandDescription, parameters: PlantParameters) -> HandDescrip
         raise ParameterError("moment_arm", parameters.moment_arm, valid)
     limits = _RIGID / np.square(hand.actuation_jacobian).max(axis=1)
     actuators = tuple(
-        dataclasses.replace(actuator, stiffness=parameters.servo_stiffness * min(actuator.stiffness, limit))
+        dataclasses.replace(
+            actuator,
+            stiffness=parameters.servo_stiffness * min(actuator.stiffness, limit),
+            backlash=actuator.backlash + parameters.backlash,
+        )
         for actuator, limit in zip(hand.actuators, limits.tolist(), strict=True)
     )
     return dataclasses.replace(

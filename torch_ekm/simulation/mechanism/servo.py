@@ -25,15 +25,21 @@ class Servo:
         lower, upper: range of each actuator ``(n_a,)`` [rad].
         parameters: the faults; ``fresh`` is bounded by ``actuator_error``, ``backlash`` is ``2 play``.
         relative_to: "encoder" or "setpoint".
+        described_backlash: that of the description, ``(n_a,)``; the parameters' comes on top [rad].
     """
 
     def __init__(
-        self, lower: Array, upper: Array, parameters: PlantParameters, relative_to: str = "encoder"
+        self,
+        lower: Array,
+        upper: Array,
+        parameters: PlantParameters,
+        relative_to: str = "encoder",
+        described_backlash: Array | float = 0.0,
     ) -> None:
         if relative_to not in ("encoder", "setpoint"):
             raise ParameterError("relative_to", relative_to, "'encoder' or 'setpoint'")
         self.lower, self.upper = np.array(lower), np.array(upper)
-        self.relative_to = relative_to
+        self.relative_to, self.described_backlash = relative_to, described_backlash
         self.set_parameters(parameters)
         self.place(np.clip(np.zeros_like(self.lower), self.lower, self.upper))
 
@@ -75,6 +81,6 @@ class Servo:
     def move_to(self, motor: Array) -> Array:
         """Turn the motors to ``motor``; returns where the tendons are then fixed (after the play)."""
         self.encoder = np.array(motor, dtype=np.float64)
-        play = self._p.backlash / 2
+        play = (self.described_backlash + self._p.backlash) / 2
         self.output = np.clip(self.output, self.encoder - play, self.encoder + play)
         return self.output

@@ -61,7 +61,13 @@ class Rig:
         self.hand, self.obj, self.config, self.parameters = hand, obj, config, parameters
         self.remember = remember
         self.transmission = make_transmission(hand, parameters)
-        self.servo = Servo(hand.actuator_lower, hand.actuator_upper, parameters, config.relative_to)
+        self.servo = Servo(
+            hand.actuator_lower,
+            hand.actuator_upper,
+            parameters,
+            config.relative_to,
+            hand.actuator_backlash,
+        )
         self.time = 0.0
         """[s] since the fingers closed."""
         self.normal = np.zeros(len(hand.pads))

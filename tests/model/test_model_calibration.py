@@ -1,0 +1,190 @@
+"""Calibration on exact recordings of a toy hand; what it cannot tell, in words; the files it writes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from calibration_toys import Toy
+
+from torch_ekm.description import load_hand, write_transmission
+from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
+from torch_ekm.kinematics import Play
+from torch_ekm.model import calibrate
+from torch_ekm.model.calibration.identifiability import unidentified
+from torch_ekm.model.calibration.motions import rests
+from torch_ekm.model.calibration.parameters import Parameter, Unknowns
+from torch_ekm.model.calibration.residuals import Evidence
+
+F64 = torch.float64
+
+
+@pytest.fixture(scope="module")
+def toy():
+    return Toy()
+
+
+def test_wrong_figures_are_found_again(toy):
+    calibration = calibrate(
+        toy.model(toy.wrong()), toy.recordings(steps=8), ("springs", "moment_arms", "stiffness")
+    )
+    truth = {
+        "springs": toy.hand.spring_stiffness,
+        "moment_arms": toy.hand.actuation_jacobian,
+        "stiffness": np.array([actuator.stiffness for actuator in toy.hand.actuators]),
+    }
+    rows = zip(calibration.unknowns.parameters, calibration.parameters, strict=True)
+    errors = [
+        abs(row.value / truth[p.kind][p.index] - 1)
+        for p, row in rows
+        if row.identifiable and row.standard_error < 0.01 * abs(row.value)
+    ]
+    assert len(errors) > 0.8 * len(calibration.unknowns)
+    assert max(errors) < 0.03
+    before, after = (np.linalg.norm(e) for e in (calibration.errors_before, calibration.errors_after))
+    assert after < 0.03 * before
+    np.testing.assert_allclose(
+        calibration.hand.actuation_jacobian, toy.hand.actuation_jacobian, rtol=0.03, atol=1e-9
+    )
+
+
+KINDS = (
+    "springs",
+    "rest",
+    "moment_arms",
+    "stiffness",
+    "offset",
+    "backlash",
+    "object_position",
+    "object_rotation",
+)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_derivative_of_the_residuals(toy, kind, monkeypatch):
+    import qpsolvers
+
+    solve = qpsolvers.solve_problem
+
+    def tight(problem, solver, **options):
+        options |= {"eps_abs": 1e-13, "eps_rel": 1e-13} if solver == "piqp" else {}
+        return solve(problem, solver, **options)
+
+    monkeypatch.setattr(qpsolvers, "solve_problem", tight)
+    hand = toy.wrong()
+    actuators = tuple(dataclasses.replace(actuator, backlash=1e-4) for actuator in hand.actuators)
+    hand = dataclasses.replace(hand, actuators=actuators)
+    unknowns = Unknowns(hand, [kind], {"offset": 1e-3, "backlash": 1e-4})
+    evidence = Evidence(toy.model(hand), rests(toy.recordings(steps=3)), unknowns)
+    x = np.full(len(unknowns), 0.02)
+    slope = evidence(x).jacobian
+    for k in range(len(x)):
+        step = np.zeros(len(x))
+        step[k] = 1e-4
+        ends = [evidence(x + sign * step, jacobian=False).value for sign in (1, -1)]
+        expected = (ends[0] - ends[1]) / 2e-4
+        assert np.abs(slope[:, k] - expected).max() < 1e-3 * np.abs(expected).max() + 1e-6, (
+            unknowns.parameters[k]
+        )
+
+
+def test_play_is_found(toy):
+    width = torch.tensor([1e-4, 5e-5, 0.0], dtype=F64)
+    recordings = toy.recordings(steps=12, play=Play(width))
+    calibration = calibrate(toy.model(toy.hand), recordings, ["backlash"], priors={"backlash": 1e-4})
+    found = calibration.hand.actuator_backlash
+    np.testing.assert_allclose(found, width, atol=3e-6)
+    assert np.linalg.norm(calibration.errors_after) < 0.2 * np.linalg.norm(calibration.errors_before)
+
+
+def test_the_offset_of_the_objects_pose_is_found(toy):
+    recordings = toy.recordings(steps=6)
+    position, rotation = (
+        torch.tensor([4e-4, -3e-4, 2e-4], dtype=F64),
+        torch.tensor([0.0, 0.0, 0.0], dtype=F64),
+    )
+    for seen in recordings[0].observations:  # the marker sits elsewhere than it is thought to
+        seen.position = seen.position - seen.rotation @ position
+    calibration = calibrate(toy.model(toy.hand), recordings, ["object_position"])
+    np.testing.assert_allclose(calibration.object_offset[0], position, atol=5e-5)
+    np.testing.assert_allclose(calibration.object_offset[1], rotation, atol=1e-12)
+
+
+def test_one_joint_or_one_actuator_can_be_chosen(toy):
+    unknowns = Unknowns(toy.hand, ["springs:j1", "moment_arms:a2", "stiffness"])
+    labels = [p.label for p in unknowns.parameters]
+    assert labels[0] == "spring of j1"
+    assert all(label.startswith("moment arm of a2 at ") for label in labels[1:-3])
+    hand = unknowns.described(np.full(len(labels), 1.0))
+    assert hand.spring_stiffness[1] == pytest.approx(np.exp(0.5) * toy.hand.spring_stiffness[1])
+    assert hand.spring_stiffness[0] == toy.hand.spring_stiffness[0]
+
+
+def test_bad_input_is_refused(toy):
+    model, recordings = toy.model(toy.hand), toy.recordings(steps=1)
+    with pytest.raises(UnknownNameError, match="moment_arms"):
+        calibrate(model, recordings, ["pulleys"])
+    with pytest.raises(UnknownNameError, match="j0"):
+        calibrate(model, recordings, ["springs:thumb"])
+    with pytest.raises(ParameterError):
+        calibrate(model, recordings, [])
+    with pytest.raises(ParameterError, match="positive"):
+        calibrate(model, recordings, ["springs"], priors={"springs": 0.0})
+    recordings[0].observations[1].status = "lost"
+    with pytest.raises(ParameterError, match="usable"):
+        calibrate(model, recordings, ["springs"])
+
+
+def parameter(kind, name):
+    return Parameter(kind, name, (0,), 1.0, 0.3)
+
+
+def information(*directions):
+    """That tells what is square to the directions, and nothing along them."""
+    n = len(directions[0])
+    _, _, rest = np.linalg.svd(np.array(directions, dtype=float))
+    told = rest[len(directions) :]
+    return 1e4 * told.T @ told + 0.02 * np.eye(n)
+
+
+def test_what_cannot_be_told_is_said_in_words():
+    spring, motor, arm = parameter("springs", "knee"), parameter("stiffness", "m1"), parameter("rest", "knee")
+    said = unidentified([spring, motor], information([1, 1]))
+    assert said == ("spring of knee and stiffness of m1 only as a ratio",)
+    assert "product" in unidentified([spring, motor], information([1, -1]))[0]
+    three = [spring, motor, parameter("springs", "hip")]
+    assert "common factor" in unidentified(three, information([1, 1, 1]))[0]
+    assert "cannot be told" in unidentified(three, information([1, 0, 0]))[0]
+    assert "rest angle of knee" in unidentified([spring, arm], information([1, 1]))[0]
+    unseen = np.diag([1e4, 0.0])
+    assert unidentified([spring, motor], unseen) == ("no motion depends on: stiffness of m1",)
+    assert unidentified([spring, motor], np.diag([1e4, 1e4])) == ()
+
+
+@pytest.mark.parametrize("name", ["icub_right", "planar_two_finger"])
+def test_a_written_transmission_reads_back(name, tmp_path):
+    hand = load_hand(name)
+    actuators = tuple(
+        dataclasses.replace(actuator, stiffness=1.0 + k, backlash=0.01 * k, offset=0.1 * k)
+        for k, actuator in enumerate(hand.actuators)
+    )
+    changed = dataclasses.replace(
+        hand,
+        actuators=actuators,
+        actuation_jacobian=1.1 * hand.actuation_jacobian,
+        spring_stiffness=0.9 * hand.spring_stiffness,
+        spring_rest=hand.spring_rest - 0.1,
+    )
+    write_transmission(changed, tmp_path / "mine.transmission.toml")
+    back = load_hand(tmp_path / "mine.urdf")
+    assert back.actuators == changed.actuators
+    for field in dataclasses.fields(changed):
+        one, other = getattr(changed, field.name), getattr(back, field.name)
+        if isinstance(one, np.ndarray):
+            np.testing.assert_array_equal(one, other)
+        elif field.name not in ("urdf", "transmission_path"):
+            assert one == other, field.name
+    with pytest.raises(DescriptionError, match="end in"):
+        write_transmission(changed, tmp_path / "mine.toml")

@@ -1,0 +1,21 @@
+"""The quick form of benchmarks/calibration.py: a simulated hand whose every figure is off."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sapien")
+pytest.importorskip("coal")
+
+
+@pytest.mark.slow
+def test_ten_motions_find_the_figures_of_a_wrong_hand():
+    from calibration import trial
+
+    outcome, calibration = trial(0, count=10)
+    assert len(outcome.sure["moment_arms"]) >= 8  # of 10
+    assert np.median(outcome.sure["moment_arms"]) < 0.02  # measured 0.00
+    assert np.median(outcome.sure["springs"]) < 0.05
+    assert outcome.ratio < 0.3
+    assert "ring_1" in calibration.unidentified[0]  # a finger that touches nothing

@@ -1,0 +1,135 @@
+"""Contact forces from what fingertips, motors and the step before say."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from model_icub import gripped
+from model_toys import F64, select, soft_two_finger, three_finger
+
+from torch_ekm.contact import ForceOptions
+from torch_ekm.exceptions import ShapeError
+from torch_ekm.kinematics import GraspState
+from torch_ekm.model.grasp_forces import friction_use, margin_std
+
+
+def noisy(state: GraspState, seed: int, std: float = 0.005) -> GraspState:
+    draw = torch.Generator().manual_seed(seed)
+    return GraspState(
+        state.q + std * torch.randn(state.q.shape, generator=draw, dtype=F64), state.position, state.rotation
+    )
+
+
+def icub():
+    model, solver, at = gripped("box")
+    lin = model.linearize(at.state, at.contacts, forces=solver.forces(at))
+    return model, at, lin
+
+
+def test_true_forces_that_are_expected_are_kept_where_the_smallest_are_far_off():
+    model, at, exact = icub()
+    expected = exact.forces_after(torch.zeros(9, dtype=F64))
+    smallest, kept = [], []
+    for seed in range(5):
+        state = noisy(at.state, seed)
+        for errors, told in ((smallest, {}), (kept, {"expected": expected})):
+            lin = model.linearize(state, at.contacts, **told)
+            errors.append(float((lin.forces.force - exact.forces.force).norm()))
+    expected = dataclasses.replace(expected, covariance=1e-4 * expected.covariance)
+    sure = model.linearize(noisy(at.state, 0), at.contacts, expected=expected).forces
+    assert float((sure.force - exact.forces.force).norm()) < 0.1 * kept[0]
+    assert sum(kept) < 0.3 * sum(smallest)
+
+
+def test_forces_follow_the_prediction_over_a_motion():
+    """Two exact equilibria: what was expected after the motion is what comes, and the balance agrees."""
+    model, solver, start = gripped("box")
+    lin = model.linearize(start.state, start.contacts, forces=solver.forces(start))
+    da = torch.zeros(9, dtype=F64)
+    da[3:7] = torch.tensor([0.004, -0.003, 0.002, 0.003], dtype=F64)
+    end = solver.move(start, start.a + da)
+    after, true = lin.forces_after(da), solver.forces(end)
+    assert float((after.force - true.force).norm()) < 0.03 * float((true.force - lin.forces.force).norm())
+    assert torch.allclose(after.margin, true.margin, atol=2e-3)
+    estimated = model.linearize(end.state, end.contacts, expected=after).forces
+    assert float((estimated.force - true.force).norm()) < 5e-3
+    assert torch.equal(estimated.margin_std > 0, torch.ones(3, dtype=torch.bool))
+
+
+@pytest.mark.parametrize("make", [three_finger, soft_two_finger])
+def test_the_margins_deviation_is_that_of_forces_drawn_from_the_covariance(make):
+    toy = make()
+    n_c = toy.contacts.n_c
+    contacts = toy.contacts.replace(friction=torch.full((n_c,), 0.3, dtype=F64))  # friction counts, too
+    forces, draw = toy.forces(), torch.Generator().manual_seed(0)
+    half = 1e-3 * torch.randn(4 * n_c, 4 * n_c, generator=draw, dtype=F64)
+    half[3::4] *= 0.03  # moments
+    mean = torch.cat([forces.force, forces.spin_moment[:, None]], -1).flatten()
+    drawn = mean + torch.randn(8000, 4 * n_c, generator=draw, dtype=F64) @ half.mT
+    drawn = drawn.unflatten(-1, (n_c, 4))
+    n_in, mu_s = -contacts.normal, contacts.friction
+    normal = (drawn[..., :3] * n_in).sum(-1)
+    across = drawn[..., :3] - normal[..., None] * n_in
+    spin = torch.zeros_like(normal)
+    if make is soft_two_finger:
+        spin = drawn[..., 3] * mu_s / contacts.torsional_friction
+    margin = mu_s * normal - (across.square().sum(-1) + spin.square()).sqrt()
+    f_n, now, gradient = friction_use(contacts, forces.force, forces.spin_moment, contacts.normal)
+    std = margin_std(contacts, f_n, gradient, half @ half.mT, ForceOptions(friction_std=0.0))
+    assert torch.allclose(margin.mean(0), now, atol=1e-3)
+    assert torch.allclose(margin.std(0), std, rtol=0.05)
+    wider = margin_std(contacts, f_n, gradient, half @ half.mT, ForceOptions(friction_std=0.1))
+    assert torch.allclose(wider.square(), std.square() + (0.1 * 0.3 * f_n).square())
+
+
+def test_fingertips_and_motor_loads_make_the_margins_surer():
+    model, at, exact = icub()
+    nothing = exact.forces_after(torch.zeros(9, dtype=F64))
+    model.hand = dataclasses.replace(
+        model.hand,
+        pads=tuple(dataclasses.replace(p, name=p.link) for p in model.hand.pads),
+    )
+    tips = torch.full((5,), float("nan"), dtype=F64)
+    tips[:3] = exact.forces.normal
+    told = [
+        {"expected": nothing},
+        {"expected": nothing, "fingertip_force": tips},
+        {"expected": nothing, "fingertip_force": tips, "actuator_load": -exact.forces.lam},
+    ]
+    std = [model.linearize(at.state, at.contacts, **what).forces.margin_std for what in told]
+    assert (std[1] < std[0]).all()
+    assert (std[2] < std[1]).all()
+    assert model.linearize(at.state, at.contacts).forces.margin_std is None  # a choice, not an estimate
+
+
+def test_a_contact_that_was_not_expected_joins_in():
+    toy = three_finger()
+    lin = toy.model.linearize(toy.state, forces=toy.forces())
+    expected = lin.forces_after(torch.zeros(3, dtype=F64))
+    fewer = select(toy.contacts, [0, 2])
+    two = dataclasses.replace(
+        expected,
+        finger=fewer.finger,
+        force=expected.force[[0, 2]],
+        spin_moment=expected.spin_moment[[0, 2]],
+        covariance=expected.covariance[:8, :8],
+    )
+    forces = toy.model.linearize(toy.state, expected=two).forces
+    assert float((forces.force - lin.forces.force).norm()) < 0.2 * float(lin.forces.force.norm())
+    swapped = dataclasses.replace(
+        expected, finger=expected.finger[::-1], force=expected.force.flip(0), covariance=expected.covariance
+    )
+    again = toy.model.linearize(toy.state, expected=swapped).forces
+    assert torch.allclose(
+        again.force, toy.model.linearize(toy.state, expected=expected).forces.force, atol=1e-6
+    )
+
+
+def test_expected_forces_of_another_batch_are_refused():
+    toy = three_finger()
+    lin = toy.model.linearize(toy.state)
+    many = lin.forces_after(torch.zeros(2, 3, dtype=F64))
+    with pytest.raises(ShapeError, match=r"expected\.force"):
+        toy.model.linearize(toy.state, expected=many)

@@ -1,0 +1,305 @@
+"""Every wrong input has a typed error that names it; what can be read rightly is."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from model_icub import gripped
+from model_toys import (
+    F64,
+    build,
+    planar_two_finger,
+    relative_error,
+    select,
+    three_finger,
+    toy_hand,
+    transform,
+)
+
+from torch_ekm.contact import ContactDetector, ContactSet, ferrari_canny
+from torch_ekm.description import load_hand, load_object
+from torch_ekm.exceptions import DescriptionError, EKMError, NonFiniteError, ParameterError, ShapeError
+from torch_ekm.kinematics import GraspState
+from torch_ekm.model import KinematicModel, ModelOptions
+
+TOY = three_finger()
+MODEL, STATE, CONTACTS = TOY.model, TOY.state, TOY.contacts
+EYE, NAN = torch.eye(3, dtype=F64), float("nan")
+HAND, BOX = load_hand("planar_two_finger"), load_object("box")
+
+
+def state(rotation):
+    return GraspState(STATE.q, STATE.position, rotation)
+
+
+def with_contacts(**changes):
+    return MODEL.linearize(STATE, CONTACTS.replace(**changes))
+
+
+def at(field, value, where=1):
+    tensor = getattr(CONTACTS, field).clone()
+    tensor[where] = value
+    return {field: tensor}
+
+
+def felt(force):
+    hand = dataclasses.replace(MODEL.hand, pads=tuple(_pad(name) for name in CONTACTS.finger))
+    model = KinematicModel(
+        hand, MODEL.obj, MODEL.options, kinematics=MODEL.kinematics, detector=lambda *_: CONTACTS
+    )
+    return model.linearize(STATE, fingertip_force=force)
+
+
+def _pad(name):
+    return dataclasses.replace(HAND.pads[0], name=name)
+
+
+WRONG = {
+    "reflection": (
+        lambda: state(torch.diag(torch.tensor([1.0, 1, -1], dtype=F64))),
+        ParameterError,
+        "reflec",
+    ),
+    "rotation scaled": (lambda: state(2 * EYE), ParameterError, "rotation matrix"),
+    "rotation sheared": (lambda: state(EYE + 0.01 * EYE.roll(1, 0)), ParameterError, "rotation matrix"),
+    "rotation of a batch": (
+        lambda: GraspState(STATE.q.expand(2, -1), STATE.position.expand(2, -1), torch.stack([EYE, 2 * EYE])),
+        ParameterError,
+        "rotation",
+    ),
+    "words": (lambda: GraspState(["left"], STATE.position, EYE), ParameterError, "numbers"),
+    "ragged list": (lambda: GraspState([[0.1], [0.1, 0.2]], STATE.position, EYE), ParameterError, "numbers"),
+    "one angle": (lambda: GraspState(torch.tensor(0.3), [0, 0, 0], EYE), ShapeError, "q must"),
+    "float32 state": (lambda: MODEL.linearize(_single(STATE)), ParameterError, "float64"),
+    "NaN in curvature": (
+        lambda: with_contacts(**at("finger_curvature", NAN)),
+        NonFiniteError,
+        "finger_curvature",
+    ),
+    "NaN in friction": (lambda: with_contacts(**at("friction", NAN)), NonFiniteError, "friction"),
+    "negative friction": (lambda: with_contacts(**at("friction", -0.5)), ParameterError, "f1_l2"),
+    "negative gamma": (lambda: with_contacts(**at("torsional_friction", -1e-3)), ParameterError, "torsional"),
+    "normal not unit": (lambda: with_contacts(normal=1.1 * CONTACTS.normal), ParameterError, "length 1.1"),
+    "normal zero": (lambda: with_contacts(**at("normal", 0.0)), ParameterError, "f1_l2"),
+    "curvature misshapen": (lambda: with_contacts(object_curvature=EYE), ShapeError, "object_curvature"),
+    "friction misshapen": (lambda: with_contacts(friction=torch.ones(2)), ShapeError, "friction"),
+    "link missing": (lambda: CONTACTS.replace(link=("f0_l2",)), ShapeError, "link"),
+    "NaN mass": (lambda: _held(mass=NAN), ParameterError, "mass"),
+    "negative mass": (lambda: _held(mass=-0.1), ParameterError, "mass"),
+    "NaN centre of mass": (lambda: _held(com=np.array([0.0, NAN, 0.0])), ParameterError, "com"),
+    "NaN mass in a file": (lambda: dataclasses.replace(BOX, mass=NAN), DescriptionError, "mass"),
+    "negative friction in a file": (lambda: dataclasses.replace(BOX, friction=-1), DescriptionError, "fric"),
+    "inertia of no body": (
+        lambda: dataclasses.replace(BOX, inertia=np.diag([1e-5, 1e-5, 3e-5])),
+        DescriptionError,
+        "sum of the others",
+    ),
+    "NaN step": (lambda: MODEL.linearize(STATE).step([0.1, NAN, 0.0]), NonFiniteError, "delta_a"),
+    "negative fingertip force": (lambda: felt([1.0, -2.0, 1.0]), ParameterError, "fingertip_force"),
+    "infinite fingertip force": (lambda: felt([1.0, math.inf, 1.0]), ParameterError, "fingertip_force"),
+    "zero planar normal": (
+        lambda: dataclasses.replace(HAND, planar_normal=(0, 0, 0)),
+        DescriptionError,
+        "zero",
+    ),
+    "planar normal across the axes": (
+        lambda: dataclasses.replace(HAND, planar_normal=(0.0, 0.1, 1.0)),
+        DescriptionError,
+        "left_0",
+    ),
+    "hand without pads": (
+        lambda: KinematicModel(dataclasses.replace(HAND, pads=()), BOX),
+        DescriptionError,
+        "pads",
+    ),
+    "contact stiffness": (lambda: ModelOptions(contact_stiffness=0.0), ParameterError, "contact_stiffness"),
+    "slack tension": (lambda: ModelOptions(slack_tension=-1.0), ParameterError, "slack_tension"),
+}
+
+
+def _single(s):
+    return GraspState(s.q.float(), s.position.float(), s.rotation.float())
+
+
+def _held(**changes):
+    obj = dataclasses.replace(MODEL.obj, **changes)
+    return KinematicModel(MODEL.hand, obj, kinematics=MODEL.kinematics, detector=lambda *_: CONTACTS)
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_input_has_a_typed_error_that_names_it(case):
+    call, kind, match = WRONG[case]
+    assert issubclass(kind, EKMError)
+    with pytest.raises(kind, match=match):
+        call()
+
+
+def test_a_planar_hand_may_have_its_normal_either_way_round_and_of_any_length():
+    assert dataclasses.replace(HAND, planar_normal=(0.0, 0.0, -2.0)).planar_normal == (0.0, 0.0, -2.0)
+
+
+def test_arrays_lists_and_both_precisions_are_read():
+    expected = MODEL.linearize(STATE).manipulation_jacobian
+    kinds = {
+        "numpy": lambda x: x.numpy(),
+        "list": lambda x: x.tolist(),
+    }
+    for kind in kinds.values():
+        s = GraspState(*(kind(x) for x in (STATE.q, STATE.position, STATE.rotation)))
+        assert torch.equal(MODEL.linearize(s).manipulation_jacobian, expected)
+        fields = {f.name: getattr(CONTACTS, f.name) for f in dataclasses.fields(CONTACTS)}
+        contacts = ContactSet(
+            **{k: kind(v) if isinstance(v, torch.Tensor) else list(v) for k, v in fields.items()}
+        )
+        assert torch.equal(MODEL.linearize(STATE, contacts).manipulation_jacobian, expected)
+    mixed = GraspState(STATE.q, STATE.position.float(), np.eye(3, dtype=np.float32))
+    assert mixed.position.dtype == mixed.rotation.dtype == F64
+    assert GraspState([0, 1], [0, 0, 0], torch.eye(3)).rotation.dtype == F64  # lists count as float64
+    single = GraspState(torch.zeros(2), np.zeros(3, dtype=np.float32), torch.eye(3))
+    assert single.position.dtype == torch.float32
+    step = MODEL.linearize(STATE).step([0.01, 0, 0])
+    assert torch.equal(step, MODEL.linearize(STATE).step(np.array([0.01, 0, 0])))
+    assert torch.allclose(step, MODEL.linearize(STATE).step(torch.tensor([0.01, 0, 0])), rtol=1e-6)
+    assert torch.equal(felt([1.0, NAN, 1.0]).forces.mu, felt(np.array([1.0, NAN, 1.0])).forces.mu)
+
+
+def test_a_sensor_that_reads_a_little_below_zero_is_noise():
+    assert felt([-0.1, 0.0, 0.0]).forces.solved
+
+
+def test_ferrari_canny_of_nothing_is_nothing():
+    kin = MODEL.contact_kinematics(STATE, CONTACTS)
+    assert ferrari_canny(kin) > 0.01
+    nothing = select(CONTACTS, [])
+    assert ferrari_canny(MODEL.contact_kinematics(STATE, nothing)) == 0.0
+    smooth = CONTACTS.replace(friction=torch.zeros(3, dtype=F64))
+    assert ferrari_canny(MODEL.contact_kinematics(STATE, smooth)) == 0.0
+    flat = planar_two_finger()
+    assert ferrari_canny(flat.model.contact_kinematics(flat.state, flat.contacts)) > 0.01
+
+
+def variant(toy, **changes):
+    model, options = toy.model, dataclasses.replace(toy.model.options, **changes)
+    return KinematicModel(
+        model.hand, model.obj, options, kinematics=model.kinematics, detector=lambda *_: toy.contacts
+    )
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.004])
+def test_stiff_contacts_tend_to_rigid_ones_without_false_alarm(gamma):
+    toy = three_finger(gamma=gamma)
+    forces, rigid = toy.forces(), toy.model.linearize(toy.state, forces=toy.forces())
+    errors = []
+    for K_c in (1e5, 1e6, 1e7, 1e12):
+        lin = variant(toy, contact_stiffness=K_c).linearize(toy.state, forces=forces)
+        errors.append(relative_error(lin.manipulation_jacobian, rigid.manipulation_jacobian, 9))
+        change = lin.contact_force_sensitivity - rigid.contact_force_sensitivity
+        errors[-1] = max(errors[-1], float(change.norm() / rigid.contact_force_sensitivity.norm()))
+    assert errors[0] > 5 * errors[1] > 25 * errors[2]  # first order in 1/K_c
+    assert errors[3] < 1e-6
+
+
+def test_compliant_contacts_are_springs_in_series():
+    """One finger of one joint presses on a fixed wall: da moves the tip by what servo and contact share."""
+    toy, L, K_c = three_finger(gamma=0.004), 0.03, 3e4
+    forces = toy.forces()
+    model = variant(toy, contact_stiffness=K_c)
+    lin = model.linearize(toy.state, forces=forces)
+    from torch_ekm.contact.contact_kinematics import constraint_matrix
+
+    kin = model.contact_kinematics(toy.state, toy.contacts)
+    moved = constraint_matrix(kin) @ lin.manipulation_jacobian
+    give = torch.tensor([K_c if row % 6 < 3 else K_c * L**2 for row in kin.rows], dtype=F64)[:, None]
+    assert torch.allclose(lin.contact_force_sensitivity, give * moved, rtol=1e-8, atol=1e-8)
+
+
+def test_a_very_stiff_actuator_is_rigid_without_false_alarm():
+    model, solver, equilibrium = gripped("box")
+    forces = solver.forces(equilibrium)
+
+    def jacobian(stiffness):
+        actuators = tuple(dataclasses.replace(a, stiffness=stiffness) for a in model.hand.actuators)
+        hand = dataclasses.replace(model.hand, actuators=actuators)
+        args = {"kinematics": model.kinematics, "detector": model.detector}
+        stiff = KinematicModel(hand, model.obj, model.options, **args)
+        return stiff.linearize(equilibrium.state, equilibrium.contacts, forces=forces).manipulation_jacobian
+
+    assert relative_error(jacobian(1e12), jacobian(math.inf), 20) < 1e-12
+    assert relative_error(jacobian(9e5), jacobian(math.inf), 20) < 1e-4
+
+
+def loose_tendon():
+    """Two planar fingers of two joints with a tendon on each joint; that of the first joint pulls nothing."""
+    J_a = np.array([[0.009, 0.0, 0, 0], [0.004, 0.008, 0, 0], [0, 0, 0.009, 0.008]])
+    z = np.array([0.0, 0.0, 1.0])
+    fingers = [
+        [(transform((0.04 * side, 0.0, 0.0)), side * z), (transform((0.0, 0.04, 0.0)), side * z)]
+        for side in (1.0, -1.0)
+    ]
+
+    def make(rows, lam):
+        return build(
+            fingers,
+            np.array([0.3, 0.35, 0.25, 0.4]),
+            J_a[rows],
+            np.tile([0.2, 0.15], 2),
+            tip=(0.0, 0.03, 0.0),
+            rho=0.008,
+            normals=[[1.0, 0.15, 0.0], [-1.0, 0.1, 0.0]],
+            contact_links=["f0_l1", "f1_l1"],
+            lam=torch.tensor(lam, dtype=F64),
+            planar=(0.0, 0.0, 1.0),
+            com=(0.002, -0.003, 0.0),
+        )
+
+    return make([0, 1, 2], [0.0, -20.0, -20.0]), make([1, 2], [-20.0, -20.0])
+
+
+def test_a_slack_tendon_moves_nothing_and_holds_nothing():
+    toy, without = loose_tendon()
+    truth = without.model.linearize(without.state).manipulation_jacobian
+    for options in ({}, {"slack_tension": 0.0}, {"slack_tension": 1e-3}):
+        J = variant(toy, **options).linearize(toy.state).manipulation_jacobian
+        assert J[:, 0].abs().max() == 0
+        assert relative_error(J[:, 1:], truth, 4) < 1e-4
+    rods = variant(toy, slack_tension=None).linearize(toy.state).manipulation_jacobian
+    assert rods[:, 0].abs().max() > 0
+    assert relative_error(rods[:, 1:], truth, 4) > 0.1  # rods hold what tendons let go
+    # forces that were not found say nothing about tensions
+    slippery = toy.contacts.replace(friction=torch.full((2,), 0.001, dtype=F64))
+    lin = toy.model.linearize(toy.state, slippery)
+    assert not lin.forces.solved
+    assert lin.manipulation_jacobian[:, 0].abs().max() > 0
+
+
+def test_states_of_a_batch_have_their_own_slack_tendons():
+    toy, _ = loose_tendon()
+    forces = toy.forces()
+    lam = torch.stack([toy.lam, toy.lam - 1.0])
+    wide = {
+        f.name: getattr(forces, f.name).expand(2, *getattr(forces, f.name).shape)
+        for f in dataclasses.fields(forces)
+        if f.name not in ("status", "lam", "covariance", "margin_std")
+    }
+    both = dataclasses.replace(forces, lam=lam, status=forces.status * 2, **wide)
+    fields = ("point", "normal", "gap", "finger_curvature", "object_curvature")
+    contacts = toy.contacts.replace(**{n: torch.stack([getattr(toy.contacts, n)] * 2) for n in fields})
+    states = GraspState(*(torch.stack([x, x]) for x in (toy.state.q, toy.state.position, toy.state.rotation)))
+    J = toy.model.linearize(states, contacts, forces=both).manipulation_jacobian
+    one = toy.model.linearize(toy.state, forces=forces).manipulation_jacobian
+    assert torch.allclose(J[0], one, atol=1e-12)
+    assert J[0, :, 0].abs().max() == 0
+    assert J[1, :, 0].abs().max() > 0
+
+
+def test_detector_without_pads():
+    with pytest.raises(DescriptionError, match="pads"):
+        ContactDetector(dataclasses.replace(HAND, pads=()), BOX)
+
+
+def test_the_toy_hand_has_no_urdf_and_may_be_planar():
+    assert toy_hand(2, np.eye(2), [0.1, 0.1], [0.0, 0.0], planar=(0, 0, 1.0)).planar_normal == (0, 0, 1.0)

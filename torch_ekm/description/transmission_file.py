@@ -1,0 +1,78 @@
+"""Write the transmission file of a hand whose figures have changed."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+from ..exceptions import DescriptionError
+from ._toml import read_toml
+from .hand import HandDescription
+
+_ENDING = ".transmission.toml"
+
+
+def write_transmission(hand: HandDescription, path: str | Path) -> Path:
+    """Write springs, rest angles, friction, moment arms, offsets, stiffness and play of ``hand`` to ``path``.
+
+    Everything else (ranges, couplings, pads, sensors, notes) is that of ``hand.transmission_path``; comments
+    are lost. The URDF is copied beside it if there is none, so that ``load_hand`` reads the hand back.
+
+    Args:
+        hand: its description.
+        path: ends in ".transmission.toml".
+
+    Raises:
+        DescriptionError: another ending, or the file that the hand was read from is gone.
+    """
+    path = Path(path)
+    if not path.name.endswith(_ENDING):
+        raise DescriptionError(path, f"the name must end in '{_ENDING}'")
+    data = read_toml(hand.transmission_path, "transmission file")
+    for j, name in enumerate(hand.joint_names):
+        data["joints"][name] = {
+            "spring": float(hand.spring_stiffness[j]),
+            "rest": float(hand.spring_rest[j]),
+            "friction": float(hand.joint_friction[j]),
+        }
+    for actuator, table, arms in zip(hand.actuators, data["actuators"], hand.actuation_jacobian, strict=True):
+        table["moment_arms"] = {
+            name: float(arm) for name, arm in zip(hand.joint_names, arms, strict=True) if arm != 0
+        }
+        for key in ("stiffness", "offset", "offset_deg", "backlash", "backlash_deg"):
+            table.pop(key, None)
+        if math.isfinite(actuator.stiffness):
+            table["stiffness"] = float(actuator.stiffness)
+        for key in ("offset", "backlash"):
+            if getattr(actuator, key):
+                table[key] = float(getattr(actuator, key))
+    path.write_text(_document(data), encoding="utf-8")
+    urdf = path.with_name(path.name.removesuffix(_ENDING) + ".urdf")
+    if not urdf.exists():
+        shutil.copyfile(hand.urdf_path, urdf)
+    return path
+
+
+def _document(data: dict[str, Any]) -> str:
+    lines: list[str] = []
+    for name, value in data.items():
+        for table in value if isinstance(value, list) else [value]:
+            lines += ["", f"[[{name}]]" if isinstance(value, list) else f"[{name}]"]
+            lines += [f"{_key(key)} = {_value(entry)}" for key, entry in table.items()]
+    return "\n".join(lines[1:]) + "\n"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_key(key)} = {_value(entry)}" for key, entry in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    # numbers, booleans and strings are written alike in JSON and in TOML
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _key(key: str) -> str:
+    return key if key.replace("_", "").replace("-", "").isalnum() and key.isascii() else json.dumps(key)

@@ -1,0 +1,9 @@
+"""The springs, arms and stiffnesses of one's own hand, from motions that it made."""
+
+from __future__ import annotations
+
+from .calibrate import calibrate
+from .motions import Recording
+from .result import Calibrated, Calibration
+
+__all__ = ["Calibrated", "Calibration", "Recording", "calibrate"]

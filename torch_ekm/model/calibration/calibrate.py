@@ -1,0 +1,160 @@
+"""Least squares from measured motions to the figures of a hand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from itertools import pairwise
+
+import numpy as np
+
+from ..._extras import require
+from ...exceptions import GraspError, ParameterError
+from ...typing import Array
+from ..kinematic_model import KinematicModel
+from .identifiability import unidentified
+from .motions import Recording, rests
+from .parameters import Unknowns
+from .residuals import GROUPS, Evidence, Residuals
+from .result import Calibration
+
+_SMALLEST_NOISE = 1e-3  # of the standard deviations at the start: below, the model's own error is left
+_UNSENSED = 0.5  # of the force problem's standard deviations, where no sensor tells their scale
+_INSIDE = 0.1  # [priors] of its bound a search begins
+_ROUNDS, _SETTLED = 8, 0.2  # of estimating the noise, at most; relative change at which it is known
+
+
+def calibrate(
+    model: KinematicModel,
+    recordings: Iterable[Recording],
+    parameters: Iterable[str] = ("springs", "moment_arms", "stiffness", "offset"),
+    *,
+    priors: Mapping[str, float] | None = None,
+    loss: str = "soft_l1",
+) -> Calibration:
+    """``min_x |W r(x)|^2 + |x|^2``: figures of the hand from measured motions, and how sure they are.
+
+    ``r``: motions against ``J_m``, joint torques that no force explains, fingertip forces
+    (:class:`~torch_ekm.model.calibration.residuals.Evidence`). ``x``: distance of each parameter from its
+    description, in units of its prior. ``W``: one standard deviation for each kind of residual, estimated
+    from the residuals in turn with x. Bounds: five priors, and no negative play. The derivative is that of
+    :meth:`KinematicModel.linearize`; solved by scipy's trust-region reflective least squares.
+
+    The scale of all springs and stiffnesses together is told by fingertip forces alone (and a little by
+    the object's weight): without them expect ratios.
+
+    Args:
+        model: of the hand as described and of the object that was moved.
+        recordings: trajectories of it, say 30 motions of 1 to 3 deg in several grasps. The encoders' readings
+            give the increments, so the faults of a position controller do no harm.
+        parameters: kinds ("springs", "rest", "moment_arms", "stiffness", "offset", "backlash",
+            "object_position", "object_rotation"), or one of a kind: "springs:thumb_2",
+            "moment_arms:thumb_distal".
+        priors: standard deviations in place of
+            :data:`~torch_ekm.model.calibration.parameters.PRIORS`, by kind.
+        loss: of scipy's ``least_squares``: "soft_l1" bears motions in which a contact slipped, "linear" is a
+            little better where there are none.
+
+    Raises:
+        UnknownNameError: no such kind of parameter, joint or actuator.
+        ParameterError: no motion can be used, or a prior is not positive.
+    """
+    unknowns = Unknowns(model.hand, parameters, priors)
+    evidence = Evidence(model, rests(recordings), unknowns)
+    nominal = np.zeros(len(unknowns))
+    start = np.maximum(nominal, unknowns.bounds[0] + _INSIDE)  # no derivative leads off a bound
+    if not any(one and other for usable in evidence.usable for one, other in pairwise(usable)):
+        reason = "with two states in a row at which the object is held and its forces are found"
+        raise ParameterError("recordings", "no usable motion", reason)
+    before = evidence(nominal, jacobian=False)
+    problem, x = _Problem(evidence, before), start
+    for _ in range(_ROUNDS):
+        at = require("scipy.optimize").least_squares(
+            problem.residuals,
+            x,
+            problem.jacobian,
+            unknowns.bounds,
+            loss=loss,
+            xtol=1e-3,
+            ftol=1e-3,
+            max_nfev=12,
+        )
+        x, last = at.x, problem.noise.copy()
+        problem.estimate_noise(x)
+        if np.abs(np.log(problem.noise / last)).max() < _SETTLED:
+            break
+    after = problem.at(x)
+    information = problem.information(x)
+    covariance: Array = np.linalg.inv(information + np.eye(len(x))).astype(np.float64)
+    return Calibration(
+        model=model,
+        unknowns=unknowns,
+        x=x,
+        covariance=covariance,
+        errors_before=before.motion,
+        errors_after=after.motion,
+        noise=problem.deviations(),
+        unidentified=unidentified(unknowns.parameters, information),
+    )
+
+
+class _Problem:
+    """The residuals as scipy wants them, each point computed once, the priors as last rows."""
+
+    def __init__(self, evidence: Evidence, start: Residuals) -> None:
+        self.evidence, self.noise = evidence, np.ones(len(GROUPS))
+        self.size = len(start.value)
+        self._key: Array | None = None
+        self._last = start
+
+    def at(self, x: Array) -> Residuals:
+        if self._key is None or not np.array_equal(self._key, x):
+            self._last, self._key = self.evidence(x), x.copy()
+        return self._last
+
+    def residuals(self, x: Array) -> Array:
+        try:
+            at = self.at(x)
+        except GraspError:  # the search then takes a smaller step
+            return np.full(self.size + len(x), np.inf)
+        return np.concatenate([at.value / self.noise[at.group], x])
+
+    def jacobian(self, x: Array) -> Array:
+        at = self.at(x)
+        return np.concatenate([at.jacobian / self.noise[at.group, None], np.eye(len(x))])
+
+    def information(self, x: Array) -> Array:
+        """Fisher information of the data alone, ``J^T W^2 J``."""
+        at = self.at(x)
+        scaled = at.jacobian / self.noise[at.group, None]
+        return scaled.T @ scaled
+
+    def deviations(self) -> dict[str, float]:
+        """Estimated standard deviations [rad, m, N m, N]."""
+        found = {name: float(s * self.noise[k]) for k, (name, s) in enumerate(GROUPS.items())}
+        scale = found.pop("equilibrium")
+        options = self.evidence.model.options.forces
+        return {**found, "torque": scale * options.torque_std, "force": scale * options.normal_std}
+
+    def estimate_noise(self, x: Array) -> None:
+        """Standard deviation of each kind of residual; those of motions by the median, since contacts slip.
+
+        Rows that no parameter moves (out of a planar hand's plane) say nothing. The parameters take their
+        share of the freedom, as far as the data and not the priors tell them.
+        """
+        at, sensors = self.at(x), self.evidence.sensors
+        told = np.abs(at.jacobian).max(axis=1) > 1e-9
+        values = np.linalg.eigvalsh(self.information(x))
+        freedom = float(np.sum(values / (1 + values)))
+        share = max(0.1, 1 - freedom / max(1, told.sum()))
+        for k, name in enumerate(GROUPS):
+            own = at.value[(at.group == k) & told]
+            if name == "equilibrium":
+                # each state has as many equations to spare as it has sensors; the rest the forces fit exactly
+                noise = float(np.sqrt(own @ own / sensors)) if sensors else _UNSENSED
+            elif not own.size:
+                continue
+            elif name == "encoder":
+                noise = float(np.sqrt(np.mean(own**2)))
+            else:
+                noise = 1.4826 * float(np.median(np.abs(own)))
+            self.noise[k] = max(_SMALLEST_NOISE, noise / share**0.5)

@@ -1,0 +1,57 @@
+"""What a recording tells the calibration: states at rest and the motors' increments between them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+
+from ...kinematics.grasp_state import GraspState
+from ...kinematics.se3 import exp
+from ...typing import Float, Tensor
+
+
+class Recording(Protocol):
+    """``torch_ekm.plant.Trajectory``, or anything with observations in the order of time.
+
+    Of each observation: ``state``, ``a`` (encoders [rad]), ``fingertip_force`` [N] (NaN, or None as a whole,
+    where there is no sensor) and ``status``; what is not "held" ends a grasp.
+    """
+
+    @property
+    def observations(self) -> Sequence[Any]: ...
+
+
+@dataclass(frozen=True)
+class Rest:
+    """One state at rest."""
+
+    state: GraspState
+    a: Float[Tensor, " n_a"]
+    force: Float[Tensor, " n_pads"] | None
+
+    def shifted(self, position: Float[Tensor, " 3"], rotation: Float[Tensor, " 3"]) -> GraspState:
+        """``o' = o + R t``, ``R' = R exp([phi]x)``: where an object read with an offset is."""
+        R, o = self.state.rotation, self.state.position
+        return GraspState(self.state.q, o + R @ position, R @ exp(rotation))
+
+
+def rests(recordings: Iterable[Recording]) -> list[list[Rest]]:
+    """The states of each grasp, in order; a state in which the object is not held or not seen ends one."""
+    grasps: list[list[Rest]] = []
+    for recording in recordings:
+        grasp: list[Rest] = []
+        for seen in recording.observations:
+            if getattr(seen.status, "value", seen.status) != "held":
+                grasps.append(grasp)
+                grasp = []
+                continue
+            force = None if seen.fingertip_force is None else seen.fingertip_force.double()
+            if force is not None and not bool(torch.isfinite(force).any()):
+                force = None
+            state = GraspState(*(part.double() for part in (seen.q, seen.position, seen.rotation)))
+            grasp.append(Rest(state, seen.a.double(), force))
+        grasps.append(grasp)
+    return [grasp for grasp in grasps if len(grasp) > 1]

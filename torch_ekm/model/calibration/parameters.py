@@ -1,0 +1,192 @@
+"""Which figures of a hand are to be found, how far they may be from the description, and their unknowns."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ...description.hand import HandDescription
+from ...exceptions import ParameterError, UnknownNameError
+from ...typing import Array, Float, Tensor
+
+PRIORS = {
+    "springs": 0.5,
+    "rest": math.radians(10),
+    "moment_arms": 0.3,
+    "stiffness": 0.7,
+    "offset": math.radians(5),
+    "backlash": math.radians(1),
+    "object_position": 0.002,
+    "object_rotation": math.radians(2),
+}
+"""Kinds of parameters, and how far off each may well be (one standard deviation): of the logarithm for
+springs, moment arms and stiffness, else [rad] or [m]."""
+_LOGARITHMIC = ("springs", "moment_arms", "stiffness")
+_WORDS = {
+    "springs": "spring",
+    "rest": "rest angle",
+    "stiffness": "stiffness",
+    "offset": "offset",
+    "backlash": "backlash",
+}
+_FURTHEST = 5.0  # priors: bounds of the search
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One unknown: ``value = nominal exp(prior x)`` of a positive figure, else ``nominal + prior x``."""
+
+    kind: str
+    name: str
+    """Joint, actuator, "actuator at joint" for a moment arm, or axis of the object's frame."""
+    index: tuple[int, ...]
+    """Where it stands in the hand's array of its kind."""
+    nominal: float
+    prior: float
+
+    @property
+    def label(self) -> str:
+        """In words."""
+        if self.kind == "moment_arms":
+            return f"moment arm of {self.name}"
+        if self.kind in _WORDS:
+            return f"{_WORDS[self.kind]} of {self.name}"
+        return f"{self.kind.replace('_', ' ')} {self.name}"
+
+    @property
+    def logarithmic(self) -> bool:
+        return self.kind in _LOGARITHMIC
+
+    @property
+    def lowest(self) -> float:
+        """Bound of x: play is not negative."""
+        return max(-_FURTHEST, -self.nominal / self.prior) if self.kind == "backlash" else -_FURTHEST
+
+    def slope(self, value: float) -> float:
+        """d value/dx."""
+        return self.prior * (abs(value) if self.logarithmic else 1.0)
+
+
+class Figures(NamedTuple):
+    """What a model and its play are made of; ``object_offset`` is ``(t, phi)`` in the object's frame."""
+
+    springs: Float[Tensor, " n_q"]
+    rest: Float[Tensor, " n_q"]
+    moment_arms: Float[Tensor, "n_a n_q"]
+    stiffness: Float[Tensor, " n_a"]
+    offset: Float[Tensor, " n_a"]
+    backlash: Float[Tensor, " n_a"]
+    object_position: Float[Tensor, " 3"]
+    object_rotation: Float[Tensor, " 3"]
+
+    @classmethod
+    def of(cls, hand: HandDescription) -> Figures:
+        """As described."""
+        zero = np.zeros(3)
+        stiffness = [actuator.stiffness for actuator in hand.actuators]
+        arrays = (hand.spring_stiffness, hand.spring_rest, hand.actuation_jacobian, stiffness)
+        parts = (*arrays, hand.actuator_offset, hand.actuator_backlash, zero, zero)
+        return cls(*(torch.as_tensor(np.array(part), dtype=torch.float64) for part in parts))
+
+
+class Unknowns:
+    """The chosen parameters as one vector x, in units of their priors: 0 is the description.
+
+    Args:
+        hand: its figures are the start.
+        chosen: kinds, or "kind:name" for one of them (all pulleys of an actuator: "moment_arms:actuator").
+            Kinds leave out actuators that only shape the hand (``posture``): they rest while an object moves.
+        priors: in place of :data:`PRIORS`, by kind.
+
+    Raises:
+        UnknownNameError: no such kind or name.
+        ParameterError: nothing is chosen, or a prior is not positive.
+    """
+
+    def __init__(
+        self, hand: HandDescription, chosen: Iterable[str], priors: Mapping[str, float] | None = None
+    ) -> None:
+        self.hand, self.nominal = hand, Figures.of(hand)
+        for kind, prior in (priors or {}).items():
+            if kind not in PRIORS:
+                raise UnknownNameError("kind of parameter", kind, PRIORS)
+            if not prior > 0:
+                raise ParameterError(f"priors[{kind!r}]", prior, "positive")
+        scale = {**PRIORS, **(priors or {})}
+        found: dict[tuple[str, tuple[int, ...]], Parameter] = {}
+        for choice in chosen:
+            kind, _, one = choice.partition(":")
+            if kind not in PRIORS:
+                raise UnknownNameError("kind of parameter", kind, PRIORS)
+            candidates = self._all(kind, scale[kind], with_posture=bool(one))
+            names = list(dict.fromkeys(part for p in candidates for part in p.name.split(" at ")[:1]))
+            if one and one not in names:
+                raise UnknownNameError(f"one of the {kind}", one, names)
+            for p in candidates:
+                if not one or p.name.split(" at ")[0] == one:
+                    found[p.kind, p.index] = p
+        self.parameters = tuple(found.values())
+        if not self.parameters:
+            raise ParameterError("parameters", list(chosen), f"some of {', '.join(PRIORS)}")
+
+    def _all(self, kind: str, prior: float, with_posture: bool) -> list[Parameter]:
+        hand, values = self.hand, getattr(self.nominal, kind)
+        motors = [k for k, a in enumerate(hand.actuators) if with_posture or not a.posture]
+        if kind.startswith("object"):
+            names = {(k,): axis for k, axis in enumerate("xyz")}
+        elif kind == "moment_arms":
+            at = np.argwhere(hand.actuation_jacobian != 0).tolist()
+            names = {(a, j): f"{hand.actuator_names[a]} at {hand.joint_names[j]}" for a, j in at}
+            names = {index: name for index, name in names.items() if index[0] in motors}
+        else:
+            by_joint = kind in ("springs", "rest")
+            of = hand.joint_names if by_joint else hand.actuator_names
+            names = {(k,): name for k, name in enumerate(of) if by_joint or k in motors}
+        entries = [Parameter(kind, name, at, float(values[at]), prior) for at, name in names.items()]
+        # a spring that is not there and an actuator that is rigid have no logarithm to search
+        return [p for p in entries if not p.logarithmic or (p.nominal != 0 and math.isfinite(p.nominal))]
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Of x; a play that starts at 0 stands on its bound."""
+        return np.array([p.lowest for p in self.parameters]), np.full(len(self), _FURTHEST)
+
+    def figures(self, x: Float[Tensor, " n"]) -> Figures:
+        """All figures at x, with its graph."""
+        result = {}
+        for kind in Figures._fields:
+            own = [k for k, p in enumerate(self.parameters) if p.kind == kind]
+            base = getattr(self.nominal, kind)
+            if own:
+                index = tuple(torch.tensor([self.parameters[k].index for k in own]).T)
+                prior = torch.tensor([self.parameters[k].prior for k in own], dtype=base.dtype)
+                step = prior * x[own]
+                value = base[index] * torch.exp(step) if kind in _LOGARITHMIC else base[index] + step
+                base = base.index_put(index, value)
+            result[kind] = base
+        return Figures(**result)
+
+    def described(self, x: Array) -> HandDescription:
+        """The hand with these figures."""
+        figures = self.figures(torch.from_numpy(x))
+        springs, rest, J_a, stiffness, offset, backlash = (part.numpy() for part in figures[:6])
+        actuators = tuple(
+            dataclasses.replace(actuator, stiffness=float(k), offset=float(a), backlash=float(w))
+            for actuator, k, a, w in zip(self.hand.actuators, stiffness, offset, backlash, strict=True)
+        )
+        return dataclasses.replace(
+            self.hand,
+            actuators=actuators,
+            actuation_jacobian=J_a,
+            spring_stiffness=springs,
+            spring_rest=rest,
+        )

@@ -1,0 +1,201 @@
+"""What measured motions and forces have against a set of figures, and its derivative."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...exceptions import GraspError
+from ...kinematics.play import Play
+from ...kinematics.se3 import exp
+from ...typing import Array, Tensor
+from ..kinematic_model import KinematicModel
+from ..linearization import Linearization
+from .motions import Rest
+from .parameters import Figures, Unknowns
+
+GROUPS = {
+    "joints": math.radians(0.3),
+    "position": 0.0002,
+    "rotation": math.radians(0.15),
+    "encoder": math.radians(0.5),
+    "equilibrium": 1.0,
+}
+"""Standard deviations at the start: of a measured motion [rad], [m], [rad], of an encoder against joints and
+tension [rad]; of joint torques and fingertip forces in units of those by which the force problem weighs them
+(it trades one for the other, so that neither can be estimated by itself). They are estimated
+anew from the residuals."""
+
+
+_SLACK = 1e-3  # [N m] a tendon with less has no length to compare
+
+
+class Residuals(NamedTuple):
+    """Of one set of figures."""
+
+    value: Array
+    """``(n_r,)``, in units of :data:`GROUPS`."""
+    jacobian: Array
+    """By x, ``(n_r, n)``; empty if not asked for."""
+    group: NDArray[np.intp]
+    """Index into :data:`GROUPS`, ``(n_r,)``."""
+    motion: Array
+    """Errors of predicted increments ``[dq; do; dphi]``, ``(n_motions, n_s)`` [rad, m, rad]."""
+
+
+class Evidence:
+    """Residuals of motions and equilibria of all grasps.
+
+    ```
+    ds - 1/2 (J_m(s) + J_m(s+)) dx,  dx = play(da)     motion; the mean of both ends is exact to second order
+    e(s),  f_n(s) - measured                           equilibrium: from the force problem of the model
+    a + z - a0 - J_a q + lam/K_a                       encoders of the actuators whose offset is an unknown
+    ```
+
+    States at which the description finds no forces, and motions from or to them, are left out for good.
+
+    Args:
+        model: of the hand as described.
+        grasps: from :func:`~torch_ekm.model.calibration.motions.rests`.
+        unknowns: what x means.
+    """
+
+    def __init__(self, model: KinematicModel, grasps: list[list[Rest]], unknowns: Unknowns) -> None:
+        # a guess of the tangential forces would pull at the figures
+        forces = dataclasses.replace(model.options.forces, start_std=100.0)
+        options = dataclasses.replace(model.options, on_unstable="flag", forces=forces)
+        self.model = KinematicModel(
+            model.hand, model.obj, options, kinematics=model.kinematics, detector=model.detector
+        )
+        self.model._detector_takes_poses = model._detector_takes_poses
+        self.grasps, self.unknowns = grasps, unknowns
+        self.with_offset = [p.index[0] for p in unknowns.parameters if p.kind == "offset"]
+        self._set(unknowns.nominal)
+        self.usable = [[self._found(rest) for rest in grasp] for grasp in grasps]
+
+    @property
+    def sensors(self) -> int:
+        """How many fingertip forces were measured, in all usable states."""
+        return sum(
+            int(torch.isfinite(rest.force).sum())
+            for grasp, usable in zip(self.grasps, self.usable, strict=True)
+            for rest, one in zip(grasp, usable, strict=True)
+            if one and rest.force is not None
+        )
+
+    def __call__(self, x: Array, *, jacobian: bool = True) -> Residuals:
+        """Residuals at x.
+
+        Raises:
+            GraspError: a state cannot be modelled with these figures.
+        """
+        at = torch.from_numpy(np.array(x, dtype=np.float64)).requires_grad_(jacobian)
+        figures = self.unknowns.figures(at)
+        self._set(figures)
+        values, slopes, groups, motions = [], [], [], []
+        with torch.set_grad_enabled(jacobian):
+            for parts, motion in self._rows(figures):
+                r = torch.cat(list(parts.values()))
+                if jacobian:
+                    slopes.append(_jacobian(r, at))
+                values.append(r.detach().numpy())
+                groups += [list(GROUPS).index(name) for name, part in parts.items() for _ in part]
+                if motion is not None:
+                    motions.append(motion.detach().numpy())
+        slope = np.concatenate(slopes) if jacobian else np.zeros((0, len(x)))
+        n_s = self.model.hand.n_q + 6
+        return Residuals(np.concatenate(values), slope, np.array(groups), np.array(motions).reshape(-1, n_s))
+
+    def _rows(self, figures: Figures) -> Iterator[tuple[dict[str, Tensor], Tensor | None]]:
+        play = Play(figures.backlash)
+        for grasp, usable in zip(self.grasps, self.usable, strict=True):
+            state, last = play.unknown(), None
+            for k, rest in enumerate(grasp):
+                lin = self._linearize(rest, figures) if usable[k] else None
+                dx = torch.zeros(0)
+                if k:
+                    dx, state = play.advance(state, rest.a - grasp[k - 1].a)
+                parts, motion = {}, None
+                if lin is not None:
+                    parts = self._equilibrium(lin, rest)
+                    if self.with_offset:
+                        parts |= self._encoders(lin, rest, state.position, figures)
+                    if last is not None:
+                        motion = self._motion(last, lin, grasp[k - 1], rest, dx, figures)
+                        moving = motion[: self.model.hand.n_q][self._moving(lin)]
+                        do, dphi = motion[-6:].split(3)
+                        parts |= _scaled(joints=moving, position=do, rotation=dphi)
+                if parts:
+                    yield parts, motion
+                last = lin
+
+    def _equilibrium(self, lin: Linearization, rest: Rest) -> dict[str, Tensor]:
+        parts = [lin.forces.residual[self._moving(lin)] / self.model.options.forces.torque_std]
+        if rest.force is not None:
+            pads = [pad.name for pad in self.model.hand.pads]
+            measured = rest.force[[pads.index(name) for name in lin.contacts.finger]]
+            known = torch.isfinite(measured)
+            parts.append((lin.forces.normal - measured)[known] / self.model.options.forces.normal_std)
+        return {"equilibrium": torch.cat(parts)}
+
+    def _encoders(self, lin: Linearization, rest: Rest, z: Tensor, at: Figures) -> dict[str, Tensor]:
+        lam, actuators = lin.forces.lam, self.model.hand.actuators
+        taut = torch.tensor([not actuator.tendon for actuator in actuators]) | (lam < -_SLACK)
+        stretch = rest.a + z - at.offset - at.moment_arms @ rest.state.q
+        unexplained = taut * (stretch + lam / self.model.reduction.stiffness)
+        return _scaled(encoder=unexplained[self.with_offset])
+
+    def _motion(
+        self, last: Linearization, lin: Linearization, before: Rest, after: Rest, dx: Tensor, at: Figures
+    ) -> Tensor:
+        """Measured less predicted increment, both of the object's point as measured."""
+        ds = 0.5 * (last.step(dx) + lin.step(dx))
+        lever = before.state.rotation @ at.object_position
+        dq, do, dphi = ds.split([self.model.hand.n_q, 3, 3])
+        predicted = torch.cat([dq, do + lever - exp(dphi) @ lever, dphi])
+        return after.state.minus(before.state) - predicted
+
+    def _moving(self, lin: Linearization) -> Tensor:
+        """Joints of the fingers that touch."""
+        links = [self.model.link_names.index(name) for name in lin.contacts.link]
+        return self.model.kinematics.upstream[links].any(0)  # type: ignore[index]
+
+    def _linearize(self, rest: Rest, figures: Figures) -> Linearization:
+        offset, state = torch.cat([figures.object_position, figures.object_rotation]), rest.state
+        if offset.requires_grad or bool((offset != 0).any()):
+            state = rest.shifted(figures.object_position, figures.object_rotation)
+        lin = self.model.linearize(state, fingertip_force=rest.force)
+        if not lin.forces.solved:
+            raise GraspError(f"no forces balance the object: {lin.forces.status[0].value}")
+        return lin
+
+    def _found(self, rest: Rest) -> bool:
+        try:
+            self._linearize(rest, self.unknowns.nominal)
+        except GraspError:
+            return False
+        return True
+
+    def _set(self, figures: Figures) -> None:
+        self.model.spring_stiffness, self.model.spring_rest = figures.springs, figures.rest
+        self.model.reduction.actuation = figures.moment_arms
+        if self.model.options.actuator_compliance:
+            self.model.reduction.stiffness = figures.stiffness
+
+
+def _scaled(**parts: Tensor) -> dict[str, Tensor]:
+    return {name: part / GROUPS[name] for name, part in parts.items()}
+
+
+def _jacobian(r: Tensor, x: Tensor) -> Array:
+    if not r.requires_grad:
+        return np.zeros((len(r), len(x)))
+    eye = torch.eye(len(r), dtype=r.dtype)
+    (slope,) = torch.autograd.grad(r, x, eye, retain_graph=True, is_grads_batched=True, allow_unused=True)
+    return slope.numpy()

@@ -1,0 +1,203 @@
+"""What speaks against a linearization: findings with figure, limit and remedy, worst first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import torch
+
+from ..contact.contact_set import ContactSet
+from ..typing import Float, Tensor
+from .grasp_forces import GraspForces
+from .options import ModelOptions
+
+SIGMA = 3.0
+"""Standard deviations of joint torque and fingertip force above which they count as unexplained."""
+AT_LIMIT = 0.01
+"""Relative margin below which a contact counts as at its friction limit."""
+
+
+class ModelStatus(Enum):
+    """How far a linearization can be trusted; from UNSTABLE on: kinds of :class:`Doubt`, worst first."""
+
+    OK = "ok"
+    UNSTABLE = "unstable"
+    """The grasp buckles; the Jacobian is formal (only with ``on_unstable="flag"``)."""
+    NO_FORCES = "no_forces"
+    """The force problem had no answer; D leaves out S, T and rolling."""
+    REUSED_FORCES = "reused_forces"
+    """The force problem had no answer; D uses the forces of the previous step."""
+    LINK_TOUCHES = "link_touches"
+    """A link that is no pad touches the object: the model knows nothing of its force."""
+    UNEXPLAINED_TORQUE = "unexplained_torque"
+    """Springs, weight and contacts do not explain the torques at the joints."""
+    CONTACT_DROPPED = "contact_dropped"
+    """A pad that touched, presses or nearly touches is farther away than the contact margin."""
+    SENSORS_DISAGREE = "sensors_disagree"
+    """A fingertip measures another force than the balance allows."""
+    FRICTION_LIMIT = "friction_limit"
+    """A contact has no friction to spare: sticking, which J_m assumes, is about to end."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """One finding; over a batch the worst state counts."""
+
+    kind: ModelStatus
+    what: str
+    """Name of the actuator, joint, pad or link; "grasp" for the whole."""
+    value: float
+    limit: float
+    """What ``value`` is held against."""
+    unit: str
+    message: str
+    """The finding and its remedy in a sentence."""
+
+    def __str__(self) -> str:
+        return self.message
+
+
+def find_doubts(
+    options: ModelOptions,
+    joint_names: Sequence[str],
+    contacts: ContactSet,
+    forces: GraspForces,
+    stability: Float[Tensor, "*batch"],
+    reused: bool,
+    measured: dict[str, Float[Tensor, "*batch"]] | None = None,
+    before: tuple[str, ...] = (),
+) -> tuple[Doubt, ...]:
+    """All that can be said against a state, worst kind first.
+
+    Args:
+        reused: the forces are those of the step before.
+        measured: normal forces that the pads measure, by pad [N].
+        before: the pads that touched a step before.
+    """
+    doubts = _of_stability(stability, options) + _of_links(contacts, options)
+    if forces.solved:
+        doubts += _of_torque(joint_names, forces, options) + _of_friction(contacts, forces)
+        doubts += _of_sensors(contacts, forces, measured or {}, options)
+    else:
+        doubts.append(_of_missing_forces(forces, reused))
+    doubts += _of_dropped_contacts(contacts, measured or {}, before, options)
+    return tuple(sorted(doubts, key=lambda doubt: _ORDER[doubt.kind]))
+
+
+_ORDER = {kind: place for place, kind in enumerate(ModelStatus)}
+
+
+def _of_stability(stability: Tensor, options: ModelOptions) -> list[Doubt]:
+    least = float(stability.min())
+    if least > 0 or options.on_unstable != "flag":
+        return []
+    message = (
+        f"the stiffness with locked actuators has the eigenvalue {least:.3g} N m/rad: the grasp buckles and "
+        "J_m is formal; grip less hard or place the fingers wider"
+    )
+    return [Doubt(ModelStatus.UNSTABLE, "grasp", least, 0.0, "N m/rad", message)]
+
+
+def _of_missing_forces(forces: GraspForces, reused: bool) -> Doubt:
+    missing = float(forces.violation.max())
+    kind = ModelStatus.REUSED_FORCES if reused else ModelStatus.NO_FORCES
+    stand_in = "those of the step before stand in" if reused else "the step leaves out their stiffness"
+    message = (
+        f"no forces inside the friction cones balance the object, {missing:.2g} N are missing: {stand_in}; "
+        "check mass, friction and pose of the object, and contact_margin if a pad is missing"
+    )
+    return Doubt(kind, "grasp", missing, 0.0, "N", message)
+
+
+def _of_torque(joint_names: Sequence[str], forces: GraspForces, options: ModelOptions) -> list[Doubt]:
+    std = options.forces.torque_std
+    residual = forces.residual.detach().reshape(-1, len(joint_names))
+    size = torch.linalg.vector_norm(residual, dim=-1)
+    value = float(size.max())
+    if value <= SIGMA * std:
+        return []
+    joint = joint_names[int(residual[int(size.argmax())].abs().argmax())]
+    message = (
+        f"springs, weight and contacts leave joint torques of {value:.3f} N m unexplained ({value / std:.0f} "
+        f"standard deviations), most at '{joint}': the object's mass, a spring, its rest angle or the "
+        "contacts are not as described"
+    )
+    return [Doubt(ModelStatus.UNEXPLAINED_TORQUE, joint, value, SIGMA * std, "N m", message)]
+
+
+def _of_friction(contacts: ContactSet, forces: GraspForces) -> list[Doubt]:
+    if float(forces.relative_margin.min()) > AT_LIMIT:
+        return []
+    least = forces.relative_margin.reshape(-1, contacts.n_c).amin(0)
+    margin = forces.margin.reshape(-1, contacts.n_c).amin(0)
+    doubts = []
+    for i, pad in enumerate(contacts.finger):
+        if float(least[i]) <= AT_LIMIT and float(contacts.friction[i]) > 0:
+            message = (
+                f"pad '{pad}' is at its friction limit ({float(margin[i]):.2f} N to spare) and may slip; "
+                "grip harder or turn less; with fingertip_force and expected the forces are estimated"
+            )
+            value = float(least[i])
+            doubts.append(Doubt(ModelStatus.FRICTION_LIMIT, pad, value, AT_LIMIT, "mu_s f_n", message))
+    return doubts
+
+
+def _of_sensors(
+    contacts: ContactSet, forces: GraspForces, measured: dict[str, Tensor], options: ModelOptions
+) -> list[Doubt]:
+    doubts, limit = [], SIGMA * options.forces.normal_std
+    for i, pad in enumerate(contacts.finger):
+        if pad not in measured:
+            continue
+        miss = (measured[pad] - forces.normal[..., i]).abs().nan_to_num(0.0)
+        value = float(miss.max())
+        if value > limit:
+            message = (
+                f"pad '{pad}' measures a normal force {value:.2f} N off the one that balances object and "
+                "joints; check its calibration, the object's mass and whether something else touches"
+            )
+            doubts.append(Doubt(ModelStatus.SENSORS_DISAGREE, pad, value, limit, "N", message))
+    return doubts
+
+
+def _of_links(contacts: ContactSet, options: ModelOptions) -> list[Doubt]:
+    return [
+        Doubt(
+            ModelStatus.LINK_TOUCHES,
+            near.link,
+            near.gap,
+            options.link_margin,
+            "m",
+            f"link '{near.link}' carries no pad and touches the object (gap {1e3 * near.gap:.1f} mm): its "
+            "force is left out; grasp elsewhere, or give the link a pad in the transmission file",
+        )
+        for near in contacts.near_misses
+        if near.pad is None
+    ]
+
+
+def _of_dropped_contacts(
+    contacts: ContactSet, measured: dict[str, Tensor], before: tuple[str, ...], options: ModelOptions
+) -> list[Doubt]:
+    doubts, margin = [], options.contact_margin
+    for near in contacts.near_misses:
+        if near.pad is None:
+            continue
+        pressed = near.pad in measured and float(measured[near.pad].max()) > SIGMA * options.forces.normal_std
+        if not (near.gap <= 1.5 * margin or near.pad in before or pressed):
+            continue
+        why = (
+            "measures a force"
+            if pressed
+            else "touched a step before"
+            if near.pad in before
+            else "nearly touches"
+        )
+        message = (
+            f"pad '{near.pad}' {why} but is {1e3 * near.gap:.1f} mm from the object and left out; "
+            f"ModelOptions(contact_margin={near.gap + 1e-4:.4f}) takes it in, if the poses are that inexact"
+        )
+        doubts.append(Doubt(ModelStatus.CONTACT_DROPPED, near.pad, near.gap, margin, "m", message))
+    return doubts
