@@ -95,13 +95,18 @@ class Witness:
         )
         self.model = KinematicModel(hand, obj, options)
         self._rig: Any = plant._rig
-        self._remember, self.frames = self._rig.on_frame, []
-        self._rig.on_frame = self._frame
+        self.frames: list[GraspState] = []
+        self._scene = self._rig.scene
+        self._step, self._count = self._scene.step, 0
+        self._scene.step = self._stepped
 
-    def _frame(self, time, q, position, rotation) -> None:
-        self.frames.append(GraspState(*(torch.from_numpy(np.asarray(x)) for x in (q, position, rotation))))
-        if self._remember is not None:
-            self._remember(time, q, position, rotation)
+    def _stepped(self, *arguments) -> None:
+        """A physics step; every tenth state is kept."""
+        self._step(*arguments)
+        self._count += 1
+        if self._count % 10 == 0:
+            seen = (self._scene.q, *self._scene.object_pose)
+            self.frames.append(GraspState(*(torch.from_numpy(np.asarray(x)) for x in seen)))
 
     def _free(self, q: np.ndarray) -> np.ndarray:
         """Joints away from their stops."""

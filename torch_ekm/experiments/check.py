@@ -10,11 +10,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 
+from ..contact import ContactSet
 from ..contact.contact_kinematics import contact_frames
 from ..contact.signed_distance import signed_distance
 from ..description import HandDescription, ObjectDescription, Shape, load_hand, load_object
 from ..exceptions import EKMError, MissingExtraError
-from ..kinematics import ActuationMap, HandKinematics
+from ..kinematics import ActuationMap, HandKinematics, LinkPoses
 from ..model import KinematicModel, Linearization, ModelOptions, ModelStatus
 from ..rendering import make_scene, save_picture
 from ..simulation import PlantConfig, SimulatedHand
@@ -23,7 +24,6 @@ from ..simulation.grasp_planning.requirements import direction_unmet, unmet
 from ..simulation.parameters import PlantParameters
 from ..simulation.physics.bodies import x_axis_to
 
-_PARALLEL = 1e-3  # [rad] between a planar hand's joints and its normal
 _SURFACE = 2e-4  # [m] between a pad and its link's collision shape
 _LOW_MARGIN = 0.1  # of the friction cone
 _CONTRADICT = 1e4  # [N/rad]: 100 N for 0.6 deg; soft actuators have some hundreds
@@ -60,7 +60,7 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
     except (EKMError, OSError) as error:
         return [Check("hand's files", "error", str(error), "see docs/your_own_hand.md")]
     rows = [Check("hand's files", "ok", f"{description.n_q} joints, {description.n_a} actuators")]
-    rows += [*_pads(description), *_plane(description), *_tensions(description)]
+    rows += [*_pads(description), *_tensions(description)]
     try:
         obj = load_object(object)
     except (EKMError, OSError) as error:
@@ -85,25 +85,6 @@ def _pads(hand: HandDescription) -> Iterator[Check]:
             yield Check(name, "warning", f"{found}; not the <collision> of its link", "make both the same")
         else:
             yield Check(name, "ok", found)
-
-
-def _plane(hand: HandDescription) -> Iterator[Check]:
-    if hand.planar_normal is None:
-        return
-    normal = np.array(hand.planar_normal)
-    kinematics = HandKinematics(hand)
-    axes = kinematics.joint_axes(kinematics(torch.from_numpy(hand.spring_rest)))[0].numpy()
-    sine = np.linalg.norm(np.cross(axes, normal / max(np.linalg.norm(normal), 1e-300)), axis=1)
-    askew = [
-        f"{joint} ({np.degrees(np.arcsin(min(1.0, value))):.1f} deg)"
-        for joint, value in zip(hand.joint_names, sine, strict=True)
-        if value > _PARALLEL
-    ]
-    if not normal.any() or askew:
-        found = f"not parallel to planar_normal {_vector(normal)}: {', '.join(askew) or 'any joint'}"
-        yield Check("planar axes", "error", found, "turn <axis> or <origin>, or leave planar_normal out")
-    else:
-        yield Check("planar axes", "ok", f"all parallel to {_vector(normal)}")
 
 
 def _tensions(hand: HandDescription) -> Iterator[Check]:
@@ -167,7 +148,9 @@ def _pinch(hand: HandDescription, obj: ObjectDescription, picture: Path | None) 
         forces = ", ".join(f"{pad.name} {force:.1f}" for pad, force in felt if force > 0)
         yield Check("pinch", "ok", f"'{obj.name}' is held in simulation; forces [N]: {forces}")
         model = KinematicModel(plant.hand, obj, ModelOptions(gravity=plant.gravity, on_unstable="flag"))
-        lin = model.linearize(seen.state, fingertip_force=seen.fingertip_force)
+        contacts = model.contacts(seen.state)
+        yield from _sides(hand, contacts, HandKinematics(hand)(seen.state.q))
+        lin = model.linearize(seen.state, contacts, fingertip_force=seen.fingertip_force)
         yield from _grasp(hand, lin)
     except MissingExtraError as error:
         yield Check("pinch", "warning", f"not tried: {error}")
@@ -179,6 +162,15 @@ def _pinch(hand: HandDescription, obj: ObjectDescription, picture: Path | None) 
             yield Check("picture", "ok", str(_draw(hand, lin, picture).resolve()))
         except (MissingExtraError, OSError, ValueError) as error:
             yield Check("picture", "warning", f"not drawn: {error}")
+
+
+def _sides(hand: HandDescription, contacts: ContactSet, poses: LinkPoses) -> Iterator[Check]:
+    pads = {pad.name: pad for pad in hand.pads}
+    for finger, normal in zip(contacts.finger, contacts.normal.numpy(), strict=True):
+        pad = pads[finger]
+        if float(normal @ poses.of(pad.link)[:3, :3].numpy() @ pad.direction) > 0:
+            mend = f"'direction' of pad '{finger}', or the limits of its joints"
+            yield Check("contact sides", "error", f"'{finger}' touches with its back", mend)
 
 
 def _grasp(hand: HandDescription, lin: Linearization) -> Iterator[Check]:
@@ -199,13 +191,6 @@ def _grasp(hand: HandDescription, lin: Linearization) -> Iterator[Check]:
     low = bool(relative.min() < _LOW_MARGIN)
     mend = "a higher friction, or wider pads" if low else ""
     yield Check("friction margins", "warning" if low else "ok", f"{found} (1: no tangential load)", mend)
-    poses = HandKinematics(hand)(lin.state.q)
-    pads = {pad.name: pad for pad in hand.pads}
-    for finger, normal in zip(lin.contacts.finger, lin.contacts.normal.numpy(), strict=True):
-        pad = pads[finger]
-        if float(normal @ poses.of(pad.link)[:3, :3].numpy() @ pad.direction) > 0:
-            mend = f"'direction' of pad '{finger}', or the limits of its joints"
-            yield Check("contact sides", "error", f"'{finger}' touches with its back", mend)
     stopped = [name for name, held in zip(hand.joint_names, lin.held_joints, strict=True) if held]
     if stopped:
         yield Check(
