@@ -168,7 +168,7 @@ class Stage:
     def observe(self) -> Observation:
         z = torch.tensor([0.0, 0.0, self.angle], dtype=torch.float64)
         zeros = torch.zeros(3, dtype=torch.float64)
-        return Observation(zeros[:1], zeros[:1], zeros, exp(z), zeros[:1])
+        return Observation(zeros[:1], z[2:], zeros, exp(z), zeros[:1])
 
     def command(self, delta_a: torch.Tensor) -> Observation:
         self.angle += float(delta_a[0])

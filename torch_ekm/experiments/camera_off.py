@@ -24,6 +24,7 @@ class CameraOff(PlantWrapper):
         axis: unit vector about which it turns there, hand frame. Rotation off this axis does not keep
             the camera on: a model that tilts the object is not to be helped for it.
         switch_off: error about the axis below which the camera is off [rad].
+        by_commands: predict from what was commanded, for a model that has learned from commands.
     """
 
     def __init__(
@@ -33,10 +34,11 @@ class CameraOff(PlantWrapper):
         target: PoseTarget,
         axis: Float[Tensor, " 3"],
         switch_off: float,
+        by_commands: bool = False,
     ) -> None:
         super().__init__(plant)
         self.predict, self.target, self.axis, self.switch_off = predict, target, axis, switch_off
-        self.dark = False
+        self.by_commands, self.dark = by_commands, False
         self._state: GraspState | None = None
         """Last passed on."""
         self._a: Tensor | None = None
@@ -51,7 +53,9 @@ class CameraOff(PlantWrapper):
         """Move the actuators by ``delta_a`` [rad], wait, read the sensors that are on."""
         before, after = self._a, self.plant.command(delta_a)
         if self.dark and self._state is not None and before is not None:
-            self._state = self._state.plus(self.predict(self._state, after.a - before))
+            self._state = self._state.plus(
+                self.predict(self._state, delta_a if self.by_commands else after.a - before)
+            )
         return self.observation(after)
 
     def observation(self, seen: Observation) -> Observation:

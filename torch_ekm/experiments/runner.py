@@ -130,10 +130,10 @@ class Bench:
         )
         axis = self.hand.rotation_axis
         target = PoseTarget.turned(start, axis, about.angle_deg * _DEG)
-        plant = self.plant
+        plant, commands = self.plant, self.learns and self.servo is None
         if blind_deg:
-            plant = CameraOff(plant, self._predictor, target, axis, blind_deg * _DEG)
-        rule, commands = self.setting.stopping_rule(), self.servo is None
+            plant = CameraOff(plant, self._predictor, target, axis, blind_deg * _DEG, commands)
+        rule = self.setting.stopping_rule()
         controller = self._controller(axis, {})
         loop = ClosedLoop(plant, controller, rule, learn=learn, learn_from_commands=commands)
         done = loop.run(target)
