@@ -21,8 +21,8 @@ from torch_ekm.contact import ContactDetector, constraint_matrix
 from torch_ekm.description import load_object
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel
-from torch_ekm.model.potential import gravity_gradient, spring_torque
-from torch_ekm.model.stiffness import geometric_stiffness
+from torch_ekm.model.stiffness.geometric import geometric_stiffness
+from torch_ekm.model.stiffness.potential import gravity_gradient, spring_torque
 
 BATCH = 1024
 

@@ -205,7 +205,7 @@ def build(
     from torch_ekm.contact.contact_kinematics import constraint_matrix
     from torch_ekm.kinematics import GraspState
     from torch_ekm.model import KinematicModel, ModelOptions
-    from torch_ekm.model.potential import gravity_gradient
+    from torch_ekm.model.stiffness.potential import gravity_gradient
 
     kin = ChainKinematics(fingers)
     q = torch.as_tensor(q, dtype=F64)

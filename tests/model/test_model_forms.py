@@ -13,8 +13,8 @@ from torch_ekm.contact.contact_kinematics import constraint_matrix
 from torch_ekm.exceptions import SingularGraspError, UnstableGraspError
 from torch_ekm.kinematics.null_space import null_space
 from torch_ekm.model.manipulation import two_stage
-from torch_ekm.model.potential import gravity_hessian
-from torch_ekm.model.stiffness import geometric_stiffness
+from torch_ekm.model.stiffness.geometric import geometric_stiffness
+from torch_ekm.model.stiffness.potential import gravity_hessian
 
 GRASPS = {
     "planar": planar_two_finger,

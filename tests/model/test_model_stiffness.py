@@ -10,13 +10,13 @@ from model_toys import F64, planar_two_finger, soft_two_finger, three_finger
 from torch_ekm.contact.contact_kinematics import constraint_matrix, contact_kinematics
 from torch_ekm.kinematics.null_space import null_space
 from torch_ekm.kinematics.se3 import exp, hat
-from torch_ekm.model.potential import (
+from torch_ekm.model.stiffness.geometric import geometric_stiffness, precedence
+from torch_ekm.model.stiffness.potential import (
     gravity_gradient,
     gravity_hessian,
     posture_stiffness,
     spring_torque,
 )
-from torch_ekm.model.stiffness import geometric_stiffness, precedence
 
 
 def equilibrium_function(model, state, surfaces, contacts, force, spin):

@@ -16,7 +16,7 @@ from ..typing import Float, Tensor
 from .force_balance import known_forces
 from .grasp_forces import GraspForces
 from .kinematic_model import KinematicModel
-from .stiffness import geometric_stiffness
+from .stiffness.geometric import geometric_stiffness
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,12 @@ from .force_balance import ForceBalance
 from .gradients import following, only_if_asked
 from .grasp_forces import ExpectedForces, GraspForces
 from .linearization import Linearization
-from .link_weights import LinkWeights
 from .options import ModelOptions
-from .potential import gravity_gradient, gravity_hessian, spring_torque
 from .reduction import Reduction
 from .sensitivity import force_change, margin_sensitivity, normal_motion, normal_sensitivity
-from .stiffness import geometric_stiffness, precedence
+from .stiffness.geometric import geometric_stiffness, precedence
+from .stiffness.link_weights import LinkWeights
+from .stiffness.potential import gravity_gradient, gravity_hessian, spring_torque
 from .validity import find_doubts
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from ..description.hand import HandDescription
-from ..typing import Float, Tensor
+from ...description.hand import HandDescription
+from ...typing import Float, Tensor
+from .geometric import precedence
 from .potential import posture_stiffness
-from .stiffness import precedence
 
 
 class LinkWeights(nn.Module):

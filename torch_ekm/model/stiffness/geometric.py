@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from ..contact.contact_kinematics import ContactKinematics
-from ..kinematics.se3 import hat
-from ..typing import Bool, Float, Tensor
+from ...contact.contact_kinematics import ContactKinematics
+from ...kinematics.se3 import hat
+from ...typing import Bool, Float, Tensor
 from .potential import posture_stiffness
 
 

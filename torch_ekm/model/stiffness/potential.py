@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import torch
 
-from ..kinematics.se3 import hat
-from ..typing import Bool, Float, Tensor
+from ...kinematics.se3 import hat
+from ...typing import Bool, Float, Tensor
 
 
 def spring_torque(

@@ -1,0 +1,1 @@
+"""Stiffness D: springs, weights, and the geometry of constant forces."""
