@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from model_icub import gripped, pinch
@@ -15,6 +17,7 @@ WISHED = torch.tensor([2.5, 1.2, 1.3], dtype=F64)  # measured normal forces [N]
 
 def icub(**options):
     model, _, at = gripped("box", **options)
+    model = copy.copy(model)  # the fixture's is kept for other tests
     model.detector = lambda *_: at.contacts
     pads = [pad.name for pad in model.hand.pads]
     measured = torch.full((len(pads),), float("nan"), dtype=F64)
