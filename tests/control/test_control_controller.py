@@ -12,6 +12,7 @@ from torch_ekm.control import (
     DEFAULT_LIMITS,
     DEFAULT_TASKS,
     ActuatorLimit,
+    EffortTask,
     FocusedPose,
     FocusTask,
     FrictionMarginLimit,
@@ -21,6 +22,7 @@ from torch_ekm.control import (
     LinearizedModel,
     LookAndMoveController,
     NormalForceLimit,
+    OffAxisTask,
     PoseTarget,
     Situation,
     Squares,
@@ -60,7 +62,7 @@ def controller(grasp, enhanced: bool = False, **parts) -> LookAndMoveController:
 def test_zero_error_gives_almost_no_command(grasp) -> None:
     _, _, seen, state = grasp
     here = PoseTarget(state.position, state.rotation)
-    decision = controller(grasp).decide(state, seen.a, here)  # no forces measured: no rows for the grip
+    decision = controller(grasp, tasks=(EffortTask(), OffAxisTask(), FocusTask())).decide(state, seen.a, here)
     assert decision.status is StopReason.RUNNING
     assert float(decision.delta_a.abs().max()) < 1e-4  # [rad]; an encoder a hair outside its range comes back
 

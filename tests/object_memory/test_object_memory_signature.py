@@ -336,5 +336,7 @@ def test_wrong_pads_and_readings_are_refused(hand) -> None:
     q, a, force = posture(hand), torch.zeros(hand.n_a).double(), torch.zeros(len(hand.pads)).double()
     with pytest.raises(ShapeError, match="fingertip_force"):
         signature(q, a, force[:2])
+    with pytest.raises(ParameterError, match="fingertip_force"):
+        signature(q, a, None)
     with pytest.raises(NonFiniteError, match="q"):
         signature(q * torch.nan, a, force)

@@ -10,6 +10,7 @@ import pytest
 from simulation_helpers import DEG, ROLL
 
 from torch_ekm.exceptions import ParameterError, UnknownNameError
+from torch_ekm.simulation import PlantParameters
 
 pytest.importorskip("sapien")
 gymnasium = pytest.importorskip("gymnasium")
@@ -160,3 +161,11 @@ env.close()
     if done.returncode < 0:
         pytest.skip("OpenGL does not work here: it ended the process")
     assert done.returncode == 0, done.stderr
+
+
+def test_a_hand_without_fingertip_sensors_has_no_entries_for_them():
+    blind = make(hand="planar_two_finger", parameters=PlantParameters(force_sensors=False)).unwrapped
+    observation, _ = blind.reset(seed=0)
+    hand = blind.plant.hand
+    assert blind.plant.observe().fingertip_force is None
+    assert observation.shape == blind.observation_space.shape == (hand.n_q + hand.n_a + 6 + 2,)

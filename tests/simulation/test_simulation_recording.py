@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -82,6 +84,19 @@ def test_a_saved_recording_replays_like_the_original(tmp_path):
     with pytest.raises(ParameterError, match="ends there"):
         replayed.command(torch.zeros(3))
     assert torch.equal(replayed.reset(0).q, original.observations[0].q)
+
+
+def test_a_hand_without_fingertip_sensors(tmp_path):
+    trajectory = record()
+    blind = [dataclasses.replace(o, fingertip_force=None) for o in trajectory.observations]
+    trajectory.observations = blind
+    loaded = Trajectory.load(trajectory.save(tmp_path / "run.h5"))
+    assert [o.fingertip_force for o in loaded.observations] == [None] * 4
+    with h5py.File(tmp_path / "run.h5") as file:
+        assert "fingertip_force" not in file
+    blind[1] = dataclasses.replace(blind[1], fingertip_force=torch.ones(1))
+    with pytest.raises(ParameterError, match="fingertip_force"):
+        trajectory.save(tmp_path / "mixed.h5")
 
 
 def test_a_recording_without_commands(tmp_path):

@@ -12,6 +12,7 @@ import torch
 from ..enhanced import EnhancedModel
 from ..exceptions import GraspError, NoContactError, ShapeError
 from ..kinematics import GraspState
+from ..model import ModelStatus
 from ..residual.checks import check_finite
 from ..typing import Float, Tensor
 from .focus import FocusedPose, PoseTarget
@@ -68,6 +69,9 @@ class LookAndMoveController:
     With ``g`` the program is nonlinear and is solved by a damped SQP on ``J_m + dg/da``:
     searching along the model's own direction instead turns the object off axis.
 
+    Where no pad measures, or one reads less than ``ForceOptions.normal_std`` and may be dead, the model's
+    estimate without it stands in: joints, springs and the other pads tell what it bears.
+
     Args:
         model: a :class:`KinematicModel`, or an :class:`EnhancedModel` around one.
         focus: what of the pose must be reached, or the axis about which the object is to be turned.
@@ -120,6 +124,16 @@ class LookAndMoveController:
             self._previous = lin, a
         return lin
 
+    def _joint_force(self, lin: Linearization) -> Tensor | None:
+        """Normal forces without the pads', where these leave a torque of the joints unexplained."""
+        if all(doubt.kind is not ModelStatus.UNEXPLAINED_TORQUE for doubt in lin.doubts):
+            return None
+        try:
+            forces = self.kinematic.linearize(lin.state, lin.contacts).forces
+        except GraspError:
+            return None
+        return forces.normal if forces.solved else None
+
     def decide(
         self,
         state: GraspState,
@@ -133,7 +147,7 @@ class LookAndMoveController:
             state: measured joint angles and object pose.
             a: actuator encoders [rad].
             target: where the object shall be.
-            fingertip_force: measured normal force of each pad [N]; None: no rows for the grip.
+            fingertip_force: measured normal force of each pad [N]; None: the model's estimate stands in.
 
         Returns:
             A :class:`Decision`. A grasp that cannot be modelled gives ``delta_a = 0`` and a
@@ -149,6 +163,10 @@ class LookAndMoveController:
         _check("a", a, hand.n_a)
         if fingertip_force is not None:
             _check("fingertip_force", fingertip_force, len(hand.pads))
+            least = self.kinematic.options.forces.normal_std
+            fingertip_force = fingertip_force.where(fingertip_force.abs() >= least, torch.nan)
+            if bool(fingertip_force.isnan().all()):
+                fingertip_force = None
         error = target.error(state)
         _check("target", error, 6)
         focused = self.focus.matrix @ error
@@ -162,7 +180,8 @@ class LookAndMoveController:
 
         travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
         desired = self.limiting(focused, travel)
-        seen = Situation(hand, self.focus, state, a, fingertip_force, error, desired)
+        alone = None if fingertip_force is None else self._joint_force(lin)
+        seen = Situation(hand, self.focus, state, a, fingertip_force, error, desired, alone)
         enhanced, J_m, da = self.enhanced, lin.manipulation_jacobian, a.new_zeros(hand.n_a)
         encoded = None if enhanced is None else enhanced.encode(state)
         linear = enhanced is None or enhanced.affine

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..exceptions import UnknownNameError
+from ..exceptions import ParameterError, UnknownNameError
 from .qp import DEGREE, Bounds, Inequality, as_array
 from .situation import LinearizedModel, Situation
 
@@ -81,19 +81,37 @@ class JointLimit:
 
 @dataclass(frozen=True)
 class NormalForceLimit:
-    """``f_n + (df_n/da) u >= minimum`` of each finger, f_n as measured."""
+    """``minimum <= f_n + (df_n/da) u <= maximum`` of each finger, f_n as measured.
+
+    For the upper limit the largest of measured and estimated force counts, with the estimate of joints and
+    springs alone where it contradicts the pads: sensors that read too little must not make the hand squeeze.
+    Where both limits contradict each other, the upper one holds.
+
+    Raises:
+        ParameterError: ``maximum`` is not above ``minimum``.
+    """
 
     minimum: float = 0.8
     """[N]"""
     step: float = 0.7
-    """At most this much of what is missing is asked for in one step [N]."""
+    """At most this much of what is missing, or too much, is asked for in one step [N]."""
+    maximum: float = 10.0
+    """[N]; the iCub's fingertips hold with 5 N, heavy objects with 8 N, and measure up to 15 N."""
+
+    def __post_init__(self) -> None:
+        if not self.maximum > self.minimum:
+            raise ParameterError("maximum", self.maximum, f"above the minimum of {self.minimum:g} N")
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Inequality | None:
-        measured = seen.normal_force(model.kinematic.contacts.finger)
-        if measured is None:
+        f_n, forces = seen.normal_force(model.kinematic), model.kinematic.forces
+        if f_n is None:
             return None
-        low = np.minimum(self.minimum - measured, self.step)
-        return Inequality(-model.kinematic.normal_force_sensitivity, -low)
+        most = np.maximum(f_n, as_array(forces.normal)) if forces.solved else f_n
+        most = most if seen.joint_force is None else np.maximum(most, as_array(seen.joint_force))
+        high = np.maximum(self.maximum - most, -self.step)
+        low = np.minimum(np.minimum(self.minimum - f_n, self.step), high)
+        S = as_array(model.kinematic.normal_force_sensitivity)
+        return Inequality(np.concatenate([-S, S]), np.concatenate([-low, high]))
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ..enhanced import EnhancedModel, Quadratic
 from ..kinematics import GraspState
 from ..typing import Float, Tensor
@@ -28,18 +30,25 @@ class Situation:
     a: Float[Tensor, " n_a"]
     """Encoders [rad]."""
     fingertip_force: Float[Tensor, " n_pads"] | None
-    """Measured normal force of each pad [N]."""
+    """Measured normal force of each pad [N], NaN where unknown; None: no pad measures."""
     error: Float[Tensor, 6]
     """e, the twist to the target [m, rad]."""
     desired: Float[Tensor, " n_x"]
     """dx_d, what one step shall do to the focused pose."""
+    joint_force: Float[Tensor, " n_c"] | None = None
+    """Normal force of each contact by joints and springs alone [N], where they contradict the pads."""
 
-    def normal_force(self, fingers: tuple[str, ...]) -> Array | None:
-        """What the pads of these fingers measure [N]; None: nothing is measured."""
+    def normal_force(self, kinematic: Linearization) -> Array | None:
+        """``f_n`` of each contact [N]: as its pad measures it, or else as the model estimates it.
+
+        None: nothing is measured, and the model finds no forces either.
+        """
+        estimated = as_array(kinematic.forces.normal) if kinematic.forces.solved else None
         if self.fingertip_force is None:
-            return None
+            return estimated
         pads = [pad.name for pad in self.hand.pads]
-        return as_array(self.fingertip_force)[[pads.index(name) for name in fingers]]
+        measured = as_array(self.fingertip_force)[[pads.index(name) for name in kinematic.contacts.finger]]
+        return np.where(np.isnan(measured), 0.0 if estimated is None else estimated, measured)
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ class OffAxisTask:
 class GripForceTask:
     """``f_n + (df_n/da) u = f``: f_n as the fingertips measure it, only its sensitivity by the model.
 
-    A grip force computed from a wrong model drops the object.
+    A grip force computed from a wrong model drops the object; a hand without fingertip sensors has no better.
 
     The finger that presses most opposes all others: it is regulated to ``force``, and the others to
     equal shares of it, so that no finger is left without a grip.
@@ -73,12 +73,12 @@ class GripForceTask:
     """At most this much of an error is corrected in one step [N]."""
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Squares | None:
-        measured = seen.normal_force(model.kinematic.contacts.finger)
-        if measured is None:
+        f_n = seen.normal_force(model.kinematic)
+        if f_n is None:
             return None
-        wanted = np.full(len(measured), self.force / max(len(measured) - 1, 1))
-        wanted[measured.argmax()] = self.force
-        change = np.clip(wanted - measured, -self.step, self.step)
+        wanted = np.full(len(f_n), self.force / max(len(f_n) - 1, 1))
+        wanted[f_n.argmax()] = self.force
+        change = np.clip(wanted - f_n, -self.step, self.step)
         return Squares(model.kinematic.normal_force_sensitivity, change, self.weight)
 
 

@@ -144,6 +144,7 @@ def _pinch(hand: HandDescription, obj: ObjectDescription, picture: Path | None) 
     try:
         plant = SimulatedHand(hand, obj)
         seen = plant.reset(0)  # as it is: the sensors have no noise
+        assert seen.fingertip_force is not None  # of a simulated hand as described
         felt = zip(hand.pads, seen.fingertip_force.tolist(), strict=True)
         forces = ", ".join(f"{pad.name} {force:.1f}" for pad, force in felt if force > 0)
         yield Check("pinch", "ok", f"'{obj.name}' is held in simulation; forces [N]: {forces}")

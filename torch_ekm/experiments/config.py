@@ -76,6 +76,8 @@ class Setting:
     capacity: int = 60
     sensing: bool = False
     """Poses from rendered camera images and joint angles from Hall counts, not truth plus noise."""
+    frames: int = 1
+    """Readings at rest after each motion; their mean is taken (:class:`~torch_ekm.plant.FramesAtRest`)."""
     tolerance_deg: float = 0.25
     max_steps: int = 60
 
@@ -84,7 +86,7 @@ class Setting:
             raise UnknownNameError("hand", self.hand, list_hands())
         if self.learner not in LEARNERS:
             raise UnknownNameError("learner", self.learner, LEARNERS)
-        for name in ("capacity", "tolerance_deg", "max_steps"):
+        for name in ("capacity", "frames", "tolerance_deg", "max_steps"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
         self.parameters()

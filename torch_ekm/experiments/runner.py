@@ -16,7 +16,7 @@ from ..enhanced import EnhancedModel, GraspEncoding
 from ..exceptions import EquilibriumError, GraspError
 from ..kinematics import GraspState
 from ..model import KinematicModel
-from ..plant import Plant, ServoInverse, ServoModel
+from ..plant import FramesAtRest, Plant, ServoInverse, ServoModel
 from ..residual import ResidualLearner
 from ..simulation import Change, DisturbedPlant, SimulatedHand, Tug
 from .camera_off import CameraOff
@@ -54,8 +54,9 @@ class Bench:
         self.disturbed = DisturbedPlant(self.hand)
         self.plant: Plant = self.disturbed
         if setting.sensing:
-            stuck = setting.parameters().stuck_joints
-            self.plant = _sensed(self.disturbed, self.hand, stuck, keep_images)
+            self.plant = _sensed(self.disturbed, self.hand, setting, keep_images)
+        else:
+            self.plant = FramesAtRest(self.plant, setting.frames)
         inverse = controller == "KM+S" or (self.learns and setting.servo_inverse)
         self.servo = ServoModel(self.hand.hand.actuator_names) if inverse else None
         if inverse:
@@ -185,15 +186,14 @@ class Bench:
         self.enhanced = EnhancedModel.for_grasp(self.model, start, self.learner, self.encoding)
 
 
-def _sensed(
-    plant: DisturbedPlant, simulated: SimulatedHand, stuck: tuple[str, ...], keep_images: bool
-) -> Plant:
+def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting, keep_images: bool) -> Plant:
     from ..sensing import ContactAligned  # OpenCV is needed only here
     from ..simulation import HallSensors, SensedPlant, Stuck
 
-    hand = simulated.hand
+    hand, stuck = simulated.hand, setting.parameters().stuck_joints
     hall = HallSensors(hand) if hand.hall_sensors else None
     sensed = SensedPlant(plant, hand, simulated.object, hall=hall, keep_images=keep_images)
     if hall is not None:  # after the calibration: a channel that was dead by then would not be believed
         hall.stuck = [Stuck.FROZEN if joint in stuck else Stuck.NO for joint in hall.joints]
-    return sensed if hall is None else ContactAligned(sensed, hand, simulated.object)
+    rested = FramesAtRest(sensed, setting.frames)
+    return rested if hall is None else ContactAligned(rested, hand, simulated.object)

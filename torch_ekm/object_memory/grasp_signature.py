@@ -91,7 +91,7 @@ class GraspSignature:
         self,
         q: Float[Tensor, "*batch n_q"],
         a: Float[Tensor, "*batch n_a"],
-        fingertip_force: Float[Tensor, "*batch n_pads"],
+        fingertip_force: Float[Tensor, "*batch n_pads"] | None,
     ) -> Float[Tensor, "*batch d"]:
         """Signature of one reading; the mean over several readings at rest has less of the sensors' noise.
 
@@ -101,9 +101,12 @@ class GraspSignature:
             fingertip_force: normal force of each of the hand's pads [N].
 
         Raises:
+            ParameterError: no forces: what a grasp feels like is told by them.
             ShapeError, NonFiniteError: readings that cannot be right.
         """
         hand = self.hand
+        if fingertip_force is None:
+            raise ParameterError("fingertip_force", None, "measured: no signature without sensors")
         sizes = {"q": (q, hand.n_q), "a": (a, hand.n_a), "fingertip_force": (fingertip_force, len(hand.pads))}
         for name, (value, size) in sizes.items():
             if value.shape != (*q.shape[:-1], size):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from .frames_at_rest import FramesAtRest
 from .observation import Observation, PlantStatus, Truth
 from .plant import Plant
 from .play_compensation import PlayCompensation
@@ -14,6 +15,7 @@ from .trial_log import TrialEntry, TrialLog
 from .wrapper import PlantWrapper
 
 __all__ = [
+    "FramesAtRest",
     "Observation",
     "Plant",
     "PlantStatus",

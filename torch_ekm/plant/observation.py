@@ -68,8 +68,8 @@ class Observation:
     """Object point o [m] (markers)."""
     rotation: Float[Tensor, "3 3"]
     """Object orientation R."""
-    fingertip_force: Float[Tensor, " n_pads"]
-    """Normal force of each contact pad [N], in the order of ``HandDescription.pads``."""
+    fingertip_force: Float[Tensor, " n_pads"] | None = None
+    """Normal force of each contact pad [N], in the order of ``HandDescription.pads``; None: no sensors."""
     time: float = 0.0
     """[s]"""
     status: PlantStatus = PlantStatus.HELD
@@ -80,7 +80,9 @@ class Observation:
 
     def __post_init__(self) -> None:
         for name in ("q", "a", "position", "rotation", "fingertip_force"):
-            finite = torch.isfinite(getattr(self, name))
+            if (value := getattr(self, name)) is None:  # the forces
+                continue
+            finite = torch.isfinite(value)
             if not bool(finite.all()):
                 raise NonFiniteError(f"Observation.{name}", torch.nonzero(~finite)[:3].tolist())
 

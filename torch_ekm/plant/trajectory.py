@@ -18,7 +18,8 @@ from ..typing import Tensor
 from .observation import Observation, PlantStatus, Truth
 
 FORMAT = "torch_ekm trial 1"
-_FIELDS = ("q", "a", "position", "rotation", "fingertip_force")
+_FIELDS = ("q", "a", "position", "rotation")
+_FORCE = "fingertip_force"  # missing where nothing measures it
 _GROUPS = ("raw", "estimate")  # what is kept of Observation.info, and "events"
 
 
@@ -42,11 +43,11 @@ class Trajectory:
         """Write an HDF5 file, whole or not at all; equal recordings give equal files, byte by byte.
 
         ``commands (n, n_a)`` [rad], each sensor ``(n + 1, ...)`` [SI], groups ``truth``, ``raw`` and
-        ``estimate``, checksums on all of it.
+        ``estimate``, checksums on all of it. Without fingertip sensors there is no ``fingertip_force``.
 
         Raises:
-            ParameterError: ``about`` is nothing that JSON can hold, or an array of ``info`` changes
-                its shape or comes and goes; nothing is written.
+            ParameterError: ``about`` is nothing that JSON can hold, or the forces or an array of ``info``
+                change their shape or come and go; nothing is written.
         """
         path = Path(path)
         about = json.dumps(plain(self.about))
@@ -77,7 +78,8 @@ class Trajectory:
                 if file.attrs.get("format") != FORMAT:
                     raise DescriptionError(path, "this HDF5 file is not a recording of torch_ekm")
                 seed, about = int(file.attrs["seed"]), json.loads(file.attrs["about"])
-                sensors = {name: torch.from_numpy(file[name][()]) for name in (*_FIELDS, "commands")}
+                names = (*_FIELDS, "commands", *((_FORCE,) if _FORCE in file else ()))
+                sensors = {name: torch.from_numpy(file[name][()]) for name in names}
                 times, words, events = (file[name][()].tolist() for name in ("time", "status", "events"))
                 groups = {
                     group: {name: torch.from_numpy(item[()]) for name, item in file[group].items()}
@@ -114,12 +116,14 @@ class Trajectory:
             ),
         }
         arrays |= {name: _stack(name, [getattr(o, name) for o in seen]) for name in _FIELDS}
-        for group in ("truth", *_GROUPS):
+        for group in ("", "truth", *_GROUPS):
             named = [o.info.get(group, {}) for o in seen]
-            if group == "truth":
+            if group == "":
+                named = [{} if o.fingertip_force is None else {_FORCE: o.fingertip_force} for o in seen]
+            elif group == "truth":
                 named = [{} if o.truth is None else o.truth.arrays() for o in seen]
             for name in sorted({name for values in named for name in values}):
-                place = f"{group}/{name}"
+                place = f"{group}/{name}" if group else name
                 if not all(name in values for values in named):
                     raise ParameterError(place, "missing in some observations", "there in all, or in none")
                 arrays[place] = _stack(place, [values[name] for values in named])

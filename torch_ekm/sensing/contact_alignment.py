@@ -31,7 +31,7 @@ class ContactAligned(PlantWrapper):
     Args:
         plant: gives estimates of joints, pose and fingertip forces.
         hand, obj: what it consists of.
-        least_force: a pad that feels less than this [N] says nothing.
+        least_force: a pad that feels less than this [N] says nothing; without fingertip sensors no pad does.
     """
 
     def __init__(
@@ -61,8 +61,9 @@ class ContactAligned(PlantWrapper):
 
     def observation(self, seen: Observation) -> Observation:
         """``seen`` with joints that agree with the contacts."""
+        felt = [0.0] * len(self.hand.pads) if seen.fingertip_force is None else seen.fingertip_force.tolist()
         for i, pad in enumerate(self.hand.pads):
-            if float(seen.fingertip_force[i]) >= self.least_force:
+            if felt[i] >= self.least_force:
                 for j in self._joints[i]:
                     self._close_gap(seen, pad.name, j)
         return dataclasses.replace(seen, q=seen.q + self._delta)

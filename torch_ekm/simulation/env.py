@@ -47,7 +47,7 @@ class InHandRotation(gymnasium.Env):
     n_a            rad     actuator encoders
     3              m       position of the object since the reset, hand frame
     3              rad     its rotation vector since the reset, hand frame
-    n_pads         N       normal force of each fingertip
+    n_pads         N       normal force of each fingertip; none without ``force_sensors``
     1              rad     angle turned so far, about the grasp's axis
     1              rad     angle still to turn
     ============== ======= ==============================================================
@@ -103,7 +103,8 @@ class InHandRotation(gymnasium.Env):
         description = self.plant.hand
         n_a = description.n_a
         bounds = (math.pi, 2 * math.pi, 1.0, math.pi, 100.0, 2 * math.pi)
-        high = np.repeat(bounds, (description.n_q, n_a, 3, 3, len(description.pads), 2))
+        n_pads = len(description.pads) if parameters.force_sensors else 0
+        high = np.repeat(bounds, (description.n_q, n_a, 3, 3, n_pads, 2))
         self.observation_space = gymnasium.spaces.Box(-high, high, dtype=np.float64)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n_a,), dtype=np.float32)
         self._start: Observation | None = None
@@ -173,7 +174,7 @@ class InHandRotation(gymnasium.Env):
             observation.a,
             observation.position - self._start.position,
             log(observation.rotation @ self._start.rotation.mT),
-            observation.fingertip_force,
+            *(() if observation.fingertip_force is None else (observation.fingertip_force,)),
             torch.tensor([turned, self._target - turned], dtype=torch.float64),
         )
         space = self.observation_space

@@ -65,6 +65,8 @@ class PlantParameters:
     """Standard deviation of the object's position, per axis [m]."""
     rotation_noise: float = 0.0
     """Standard deviation of the object's orientation, per axis [rad]."""
+    force_sensors: bool = True
+    """The fingertips feel; without, ``Observation.fingertip_force`` is None."""
     force_noise: float = 0.0
     """Standard deviation of the force of a fingertip that touches [N]."""
     force_offset: float = 0.0

@@ -145,8 +145,9 @@ class SimulatedHand:
             status = PlantStatus.NOT_SEEN
         torque = rig.transmission.actuator_torque(q, rig.servo.output)
         pictured = GraspState(*_tensors(picture.q, picture.position, picture.rotation))
+        q_seen, a, o, R, felt = _tensors(joints, rig.servo.encoder, seen_position, seen_rotation, force)
         return Observation(
-            *_tensors(joints, rig.servo.encoder, seen_position, seen_rotation, force),
+            *(q_seen, a, o, R, felt if self.parameters.force_sensors else None),
             time=rig.time,
             status=status,
             truth=Truth(*_tensors(q, position, rotation, rig.normal, torque), pictured=pictured),

@@ -123,8 +123,10 @@ class GraspShow:
         return self.scene().transforms[0]
 
     def _words(self) -> str:
-        forces = zip(self.plant.hand.pads, self._seen.fingertip_force.tolist(), strict=True)
-        felt = ", ".join(f"{pad.name} {force:.1f} N" for pad, force in forces if force > 0)
+        force, felt = self._seen.fingertip_force, "no sensors"
+        if force is not None:
+            forces = zip(self.plant.hand.pads, force.tolist(), strict=True)
+            felt = ", ".join(f"{pad.name} {force:.1f} N" for pad, force in forces if force > 0)
         status = "lost" if self._seen.status is PlantStatus.LOST else "held"
         return f"The object is **{status}**; fingertips: {felt or 'nothing'}."
 
