@@ -139,7 +139,8 @@ def test_an_enhanced_model_learns_unless_told_not_to(held) -> None:
     for learn in (True, False):
         ekm = EnhancedModel.for_grasp(loop.kinematic, seen.state)
         controller = LookAndMoveController(ekm, axis)
-        driven = ClosedLoop(FrozenPlant(seen), controller, RULE, learn=learn, learn_from_commands=True)
+        ekm.servo = None  # it learns from the commands
+        driven = ClosedLoop(FrozenPlant(seen), controller, RULE, learn=learn)
         steps = driven.run(target).steps
         assert [step.report is not None for step in steps] == [learn] * 3
         da = steps[0].decision.delta_a
@@ -158,7 +159,7 @@ def test_an_object_that_is_lost_teaches_nothing(held) -> None:
 
 
 def test_the_learner_is_told_what_the_encoders_did(held) -> None:
-    """Servos that go half of the way: the object's motion is learned for that half."""
+    """Servos that go half of the way: the object's motion is learned for what they did."""
     seen, axis, loop = held
     ekm = EnhancedModel.for_grasp(loop.kinematic, seen.state)
     told = []
@@ -176,8 +177,11 @@ def test_the_learner_is_told_what_the_encoders_did(held) -> None:
         ClosedLoop(Half(seen), controller, RULE).run(PoseTarget.turned(seen.state, axis, degrees=80)).steps
     )
     for (da, nominal), step in zip(told, steps, strict=True):
-        torch.testing.assert_close(da, 0.5 * step.decision.delta_a)
-        torch.testing.assert_close(nominal, 0.5 * step.decision.nominal)
+        torch.testing.assert_close(da, step.after.a - step.before.a)
+        torch.testing.assert_close(nominal, step.decision.linearization.step(da))
+        assert not torch.allclose(da, step.decision.delta_a)
+    assert bool((ekm.servo.dead_zone > 0).any())
+    assert any(name.startswith("servo.") for name in ekm.state_dict())  # and it is saved with the learner
 
 
 # -- the hand holds whatever ends the loop ------------------------------------------------------------

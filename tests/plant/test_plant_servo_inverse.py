@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
-from torch_ekm.plant import Observation, ServoInverse, ServoModel
+from torch_ekm.kinematics import ServoModel
+from torch_ekm.plant import Observation, ServoInverse
 
 DEG = math.pi / 180
 EYE, ORIGIN = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)

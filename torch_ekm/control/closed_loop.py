@@ -11,7 +11,7 @@ from typing import NamedTuple, Self
 
 import torch
 
-from ..plant import Observation, Plant, PlantStatus
+from ..plant import Observation, Plant, PlantStatus, ServoInverse
 from ..residual import UpdateReport
 from ..typing import Float, Tensor
 from .controller import Decision, LookAndMoveController
@@ -85,9 +85,9 @@ class ClosedLoop:
         controller: its :class:`~torch_ekm.enhanced.EnhancedModel`, if it has one, learns after every motion.
         rule: when to stop.
         learn: False leaves the learner as it is.
-        learn_from_commands: the learner's action is what was commanded, in place of what the encoders did.
-            For a plant without a :class:`~torch_ekm.plant.ServoInverse`, whose dead zone is then learned
-            together with the hand.
+
+    An enhanced model with a ``servo`` commands through a :class:`~torch_ekm.plant.ServoInverse`, and
+    it learns from what the encoders did. One without learns from the commands.
     """
 
     def __init__(
@@ -97,11 +97,13 @@ class ClosedLoop:
         rule: StoppingRule | None = None,
         *,
         learn: bool = True,
-        learn_from_commands: bool = False,
     ) -> None:
         self.plant, self.controller = plant, controller
         self.rule = StoppingRule() if rule is None else rule
-        self.learn, self.learn_from_commands = learn, learn_from_commands
+        self.learn = learn
+        servo = None if controller.enhanced is None else controller.enhanced.servo
+        if servo is not None and not isinstance(plant, ServoInverse):
+            self.plant = ServoInverse(plant, controller.kinematic.hand, servo)
         self._stop = threading.Event()
 
     def __enter__(self) -> Self:
@@ -188,7 +190,7 @@ class ClosedLoop:
         enhanced = self.controller.enhanced
         if not self.learn or enhanced is None or after.status is not PlantStatus.HELD:
             return None
-        if self.learn_from_commands:
+        if not isinstance(self.plant, ServoInverse):
             return enhanced.update(seen.state, decision.delta_a, increment, decision.nominal)
         moved = after.a - seen.a
         nominal = None if decision.linearization is None else decision.linearization.step(moved)

@@ -11,7 +11,7 @@ from torch import nn
 from torch.func import jacrev
 
 from ..exceptions import ShapeError
-from ..kinematics import GraspState
+from ..kinematics import GraspState, ServoModel
 from ..residual.base import ResidualLearner, UpdateReport
 from ..residual.checks import check_finite
 from ..residual.kernels.action_linear import ActionLinearKernel
@@ -42,9 +42,8 @@ class EnhancedModel(nn.Module):
         outputs: indices of the increment that the learner corrects; all if None.
         action_scale: factor from the action's unit to the learner's.
         output_scale: factor, or one for each output, from the increment's unit to the learner's.
-
-    The training increment is the one *commanded relative to the encoder*: the measured one
-    hides the dead zone, which is much of what there is to learn.
+        servo: of the actuators. A :class:`~torch_ekm.control.ClosedLoop` commands through its inverse and
+            trains on what the encoders did; without it g has to learn the dead zones, too.
     """
 
     def __init__(
@@ -56,12 +55,13 @@ class EnhancedModel(nn.Module):
         outputs: list[int] | None = None,
         action_scale: float = 1.0,
         output_scale: float | Float[Tensor, " n_out"] = 1.0,
+        servo: ServoModel | None = None,
     ) -> None:
         super().__init__()
         self.model: Any = model  # a Module is registered, any other callable is kept as it is
         self.learner: ResidualLearner = learner
         self.encode: Callable[[Any], Tensor] = nn.Identity() if encode is None else encode
-        self.outputs = outputs
+        self.outputs, self.servo = outputs, servo
         self.action_scale = action_scale
         self.output_scale = nn.Buffer(torch.as_tensor(output_scale))
 
@@ -72,6 +72,7 @@ class EnhancedModel(nn.Module):
         state: GraspState,
         learner: ResidualLearner | Callable[[int, int], ResidualLearner] | None = None,
         encode: GraspEncoding | None = None,
+        servo: ServoModel | None = None,
     ) -> EnhancedModel:
         """An E-KM of a grasped object, with nothing learned yet.
 
@@ -84,6 +85,7 @@ class EnhancedModel(nn.Module):
             learner: of ``[encode(s); da]``, or ``learner(n_s, n_a)`` that makes one for ``n_s`` features of
                 the state and ``n_a`` actuators; None: :func:`~torch_ekm.enhanced.grasp_learner`.
             encode: what it sees of a state; None: of this grasp.
+            servo: what is known of the hand's servos; None: nothing yet.
 
         Raises:
             NoContactError: nothing touches the object.
@@ -95,7 +97,9 @@ class EnhancedModel(nn.Module):
         scale = torch.tensor([1e3] * 3 + [180 / math.pi] * 3, dtype=state.q.dtype)  # m -> mm, rad -> deg
         rows = list(range(n_q, n_q + 6))
         step = math.radians(2.0)
-        return cls(model, learner, encode=encode, outputs=rows, action_scale=1 / step, output_scale=scale)
+        servo = ServoModel(model.hand.actuator_names) if servo is None else servo
+        scales = {"action_scale": 1 / step, "output_scale": scale}
+        return cls(model, learner, encode=encode, outputs=rows, servo=servo, **scales)
 
     @property
     def affine(self) -> bool:

@@ -70,7 +70,7 @@ class Setting:
     defaults is added (:mod:`~torch_ekm.control.tasks`, :mod:`~torch_ekm.control.limits`, and the
     ``LimitingFunction``)."""
     servo_inverse: bool = True
-    """The E-KM's plant has one; without it the dead zone is learned together with the hand."""
+    """The E-KM commands through one; without it the dead zone is learned together with the hand."""
     learner: str = DEFAULT_LEARNER
     learner_options: Mapping[str, Any] = field(default_factory=dict)
     capacity: int = 60

@@ -14,9 +14,9 @@ from ..control import ClosedLoop, LookAndMoveController, PoseTarget
 from ..description import ObjectDescription
 from ..enhanced import EnhancedModel, GraspEncoding
 from ..exceptions import EquilibriumError, GraspError
-from ..kinematics import GraspState
+from ..kinematics import GraspState, ServoModel
 from ..model import KinematicModel
-from ..plant import FramesAtRest, Plant, ServoInverse, ServoModel
+from ..plant import FramesAtRest, Plant, ServoInverse
 from ..residual import ResidualLearner
 from ..simulation import Change, DisturbedPlant, SimulatedHand, Tug
 from .camera_off import CameraOff
@@ -57,9 +57,9 @@ class Bench:
             self.plant = _sensed(self.disturbed, self.hand, setting, keep_images)
         else:
             self.plant = FramesAtRest(self.plant, setting.frames)
-        inverse = controller == "KM+S" or (self.learns and setting.servo_inverse)
-        self.servo = ServoModel(self.hand.hand.actuator_names) if inverse else None
-        if inverse:
+        self.servo = ServoModel(self.hand.hand.actuator_names)
+        """Of the KM+S and the E-KM; it stays when the object changes."""
+        if controller == "KM+S":
             self.plant = ServoInverse(self.plant, self.hand.hand, self.servo)
         self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model_options())
         self.learner: ResidualLearner | None = None
@@ -131,12 +131,11 @@ class Bench:
         )
         axis = self.hand.rotation_axis
         target = PoseTarget.turned(start, axis, about.angle_deg * _DEG)
-        plant, commands = self.plant, self.learns and self.servo is None
+        plant = self.plant
         if blind_deg:
+            commands = self.learns and not self.setting.servo_inverse
             plant = CameraOff(plant, self._predictor, target, axis, blind_deg * _DEG, commands)
-        rule = self.setting.stopping_rule()
-        controller = self._controller(axis, {})
-        loop = ClosedLoop(plant, controller, rule, learn=learn, learn_from_commands=commands)
+        loop = ClosedLoop(plant, self._controller(axis, {}), self.setting.stopping_rule(), learn=learn)
         done = loop.run(target)
         return TrialRecord.of(about, done, axis, learns=self.learns, poses=poses)
 
@@ -183,7 +182,9 @@ class Bench:
         if self.learner is None:
             sizes = self.encoding.n_features, self.model.hand.n_a, setting.capacity
             self.learner = make_learner(setting.learner, *sizes, **setting.learner_options)
-        self.enhanced = EnhancedModel.for_grasp(self.model, start, self.learner, self.encoding)
+        self.enhanced = EnhancedModel.for_grasp(self.model, start, self.learner, self.encoding, self.servo)
+        if not setting.servo_inverse:
+            self.enhanced.servo = None
 
 
 def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting, keep_images: bool) -> Plant:

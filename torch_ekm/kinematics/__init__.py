@@ -7,6 +7,7 @@ from .grasp_state import GraspState
 from .hand_kinematics import HandKinematics
 from .link_poses import LinkPoses
 from .play import Play, PlayState
+from .servo_model import ServoModel
 
 __all__ = [
     "ActuationMap",
@@ -15,4 +16,5 @@ __all__ = [
     "LinkPoses",
     "Play",
     "PlayState",
+    "ServoModel",
 ]

@@ -9,7 +9,6 @@ from .play_compensation import PlayCompensation
 from .recording_plant import RecordingPlant
 from .replayed_plant import ReplayedPlant
 from .servo_inverse import ServoInverse
-from .servo_model import ServoModel
 from .trajectory import Trajectory
 from .trial_log import TrialEntry, TrialLog
 from .wrapper import PlantWrapper
@@ -24,7 +23,6 @@ __all__ = [
     "RecordingPlant",
     "ReplayedPlant",
     "ServoInverse",
-    "ServoModel",
     "Trajectory",
     "TrialEntry",
     "TrialLog",

@@ -5,18 +5,18 @@ from __future__ import annotations
 import torch
 
 from ..description import HandDescription
+from ..kinematics import ServoModel
 from ..typing import Float, Tensor
 from .observation import Observation
 from .plant import Plant
-from .servo_model import ServoModel
 from .wrapper import PlantWrapper
 
 
 class ServoInverse(PlantWrapper):
     """A plant whose increments are what its encoders shall do: commands go through the inverse of the servos.
 
-    Dead zone and bias of each servo are learned from every motion (:class:`ServoModel`). What is learned of
-    the hand is then free of them::
+    Dead zone and bias of each servo are learned from every motion
+    (:class:`~torch_ekm.kinematics.ServoModel`). What is learned of the hand is then free of them::
 
         plant = ServoInverse(SimulatedHand(hand, obj), hand)
         plant.command(delta_a)      # the encoders move by delta_a, as nearly as the servos can

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
-from ..exceptions import ParameterError, ShapeError
-from ..residual.checks import check_finite
+from ..exceptions import NonFiniteError, ParameterError, ShapeError
 from ..typing import Bool, Float, Tensor
 
 _DEG = math.pi / 180
@@ -122,7 +121,8 @@ class ServoModel(nn.Module):
         for name, value in (("command", command), ("moved", moved)):
             if value.shape != self.stuck.shape:
                 raise ShapeError(name, f"({len(self.names)},)", value.shape)
-            check_finite(name, value)
+            if not bool(torch.isfinite(value).all()):
+                raise NonFiniteError(name, torch.nonzero(~torch.isfinite(value))[:3].tolist())
         free = torch.ones_like(self.stuck) if free is None else free
         v, w = command.double(), moved.double()
         went = free & (w.abs() > self.moved_from)
