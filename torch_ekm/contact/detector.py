@@ -13,8 +13,9 @@ import torch
 
 from .._extras import require
 from ..description import HandDescription, ObjectDescription
-from ..exceptions import DescriptionError, NonFiniteError, ParameterError, ShapeError
+from ..exceptions import DescriptionError, ParameterError, ShapeError
 from ..kinematics import HandKinematics, LinkPoses
+from ..kinematics.tensors import check_finite
 from ..typing import Array, Float, Tensor
 from .contact_set import ContactSet, NearMiss
 from .link_contact import LinkShapes
@@ -190,6 +191,4 @@ class ContactDetector:
 def _check(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
     if tuple(value.shape) != shape:
         raise ShapeError(name, str(shape), value.shape, "one posture and one pose at a time")
-    finite = torch.isfinite(value)
-    if not bool(finite.all()):
-        raise NonFiniteError(name, torch.nonzero(~finite)[:3].tolist())
+    check_finite(name, value)

@@ -150,7 +150,7 @@ def _pinch(hand: HandDescription, obj: ObjectDescription, picture: Path | None) 
         yield Check("pinch", "ok", f"'{obj.name}' is held in simulation; forces [N]: {forces}")
         model = KinematicModel(plant.hand, obj, ModelOptions(gravity=plant.gravity, on_unstable="flag"))
         contacts = model.contacts(seen.state)
-        yield from _sides(hand, contacts, HandKinematics(hand)(seen.state.q))
+        yield from _sides(hand, contacts, model.kinematics(seen.state.q))
         lin = model.linearize(seen.state, contacts, fingertip_force=seen.fingertip_force)
         yield from _grasp(hand, lin)
     except MissingExtraError as error:

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import torch
 
-from ..exceptions import NonFiniteError, ParameterError, ShapeError
+from ..exceptions import ParameterError, ShapeError
 from ..typing import Float, Tensor
 from .se3 import exp, log
-from .tensors import as_tensors
+from .tensors import as_tensors, check_finite
 
 _ROUNDED = 1e-4
 """What a rotation matrix may be off by, entry by entry: four digits are enough, a scale or a shear is not."""
@@ -48,9 +48,7 @@ class GraspState:
             raise ShapeError("rotation", f"{(*batch, 3, 3)} to go with q", self.rotation.shape)
         if not bool(torch.isfinite(torch.cat([getattr(self, name).flatten() for name in given])).all()):
             for name in given:
-                finite = torch.isfinite(getattr(self, name))
-                if not bool(finite.all()):
-                    raise NonFiniteError(name, torch.nonzero(~finite)[:3].tolist())
+                check_finite(name, getattr(self, name))
         _check_rotation(self.rotation)
 
     @property

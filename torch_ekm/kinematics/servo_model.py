@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
-from ..exceptions import NonFiniteError, ParameterError, ShapeError
+from ..exceptions import ParameterError, ShapeError
 from ..typing import Bool, Float, Tensor
+from .tensors import check_finite
 
 _DEG = math.pi / 180
 
@@ -121,8 +122,7 @@ class ServoModel(nn.Module):
         for name, value in (("command", command), ("moved", moved)):
             if value.shape != self.stuck.shape:
                 raise ShapeError(name, f"({len(self.names)},)", value.shape)
-            if not bool(torch.isfinite(value).all()):
-                raise NonFiniteError(name, torch.nonzero(~torch.isfinite(value))[:3].tolist())
+            check_finite(name, value)
         free = torch.ones_like(self.stuck) if free is None else free
         v, w = command.double(), moved.double()
         went = free & (w.abs() > self.moved_from)

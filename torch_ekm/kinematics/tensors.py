@@ -6,7 +6,7 @@ import functools
 
 import torch
 
-from ..exceptions import ParameterError
+from ..exceptions import NonFiniteError, ParameterError
 from ..typing import Tensor
 
 
@@ -29,3 +29,14 @@ def as_tensors(**values: object) -> list[Tensor]:
     except (TypeError, ValueError, RuntimeError) as error:
         valid = f"numbers, in a tensor, an array or nested lists ({error})"
         raise ParameterError(", ".join(values), tuple(values.values()), valid) from None
+
+
+def check_finite(name: str, value: Tensor) -> None:
+    """No entry is NaN or infinite.
+
+    Raises:
+        NonFiniteError: with the first places of those that are.
+    """
+    finite = torch.isfinite(value)
+    if not bool(finite.all()):
+        raise NonFiniteError(name, torch.nonzero(~finite)[:3].tolist())

@@ -37,8 +37,7 @@ class ForceBalance:
         self.pose_basis = reduction.pose_basis.double().numpy()
         self.tendon = np.array([actuator.tendon for actuator in hand.actuators])
         # joint torque [N m] that the weight of the forces may leave where a tendon pulls nothing
-        pull = reduction.actuation.detach().double().cpu().numpy() @ self.joint_basis
-        arm, limit = np.linalg.norm(pull, axis=1), options.slack_tension
+        arm, limit = np.linalg.norm(self._arms(), axis=0), options.slack_tension
         no_pull = 1e-3 * options.length / np.where(arm > 0, arm, 1.0) + (0.0 if limit is None else limit)
         pulls = self.tendon & (limit is not None)
         self.slack_above = torch.from_numpy(np.where(pulls, -no_pull, np.inf))
@@ -52,6 +51,10 @@ class ForceBalance:
         self.lift = self.joint_basis @ np.linalg.inv(gram)
         # in a plane the third row of the pose basis is the rotation
         self.moment_rows: Mask = np.any(np.abs(self.pose_basis[3:]) > 1e-9, axis=0)
+
+    def _arms(self) -> Array:
+        """``(J_a Z)^T`` as it is now: calibration changes the moment arms."""
+        return (self.reduction.actuation.detach().double().cpu().numpy() @ self.joint_basis).T
 
     def held_by_stops(
         self, q: Float[Tensor, "*batch n_q"], torque: Float[Tensor, "*batch n_q"]
@@ -104,7 +107,7 @@ class ForceBalance:
             kin.models, kin.contacts.friction.tolist(), kin.contacts.torsional_friction.tolist()
         )
         spins = tuple(at for at, row in enumerate(kin.rows) if row % 6 >= 3)
-        actuation = (self.reduction.actuation.detach().double().cpu().numpy() @ self.joint_basis).T
+        actuation = self._arms()
         results = []
         for k, (q_k, A_k, V_q_k, V_p_k) in enumerate(states):
             joints, lower, upper = self._bounded(q_k, locked)

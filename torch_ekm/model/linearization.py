@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 
 from ..contact.contact_set import ContactSet
-from ..exceptions import NonFiniteError, ShapeError
+from ..exceptions import ShapeError
 from ..kinematics.grasp_state import GraspState
-from ..kinematics.tensors import as_tensors
+from ..kinematics.tensors import as_tensors, check_finite
 from ..typing import Bool, Float, Tensor
 from .grasp_forces import ExpectedForces, GraspForces, drift, friction_use, margin_std, start_covariance
 from .options import ModelOptions
@@ -134,9 +134,7 @@ class Linearization:
         n_a = self.manipulation_jacobian.shape[-1]
         if delta_a.shape[-1:] != (n_a,):
             raise ShapeError("delta_a", f"(*batch, {n_a})", delta_a.shape, "one entry per actuator")
-        finite = torch.isfinite(delta_a)
-        if not bool(finite.all()):
-            raise NonFiniteError("delta_a", torch.nonzero(~finite)[:3].tolist())
+        check_finite("delta_a", delta_a)
         return delta_a
 
 

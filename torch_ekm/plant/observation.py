@@ -6,10 +6,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
-import torch
-
-from ..exceptions import NonFiniteError
 from ..kinematics import GraspState
+from ..kinematics.tensors import check_finite
 from ..typing import Float, Tensor
 
 
@@ -82,9 +80,7 @@ class Observation:
         for name in ("q", "a", "position", "rotation", "fingertip_force"):
             if (value := getattr(self, name)) is None:  # the forces
                 continue
-            finite = torch.isfinite(value)
-            if not bool(finite.all()):
-                raise NonFiniteError(f"Observation.{name}", torch.nonzero(~finite)[:3].tolist())
+            check_finite(f"Observation.{name}", value)
 
     @property
     def state(self) -> GraspState:

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import torch
 
 from ..description import HandDescription
-from ..exceptions import JointMismatchError, NonFiniteError, ParameterError, ShapeError
+from ..exceptions import JointMismatchError, ParameterError, ShapeError
+from ..kinematics.tensors import check_finite
 from ..typing import Float, Tensor
 from .hall.calibration import HallCalibration
 
@@ -85,8 +86,7 @@ class JointEstimator:
         """
         if actuators.ndim == 0 or actuators.shape != (*readings.shape[:-1], self.hand.n_a):
             raise ShapeError("actuators", f"{(*readings.shape[:-1], self.hand.n_a)}", actuators.shape)
-        if not bool(torch.isfinite(actuators).all()):
-            raise NonFiniteError("actuators", torch.nonzero(~torch.isfinite(actuators))[:3].tolist())
+        check_finite("actuators", actuators)
         hall = self.calibration.estimate(readings)
         weight = hall.std**-2
         S = self._select

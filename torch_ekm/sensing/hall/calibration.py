@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from ...exceptions import DescriptionError, NonFiniteError, ParameterError, ShapeError
+from ...exceptions import DescriptionError, ParameterError, ShapeError
+from ...kinematics.tensors import check_finite
 from ...typing import Bool, Float, Tensor
 from .channel import FULL_SCALE, HallChannel, fit_channel
 
@@ -95,8 +96,7 @@ class HallCalibration:
         if angles.shape != readings.shape:
             raise ShapeError("angles", f"{tuple(readings.shape)} as the readings", angles.shape)
         for name, value in (("readings", readings), ("angles", angles)):
-            if not bool(torch.isfinite(value).all()):
-                raise NonFiniteError(name, torch.nonzero(~torch.isfinite(value))[:3].tolist())
+            check_finite(name, value)
         if bool((readings < 0).any() or (readings > FULL_SCALE).any()):
             found = (float(readings.min()), float(readings.max()))
             raise ParameterError("readings", found, "within 0..255")
@@ -111,8 +111,7 @@ class HallCalibration:
         """
         if readings.ndim == 0 or readings.shape[-1] != self.n_channels:
             raise ShapeError("readings", f"(*batch, {self.n_channels})", readings.shape)
-        if not bool(torch.isfinite(readings).all()):
-            raise NonFiniteError("readings", torch.nonzero(~torch.isfinite(readings))[:3].tolist())
+        check_finite("readings", readings)
         n = readings.to(torch.float64)
         held = n.clamp(self._low, self._high)  # noise may carry a sound reading past the range of the sweep
         r, c = held / FULL_SCALE, self._c
