@@ -1,4 +1,5 @@
-"""The six everyday objects: dimensions, masses, friction. Chosen by us; only their names are the paper's.
+"""Everyday objects: dimensions, masses, friction, all chosen by us. The names of the first six are the paper's;
+the other six reach from 15 to 66 mm and from 0.03 to 0.3 kg, and nothing is tuned on them.
 
 Object frame: origin at the geometric centre, x along the longest side, y the direction in which the
 fingers press, z = x cross y. A part is a solid with its mass, of uniform density.
@@ -95,6 +96,63 @@ OBJECTS = (
         0.040,
         0.7,
         colour="0.75 0.15 0.15 1",
+    ),
+    Thing(
+        "pen_case",
+        "a thin case of 120 x 15 x 30 mm with a few pens",
+        ((Box((0, 0, 0), (0.120, 0.015, 0.030)), 0.030),),
+        0.015,
+        0.060,
+        0.8,
+        colour="0.20 0.35 0.60 1",
+    ),
+    Thing(
+        "flashlight",
+        "a flashlight: a grip of 22 mm with a broader head, heavier at the head",
+        (
+            (Rod((-0.060, 0, 0), (0.035, 0, 0), 0.011, round=False), 0.080),
+            (Rod((0.035, 0, 0), (0.055, 0, 0), 0.016, round=False), 0.040),
+        ),
+        0.022,
+        0.055,
+        0.8,
+        colour="0.25 0.25 0.28 1",
+    ),
+    Thing(
+        "charger",
+        "a heavy charger of 80 x 30 x 45 mm",
+        ((Box((0, 0, 0), (0.080, 0.030, 0.045)), 0.300),),
+        0.030,
+        0.040,
+        0.9,
+        colour="0.15 0.15 0.15 1",
+    ),
+    Thing(
+        "tea_tin",
+        "a tin of 90 x 46 x 46 mm",
+        ((Box((0, 0, 0), (0.090, 0.046, 0.046)), 0.150),),
+        0.046,
+        0.045,
+        0.8,
+        colour="0.30 0.50 0.35 1",
+    ),
+    Thing(
+        "jar",
+        "a jar of 52 mm diameter",
+        ((Rod((-0.040, 0, 0), (0.040, 0, 0), 0.026, round=False), 0.180),),
+        0.052,
+        0.040,
+        0.8,
+        colour="0.80 0.70 0.30 1",
+    ),
+    Thing(
+        "carton",
+        "a light carton, 66 mm wide",
+        ((Box((0, 0, 0), (0.090, 0.066, 0.050)), 0.100),),
+        0.066,
+        0.045,
+        0.9,
+        colour="0.85 0.75 0.60 1",
     ),
 )
 

@@ -1,4 +1,4 @@
-"""The six objects: figures a reader can check, and that bodies are physical."""
+"""The objects: figures a reader can check, and that bodies are physical."""
 
 from __future__ import annotations
 
@@ -9,14 +9,18 @@ from torch_ekm.description import Shape, list_objects, load_object
 from torch_ekm.description.shape import merge_capsules
 
 
-def test_the_papers_six() -> None:
-    assert set(list_objects()) == {"toothpaste", "applier", "box", "weighted_box", "bottle", "can"}
+def test_the_papers_six_and_six_more() -> None:
+    papers = {"toothpaste", "applier", "box", "weighted_box", "bottle", "can"}
+    more = set(list_objects()) - papers
+    assert set(list_objects()) > papers
+    widths, masses = zip(*((load_object(n).grasp_width, load_object(n).mass) for n in more), strict=True)
+    assert (min(widths), max(widths), min(masses), max(masses)) == pytest.approx((0.015, 0.066, 0.03, 0.3))
 
 
 @pytest.mark.parametrize("name", list_objects())
 def test_objects_are_physical(name: str) -> None:
     obj = load_object(name)
-    assert 0.02 < obj.mass < 0.2
+    assert 0.02 < obj.mass <= 0.3
     assert 0.2 < obj.friction < 1.2
     principal = np.linalg.eigvalsh(obj.inertia)
     assert principal[0] > 0

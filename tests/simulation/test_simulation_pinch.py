@@ -8,7 +8,7 @@ import torch
 from simulation_helpers import DEG
 
 from torch_ekm.contact.detector import ContactDetector
-from torch_ekm.description import list_objects, load_hand, load_object
+from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.simulation import PlantConfig, PlantParameters
@@ -32,7 +32,7 @@ def contacts_of(hand, obj, plan):
     return ContactDetector(hand, obj)(*parts)
 
 
-@pytest.mark.parametrize("name", list_objects())
+@pytest.mark.parametrize("name", ["toothpaste", "applier", "bottle", "can", "pen_case", "carton"])
 def test_a_plan_is_an_equilibrium(name):
     hand, obj, plan, transmission = plan_for(name)
     seen = contacts_of(hand, obj, plan)
@@ -58,7 +58,7 @@ def test_a_plan_is_an_equilibrium(name):
     np.testing.assert_allclose(balance[loaded], 0.0, atol=2e-3)
 
 
-@pytest.mark.parametrize("name", list_objects())
+@pytest.mark.parametrize("name", ["toothpaste", "applier", "bottle", "can", "pen_case", "carton"])
 def test_a_plan_keeps_well_inside_cones_and_stops(name):
     hand, obj, plan, _ = plan_for(name)
     normal = -np.einsum("ci,ci->c", plan.forces, plan.normals)

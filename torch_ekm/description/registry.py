@@ -15,7 +15,10 @@ _HANDS = {
     "icub_left": "icub_left_hand.urdf",
     "planar_two_finger": "planar_two_finger.urdf",
 }
-_OBJECTS = ("toothpaste", "applier", "box", "weighted_box", "bottle", "can")
+_OBJECTS = (
+    "toothpaste", "applier", "box", "weighted_box", "bottle", "can",
+    "pen_case", "flashlight", "charger", "tea_tin", "jar", "carton",
+)  # fmt: skip
 
 
 def urdf_folder() -> Path:

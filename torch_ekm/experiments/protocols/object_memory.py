@@ -64,7 +64,7 @@ class ObjectMemory(Protocol):
     """
 
     setting: Setting = field(default_factory=Setting)
-    objects: tuple[str, ...] = field(default_factory=list_objects)
+    objects: tuple[str, ...] = field(default_factory=lambda: list_objects()[:6])
     turns_each: int = 8
     models: int = 8
     """Largest number of models that the bank may keep."""
