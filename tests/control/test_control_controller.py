@@ -26,6 +26,7 @@ from torch_ekm.control import (
     PoseTarget,
     Situation,
     Squares,
+    StepBound,
     StopReason,
     UncertaintyTask,
 )
@@ -38,6 +39,8 @@ from torch_ekm.simulation import SimulatedHand
 
 DEG = math.pi / 180
 STEP = LimitingFunction().step
+#: The model's own doubts about a step are another matter.
+WHOLE = StepBound(least=math.inf)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +59,8 @@ def controller(grasp, enhanced: bool = False, **parts) -> LookAndMoveController:
         learner = SparseOnlineGP(6 + plant.hand.n_a, 6)
         rows = list(range(plant.hand.n_q, plant.hand.n_q + 6))
         used = EnhancedModel(model, learner, encode=lambda s: s.coordinates(s)[..., -6:], outputs=rows)
-    return LookAndMoveController(used, FocusedPose.rotation_about(plant.rotation_axis), **parts)
+    axis = FocusedPose.rotation_about(plant.rotation_axis)
+    return LookAndMoveController(used, axis, **{"bound": WHOLE, **parts})
 
 
 def test_zero_error_gives_almost_no_command(grasp) -> None:
@@ -240,10 +244,10 @@ def test_a_translation_carries_every_contact_as_far(grasp) -> None:
     focus = FocusedPose(torch.eye(6, dtype=torch.float64)[:3])
     target = PoseTarget(state.position + torch.tensor([3e-3, 4e-3, 0.0]), state.rotation)
     short = LimitingFunction(step=1.0, contact_travel=0.5e-3)
-    decision = LookAndMoveController(model, focus, limiting=short).decide(state, seen.a, target)
+    decision = LookAndMoveController(model, focus, limiting=short, bound=WHOLE).decide(state, seen.a, target)
     torch.testing.assert_close(decision.desired, torch.tensor([0.3e-3, 0.4e-3, 0.0], dtype=torch.float64))
     free = LimitingFunction(gain=0.8, step=1.0, contact_travel=None)
-    decision = LookAndMoveController(model, focus, limiting=free).decide(state, seen.a, target)
+    decision = LookAndMoveController(model, focus, limiting=free, bound=WHOLE).decide(state, seen.a, target)
     torch.testing.assert_close(decision.desired, 0.8 * torch.tensor([3e-3, 4e-3, 0.0], dtype=torch.float64))
 
 
@@ -304,7 +308,7 @@ def decide(grasp, taught: EnhancedModel, weight: float | None = None, **options:
     target = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG)
     focus = FocusedPose.rotation_about(plant.rotation_axis)
     more = () if weight is None else (UncertaintyTask(weight),)
-    loop = LookAndMoveController(taught, focus, (*DEFAULT_TASKS, *more), **options)
+    loop = LookAndMoveController(taught, focus, (*DEFAULT_TASKS, *more), bound=WHOLE, **options)
     decision = loop.decide(state, seen.a, target, seen.fingertip_force)
     about = torch.cat([torch.zeros(plant.hand.n_q + 3), plant.rotation_axis.square()]).double()
     return loop, decision, float(taught.variance(state, decision.delta_a, about).value) / DEG**2

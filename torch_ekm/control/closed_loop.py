@@ -11,11 +11,16 @@ from typing import NamedTuple, Self
 
 import torch
 
+from ..enhanced import EnhancedModel
+from ..model import Linearization
 from ..plant import Observation, Plant, PlantStatus, ServoInverse
 from ..residual import UpdateReport
 from ..typing import Float, Tensor
+from .caution import Caution
 from .controller import Decision, LookAndMoveController
 from .focus import FocusedPose, PoseTarget
+from .limiting import contact_lever
+from .situation import pad_indices
 from .termination import StoppingRule, StopReason
 
 
@@ -32,6 +37,11 @@ class Step:
     """Of the learner; None where nothing was learned."""
     seconds: float
     """Decision and training, without the plant [s]."""
+
+    @property
+    def retreat(self) -> bool:
+        """The motion undid an earlier one."""
+        return self.decision.share == 0.0
 
 
 class Stop(NamedTuple):
@@ -85,6 +95,7 @@ class ClosedLoop:
         controller: its :class:`~torch_ekm.enhanced.EnhancedModel`, if it has one, learns after every motion.
         rule: when to stop.
         learn: False leaves the learner as it is.
+        caution: when to look again, to go back and to give up.
 
     An enhanced model with a ``servo`` commands through a :class:`~torch_ekm.plant.ServoInverse`, and
     it learns from what the encoders did. One without learns from the commands.
@@ -97,10 +108,12 @@ class ClosedLoop:
         rule: StoppingRule | None = None,
         *,
         learn: bool = True,
+        caution: Caution | None = None,
     ) -> None:
         self.plant, self.controller = plant, controller
         self.rule = StoppingRule() if rule is None else rule
         self.learn = learn
+        self.caution = Caution() if caution is None else caution
         servo = None if controller.enhanced is None else controller.enhanced.servo
         if servo is not None and not isinstance(plant, ServoInverse):
             self.plant = ServoInverse(plant, controller.kinematic.hand, servo)
@@ -155,43 +168,145 @@ class ClosedLoop:
         started = time.monotonic()
         seen = self.plant.observe()
         self.controller.reset()
-        start, focus = seen.state, self.controller.focus
-        errors, limited, off_rotation = [focus.error(target, start)], False, 0.0
+        turn = _Turn(target, self.controller.focus, seen, self.caution.off_rotation)
         while True:
             if seen.status is PlantStatus.LOST:
                 return Stop(StopReason.OBJECT_LOST, seen)
-            if off_rotation > self.rule.off_limit:
+            if turn.off_rotation(seen) > self.rule.off_limit:
                 return Stop(StopReason.OBJECT_LOST, seen, "dislocated off the focused axis")
             if self._stop.is_set():
                 return Stop(StopReason.STOPPED, seen)
             if time.monotonic() - started > self.rule.max_seconds:
                 return Stop(StopReason.TIME_OUT, seen)
-            reason = self.rule.judge(errors, limited)
+            reason = self.rule.judge(turn.errors, turn.limited)
             if reason is not StopReason.RUNNING:
                 return Stop(reason, seen)
-            began = time.perf_counter()
-            decision = self.controller.decide(seen.state, seen.a, target, seen.fingertip_force)
-            seconds = time.perf_counter() - began
+            seen, decision, seconds = self._decide(seen, turn)
+            sign = self._sign(turn, seen, decision)
+            if sign and turn.way and decision.status is not StopReason.OBJECT_LOST:
+                turn.alarms += 1
+                turn.off_allowed = max(turn.off_allowed, turn.off_rotation(seen) + self.caution.off_further)
+                seen, clear = yield from self._go_back(seen, decision, turn)
+                if seen.status is PlantStatus.LOST:
+                    return Stop(StopReason.OBJECT_LOST, seen, sign)
+                if not clear or turn.alarms > self.caution.retreats:
+                    return Stop(StopReason.GIVEN_UP, seen, sign)
+                self._be_careful()
+                continue
             if decision.status is not StopReason.RUNNING:
                 return Stop(decision.status, seen, decision.message)
-            after = self.plant.command(decision.delta_a)
-            increment = after.state.minus(seen.state)
-            began = time.perf_counter()
-            report = self._learn(seen, decision, after, increment)
-            seconds += time.perf_counter() - began
-            yield Step(seen, decision, after, increment, report, seconds)
-            off_rotation = focus.off_rotation(after.state.minus(start))
-            seen, limited = after, decision.limited
-            errors.append(focus.error(target, seen.state))
+            step = self._move(seen, decision, turn, seconds)
+            yield step
+            seen, turn.limited = step.after, decision.limited
+
+    def _decide(self, seen: Observation, turn: _Turn) -> tuple[Observation, Decision, float]:
+        """A decision; a state that the model refuses is looked at again, and the last look counts."""
+        began = time.perf_counter()
+        decision = self.controller.decide(seen.state, seen.a, turn.target, seen.fingertip_force)
+        seconds = time.perf_counter() - began
+        for _ in range(self.caution.looks):
+            if decision.status is StopReason.RUNNING or seen.status is not PlantStatus.HELD:
+                break
+            seen = self.plant.observe()
+            decision = self.controller.decide(seen.state, seen.a, turn.target, seen.fingertip_force)
+        return seen, decision, seconds
+
+    def _sign(self, turn: _Turn, seen: Observation, decision: Decision) -> str:
+        """What speaks for a loss to come; empty: nothing."""
+        if decision.status is not StopReason.RUNNING:
+            return decision.message
+        links = self.caution.bearing_links(decision.linearization)
+        turn.bearing = links if turn.bearing is None else turn.bearing
+        return self.caution.sign(turn.off_rotation(seen), turn.off_allowed, links - turn.bearing)
+
+    def _go_back(
+        self, seen: Observation, decision: Decision, turn: _Turn
+    ) -> Generator[Step, None, tuple[Observation, bool]]:
+        """Undo the last motions until nothing speaks for a loss; False: it still does."""
+        for _ in range(min(self.caution.way_back, len(turn.way))):
+            back = -turn.way.pop()
+            step = self._move(seen, self.controller.retreat(decision, back), turn)
+            turn.way.pop()  # that motion is no way forward
+            yield step
+            seen = step.after
+            if seen.status is PlantStatus.LOST:
+                break
+            seen, decision, _ = self._decide(seen, turn)
+            if not self._sign(turn, seen, decision):
+                return seen, True
+        return seen, False
+
+    def _be_careful(self) -> None:
+        """Grip harder and go slower."""
+        self.controller.tighter += self.caution.tighten
+        enhanced = self.controller.enhanced
+        if enhanced is not None and enhanced.trust is not None:
+            enhanced.trust.restart()
+
+    def _move(self, seen: Observation, decision: Decision, turn: _Turn, seconds: float = 0.0) -> Step:
+        """Command, observe, learn."""
+        after = self.plant.command(decision.delta_a)
+        increment = after.state.minus(seen.state)
+        began = time.perf_counter()
+        report = self._learn(seen, decision, after, increment)
+        seconds += time.perf_counter() - began
+        turn.way.append(after.a - seen.a)
+        turn.errors.append(turn.focus.error(turn.target, after.state))
+        return Step(seen, decision, after, increment, report, seconds)
 
     def _learn(
         self, seen: Observation, decision: Decision, after: Observation, increment: Tensor
     ) -> UpdateReport | None:
-        enhanced = self.controller.enhanced
-        if not self.learn or enhanced is None or after.status is not PlantStatus.HELD:
+        enhanced, lin = self.controller.enhanced, decision.linearization
+        if not self.learn or enhanced is None or after.status is not PlantStatus.HELD or lin is None:
             return None
-        if not isinstance(self.plant, ServoInverse):
-            return enhanced.update(seen.state, decision.delta_a, increment, decision.nominal)
-        moved = after.a - seen.a
-        nominal = None if decision.linearization is None else decision.linearization.step(moved)
+        servo = isinstance(self.plant, ServoInverse)
+        moved = after.a - seen.a if servo else decision.delta_a
+        foretold, nominal = self.controller.foretell(lin, moved)
+        surprise = self._learn_forces(enhanced, lin, seen, moved, after)
+        if enhanced.trust is not None:
+            lever = contact_lever(lin.contacts.point - seen.position)
+            enhanced.trust.judge(foretold[-6:], increment[-6:], lever, decision.share, surprise)
         return enhanced.update(seen.state, moved, increment, nominal)
+
+    def _learn_forces(
+        self,
+        enhanced: EnhancedModel,
+        lin: Linearization,
+        seen: Observation,
+        moved: Tensor,
+        after: Observation,
+    ) -> Float[Tensor, " n_c"] | None:
+        """How far each contact's normal force is from what was foretold [N]; None: not all pads measure."""
+        if seen.fingertip_force is None or after.fingertip_force is None:
+            return None
+        pads = pad_indices(self.controller.kinematic.hand, lin.contacts.finger)
+        before, now = seen.fingertip_force[pads], after.fingertip_force[pads]
+        if bool((torch.minimum(before, now) < self.controller.kinematic.options.forces.normal_std).any()):
+            return None  # a pad that reads so little may be dead, or has let go
+        wrong = now - before - lin.normal_force_sensitivity @ moved
+        correction = enhanced.force_correction(seen.state, moved)
+        y = torch.zeros_like(seen.fingertip_force)
+        y[pads] = wrong
+        enhanced.update_forces(seen.state, moved, y)
+        return wrong if correction is None else wrong - correction[0][pads]
+
+
+class _Turn:
+    """How far a manipulation has come."""
+
+    def __init__(self, target: PoseTarget, focus: FocusedPose, seen: Observation, off: float) -> None:
+        self.target, self.focus, self.start = target, focus, seen.state
+        self.off_allowed = off
+        """[rad]"""
+        self.errors = [focus.error(target, seen.state)]
+        self.limited = False
+        self.alarms = 0
+        self.way: list[Tensor] = []
+        """What the encoders did [rad], motion by motion, without what was undone."""
+        self.bearing: frozenset[str] | None = None
+        """Links without a pad that bore on the object at the start."""
+
+    def off_rotation(self, seen: Observation) -> float:
+        """Of the object off the focus since the start [rad]."""
+        return self.focus.off_rotation(seen.state.minus(self.start))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ from .limiting import LimitingFunction, contact_travel
 from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
 from .qp import DEGREE, ControlProblem, ControlSolution, as_array, build_qp
 from .situation import LinearizedModel, Situation
+from .step_bound import StepBound
 from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
 from .termination import StopReason
 
@@ -45,6 +47,8 @@ class Decision:
     """(f + g)(s, da)."""
     nominal: Float[Tensor, " n_s"]
     """f(s, da) = J_m da: what the kinematic model alone predicts."""
+    share: float = 1.0
+    """Of the largest step that the pace allows."""
     limited: bool = False
     """The step could not be met in full because actuators stand at their limits."""
     slack: float = 0.0
@@ -81,6 +85,7 @@ class LookAndMoveController:
         sqp_iterations: at most so many quadratic programs, for a model that is not linear in the action.
         sqp_damping: share of each change that is made.
         sqp_tolerance: a smaller change is the last [rad].
+        bound: how much of a step is made where the model foretells that it goes wrong.
         solver: any that qpsolvers finds installed.
     """
 
@@ -95,6 +100,7 @@ class LookAndMoveController:
         sqp_iterations: int = 6,
         sqp_damping: float = 0.6,
         sqp_tolerance: float = 1e-3 * DEGREE,
+        bound: StepBound | None = None,
         solver: str = "piqp",
     ) -> None:
         self.enhanced = model if isinstance(model, EnhancedModel) else None
@@ -103,13 +109,33 @@ class LookAndMoveController:
         self.tasks = DEFAULT_TASKS if tasks is None else tuple(tasks)
         self.limits = DEFAULT_LIMITS if limits is None else tuple(limits)
         self.limiting = LimitingFunction() if limiting is None else limiting
+        self.bound = StepBound() if bound is None else bound
         self.sqp_iterations, self.sqp_damping, self.sqp_tolerance = sqp_iterations, sqp_damping, sqp_tolerance
         self.solver = solver
+        self.tighter = 0.0
+        """Grip force on top of the one that suits the object [N]."""
+        self._weight = float(torch.linalg.vector_norm(self.kinematic.weight))
         self._previous: tuple[Linearization, Tensor] | None = None
 
     def reset(self) -> None:
-        """Forget the contact forces of the last grasp; a :class:`ClosedLoop` does so when it begins."""
-        self._previous = None
+        """Forget the contact forces and the tighter grip of the last grasp; a :class:`ClosedLoop` does so
+        when it begins."""
+        self._previous, self.tighter = None, 0.0
+
+    @property
+    def pace(self) -> float:
+        """Factor of the largest step, by a :class:`~torch_ekm.enhanced.TrustRegion`; 1 without one."""
+        trust = None if self.enhanced is None else self.enhanced.trust
+        return 1.0 if trust is None else trust.pace
+
+    def foretell(
+        self, lin: Linearization, moved: Float[Tensor, " n_a"]
+    ) -> tuple[Float[Tensor, " n_s"], Float[Tensor, " n_s"]]:
+        """``(f + g)(s, w)`` and ``f(s, w)`` of what the encoders did from a linearized state."""
+        nominal = lin.step(moved)
+        if self.enhanced is None:
+            return nominal, nominal
+        return self.enhanced.linearize(lin.state, moved, lin.manipulation_jacobian)[0], nominal
 
     def _linearize(self, state: GraspState, a: Tensor, fingertip_force: Tensor | None) -> Linearization:
         """The kinematic model with the forces that the fingertips and the last forces speak for."""
@@ -133,6 +159,18 @@ class LookAndMoveController:
         except GraspError:
             return None
         return forces.normal if forces.solved else None
+
+    def retreat(self, at: Decision, delta_a: Float[Tensor, " n_a"]) -> Decision:
+        """The decision to undo a motion, instead of the one that was taken ``at`` the state."""
+        still = at.predicted.new_zeros(at.predicted.shape)
+        predicted, nominal = still, still
+        if at.linearization is not None:
+            predicted, nominal = self.foretell(at.linearization, delta_a)
+        desired = self.focus.matrix @ predicted[-6:]
+        lin = at.linearization
+        return Decision(
+            delta_a, StopReason.RUNNING, desired, predicted, nominal, share=0.0, linearization=lin
+        )
 
     def decide(
         self,
@@ -179,27 +217,64 @@ class LookAndMoveController:
             return Decision(zero, status, self.limiting(focused), still, still, message=str(failure))
 
         travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
-        desired = self.limiting(focused, travel)
+        pace, steps = self.pace, self.limiting.steps(focused, travel)
+        share = min(self.limiting.gain * steps / pace, 1.0)
+        desired = self.limiting(focused, travel, pace)
         alone = None if fingertip_force is None else self._joint_force(lin)
-        seen = Situation(hand, self.focus, state, a, fingertip_force, error, desired, alone)
-        enhanced, J_m, da = self.enhanced, lin.manipulation_jacobian, a.new_zeros(hand.n_a)
-        encoded = None if enhanced is None else enhanced.encode(state)
+        seen = Situation(
+            hand, self.focus, state, a, fingertip_force, error, desired, alone, self._weight, self.tighter
+        )
+        da, predicted, problem, solution = self._solve(lin, seen)
+        phi = self.bound.share(lin, da, predicted, seen, self._wanted_grip(lin, seen))
+        phi = max(phi, min(1.0, self.bound.least / max(share * pace, 1e-9)))
+        if phi < 1:
+            desired, share = phi * desired, phi * share
+            seen = dataclasses.replace(seen, desired=desired)
+            da, predicted, problem, solution = self._solve(lin, seen)
+        nominal = lin.manipulation_jacobian @ da
+        slack = float(np.abs(solution.slack).max(initial=0.0))
+        limited = slack > 0.05 * float(desired.abs().max()) and self._at_limit(a, da, problem)
+        figures = {"share": share, "limited": limited, "slack": slack}
+        return Decision(
+            da,
+            StopReason.RUNNING,
+            desired,
+            predicted,
+            nominal,
+            **figures,
+            linearization=lin,
+            solution=solution,
+        )
+
+    def _solve(
+        self, lin: Linearization, seen: Situation
+    ) -> tuple[Tensor, Tensor, ControlProblem, ControlSolution]:
+        """The best increment, what the model foretells of it, and the last program with its solution."""
+        enhanced, da = self.enhanced, seen.a.new_zeros(len(seen.a))
+        encoded = None if enhanced is None else enhanced.encode(seen.state)
         linear = enhanced is None or enhanced.affine
         for _ in range(1 if linear else self.sqp_iterations):
             model = LinearizedModel.about(da, lin, enhanced, encoded)
             problem = self.program(model, seen)
             solution = problem.solve(self.solver)
-            best = torch.as_tensor(solution.u, dtype=a.dtype)
+            best = torch.as_tensor(solution.u, dtype=da.dtype)
             change = best - da
             done = linear or float(change.abs().max()) <= self.sqp_tolerance
             da = best if done else da + self.sqp_damping * change
             if done:
                 break
-        nominal = J_m @ da
-        predicted = nominal if enhanced is None else enhanced.linearize(state, da, J_m, encoded)[0]
-        slack = float(np.abs(solution.slack).max(initial=0.0))
-        limited = slack > 0.05 * float(desired.abs().max()) and self._at_limit(a, da, problem)
-        return Decision(da, StopReason.RUNNING, desired, predicted, nominal, limited, slack, lin, solution)
+        if enhanced is None or linear:
+            return da, model.offset + model.jacobian @ da, problem, solution
+        return (
+            da,
+            enhanced.linearize(seen.state, da, lin.manipulation_jacobian, encoded)[0],
+            problem,
+            solution,
+        )
+
+    def _wanted_grip(self, lin: Linearization, seen: Situation) -> float | None:
+        grips = (task for task in self.tasks if isinstance(task, GripForceTask))
+        return next((task.wanted(lin, seen) for task in grips), None)
 
     def program(self, model: LinearizedModel, seen: Situation) -> ControlProblem:
         """The quadratic program of one iteration: the sum of all tasks and limits."""

@@ -12,10 +12,11 @@ from .qp import DEGREE
 
 @dataclass(frozen=True)
 class LimitingFunction:
-    """``dx_d = e min(gain, step/|e|, contact_travel/|v(e)|)``: keeps the direction, linear near the goal.
+    """``dx_d = e min(gain, p step/|e|, p contact_travel/|v(e)|)``: keeps the direction, linear near the goal.
 
     v(e) is the way that the whole error would carry the contact that moves most. The limiting function of the
     E-KM paper (section III.B) is that of ``step``; the other two hold off noise and wide objects.
+    The pace p is 1 unless a :class:`~torch_ekm.enhanced.TrustRegion` sets it.
     """
 
     gain: float = 0.8
@@ -27,17 +28,23 @@ class LimitingFunction:
     """And no contact is asked to move farther than this [m]: a wide object turns in smaller steps.
     None: no such limit."""
 
-    def __call__(self, error: Float[Tensor, " n_x"], travel: float = 0.0) -> Float[Tensor, " n_x"]:
+    def __call__(
+        self, error: Float[Tensor, " n_x"], travel: float = 0.0, pace: float = 1.0
+    ) -> Float[Tensor, " n_x"]:
         """dx_d.
 
         Args:
             error: e, focused error.
             travel: ``|v(e)|``, see :func:`contact_travel` [m].
+            pace: p.
         """
+        size = self.steps(error, travel)
+        return error * min(self.gain, pace / size) if size > 0 else error
+
+    def steps(self, error: Float[Tensor, " n_x"], travel: float = 0.0) -> float:
+        """How many of the largest steps, at pace 1, make up an error."""
         size = float(torch.linalg.vector_norm(error)) / self.step
-        if self.contact_travel is not None:
-            size = max(size, travel / self.contact_travel)
-        return error * min(self.gain, 1.0 / size) if size > 0 else error
+        return size if self.contact_travel is None else max(size, travel / self.contact_travel)
 
 
 def contact_travel(twist: Float[Tensor, 6], lever: Float[Tensor, "n_c 3"]) -> float:
@@ -45,3 +52,8 @@ def contact_travel(twist: Float[Tensor, 6], lever: Float[Tensor, "n_c 3"]) -> fl
     v, w = twist.split(3)
     carried = v + torch.linalg.cross(w.expand_as(lever), lever)
     return float(torch.linalg.vector_norm(carried, dim=-1).max())
+
+
+def contact_lever(lever: Float[Tensor, "n_c 3"]) -> float:
+    """Root mean square distance of the contacts from the object's point [m]."""
+    return float(lever.square().sum(-1).mean().sqrt())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -37,6 +37,10 @@ class Situation:
     """dx_d, what one step shall do to the focused pose."""
     joint_force: Float[Tensor, " n_c"] | None = None
     """Normal force of each contact by joints and springs alone [N], where they contradict the pads."""
+    weight: float = 0.0
+    """Of the object [N]."""
+    tighter: float = 0.0
+    """Wanted on top of the grip that suits the object [N]."""
 
     def normal_force(self, kinematic: Linearization) -> Array | None:
         """``f_n`` of each contact [N]: as its pad measures it, or else as the model estimates it.
@@ -46,8 +50,7 @@ class Situation:
         estimated = as_array(kinematic.forces.normal) if kinematic.forces.solved else None
         if self.fingertip_force is None:
             return estimated
-        pads = [pad.name for pad in self.hand.pads]
-        measured = as_array(self.fingertip_force)[[pads.index(name) for name in kinematic.contacts.finger]]
+        measured = as_array(self.fingertip_force)[pad_indices(self.hand, kinematic.contacts.finger)]
         return np.where(np.isnan(measured), 0.0 if estimated is None else estimated, measured)
 
 
@@ -61,6 +64,10 @@ class LinearizedModel:
     offset: Float[Tensor, " n_s"]
     jacobian: Float[Tensor, "n_s n_a"]
     """Rows: joints [rad/rad], object point [m/rad], object rotation [rad/rad]."""
+    force_offset: Array | float = 0.0
+    force_jacobian: Array | None = None
+    """``f_n' = f_n + force_offset + force_jacobian u`` of each contact [N], [N/rad]; None: as the model of
+    the grasp has it."""
     variance: Callable[[Float[Tensor, " n_s"]], Quadratic] | None = None
     """``sum_j w_j Var[ds_j]`` of weights w, as a quadratic about ``action``; None: nothing is learned."""
 
@@ -81,4 +88,23 @@ class LinearizedModel:
         if enhanced is None:
             return cls(kinematic, action, J.new_zeros(len(J)), J)
         value, J = enhanced.linearize(state, action, J, encoded)
-        return cls(kinematic, action, value - J @ action, J, partial(enhanced.variance, state, action))
+        offset, S = 0.0, as_array(kinematic.normal_force_sensitivity)
+        forces = enhanced.force_correction(state, action, encoded)
+        if forces is not None:
+            pads = pad_indices(enhanced.model.hand, kinematic.contacts.finger)
+            mean, slope = (as_array(part)[pads] for part in forces)
+            offset, S = mean - slope @ as_array(action), S + slope
+        variance = partial(enhanced.variance, state, action)
+        return cls(kinematic, action, value - J @ action, J, offset, S, variance)
+
+    @property
+    def grip(self) -> tuple[Array | float, Array]:
+        """``(c, S)`` of ``f_n' = f_n + c + S u`` [N], [N/rad]."""
+        S = self.force_jacobian
+        return self.force_offset, as_array(self.kinematic.normal_force_sensitivity) if S is None else S
+
+
+def pad_indices(hand: HandDescription, fingers: Sequence[str]) -> list[int]:
+    """Place of each contact's pad among those of the hand."""
+    names = [pad.name for pad in hand.pads]
+    return [names.index(finger) for finger in fingers]

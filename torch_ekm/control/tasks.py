@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
 
 from ..enhanced import Quadratic
+from .limiting import contact_travel
 from .qp import DEGREE, Equality, Squares
 from .situation import LinearizedModel, Situation
+
+if TYPE_CHECKING:
+    from ..model import Linearization
 
 
 class Task(Protocol):
@@ -57,16 +61,29 @@ class OffAxisTask:
 
 @dataclass(frozen=True)
 class GripForceTask:
-    """``f_n + (df_n/da) u = f``: f_n as the fingertips measure it, only its sensitivity by the model.
+    """``f_n + (df_n/da) u = f``: f_n as the fingertips measure it, only its sensitivity by the model,
+    corrected by what was learned of it.
 
     A grip force computed from a wrong model drops the object; a hand without fingertip sensors has no better.
 
     The finger that presses most opposes all others: it is regulated to ``force``, and the others to
     equal shares of it, so that no finger is left without a grip.
+
+    The grip follows from the object: each side bears half the weight and what turning asks for, which grows
+    with the lever r of the contacts about the axis, with a ``1/safety`` of its friction::
+
+        f = clip(safety/mu (m g/2 + turning_load r), least, most)
     """
 
-    force: float = 5.0
+    force: float | None = None
+    """[N]; None: by the object."""
+    safety: float = 2.5
+    turning_load: float = 95.0
+    """Tangential force for each metre of the lever [N/m]."""
+    least: float = 5.0
     """[N]"""
+    most: float = 8.5
+    """[N]; also of a grip that was tightened."""
     weight: float = 4.0
     """Per N^2."""
     step: float = 0.7
@@ -76,10 +93,23 @@ class GripForceTask:
         f_n = seen.normal_force(model.kinematic)
         if f_n is None:
             return None
-        wanted = np.full(len(f_n), self.force / max(len(f_n) - 1, 1))
-        wanted[f_n.argmax()] = self.force
+        force = self.wanted(model.kinematic, seen)
+        wanted = np.full(len(f_n), force / max(len(f_n) - 1, 1))
+        wanted[f_n.argmax()] = force
         change = np.clip(wanted - f_n, -self.step, self.step)
-        return Squares(model.kinematic.normal_force_sensitivity, change, self.weight)
+        offset, S = model.grip
+        return Squares(S, change - offset, self.weight)
+
+    def wanted(self, kinematic: Linearization, seen: Situation) -> float:
+        """f, of the finger that opposes the others [N]."""
+        if self.force is not None:
+            return self.force + seen.tighter
+        contacts = kinematic.contacts
+        mu = max(float(contacts.friction.mean()), 1e-3)
+        turning = seen.focus.matrix[seen.focus.matrix[:, 3:].abs().sum(-1) > 0]
+        lever = max((contact_travel(row, contacts.point - seen.state.position) for row in turning), default=0)
+        force = self.safety / mu * (seen.weight / 2 + self.turning_load * lever)
+        return min(max(force, self.least) + seen.tighter, self.most)
 
 
 @dataclass(frozen=True)

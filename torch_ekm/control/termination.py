@@ -18,6 +18,8 @@ class StopReason(Enum):
     STEP_LIMIT = "step limit"
     ACTUATOR_LIMITS = "actuator limits"
     UNSTABLE_GRASP = "unstable grasp"
+    GIVEN_UP = "given up"
+    """With the object in the hand, see :class:`~torch_ekm.control.Caution`."""
     OBJECT_LOST = "object lost"
     TIME_OUT = "time-out"
     STOPPED = "stopped"

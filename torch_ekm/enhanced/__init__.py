@@ -6,10 +6,13 @@ from .action_variance import Quadratic
 from .encoding import GraspEncoding
 from .enhanced_model import EnhancedModel
 from .grasp_learner import grasp_learner
+from .trust_region import TrustOptions, TrustRegion
 
 __all__ = [
     "EnhancedModel",
     "GraspEncoding",
     "Quadratic",
+    "TrustOptions",
+    "TrustRegion",
     "grasp_learner",
 ]

@@ -19,6 +19,7 @@ from ..typing import Float, Tensor
 from .action_variance import Quadratic, action_variance
 from .encoding import GraspEncoding
 from .grasp_learner import grasp_learner
+from .trust_region import TrustRegion
 
 if TYPE_CHECKING:
     from ..model import KinematicModel
@@ -44,6 +45,9 @@ class EnhancedModel(nn.Module):
         output_scale: factor, or one for each output, from the increment's unit to the learner's.
         servo: of the actuators. A :class:`~torch_ekm.control.ClosedLoop` commands through its inverse and
             trains on what the encoders did; without it g has to learn the dead zones, too.
+        force_learner: of the fingertips' normal forces, with the inputs of ``learner`` and one output [N] for
+            each pad; without it the model's sensitivities of the forces are believed.
+        trust: sets the pace of a closed loop by how well f + g foretells; without it the pace is fixed.
     """
 
     def __init__(
@@ -56,12 +60,15 @@ class EnhancedModel(nn.Module):
         action_scale: float = 1.0,
         output_scale: float | Float[Tensor, " n_out"] = 1.0,
         servo: ServoModel | None = None,
+        force_learner: ResidualLearner | None = None,
+        trust: TrustRegion | None = None,
     ) -> None:
         super().__init__()
         self.model: Any = model  # a Module is registered, any other callable is kept as it is
         self.learner: ResidualLearner = learner
         self.encode: Callable[[Any], Tensor] = nn.Identity() if encode is None else encode
-        self.outputs, self.servo = outputs, servo
+        self.outputs, self.servo, self.trust = outputs, servo, trust
+        self.force_learner = force_learner
         self.action_scale = action_scale
         self.output_scale = nn.Buffer(torch.as_tensor(output_scale))
 
@@ -73,6 +80,7 @@ class EnhancedModel(nn.Module):
         learner: ResidualLearner | Callable[[int, int], ResidualLearner] | None = None,
         encode: GraspEncoding | None = None,
         servo: ServoModel | None = None,
+        trust: TrustRegion | None = None,
     ) -> EnhancedModel:
         """An E-KM of a grasped object, with nothing learned yet.
 
@@ -86,6 +94,7 @@ class EnhancedModel(nn.Module):
                 the state and ``n_a`` actuators; None: :func:`~torch_ekm.enhanced.grasp_learner`.
             encode: what it sees of a state; None: of this grasp.
             servo: what is known of the hand's servos; None: nothing yet.
+            trust: how far it may go; None: as far as with a new object.
 
         Raises:
             NoContactError: nothing touches the object.
@@ -99,7 +108,9 @@ class EnhancedModel(nn.Module):
         step = math.radians(2.0)
         servo = ServoModel(model.hand.actuator_names) if servo is None else servo
         scales = {"action_scale": 1 / step, "output_scale": scale}
-        return cls(model, learner, encode=encode, outputs=rows, servo=servo, **scales)
+        forces = grasp_learner(encode.n_features, n_a, n_out=len(model.hand.pads))
+        parts = {"servo": servo, "force_learner": forces, "trust": TrustRegion() if trust is None else trust}
+        return cls(model, learner, encode=encode, outputs=rows, **parts, **scales)
 
     @property
     def affine(self) -> bool:
@@ -148,6 +159,32 @@ class EnhancedModel(nn.Module):
             check_finite(name, value)
         residual = self._gather(increment - predicted) * self.output_scale
         return self.learner.update(self.features(state, action), residual)
+
+    @torch.no_grad()
+    def update_forces(
+        self, state: Any, action: Float[Tensor, " n_a"], change: Float[Tensor, " n_pads"]
+    ) -> UpdateReport | None:
+        """Train on one motion: ``y = df_n - (df_n/da) da`` of each pad [N]; None without a force learner.
+
+        Raises:
+            NonFiniteError, ShapeError: as :meth:`update`.
+        """
+        if self.force_learner is None:
+            return None
+        return self.force_learner.update(self.features(state, action), change)
+
+    def force_correction(
+        self, state: Any, action: Float[Tensor, " n_a"], encoded: Float[Tensor, " d"] | None = None
+    ) -> tuple[Float[Tensor, " n_pads"], Float[Tensor, "n_pads n_a"]] | None:
+        """What is learned of the change of each pad's normal force [N], and its Jacobian [N/rad].
+
+        None: no forces are learned.
+        """
+        if self.force_learner is None:
+            return None
+        seen = self.encode(state) if encoded is None else encoded
+        mean, slope = self.force_learner.linearize(torch.cat([seen, self.action_scale * action], dim=-1))
+        return mean, slope[..., -action.shape[-1] :] * self.action_scale
 
     def linearize(
         self,

@@ -15,6 +15,7 @@ from ..control import (
     DEFAULT_LIMITS,
     DEFAULT_TASKS,
     ActuatorLimit,
+    Caution,
     EffortTask,
     FocusTask,
     FrictionMarginLimit,
@@ -23,10 +24,12 @@ from ..control import (
     LimitingFunction,
     NormalForceLimit,
     OffAxisTask,
+    StepBound,
     StoppingRule,
     UncertaintyTask,
 )
 from ..description import hand_paths, list_hands, object_paths
+from ..enhanced import TrustOptions, TrustRegion
 from ..exceptions import ParameterError, UnknownNameError
 from ..model import ModelOptions
 from ..simulation import PlantConfig, PlantParameters, preset
@@ -44,6 +47,8 @@ FIRST_REPORTED = 1000
 #: Parts of a controller in the order in which they are summed.
 _TASKS = (EffortTask, UncertaintyTask, OffAxisTask, GripForceTask, FocusTask)
 _LIMITS = (ActuatorLimit, NormalForceLimit, FrictionMarginLimit, JointLimit)
+#: How far a step goes, and what is done when it goes wrong.
+_PACE = (LimitingFunction, StepBound, Caution, TrustRegion)
 
 
 @dataclass(frozen=True)
@@ -67,10 +72,14 @@ class Setting:
     """Changes of :class:`ModelOptions`."""
     control: Mapping[str, Any] = field(default_factory=dict)
     """Changes of the controller's parts, ``{"OffAxisTask.rotation_weight": 0.1}``; one that is not among the
-    defaults is added (:mod:`~torch_ekm.control.tasks`, :mod:`~torch_ekm.control.limits`, and the
-    ``LimitingFunction``)."""
+    defaults is added (:mod:`~torch_ekm.control.tasks`, :mod:`~torch_ekm.control.limits`, and
+    ``LimitingFunction``, ``StepBound``, ``Caution``, ``TrustRegion``)."""
     servo_inverse: bool = True
     """The E-KM commands through one; without it the dead zone is learned together with the hand."""
+    force_learner: bool = True
+    """The E-KM learns the normal forces, too."""
+    oracle: bool = False
+    """The model is the plant's own, and pose, joints and forces are the true ones: what physics allows."""
     learner: str = DEFAULT_LEARNER
     learner_options: Mapping[str, Any] = field(default_factory=dict)
     capacity: int = 60
@@ -118,22 +127,35 @@ class Setting:
         return _changed(ModelOptions(), "model", self.model)
 
     def controller_parts(self) -> dict[str, Any]:
-        """``tasks``, ``limits`` and ``limiting``, the same for every :class:`LookAndMoveController`."""
-        parts: dict[str, Any] = {
-            type(part).__name__: part for part in (*DEFAULT_TASKS, *DEFAULT_LIMITS, LimitingFunction())
-        }
-        known = {kind.__name__: kind for kind in (*_TASKS, *_LIMITS, LimitingFunction)}
+        """``tasks``, ``limits``, ``limiting``, ``bound``, of every :class:`LookAndMoveController`."""
+        parts = self._parts()
+        tasks, limits = (
+            tuple(parts[kind.__name__] for kind in kinds if kind.__name__ in parts)
+            for kinds in (_TASKS, _LIMITS)
+        )
+        pace = {"limiting": parts["LimitingFunction"], "bound": parts["StepBound"]}
+        return {"tasks": tasks, "limits": limits, **pace}
+
+    def caution(self) -> Caution:
+        """The same for every controller."""
+        return self._parts()["Caution"]
+
+    def trust_region(self) -> TrustRegion:
+        """Of an E-KM, with nothing known of the object."""
+        return TrustRegion(self._parts()["TrustRegion"])
+
+    def _parts(self) -> dict[str, Any]:
+        defaults = (*DEFAULT_TASKS, *DEFAULT_LIMITS, LimitingFunction(), StepBound(), Caution())
+        parts: dict[str, Any] = {type(part).__name__: part for part in defaults}
+        parts["TrustRegion"] = TrustOptions()
+        known = {kind.__name__: kind for kind in (*_TASKS, *_LIMITS, *_PACE)}
         for key, value in self.control.items():
             name, _, figure = key.partition(".")
             if name not in known:
                 raise ParameterError("control", key, f"PART.FIGURE, the part one of {', '.join(known)}")
             part = parts[name] if name in parts else known[name]()
             parts[name] = _changed(part, f"control of {name}", {figure: value})
-        tasks, limits = (
-            tuple(parts[kind.__name__] for kind in kinds if kind.__name__ in parts)
-            for kinds in (_TASKS, _LIMITS)
-        )
-        return {"tasks": tasks, "limits": limits, "limiting": parts["LimitingFunction"]}
+        return parts
 
     def stopping_rule(self) -> StoppingRule:
         """The same for every controller."""
@@ -146,7 +168,7 @@ class Setting:
             "plant_config": dataclasses.asdict(self.plant_config("KM")),
             "model": dataclasses.asdict(self.model_options()),
             "stopping_rule": dataclasses.asdict(self.stopping_rule()),
-            "controller": {name: repr(parts) for name, parts in self.controller_parts().items()},
+            "controller": {name: repr(part) for name, part in self._parts().items()},
             "learner": learner_figures(self.learner, self.capacity, **self.learner_options),
         }
 

@@ -81,6 +81,8 @@ class TrialRecord(Trial):
     """Rotation off the focused axis at the end, as measured."""
     seconds: tuple[float, ...]
     """Decision and training of each motion, without the plant [s]."""
+    retreats: int
+    """Motions that undid an earlier one."""
     poses: tuple[Any, ...] = ()
     """True joint angles [rad], position [m] and rotation before each motion and at the end, for pictures;
     empty unless they were asked for."""
@@ -91,6 +93,11 @@ class TrialRecord(Trial):
     def lost(self) -> bool:
         """The object was dropped, or turned off the axis beyond help."""
         return self.reason == StopReason.OBJECT_LOST.value
+
+    @property
+    def given_up(self) -> bool:
+        """The object is in the hand, but not where it was to be."""
+        return not self.lost and self.reason != StopReason.REACHED.value
 
     @property
     def steps(self) -> int:
@@ -124,12 +131,13 @@ class TrialRecord(Trial):
             learns: the controller has predictions of its own.
         """
         steps, focus, measured = done.steps, done.focus, done.errors
-        asked = [float(torch.linalg.vector_norm(step.decision.desired)) for step in steps]
         # how much of a step was missing: |e| should have fallen by what was asked for
-        short = [
-            abs(after - (before - a)) for (before, after), a in zip(pairwise(measured), asked, strict=True)
-        ]
-        moving = [s for s, a in zip(short, asked, strict=True) if a >= _MOVING]
+        short, moving = [], []
+        for step, (before, after) in zip(steps, pairwise(measured), strict=True):
+            asked = float(torch.linalg.vector_norm(step.decision.desired))
+            if not step.retreat:
+                short.append(abs(after - (before - asked)))
+                moving += [short[-1]] if asked >= _MOVING else []
         truth = [true_state(seen) for seen in (*(step.before for step in steps), done.stop.final)]
         turned = [axis @ after.minus(before)[-3:] for before, after in pairwise(truth)]
 
@@ -158,6 +166,7 @@ class TrialRecord(Trial):
             true_prediction_ekm_deg=true_errors("predicted") if learns else (),
             off_rotation_deg=off / _DEG,
             seconds=tuple(step.seconds for step in steps),
+            retreats=sum(step.retreat for step in steps),
             poses=tuple([s.q.tolist(), s.position.tolist(), s.rotation.tolist()] for s in truth if poses),
         )
 

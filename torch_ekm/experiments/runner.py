@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..control import ClosedLoop, LookAndMoveController, PoseTarget
+from ..control import ClosedLoop, LookAndMoveController, PoseTarget, StoppingRule
 from ..description import ObjectDescription
 from ..enhanced import EnhancedModel, GraspEncoding
 from ..exceptions import EquilibriumError, GraspError
@@ -22,6 +22,7 @@ from ..simulation import Change, DisturbedPlant, SimulatedHand, Tug
 from .camera_off import CameraOff
 from .config import Setting, object_name
 from .learners import make_learner
+from .oracle import Omniscient, true_model
 from .records import NotGrasped, Record, Trial, TrialRecord, true_state
 
 _DEG = math.pi / 180
@@ -62,6 +63,8 @@ class Bench:
         if controller == "KM+S":
             self.plant = ServoInverse(self.plant, self.hand.hand, self.servo)
         self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model_options())
+        if setting.oracle:
+            self.plant, self.model = Omniscient(self.plant), true_model(self.hand, setting.model_options())
         self.learner: ResidualLearner | None = None
         self.encoding: GraspEncoding | None = None
         self.enhanced: EnhancedModel | None = None
@@ -135,7 +138,7 @@ class Bench:
         if blind_deg:
             commands = self.learns and not self.setting.servo_inverse
             plant = CameraOff(plant, self._predictor, target, axis, blind_deg * _DEG, commands)
-        loop = ClosedLoop(plant, self._controller(axis, {}), self.setting.stopping_rule(), learn=learn)
+        loop = self._loop(plant, self._controller(axis, {}), self.setting.stopping_rule(), learn)
         done = loop.run(target)
         return TrialRecord.of(about, done, axis, learns=self.learns, poses=poses)
 
@@ -156,7 +159,7 @@ class Bench:
             "ActuatorLimit.step": 20 * _DEG,
         }
         rule = dataclasses.replace(self.setting.stopping_rule(), max_steps=1, off_limit=math.inf)
-        loop = ClosedLoop(self.plant, self._controller(axis, wide), rule, learn=False)
+        loop = self._loop(self.plant, self._controller(axis, wide), rule, False)
         done = loop.run(PoseTarget.turned(start, axis, step_deg * _DEG))
         before = true_state(done.steps[0].before if done.steps else done.stop.final)
         turned = true_state(done.stop.final).minus(before)[-3:] @ axis
@@ -175,6 +178,11 @@ class Bench:
         setting = self.setting.replace(control={**self.setting.control, **changes})
         return LookAndMoveController(self._predictor, axis, **setting.controller_parts())
 
+    def _loop(
+        self, plant: Plant, controller: LookAndMoveController, rule: StoppingRule, learn: bool
+    ) -> ClosedLoop:
+        return ClosedLoop(plant, controller, rule, learn=learn, caution=self.setting.caution())
+
     def _prepare_learner(self, start: GraspState) -> None:
         setting = self.setting
         if self.encoding is None:
@@ -182,7 +190,10 @@ class Bench:
         if self.learner is None:
             sizes = self.encoding.n_features, self.model.hand.n_a, setting.capacity
             self.learner = make_learner(setting.learner, *sizes, **setting.learner_options)
-        self.enhanced = EnhancedModel.for_grasp(self.model, start, self.learner, self.encoding, self.servo)
+        known = {"servo": self.servo, "trust": setting.trust_region()}
+        self.enhanced = EnhancedModel.for_grasp(self.model, start, self.learner, self.encoding, **known)
+        if not setting.force_learner:
+            self.enhanced.force_learner = None
         if not setting.servo_inverse:
             self.enhanced.servo = None
 

@@ -73,6 +73,17 @@ _OPTIONS: list[tuple[str, str, str, dict[str, Any], tuple[str, ...]]] = [
     ),
     ("controller", "uncertainty in the cost", "control", {"UncertaintyTask.weight": 1.0}, _LEARNING),
     ("controller", "rows for the friction margin", "control", {"FrictionMarginLimit.minimum": 0.5}, _ALL),
+    ("care", "a grip of 5 N for every object", "control", {"GripForceTask.force": 5.0}, _ALL),
+    (
+        "care", "the pace fixed", "control",
+        {"TrustRegion.start": 1.0, "TrustRegion.smallest": 1.0, "TrustRegion.largest": 1.0}, _LEARNING,
+    ),
+    ("care", "steps never cut", "control", {"StepBound.least": math.inf}, _ALL),
+    ("care", "no second look", "control", {"Caution.looks": 0}, _ALL),
+    (
+        "care", "no way back", "control",
+        {"Caution.off_rotation": math.inf, "Caution.link_gap": -math.inf, "Caution.way_back": 0}, _ALL,
+    ),
     *(("dead zone", f"{x:g} deg", "plant", {"dead_zone": x * _DEG}, _ALL) for x in (0, 0.5, 0.9, 1.3, 1.7)),
 ]  # fmt: skip
 
@@ -83,7 +94,12 @@ def variants(base: Setting) -> list[Variant]:
     others = [name for name in HAND_LEARNERS if name != base.learner]
     plants = {name: {key: nominal[key] for key in keys} for name, keys in DISTURBANCES.items()}
     return [
-        *(Variant(group, _BASE) for group in ("learner", "online learning", "model", "controller")),
+        *(Variant(group, _BASE) for group in ("learner", "online learning", "model")),
+        *(Variant(group, _BASE, controllers=_ALL) for group in ("controller", "care")),
+        Variant("care", "normal forces not learned", {"force_learner": False}, _LEARNING),
+        Variant("care", "the true model, pose and forces", {"oracle": True}, ("KM+S",)),
+        Variant("care", "pose and joints from six readings at rest", {"frames": 6}, _ALL),
+        Variant("care", "the same, to a tolerance of 0.1 deg", {"frames": 6, "tolerance_deg": 0.1}, _ALL),
         Variant("preset", f"{base.preset}: {_BASE}"),
         *(Variant("learner", name, {"learner": name, "learner_options": {}}, _LEARNING) for name in others),
         Variant("learner", "rbf over commands", {"learner": "rbf", "servo_inverse": False}, _LEARNING),
@@ -112,7 +128,7 @@ class Ablation(Protocol):
     angles_deg: tuple[float, ...] = (9.0, 19.0, 29.0)
     warm_up: int = 3
     groups: tuple[str, ...] = (
-        "learner", "online learning", "model", "controller", "preset", "disturbance", "dead zone",
+        "learner", "online learning", "model", "controller", "care", "preset", "disturbance", "dead zone",
     )  # fmt: skip
 
     def quick(self) -> Self:
@@ -147,12 +163,13 @@ class Ablation(Protocol):
             row: list[Cell] = [variant.name]
             row += [estimate(turns.get(name, []), steady_state_error) for name in _ALL]
             row += [*prediction_cells(records), prediction_cells(records, "true_")[-1]]
-            lost = [turns.get(name, []) for name in ("KM", "E-KM")]
-            rows.append(row + [rate(r.lost for r in mine) if mine else None for mine in lost])
+            lost = [turns.get(name, []) for name in ("KM+I", "E-KM")]
+            row += [rate(r.lost for r in mine) if mine else None for mine in lost]
+            rows.append([*row, rate(r.given_up for r in lost[-1]) if lost[-1] else None])
         columns = [
             group, "steady-state error KM", "KM+I", "KM+S", "E-KM", "prediction KM", "prediction E-KM",
             Column("E-KM:KM [%]", ".0f", percent=True), Column("E-KM:KM, true [%]", ".0f", percent=True),
-            "lost: KM", "lost: E-KM",
+            "lost: KM+I", "lost: E-KM", "given up: E-KM",
         ]  # fmt: skip
         note = (
             f"{object_name(self.object)}, {', '.join(f'{a:g}' for a in self.angles_deg)} deg, "

@@ -288,7 +288,8 @@ def comparison_table(sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
     for ours, theirs in [*pairs, ("one model", "labelled")]:
         row: list[Cell] = [f"{ours} : {theirs}"]
         for first in (None, _FIRST):
-            row += ratio_and_p(_means(sessions, ours, first), _means(sessions, theirs, first))
+            means = _means(sessions, ours, first), _means(sessions, theirs, first)
+            row += ratio_and_p(*means, len(means[0]))
         rows.append(row)
     columns: list[Column | str] = ["memories"]
     for what in ("all motions", f"first {_FIRST} of a turn"):

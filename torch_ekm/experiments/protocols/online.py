@@ -124,7 +124,10 @@ class Online(Protocol):
         if some.sum() > 1:
             events = ", ".join(map(str, self.events)) or "none"
             caption = f"One-step prediction error in each trial (Fig. 5a). Events in trials {events}."
-            figure = plot_prediction_error(ekm[:, some], km[:, some])
+            happened = {trial: "dislocated" for trial in self.dislocations if trial <= self.trials}
+            happened |= {self.tendons_replaced: "new tendons"} if self.tendons_replaced in self.events else {}
+            trials = np.flatnonzero(some) + 1.0
+            figure = plot_prediction_error(ekm[:, some], km[:, some], trials=trials, events=happened)
             figures.append(save_figure(figure, folder, "prediction_error", caption))
         some = np.isfinite(ekm[0])
         if some.sum() > 1:
@@ -132,6 +135,7 @@ class Online(Protocol):
             figure = plot_learning_test(ekm[0][some], km[0][some])
             figures.append(save_figure(figure, folder, "learning_test", caption))
         shown = [
+            self.paper_table(records),
             tables.targets_table(self.targets(results)),
             self.learning_table(records),
             self.learning_table(records, against_truth=True),
@@ -143,6 +147,25 @@ class Online(Protocol):
         ]
         summary = f"{self.trials} turns of the {object_name(self.object)}. {tables.verdict(records, seeds)}"
         return Report("Online manipulation: learning while turning", summary, shown, figures)
+
+    def paper_table(self, records: Sequence[Record]) -> Table:
+        """The figures that the paper prints, beside those found here."""
+        learned = [Learning.of(ekm, km, self.events) for ekm, km in prediction_curves(records, self.trials)]
+        negative, upper = (
+            [float(x) for one in learned if (x := getattr(one, name)) is not None]
+            for name in ("last_negative", "last_upper")
+        )
+        rows: list[list[Cell]] = [
+            [
+                "last index of negative result",
+                "16",
+                float(np.mean(negative)) if negative else None,
+                len(negative),
+            ],
+            ["last upper boundary [deg]", "-0.57", float(np.mean(upper)) if upper else None, len(upper)],
+        ]
+        columns = ["", "paper", Column("here, mean of seeds", ".3g"), "seeds"]
+        return Table("paper", "The paper's figures and ours", columns, rows)
 
     def learning_table(self, records: Sequence[Record], against_truth: bool = False) -> Table:
         """How fast the E-KM learns (the paper's Fig. 5b), for each seed and for the mean over seeds."""

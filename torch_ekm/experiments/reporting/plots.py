@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,18 +45,26 @@ def save_figure(figure: Figure, folder: Path, name: str, caption: str = "") -> F
     return FigureFile(f"{name}.svg", caption)
 
 
-def plot_prediction_error(ekm_deg: Array, km_deg: Array, xlabel: str = "trial") -> Figure:
+def plot_prediction_error(
+    ekm_deg: Array,
+    km_deg: Array,
+    xlabel: str = "trial",
+    trials: Array | None = None,
+    events: Mapping[int, str] | None = None,
+) -> Figure:
     """Prediction errors of E-KM and KM over the trials (the paper's Fig. 5a).
 
     Args:
         ekm_deg: ``(n_runs, n_trials)`` absolute errors [deg]; a single run may be ``(n_trials,)``.
         km_deg: the same for the kinematic model on the same motions.
+        trials: their numbers ``(n_trials,)``; None: 1, 2, 3...
+        events: number of a trial -> what happened in it.
     """
     ekm_deg, km_deg = np.atleast_2d(ekm_deg), np.atleast_2d(km_deg)
     if ekm_deg.shape != km_deg.shape:
         raise ShapeError("km_deg", f"{ekm_deg.shape}, that of ekm_deg", km_deg.shape)
     figure, (axis,) = new_figure(7.0, 3.4)
-    k = np.arange(1, ekm_deg.shape[1] + 1)
+    k = np.arange(1, ekm_deg.shape[1] + 1) if trials is None else trials
     for name, values in (("KM", km_deg), ("E-KM", ekm_deg)):
         middle = np.nanmedian(values, axis=0)
         if len(values) > 1:
@@ -65,6 +73,12 @@ def plot_prediction_error(ekm_deg: Array, km_deg: Array, xlabel: str = "trial") 
         axis.plot(k, middle, color=COLOURS[name], marker=_MARKERS[name], markersize=3.5, label=name)
     axis.set(xlabel=xlabel, ylabel="prediction error [deg]", ylim=(0, None))
     axis.xaxis.get_major_locator().set_params(integer=True)
+    for trial, what in (events or {}).items():
+        axis.axvline(trial, color=COLOURS["limit"], linewidth=1, linestyle=":")
+        axis.annotate(
+            what, (trial, 0.98), xycoords=("data", "axes fraction"), rotation=90, fontsize=7,
+            ha="right", va="top", color=COLOURS["limit"],
+        )  # fmt: skip
     quartiles = " (median, quartiles)" if len(ekm_deg) > 1 else ""
     axis.set_title(f"One-step prediction error{quartiles}", loc="left")
     axis.legend(frameon=False)

@@ -20,6 +20,8 @@ Value = Callable[[TrialRecord], "float | None"]
 BAND_DEG = 0.5
 #: Significance level of the learning curves.
 ALPHA = 0.05
+#: With fewer seeds nothing is called better, and no p-value is given.
+LEAST_SEEDS = 10
 
 
 def steady_state_error(record: TrialRecord) -> float:
@@ -41,6 +43,12 @@ def settle_steps(limit: int) -> Value:
         return float(limit if record.lost or settled >= len(record.errors_deg) else settled)
 
     return value
+
+
+def beyond_least(limit: int, step_deg: float) -> Value:
+    """Motions to settle beyond the least possible, ``ceil(angle / step)``; below 0 where steps are larger."""
+    settled = settle_steps(limit)
+    return lambda record: (settled(record) or 0.0) - np.ceil(abs(record.angle_deg) / step_deg - 1e-9)
 
 
 def mean_of(name: str) -> Value:

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...control import StopReason
+from ...control import LimitingFunction, StopReason
+from ...control.qp import DEGREE
 from ..config import CONTROLLERS, FIRST_REPORTED
 from ..records import NotGrasped, Record, TrialRecord
 from . import statistics as stats
 from .report import Cell, Column, Table
-from .statistics import BAND_DEG, Array, Estimate, Value, bootstrap_ratio, steady_state_error
+from .statistics import BAND_DEG, LEAST_SEEDS, Array, Estimate, Value, bootstrap_ratio, steady_state_error
 
 Trials = Sequence[TrialRecord]
 
@@ -58,23 +59,27 @@ def by_controller(records: Sequence[Record], kind: str = "turn") -> dict[str, li
 
 def controller_table(records: Sequence[Record], limit: int) -> Table:
     """Every controller on the same seeds and grasps."""
+    step = LimitingFunction().step / DEGREE
+    beyond = stats.beyond_least(limit, step)
     columns: dict[Column, Callable[[Trials], Cell]] = {
         Column("steady-state error"): lambda mine: stats.estimate(mine, steady_state_error),
         Column("survivors"): lambda mine: stats.estimate(mine, stats.survivor_error),
         Column("median"): lambda mine: float(np.median([steady_state_error(r) for r in mine])),
         Column("motions", ".1f"): lambda mine: stats.estimate(mine, lambda r: r.steps),
-        Column("motions to settle", ".1f"): lambda mine: stats.estimate(mine, stats.settle_steps(limit)),
+        Column("beyond the least", ".1f"): lambda mine: stats.estimate(mine, beyond),
         Column("first motion"): lambda mine: stats.estimate(mine, lambda r: r.first_step_deg),
         Column("of all motions"): lambda mine: stats.estimate(mine, lambda r: r.step_error_deg),
         Column("off-axis rotation", ".1f"): lambda mine: stats.estimate(mine, survivors_off_axis),
         Column("reached"): lambda mine: stats.rate(r.reason == StopReason.REACHED.value for r in mine),
+        Column("given up"): lambda mine: stats.rate(r.given_up for r in mine),
         Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
     }
     note = (
         "Mean and 95 % bootstrap interval over seeds; angles in degrees, steady-state errors by the "
         "simulation's truth. A lost object counts with the whole angle that was asked for; 'survivors' "
-        f"leaves it out. Settled: the measured error stays within {BAND_DEG:g} deg; a turn that never "
-        "settles counts with the step limit. Intervals of rates are Wilson's."
+        f"leaves it out. Beyond the least: motions until the measured error stays within {BAND_DEG:g} deg, "
+        f"less the angle over {step:g} deg, rounded up; a turn that never settles counts with the step limit. "
+        "Given up: the object is in the hand, but not where it was to be. Intervals of rates are Wilson's."
     )
     items = by_controller(records)
     return Table.of("controllers", "All turns of each controller", "controller", items, columns, note)
@@ -110,20 +115,21 @@ def comparison_table(records: Sequence[Record], limit: int) -> Table:
         "steady-state error, camera off": ("camera off", steady_state_error),
     }
     rows: list[list[Cell]] = []
-    there = {r.controller for r in records}
+    there, n_seeds = {r.controller for r in records}, len({r.seed for r in records})
     pairs = [pair for pair in _PAIRS if there.issuperset(pair)]
     for what, (kind, value) in values.items():
         if kind != "turn" and not any(r.kind == kind for r in records):
             continue
         row: list[Cell] = [what]
         for ours, theirs in pairs:
-            row += ratio_and_p(*paired(records, ours, theirs, value, kind))
+            row += ratio_and_p(*paired(records, ours, theirs, value, kind), n_seeds)
         rows.append(row)
     columns: list[Column | str] = [""]
     for pair in map(" : ".join, pairs):
         columns += [Column(f"{pair} [%]", ".0f", percent=True), Column(f"p, {pair}", ".1g")]
     note = (
-        "Ratio of means over the same objects and seeds, 95 % bootstrap over pairs, p of the paired t-test."
+        "Ratio of means over the same objects and seeds, 95 % bootstrap over pairs, p of the paired t-test "
+        f"(none with fewer than {LEAST_SEEDS} seeds)."
     )
     return Table("comparison", "Paired ratios", columns, rows, note)
 
@@ -136,11 +142,11 @@ def paired(
     return stats.paired_means(mine, others, value)
 
 
-def ratio_and_p(ours: Array, theirs: Array) -> tuple[Estimate | None, float | None]:
-    """Ratio of means, and p of the paired t-test, where there are such."""
+def ratio_and_p(ours: Array, theirs: Array, n_seeds: int) -> tuple[Estimate | None, float | None]:
+    """Ratio of means, and p of the paired t-test, where there are such and enough seeds."""
     if not len(ours) or theirs.mean() == 0:
         return None, None
-    tests = stats.paired_test(ours, theirs)
+    tests = stats.paired_test(ours, theirs) if n_seeds >= LEAST_SEEDS else None
     return bootstrap_ratio(ours, theirs), None if tests is None else tests.paired_p
 
 
@@ -200,11 +206,17 @@ def timing_table(records: Sequence[Record]) -> Table:
 
 
 def verdict(records: Sequence[Record], seeds: Sequence[int]) -> str:
-    """What the E-KM is worth beside the KM, in one sentence."""
+    """What the E-KM is worth beside the others, in one sentence; none from too few seeds."""
+    if len(seeds) < LEAST_SEEDS:
+        return which_seeds(seeds)
     ours, theirs = paired(records, "E-KM", "KM", steady_state_error)
     parts = []
     if len(ours) and theirs.mean() > 0:
         parts.append(f"Steady-state error E-KM : KM {100 * bootstrap_ratio(ours, theirs):.0f} %")
+        for name, mine in by_controller(records).items():
+            if name != "KM":
+                lost, given_up = sum(r.lost for r in mine), sum(r.given_up for r in mine)
+                parts.append(f"{name}: {lost} lost, {given_up} given up of {len(mine)}")
     ours, theirs = prediction_means(records)
     if len(ours):
         parts.append(f"prediction error on the same motions {100 * bootstrap_ratio(ours, theirs):.0f} %")
@@ -221,7 +233,7 @@ def _never_grasped(records: Sequence[Record]) -> Mapping[str, str]:
 
 def which_seeds(seeds: Sequence[int]) -> str:
     """How many, and what may be concluded from them."""
-    few = " Fewer than 20 seeds: no basis for a claim." if len(seeds) < 20 else ""
+    few = f" Fewer than {LEAST_SEEDS} seeds: no verdict." if len(seeds) < LEAST_SEEDS else ""
     development = min(seeds) < FIRST_REPORTED
     tuned = " Development seeds: figures may have been tuned on them." if development else ""
     return f"{len(seeds)} seeds, {seeds[0]} to {seeds[-1]}.{few}{tuned}"
