@@ -29,9 +29,9 @@ class Caution:
 
     looks: int = 2
     """Further readings of a state that the model refuses."""
-    off_rotation: float = 4 * _DEG
+    off_rotation: float = 8 * _DEG
     """[rad]"""
-    off_further: float = 2 * _DEG
+    off_further: float = 4 * _DEG
     """An object that has slid does not come back: after a sign it may turn so much further [rad]."""
     link_gap: float = 0.2e-3
     """A link without a pad as near to the object as this counts, unless it was so near at the start [m]."""

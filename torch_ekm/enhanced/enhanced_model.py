@@ -81,6 +81,7 @@ class EnhancedModel(nn.Module):
         encode: GraspEncoding | None = None,
         servo: ServoModel | None = None,
         trust: TrustRegion | None = None,
+        force_learner: ResidualLearner | None = None,
     ) -> EnhancedModel:
         """An E-KM of a grasped object, with nothing learned yet.
 
@@ -95,6 +96,8 @@ class EnhancedModel(nn.Module):
             encode: what it sees of a state; None: of this grasp.
             servo: what is known of the hand's servos; None: nothing yet.
             trust: how far it may go; None: as far as with a new object.
+            force_learner: of the pads' normal forces, see the class; None: the model's sensitivities hold. In
+                our simulation learned ones make the object turn off its axis.
 
         Raises:
             NoContactError: nothing touches the object.
@@ -108,8 +111,8 @@ class EnhancedModel(nn.Module):
         step = math.radians(2.0)
         servo = ServoModel(model.hand.actuator_names) if servo is None else servo
         scales = {"action_scale": 1 / step, "output_scale": scale}
-        forces = grasp_learner(encode.n_features, n_a, n_out=len(model.hand.pads))
-        parts = {"servo": servo, "force_learner": forces, "trust": TrustRegion() if trust is None else trust}
+        trust = TrustRegion() if trust is None else trust
+        parts = {"servo": servo, "force_learner": force_learner, "trust": trust}
         return cls(model, learner, encode=encode, outputs=rows, **parts, **scales)
 
     @property

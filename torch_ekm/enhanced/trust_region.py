@@ -20,7 +20,7 @@ class TrustOptions:
 
     start: float = 0.7
     """Pace with an object that is new."""
-    smallest: float = 0.35
+    smallest: float = 0.5
     largest: float = 2.0
     agree: float = 1.0
     """rho up to which the pace grows."""
@@ -30,9 +30,9 @@ class TrustOptions:
     shrink: float = 0.7
     relative: float = 0.12
     """Error that is no surprise, as a share of the motion; of a translation the contacts' way counts."""
-    translation_noise: float = 0.25e-3
+    translation_noise: float = 0.3e-3
     """Standard deviation of a measured motion [m]."""
-    rotation_noise: float = 0.25 * _DEG
+    rotation_noise: float = 0.3 * _DEG
     """[rad]"""
     force_noise: float = 0.5
     """[N]"""
@@ -98,9 +98,9 @@ class TrustRegion(nn.Module):
         """
         unit = foretold.new_tensor([lever] * 3 + [1.0] * 3)
         o = self.options
-        size = o.relative * torch.linalg.vector_norm(foretold / unit) * unit
+        size = torch.linalg.vector_norm(foretold / unit)
         noise = foretold.new_tensor([o.translation_noise] * 3 + [o.rotation_noise] * 3)
-        terms = (came - foretold).square() / (noise.square() + size.square())
+        terms = (came - foretold).square() / (noise.square() + (o.relative * size * unit).square())
         if surprise is not None:
             terms = torch.cat([terms, (surprise / o.force_noise).square()])
         rho = float(terms.mean().sqrt())

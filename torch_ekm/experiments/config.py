@@ -76,8 +76,8 @@ class Setting:
     ``LimitingFunction``, ``StepBound``, ``Caution``, ``TrustRegion``)."""
     servo_inverse: bool = True
     """The E-KM commands through one; without it the dead zone is learned together with the hand."""
-    force_learner: bool = True
-    """The E-KM learns the normal forces, too."""
+    force_learner: bool = False
+    """The E-KM learns the normal forces, too, and grips by what it learned."""
     oracle: bool = False
     """The model is the plant's own, and pose, joints and forces are the true ones: what physics allows."""
     learner: str = DEFAULT_LEARNER

@@ -81,11 +81,11 @@ class TrialRecord(Trial):
     """Rotation off the focused axis at the end, as measured."""
     seconds: tuple[float, ...]
     """Decision and training of each motion, without the plant [s]."""
-    retreats: int
-    """Motions that undid an earlier one."""
     poses: tuple[Any, ...] = ()
     """True joint angles [rad], position [m] and rotation before each motion and at the end, for pictures;
     empty unless they were asked for."""
+    retreats: int = 0
+    """Motions that undid an earlier one."""
 
     grasped: ClassVar[bool] = True
 

@@ -12,7 +12,7 @@ import torch
 
 from ..control import ClosedLoop, LookAndMoveController, PoseTarget, StoppingRule
 from ..description import ObjectDescription
-from ..enhanced import EnhancedModel, GraspEncoding
+from ..enhanced import EnhancedModel, GraspEncoding, grasp_learner
 from ..exceptions import EquilibriumError, GraspError
 from ..kinematics import GraspState, ServoModel
 from ..model import KinematicModel
@@ -190,10 +190,11 @@ class Bench:
         if self.learner is None:
             sizes = self.encoding.n_features, self.model.hand.n_a, setting.capacity
             self.learner = make_learner(setting.learner, *sizes, **setting.learner_options)
-        known = {"servo": self.servo, "trust": setting.trust_region()}
+        known: dict[str, Any] = {"servo": self.servo, "trust": setting.trust_region()}
+        if setting.force_learner:
+            n_s, n_a, pads = self.encoding.n_features, self.model.hand.n_a, len(self.model.hand.pads)
+            known["force_learner"] = grasp_learner(n_s, n_a, setting.capacity, pads)
         self.enhanced = EnhancedModel.for_grasp(self.model, start, self.learner, self.encoding, **known)
-        if not setting.force_learner:
-            self.enhanced.force_learner = None
         if not setting.servo_inverse:
             self.enhanced.servo = None
 

@@ -96,7 +96,7 @@ def variants(base: Setting) -> list[Variant]:
     return [
         *(Variant(group, _BASE) for group in ("learner", "online learning", "model")),
         *(Variant(group, _BASE, controllers=_ALL) for group in ("controller", "care")),
-        Variant("care", "normal forces not learned", {"force_learner": False}, _LEARNING),
+        Variant("care", "normal forces learned, too", {"force_learner": True}, _LEARNING),
         Variant("care", "the true model, pose and forces", {"oracle": True}, ("KM+S",)),
         Variant("care", "pose and joints from six readings at rest", {"frames": 6}, _ALL),
         Variant("care", "the same, to a tolerance of 0.1 deg", {"frames": 6, "tolerance_deg": 0.1}, _ALL),

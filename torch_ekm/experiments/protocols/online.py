@@ -126,7 +126,7 @@ class Online(Protocol):
             caption = f"One-step prediction error in each trial (Fig. 5a). Events in trials {events}."
             happened = {trial: "dislocated" for trial in self.dislocations if trial <= self.trials}
             happened |= {self.tendons_replaced: "new tendons"} if self.tendons_replaced in self.events else {}
-            trials = np.flatnonzero(some) + 1.0
+            trials = np.arange(1.0, self.trials + 1)[some]
             figure = plot_prediction_error(ekm[:, some], km[:, some], trials=trials, events=happened)
             figures.append(save_figure(figure, folder, "prediction_error", caption))
         some = np.isfinite(ekm[0])

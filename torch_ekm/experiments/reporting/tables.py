@@ -78,7 +78,7 @@ def controller_table(records: Sequence[Record], limit: int) -> Table:
         "Mean and 95 % bootstrap interval over seeds; angles in degrees, steady-state errors by the "
         "simulation's truth. A lost object counts with the whole angle that was asked for; 'survivors' "
         f"leaves it out. Beyond the least: motions until the measured error stays within {BAND_DEG:g} deg, "
-        f"less the angle over {step:g} deg, rounded up; a turn that never settles counts with the step limit. "
+        f"less the angle over {step:g} deg, rounded up; a turn that never settles counts with the limit. "
         "Given up: the object is in the hand, but not where it was to be. Intervals of rates are Wilson's."
     )
     items = by_controller(records)
