@@ -19,6 +19,7 @@ from torch_ekm.experiments.protocols.object_memory import (
     comparison_table,
     recognition,
 )
+from torch_ekm.experiments.reporting.statistics import LEAST_SEEDS
 from torch_ekm.experiments.runner import Bench
 
 NAMES = ("none", "bank", "labelled", "one model", "fresh")
@@ -37,7 +38,7 @@ def made_up_session(seed: int, share: dict[str, float], wrong: int = 0) -> list[
 
 
 def test_comparison_is_paired() -> None:
-    sessions = [made_up_session(seed, {"bank": 0.5, "labelled": 0.8}) for seed in range(6)]
+    sessions = [made_up_session(seed, {"bank": 0.5, "labelled": 0.8}) for seed in range(LEAST_SEEDS)]
     table = comparison_table(sessions)
     rows = {row[0]: row for row in table.rows}
     ratio = rows["bank : labelled"][1]
@@ -47,6 +48,8 @@ def test_comparison_is_paired() -> None:
     assert rows["one model : labelled"][1].mean == pytest.approx(1.25)
     assert rows["bank : fresh"][2] < 1e-4
     assert all(len(row) == len(table.header) for row in table.rows)
+    few = comparison_table(sessions[:-1])
+    assert all(row[2] is None for row in few.rows)  # no p-value
 
 
 def test_share_of_recognised_turns() -> None:

@@ -98,7 +98,7 @@ def test_report_is_complete(name: str, tmp_path: Path) -> None:
     assert configuration["versions"]["torch"]
     assert configuration["plant"]["dead_zone"] > 0
     assert "Development seeds" in report.summary
-    assert "no basis for a claim" in report.summary
+    assert "no verdict" in report.summary
 
 
 @pytest.mark.usefixtures("made_up")

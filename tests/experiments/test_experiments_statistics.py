@@ -251,7 +251,7 @@ def test_object_table_shows_means_ratios_and_losses() -> None:
     assert row["KM [deg]"].mean == pytest.approx(8.0)  # (20 + 3 + 4 + 5) / 4
     assert row["E-KM [deg]"].mean == pytest.approx(0.875)
     assert row["E-KM:KM [%]"].mean == pytest.approx(0.875 / 8)
-    assert (row["KM lost"], row["E-KM lost"]) == (1, 0)
+    assert (row["KM lost, given up"], row["E-KM lost, given up"]) == ("1, 0", "0, 0")
     assert table.text()[0][5] == "11 [" + table.text()[0][5].split("[")[1]  # in percent
     assert table.rows[-1][0] == "all"
     controllers = controller_table(records, limit=40)

@@ -197,7 +197,7 @@ def paper_table(records: Sequence[Record]) -> Table:
         ["steady-state error E-KM : KM [%]", "28.5 to 70", percent],
         ["p, paired", "3.8e-4", None if p is None else f"{p:.1g}"],
     ]
-    return Table("paper", "The paper's figures and ours", ["", "paper", "here"], rows)
+    return Table("paper", "Figures of the paper and those found here", ["", "paper", "here"], rows)
 
 
 def object_table(records: Sequence[Record]) -> Table:

@@ -165,7 +165,7 @@ class Online(Protocol):
             ["last upper boundary [deg]", "-0.57", float(np.mean(upper)) if upper else None, len(upper)],
         ]
         columns = ["", "paper", Column("here, mean of seeds", ".3g"), "seeds"]
-        return Table("paper", "The paper's figures and ours", columns, rows)
+        return Table("paper", "Figures of the paper and those found here", columns, rows)
 
     def learning_table(self, records: Sequence[Record], against_truth: bool = False) -> Table:
         """How fast the E-KM learns (the paper's Fig. 5b), for each seed and for the mean over seeds."""

@@ -207,8 +207,9 @@ def timing_table(records: Sequence[Record]) -> Table:
 
 def verdict(records: Sequence[Record], seeds: Sequence[int]) -> str:
     """What the E-KM is worth beside the others, in one sentence; none from too few seeds."""
+    never = [f"{name} was never grasped ({why})" for name, why in _never_grasped(records).items()]
     if len(seeds) < LEAST_SEEDS:
-        return which_seeds(seeds)
+        return ". ".join([*never, which_seeds(seeds)])
     ours, theirs = paired(records, "E-KM", "KM", steady_state_error)
     parts = []
     if len(ours) and theirs.mean() > 0:
@@ -220,8 +221,7 @@ def verdict(records: Sequence[Record], seeds: Sequence[int]) -> str:
     ours, theirs = prediction_means(records)
     if len(ours):
         parts.append(f"prediction error on the same motions {100 * bootstrap_ratio(ours, theirs):.0f} %")
-    parts += [f"{name} was never grasped ({why})" for name, why in _never_grasped(records).items()]
-    return "; ".join(parts or ["Nothing to compare"]) + f". {which_seeds(seeds)}"
+    return "; ".join([*parts, *never] or ["Nothing to compare"]) + f". {which_seeds(seeds)}"
 
 
 def _never_grasped(records: Sequence[Record]) -> Mapping[str, str]:
