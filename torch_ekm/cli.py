@@ -128,11 +128,14 @@ def reproduce(
     out: Annotated[Path | None, Option(help="Folder for the report [reproduce_<experiment>].")] = None,
     quick: Annotated[bool, Option(help="Two seeds, small turns: to see that it works.")] = False,
     objects: Annotated[
-        Path | None, Option(help="Folder with URDF files of your own objects (generalize, adapt).")
-    ] = None,
+        str,
+        Option(
+            help="Names separated by commas, or a folder with URDF files of your own (generalize, adapt)."
+        ),
+    ] = "",
     hand: Hand = "icub_right",
     preset: Preset = "nominal",
-    learner: Annotated[str, Option(help="rbf, action-linear, linear RLS, SOGP deep, ...")] = "rbf",
+    learner: Annotated[str, Option(help="action-linear, rbf, linear RLS, SOGP deep, ...")] = "action-linear",
     sensing: Sensing = True,
     angles: Annotated[
         str, Option(help="Turns [deg], e.g. 5,10,15; Table I if left out (generalize, ablation).")
@@ -156,7 +159,12 @@ def reproduce(
     setting = Setting(hand=hand, preset=preset, learner=learner, sensing=sensing, control=control)
     turns = _numbers("angles", angles) if angles else None
     planned = plan(
-        experiment, parse_seeds(seeds), setting=setting, objects=objects, angles_deg=turns, quick=quick
+        experiment,
+        parse_seeds(seeds),
+        setting=setting,
+        objects=objects or None,
+        angles_deg=turns,
+        quick=quick,
     )
     _run(experiment, planned, out or Path(f"reproduce_{experiment}"), jobs, address)
 

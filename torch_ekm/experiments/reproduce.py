@@ -47,7 +47,7 @@ def plan(
     seeds: tuple[int, ...] = REPORTED_SEEDS,
     *,
     setting: Setting | None = None,
-    objects: Path | None = None,
+    objects: str | Path | None = None,
     angles_deg: tuple[float, ...] | None = None,
     quick: bool = False,
 ) -> Experiment:
@@ -56,7 +56,7 @@ def plan(
     Args:
         name: a key of :data:`PROTOCOLS`.
         seeds: each is an independent run; every controller gets the same ones.
-        objects: a folder with URDF files to be used instead of the objects that come with the package.
+        objects: names separated by commas, or a folder with URDF files, instead of the experiment's own.
         angles_deg: turns to be made instead of the experiment's own.
         quick: two seeds and a few small turns: to see that it works, not to claim anything.
 
@@ -74,7 +74,7 @@ def plan(
         protocol, seeds = protocol.quick(), seeds[: protocol.quick_seeds]
     changes: dict[str, Any] = {} if setting is None else {"setting": setting}
     if objects is not None:
-        changes["objects"] = urdf_files(objects)
+        changes["objects"] = objects_of(objects)
     if angles_deg is not None:
         changes["angles_deg"] = angles_deg
     for key in changes:
@@ -113,13 +113,20 @@ def reproduce(
     return report
 
 
-def urdf_files(folder: Path) -> tuple[str, ...]:
-    """URDF files of a folder, sorted.
+def objects_of(names: str | Path) -> tuple[str, ...]:
+    """Names, or the URDF files of a folder, sorted.
 
     Raises:
-        ParameterError: there are none.
+        UnknownNameError: no folder, and no object has such a name; the message lists them.
+        ParameterError: there are no URDF files in the folder.
         DescriptionError: one is faulty; the message names file and place.
     """
+    folder = Path(names)
+    if not folder.is_dir() and not isinstance(names, Path):
+        chosen = tuple(part.strip() for part in names.split(",") if part.strip())
+        for name in chosen:
+            load_object(name)
+        return chosen
     found = tuple(str(path) for path in sorted(folder.glob("*.urdf")))
     if not found:
         raise ParameterError(
