@@ -1,0 +1,238 @@
+"""The pace, the grip by the object, the bound of a step, and the way back."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm.control import (
+    Caution,
+    ClosedLoop,
+    GripForceTask,
+    LookAndMoveController,
+    PoseTarget,
+    Situation,
+    StepBound,
+    StoppingRule,
+)
+from torch_ekm.control import StopReason as Reason
+from torch_ekm.enhanced import EnhancedModel, TrustOptions, TrustRegion
+from torch_ekm.exceptions import ParameterError
+from torch_ekm.kinematics.se3 import exp
+from torch_ekm.model import KinematicModel
+from torch_ekm.plant import Observation
+from torch_ekm.simulation import SimulatedHand
+
+DEG = math.pi / 180
+RULE = StoppingRule(max_steps=20)
+
+
+class Sliding:
+    """Encoders obey; joints and object stay, but for what ``off`` says of each observation after a motion."""
+
+    def __init__(self, seen: Observation, across: torch.Tensor, off: list[float]) -> None:
+        self.seen, self.across, self.off = seen, across, off
+        self.commands: list[torch.Tensor] = []
+        self.looks = 0
+
+    def observe(self) -> Observation:
+        self.looks += 1
+        angle = self.off[min(len(self.commands), len(self.off) - 1)] * DEG
+        return dataclasses.replace(self.seen, rotation=exp(angle * self.across) @ self.seen.rotation)
+
+    def command(self, delta_a: torch.Tensor) -> Observation:
+        self.commands.append(delta_a)
+        self.seen = dataclasses.replace(self.seen, a=self.seen.a + delta_a)
+        return self.observe()
+
+    def reset(self, seed: int) -> Observation:
+        return self.observe()
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def held():
+    plant = SimulatedHand("icub_right", "box")
+    seen = plant.reset(seed=4)
+    return plant, KinematicModel(plant.hand, plant.object), seen
+
+
+def slide(held, off: list[float], caution: Caution):
+    plant, model, seen = held
+    axis = plant.rotation_axis
+    across = torch.linalg.cross(axis, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    sliding = Sliding(seen, across / torch.linalg.vector_norm(across), off)
+    loop = ClosedLoop(sliding, LookAndMoveController(model, axis), RULE, caution=caution)
+    return loop.run(PoseTarget.turned(seen.state, axis, degrees=20.0)), sliding, loop
+
+
+CAREFUL = Caution(off_rotation=1.0 * DEG, off_further=0.5 * DEG, retreats=1, tighten=0.5)
+
+
+def test_a_sign_of_a_loss_sends_the_hand_back_and_a_second_one_ends_the_turn(held) -> None:
+    # motions: 1 and 2 go forth, 3 goes back and helps, 4 goes forth, 5 goes back: enough
+    done, sliding, loop = slide(held, [0.0, 0.0, 1.2, 0.5, 2.0, 0.6], CAREFUL)
+    assert done.reason is Reason.GIVEN_UP
+    assert not done.lost
+    assert "off the focus" in done.stop.message
+    assert [step.retreat for step in done.steps] == [False, False, True, False, True]
+    torch.testing.assert_close(sliding.commands[2], -sliding.commands[1])
+    torch.testing.assert_close(sliding.commands[4], -sliding.commands[3])
+    assert loop.controller.tighter == CAREFUL.tighten
+
+
+def test_the_way_back_is_gone_as_far_as_it_helps(held) -> None:
+    done, sliding, _ = slide(held, [0.0, 0.0, 0.0, 1.2, 1.8, 0.9, 0.0], CAREFUL)
+    assert [step.retreat for step in done.steps][:5] == [False, False, False, True, True]
+    torch.testing.assert_close(sliding.commands[3], -sliding.commands[2])
+    torch.testing.assert_close(sliding.commands[4], -sliding.commands[1])
+
+
+def test_where_going_back_does_not_help_the_turn_is_given_up_at_once(held) -> None:
+    done, _, _ = slide(held, [0.0, 0.0, 1.2, 1.8, 1.9, 1.9], CAREFUL)
+    assert done.reason is Reason.GIVEN_UP
+    assert [step.retreat for step in done.steps] == [False, False, True, True]
+
+
+def test_a_refused_state_is_looked_at_again(held) -> None:
+    plant, model, seen = held
+    away = dataclasses.replace(seen, position=seen.position + 0.2)
+
+    class Glimpse(Sliding):
+        def observe(self) -> Observation:
+            good = super().observe()
+            return away if self.looks in (2, 3) else good  # the first motion's reading and the next look
+
+    sliding = Glimpse(seen, plant.rotation_axis, [0.0])
+    loop = ClosedLoop(sliding, LookAndMoveController(model, plant.rotation_axis), RULE)
+    target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0)
+    steps = loop.steps(target)
+    next(steps)
+    assert not next(steps).retreat
+    assert sliding.looks == 5
+
+
+def test_the_grip_follows_from_weight_friction_and_lever(held) -> None:
+    """``f = 2.5/mu (m g/2 + 95 r)``: 80 g, mu = 0.9, contacts about 15 mm from the axis."""
+    plant, model, seen = held
+    lin = model.linearize(seen.state)
+    task, axis = GripForceTask(least=1.0), LookAndMoveController(model, plant.rotation_axis).focus
+    at = Situation(
+        plant.hand, axis, seen.state, seen.a, None, torch.zeros(6), torch.zeros(1), weight=0.08 * 9.81
+    )
+    arm = torch.linalg.cross(plant.rotation_axis.expand(3, 3), lin.contacts.point - seen.position)
+    lever = float(torch.linalg.vector_norm(arm, dim=-1).max())
+    assert task.wanted(lin, at) == pytest.approx(2.5 / 0.9 * (0.04 * 9.81 + 95 * lever), rel=1e-3)
+    heavy = dataclasses.replace(at, weight=4.0)
+    assert task.wanted(lin, heavy) == task.most == 8.5
+    assert GripForceTask().wanted(lin, dataclasses.replace(at, weight=0.0)) >= 5.0
+    tighter = dataclasses.replace(at, tighter=0.5)
+    assert task.wanted(lin, tighter) == pytest.approx(task.wanted(lin, at) + 0.5)
+    assert GripForceTask(force=4.0).wanted(lin, tighter) == 4.5
+
+
+def test_a_step_is_cut_in_proportion_to_what_is_foretold_to_go_wrong(held) -> None:
+    plant, model, seen = held
+    controller = LookAndMoveController(model, plant.rotation_axis)
+    lin, focus = model.linearize(seen.state), controller.focus
+    at = Situation(plant.hand, focus, seen.state, seen.a, None, torch.zeros(6), torch.zeros(1), weight=0.8)
+    still, bound = torch.zeros(plant.hand.n_a, dtype=torch.float64), StepBound()
+    predicted = torch.zeros(plant.hand.n_q + 6, dtype=torch.float64)
+    assert bound.share(lin, still, predicted, at, None) == 1.0
+    off = focus.off_matrix[~focus.off_translation][0]
+    turned = predicted.clone()
+    turned[-6:] = 3 * DEG * off
+    assert bound.share(lin, still, turned, at, None) == pytest.approx(0.5)
+    carried = predicted.clone()
+    carried[-6:] = 10e-3 * focus.off_matrix[focus.off_translation][0]
+    assert bound.share(lin, still, carried, at, None) == pytest.approx(0.25)
+    force = float(at.normal_force(lin).max())  # type: ignore[union-attr]
+    assert bound.share(lin, still, predicted, at, 2 * force) == pytest.approx(0.25)
+    # a motion that takes the margins away: the heavier the object, the less of it is made
+    delta = 4 * DEG * torch.from_numpy(np.sign(lin.margin_sensitivity.sum(0).numpy())) * -1.0
+    shares = [bound.share(lin, delta, predicted, dataclasses.replace(at, weight=w), None) for w in (0.3, 3.0)]
+    assert 0 < shares[1] < shares[0] < 1
+
+
+def test_the_bound_shortens_the_step_that_is_made(held) -> None:
+    plant, model, seen = held
+    target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0)
+    whole, cut = (
+        LookAndMoveController(model, plant.rotation_axis, bound=StepBound(off_travel=x)).decide(
+            seen.state, seen.a, target, seen.fingertip_force
+        )
+        for x in (1.0, 1e-5)
+    )
+    assert whole.share > 0.9
+    assert cut.share == pytest.approx(StepBound().least)
+    torch.testing.assert_close(cut.desired, cut.share / whole.share * whole.desired)
+
+
+def test_the_pace_grows_where_the_model_is_right_and_shrinks_where_it_is_not() -> None:
+    trust, options = TrustRegion(), TrustOptions()
+    foretold = torch.tensor([0.0, 0.0, 0.0, 2.5 * DEG, 0.0, 0.0], dtype=torch.float64)
+    wrong = foretold + torch.tensor([0.0, 0.0, 0.0, 0.0, 3 * DEG, 0.0], dtype=torch.float64)
+    assert trust.judge(foretold, foretold, 0.015) == 0.0
+    assert trust.pace == pytest.approx(options.start * options.grow)
+    # one direction of six is wrong by 3 deg: rho^2 = 9 / 6 / (0.3^2 + (0.12 * 2.5)^2)
+    assert trust.judge(foretold, wrong, 0.015) == pytest.approx(math.sqrt(9 / 6 / 0.18), rel=1e-6)
+    assert trust.pace == pytest.approx(options.start * options.grow * options.shrink)
+    before = trust.pace
+    trust.judge(foretold, foretold, 0.015, share=0.5)  # half a step says nothing for a larger one
+    assert trust.pace == before
+    trust.judge(foretold, foretold, 0.015, surprise=torch.full((3,), 5.0))  # forces went wrong
+    assert trust.pace < before
+    for _ in range(50):
+        trust.judge(foretold, foretold, 0.015)
+    assert trust.pace == options.largest
+    other = TrustRegion()
+    other.load_state_dict(trust.state_dict())
+    assert other.pace == options.largest
+    trust.restart()
+    assert trust.pace == options.smallest
+
+
+@pytest.mark.parametrize(
+    ("kind", "figures"),
+    [
+        (TrustOptions, {"start": 0.1}),
+        (TrustOptions, {"agree": 2.0}),
+        (TrustOptions, {"force_noise": 0.0}),
+        (Caution, {"retreats": -1}),
+        (StepBound, {"creep": 0.0}),
+    ],
+)
+def test_figures_outside_their_range_are_refused(kind, figures) -> None:
+    with pytest.raises(ParameterError, match=next(iter(figures))):
+        kind(**figures)
+
+
+def test_learned_forces_correct_the_rows_of_the_grip(held) -> None:
+    """Two pads answer to actuator 3 by 2 N/rad more than the model says: so do the rows after a while."""
+    from torch_ekm.control.situation import LinearizedModel, pad_indices
+    from torch_ekm.enhanced import GraspEncoding, grasp_learner
+
+    plant, model, seen = held
+    encode = GraspEncoding.of(model, seen.state)
+    learner = grasp_learner(encode.n_features, plant.hand.n_a, n_out=len(plant.hand.pads))
+    enhanced = EnhancedModel.for_grasp(model, seen.state, encode=encode, force_learner=learner)
+    lin = model.linearize(seen.state)
+    pads = pad_indices(plant.hand, lin.contacts.finger)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(40):
+        moved = 0.05 * torch.randn(plant.hand.n_a, dtype=torch.float64, generator=generator)
+        change = torch.zeros(len(plant.hand.pads), dtype=torch.float64)
+        change[pads[:2]] = 2.0 * moved[3]
+        enhanced.update_forces(seen.state, moved, change)
+    still = torch.zeros(plant.hand.n_a, dtype=torch.float64)
+    _, S = LinearizedModel.about(still, lin, enhanced).grip
+    more = S - lin.normal_force_sensitivity.numpy()
+    np.testing.assert_allclose(more[:2, 3], 2.0, rtol=0.1)
+    assert np.abs(more[2]).max() < 1e-9
+    assert EnhancedModel.for_grasp(model, seen.state).force_correction(seen.state, still) is None
