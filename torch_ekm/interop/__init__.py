@@ -1,0 +1,61 @@
+"""Learners in other libraries' words: river, scikit-learn, CapyMOA, CasADi, acados, MCAP recordings.
+
+Each function imports its library when it is called, and names the extra ``interop`` if that is missing.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from ..residual import ResidualLearner
+from .capymoa_regressor import CapyMOARegressor
+from .online_regressor import LearnerLike, OnlineRegressor
+
+if TYPE_CHECKING:
+    from .river_regressor import RiverMultiTargetRegressor, RiverRegressor
+    from .sklearn_regressor import SklearnRegressor
+
+
+def as_river(learner: LearnerLike = None, targets: int = 1) -> RiverRegressor | RiverMultiTargetRegressor:
+    """``y = c + g(x)`` as a regressor of river; a multi-target one if there is more than one output.
+
+    Args:
+        learner: untrained; or ``factory(in_features, out_features)``; None: the default.
+        targets: how many outputs, where a factory has to know.
+
+    Raises:
+        MissingExtraError: river is not installed.
+    """
+    from .river_regressor import RiverMultiTargetRegressor, RiverRegressor
+
+    if isinstance(learner, ResidualLearner):
+        targets = learner.out_features
+    return RiverRegressor(learner) if targets == 1 else RiverMultiTargetRegressor(learner)
+
+
+def as_sklearn(learner: LearnerLike = None) -> SklearnRegressor:
+    """``y = c + g(X)`` as a regressor of scikit-learn with ``partial_fit``.
+
+    Args:
+        learner: ``factory(in_features, out_features)``, or untrained and of the right sizes; None: the
+            default.
+
+    Raises:
+        MissingExtraError: scikit-learn is not installed.
+    """
+    from .sklearn_regressor import SklearnRegressor
+
+    return SklearnRegressor(learner)
+
+
+def as_capymoa(schema: Any = None, learner: LearnerLike = None) -> CapyMOARegressor:
+    """``y = c + g(x)`` as a regressor of CapyMOA, which needs not be importable.
+
+    Args:
+        schema: ``stream.get_schema()``.
+        learner: as in :func:`as_sklearn`.
+    """
+    return CapyMOARegressor(schema, learner)
+
+
+__all__ = ["CapyMOARegressor", "LearnerLike", "OnlineRegressor", "as_capymoa", "as_river", "as_sklearn"]
