@@ -175,21 +175,29 @@ def measure(data: Path | None, limit: int | None) -> Iterator[Row]:
         yield from capymoa_peers(x, y)
 
 
-def page(rows: list[Row]) -> str:
-    """The results as Markdown, with everything that is needed to get them again."""
-    git = lambda *words: subprocess.run(["git", *words], capture_output=True, text=True).stdout.strip()  # noqa: E731
+def commit() -> str:
+    """What is measured; asked before, since a long run outlives it."""
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], capture_output=True, text=True, check=False).stdout.strip()
+
     changed = " with changes" if git("status", "--porcelain", "--untracked-files=no") else ""
+    return git("rev-parse", "--short", "HEAD") + changed
+
+
+def page(rows: list[Row], of: str) -> str:
+    """The results as Markdown, with everything that is needed to get them again."""
     versions = versions_of(["torch", "numpy", "river", "capymoa"])
     lines = [
         "# Public records of streaming regression", "",
         "Written by `python benchmarks/public_streams.py --data ../shared/data --page "
         "docs/benchmarks/public_streams.md`; protocols are told at the top of that file.", "",
-        f"Commit {git('rev-parse', '--short', 'HEAD')}{changed}, {datetime.date.today()}, "
+        f"Commit {of}, {datetime.date.today()}, "
         f"{platform.machine()} {platform.system()}, {os.cpu_count()} cores, one thread; seed {SEED}; "
         f"{', '.join(f'{name} {version}' for name, version in versions.items())}.", "",
-        "Errors are those of each sample before it is learned. \"95 %\": share of samples in the interval, and "
-        "its mean width over the range of y. \"again\": the peer, run on the same machine. Times are those of "
-        "a machine that does other things, too.", "",
+        "Errors are those of each sample before it is learned. \"95 %\": share of samples in the interval, "
+        "and its mean width over the range of y. \"again\": the peer, run on the same machine. Times are "
+        "those of a machine that does other things, too.", "",
     ]  # fmt: skip
     for stream in STREAMS:
         mine = [row for row in rows if row.stream == stream]
@@ -243,11 +251,11 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="the first 150 samples of each stream")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    rows = []
+    rows, of = [], commit()
     for row in measure(options.data, 150 if options.quick else None):
         print(row, flush=True)
         rows.append(row)
-    text = page(rows)
+    text = page(rows, of)
     if options.page is None:
         print(text)
     else:
