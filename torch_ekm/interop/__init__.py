@@ -12,6 +12,7 @@ from .capymoa_regressor import CapyMOARegressor
 from .online_regressor import LearnerLike, OnlineRegressor
 
 if TYPE_CHECKING:
+    from .casadi_residual import CasadiResidual
     from .river_regressor import RiverMultiTargetRegressor, RiverRegressor
     from .sklearn_regressor import SklearnRegressor
 
@@ -58,4 +59,28 @@ def as_capymoa(schema: Any = None, learner: LearnerLike = None) -> CapyMOARegres
     return CapyMOARegressor(schema, learner)
 
 
-__all__ = ["CapyMOARegressor", "LearnerLike", "OnlineRegressor", "as_capymoa", "as_river", "as_sklearn"]
+def to_casadi(learner: ResidualLearner, *, variance: bool = True) -> CasadiResidual:
+    """``g(x; p)`` as a CasADi function; p is all that learning changes, so an optimiser is built once.
+
+    Args:
+        learner: a SparseOnlineGP or a MixtureResidual of such.
+        variance: with the variance and its derivative; without, p is much shorter.
+
+    Raises:
+        MissingExtraError: CasADi is not installed.
+        ParameterError: a learner, kernel or units of another kind.
+    """
+    from .casadi_residual import CasadiResidual
+
+    return CasadiResidual(learner, variance=variance)
+
+
+__all__ = [
+    "CapyMOARegressor",
+    "LearnerLike",
+    "OnlineRegressor",
+    "as_capymoa",
+    "as_river",
+    "as_sklearn",
+    "to_casadi",
+]
