@@ -98,7 +98,7 @@ def track(name: str, method: str, model: Any, limit: int | None) -> Row:
     data = getattr(datasets, name)()
     data = list(data)[:limit]
     begin = time.perf_counter()
-    scores = evaluate.progressive_val_score(data, model, metrics.MAE() + metrics.RMSE())
+    scores: Any = evaluate.progressive_val_score(data, model, metrics.MAE() + metrics.RMSE())
     milliseconds = 1e3 * (time.perf_counter() - begin) / len(data)
     mae, rmse = (score.get() for score in scores)
     return Row(name, method, len(data), mae, rmse, milliseconds)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from ..residual import ResidualLearner
+from .acados_residual import AcadosResidual
 from .capymoa_regressor import CapyMOARegressor
 from .online_regressor import LearnerLike, OnlineRegressor
 
@@ -76,6 +77,7 @@ def to_casadi(learner: ResidualLearner, *, variance: bool = True) -> CasadiResid
 
 
 __all__ = [
+    "AcadosResidual",
     "CapyMOARegressor",
     "LearnerLike",
     "OnlineRegressor",

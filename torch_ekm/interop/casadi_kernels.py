@@ -90,7 +90,7 @@ def _expressions(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) ->
         w = inputs.take("inverse_lengthscale", lambda: base.log_lengthscale.neg().exp())
         points = inputs.take("scaled", lambda: basis() * base.log_lengthscale.neg().exp())
 
-        def embed(z: ca.SX) -> ca.SX:
+        def embed(z: ca.SX, /) -> ca.SX:
             return z * w
     else:
         valid = "squared exponential, Matern, action-linear, deep, or sums and products of these"

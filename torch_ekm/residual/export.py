@@ -36,9 +36,11 @@ def export_learner(learner: Any, path: str | Path, format: str) -> Path:
         if format == "pt2":
             torch.export.save(program, path)
         else:
-            require("onnx"), require("onnxscript")
+            require("onnx")
+            require("onnxscript")
             names = {"input_names": ["x"], "output_names": list(OUTPUTS)}
-            torch.onnx.export(program, (two,), dynamo=True, verbose=False, **names).save(str(path))
+            made: Any = torch.onnx.export(program, (two,), dynamo=True, verbose=False, **names)
+            made.save(str(path))
     return path
 
 
