@@ -128,7 +128,7 @@ def fly(steps: int, learner: SparseOnlineGP | None) -> Flight:
             learner.update(torch.from_numpy(seen), torch.from_numpy(left_over))
         state = np.array(moved(state, happened)).ravel()
         away = state - reference((k + 1) * STEP)
-        cost += away @ WEIGHTS @ away + EFFORT * float(np.sum((thrust - 0.5 * MASS * GRAVITY) ** 2))
+        cost += float(away @ WEIGHTS @ away) + EFFORT * float(np.sum((thrust - 0.5 * MASS * GRAVITY) ** 2))
         distance += float(np.sum(away[:2] ** 2))
     milliseconds = 1e3 * (time.perf_counter() - begin) / steps
     return Flight(cost, float(np.sqrt(distance / steps)), milliseconds, learner)
