@@ -5,6 +5,8 @@ Each function imports its library when it is called, and names the extra ``inter
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..residual import ResidualLearner
@@ -13,6 +15,8 @@ from .capymoa_regressor import CapyMOARegressor
 from .online_regressor import LearnerLike, OnlineRegressor
 
 if TYPE_CHECKING:
+    from ..plant import TrialLog
+    from .bags import BagTable
     from .casadi_residual import CasadiResidual
     from .river_regressor import RiverMultiTargetRegressor, RiverRegressor
     from .sklearn_regressor import SklearnRegressor
@@ -76,13 +80,47 @@ def to_casadi(learner: ResidualLearner, *, variance: bool = True) -> CasadiResid
     return CasadiResidual(learner, variance=variance)
 
 
+def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTable:
+    """A recording of ROS (MCAP, sqlite3 or .bag) as a table: a row for each message of ``clock``.
+
+    See :func:`torch_ekm.interop.bags.read_bag`.
+
+    Raises:
+        MissingExtraError: ``rosbags`` is not installed.
+        DescriptionError: there is no such recording, it cannot be read, or no row is complete.
+        UnknownNameError: there is no such topic; the message lists them.
+    """
+    from . import bags
+
+    return bags.read_bag(path, clock, topics)
+
+
+def log_to_mcap(log: TrialLog, folder: str | Path) -> list[Path]:
+    """Every trial of a log as a rosbag2 recording in MCAP; see :mod:`torch_ekm.interop.mcap_log`.
+
+    Raises:
+        MissingExtraError: ``rosbags`` is not installed.
+        ParameterError: one of the recordings exists already.
+    """
+    from . import mcap_log
+
+    return mcap_log.log_to_mcap(log, folder)
+
+
+def log_from_mcap(folder: str | Path, target: str | Path) -> TrialLog:
+    """The log again, in ``target``, with the same figures.
+
+    Raises:
+        MissingExtraError: ``rosbags`` is not installed.
+        DescriptionError: there is no recording of torch_ekm, or one cannot be read.
+        ParameterError: a trial is in the target already.
+    """
+    from . import mcap_log
+
+    return mcap_log.log_from_mcap(folder, target)
+
+
 __all__ = [
-    "AcadosResidual",
-    "CapyMOARegressor",
-    "LearnerLike",
-    "OnlineRegressor",
-    "as_capymoa",
-    "as_river",
-    "as_sklearn",
-    "to_casadi",
-]
+    "AcadosResidual", "CapyMOARegressor", "LearnerLike", "OnlineRegressor", "as_capymoa", "as_river",
+    "as_sklearn", "log_from_mcap", "log_to_mcap", "read_bag", "to_casadi",
+]  # fmt: skip
