@@ -14,7 +14,7 @@ _BRINGS = {
     "notebooks": ("IPython", "pyarrow"),
     "peers": ("gpytorch", "river"),
     "cluster": ("distributed",),
-    "interop": ("sklearn", "onnx", "onnxruntime", "onnxscript", "casadi", "rosbags"),
+    "interop": ("sklearn", "onnx", "onnxscript", "casadi", "rosbags"),
 }
 _EXTRA_OF = {module: extra for extra, modules in _BRINGS.items() for module in modules}
 
