@@ -39,7 +39,7 @@ def test_motions_are_what_the_model_left_over(tmp_path: Path) -> None:
     angle, rate = table[:-1, 0], table[:-1, 1]
     assert own.y[:, 0].numpy() == pytest.approx(0.02 * rate - 0.05 * np.sin(angle))
     three = load_own(path, COLUMNS, lambda s, u: 0.3 * u, every=3)
-    assert three.y[4, 0] == pytest.approx(table[15, 0] - table[12, 0] - 0.3 * table[12:15, 1].mean())
+    assert three.y[1, 0] == pytest.approx(table[6, 0] - table[3, 0] - 0.3 * table[3:6, 1].mean())
     assert len(three.y) == 67 - 1 + (199 % 3 == 0)
     alone = load_own(path, COLUMNS)
     assert alone.y[:, 0].numpy() == pytest.approx(np.diff(table[:, 0]))
