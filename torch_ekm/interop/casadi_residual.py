@@ -77,14 +77,15 @@ def _build(learner: ResidualLearner, inputs: Inputs, variance: bool) -> _Express
 
 
 def _sparse(learner: SparseOnlineGP, inputs: Inputs, variance: bool) -> _Expression:
-    """``mean = scale alpha'k``, ``var = scale^2 (k** + k'Ck)``, in the learner's units."""
+    """``mean = scale alpha'k + offset``, ``var = scale^2 (k** + k'Ck)``, k in the learner's units."""
     units, posterior = learner.units, learner.posterior
     if isinstance(units, Standardize):
         shift = inputs.take("shift", lambda: units.input.shift)
         wide = inputs.take("input_scale", lambda: units.input.scale)
         scale = inputs.take("output_scale", lambda: units.output.scale)
+        offset = inputs.take("output_shift", lambda: units.output.shift)
     elif type(units) is Units:
-        shift, wide, scale = 0.0, 1.0, ca.SX.ones(learner.out_features)
+        shift, wide, scale, offset = 0.0, 1.0, ca.SX.ones(learner.out_features), 0.0
     else:
         raise ParameterError("units", type(units).__name__, "those of x and y, or Standardize")
     covariance = Covariance(learner.kernel, lambda: posterior.basis, inputs)
@@ -95,7 +96,7 @@ def _sparse(learner: SparseOnlineGP, inputs: Inputs, variance: bool) -> _Express
         z = (x - shift) / wide
         k = covariance.column(z)
         latent = ca.SX(0) if C is None else covariance.diagonal(z) + k.T @ (C @ k)
-        return scale * (alpha.T @ k), scale * scale * latent
+        return scale * (alpha.T @ k) + offset, scale * scale * latent
 
     return expression
 
