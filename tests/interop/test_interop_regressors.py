@@ -82,7 +82,7 @@ def test_features_come_and_go_by_name() -> None:
 def test_scikit_learn_finds_nothing_wrong() -> None:
     from sklearn.utils.estimator_checks import check_estimator
 
-    results = check_estimator(as_sklearn(tiny), on_skip=None)
+    results = check_estimator(as_sklearn(small), on_skip=None)
     assert {result["status"] for result in results} <= {"passed", "skipped"}
     skipped = {result["check_name"] for result in results if result["status"] == "skipped"}
     assert skipped <= {"check_array_api_input"}
