@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+import pathlib
 from abc import ABC, abstractmethod
-from pathlib import Path
 from typing import Literal
 
 import torch
@@ -14,7 +14,6 @@ from torch.distributions import Distribution, Normal
 from ..exceptions import ParameterError, ShapeError
 from ..typing import Bool, Float, Tensor
 from .checks import check_count, check_counts, check_finite
-from .export import export_learner
 from .report import UpdateReport
 
 
@@ -106,7 +105,7 @@ class ResidualLearner(nn.Module, ABC):
             ]
         return mean.detach(), torch.stack(rows, dim=-2)
 
-    def export(self, path: str | Path, *, format: Literal["onnx", "pt2"] = "pt2") -> Path:
+    def export(self, path: str | pathlib.Path, *, format: Literal["onnx", "pt2"] = "pt2") -> pathlib.Path:
         """Write what the learner predicts now to a file that other runtimes read, and return its path.
 
         The input is ``x (n, in)``; the outputs are ``mean`` and latent ``variance`` ``(n, out)`` and their
@@ -122,6 +121,8 @@ class ResidualLearner(nn.Module, ABC):
                 or a MixtureResidual of such has), or is a fleet; or an unknown format.
             MissingExtraError: for ONNX, a package is missing.
         """
+        from .export import export_learner  # torch's exporter is slow to import
+
         return export_learner(self, path, format)
 
     # -- learning -----------------------------------------------------------------------------
