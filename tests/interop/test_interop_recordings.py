@@ -92,25 +92,29 @@ def test_a_recording_is_a_table(tmp_path: Path) -> None:
         read_bag(bag, clock="/wrench")
 
 
-def test_other_topics_stand_as_they_were_last_heard(tmp_path: Path) -> None:
-    from rosbags.rosbag2 import StoragePlugin, Writer
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
+def test_other_topics_stand_as_they_were_last_heard(kind: str, tmp_path: Path) -> None:
+    from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore
 
-    types = get_typestore(Stores.ROS2_HUMBLE)
+    types = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
     joints, number = types.types["sensor_msgs/msg/JointState"], types.types["std_msgs/msg/Float64"]
-    header = types.types["std_msgs/msg/Header"](types.types["builtin_interfaces/msg/Time"](0, 0), "")
-    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    time = types.types["builtin_interfaces/msg/Time"](0, 0)
+    header = types.types["std_msgs/msg/Header"](*([0] if kind == "ros1" else []), time, "")
+    bag = tmp_path / ("own.bag" if kind == "ros1" else "own")
+    plugin = getattr(rosbag2.StoragePlugin, kind.upper(), None)
+    made = rosbag1.Writer(bag) if kind == "ros1" else rosbag2.Writer(bag, version=9, storage_plugin=plugin)
+    pack = types.serialize_ros1 if kind == "ros1" else types.serialize_cdr
+    with made as writer:
         slow = writer.add_connection("/joints", "sensor_msgs/msg/JointState", typestore=types)
         fast = writer.add_connection("/command", "std_msgs/msg/Float64", typestore=types)
         for stamp in range(10):
             if stamp % 4 == 2:
                 position = np.array([1.0, 2.0]) * stamp
                 message = joints(header, ["thumb", "index"], position, np.zeros(0), np.zeros(0))
-                raw = types.serialize_cdr(message, "sensor_msgs/msg/JointState")
-                writer.write(slow, 10**9 * stamp, raw)
-            raw = types.serialize_cdr(number(data=float(stamp)), "std_msgs/msg/Float64")
-            writer.write(fast, 10**9 * stamp + 1, raw)
-    table = read_bag(tmp_path / "bag", clock="/command")
+                writer.write(slow, 10**9 * stamp, pack(message, "sensor_msgs/msg/JointState"))
+            writer.write(fast, 10**9 * stamp + 1, pack(number(data=float(stamp)), "std_msgs/msg/Float64"))
+    table = read_bag(bag, clock="/command")
     columns = dict(zip(table.names, table.values.T, strict=True))
     assert columns["/command.data"].tolist() == [2, 3, 4, 5, 6, 7, 8, 9]
     assert columns["/joints.position.index"].tolist() == [4, 4, 4, 4, 12, 12, 12, 12]
