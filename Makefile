@@ -23,11 +23,11 @@ demo: install
 test: install
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
-# 01 to 03 are run, 04 and 05 keep their outputs: they are the evidence
+# 01 to 03 are run, 04 to 06 keep their outputs: they are the evidence
 notebooks: install
 	$(BIN)/python -m pytest -o addopts="" -o timeout=1800 --nbmake --nbmake-timeout=1800 $(wildcard notebooks/0[123]*.ipynb)
 	$(BIN)/jupyter nbconvert --to notebook --execute --inplace --ExecutePreprocessor.record_timing=False \
-		--ExecutePreprocessor.timeout=1800 $(wildcard notebooks/0[45]*.ipynb)
+		--ExecutePreprocessor.timeout=1800 $(wildcard notebooks/0[456]*.ipynb)
 
 notebooks-smoke: install
 	TORCH_EKM_SMOKE=1 $(BIN)/python -m pytest -o addopts="" -o timeout=600 --nbmake --nbmake-timeout=600 notebooks

@@ -89,7 +89,7 @@ def test_the_front_door_needs_torch_and_numpy_only() -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("room", ["plant", "sensing", "simulation", "rendering"])
+@pytest.mark.parametrize("room", ["plant", "sensing", "simulation", "rendering", "interop"])
 def test_rooms_ask_for_their_extras_when_they_need_them(room: str) -> None:
     code = _LIGHT + f"import torch_ekm.{room}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -147,7 +147,12 @@ def test_every_optional_module_has_an_extra_that_brings_it() -> None:
     if not project.is_file():
         pytest.skip("pyproject.toml is not part of this installation")
     extras = tomllib.loads(project.read_text(encoding="utf-8"))["project"]["optional-dependencies"]
-    packages = {"cv2": "opencv-python", "mpl_toolkits": "matplotlib", "IPython": "ipykernel"}
+    packages = {
+        "cv2": "opencv-python",
+        "mpl_toolkits": "matplotlib",
+        "IPython": "ipykernel",
+        "sklearn": "scikit-learn",
+    }
     for root, extra in _EXTRA_OF.items():
         listed = {re.split(r"[\[>=]", line)[0] for line in extras[extra]}
         assert packages.get(root, root.replace("_", "-")) in listed, f"{root}: not in the extra '{extra}'"

@@ -14,18 +14,22 @@ _BRINGS = {
     "notebooks": ("IPython", "pyarrow"),
     "peers": ("gpytorch", "river"),
     "cluster": ("distributed",),
+    "interop": ("sklearn", "onnx", "onnxscript", "casadi", "rosbags"),
 }
 _EXTRA_OF = {module: extra for extra, modules in _BRINGS.items() for module in modules}
 
 
-def require(module: str) -> ModuleType:
+def require(module: str, extra: str | None = None) -> ModuleType:
     """Import ``module``, whose root must be in the table above, and return it.
+
+    Args:
+        extra: the one to name, where several bring it; None: that of the table.
 
     Raises:
         MissingExtraError: it is not installed; the message names the extra.
     """
     root = module.split(".")[0]
-    extra = _EXTRA_OF[root]
+    extra = extra or _EXTRA_OF[root]
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:

@@ -18,7 +18,7 @@ from torch_ekm.experiments.reporting.notebook import (
 from torch_ekm.experiments.reporting.report import Table
 
 NAMES = sorted(path.name for path in notebook_folder().glob("*.ipynb"))
-EVIDENCE = ("04_", "05_")  # their outputs are kept
+EVIDENCE = ("04_", "05_", "06_")  # their outputs are kept
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -51,7 +51,7 @@ class Trajectory:
         """
         path = Path(path)
         about = json.dumps(plain(self.about))
-        arrays = self._arrays()
+        arrays = self.arrays()
         part = path.with_name(path.name + ".part")
         # version 1.10 of the format has checksums on its own records too
         with require("h5py").File(part, "w", libver=("v110", "v110")) as file:
@@ -78,33 +78,53 @@ class Trajectory:
                 if file.attrs.get("format") != FORMAT:
                     raise DescriptionError(path, "this HDF5 file is not a recording of torch_ekm")
                 seed, about = int(file.attrs["seed"]), json.loads(file.attrs["about"])
-                names = (*_FIELDS, "commands", *((_FORCE,) if _FORCE in file else ()))
-                sensors = {name: torch.from_numpy(file[name][()]) for name in names}
-                times, words, events = (file[name][()].tolist() for name in ("time", "status", "events"))
-                groups = {
-                    group: {name: torch.from_numpy(item[()]) for name, item in file[group].items()}
-                    for group in ("truth", *_GROUPS)
-                    if group in file
-                }
-            commands, truth = list(sensors.pop("commands")), groups.pop("truth", None)
-            observations = []
-            for k, time in enumerate(times):
-                info: dict[str, Any] = {group: _row(arrays, k) for group, arrays in groups.items()}
-                if happened := json.loads(events[k]):
-                    info["events"] = tuple(happened)
-                told = None if truth is None else Truth(**_row(truth, k))
-                status = PlantStatus(words[k].decode())
-                observations.append(
-                    Observation(**_row(sensors, k), time=time, status=status, info=info, truth=told)
-                )
+                arrays: dict[str, np.ndarray] = {}
+
+                def take(place: str, item: Any) -> None:
+                    if hasattr(item, "shape"):
+                        arrays[place] = item[()]
+
+                file.visititems(take)
+            return cls.from_arrays(seed, about, arrays)
         except DescriptionError:
             raise
         except Exception as error:  # a damaged file fails in any way that HDF5 can think of
             raise DescriptionError(path, f"damaged recording: {error}") from None
+
+    @classmethod
+    def from_arrays(cls, seed: int, about: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Trajectory:
+        """What :meth:`arrays` gave, as a trajectory again.
+
+        Raises:
+            KeyError: an array is missing.
+        """
+        names = (*_FIELDS, "commands", *((_FORCE,) if _FORCE in arrays else ()))
+        sensors = {name: torch.from_numpy(arrays[name]) for name in names}
+        times, words, events = (arrays[name].tolist() for name in ("time", "status", "events"))
+        groups: dict[str, dict[str, Tensor]] = {}
+        for place, value in arrays.items():
+            group, _, name = place.partition("/")
+            if name:
+                groups.setdefault(group, {})[name] = torch.from_numpy(value)
+        commands, truth = list(sensors.pop("commands")), groups.pop("truth", None)
+        observations = []
+        for k, time in enumerate(times):
+            info: dict[str, Any] = {group: _row(values, k) for group, values in groups.items()}
+            if happened := json.loads(events[k]):
+                info["events"] = tuple(happened)
+            told = None if truth is None else Truth(**_row(truth, k))
+            status = PlantStatus(words[k].decode())
+            observations.append(
+                Observation(**_row(sensors, k), time=time, status=status, info=info, truth=told)
+            )
         return cls(seed, commands, observations, about)
 
-    def _arrays(self) -> dict[str, np.ndarray]:
-        """Everything that is written, by its place in the file."""
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything but seed and ``about``, by its place in the file; see :meth:`from_arrays`.
+
+        Raises:
+            ParameterError: the forces or an array of ``info`` change their shape or come and go.
+        """
         seen = self.observations
         arrays = {
             "commands": _stack("commands", self.commands),

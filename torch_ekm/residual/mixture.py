@@ -15,6 +15,7 @@ from ..typing import Float, Tensor
 from .base import ResidualLearner
 from .checks import check_factor
 from .report import UpdateReport
+from .sparse_gp.sparse_online_gp import Prediction
 from .tails import ScaleMixture
 
 _PRIOR = 0.8  # belief that a learner is to be taken at its word
@@ -134,6 +135,38 @@ class MixtureResidual(ResidualLearner):
         slopes = torch.stack([slope for _, slope in pairs], dim=-1).to(x.dtype)
         return (self.gain * means).sum(-1) + self.offset, (self.gain.unsqueeze(-2) * slopes).sum(-1)
 
+    def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> Prediction:
+        """Mean, variance (as :meth:`predict`) and both derivatives, from those of the learners::
+
+            d var/dx = sum_e p_e (h_e^2 dv_e/dx + 2 h_e (mean_e - mean) dm_e/dx)
+
+        Raises:
+            ParameterError: a learner does not give its own in closed form.
+        """
+        x = self._check_query(x)
+        for learner in self.members:
+            if not hasattr(learner, "predict_with_jacobians"):
+                valid = "learners with predict_with_jacobians, such as SparseOnlineGP"
+                raise ParameterError("learners", type(learner).__name__, valid)
+        each = [cast("Any", learner).predict_with_jacobians(x) for learner in self.members]
+        m, v, dm, dv = (torch.stack(part, dim=-1).to(x.dtype) for part in zip(*each, strict=True))
+        noisy = [learner.predict(x, observation=True).variance for learner in self.members]
+        mean = (self.gain * m).sum(-1) + self.offset
+        p, h, inflation = self._weights(), self._experts[0], self.inflation
+        apart = self._means(m) - mean.unsqueeze(-1)
+        variance = (p * (h.square() * (v @ self._owner.mT) + apart.square())).sum(-1)
+        of_v, of_m = (p * h.square()) @ self._owner, (2.0 * p * h * apart) @ self._owner
+        slope = (of_v.unsqueeze(-2) * dv).sum(-1) + (of_m.unsqueeze(-2) * dm).sum(-1)
+        share = self.weights
+        most = inflation * (share * torch.stack(noisy, dim=-1).to(x.dtype)).sum(-1)
+        steepest = inflation.unsqueeze(-1) * (share.unsqueeze(-2) * dv).sum(-1)
+        return Prediction(
+            mean,
+            torch.minimum(variance, most),
+            (self.gain.unsqueeze(-2) * dm).sum(-1),
+            torch.where((variance <= most).unsqueeze(-1), slope, steepest),
+        )
+
     @property
     def members(self) -> list[ResidualLearner]:
         """The learners, in their order."""
@@ -148,6 +181,26 @@ class MixtureResidual(ResidualLearner):
     def carry(self) -> Float[Tensor, "*batch out"]:
         """Expected kappa: which part of an innovation comes back with the opposite sign."""
         return (self._weights() * self._experts[1]).sum(-1)
+
+    @property
+    def shares(self) -> Float[Tensor, " experts"]:
+        """h of each expert."""
+        return self._experts[0]
+
+    @property
+    def owner(self) -> Float[Tensor, "experts learners"]:
+        """1 where an expert takes its mean from that learner."""
+        return self._owner
+
+    @property
+    def beliefs(self) -> Float[Tensor, "*batch out experts"]:
+        """p of each expert."""
+        return self._weights()
+
+    @property
+    def carried(self) -> Float[Tensor, "*batch out experts"]:
+        """What each expert adds to its learner's mean: ``l - kappa w``."""
+        return self._carried()
 
     # -- learning -------------------------------------------------------------------------------
 

@@ -1,0 +1,154 @@
+"""What is exported says what torch says, to 1e-12."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.func import jacrev, vmap
+
+from torch_ekm import (
+    ActionLinearKernel,
+    DeepKernelSOGP,
+    KRLSTracker,
+    LearnHyperparameters,
+    MixtureResidual,
+    ProcessNoise,
+    ResidualLearner,
+    RobustWeight,
+    SparseOnlineGP,
+    SquaredExponential,
+    Standardize,
+)
+from torch_ekm.exceptions import ParameterError
+from torch_ekm.interop import to_casadi
+from torch_ekm.residual import Matern32, Matern52
+
+
+def deep(d: int = 3, m: int = 2) -> SparseOnlineGP:
+    parts = [RobustWeight(3.0), Standardize()]
+    return DeepKernelSOGP(d, m, capacity=12, hidden=(8, 8), features=3, parts=parts)
+
+
+def wandering(d: int = 3, m: int = 2) -> SparseOnlineGP:
+    parts = [RobustWeight(3.0), ProcessNoise(0.003), Standardize(), LearnHyperparameters()]
+    return SparseOnlineGP(d, m, capacity=12, parts=parts)
+
+
+LEARNERS = {
+    "plain": lambda: SparseOnlineGP(3, 2, capacity=15),
+    "matern": lambda: SparseOnlineGP(
+        3, 2, capacity=12, kernel=Matern52(3) + Matern32(3), parts=[Standardize()]
+    ),
+    "action-linear": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=ActionLinearKernel(3, 1)),
+    "product": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=SquaredExponential(3) * Matern32(3)),
+    "deep": deep,
+    "mixture": lambda: MixtureResidual([deep(), wandering()]),
+}
+
+
+def trained(name: str, n: int = 120) -> ResidualLearner:
+    torch.manual_seed(0)
+    learner = LEARNERS[name]()
+    learn(learner, n)
+    return learner
+
+
+def learn(learner: ResidualLearner, n: int) -> None:
+    x = 2.0 * torch.rand(n, 3, dtype=torch.float64) - 1.0
+    y = torch.stack([torch.sin(2 * x.sum(-1)), x[:, 0] * x[:, 2]], dim=-1)
+    learner.update(x, y + 0.02 * torch.randn_like(y))
+
+
+def queries(n: int = 9) -> torch.Tensor:
+    return 2.4 * torch.rand(n, 3, dtype=torch.float64) - 1.2
+
+
+def close(name: str, ours: torch.Tensor | np.ndarray, truth: torch.Tensor) -> None:
+    torch.testing.assert_close(
+        torch.as_tensor(ours), truth, rtol=1e-12, atol=1e-12, msg=lambda m: f"{name}: {m}"
+    )
+
+
+def test_jacobians_of_a_mixture_are_those_of_autograd() -> None:
+    learner, x = trained("mixture"), queries(40)
+    prediction = learner.predict_with_jacobians(x)
+    law = learner.predict(x)
+    torch.testing.assert_close(prediction.mean, law.mean, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(prediction.variance, law.variance, rtol=1e-10, atol=1e-12)
+    for field, moment in (("mean_jacobian", "mean"), ("variance_jacobian", "variance")):
+        slope = vmap(jacrev(lambda one, moment=moment: getattr(learner.predict(one), moment)))(x)
+        torch.testing.assert_close(getattr(prediction, field), slope, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize(("name", "format"), [("plain", "pt2"), ("mixture", "onnx")])
+def test_an_exported_learner_says_the_same(name: str, format: str, tmp_path: Path) -> None:
+    learner = trained(name)
+    if format == "onnx":
+        pytest.importorskip("onnx", reason="extra 'interop'")
+        onnxruntime = pytest.importorskip("onnxruntime", reason="extra 'interop'")
+        path = learner.export(tmp_path / "learner.onnx", format="onnx")
+        session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+        assert session.get_outputs()[0].name == "mean"
+
+        def run(x: torch.Tensor) -> list:
+            return session.run(None, {"x": x.numpy()})
+    else:
+        run = torch.export.load(learner.export(tmp_path / "learner.pt2")).module()
+    for n in (1, 9):
+        x = queries(n)
+        truth = learner.predict_with_jacobians(x)
+        for field, ours in zip(truth._fields, run(x), strict=True):
+            close(field, ours, getattr(truth, field))
+
+
+def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="SparseOnlineGP or a MixtureResidual"):
+        KRLSTracker(3, 2, capacity=5).export(tmp_path / "a.pt2")
+    with pytest.raises(ParameterError, match="batch_shape"):
+        SparseOnlineGP(3, 2, batch_shape=(2,)).export(tmp_path / "a.pt2")
+    with pytest.raises(ParameterError, match="'onnx' or 'pt2'"):
+        SparseOnlineGP(3, 2).export(tmp_path / "a.pt2", format="pickle")
+    with pytest.raises(ParameterError, match="KRLSTracker"):
+        MixtureResidual(KRLSTracker(3, 2, capacity=5)).predict_with_jacobians(torch.zeros(3))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_casadi_says_the_same_while_it_learns(name: str) -> None:
+    pytest.importorskip("casadi", reason="extra 'interop'")
+    learner = trained(name)
+    g = to_casadi(learner)
+    function = g.function
+    for _ in range(2):
+        x = queries()
+        truth = learner.predict_with_jacobians(x)
+        for row in range(len(x)):
+            ours = g(x[row].numpy())
+            for field in truth._fields:
+                close(field, ours[field], getattr(truth, field)[row])
+        learn(learner, 40)  # basis, coefficients, hyperparameters and units move; the function stays
+    assert g.function is function
+    assert g.parameters().shape == (g.n_parameters,)
+
+
+def test_casadi_without_the_variance() -> None:
+    pytest.importorskip("casadi", reason="extra 'interop'")
+    learner = trained("mixture")
+    g, x = to_casadi(learner, variance=False), queries(1)[0]
+    mean, jacobian = learner.linearize(x)
+    ours = g(x.numpy())
+    assert set(ours) == {"mean", "mean_jacobian"}
+    close("mean", ours["mean"], mean)
+    close("jacobian", ours["mean_jacobian"], jacobian)
+    assert g.n_parameters < to_casadi(learner).n_parameters
+
+
+def test_casadi_names_what_it_cannot_say() -> None:
+    pytest.importorskip("casadi", reason="extra 'interop'")
+    with pytest.raises(ParameterError, match="KRLSTracker"):
+        to_casadi(KRLSTracker(3, 2, capacity=5))
+    with pytest.raises(ParameterError, match="one model"):
+        to_casadi(SparseOnlineGP(3, 2, batch_shape=(2,)))

@@ -1,0 +1,126 @@
+"""Trials leave as MCAP and come back with the same figures; any recording is read without ROS."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
+from torch_ekm.interop import log_from_mcap, log_to_mcap, read_bag
+from torch_ekm.kinematics import se3
+from torch_ekm.plant import Observation, PlantStatus, Trajectory, TrialLog, Truth
+
+pytest.importorskip("rosbags", reason="extra 'interop'")
+pytest.importorskip("h5py", reason="extra 'sim'")
+
+
+def trajectory(seed: int, n: int = 3, forces: bool = True) -> Trajectory:
+    """Made up: what every sensor said, with raw counts, an image and events."""
+    random = torch.Generator().manual_seed(seed)
+
+    def some(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=random, dtype=torch.float64)
+
+    seen = []
+    for k in range(n + 1):
+        rotation = se3.exp(some(3))
+        info = {
+            "raw": {"counts": torch.arange(4, dtype=torch.int32) + k, "image": torch.full((9, 9), k).byte()},
+            "estimate": {"covariance": some(2, 2).float()},
+        }
+        if k == 1:
+            info["events"] = ("a tendon slipped",)
+        q, a, position = some(4), some(2), some(3)
+        truth = Truth(q + 0.01, position, rotation)
+        status = PlantStatus.LOST if k == n else PlantStatus.HELD
+        force = some(2) if forces else None
+        seen.append(Observation(q, a, position, rotation, force, 0.1 * k + 0.3, status, info, truth))
+    return Trajectory(seed, [some(2) for _ in range(n)], seen, {"note": "made up"})
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
+
+
+def test_a_log_comes_back_byte_by_byte(tmp_path: Path) -> None:
+    log = TrialLog(tmp_path / "log", {"hand": "made up"})
+    for trial in range(2):
+        log.write(trial, trajectory(trial, forces=trial == 0), {"reason": "done"})
+    log.write(2, Trajectory(7), {"reason": "not grasped"})
+    bags = log_to_mcap(log, tmp_path / "bags")
+    assert [bag.name for bag in bags] == ["trial_000000", "trial_000001", "trial_000002"]
+    again = log_from_mcap(tmp_path / "bags", tmp_path / "again")
+    assert digests(tmp_path / "again") == digests(tmp_path / "log")
+    assert again.index == log.index
+    with pytest.raises(ParameterError, match="does not exist yet"):
+        log_to_mcap(log, tmp_path / "bags")
+    with pytest.raises(ParameterError, match="without this trial"):
+        log_from_mcap(tmp_path / "bags", tmp_path / "again")
+    with pytest.raises(DescriptionError, match="trial_000000"):
+        log_from_mcap(tmp_path, tmp_path / "nothing")
+
+
+def test_a_recording_is_a_table(tmp_path: Path) -> None:
+    one = trajectory(3, n=5)
+    log = TrialLog(tmp_path / "log", {})
+    log.write(0, one)
+    (bag,) = log_to_mcap(log, tmp_path / "bags")
+    table = read_bag(bag, clock="/commands", topics=["/q", "/object_pose"])
+    assert table.values.shape == (5, 2 + 4 + 7)
+    assert table.time == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    columns = dict(zip(table.names, table.values.T, strict=True))
+    assert columns["/q.position[1]"].tolist() == [float(o.q[1]) for o in one.observations[:5]]
+    assert columns["/commands.position[0]"].tolist() == [float(c[0]) for c in one.commands]
+    assert columns["/object_pose.pose.position.z"].tolist() == [
+        float(o.position[2]) for o in one.observations[:5]
+    ]
+    x, y, z, w = (columns[f"/object_pose.pose.orientation.{axis}"] for axis in "xyzw")
+    for k, seen in enumerate(one.observations[:5]):
+        half = np.arccos(np.clip(w[k], -1, 1))
+        axis = np.array([x[k], y[k], z[k]]) / np.sin(half)
+        turned = se3.exp(torch.from_numpy(2 * half * axis))
+        torch.testing.assert_close(turned, seen.rotation, rtol=0, atol=1e-9)
+    (file,) = bag.glob("*.mcap")
+    assert np.array_equal(read_bag(file, "/commands", ["/q", "/object_pose"]).values, table.values)
+    everything = read_bag(bag, clock="/q")
+    assert not any("image" in name for name in everything.names), "81 numbers are an image"
+    with pytest.raises(UnknownNameError, match="/object_pose"):
+        read_bag(bag, clock="/wrench")
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
+def test_other_topics_stand_as_they_were_last_heard(kind: str, tmp_path: Path) -> None:
+    from rosbags import rosbag1, rosbag2
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    joints, number = types.types["sensor_msgs/msg/JointState"], types.types["std_msgs/msg/Float64"]
+    time = types.types["builtin_interfaces/msg/Time"](0, 0)
+    header = types.types["std_msgs/msg/Header"](*([0] if kind == "ros1" else []), time, "")
+    bag = tmp_path / ("own.bag" if kind == "ros1" else "own")
+    plugin = getattr(rosbag2.StoragePlugin, kind.upper(), None)
+    made = rosbag1.Writer(bag) if kind == "ros1" else rosbag2.Writer(bag, version=9, storage_plugin=plugin)
+    pack = types.serialize_ros1 if kind == "ros1" else types.serialize_cdr
+    with made as writer:
+        slow = writer.add_connection("/joints", "sensor_msgs/msg/JointState", typestore=types)
+        fast = writer.add_connection("/command", "std_msgs/msg/Float64", typestore=types)
+        for stamp in range(10):
+            if stamp % 4 == 2:
+                position = np.array([1.0, 2.0]) * stamp
+                message = joints(header, ["thumb", "index"], position, np.zeros(0), np.zeros(0))
+                writer.write(slow, 10**9 * stamp, pack(message, "sensor_msgs/msg/JointState"))
+            writer.write(fast, 10**9 * stamp + 1, pack(number(data=float(stamp)), "std_msgs/msg/Float64"))
+    table = read_bag(bag, clock="/command")
+    columns = dict(zip(table.names, table.values.T, strict=True))
+    assert columns["/command.data"].tolist() == [2, 3, 4, 5, 6, 7, 8, 9]
+    assert columns["/joints.position.index"].tolist() == [4, 4, 4, 4, 12, 12, 12, 12]
+    assert columns["/joints.position.thumb"].tolist() == [2, 2, 2, 2, 6, 6, 6, 6]
+    with pytest.raises(DescriptionError, match="no such recording"):
+        read_bag(tmp_path / "nothing", clock="/command")
+    (tmp_path / "broken.mcap").write_bytes(b"not a recording")
+    with pytest.raises(DescriptionError, match="cannot be read"):
+        read_bag(tmp_path / "broken.mcap", clock="/command")

@@ -1,0 +1,172 @@
+"""Learners keep river's, scikit-learn's and CapyMOA's contracts."""
+
+from __future__ import annotations
+
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm import LearnHyperparameters, SparseOnlineGP, Standardize
+from torch_ekm.exceptions import MissingExtraError, ParameterError, ShapeError
+from torch_ekm.interop import OnlineRegressor, as_capymoa, as_river, as_sklearn
+
+river = pytest.importorskip("river", reason="extra 'interop'")
+sklearn = pytest.importorskip("sklearn", reason="extra 'interop'")
+
+
+def small(d: int, m: int) -> SparseOnlineGP:
+    return SparseOnlineGP(d, m, capacity=30, parts=[Standardize(), LearnHyperparameters()])
+
+
+def tiny(d: int, m: int) -> SparseOnlineGP:
+    """For the libraries' own checks, which learn thousands of samples and ask for no accuracy."""
+    return SparseOnlineGP(d, m, capacity=6, parts=[Standardize()])
+
+
+def wave(n: int, seed: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """40 + a sum of sines of three inputs, noise .05."""
+    random = np.random.default_rng(seed)
+    x = random.uniform(-1.5, 1.5, (n, 3))
+    return x, 40.0 + np.sin(2 * x).sum(1) + 0.05 * random.normal(size=n)
+
+
+def test_river_finds_nothing_wrong() -> None:
+    from river import checks
+
+    checks.check_estimator(as_river(tiny(6, 1)))
+
+
+def test_river_finds_nothing_wrong_with_features_that_come_and_go() -> None:
+    """With a factory, which is asked for as many inputs as the first sample has features."""
+    from river import checks
+
+    model = as_river(tiny)
+    for check in checks.yield_checks(model):
+        if "features" in check.__name__ or "clone" in check.__name__:
+            check(model.clone())
+
+
+def test_river_finds_nothing_wrong_with_several_targets() -> None:
+    from river import checks
+
+    model = as_river(tiny, targets=3)
+    for check in checks.yield_checks(model):
+        if "memory" not in check.__name__:  # three thousand samples of SolarFlare: same buffers as above
+            check(model.clone())
+
+
+def test_river_example() -> None:
+    from river import datasets, dummy, evaluate, metrics, stats
+
+    model = as_river(SparseOnlineGP(6, 1, parts=[Standardize(), LearnHyperparameters()]))
+    error = evaluate.progressive_val_score(datasets.TrumpApproval().take(300), model, metrics.RMSE())
+    mean = evaluate.progressive_val_score(
+        datasets.TrumpApproval().take(300), dummy.StatisticRegressor(stats.Mean()), metrics.RMSE()
+    )
+    assert error.get() < 0.5 * mean.get()
+
+
+def test_features_come_and_go_by_name() -> None:
+    one, other = as_river(small(3, 1)), as_river(small(3, 1))
+    x, y = wave(60)
+    assert one.predict_one({"a": 1.0}) is None
+    for row, target in zip(x, y, strict=True):
+        named = dict(zip("abc", row, strict=True))
+        one.learn_one(named, target)
+        other.learn_one(dict(reversed(named.items())), target)
+    assert one.predict_one({"c": 0.2, "a": 0.1, "b": 0.0}) == other.predict_one(
+        {"a": 0.1, "b": 0.0, "c": 0.2}
+    )
+    at_the_mean = {"a": 0.3, "b": 0.3, "c": float(x[:, 2].mean())}
+    assert one.predict_one({"a": 0.3, "b": 0.3}) == pytest.approx(one.predict_one(at_the_mean), abs=1e-9)
+    low, high = one.predict_interval_one(at_the_mean)
+    assert low < one.predict_one(at_the_mean) < high
+    with pytest.raises(ShapeError, match="a, b, c, d"):
+        one.learn_one({"a": 0.0, "d": 1.0}, 0.0)
+
+
+def test_scikit_learn_finds_nothing_wrong() -> None:
+    from sklearn.utils.estimator_checks import check_estimator
+
+    results = check_estimator(as_sklearn(small), on_skip=None)
+    assert {result["status"] for result in results} <= {"passed", "skipped"}
+    skipped = {result["check_name"] for result in results if result["status"] == "skipped"}
+    assert skipped <= {"check_array_api_input"}
+
+
+def test_scikit_learn_example() -> None:
+    from sklearn.model_selection import cross_val_score
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    x, y = wave(240)
+    regressor = as_sklearn(small)
+    for start in range(0, 200, 50):
+        regressor.partial_fit(x[start : start + 50], y[start : start + 50])
+    assert regressor.score(x[200:], y[200:]) > 0.85
+    mean, deviation = regressor.predict(x[200:], return_std=True)
+    assert mean.shape == deviation.shape == (40,)
+    whole = as_sklearn(small).fit(x[:200], y[:200])
+    assert np.array_equal(whole.predict(x[200:]), mean), "rows learned at once or in turn are the same"
+    assert cross_val_score(make_pipeline(StandardScaler(), as_sklearn(small)), x, y, cv=3).min() > 0.7
+
+
+def test_what_capymoa_asks_of_a_regressor() -> None:
+    x, y = wave(200)
+    regressor, errors, held = as_capymoa(learner=small), [], []
+    for row, target in zip(x, y, strict=True):
+        instance = SimpleNamespace(x=row, y_value=target)
+        low, mean, high = regressor.predict_interval(instance)
+        assert mean == pytest.approx(regressor.predict(instance))
+        errors.append(target - mean)
+        held.append(low <= target <= high)
+        regressor.train(instance)
+    assert errors[0] == y[0], "before the first sample it predicts 0"
+    assert np.std(errors[100:]) < 0.45 * y.std()
+    assert np.mean(held[100:]) > 0.85
+    assert str(regressor) == "torch_ekm SparseOnlineGP"
+
+
+def test_capymoa_example() -> None:
+    pytest.importorskip("capymoa", reason="CapyMOA needs Java and is not among the extras")
+    from capymoa.evaluation import prequential_evaluation
+    from capymoa.stream import NumpyStream
+
+    x, y = wave(300)
+    stream = NumpyStream(x, y, dataset_name="wave", target_type="numeric")
+    result = prequential_evaluation(stream, as_capymoa(stream.get_schema(), small))
+    assert result.cumulative.rmse() < 45.0
+
+
+def test_a_wrong_learner_is_named() -> None:
+    with pytest.raises(ParameterError, match="one model of 3 inputs and 1 outputs"):
+        as_sklearn(small(2, 1)).fit(*wave(20))
+    regressor = OnlineRegressor(small(3, 1))
+    with pytest.raises(ParameterError, match="level"):
+        regressor.interval(np.zeros((1, 3)), 95.0)
+
+
+@pytest.mark.parametrize(("module", "make"), [("river", as_river), ("sklearn", as_sklearn)])
+def test_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, module: str, make) -> None:
+    for name in [name for name in sys.modules if name.split(".")[0] == module or "interop." in name]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingExtraError, match="interop"):
+        make(small)
+
+
+def test_predictions_are_those_of_the_learner() -> None:
+    x, y = wave(50)
+    regressor, learner = OnlineRegressor(small(3, 1)), small(3, 1)
+    for row, target in zip(x, y, strict=True):
+        regressor.learn(row, np.array([target]))
+        learner.update(torch.from_numpy(row), torch.from_numpy(np.array([target]) - y[0]))
+    law = learner.predict(torch.from_numpy(x), observation=True)
+    mean, deviation = regressor.predict(x)
+    assert np.allclose(mean, y[0] + law.mean.numpy(), rtol=1e-12)
+    assert np.allclose(deviation, law.stddev.numpy(), rtol=1e-9)
+    low, high = regressor.interval(x, 0.95)
+    assert np.allclose(high - low, 2 * 1.959963984540054 * deviation, rtol=1e-12)

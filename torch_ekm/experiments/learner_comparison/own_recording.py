@@ -1,0 +1,137 @@
+"""What a recording of one's own hand holds for a learner: which columns are state, command, observation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ...exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
+from ...interop import read_bag
+from ...typing import Array, Float, Tensor
+from .stream import LEAST, Stream
+from .table_file import read_table
+
+#: ``f(state, command) -> increment of the observation`` of all motions at once, ``(n, .)`` each.
+Model = Callable[[Array, Array], Array]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Names of columns, or their beginnings with ``*`` at the end, such as ``/joint_states.position*``.
+
+    Attributes:
+        state: what is known before a motion.
+        command: what is asked of the motors, as a rate or an increment.
+        observation: what is to be predicted: its increment over the motion.
+    """
+
+    state: Sequence[str]
+    command: Sequence[str]
+    observation: Sequence[str]
+
+
+@dataclass(frozen=True)
+class OwnRecording:
+    """Motions of a recording: ``y = o(t + k) - o(t) - f(s(t), u)``, u the mean command over the k rows.
+
+    Attributes:
+        name: of the file.
+        x: state and command ``(n, d)``, in the recording's units.
+        y: what the model left over ``(n, m)``, in the units of the observation.
+        inputs, outputs: names of the columns of x and y.
+        about: what it is, and what "the model alone" predicts.
+    """
+
+    name: str
+    x: Float[Tensor, "n d"]
+    y: Float[Tensor, "n m"]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    about: str
+
+    def stream(self) -> Stream:
+        """For :func:`compare`: in units of its first tenth (20 to 200 samples), which is not scored.
+
+        Only x is centred: 0 is what the model says.
+        """
+        warm_up = min(max(len(self.y) // 10, 20), 200)
+
+        def deviation(values: Tensor) -> Tensor:
+            first, whole = values[:warm_up].std(0), values.std(0)
+            scale = torch.where(first > 1e-9 * values.abs().amax(0), first, whole)
+            return torch.where(scale > 0, scale, 1.0)
+
+        x = (self.x - self.x[:warm_up].mean(0)) / deviation(self.x)
+        return Stream(self.name, x, self.y / deviation(self.y), warm_up, about=self.about)
+
+
+def load_own(
+    path: str | Path,
+    columns: Columns,
+    model: Model | None = None,
+    *,
+    clock: str | None = None,
+    every: int = 1,
+) -> OwnRecording:
+    """Motions from CSV, Parquet, or a recording of ROS (MCAP, sqlite3, .bag).
+
+    Args:
+        path: the file, or the folder of rosbag2; rows in the order of time.
+        columns: which column is what.
+        model: f; None: nothing moves.
+        clock: in a recording of ROS, the topic that sets the rhythm, such as that of the commands.
+        every: rows k in one motion: at a high rate the increment over one row is noise.
+
+    Raises:
+        DescriptionError: the file cannot be used or is too short.
+        UnknownNameError: a column or topic is not there; the message lists them.
+        ParameterError: ``clock`` or ``every`` does not fit.
+        ShapeError: the model's increments have another shape than the observation.
+    """
+    path = Path(path)
+    if every < 1 or int(every) != every:
+        raise ParameterError("every", every, "an integer of at least 1")
+    if path.suffix.lower() in (".csv", ".tsv", ".txt", ".parquet", ".pq"):
+        names, values = read_table(path)
+    elif clock is None:
+        raise ParameterError("clock", clock, "a topic, such as that of the commands, for a recording of ROS")
+    else:
+        names, _, values = read_bag(path, clock)
+    state, command, seen = (
+        _find(wanted, names) for wanted in (columns.state, columns.command, columns.observation)
+    )
+    starts = np.arange(0, len(values) - every, every)
+    if len(starts) < LEAST:
+        problem = f"it has {len(starts)} motions of {every} rows; at least {LEAST} are needed"
+        raise DescriptionError(path, problem)
+    sums = np.vstack([np.zeros(len(command)), values[:, command].cumsum(0)])
+    s, u = values[starts][:, state], (sums[starts + every] - sums[starts]) / every
+    moved = values[starts + every][:, seen] - values[starts][:, seen]
+    nominal = np.zeros_like(moved) if model is None else np.asarray(model(s, u), dtype=np.float64)
+    if nominal.shape != moved.shape:
+        raise ShapeError("increments of the model", str(moved.shape), nominal.shape)
+    alone = "nothing moves" if model is None else getattr(model, "__name__", type(model).__name__)
+    inputs, outputs = ([names[i] for i in which] for which in ([*state, *command], seen))
+    about = f"increments of {len(outputs)} columns of {path.name}; alone: {alone}"
+    x, y = torch.from_numpy(np.hstack([s, u])), torch.from_numpy(moved - nominal)
+    return OwnRecording(path.stem, x, y, tuple(inputs), tuple(outputs), about)
+
+
+def _find(wanted: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Places of the columns, in the order in which they are asked for."""
+    found: list[int] = []
+    for pattern in wanted:
+        begin = pattern.removesuffix("*")
+        fits = [
+            i
+            for i, name in enumerate(names)
+            if name == pattern or (begin != pattern and name.startswith(begin))
+        ]
+        if not fits:
+            raise UnknownNameError("column", pattern, names)
+        found += [i for i in fits if i not in found]
+    return found

@@ -1,0 +1,125 @@
+"""Recordings of ROS 1 and 2 (MCAP, sqlite3, .bag) as a table of numbers, without ROS (extra ``interop``)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from .._extras import require
+from ..exceptions import DescriptionError, UnknownNameError
+from ..typing import Array
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+else:
+    AnyReader = require("rosbags.highlevel").AnyReader
+    _typesys = require("rosbags.typesys")
+    Stores, get_typestore = _typesys.Stores, _typesys.get_typestore
+
+_MOST = 64  # numbers of one field; more is an image or a cloud
+_LEFT_OUT = ("header", "layout")  # stamps and array shapes
+
+
+class BagTable(NamedTuple):
+    """Rows in the order of time."""
+
+    names: tuple[str, ...]
+    """``/topic.field.joint`` or ``/topic.field[0]``, of each column."""
+    time: Array
+    """Of the recording's clock, from its first row on [s] ``(n,)``."""
+    values: Array
+    """``(n, columns)``, in the messages' own units."""
+
+
+def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTable:
+    """Every moment with a message of ``clock`` gives a row; other topics stand as they were last heard.
+
+    Nothing of the future enters a row. Rows before every topic was heard once are left out, and so are
+    texts, headers and fields of more than 64 numbers.
+
+    Args:
+        path: a folder of rosbag2, a single ``.mcap`` or ``.db3`` file, or a ``.bag`` of ROS 1.
+        clock: the topic that sets the rhythm, such as that of the commands.
+        topics: those that are read; all of them by default.
+
+    Raises:
+        MissingExtraError: ``rosbags`` is not installed.
+        DescriptionError: there is no such recording, it cannot be read, or no row is complete.
+        UnknownNameError: there is no such topic; the message lists them.
+    """
+    path = Path(path)
+    heard: dict[str, float] = {}
+    rows: list[tuple[int, dict[str, float]]] = []
+    try:
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+        with reader:
+            there = sorted({connection.topic for connection in reader.connections})
+            for topic in (clock, *topics):
+                if topic not in there:
+                    raise UnknownNameError("topic", topic, there)
+            wanted = {clock, *(topics or there)}
+            connections = [one for one in reader.connections if one.topic in wanted]
+            due: int | None = None  # messages of one moment belong together, whichever comes first
+            for connection, stamp, raw in reader.messages(connections=connections):
+                if due is not None and stamp > due:
+                    rows.append((due, dict(heard)))
+                    due = None
+                message = reader.deserialize(raw, connection.msgtype)
+                heard.update(_numbers(message, connection.topic))
+                if connection.topic == clock:
+                    due = stamp
+            if due is not None:
+                rows.append((due, dict(heard)))
+    except UnknownNameError:
+        raise
+    except FileNotFoundError:
+        raise DescriptionError(path, "there is no such recording") from None
+    except Exception as error:  # a damaged recording fails in any way that its format can think of
+        raise DescriptionError(path, f"this recording cannot be read: {error}") from error
+    complete = [(stamp, row) for stamp, row in rows if len(row) == len(heard)]
+    if not complete:
+        raise DescriptionError(path, f"no message of '{clock}' comes after every other topic was heard")
+    first = complete[0][0]
+    time = np.array([1e-9 * (stamp - first) for stamp, _ in complete])
+    return BagTable(tuple(heard), time, np.array([[row[name] for name in heard] for _, row in complete]))
+
+
+def topics_of(path: str | Path) -> dict[str, tuple[str, int]]:
+    """Topic -> message type and number of messages.
+
+    Raises:
+        DescriptionError: there is no such recording, or it cannot be read.
+    """
+    try:
+        with AnyReader([Path(path)], default_typestore=get_typestore(Stores.LATEST)) as reader:
+            return {one.topic: (one.msgtype, one.msgcount) for one in reader.connections}
+    except Exception as error:
+        raise DescriptionError(path, f"this recording cannot be read: {error}") from error
+
+
+def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
+    """The numbers of a message, by name; joint names stand for indices where a message has them."""
+    if is_dataclass(value):
+        given = getattr(value, "name", None)
+        labels = given if isinstance(given, list) else []
+        for field in fields(value):
+            part = getattr(value, field.name)
+            if field.name in _LEFT_OUT or field.name.startswith("__"):
+                continue
+            if labels and isinstance(part, np.ndarray) and len(part) == len(labels):
+                yield from (
+                    (f"{place}.{field.name}.{label}", float(one))
+                    for label, one in zip(labels, part, strict=True)
+                )
+            else:
+                yield from _numbers(part, f"{place}.{field.name}")
+    elif isinstance(value, bool | int | float | np.number):
+        yield place, float(value)
+    elif isinstance(value, list | np.ndarray) and len(value) <= _MOST:
+        for i, one in enumerate(value):
+            yield from _numbers(one, f"{place}[{i}]")

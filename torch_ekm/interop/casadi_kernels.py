@@ -1,0 +1,146 @@
+"""Covariance functions as CasADi expressions whose parameters are inputs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .._extras import require
+from ..exceptions import ParameterError
+from ..residual import (
+    ActionLinearKernel,
+    DeepKernel,
+    Kernel,
+    Matern32,
+    Matern52,
+    ProductKernel,
+    SquaredExponential,
+    SumKernel,
+)
+from ..typing import Array, Tensor
+
+if TYPE_CHECKING:
+    import casadi as ca
+else:
+    ca = require("casadi")
+
+_TINY = 1e-30  # below it a squared distance is rounding, and the root has no derivative at 0
+
+
+class Inputs:
+    """Symbols that stand for a learner's tensors, in the order in which they were asked for."""
+
+    def __init__(self) -> None:
+        self.symbols: list[ca.SX] = []
+        self.sources: list[Callable[[], Tensor]] = []
+
+    def take(self, name: str, source: Callable[[], Tensor]) -> ca.SX:
+        """Symbols of the shape of what ``source()`` gives: a scalar, a column, or a matrix."""
+        shape = tuple(source().shape) + (1,) * (2 - source().dim())
+        self.symbols.append(ca.SX.sym(name, *shape))
+        self.sources.append(source)
+        return self.symbols[-1]
+
+    def vector(self) -> ca.SX:
+        """All symbols as one column."""
+        return ca.vertcat(*(ca.vec(symbol) for symbol in self.symbols))
+
+    def values(self) -> Array:
+        """What they stand for at present, in the same order ``(n,)``; CasADi's matrices are column-major."""
+        tensors = (source().detach().double().cpu().numpy() for source in self.sources)
+        return np.concatenate([tensor.ravel(order="F") for tensor in tensors])
+
+
+class Covariance:
+    """A kernel and a basis: ``k(X, z)`` ``(M, 1)`` and ``k(z, z)`` of a column z.
+
+    Args:
+        kernel: of one model.
+        basis: gives X ``(M, d)``.
+        inputs: takes the parameters in.
+
+    Raises:
+        ParameterError: a kernel of another kind.
+    """
+
+    def __init__(self, kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> None:
+        self.column, self.diagonal = _expressions(kernel, basis, inputs)
+
+
+_Function = Callable[["ca.SX"], "ca.SX"]
+
+
+def _expressions(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> tuple[_Function, _Function]:
+    if isinstance(kernel, SumKernel | ProductKernel):
+        (k1, d1), (k2, d2) = (_expressions(one, basis, inputs) for one in (kernel.first, kernel.second))
+        if isinstance(kernel, SumKernel):
+            return lambda z: k1(z) + k2(z), lambda z: d1(z) + d2(z)
+        return lambda z: k1(z) * k2(z), lambda z: d1(z) * d2(z)
+    if isinstance(kernel, ActionLinearKernel):
+        return _action_linear(kernel, basis, inputs)
+    if isinstance(kernel, DeepKernel):
+        phi, base = _phi(kernel.base), kernel.base
+        points = inputs.take("embedded", lambda: kernel.embed(basis()))
+        embed = _embedding(kernel, inputs)
+    elif isinstance(kernel, SquaredExponential | Matern32 | Matern52):
+        phi, base = _phi(kernel), kernel
+        w = inputs.take("inverse_lengthscale", lambda: base.log_lengthscale.neg().exp())
+        points = inputs.take("scaled", lambda: basis() * base.log_lengthscale.neg().exp())
+
+        def embed(z: ca.SX, /) -> ca.SX:
+            return z * w
+    else:
+        valid = "squared exponential, Matern, action-linear, deep, or sums and products of these"
+        raise ParameterError("kernel", type(kernel).__name__, valid)
+    v = inputs.take("variance", lambda: base.log_variance.exp())
+
+    def column(z: ca.SX) -> ca.SX:
+        away = points - ca.repmat(embed(z).T, points.shape[0], 1)
+        return v * phi(ca.sum2(away * away))
+
+    return column, lambda z: v
+
+
+def _phi(kernel: Kernel) -> _Function:
+    """Correlation at a squared scaled distance."""
+    if isinstance(kernel, SquaredExponential):
+        return lambda d2: ca.exp(-0.5 * d2)
+    root = math.sqrt(3.0 if isinstance(kernel, Matern32) else 5.0)
+
+    def matern(d2: ca.SX) -> ca.SX:
+        r = root * ca.sqrt(ca.fmax(d2, _TINY))
+        value = 1.0 + r if isinstance(kernel, Matern32) else 1.0 + r + r * r / 3.0
+        return value * ca.exp(-r)
+
+    return matern
+
+
+def _action_linear(
+    kernel: ActionLinearKernel, basis: Callable[[], Tensor], inputs: Inputs
+) -> tuple[_Function, _Function]:
+    n = kernel.state_features
+    state, of_state = _expressions(kernel.state_kernel, lambda: basis()[:, :n], inputs)
+    actions = inputs.take("actions", lambda: basis()[:, n:])
+    variance = inputs.take("action_variance", lambda: kernel.action_variance)
+    return (
+        lambda z: state(z[:n]) * (actions @ (variance * z[n:])),
+        lambda z: of_state(z[:n]) * ca.sum1(variance * z[n:] * z[n:]),
+    )
+
+
+def _embedding(kernel: DeepKernel, inputs: Inputs) -> _Function:
+    """``[z / L, net(z)]``, weights being inputs."""
+    w = inputs.take("inverse_lengthscale", lambda: kernel.base.log_lengthscale.neg().exp())
+    weights = [inputs.take("weight", lambda one=one: one) for one in kernel.weights]
+    biases = [inputs.take("bias", lambda one=one: one) for one in kernel.biases]
+
+    def embed(z: ca.SX) -> ca.SX:
+        hidden = z
+        for weight, bias in zip(weights[:-1], biases, strict=True):
+            hidden = ca.tanh(weight.T @ hidden + bias)
+        return ca.vertcat(z * w, weights[-1].T @ hidden)
+
+    return embed

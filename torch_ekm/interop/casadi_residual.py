@@ -1,0 +1,145 @@
+"""A learner as a CasADi function whose basis and coefficients are inputs (extra ``interop``)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .._extras import require
+from ..exceptions import ParameterError
+from ..residual import MixtureResidual, ResidualLearner, SparseOnlineGP, Standardize
+from ..residual.sparse_gp.part import Units
+from ..typing import Array
+from .casadi_kernels import Covariance, Inputs
+
+if TYPE_CHECKING:
+    import casadi as ca
+else:
+    ca = require("casadi")
+
+
+class CasadiResidual:
+    """``g(x; p)``: p holds all that learning changes, so that an optimiser built once stays valid.
+
+    Attributes:
+        function: ``casadi.Function (x, p) -> (mean, variance, mean_jacobian, variance_jacobian)`` with x
+            ``(in, 1)``, mean and latent variance ``(out, 1)``, their derivatives ``(out, in)``; without the
+            second and the last if ``variance`` is off.
+        n_parameters: length of p.
+
+    Args:
+        learner: a SparseOnlineGP or a MixtureResidual of such, one model; its values are read whenever
+            :meth:`parameters` is asked.
+        variance: with the variance, whose coefficients are most of p.
+
+    Raises:
+        ParameterError: a learner, kernel or units of another kind.
+    """
+
+    def __init__(self, learner: ResidualLearner, *, variance: bool = True) -> None:
+        if tuple(learner.batch_shape):
+            raise ParameterError("learner", f"a fleet {tuple(learner.batch_shape)}", "one model")
+        self.learner, self._inputs = learner, Inputs()
+        x = ca.SX.sym("x", learner.in_features)
+        mean, spread = _build(learner, self._inputs, variance)(x)
+        p = self._inputs.vector()
+        self.n_parameters: int = p.shape[0]
+        outputs = {"mean": mean, "mean_jacobian": ca.jacobian(mean, x)}
+        if variance:
+            outputs = {
+                "mean": mean, "variance": ca.fmax(spread, 0.0),
+                "mean_jacobian": outputs["mean_jacobian"], "variance_jacobian": ca.jacobian(spread, x),
+            }  # fmt: skip
+        self.function: Any = ca.Function("g", [x, p], list(outputs.values()), ["x", "p"], list(outputs))
+
+    def parameters(self) -> Array:
+        """The present p, ``(n_parameters,)``."""
+        return self._inputs.values()
+
+    def __call__(self, x: Array) -> dict[str, Array]:
+        """Everything at one x ``(in,)``, by name; means and variances ``(out,)``."""
+        values = self.function(x=np.asarray(x), p=self.parameters())
+        full = {name: np.array(values[name]) for name in self.function.name_out()}
+        return {name: full[name][:, 0] if "jacobian" not in name else full[name] for name in full}
+
+
+_Expression = Callable[["ca.SX"], tuple["ca.SX", "ca.SX"]]
+
+
+def _build(learner: ResidualLearner, inputs: Inputs, variance: bool) -> _Expression:
+    if isinstance(learner, MixtureResidual):
+        return _mixture(learner, inputs, variance)
+    if isinstance(learner, SparseOnlineGP):
+        return _sparse(learner, inputs, variance)
+    raise ParameterError("learner", type(learner).__name__, "a SparseOnlineGP or a MixtureResidual of such")
+
+
+def _sparse(learner: SparseOnlineGP, inputs: Inputs, variance: bool) -> _Expression:
+    """``mean = scale alpha'k + offset``, ``var = scale^2 (k** + k'Ck)``, k in the learner's units."""
+    units, posterior = learner.units, learner.posterior
+    if isinstance(units, Standardize):
+        shift = inputs.take("shift", lambda: units.input.shift)
+        wide = inputs.take("input_scale", lambda: units.input.scale)
+        scale = inputs.take("output_scale", lambda: units.output.scale)
+        offset = inputs.take("output_shift", lambda: units.output.shift)
+    elif type(units) is Units:
+        shift, wide, scale, offset = 0.0, 1.0, ca.SX.ones(learner.out_features), 0.0
+    else:
+        raise ParameterError("units", type(units).__name__, "those of x and y, or Standardize")
+    covariance = Covariance(learner.kernel, lambda: posterior.basis, inputs)
+    alpha = inputs.take("alpha", lambda: posterior.alpha)
+    C = inputs.take("C", lambda: posterior.covariance) if variance else None
+
+    def expression(x: ca.SX) -> tuple[ca.SX, ca.SX]:
+        z = (x - shift) / wide
+        k = covariance.column(z)
+        latent = ca.SX(0) if C is None else covariance.diagonal(z) + k.T @ (C @ k)
+        return scale * (alpha.T @ k) + offset, scale * scale * latent
+
+    return expression
+
+
+def _mixture(learner: MixtureResidual, inputs: Inputs, variance: bool) -> _Expression:
+    """The moments of :meth:`MixtureResidual.predict`; gain, offset and weights are inputs."""
+    members = [_build(one, inputs, variance) for one in learner.members]
+    noises = (
+        [inputs.take("noise", lambda one=one: _noise(one)) for one in learner.members] if variance else []
+    )
+    gain = inputs.take("gain", lambda: learner.gain)
+    offset = inputs.take("offset", lambda: learner.offset)
+    if not variance:
+        return lambda x: (_weighted(gain, [member(x)[0] for member in members]) + offset, ca.SX(0))
+    beliefs = inputs.take("beliefs", lambda: learner.beliefs)
+    carried = inputs.take("carried", lambda: learner.carried)
+    share = inputs.take("weights", lambda: learner.weights)
+    inflation = inputs.take("inflation", lambda: learner.inflation)
+    h = ca.DM(learner.shares.tolist()).T
+    owner = ca.DM(learner.owner.tolist()).T  # (members, experts)
+    one = ca.DM.ones(1, h.shape[1])
+
+    def expression(x: ca.SX) -> tuple[ca.SX, ca.SX]:
+        each = [member(x) for member in members]
+        means, variances = (ca.horzcat(*part) for part in zip(*each, strict=True))
+        mean = _weighted(gain, [m for m, _ in each]) + offset
+        apart = (means @ owner) * ca.repmat(h, means.shape[0], 1) + carried - mean @ one
+        inside = (variances @ owner) * ca.repmat(h * h, means.shape[0], 1)
+        spread = ca.sum2(beliefs * (inside + apart * apart))
+        most = inflation * _weighted(share, [v + s for (_, v), s in zip(each, noises, strict=True)])
+        return mean, ca.if_else(spread <= most, spread, most)
+
+    return expression
+
+
+def _weighted(weights: ca.SX, columns: list[ca.SX]) -> ca.SX:
+    return ca.sum2(weights * ca.horzcat(*columns))
+
+
+def _noise(learner: ResidualLearner) -> Any:
+    """Observation noise variance ``(out,)``; of a mixture in a mixture there is no such thing."""
+    if not isinstance(learner, SparseOnlineGP):
+        raise ParameterError(
+            "learners", type(learner).__name__, "SparseOnlineGPs, where the variance is wanted"
+        )
+    return learner.noise_variance

@@ -1,0 +1,192 @@
+"""Trials as rosbag2 recordings in MCAP, and back with the same figures (extra ``interop``)."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .._extras import require
+from ..exceptions import DescriptionError, ParameterError
+from ..kinematics import se3
+from ..plant import Trajectory, TrialLog
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+else:
+    AnyReader = require("rosbags.highlevel").AnyReader
+    _rosbag2, _typesys = require("rosbags.rosbag2"), require("rosbags.typesys")
+    StoragePlugin, Writer = _rosbag2.StoragePlugin, _rosbag2.Writer
+    Stores, get_typestore = _typesys.Stores, _typesys.get_typestore
+
+_ABOUT, _POSE = "/about", "/object_pose"
+_JOINTS = ("q", "a", "commands")  # as JointState, which viewers know
+_KINDS = {"f8": "Float64", "f4": "Float32", "i8": "Int64", "u1": "UInt8"}
+
+
+def trajectory_to_mcap(trajectory: Trajectory, folder: str | Path) -> Path:
+    """Write a trial as a rosbag2 folder with one MCAP file; returns the folder, which must be new.
+
+    A topic for each array, a message for each observation at its time: ``/q``, ``/a`` and ``/commands``
+    (increments [rad], at the time of the observation before them) as JointState, ``/object_pose`` as
+    PoseStamped in the frame ``hand``, all others as they are, as multi-arrays; ``/about`` says the rest.
+
+    Raises:
+        ParameterError: the folder exists, or an array of the trial changes its shape.
+        MissingExtraError: ``rosbags`` is not installed.
+    """
+    folder = Path(folder)
+    if folder.exists():
+        raise ParameterError("folder", str(folder), "a folder that does not exist yet")
+    arrays = trajectory.arrays()
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    made = _Messages(types)
+    stamps = [round(1e9 * time) for time in arrays["time"].tolist()]
+    shapes = {place: [list(array.shape), array.dtype.str] for place, array in arrays.items()}
+    about = {"seed": trajectory.seed, "about": trajectory.about, "arrays": shapes}
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+
+        def topic(name: str, kind: str, rows: list[tuple[int, Any]]) -> None:
+            connection = writer.add_connection(name, kind, typestore=types)
+            for stamp, message in rows:
+                writer.write(connection, stamp, types.serialize_cdr(message, kind))
+
+        kind = "std_msgs/msg/String"
+        topic(_ABOUT, kind, [(min(stamps, default=0), made.text(json.dumps(about)))])
+        for place, array in arrays.items():
+            kind, make = made.of(place, array)
+            topic(
+                f"/{place}",
+                kind,
+                [(stamp, make(stamp, row)) for stamp, row in zip(stamps, array, strict=False)],
+            )
+        poses = zip(stamps, trajectory.observations, strict=True)
+        rows = [(stamp, made.pose(stamp, one.position, one.rotation)) for stamp, one in poses]
+        topic(_POSE, "geometry_msgs/msg/PoseStamped", rows)
+    return folder
+
+
+def trajectory_from_mcap(folder: str | Path) -> Trajectory:
+    """Read what :func:`trajectory_to_mcap` wrote, figure by figure.
+
+    Raises:
+        DescriptionError: no such recording, or not one of torch_ekm.
+        MissingExtraError: ``rosbags`` is not installed.
+    """
+    folder = Path(folder)
+    if not folder.exists():
+        raise DescriptionError(folder, "there is no such recording")
+    rows: dict[str, list[Any]] = {}
+    try:
+        with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            for connection, _, raw in reader.messages():
+                message: Any = reader.deserialize(raw, connection.msgtype)
+                if connection.topic != _POSE:
+                    rows.setdefault(connection.topic[1:], []).append(message)
+    except Exception as error:
+        raise DescriptionError(folder, f"this recording cannot be read: {error}") from error
+    if _ABOUT[1:] not in rows:
+        raise DescriptionError(folder, "this recording has no topic '/about': it is not one of torch_ekm")
+    about = json.loads(rows[_ABOUT[1:]][0].data)
+    arrays = {}
+    for place, (shape, dtype) in about["arrays"].items():
+        values = [_values(message) for message in rows.get(place, [])]
+        if len(values) != (shape[0] if shape else 0):
+            raise DescriptionError(folder, f"'/{place}' has {len(values)} messages instead of {shape[0]}")
+        arrays[place] = np.array(values).reshape(shape).astype(np.dtype(dtype))
+    return Trajectory.from_arrays(about["seed"], about["about"], arrays)
+
+
+def log_to_mcap(log: TrialLog, folder: str | Path) -> list[Path]:
+    """Write every trial of a log as a recording of its own, ``trial_000000`` and so on.
+
+    Raises:
+        ParameterError: one of them exists already.
+        MissingExtraError: ``rosbags`` is not installed.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    return [trajectory_to_mcap(log.read(trial), folder / f"trial_{trial:06d}") for trial in log.trials]
+
+
+def log_from_mcap(folder: str | Path, target: str | Path) -> TrialLog:
+    """The log again, from the recordings in ``folder``: the same figures, in the same HDF5 files.
+
+    Raises:
+        DescriptionError: there is no recording, or one cannot be read.
+        ParameterError: a trial is in the target already.
+    """
+    found = sorted(Path(folder).glob("trial_[0-9]*"))
+    if not found:
+        raise DescriptionError(
+            folder, "no recording: there is no folder named trial_000000 or the like in it"
+        )
+    target = Path(target)
+    target.mkdir(parents=True, exist_ok=True)
+    for recording in found:
+        path = target / f"{recording.stem}.h5"
+        if path.exists():
+            raise ParameterError("target", str(path), "a log without this trial")
+        trajectory_from_mcap(recording).save(path)
+    return TrialLog.open(target)
+
+
+class _Messages:
+    """Makes the messages of one set of types."""
+
+    def __init__(self, types: Any) -> None:
+        self.types = types.types
+
+    def of(self, place: str, array: np.ndarray) -> tuple[str, Any]:
+        """Message type of an array's rows, and what makes one of (stamp, row)."""
+        if place in _JOINTS:
+            return "sensor_msgs/msg/JointState", self.joints
+        if array.dtype.kind == "S":
+            return "std_msgs/msg/String", lambda _, row: self.text(row.decode())
+        code = array.dtype.kind + str(array.dtype.itemsize)
+        code = code if code in _KINDS else {"f": "f8", "b": "u1"}.get(array.dtype.kind, "i8")
+        kind = f"std_msgs/msg/{_KINDS[code]}MultiArray"
+        return kind, lambda _, row: self.array(kind, np.asarray(row, dtype=code))
+
+    def text(self, data: str) -> Any:
+        return self.types["std_msgs/msg/String"](data=data)
+
+    def array(self, kind: str, row: np.ndarray) -> Any:
+        dimension = self.types["std_msgs/msg/MultiArrayDimension"]
+        sizes = [dimension(label="", size=size, stride=size) for size in row.shape]
+        layout = self.types["std_msgs/msg/MultiArrayLayout"](dim=sizes, data_offset=0)
+        return self.types[kind](layout=layout, data=np.atleast_1d(row).ravel())
+
+    def joints(self, stamp: int, row: np.ndarray) -> Any:
+        empty = np.zeros(0)
+        position = np.asarray(row, dtype=np.float64)
+        return self.types["sensor_msgs/msg/JointState"](
+            header=self.header(stamp), name=[], position=position, velocity=empty, effort=empty
+        )
+
+    def pose(self, stamp: int, position: Any, rotation: Any) -> Any:
+        x, y, z = (float(one) for one in position)
+        phi = se3.log(rotation)
+        angle = float(phi.norm())
+        i, j, k = (float(one) * (math.sin(0.5 * angle) / angle if angle else 0.5) for one in phi)
+        w = math.cos(0.5 * angle)
+        point = self.types["geometry_msgs/msg/Point"](x=x, y=y, z=z)
+        turn = self.types["geometry_msgs/msg/Quaternion"](x=i, y=j, z=k, w=w)
+        pose = self.types["geometry_msgs/msg/Pose"](position=point, orientation=turn)
+        return self.types["geometry_msgs/msg/PoseStamped"](header=self.header(stamp), pose=pose)
+
+    def header(self, stamp: int) -> Any:
+        time = self.types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+        return self.types["std_msgs/msg/Header"](stamp=time, frame_id="hand")
+
+
+def _values(message: Any) -> Any:
+    """What a message of ours carries."""
+    if hasattr(message, "position"):
+        return message.position
+    return message.data.encode() if isinstance(message.data, str) else message.data
