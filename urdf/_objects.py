@@ -1,5 +1,5 @@
-"""Everyday objects: dimensions, masses, friction, all chosen by us. The names of the first six are the paper's;
-the other six reach from 15 to 66 mm and from 0.03 to 0.3 kg, and nothing is tuned on them.
+"""Everyday objects: dimensions, masses, friction, all chosen by us. The names of the first six are the
+paper's; the other six reach from 15 to 66 mm and from 0.03 to 0.3 kg, and nothing is tuned on them.
 
 Object frame: origin at the geometric centre, x along the longest side, y the direction in which the
 fingers press, z = x cross y. A part is a solid with its mass, of uniform density.
