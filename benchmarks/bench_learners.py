@@ -302,7 +302,7 @@ def table(compiled: bool) -> list[tuple[str, float, str]]:
             (f"predict b={b}, 256 models, per model", microseconds(predictions(gp, 6, shape)) / 256, "")
         )
     if compiled:
-        gp = filled(100, 6, compile_step=True)
+        gp = filled(100, 6, backend="inductor")
         rows.append(("update b=100 m=6 compiled", microseconds(updates(gp, 6), 2.0), "150"))
         compiled_call = torch.compile(gp.predict_with_jacobians)
         timed = Timed(torch.no_grad()(compiled_call), stream(64, 6)[0])

@@ -49,6 +49,14 @@ class Units:
         """The second derivative of a variance by the last columns of x."""
         return curvature
 
+    def affine(self) -> tuple[Tensor, ...] | None:
+        """Buffers (shift, scale) of x, then of y, with ``z = (x - shift) / scale``, for compiled loops.
+
+        They are read at each call and so change in place; ``()`` if x and y stay as they are. None if the
+        units are something else: the other methods are called then.
+        """
+        return () if type(self) is Units else None
+
 
 class Sample(NamedTuple):
     """One sample per model after its update."""

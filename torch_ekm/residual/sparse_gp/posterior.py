@@ -112,6 +112,20 @@ class SparsePosterior(nn.Module):
         diagonal = torch.where(self.active > 0, diagonal, 1.0)
         return (0.5 * (K + K.mT)).diagonal_scatter(diagonal, dim1=-2, dim2=-1)
 
+    def inverse_error(self, kernel: Kernel) -> float:
+        """Largest entry of ``Q K_i - 1_i``, i the point of each model that the others explain best.
+
+        There Q_ii is largest, and rounding, which every step adds, shows first. O(b^2); waits for a GPU.
+        """
+        Q = self.moments[..., 1, :, :]
+        point = Q.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None]
+        x = self.basis.gather(-2, point.expand(*self.batch_shape, 1, self.basis.shape[-1])).squeeze(-2)
+        here = self.slots == point.squeeze(-1)
+        k = kernel.vector(x, self.basis) * self.active
+        k = torch.where(here, kernel.diagonal(x).unsqueeze(-1) * (1.0 + self.jitter), k)
+        error = (Q @ k.unsqueeze(-1)).squeeze(-1) - here.to(k.dtype) * self.active
+        return float((error * self.active).abs().max())
+
     def rebuild(self, kernel: Kernel, s2: Float[Tensor, "*batch"]) -> None:
         """alpha, C, Q from the natural form by Cholesky."""
         self.rebuild_from(self.gram(kernel), s2)
