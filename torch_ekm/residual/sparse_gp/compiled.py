@@ -131,11 +131,15 @@ class CompiledLoops:
         """Whether this call is one for compiled loops; prepares the arrays."""
         if torch.compiler.is_compiling() or not _is_plain(x, (*gp.batch_shape, gp.in_features)):
             return False
-        if vars(gp)["_modules"]["kernel"] is not self._kernel or not self._is_current():
-            self._bind(gp)
-        if not self._usable:
+        if not self._is_bound(gp):
             return False
         return not (torch.is_grad_enabled() and any(p.requires_grad for p in self._parameters))
+
+    def _is_bound(self, gp: Learner) -> bool:
+        """Whether the arrays, made anew if need be, are of use."""
+        if vars(gp)["_modules"]["kernel"] is not self._kernel or not self._is_current():
+            self._bind(gp)
+        return self._usable
 
     def _is_current(self) -> bool:
         """Whether all tensors are those that were bound, at the same place in memory."""
