@@ -1,7 +1,7 @@
 """Does the learner survive a long smooth trajectory? ``benchmarks/soak_learners.py --samples 1000000``
 
-A 100 Hz trajectory that stands still at times, so samples repeat exactly, whose system jumps every 1e5 samples,
-with an outlier of a hundred times the noise in every thousand. Reports, over the whole run:
+A 100 Hz trajectory that stands still at times, so samples repeat exactly; its system jumps every 1e5 samples,
+and one sample in a thousand is an outlier of a hundred times the noise. Reports, over the whole run:
 whether all was finite, the smallest variance, the largest difference between the carried state and one
 rebuilt from the natural form, the condition of the basis, and the process' memory.
 

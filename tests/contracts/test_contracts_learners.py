@@ -115,7 +115,7 @@ def test_contract_of_river():
     pytest.importorskip("river")
     from torch_ekm.residual import RiverResidual
 
-    options = {"differentiable": False, "separates_noise": False}
+    options = {"differentiable": False, "separates_noise": False, "has_state": False}
     check_residual_learner(lambda **o: RiverResidual(3, 2, **o), **options)
     check_residual_learner(
         lambda **o: LearnerFleet(RiverResidual, 3, 2, batch_shape=(2,), **o), n_samples=12, **options

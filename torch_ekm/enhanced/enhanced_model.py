@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
 from torch.func import jacrev
 
+from .._recorded import Recorded, check_state, describe
 from ..exceptions import ShapeError
 from ..kinematics import GraspState, ServoModel
 from ..residual.base import ResidualLearner, UpdateReport
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from ..model import KinematicModel
 
 
-class EnhancedModel(nn.Module):
+class EnhancedModel(Recorded, nn.Module):
     """Enhanced model ``ds = f(s, da) + g(s, da)`` (eq. 3 of the E-KM paper).
 
     The learner ``g`` sees ``x = [encode(s); action_scale * da]`` and learns the residual
@@ -205,6 +206,27 @@ class EnhancedModel(nn.Module):
         weight = self._gather(weight) / self.output_scale**2
         v = action_variance(self.learner, self.features(state, action), n_a, weight)
         return Quadratic(v.value, v.gradient * scale, v.curvature * scale**2)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Encoding, outputs and scales: what the learner's inputs and outputs mean."""
+        made = describe(self)
+        names = "encode", "outputs", "action_scale", "output_scale"
+        return {"made_with": {**made, "arguments": {name: made["arguments"][name] for name in names}}}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """They were compared before anything was loaded."""
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        """See ``torch.nn.Module``; all or nothing.
+
+        Raises:
+            StateMismatchError: the state is one of another encoding, learner or model. Nothing was changed.
+        """
+        if strict:
+            check_state(self, state_dict)
+        return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     def _gather(self, increment: Tensor) -> Tensor:
         return increment if self.outputs is None else increment[..., self.outputs]

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import nn
 from torch.distributions import Distribution, Normal
 
+from .._recorded import Recorded, check_state, describe
 from ..exceptions import ParameterError, ShapeError
 from ..typing import Bool, Float, Tensor
 from .checks import check_count, check_counts, check_finite
 from .report import UpdateReport
 
 
-class ResidualLearner(nn.Module, ABC):
+class ResidualLearner(Recorded, nn.Module, ABC):
     """g(x), learned from a stream: ``y ~ N(g(x), R)``, and ``g = 0`` before the first sample.
 
     Shapes: a learner is a fleet of independent models of shape ``batch_shape`` (one model: ``()``).
@@ -155,6 +156,25 @@ class ResidualLearner(nn.Module, ABC):
         event = (one if mask is None else mask).to(torch.int64)
         novelty = 0.0 * one if novelty is None else novelty
         return UpdateReport(event, novelty, nis, one if weight is None else weight)
+
+    # -- state ----------------------------------------------------------------------------------
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What it was made with, so that no other learner takes its state. Subclasses add to it."""
+        return {"made_with": describe(self)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """See :meth:`get_extra_state`; what it was made with has been compared already."""
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **options: Any):
+        """All or nothing, wherever in a tree of modules this learner stands.
+
+        Raises:
+            StateMismatchError: the state is one of a learner made otherwise, or damaged. Nothing was changed.
+        """
+        own = {name[len(prefix) :]: value for name, value in state_dict.items() if name.startswith(prefix)}
+        check_state(self, own)
+        super()._load_from_state_dict(state_dict, prefix, *args, **options)
 
     # -- checks ---------------------------------------------------------------------------------
 

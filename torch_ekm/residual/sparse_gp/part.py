@@ -9,6 +9,7 @@ from typing import ClassVar, NamedTuple, Protocol, TypeVar
 import torch
 from torch import nn
 
+from ..._recorded import Recorded
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..kernels.kernel import Kernel
@@ -97,7 +98,7 @@ class Host(Protocol):
         ...
 
 
-class Part(nn.Module):
+class Part(Recorded, nn.Module):
     """One thing that a :class:`SparseOnlineGP` does beside projecting samples onto its basis.
 
     A part holds its few figures when it is made; the learner copies it and calls :meth:`bind` once, so one

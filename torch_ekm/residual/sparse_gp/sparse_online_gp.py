@@ -83,6 +83,7 @@ class SparseOnlineGP(DoubleStateLearner):
         ParameterError: a parameter is outside its range, or parts do not go together.
     """
 
+    starts = ("noise_variance",)
     units: Units
 
     def __init__(
@@ -345,7 +346,7 @@ class SparseOnlineGP(DoubleStateLearner):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Number of samples seen: the rhythm of rebuilds continues after a reload."""
-        return {"n_samples": self.n_samples}
+        return {**super().get_extra_state(), "n_samples": self.n_samples}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self.n_samples = int(state["n_samples"])
