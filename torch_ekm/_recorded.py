@@ -74,8 +74,9 @@ def plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {one.name: plain(getattr(value, one.name)) for one in dataclasses.fields(value)}
         return {"class": type(value).__name__, "arguments": fields}
-    if callable(value) and getattr(value, "__module__", "").startswith("torch_ekm."):
-        return {"named": value.__qualname__}
+    if isinstance(value, type) or inspect.isfunction(value):
+        ours = str(value.__module__).startswith("torch_ekm.")
+        return {"named": value.__qualname__} if ours else {"opaque": value.__qualname__}
     return {"opaque": type(value).__name__}
 
 

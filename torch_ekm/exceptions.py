@@ -193,6 +193,16 @@ class ObjectLostError(GraspError):
     """The object has left the hand (dropped, thrown, or not seen any more)."""
 
 
+class NoDerivativeError(EKMError, TypeError):
+    """A model f does not tell how its prediction changes with the action."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(
+            f"f gives no derivative by the action: {reason}; pass jacobian=<a function (state, action) -> "
+            "matrix (n_s, n_a)>, or jacobian='finite-difference'"
+        )
+
+
 # -- states and files -----------------------------------------------------------------------
 
 
