@@ -273,8 +273,10 @@ class SparseOnlineGP(DoubleStateLearner):
 
     def update(self, x: Tensor, y: Tensor, mask: Tensor | None = None) -> UpdateReport:
         """See :meth:`ResidualLearner.update`."""
-        if mask is None and self._loops is not None and self._loops.accept(self, x, y):
-            return self._absorb(x, y, None)
+        if mask is None and self._loops is not None:
+            with self.lock:
+                if self._loops.accept(self, x, y):
+                    return self._absorb(x, y, None)
         return super().update(x, y, mask)
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
