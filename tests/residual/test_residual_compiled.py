@@ -99,6 +99,10 @@ def test_compiled_loops_do_what_torch_does(name, shape):
         for figure in ("novelty", "nis", "weight"):
             torch.testing.assert_close(getattr(b, figure), getattr(a, figure), atol=1e-9, rtol=1e-9)
     assert_alike(reference, fast, x, float(y.abs().max()))
+    fast.posterior.alpha[..., 0, :] *= 1.0 + 1e-5  # a fault that both must see alike
+    drift, same = fast._loops.drift(fast), fast.posterior.drift(fast.kernel, fast.shared_noise())
+    assert drift is None if name == "deep" else drift == pytest.approx(same, rel=1e-4)
+    fast.posterior.alpha[..., 0, :] /= 1.0 + 1e-5
     if shape:
         mask = torch.rand(60, *shape, generator=torch.Generator().manual_seed(1)) < 0.7
         a, b = reference.update(x[:60], y[:60], mask), fast.update(x[:60], y[:60], mask)
@@ -180,8 +184,9 @@ def test_without_numba_torch_does_it_all(monkeypatch):
     reference = pair("all")[0]
     reference.update(x, y)
     monkeypatch.setitem(sys.modules, "numba", None)
-    monkeypatch.delitem(sys.modules, "torch_ekm.residual.sparse_gp.numba_kernels", raising=False)
-    monkeypatch.delattr(sys.modules["torch_ekm.residual.sparse_gp"], "numba_kernels", raising=False)
+    for name in ("numba_drift", "numba_kernels"):
+        monkeypatch.delitem(sys.modules, f"torch_ekm.residual.sparse_gp.{name}", raising=False)
+        monkeypatch.delattr(sys.modules["torch_ekm.residual.sparse_gp"], name, raising=False)
     compiled.load_kernels.cache_clear()
     try:
         assert compiled.load_kernels() is None

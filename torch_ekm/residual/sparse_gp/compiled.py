@@ -26,13 +26,13 @@ _PRUNING = {"kl": 0, "mean": 1, "freeze": 2}
 
 
 @cache
-def load_kernels() -> ModuleType | None:
+def load_kernels() -> tuple[ModuleType, ModuleType] | None:
     """The compiled loops; None where numba is missing, does not fit numpy, or cannot write its cache."""
     try:
-        from . import numba_kernels
+        from . import numba_drift, numba_kernels
     except (ImportError, RuntimeError):
         return None
-    return numba_kernels
+    return numba_kernels, numba_drift
 
 
 class Learner(Host, Protocol):
@@ -125,6 +125,14 @@ class CompiledLoops:
         results = (torch.from_numpy(a.reshape(s)) for a, s in zip((mean, v, J, dv), shapes, strict=True))
         return tuple(results)  # type: ignore[return-value]
 
+    def drift(self, gp: Learner) -> float | None:
+        """See ``SparsePosterior.drift``; None: torch must tell."""
+        if torch.compiler.is_compiling() or not self._is_bound(gp) or self._given:
+            return None
+        basis, active, _, _, moments, vectors = self._state
+        jitter = self._posterior.jitter
+        return self._drift(self._flags, basis, active, moments, vectors, *self._hyper, self._noise, jitter)
+
     # -- what they work on ----------------------------------------------------------------------
 
     def _takes(self, gp: Learner, x: Tensor) -> bool:
@@ -162,10 +170,11 @@ class CompiledLoops:
         tensors = (*state, gp.log_noise_variance, *self._parameters, *(units or ()))
         self._sources = _sources(gp, tensors)
         on_host = all(t.is_cpu and t.is_contiguous() for t in tensors) and gp.dtype == torch.float64
-        kernels = load_kernels() if on_host else None
+        modules = load_kernels() if on_host else None
         robust = [part.threshold for part in gp.weighing if type(part) is RobustWeight]
-        if kernels is None or len(robust) < len(gp.weighing):
+        if modules is None or len(robust) < len(gp.weighing):
             return
+        kernels, drift = modules
         self._given = own is None or units is None
         kind, n_actions = (kernels.GIVEN, 0) if self._given or own is None else own[0]
         self._flags, self._robust = np.array([kind, n_actions, 0, 0]), np.array(robust)
@@ -185,6 +194,7 @@ class CompiledLoops:
                 self._units = tuple(t.numpy().reshape(n, -1) for t in units)
         self._absorb: Callable = kernels.absorb_fleet
         self._query: Callable = kernels.query_fleet
+        self._drift: Callable = drift.drift_fleet
         self._have_squares: Callable = kernels.have_squares
         self._usable = True
 

@@ -22,7 +22,7 @@ from .posterior import SparsePosterior
 from .recursion import Absorbed, absorb, compiled_absorb
 
 _LATEST = 8  # rounds of ``refresh_every`` after which the caches are rebuilt in any case
-_DRIFT = 1e-7  # beyond which they are rebuilt at once, see SparsePosterior.drift
+_DRIFT = 1e-8  # beyond which they are rebuilt at once, see SparsePosterior.drift
 
 
 class Prediction(NamedTuple):
@@ -307,7 +307,8 @@ class SparseOnlineGP(DoubleStateLearner):
         """Whether the caches must be made anew although no part changed the state."""
         if self.device.type != "cpu" or (self.n_samples + 1) % (_LATEST * self.refresh_every) == 0:
             return True  # on a GPU looking would mean waiting
-        return self.posterior.drift(self.kernel, self.shared_noise()) > _DRIFT
+        drift = None if self._loops is None else self._loops.drift(self)
+        return (self.posterior.drift(self.kernel, self.shared_noise()) if drift is None else drift) > _DRIFT
 
     def start_anew(
         self,
