@@ -72,8 +72,8 @@ class SparseOnlineGP(DoubleStateLearner):
             ``"freeze"``: a full basis stays.
         parts: what it does beside; copied.
         refresh_every: samples after which parts may change the state, and the caches are rebuilt. Without a
-            part that does, and on the CPU, they are rebuilt only when they have drifted, and at the latest
-            after eight times as many.
+            part that does, and on the CPU, one looks twice as often whether they have drifted; they are
+            rebuilt when they have, and at the latest after eight times as many.
         backend: ``"auto"``: where numba is installed (extra ``fast``) compiled loops do updates and queries
             of one sample per model, on the CPU in float64; they agree with torch to rounding. ``"torch"``:
             never. ``"inductor"``: updates through torch.compile, which needs a C++ compiler and a minute.
@@ -282,8 +282,11 @@ class SparseOnlineGP(DoubleStateLearner):
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         on = None if mask is None else mask.to(x.dtype)
         done = self._learn(x, y, on)
-        due = (self.n_samples + 1) % self.refresh_every == 0
-        anew = due and (bool(self._rebuilding) or self._is_stale())
+        n = self.n_samples + 1
+        if self._rebuilding or self.device.type != "cpu":  # on a GPU looking would mean waiting
+            anew = n % self.refresh_every == 0
+        else:
+            anew = n % max(self.refresh_every // 2, 1) == 0 and self._is_stale(n)
         if self._noting:
             sample = Sample(x, y, on, done.innovation, done.variance, done.report)
             with torch.no_grad():
@@ -303,10 +306,10 @@ class SparseOnlineGP(DoubleStateLearner):
         z, t = self.units.inputs(x), self.units.targets(y)
         return step(self.posterior, z, t, self.kernel, self.shared_noise(), on, self.weighing)
 
-    def _is_stale(self) -> bool:
-        """Whether the caches must be made anew although no part changed the state."""
-        if self.device.type != "cpu" or (self.n_samples + 1) % (_LATEST * self.refresh_every) == 0:
-            return True  # on a GPU looking would mean waiting
+    def _is_stale(self, n: int) -> bool:
+        """Whether the caches must be made anew after n samples although no part changed the state."""
+        if n % (_LATEST * self.refresh_every) == 0:
+            return True
         drift = None if self._loops is None else self._loops.drift(self)
         return (self.posterior.drift(self.kernel, self.shared_noise()) if drift is None else drift) > _DRIFT
 
