@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import subprocess
 import sys
 
 import pytest
@@ -209,4 +210,17 @@ def test_drifted_caches_are_rebuilt_at_once_and_sound_ones_late():
     assert rebuilt == [256]
     gp.posterior.moments[1].mul_(1.0 + 1e-6)
     gp.update(x[300:330], y[300:330])
-    assert rebuilt == [256, 304]
+    assert rebuilt == [256, 320]
+
+
+@numba_here
+def test_where_numba_can_write_no_cache_torch_does_it_all():
+    code = (
+        "import numba.core.caching as caching, torch; caching.CacheImpl._locator_classes = []\n"
+        "from torch_ekm import SparseOnlineGP\n"
+        "from torch_ekm.residual.sparse_gp.compiled import load_kernels\n"
+        "x = torch.ones(3).double(); gp = SparseOnlineGP(3, 1); gp.update(x, x[:1])\n"
+        "assert load_kernels() is None and float(gp(x)) > 0.9"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -72,8 +72,8 @@ class SparseOnlineGP(DoubleStateLearner):
             ``"freeze"``: a full basis stays.
         parts: what it does beside; copied.
         refresh_every: samples after which parts may change the state, and the caches are rebuilt. Without a
-            part that does, and on the CPU, one looks twice as often whether they have drifted; they are
-            rebuilt when they have, and at the latest after eight times as many.
+            part that does, and on the CPU, one looks whether they have drifted (four times as often where
+            they do); they are rebuilt when they have, and at the latest after eight times as many.
         backend: ``"auto"``: where numba is installed (extra ``fast``) compiled loops do updates and queries
             of one sample per model, on the CPU in float64; they agree with torch to rounding. ``"torch"``:
             never. ``"inductor"``: updates through torch.compile, which needs a C++ compiler and a minute.
@@ -128,6 +128,7 @@ class SparseOnlineGP(DoubleStateLearner):
         )
         # samples of each model since the caches were made
         self.pending = nn.Buffer(torch.zeros(shape, **double))
+        self.drifts = False  # the last look at the caches found them less exact than rounding would have it
         self.n_samples = 0  # on the host, so that the rhythm of rebuilds never asks the GPU
         self._parts: tuple[Part, ...] = ()
         for part in copy_parts(parts):
@@ -237,7 +238,7 @@ class SparseOnlineGP(DoubleStateLearner):
             part.reset()
         self.pending.zero_()
         self.n_refused.zero_()
-        self.n_samples = 0
+        self.n_samples, self.drifts = 0, False
 
     @torch.no_grad()
     def set_basis(self, x: Float[Tensor, "n *batch in"]) -> None:
@@ -286,7 +287,8 @@ class SparseOnlineGP(DoubleStateLearner):
         if self._rebuilding or self.device.type != "cpu":  # on a GPU looking would mean waiting
             anew = n % self.refresh_every == 0
         else:
-            anew = n % max(self.refresh_every // 2, 1) == 0 and self._is_stale(n)
+            every = max(self.refresh_every // 4, 1) if self.drifts else self.refresh_every
+            anew = n % every == 0 and self._is_stale(n)
         if self._noting:
             sample = Sample(x, y, on, done.innovation, done.variance, done.report)
             with torch.no_grad():
@@ -311,7 +313,9 @@ class SparseOnlineGP(DoubleStateLearner):
         if n % (_LATEST * self.refresh_every) == 0:
             return True
         drift = None if self._loops is None else self._loops.drift(self)
-        return (self.posterior.drift(self.kernel, self.shared_noise()) if drift is None else drift) > _DRIFT
+        drift = self.posterior.drift(self.kernel, self.shared_noise()) if drift is None else drift
+        vars(self)["drifts"] = drift > 0.01 * _DRIFT
+        return drift > _DRIFT
 
     def start_anew(
         self,
@@ -352,10 +356,10 @@ class SparseOnlineGP(DoubleStateLearner):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Number of samples seen: the rhythm of rebuilds continues after a reload."""
-        return {**super().get_extra_state(), "n_samples": self.n_samples}
+        return {**super().get_extra_state(), "n_samples": self.n_samples, "drifts": self.drifts}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self.n_samples = int(state["n_samples"])
+        self.n_samples, self.drifts = int(state["n_samples"]), bool(state["drifts"])
 
 
 def _overriding(parts: Iterable[Part], *names: str) -> tuple[Part, ...]:
