@@ -2,7 +2,8 @@
 for a table of everything measured in one run with its ratios.
 
 Twenty inputs, one thread, float64, a full basis with a point added and one pruned at every sample. Plain C,
-compiled on the spot, is the limit; GPyTorch, scikit-learn and river take part where they are installed.
+compiled on the spot, is the limit; GPyTorch, scikit-learn and river take part where they are installed. What
+is compared takes turns.
 """
 
 from __future__ import annotations
@@ -12,8 +13,11 @@ import ctypes
 import functools
 import importlib.util
 import itertools
+import math
+import os
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -24,11 +28,16 @@ import pytest
 import torch
 
 from torch_ekm.residual import (
+    CalibrateNoise,
     DeepKernel,
     DeepKernelSOGP,
+    DetectChanges,
+    ForgettingFactor,
     LearnHyperparameters,
+    RobustWeight,
     SparseOnlineGP,
     SquaredExponential,
+    Standardize,
 )
 
 D = 20
@@ -264,53 +273,112 @@ def microseconds(call: Callable, budget: float = 0.6) -> float:
     return float(np.median(times) * 1e6)
 
 
-def table(compiled: bool) -> list[tuple[str, float, str]]:
-    """(what, microseconds, target) of everything, in one run."""
-    rows: list[tuple[str, float, str]] = []
-    for b in (30, 100, 300):
-        rows.append((f"plain C update b={b} m=6", PlainC(b, 6).microseconds("update"), ""))
-        rows.append((f"plain C predict b={b} m=6", PlainC(b, 6).microseconds("predict"), ""))
-        gp = filled(b, 6)
-        rows.append((f"update b={b} m=6", microseconds(updates(gp, 6)), "300" if b == 100 else ""))
-        rows.append(
-            (f"predict+jacobians b={b} m=6", microseconds(predictions(gp, 6)), "120" if b == 100 else "")
-        )
-    gp = filled(100, 26)
-    rows.append(("update b=100 m=26", microseconds(updates(gp, 26)), "1.2 x m=6"))
-    rows.append(("predict+jacobians b=100 m=26", microseconds(predictions(gp, 26)), "1.2 x m=6"))
-    for name, plain, adaptive in (
-        ("kernel", SparseOnlineGP(D, 6), SparseOnlineGP(D, 6, parts=[LearnHyperparameters()])),
-        (
-            "deep kernel",
-            SparseOnlineGP(D, 6, kernel=DeepKernel(SquaredExponential(D))),
-            DeepKernelSOGP(D, 6),
-        ),
-    ):
-        for gp in (plain, adaptive):
-            gp.update(*stream(2110, 6, seed=1))  # a memory is full then
-        block, cost = stream(64, 6), []
-        for gp in (plain, adaptive):
-            cost.append(microseconds(functools.partial(gp.update, *block), 2.0) / 64)
-        rows.append((f"adaptation of the {name}, per sample", cost[1] - cost[0], "300"))
-    for b in (30, 100):
-        gp, shape = filled(b, 6, (256,)), (256,)
-        target = "10" if b == 30 else "40"
-        rows.append(
-            (f"update b={b}, 256 models, per model", microseconds(updates(gp, 6, shape)) / 256, target)
-        )
-        rows.append(
-            (f"predict b={b}, 256 models, per model", microseconds(predictions(gp, 6, shape)) / 256, "")
-        )
+def alternately(calls: dict[str, Callable], rounds: int = 5, budget: float = 0.3) -> dict[str, float]:
+    """Medians of calls that take turns, so that what else the machine does falls on all of them."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, call in calls.items():
+            times[name].append(microseconds(call, budget))
+    return {name: float(np.median(each)) for name, each in times.items()}
+
+
+def all_of(gp: SparseOnlineGP, m: int, shape: tuple[int, ...], n: int) -> Callable:
+    """n updates in a row, with the rebuilds and looks at the drift that fall among them."""
+    x, y = stream(64, m, shape)
+    pairs = itertools.cycle(list(zip(x, y, strict=True)))
+
+    def call() -> None:
+        for _ in range(n):
+            gp.update(*next(pairs))
+
+    return call
+
+
+FIRST_CALL = """import time, torch
+from torch_ekm.residual import SparseOnlineGP
+gp, begin = SparseOnlineGP(20, 6), time.perf_counter()
+gp.update(torch.zeros(20).double(), torch.zeros(6).double())
+print(time.perf_counter() - begin)"""
+
+
+def first_call(cache: Path) -> float:
+    """Seconds of the first update in a new process."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    command = [sys.executable, "-c", FIRST_CALL]
+    return float(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+
+
+def against_c(b: int, m: int, backends: dict[str, dict]) -> list[tuple[str, float, float]]:
+    """(what, microseconds, times plain C), C and each backend in turns."""
+    reference = PlainC(b, m)
+    rows = []
+    for what, make in (("update", updates), ("predict", predictions)):
+        calls = {name: make(filled(b, m, **options), m) for name, options in backends.items()}
+        rounds = []
+        for _ in range(5):
+            limit = reference.microseconds(what)
+            rounds.append([limit, *(microseconds(call, 0.3) for call in calls.values())])
+        limit, *found = np.median(rounds, axis=0)
+        ratios = np.median(np.array(rounds) / np.array(rounds)[:, :1], axis=0)[1:]
+        name = "predict + jacobians" if what == "predict" else what
+        rows.append((f"{name} b={b} m={m}: plain C", limit, 1.0))
+        for label, us, ratio in zip(calls, found, ratios, strict=True):
+            rows.append((f"{name} b={b} m={m}: {label}", us, ratio))
+    return rows
+
+
+def table(compiled: bool) -> list[tuple[str, float, float]]:
+    """(what, microseconds, ratio to the row named in it or nan)."""
+    backends: dict[str, dict] = {"auto": {"backend": "auto"}, "torch": {"backend": "torch"}}
     if compiled:
-        gp = filled(100, 6, compile_step=True)
-        rows.append(("update b=100 m=6 compiled", microseconds(updates(gp, 6), 2.0), "150"))
-        compiled_call = torch.compile(gp.predict_with_jacobians)
-        timed = Timed(torch.no_grad()(compiled_call), stream(64, 6)[0])
-        rows.append(("predict+jacobians b=100 m=6 compiled", microseconds(timed), "60"))
+        backends["inductor"] = {"backend": "inductor"}
+    rows: list[tuple[str, float, float]] = []
+    for b, m in ((30, 6), (100, 6), (300, 6), (100, 26)):
+        rows += against_c(b, m, backends)
+    for b in (30, 100):
+        shape = (256,)
+        fleets = {name: filled(b, 6, shape, backend=name) for name in ("auto", "torch")}
+        calls: dict[str, Callable] = {}
+        for name, gp in fleets.items():
+            calls[f"update b={b}, 256 models, per model: {name}"] = updates(gp, 6, shape)
+            calls[f"predict b={b}, 256 models, per model: {name}"] = predictions(gp, 6, shape)
+        found = alternately(calls, rounds=3)
+        rows += [(name, us / 256, math.nan) for name, us in found.items()]
+        begin = all_of(fleets["auto"], 6, shape, 256)
+        whole = f"update b={b}, 256 models, per model: auto, mean with rebuilds"
+        rows.append((whole, microseconds(begin, 0.0) / 256**2, math.nan))
+    for learned, parts in (
+        ("units", [Standardize()]),
+        ("robust, forgets", [RobustWeight(3.0), ForgettingFactor(0.99)]),
+        ("calibrated, detects changes", [CalibrateNoise(), DetectChanges()]),
+        ("learns its kernel", [LearnHyperparameters()]),
+    ):
+        gps = {name: filled(100, 6, backend=name, parts=parts) for name in ("auto", "torch")}
+        calls = {backend: all_of(gp, 6, (), 64) for backend, gp in gps.items()}
+        for _ in range(17):  # units stand still after a thousand samples
+            [call() for call in calls.values()]
+        found = alternately(calls, rounds=3)
+        for backend, us in found.items():
+            rows.append((f"update b=100 m=6, {learned}, mean: {backend}", us / 64, math.nan))
+    deep = SparseOnlineGP(D, 6, kernel=DeepKernel(SquaredExponential(D))), DeepKernelSOGP(D, 6)
+    for gp in deep:
+        gp.update(*stream(2110, 6, seed=1))  # a memory is full then
+    cost = [microseconds(functools.partial(gp.update, *stream(64, 6)), 2.0) / 64 for gp in deep]
+    rows.append(("adaptation of the deep kernel, per sample", cost[1] - cost[0], math.nan))
     for name, make in PEERS.items():
         module = name.split()[0].replace("scikit-learn", "sklearn")
         if importlib.util.find_spec(module) is not None:
-            rows.append((name + " b=100 m=6", microseconds(make(100, 6), 2.0), ""))
+            gp = filled(100, 6)
+            ours = Timed(lambda x, y, gp=gp: (gp.update(x, y), gp.predict(x + 0.1)), *stream(64, 6))
+            found = alternately({"peer": make(100, 6), "ours": ours}, rounds=3)
+            rows.append(
+                (f"{name} b=100 m=6, over our update + predict", found["peer"], found["peer"] / found["ours"])
+            )
+    if importlib.util.find_spec("numba") is not None:
+        with tempfile.TemporaryDirectory() as cache:
+            for which in ("without", "with"):
+                name = f"first update of a process, {which} cache [s]"
+                rows.append((name, first_call(Path(cache)), math.nan))
     return rows
 
 
@@ -318,14 +386,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--compiled", action="store_true", help="torch.compile too (minutes)")
     parser.add_argument("--output", type=Path, help="write the table as Markdown here")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    rows = table(options.compiled)
-    values = {name: value for name, value, _ in rows}
-    update, limit = values["update b=100 m=6"], values["plain C update b=100 m=6"]
-    lines = ["| what | us | target | of our update | of plain C |", "|---|---|---|---|---|"]
-    for name, value, target in rows:
-        lines.append(f"| {name} | {value:.1f} | {target} | {value / update:.2f} | {value / limit:.1f} |")
+    options, _ = parser.parse_args(), torch.set_num_threads(1)
+    lines = ["| what | us | ratio |", "|---|---|---|"]
+    for name, value, ratio in table(options.compiled):
+        lines.append(f"| {name} | {value:.1f} | {'' if math.isnan(ratio) else f'{ratio:.1f}'} |")
     text = "\n".join(lines)
     print(text)
     if options.output:

@@ -14,13 +14,16 @@ from __future__ import annotations
 from importlib.metadata import PackageNotFoundError, version
 
 from . import exceptions
-from .enhanced import EnhancedModel
+from .enhanced import EnhancedModel, load, save
 from .exceptions import (
     EKMError,
+    FileFormatError,
     MissingExtraError,
     NonFiniteError,
+    NoStateError,
     ParameterError,
     ShapeError,
+    StateMismatchError,
     UnknownNameError,
 )
 from .residual import (
@@ -56,9 +59,10 @@ except PackageNotFoundError:  # a source tree that was never installed
 
 __all__ = [
     "ActionLinearKernel", "CalibrateNoise", "DeepKernelSOGP", "DetectChanges", "EKMError", "EnhancedModel",
-    "ForgettingFactor", "KRLSTracker", "LearnHyperparameters", "LearnerFleet", "LocalGPs",
-    "MissingExtraError", "MixtureResidual", "NonFiniteError", "ParameterError", "ProcessNoise",
+    "FileFormatError", "ForgettingFactor", "KRLSTracker", "LearnHyperparameters", "LearnerFleet", "LocalGPs",
+    "MissingExtraError", "MixtureResidual", "NoStateError", "NonFiniteError", "ParameterError",
+    "ProcessNoise",
     "RandomFeatureRLS", "RecursiveLeastSquares", "ReplayMLP", "ResidualLearner", "RobustWeight", "ShapeError",
     "SparseOnlineGP", "SquaredExponential", "Standardize", "UnknownNameError", "UpdateEvent", "UpdateReport",
-    "WindowGP", "ZeroResidual", "__version__", "exceptions",
+    "StateMismatchError", "WindowGP", "ZeroResidual", "__version__", "exceptions", "load", "save",
 ]  # fmt: skip

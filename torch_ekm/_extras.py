@@ -13,6 +13,7 @@ _BRINGS = {
     "experiments": ("joblib", "matplotlib", "mpl_toolkits", "jinja2", "pyvista", "viser", "typer", "rich"),
     "notebooks": ("IPython", "pyarrow"),
     "peers": ("gpytorch", "river"),
+    "fast": ("numba",),
     "cluster": ("distributed",),
     "interop": ("sklearn", "onnx", "onnxscript", "casadi", "rosbags"),
 }

@@ -193,6 +193,57 @@ class ObjectLostError(GraspError):
     """The object has left the hand (dropped, thrown, or not seen any more)."""
 
 
+class NoDerivativeError(EKMError, TypeError):
+    """A model f does not tell how its prediction changes with the action."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(
+            f"f gives no derivative by the action: {reason}; pass jacobian=<a function (state, action) -> "
+            "matrix (n_s, n_a)>, or jacobian='finite-difference'"
+        )
+
+
+# -- states and files -----------------------------------------------------------------------
+
+
+class StateMismatchError(EKMError, RuntimeError):
+    """A state dict or a file is not one of this learner; nothing of it was taken over.
+
+    Attributes:
+        differences: what does not fit, one text each.
+    """
+
+    def __init__(self, differences: Iterable[str]) -> None:
+        self.differences = tuple(differences)
+        shown = "; ".join(self.differences[:5]) + ("; ..." if len(self.differences) > 5 else "")
+        super().__init__(f"the state is not one of this learner, nothing was loaded: {shown}")
+
+
+class NoStateError(EKMError, TypeError):
+    """A learner cannot be saved as plain figures.
+
+    Attributes:
+        learner: its kind.
+    """
+
+    def __init__(self, learner: str, reason: str) -> None:
+        self.learner = learner
+        super().__init__(f"{learner} has no state dict and cannot be saved: {reason}")
+
+
+class FileFormatError(EKMError, ValueError):
+    """A file cannot be read as what it should be.
+
+    Attributes:
+        path: of the file.
+        problem: what is wrong with it.
+    """
+
+    def __init__(self, path: object, problem: str) -> None:
+        self.path, self.problem = str(path), problem
+        super().__init__(f"{path}: {problem}")
+
+
 # -- solvers and control --------------------------------------------------------------------
 
 

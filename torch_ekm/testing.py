@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Normal
 
-from .exceptions import EKMError, NonFiniteError, ShapeError
+from .exceptions import EKMError, NonFiniteError, NoStateError, ShapeError, StateMismatchError
 from .residual.base import ResidualLearner, UpdateReport
 
 QUERY_SHAPES = ((), (1,), (5,), (2, 3))
@@ -29,6 +29,7 @@ def check_residual_learner(
     differentiable: bool = True,
     vmap: bool = True,
     separates_noise: bool = True,
+    has_state: bool = True,
 ) -> None:
     """Assert every clause of the learner contract that a short stream can show, each dtype and query shape.
 
@@ -42,6 +43,8 @@ def check_residual_learner(
         differentiable: whether gradients of ``forward`` reach x and equal ``linearize``.
         vmap: whether ``torch.func.vmap(jacrev(learner))`` must work.
         separates_noise: whether ``predict(x, observation=True)`` is wider than ``predict(x)``.
+        has_state: whether it has a state dict; without one it raises NoStateError, and is copied and
+            pickled only.
 
     Raises:
         AssertionError: naming the clause.
@@ -51,7 +54,7 @@ def check_residual_learner(
         x, y = _stream(learner, n_samples)
         _check_module(learner)
         _check_prior(learner, x)
-        _check_bad_input(learner, x, y)
+        _check_bad_input(learner, x, y, has_state)
         given = x.clone(), y.clone()
         for t in range(n_samples // 2):
             _check_report(learner.update(x[t], y[t]), learner)
@@ -59,13 +62,13 @@ def check_residual_learner(
         _check_report(learner.update(x[rest], y[rest]), learner, len(x[rest]))
         assert torch.equal(x, given[0]), "update changed the caller's x"
         assert torch.equal(y, given[1]), "update changed the caller's y"
-        _check_bad_input(learner, x, y)
+        _check_bad_input(learner, x, y, has_state)
         _check_learns(learner, x, separates_noise)
         _check_queries(learner, x)
         if differentiable:
             _check_gradients(learner, x, vmap)
         _check_modes(learner, x)
-        _check_persistence(learner, factory, x, y)
+        _check_persistence(learner, factory, x, y, has_state)
         _check_mask(learner, x, y)
         _check_skip(learner, x, y)
         _check_batch_is_sequence(factory, learner, x, y)
@@ -157,8 +160,8 @@ def _check_modes(learner: ResidualLearner, x: Tensor) -> None:
     assert torch.equal(mean, learner.eval()(x)), "train() and eval() predict differently"
 
 
-def _check_bad_input(learner: ResidualLearner, x: Tensor, y: Tensor) -> None:
-    before = copy.deepcopy(learner.state_dict())
+def _check_bad_input(learner: ResidualLearner, x: Tensor, y: Tensor, has_state: bool) -> None:
+    before = _figures(learner, has_state)
     cases: list[tuple[str, Tensor, Tensor]] = [
         ("width of x", x[0][..., :-1], y[0]),
         ("width of y", x[0], torch.cat([y[0], y[0]], -1)),
@@ -174,7 +177,7 @@ def _check_bad_input(learner: ResidualLearner, x: Tensor, y: Tensor) -> None:
                 pair[which][2, ..., -1] = value  # the last of a block: the first must not stay
                 _raises(lambda p=pair: learner.update(*p), NonFiniteError, f"{value} in a sample")
     _raises(lambda: learner(x[0][..., :-1]), ShapeError, "width of a query")
-    assert _same(before, learner.state_dict()), "a refused sample changed the state"
+    assert _same(before, _figures(learner, has_state)), "a refused sample changed the state"
 
 
 def _check_mask(learner: ResidualLearner, x: Tensor, y: Tensor) -> None:
@@ -211,17 +214,19 @@ def _check_reset(learner: ResidualLearner, factory: Callable, x: Tensor) -> None
         _close(*deviations, learner, "reset() leaves the deviation of what was learned")
 
 
-def _check_persistence(learner: ResidualLearner, factory: Callable, x: Tensor, y: Tensor) -> None:
-    file = io.BytesIO()
-    torch.save(learner.state_dict(), file)
-    file.seek(0)
-    fresh = factory(dtype=learner.dtype)
-    fresh.load_state_dict(torch.load(file, weights_only=True))
-    copies = {
-        "state_dict": fresh,
-        "deepcopy": copy.deepcopy(learner),
-        "pickle": pickle.loads(pickle.dumps(learner)),
-    }
+def _check_persistence(
+    learner: ResidualLearner, factory: Callable, x: Tensor, y: Tensor, has_state: bool
+) -> None:
+    copies = {"deepcopy": copy.deepcopy(learner), "pickle": pickle.loads(pickle.dumps(learner))}
+    if has_state:
+        copies["state_dict"] = factory(dtype=learner.dtype)
+        _check_damaged_state(learner, copies["state_dict"])
+        file = io.BytesIO()
+        torch.save(learner.state_dict(), file)
+        file.seek(0)
+        copies["state_dict"].load_state_dict(torch.load(file, weights_only=True))
+    else:
+        _raises(learner.state_dict, NoStateError, "has_state=False")
     original = copy.deepcopy(learner)
     original.update(x, y)
     for name, other in copies.items():
@@ -236,6 +241,27 @@ def _check_persistence(learner: ResidualLearner, factory: Callable, x: Tensor, y
     _close(
         single(x.float()).to(x), original(x), single, "after .to(float32) it learns differently", factor=1000
     )
+
+
+def _check_damaged_state(learner: ResidualLearner, fresh: ResidualLearner) -> None:
+    """A state that is not one of this learner is refused whole: the last entry decides on the first."""
+    before = copy.deepcopy(fresh.state_dict())
+    good = copy.deepcopy(learner.state_dict())
+    tensors = [name for name, value in good.items() if isinstance(value, Tensor)]
+    figures = [name for name in tensors if good[name].is_floating_point() and good[name].numel()]
+    damaged = {"shape": {**good, tensors[-1]: good[tensors[-1]].new_zeros(7, 3, 1)}}
+    damaged["missing"] = {name: value for name, value in good.items() if name != tensors[-1]}
+    if figures:
+        damaged["NaN"] = {**good, figures[-1]: torch.full_like(good[figures[-1]], torch.nan)}
+    for name, state in damaged.items():
+        _raises(lambda s=state: fresh.load_state_dict(s), StateMismatchError, f"state dict: {name}")
+        assert _same(before, fresh.state_dict()), f"state dict: half of a damaged one was loaded ({name})"
+
+
+def _figures(learner: ResidualLearner, has_state: bool) -> dict:
+    if has_state:
+        return copy.deepcopy(learner.state_dict())
+    return {name: value.clone() for name, value in learner.named_buffers()}
 
 
 def _check_batch_is_sequence(factory: Callable, learner: ResidualLearner, x: Tensor, y: Tensor) -> None:

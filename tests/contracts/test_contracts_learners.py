@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+import sys
+import types
+from pathlib import Path
 
 import pytest
 import torch
@@ -115,7 +119,7 @@ def test_contract_of_river():
     pytest.importorskip("river")
     from torch_ekm.residual import RiverResidual
 
-    options = {"differentiable": False, "separates_noise": False}
+    options = {"differentiable": False, "separates_noise": False, "has_state": False}
     check_residual_learner(lambda **o: RiverResidual(3, 2, **o), **options)
     check_residual_learner(
         lambda **o: LearnerFleet(RiverResidual, 3, 2, batch_shape=(2,), **o), n_samples=12, **options
@@ -138,6 +142,16 @@ def test_contract_of_gpytorch_window():
 
     options = {"window": 10, "refit_every": 8, "steps": 2, "noise_variance": 0.05}
     check_residual_learner(lambda **o: GPyTorchWindow(3, 2, **options, **o), vmap=False)
+
+
+def test_the_learner_of_the_docs_uses_public_names_only(monkeypatch):
+    text = (Path(__file__).parents[2] / "docs" / "choosing_a_learner.md").read_text(encoding="utf-8")
+    (block,) = [one for one in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "class Offset" in one]
+    assert not re.search(r"\b_[a-z]", block)
+    assert len(block.split("class Offset")[1].split("\n\n\n")[0].splitlines()) <= 22
+    module = types.ModuleType("of_the_docs")
+    monkeypatch.setitem(sys.modules, module.__name__, module)  # a class is pickled by its module's name
+    exec(compile(block, "choosing_a_learner.md", "exec"), vars(module))
 
 
 class _WrongPrior(RecursiveLeastSquares):

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch.func import jacrev
 
 from torch_ekm.enhanced import EnhancedModel, GraspEncoding
-from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
+from torch_ekm.exceptions import (
+    NoDerivativeError,
+    NonFiniteError,
+    ParameterError,
+    ShapeError,
+    UnknownNameError,
+)
 from torch_ekm.kinematics.grasp_state import GraspState
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.residual import ActionLinearKernel, SparseOnlineGP
@@ -129,3 +136,70 @@ def test_grasp_encoding_is_zero_at_the_reference_and_scaled(generator: torch.Gen
         GraspEncoding(reference, [4])
     with pytest.raises(ParameterError, match="q_scale"):
         GraspEncoding(reference, [0], q_scale=0.0)
+
+
+def in_numpy(state: torch.Tensor, action: torch.Tensor) -> np.ndarray:
+    """The same model, from a library that knows no tensors."""
+    s, a = state.numpy(), action.numpy()
+    return np.stack([a[..., 0], a[..., 1] * np.cos(s[..., 0]), a.prod(-1)], axis=-1)
+
+
+def half_detached(state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+    value = model(state, action)
+    return torch.cat([value[..., :2], value[..., 2:].detach()], dim=-1)
+
+
+@pytest.mark.parametrize(
+    "f", [in_numpy, torch.no_grad()(model), lambda s, a: model(s, a).detach(), half_detached]
+)
+def test_a_model_without_derivative_is_refused_and_differences_help(f, generator: torch.Generator) -> None:
+    n_x = N_S + N_A
+    state, action = (one[0] for one in sample(generator))
+    ekm = EnhancedModel(f, SparseOnlineGP(n_x, 3, capacity=20))
+    ekm.update(state, action, world(state, action))  # learning and predicting need none
+    torch.testing.assert_close(ekm.predict(state, action).mean, ekm(state, action))
+    with pytest.raises(NoDerivativeError, match="finite-difference"):
+        ekm.linearize(state, action)
+    expected = EnhancedModel(model, ekm.learner).linearize(state, action)
+    for jacobian in ("finite-difference", lambda s, a: jacrev(lambda b: model(s, b))(a).numpy()):
+        given = EnhancedModel(f, ekm.learner, jacobian=jacobian).linearize(state, action)
+        torch.testing.assert_close(given, expected, atol=1e-8, rtol=1e-8)
+    with pytest.raises(ShapeError, match="jacobian"):
+        EnhancedModel(f, ekm.learner, jacobian=lambda s, a: torch.eye(2)).linearize(state, action)
+
+
+@pytest.mark.parametrize("jacobian", [None, "finite-difference"])
+def test_batches_and_dtypes(jacobian, generator: torch.Generator) -> None:
+    ekm = train(enhanced(outputs=[2, 0, 1], action_scale=0.7, jacobian=jacobian), generator, 40)
+    states, actions = sample(generator, 6)
+    for shape in ((6,), (2, 3)):
+        value, J = ekm.linearize(states.view(*shape, N_S), actions.view(*shape, N_A))
+        for i in range(6):
+            one = ekm.linearize(states[i], actions[i])
+            torch.testing.assert_close(value.view(6, -1)[i], one[0], atol=1e-11, rtol=0)
+            torch.testing.assert_close(J.view(6, 3, N_A)[i], one[1], atol=1e-8, rtol=0)
+    s, a = states[0].float(), actions[0].float()
+    law = ekm.predict(s, a)
+    single = (*ekm.linearize(s, a), ekm(s, a), law.mean, law.stddev)
+    assert {one.dtype for one in single} == {torch.float32}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"model": 3.0},
+        {"learner": torch.nn.Linear(5, 3)},
+        {"encode": "identity"},
+        {"outputs": [0, 0, 1]},
+        {"outputs": [0, 1]},
+        {"action_scale": 0.0},
+        {"output_scale": [1.0, 2.0]},
+        {"output_scale": torch.tensor([1.0, torch.nan, 2.0])},
+        {"servo": object()},
+        {"jacobian": "exact"},
+    ],
+)
+def test_arguments_are_checked(wrong: dict) -> None:
+    given = {"model": model, "learner": SparseOnlineGP(N_S + N_A, 3, capacity=4), **wrong}
+    with pytest.raises(ParameterError, match=next(iter(wrong))):
+        EnhancedModel(given.pop("model"), given.pop("learner"), **given)

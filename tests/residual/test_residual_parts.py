@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import threading
+import time
 from collections.abc import Iterable
 
 import pytest
@@ -328,3 +330,37 @@ def test_at_most_a_dozen_arguments():
 
     every_learner = {"self", "options"}
     assert len(set(inspect.signature(SparseOnlineGP.__init__).parameters) - every_learner) <= 12
+
+
+class OneAtATime(Part):
+    """Sleeps in the middle of an update and counts who else is there."""
+
+    def bind(self, learner):
+        self.inside = self.most = 0
+
+    def after_update(self, learner, sample):
+        self.inside += 1
+        self.most = max(self.most, self.inside)
+        time.sleep(1e-3)
+        self.inside -= 1
+        return False
+
+
+@pytest.mark.parametrize("backend", ["auto", "torch"])
+def test_updates_of_two_threads_come_one_after_the_other(backend):
+    gp = SparseOnlineGP(3, 2, capacity=8, parts=[OneAtATime()], backend=backend)
+    x = torch.randn(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def work():
+        for row in x:
+            gp.update(row, row[:2])
+
+    threads = [threading.Thread(target=work) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert gp.n_samples == 80
+    assert gp.part(OneAtATime).most == 1
+    with copy.deepcopy(gp).lock, gp.lock:  # each has its own, and its holder may update
+        gp.update(x, x[:, :2])

@@ -179,7 +179,7 @@ def test_deleting_the_newest_is_the_projection(monkeypatch):
     monkeypatch.setattr(
         recursion, "pruning_loss", lambda posterior, c, q, w: (posterior.slots != 10).double()
     )
-    other = learner(capacity=10, refresh_every=10**6)
+    other = learner(capacity=10, refresh_every=10**6, backend="torch")  # that is what was patched
     other.set_basis(x[:10])
     assert other.update(x[10], y[10]).event == UpdateEvent.REPLACED
     assert int(other.posterior.slot) == 10

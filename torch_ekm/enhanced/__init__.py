@@ -6,6 +6,7 @@ from .action_variance import Quadratic
 from .encoding import GraspEncoding
 from .enhanced_model import EnhancedModel
 from .grasp_learner import grasp_learner
+from .saving import load, save
 from .trust_region import TrustOptions, TrustRegion
 
 __all__ = [
@@ -15,4 +16,6 @@ __all__ = [
     "TrustOptions",
     "TrustRegion",
     "grasp_learner",
+    "load",
+    "save",
 ]

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from .._recorded import Recorded
 from ..exceptions import UnknownNameError
 from ..kinematics.grasp_state import GraspState
 from ..residual.checks import check_positive
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from ..model import KinematicModel
 
 
-class GraspEncoding:
+class GraspEncoding(Recorded):
     """``x_s = [(q_sel - q_ref) / q_scale; (o - o_ref) / o_scale; Log(R R_ref^T) / r_scale]``.
 
     Scaled so that the workspace of a pinch is of the order of 1 in each input.

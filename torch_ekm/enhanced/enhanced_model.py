@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import nn
-from torch.func import jacrev
 
-from ..exceptions import ShapeError
+from .._recorded import Recorded, check_state, describe
+from ..exceptions import ParameterError, ShapeError
 from ..kinematics import GraspState, ServoModel
 from ..residual.base import ResidualLearner, UpdateReport
 from ..residual.checks import check_finite
@@ -19,13 +19,14 @@ from ..typing import Float, Tensor
 from .action_variance import Quadratic, action_variance
 from .encoding import GraspEncoding
 from .grasp_learner import grasp_learner
+from .model_jacobian import checked_jacobian, differentiated, finite_differences
 from .trust_region import TrustRegion
 
 if TYPE_CHECKING:
     from ..model import KinematicModel
 
 
-class EnhancedModel(nn.Module):
+class EnhancedModel(Recorded, nn.Module):
     """Enhanced model ``ds = f(s, da) + g(s, da)`` (eq. 3 of the E-KM paper).
 
     The learner ``g`` sees ``x = [encode(s); action_scale * da]`` and learns the residual
@@ -33,9 +34,9 @@ class EnhancedModel(nn.Module):
     update ``g = 0``, so ``f + g == f`` exactly.
 
     Args:
-        model: any callable ``f(state, action) -> increment``. If it has ``linearize(state)``
-            with a ``manipulation_jacobian`` J_m ``(n_s, n_a)``, then ``f = J_m da`` and J_m is used
-            instead of automatic differentiation.
+        model: any callable ``f(state, action) -> increment``; it may give arrays. If it has
+            ``linearize(state)`` with a ``manipulation_jacobian`` J_m ``(n_s, n_a)``, then ``f = J_m da`` and
+            J_m is its derivative.
         learner: a residual learner (see :mod:`torch_ekm.residual`) with
             ``in_features = dim(encode(s)) + dim(a)``.
         encode: turns the state into the learner's inputs ``(*batch, d)``; the identity if None
@@ -48,6 +49,13 @@ class EnhancedModel(nn.Module):
         force_learner: of the fingertips' normal forces, with the inputs of ``learner`` and one output [N] for
             each pad; without it the model's sensitivities of the forces are believed.
         trust: sets the pace of a closed loop by how well f + g foretells; without it the pace is fixed.
+        jacobian: df/dda for :meth:`linearize`: a callable ``(state, action) -> (*batch, n_s, n_a)``, or
+            ``"finite-difference"`` (central, 2 n_a calls of f); None: J_m, or automatic differentiation.
+
+    Values have the dtype of the action.
+
+    Raises:
+        ParameterError: an argument is of another type, or ``outputs`` do not go with the learner.
     """
 
     def __init__(
@@ -62,15 +70,26 @@ class EnhancedModel(nn.Module):
         servo: ServoModel | None = None,
         force_learner: ResidualLearner | None = None,
         trust: TrustRegion | None = None,
+        jacobian: Callable[[Any, Tensor], Any] | Literal["finite-difference"] | None = None,
     ) -> None:
         super().__init__()
+        _check_arguments(model, learner, encode, outputs, servo, jacobian)
+        if not math.isfinite(action_scale) or action_scale == 0:
+            raise ParameterError("action_scale", action_scale, "a finite number other than 0")
+        scale = torch.as_tensor(output_scale)
+        if scale.shape not in ((), (learner.out_features,)) or not bool(
+            (scale.isfinite() & (scale != 0)).all()
+        ):
+            valid = f"a finite number other than 0, or one for each of {learner.out_features} outputs"
+            raise ParameterError("output_scale", output_scale, valid)
         self.model: Any = model  # a Module is registered, any other callable is kept as it is
         self.learner: ResidualLearner = learner
         self.encode: Callable[[Any], Tensor] = nn.Identity() if encode is None else encode
         self.outputs, self.servo, self.trust = outputs, servo, trust
         self.force_learner = force_learner
         self.action_scale = action_scale
-        self.output_scale = nn.Buffer(torch.as_tensor(output_scale))
+        self.output_scale = nn.Buffer(scale)
+        self.jacobian: Any = jacobian
 
     @classmethod
     def for_grasp(
@@ -126,9 +145,13 @@ class EnhancedModel(nn.Module):
 
     def forward(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_s"]:
         """``f(s, da) + g(s, da)``."""
-        nominal = self.model(state, action)
+        nominal = self.nominal(state, action)
         mean = self.learner(self.features(state, action)) / self.output_scale
         return nominal + self._scatter(mean, nominal)
+
+    def nominal(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_s"]:
+        """``f(s, da)``, as a tensor of the action's dtype."""
+        return torch.as_tensor(self.model(state, action)).to(action)
 
     @torch.no_grad()
     def update(
@@ -153,7 +176,7 @@ class EnhancedModel(nn.Module):
             NonFiniteError: an entry is NaN or infinite; nothing was changed.
             ShapeError: the increment has not the shape of the model's prediction.
         """
-        predicted: Tensor = self.model(state, action) if nominal is None else nominal
+        predicted = self.nominal(state, action) if nominal is None else nominal
         if increment.shape != predicted.shape:
             raise ShapeError(
                 "increment", f"{tuple(predicted.shape)}, that of the prediction", increment.shape
@@ -192,42 +215,52 @@ class EnhancedModel(nn.Module):
     def linearize(
         self,
         state: Any,
-        action: Float[Tensor, " n_a"],
-        nominal_jacobian: Float[Tensor, "n_s n_a"] | None = None,
-        encoded: Float[Tensor, " d"] | None = None,
-    ) -> tuple[Float[Tensor, " n_s"], Float[Tensor, "n_s n_a"]]:
-        """``(f + g, d(f + g)/d da)`` at one state and action.
+        action: Float[Tensor, "*batch n_a"],
+        nominal_jacobian: Float[Tensor, "*batch n_s n_a"] | None = None,
+        encoded: Float[Tensor, "*batch d"] | None = None,
+    ) -> tuple[Float[Tensor, "*batch n_s"], Float[Tensor, "*batch n_s n_a"]]:
+        """``(f + g, d(f + g)/d da)`` at a state and action, or at each of a batch.
 
         Args:
             nominal_jacobian: J_m if it is known already (then ``f = J_m da``).
             encoded: ``encode(state)`` if it is known already.
+
+        Raises:
+            NoDerivativeError: f carries no derivative (numpy, ``no_grad``, a detached output).
+            ShapeError: ``jacobian`` gave another shape.
         """
-        J = nominal_jacobian
-        if J is None and hasattr(self.model, "linearize"):
-            J = self.model.linearize(state).manipulation_jacobian
-        if J is not None:
-            nominal = J @ action
-        else:
-            f: Any = self.model
-            nominal = f(state, action)
-            J = jacrev(lambda a: f(state, a))(action)
+        nominal, J = self._nominal_with_jacobian(state, action, nominal_jacobian)
         seen = self.encode(state) if encoded is None else encoded
         mean, dmean = self.learner.linearize(torch.cat([seen, self.action_scale * action], dim=-1))
         n_a = action.shape[-1]
         value = nominal + self._scatter(mean / self.output_scale, nominal)
-        slope = dmean[..., -n_a:] * self.action_scale / self.output_scale.reshape(-1, 1)
-        jacobian = J.clone()
+        slope = (dmean[..., -n_a:] * self.action_scale / self.output_scale.reshape(-1, 1)).to(J.dtype)
         if self.outputs is None:
-            jacobian = jacobian + slope
-        else:
-            jacobian[self.outputs] += slope
+            return value, J + slope
+        jacobian = J.clone()
+        jacobian[..., self.outputs, :] += slope
         return value, jacobian
+
+    def _nominal_with_jacobian(
+        self, state: Any, action: Tensor, J: Tensor | None
+    ) -> tuple[Float[Tensor, "*batch n_s"], Float[Tensor, "*batch n_s n_a"]]:
+        if J is None and self.jacobian is None and hasattr(self.model, "linearize"):
+            J = self.model.linearize(state).manipulation_jacobian
+        if J is not None:
+            return (J @ action.unsqueeze(-1)).squeeze(-1), J
+        if self.jacobian is None:
+            return differentiated(self.nominal, state, action)
+        nominal = self.nominal(state, action)
+        if self.jacobian == "finite-difference":
+            return nominal, finite_differences(self.nominal, state, action)
+        return nominal, checked_jacobian(self.jacobian(state, action), nominal, action)
 
     def predict(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> torch.distributions.Normal:
         """Distribution of the learned outputs' increment, in the increment's unit."""
-        nominal = self._gather(self.model(state, action))
+        nominal = self._gather(self.nominal(state, action))
         g = self.learner.predict(self.features(state, action))
-        return torch.distributions.Normal(nominal + g.mean / self.output_scale, g.stddev / self.output_scale)
+        mean, deviation = (value / self.output_scale for value in (g.mean, g.stddev))
+        return torch.distributions.Normal(nominal + mean.to(nominal), deviation.abs().to(nominal))
 
     def variance(self, state: Any, action: Float[Tensor, " n_a"], weight: Float[Tensor, " n_s"]) -> Quadratic:
         """``sum_j weight_j Var[ds_j]`` about one action, as a convex quadratic in the action.
@@ -246,12 +279,55 @@ class EnhancedModel(nn.Module):
         v = action_variance(self.learner, self.features(state, action), n_a, weight)
         return Quadratic(v.value, v.gradient * scale, v.curvature * scale**2)
 
+    def get_extra_state(self) -> dict[str, Any]:
+        """Encoding, outputs and scales: what the learner's inputs and outputs mean."""
+        made = describe(self)
+        names = "encode", "outputs", "action_scale", "output_scale"
+        return {"made_with": {**made, "arguments": {name: made["arguments"][name] for name in names}}}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """They were compared before anything was loaded."""
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        """See ``torch.nn.Module``; all or nothing.
+
+        Raises:
+            StateMismatchError: the state is one of another encoding, learner or model. Nothing was changed.
+        """
+        if strict:
+            check_state(self, state_dict)
+        return super().load_state_dict(state_dict, strict=strict, assign=assign)
+
     def _gather(self, increment: Tensor) -> Tensor:
         return increment if self.outputs is None else increment[..., self.outputs]
 
     def _scatter(self, values: Tensor, like: Tensor) -> Tensor:
         if self.outputs is None:
-            return values
+            return values.to(like.dtype)
         out = torch.zeros_like(like)
         index = torch.tensor(self.outputs, device=like.device)
         return out.index_copy(-1, index, values.to(like.dtype))
+
+
+def _check_arguments(model: Any, learner: Any, encode: Any, outputs: Any, servo: Any, jacobian: Any) -> None:
+    checks = (
+        ("model", model, callable(model), "a callable f(state, action) -> increment"),
+        ("learner", learner, isinstance(learner, ResidualLearner), "a ResidualLearner"),
+        ("encode", encode, encode is None or callable(encode), "a callable of the state, or None"),
+        ("servo", servo, servo is None or isinstance(servo, ServoModel), "a ServoModel, or None"),
+        (
+            "jacobian", jacobian, jacobian in (None, "finite-difference") or callable(jacobian),
+            "a callable of state and action, 'finite-difference', or None",
+        ),
+    )  # fmt: skip
+    for name, value, good, valid in checks:
+        if not good:
+            raise ParameterError(name, value, valid)
+    if outputs is not None:
+        indices = list(outputs)
+        good = all(type(i) is int and i >= 0 for i in indices) and len(set(indices)) == len(indices)
+        if not good or len(indices) != learner.out_features:
+            valid = f"{learner.out_features} different indices, one for each output of the learner"
+            raise ParameterError("outputs", outputs, valid)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
+from .._recorded import Recorded
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 
@@ -52,7 +53,7 @@ class TrustOptions:
                 raise ParameterError(name, getattr(self, name), "greater than 0")
 
 
-class TrustRegion(nn.Module):
+class TrustRegion(Recorded, nn.Module):
     """``pace <- pace * grow`` where ``rho < agree``, ``pace * shrink`` where ``rho > disagree``, with::
 
         rho^2 = mean_i (dx_i - foretold_i)^2 / (noise_i^2 + (relative_i |foretold|)^2)

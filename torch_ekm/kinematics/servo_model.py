@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
+from .._recorded import Recorded
 from ..exceptions import ParameterError, ShapeError
 from ..typing import Bool, Float, Tensor
 from .tensors import check_finite
@@ -15,7 +16,7 @@ from .tensors import check_finite
 _DEG = math.pi / 180
 
 
-class ServoModel(nn.Module):
+class ServoModel(Recorded, nn.Module):
     """``w = D(v + b; d)``, ``D(x; d) = x - clip(x, -d, d)``: v commanded, w moved, for each servo.
 
     ```

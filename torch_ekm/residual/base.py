@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 import pathlib
 from abc import ABC, abstractmethod
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import nn
 from torch.distributions import Distribution, Normal
 
+from .._recorded import Recorded, check_state, describe
 from ..exceptions import ParameterError, ShapeError
 from ..typing import Bool, Float, Tensor
 from .checks import check_count, check_counts, check_finite
+from .lock import UpdateLock
 from .report import UpdateReport
 
 
-class ResidualLearner(nn.Module, ABC):
+class ResidualLearner(Recorded, nn.Module, ABC):
     """g(x), learned from a stream: ``y ~ N(g(x), R)``, and ``g = 0`` before the first sample.
 
     Shapes: a learner is a fleet of independent models of shape ``batch_shape`` (one model: ``()``).
@@ -25,9 +27,12 @@ class ResidualLearner(nn.Module, ABC):
     ``(*batch_shape, in_features)``, or a time-ordered block with the time first,
     ``(n, *batch_shape, in_features)``.
 
-    A subclass implements ``forward``, ``predict``, ``_absorb`` and, unless all its buffers start at 0,
+    A subclass implements ``forward``, ``predict``, ``absorb`` and, unless all its buffers start at 0,
     ``reset``. It keeps all it has learned in buffers of fixed size, so that ``state_dict``, ``deepcopy``,
     ``.to()`` move all of it.
+
+    Threads: updates of one learner come one after the other. A query does not wait for them; where another
+    thread updates, query ``with learner.lock:`` to see the state before an update or after it.
 
     Args:
         in_features: width of x.
@@ -60,6 +65,7 @@ class ResidualLearner(nn.Module, ABC):
             raise ParameterError("on_invalid", on_invalid, "'raise' or 'skip'")
         self.on_invalid = on_invalid
         self.n_refused = nn.Buffer(torch.zeros(self.batch_shape, dtype=torch.int64, device=device))
+        self.lock = UpdateLock()
         # An empty float tensor follows .to() and so remembers dtype and device for all subclasses.
         self._like = nn.Buffer(torch.empty(0, dtype=dtype, device=device), persistent=False)
 
@@ -85,9 +91,15 @@ class ResidualLearner(nn.Module, ABC):
         for buffer in self.buffers(recurse=False):
             buffer.zero_()
 
-    @abstractmethod
+    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        """Take in one checked sample per model; models outside ``mask`` must not change.
+
+        :meth:`update` calls it, under the lock and without autograd. Report with :meth:`UpdateReport.of`.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no absorb(x, y, mask)")
+
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        """Take in one checked sample per model; models outside ``mask`` must not change."""
+        return self.absorb(x, y, mask)
 
     def linearize(
         self, x: Float[Tensor, "*any in_features"]
@@ -150,6 +162,10 @@ class ResidualLearner(nn.Module, ABC):
             NonFiniteError: NaN, infinity or a number whose square is infinite in an unmasked sample,
                 under ``on_invalid="raise"``; a block is refused as a whole. The state is untouched.
         """
+        with self.lock:
+            return self._update(x, y, mask)
+
+    def _update(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         x, y = self._cast(x), self._cast(y)
         if mask is not None and not isinstance(mask, Tensor):
             mask = torch.as_tensor(mask, device=self.device)
@@ -171,11 +187,26 @@ class ResidualLearner(nn.Module, ABC):
     def _report(
         self, nis: Tensor, mask: Tensor | None, novelty: Tensor | None = None, weight: Tensor | None = None
     ) -> UpdateReport:
-        """Of samples that were taken in; without a basis no novelty, and by default weight 1."""
-        one = torch.ones_like(nis)
-        event = (one if mask is None else mask).to(torch.int64)
-        novelty = 0.0 * one if novelty is None else novelty
-        return UpdateReport(event, novelty, nis, one if weight is None else weight)
+        return UpdateReport.of(nis, mask, novelty, weight)
+
+    # -- state ----------------------------------------------------------------------------------
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What it was made with, so that no other learner takes its state. Subclasses add to it."""
+        return {"made_with": describe(self)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """See :meth:`get_extra_state`; what it was made with has been compared already."""
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **options: Any):
+        """All or nothing, wherever in a tree of modules this learner stands.
+
+        Raises:
+            StateMismatchError: the state is one of a learner made otherwise, or damaged. Nothing was changed.
+        """
+        own = {name[len(prefix) :]: value for name, value in state_dict.items() if name.startswith(prefix)}
+        check_state(self, own)
+        super()._load_from_state_dict(state_dict, prefix, *args, **options)
 
     # -- checks ---------------------------------------------------------------------------------
 
@@ -189,6 +220,14 @@ class ResidualLearner(nn.Module, ABC):
 
     def _cast(self, x: Tensor) -> Tensor:
         return torch.as_tensor(x, dtype=self._like.dtype, device=self._like.device)
+
+    def check_query(self, x: Float[Tensor, "*any in_features"]) -> Float[Tensor, "*any in_features"]:
+        """x in the learner's dtype, with all the fleet's axes.
+
+        Raises:
+            ShapeError: another width, or axes that are not the fleet's.
+        """
+        return self._check_query(x)
 
     def _check_query(self, x: Tensor) -> Tensor:
         x = self._cast(x)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...exceptions import MissingExtraError, ParameterError, ShapeError
+from ...exceptions import MissingExtraError, NoStateError, ParameterError, ShapeError
 from ...residual import ResidualLearner
 from ...typing import Array
 from ..jobs import run_jobs
@@ -150,5 +151,8 @@ def _squared(error: torch.Tensor) -> Array:
 
 
 def _kilobytes(model: torch.nn.Module) -> float:
-    tensors = [value for value in model.state_dict().values() if isinstance(value, torch.Tensor)]
+    try:
+        tensors = [value for value in model.state_dict().values() if isinstance(value, torch.Tensor)]
+    except NoStateError:  # what it keeps are objects
+        return len(pickle.dumps(model)) / 1024
     return sum(value.numel() * value.element_size() for value in tensors) / 1024

@@ -87,7 +87,8 @@ class GPyTorchLearner(SingleLearner):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Sample count, and the state dicts of what GPyTorch made."""
-        return {"count": self._count, **{type(part).__name__: part.state_dict() for part in self._peer}}
+        peer = {type(part).__name__: part.state_dict() for part in self._peer}
+        return {**super().get_extra_state(), "count": self._count, **peer}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self._count = int(state["count"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from typing import Any
 
 import torch
@@ -10,6 +9,7 @@ from torch import nn
 from torch.distributions import Normal
 
 from ..._extras import require
+from ...exceptions import NoStateError
 from ...typing import Tensor
 from ..base import SingleLearner
 from ..checks import check_positive
@@ -20,7 +20,8 @@ class RiverResidual(SingleLearner):
     """Any river regressor, one copy per output; the variance is that of recent innovations.
 
     The mean is 0 before the first sample. River predicts on dictionaries of Python floats: it is not
-    differentiable (``linearize`` takes central differences).
+    differentiable (``linearize`` takes central differences). Its regressors are Python objects, not figures:
+    the learner can be copied and pickled, but has no state dict.
 
     Args:
         model: a river regressor, copied; default ARFRegressor.
@@ -87,10 +88,12 @@ class RiverResidual(SingleLearner):
         self._count += 1
         return self._report((error / self.noise).mean(-1), mask)
 
-    def get_extra_state(self) -> Tensor:
-        """The pickled regressors."""
-        return torch.frombuffer(bytearray(pickle.dumps((self._count, self._models))), dtype=torch.uint8)
+    def get_extra_state(self) -> dict[str, Any]:
+        """None: reading river's objects from a file would mean to run what the file says.
 
-    def set_extra_state(self, state: Tensor) -> None:
-        """See get_extra_state. Unpickles: load only what you trust."""
-        self._count, self._models = pickle.loads(bytes(state.tolist()))
+        Raises:
+            NoStateError: always.
+        """
+        raise NoStateError(
+            type(self).__name__, "river's regressors are objects; pickle it if you trust the file"
+        )

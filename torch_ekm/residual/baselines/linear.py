@@ -131,7 +131,7 @@ class LinearInFeatures(ResidualLearner):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Number of samples seen: the rhythm of rebuilds continues after a reload."""
-        return {"n_samples": self._n_samples}
+        return {**super().get_extra_state(), "n_samples": self._n_samples}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self._n_samples = int(state["n_samples"])

@@ -32,6 +32,8 @@ class ActionLinearKernel(Kernel):
         ParameterError: no column is left for the state.
     """
 
+    starts = ("action_variance",)
+
     def __init__(
         self,
         in_features: int,

@@ -35,6 +35,8 @@ class DeepKernel(Kernel):
         ParameterError: ``base`` is not stationary.
     """
 
+    starts = ("seed",)
+
     def __init__(
         self,
         base: StationaryKernel,

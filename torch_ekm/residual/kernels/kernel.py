@@ -14,11 +14,12 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
+from ..._recorded import Recorded
 from ...exceptions import ParameterError
 from ...typing import Float, Tensor
 
 
-class Kernel(nn.Module, ABC):
+class Kernel(Recorded, nn.Module, ABC):
     """A covariance function k(x, z)."""
 
     @abstractmethod

@@ -30,6 +30,8 @@ class StationaryKernel(Kernel):
         variance: v.
     """
 
+    starts = ("lengthscale", "variance")
+
     def __init__(
         self,
         in_features: int,

@@ -9,6 +9,7 @@ from typing import ClassVar, NamedTuple, Protocol, TypeVar
 import torch
 from torch import nn
 
+from ..._recorded import Recorded
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..kernels.kernel import Kernel
@@ -48,6 +49,14 @@ class Units:
     def curvature(self, curvature: Float[Tensor, "*any out_or_1 columns columns"]) -> Tensor:
         """The second derivative of a variance by the last columns of x."""
         return curvature
+
+    def affine(self) -> tuple[Tensor, ...] | None:
+        """Buffers (shift, scale) of x, then of y, with ``z = (x - shift) / scale``, for compiled loops.
+
+        They are read at each call and so change in place; ``()`` if x and y stay as they are. None if the
+        units are something else: the other methods are called then.
+        """
+        return () if type(self) is Units else None
 
 
 class Sample(NamedTuple):
@@ -89,7 +98,7 @@ class Host(Protocol):
         ...
 
 
-class Part(nn.Module):
+class Part(Recorded, nn.Module):
     """One thing that a :class:`SparseOnlineGP` does beside projecting samples onto its basis.
 
     A part holds its few figures when it is made; the learner copies it and calls :meth:`bind` once, so one

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -13,6 +13,18 @@ from ..kernels.kernel import Kernel
 from ..report import UpdateEvent, UpdateReport
 from .part import Part
 from .posterior import SparsePosterior
+
+#: what losses may differ by and count as the same, relative and per output in nats: a basis that has learned
+#: nothing yet must not depend on how a processor rounds
+TIE, TIE_KL = 1e-9, 1e-14
+
+
+class Absorbed(NamedTuple):
+    """What an update did with one sample per model."""
+
+    report: UpdateReport
+    innovation: Float[Tensor, "*batch out"]  #: before the update, as the latent variance
+    variance: Float[Tensor, "*batch"]
 
 
 def absorb(
@@ -23,7 +35,7 @@ def absorb(
     s2: Float[Tensor, "*batch"],
     mask: Float[Tensor, "*batch"] | None,
     weighing: Sequence[Part] = (),
-) -> tuple[UpdateReport, Float[Tensor, "*batch out"], Float[Tensor, "*batch"]]:
+) -> Absorbed:
     """One sample per model, without a branch on data (a mask multiplies every change by 0)::
 
         e = Qk, gamma = k** - k'e, v = k** + k'Ck, i = y - mean
@@ -103,7 +115,7 @@ def absorb(
         event = event * (mask > 0)
     # k** may be 0: no action, no effect
     novelty = gamma / prior.clamp_min(torch.finfo(prior.dtype).tiny)
-    return UpdateReport(event, novelty, nis, weight), innovation, v
+    return Absorbed(UpdateReport(event, novelty, nis, weight), innovation, v)
 
 
 def _add_and_prune(
@@ -122,7 +134,8 @@ def _add_and_prune(
     diagonal = posterior.moments.diagonal(dim1=-2, dim2=-1) + scaled * added
     c_diag, q_diag, w_diag = diagonal.unbind(-2)
     loss = pruning_loss(posterior, c_diag, q_diag, w_diag / s2.unsqueeze(-1))
-    i = loss.where(posterior.active > 0, torch.inf).argmin(-1, keepdim=True)
+    loss = loss.where(posterior.active > 0, torch.inf)
+    i = (loss <= _with_ties(loss.amin(-1, keepdim=True), posterior)).to(torch.uint8).argmax(-1, keepdim=True)
     # rows, which lie together in memory, stand for columns
     columns = posterior.moments.gather(-2, i[..., None, None].expand(*fleet, 3, 1, M)).squeeze(-2)
     columns = columns + scaled * added.gather(-1, i.unsqueeze(-2).expand(*fleet, 3, 1))
@@ -167,6 +180,12 @@ def pruning_loss(
     rest = _remaining(c, q)
     loss = posterior.alpha.square().sum(-1) / rest
     return loss if posterior.pruning == "mean" else loss + posterior.out_features * (w / q + (rest / q).log())
+
+
+def _with_ties(least: Tensor, posterior: SparsePosterior) -> Tensor:
+    """Losses up to this differ from the least one by rounding at most: the first of them goes."""
+    rounding = 0.0 if posterior.pruning == "mean" else TIE_KL * posterior.out_features
+    return least + TIE * least.abs() + rounding
 
 
 def _remaining(c: Tensor, q: Tensor) -> Tensor:

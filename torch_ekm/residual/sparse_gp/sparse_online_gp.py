@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import nn
 from torch.distributions import Normal
 
-from ...exceptions import ShapeError
+from ...exceptions import ParameterError, ShapeError
 from ...typing import Bool, Float, Tensor
 from ..base import DoubleStateLearner
 from ..checks import check_count, check_finite
 from ..kernels.kernel import Kernel, check_kernel, log_parameter
 from ..kernels.stationary import SquaredExponential
 from ..report import UpdateReport
+from .compiled import CompiledLoops
 from .part import P, Part, Sample, Units, copy_parts
 from .posterior import SparsePosterior
-from .recursion import absorb, compiled_absorb
+from .recursion import Absorbed, absorb, compiled_absorb
+
+_LATEST = 8  # rounds of ``refresh_every`` after which the caches are rebuilt in any case
+_DRIFT = 1e-8  # beyond which they are rebuilt at once, see SparsePosterior.drift
 
 
 class Prediction(NamedTuple):
@@ -67,14 +71,19 @@ class SparseOnlineGP(DoubleStateLearner):
         pruning: the point goes that loses least: ``"kl"`` exact loss, ``"mean"`` its first term;
             ``"freeze"``: a full basis stays.
         parts: what it does beside; copied.
-        refresh_every: samples between two rebuilds of the caches.
-        compile_step: updates through torch.compile: needs a C++ compiler and a minute at the first one.
+        refresh_every: samples after which parts may change the state, and the caches are rebuilt. Without a
+            part that does, and on the CPU, one looks whether they have drifted (four times as often where
+            they do); they are rebuilt when they have, and at the latest after eight times as many.
+        backend: ``"auto"``: where numba is installed (extra ``fast``) compiled loops do updates and queries
+            of one sample per model, on the CPU in float64; they agree with torch to rounding. ``"torch"``:
+            never. ``"inductor"``: updates through torch.compile, which needs a C++ compiler and a minute.
         options: see ResidualLearner.
 
     Raises:
         ParameterError: a parameter is outside its range, or parts do not go together.
     """
 
+    starts = ("noise_variance",)
     units: Units
 
     def __init__(
@@ -91,13 +100,15 @@ class SparseOnlineGP(DoubleStateLearner):
         pruning: Literal["kl", "mean", "freeze"] = "kl",
         parts: Iterable[nn.Module] = (),
         refresh_every: int = 32,
-        compile_step: bool = False,
+        backend: Literal["auto", "torch", "inductor"] = "auto",
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
+        if backend not in ("auto", "torch", "inductor"):
+            raise ParameterError("backend", backend, "'auto', 'torch' or 'inductor'")
+        self.backend = backend
         self.capacity = check_count("capacity", capacity)
         self.refresh_every = check_count("refresh_every", refresh_every)
-        self.compile_step = bool(compile_step)
         shape, double = self.batch_shape, {"dtype": torch.float64, "device": self.device}
         if kernel is None:
             kernel = SquaredExponential(self.in_features, batch_shape=shape, **double)
@@ -117,6 +128,7 @@ class SparseOnlineGP(DoubleStateLearner):
         )
         # samples of each model since the caches were made
         self.pending = nn.Buffer(torch.zeros(shape, **double))
+        self.drifts = False  # the last look at the caches found them less exact than rounding would have it
         self.n_samples = 0  # on the host, so that the rhythm of rebuilds never asks the GPU
         self._parts: tuple[Part, ...] = ()
         for part in copy_parts(parts):
@@ -126,17 +138,24 @@ class SparseOnlineGP(DoubleStateLearner):
         units = next((part for part in self._parts if isinstance(part, Units)), Units())
         # not as a second child: its buffers would be in the state dict twice
         object.__setattr__(self, "units", units)
-        self._weighing = tuple(part for part in self._parts if type(part).weigh is not Part.weigh)
+        self.weighing = _overriding(self._parts, "weigh")
+        self._noting = _overriding(self._parts, "after_update")
+        self._rebuilding = _overriding(self._parts, "on_rebuild", "after_rebuild")
+        self._loops = CompiledLoops() if backend == "auto" else None
 
     # -- predictions ----------------------------------------------------------------------------
 
     def forward(self, x: Tensor) -> Tensor:
         """``alpha' k(X, x)``, differentiable in x."""
+        if self._loops is not None and (found := self._loops.query(self, x)) is not None:
+            return found[0]
         k = self._cross(self.units.inputs(self._check_query(x)))
         return self._out((k.unsqueeze(-2) @ self.posterior.alpha).squeeze(-2), 1)
 
     def variance(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any out"]:
         """Latent variance ``k** + k'Ck`` of each output, differentiable in x."""
+        if self._loops is not None and (found := self._loops.query(self, x, variance=True)) is not None:
+            return found[1]
         z = self.units.inputs(self._check_query(x))
         k = self._cross(z).unsqueeze(-1)
         v = self.kernel.diagonal(z) + (k.mT @ (self.posterior.covariance @ k)).squeeze(-1).squeeze(-1)
@@ -144,13 +163,16 @@ class SparseOnlineGP(DoubleStateLearner):
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """N(mean, var), with the observation noise added on request."""
-        variance = self.variance(x)
+        found = None if self._loops is None else self._loops.query(self, x, variance=True)
+        mean, variance = (self(x), self.variance(x)) if found is None else found[:2]
         if observation:
             variance = variance + self.noise_variance.to(self.dtype)
-        return Normal(self(x), variance.sqrt(), validate_args=False)
+        return Normal(mean, variance.sqrt(), validate_args=False)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """``(alpha'k, alpha' dk/dx)`` in closed form."""
+        if self._loops is not None and (found := self._loops.query(self, x, slopes=True)) is not None:
+            return found[0], found[2]
         # free slots need no mask here: their rows in alpha and C are 0
         k, dk = self.kernel.with_gradient(self.units.inputs(self._check_query(x)), self.posterior.basis)
         coefficients = self.posterior.alpha.mT
@@ -162,6 +184,10 @@ class SparseOnlineGP(DoubleStateLearner):
 
         d mean/dx = alpha' dk/dx,   d var/dx = dk(x,x)/dx + 2 (Ck)' dk/dx
         """
+        if self._loops is not None:
+            found = self._loops.query(self, x, variance=True, slopes=True)
+            if found is not None:
+                return Prediction(*found)
         z = self.units.inputs(self._check_query(x))
         k, dk = self.kernel.with_gradient(z, self.posterior.basis)
         column = k.unsqueeze(-1)
@@ -212,7 +238,7 @@ class SparseOnlineGP(DoubleStateLearner):
             part.reset()
         self.pending.zero_()
         self.n_refused.zero_()
-        self.n_samples = 0
+        self.n_samples, self.drifts = 0, False
 
     @torch.no_grad()
     def set_basis(self, x: Float[Tensor, "n *batch in"]) -> None:
@@ -246,25 +272,50 @@ class SparseOnlineGP(DoubleStateLearner):
         for part in self._parts:
             part.after_rebuild(self)
 
+    def update(self, x: Tensor, y: Tensor, mask: Tensor | None = None) -> UpdateReport:
+        """See :meth:`ResidualLearner.update`."""
+        if mask is None and self._loops is not None:
+            with self.lock:
+                if self._loops.accept(self, x, y):
+                    return self._absorb(x, y, None)
+        return super().update(x, y, mask)
+
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         on = None if mask is None else mask.to(x.dtype)
-        step = compiled_absorb(x.device.type) if self.compile_step else absorb
-        report, innovation, variance = self._learn(x, y, on, step)
-        sample = Sample(x, y, on, innovation, variance, report)
-        due = (self.n_samples + 1) % self.refresh_every == 0
-        for part in self._parts:
-            due |= part.after_update(self, sample)
+        done = self._learn(x, y, on)
+        n = self.n_samples + 1
+        if self._rebuilding or self.device.type != "cpu":  # on a GPU looking would mean waiting
+            anew = n % self.refresh_every == 0
+        else:
+            every = max(self.refresh_every // 4, 1) if self.drifts else self.refresh_every
+            anew = n % every == 0 and self._is_stale(n)
+        if self._noting:
+            sample = Sample(x, y, on, done.innovation, done.variance, done.report)
+            with torch.no_grad():
+                for part in self._noting:
+                    anew |= part.after_update(self, sample)
         self.pending += 1.0 if on is None else on
-        self.n_samples += 1
-        if due:
+        # past Module.__setattr__, which asks of every value whether it is a tensor
+        vars(self)["n_samples"] += 1
+        if anew:
             self.refresh()
-        return report
+        return done.report
 
-    def _learn(
-        self, x: Tensor, y: Tensor, on: Tensor | None, step: Callable = absorb
-    ) -> tuple[UpdateReport, Tensor, Tensor]:
+    def _learn(self, x: Tensor, y: Tensor, on: Tensor | None) -> Absorbed:
+        if self._loops is not None and (done := self._loops.absorb(self, x, y, on)) is not None:
+            return done
+        step = compiled_absorb(x.device.type) if self.backend == "inductor" else absorb
         z, t = self.units.inputs(x), self.units.targets(y)
-        return step(self.posterior, z, t, self.kernel, self.shared_noise(), on, self._weighing)
+        return step(self.posterior, z, t, self.kernel, self.shared_noise(), on, self.weighing)
+
+    def _is_stale(self, n: int) -> bool:
+        """Whether the caches must be made anew after n samples although no part changed the state."""
+        if n % (_LATEST * self.refresh_every) == 0:
+            return True
+        drift = None if self._loops is None else self._loops.drift(self)
+        drift = self.posterior.drift(self.kernel, self.shared_noise()) if drift is None else drift
+        vars(self)["drifts"] = drift > 0.01 * _DRIFT
+        return drift > _DRIFT
 
     def start_anew(
         self,
@@ -305,7 +356,12 @@ class SparseOnlineGP(DoubleStateLearner):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Number of samples seen: the rhythm of rebuilds continues after a reload."""
-        return {"n_samples": self.n_samples}
+        return {**super().get_extra_state(), "n_samples": self.n_samples, "drifts": self.drifts}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self.n_samples = int(state["n_samples"])
+        self.n_samples, self.drifts = int(state["n_samples"]), bool(state["drifts"])
+
+
+def _overriding(parts: Iterable[Part], *names: str) -> tuple[Part, ...]:
+    """Those of the parts that do something of their own in one of these methods."""
+    return tuple(p for p in parts if any(getattr(type(p), name) is not getattr(Part, name) for name in names))

@@ -65,6 +65,9 @@ class Standardize(Part, Units):
     def _scale(self, power: int) -> Tensor:
         return self.output.scale if power == 1 else self.output.scale.square()
 
+    def affine(self) -> tuple[Tensor, ...]:
+        return self.input.shift, self.input.scale, self.output.shift, self.output.scale
+
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Take x in where there is a sample, y with the sample's weight too."""
         n = learner.n_samples

@@ -1,0 +1,226 @@
+"""Compiled loops do what torch does, share its memory, and step back where torch must work."""
+
+from __future__ import annotations
+
+import copy
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from torch_ekm.residual import (
+    ActionLinearKernel,
+    CalibrateNoise,
+    DeepKernel,
+    DetectChanges,
+    ForgettingFactor,
+    LearnHyperparameters,
+    Matern32,
+    Matern52,
+    ProcessNoise,
+    RobustWeight,
+    SparseOnlineGP,
+    SquaredExponential,
+    Standardize,
+)
+from torch_ekm.residual.sparse_gp import compiled
+
+D, M = 4, 2
+numba_here = pytest.mark.skipif(compiled.load_kernels() is None, reason="needs the extra 'fast'")
+
+
+def hard_stream(n: int, *fleet: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Motion with rests, outliers and a jump of the system."""
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn(n, *fleet, D, generator=generator, dtype=torch.float64)
+    noise = torch.randn(n, *fleet, M, generator=generator, dtype=torch.float64)
+    x[n // 4 : n // 4 + 20] = x[n // 4].clone()
+    y = torch.sin(x[..., :M] + x[..., M:]) + 0.1 * noise
+    y[n // 2 :] -= 2.0
+    y[::37] += 30.0 * noise[::37]
+    return x, y
+
+
+def all_parts() -> list:
+    return [
+        RobustWeight(3.0), CalibrateNoise(), DetectChanges(), ForgettingFactor(0.995), Standardize(),
+        LearnHyperparameters(memory=50),
+    ]  # fmt: skip
+
+
+OPTIONS = {
+    "plain": lambda shape: {},
+    "matern32": lambda shape: {"kernel": Matern32(D, lengthscale=[1.0, 2.0, 3.0, 4.0], batch_shape=shape)},
+    "matern52": lambda shape: {"kernel": Matern52(D, variance=2.0), "projection": "fitc"},
+    "action": lambda shape: {
+        "kernel": ActionLinearKernel(D, 2, state_kernel=Matern32(2, batch_shape=shape), batch_shape=shape),
+        "parts": [Standardize(), RobustWeight(3.0)],
+    },
+    "deep": lambda shape: {
+        "kernel": DeepKernel(SquaredExponential(D), hidden=(8,)),
+        "parts": [Standardize()],
+    },
+    "mean": lambda shape: {"pruning": "mean", "novelty_threshold": 0.0, "jitter": 1e-4},
+    "freeze": lambda shape: {"pruning": "freeze", "noise_variance": torch.tensor([0.1, 0.3]).double()},
+    "wanders": lambda shape: {"parts": [ProcessNoise(0.01), RobustWeight(2.0)], "refresh_every": 8},
+    "all": lambda shape: {"parts": all_parts(), "projection": "fitc"},
+}
+
+
+def pair(name: str, shape: tuple[int, ...] = ()) -> list[SparseOnlineGP]:
+    common = {"capacity": 12, "batch_shape": shape, "noise_variance": 0.1}
+    return [
+        SparseOnlineGP(D, M, **{**common, "backend": backend, **OPTIONS[name](shape)})
+        for backend in ("torch", "auto")
+    ]
+
+
+def assert_alike(a: SparseOnlineGP, b: SparseOnlineGP, x: torch.Tensor, largest: float) -> None:
+    tolerance = 1e-11 * largest  # of the targets: outliers are a thousand times what noise is
+    for query in (x[0], x[-1]):  # one query per model: compiled
+        for ask in ("forward", "variance", "linearize", "predict_with_jacobians"):
+            torch.testing.assert_close(
+                getattr(b, ask)(query), getattr(a, ask)(query), atol=tolerance, rtol=tolerance
+            )
+        law, other = (g.predict(query, observation=True) for g in (a, b))
+        torch.testing.assert_close(other.stddev, law.stddev, atol=tolerance, rtol=tolerance)
+    torch.testing.assert_close(b(x), a(x), atol=tolerance, rtol=tolerance)
+
+
+@numba_here
+@pytest.mark.parametrize("shape", [(), (3,)])
+@pytest.mark.parametrize("name", OPTIONS)
+def test_compiled_loops_do_what_torch_does(name, shape):
+    reference, fast = pair(name, shape)
+    x, y = hard_stream(400, *shape)
+    for t in range(len(x)):
+        a, b = reference.update(x[t], y[t]), fast.update(x[t], y[t])
+        assert torch.equal(a.event, b.event), t
+        for figure in ("novelty", "nis", "weight"):
+            torch.testing.assert_close(getattr(b, figure), getattr(a, figure), atol=1e-9, rtol=1e-9)
+    assert_alike(reference, fast, x, float(y.abs().max()))
+    fast.posterior.alpha[..., 0, :] *= 1.0 + 1e-5  # a fault that both must see alike
+    drift, same = fast._loops.drift(fast), fast.posterior.drift(fast.kernel, fast.shared_noise())
+    assert drift is None if name == "deep" else drift == pytest.approx(same, rel=1e-4)
+    fast.posterior.alpha[..., 0, :] /= 1.0 + 1e-5
+    if shape:
+        mask = torch.rand(60, *shape, generator=torch.Generator().manual_seed(1)) < 0.7
+        a, b = reference.update(x[:60], y[:60], mask), fast.update(x[:60], y[:60], mask)
+        assert torch.equal(a.event, b.event)
+        assert_alike(reference, fast, x, float(y.abs().max()))
+
+
+class Doubling(RobustWeight):
+    def weigh(self, nis):
+        return 0.5 * super().weigh(nis)
+
+
+def used(gp: SparseOnlineGP, call, monkeypatch) -> bool:
+    """Whether the call reached a compiled loop that worked."""
+    done = []
+    loops = gp._loops
+    for name in ("absorb", "query"):
+        inner = getattr(type(loops), name)
+
+        def outer(self, *args, inner=inner, **options):
+            found = inner(self, *args, **options)
+            done.append(found is not None)
+            return found
+
+        monkeypatch.setattr(type(loops), name, outer)
+    call()
+    monkeypatch.undo()
+    return any(done)
+
+
+@numba_here
+def test_where_torch_must_do_the_work(monkeypatch):
+    x, y = hard_stream(30)
+    gp = pair("plain")[1]
+    gp.update(x, y)
+    query = x[0]
+    assert used(gp, lambda: gp(query), monkeypatch)
+    assert used(gp, lambda: gp.update(x[0], y[0]), monkeypatch)
+    assert not used(gp, lambda: gp(query.clone().requires_grad_(True)), monkeypatch)
+    assert not used(gp, lambda: gp(x), monkeypatch)  # products are faster for many
+    assert not used(gp, lambda: torch.func.vmap(gp)(x), monkeypatch)
+    assert not used(gp, lambda: torch.func.jacfwd(gp)(query), monkeypatch)
+    graph = torch.fx.experimental.proxy_tensor.make_fx(gp)(query)
+    torch.testing.assert_close(graph(x[5]), gp(x[5]))
+    with torch.autograd.forward_ad.dual_level():
+        dual = torch.autograd.forward_ad.make_dual(query, torch.ones_like(query))
+        tangent = torch.autograd.forward_ad.unpack_dual(gp(dual)).tangent
+    torch.testing.assert_close(tangent, gp.linearize(query)[1].sum(-1))
+    gp.kernel.requires_grad_(True)
+    assert gp(query).requires_grad
+    gp.kernel.requires_grad_(False)
+    single = copy.deepcopy(gp).to(torch.float32)
+    assert not used(single, lambda: single.update(x[0].float(), y[0].float()), monkeypatch)
+    other = SparseOnlineGP(D, M, capacity=12, parts=[Doubling(3.0)])
+    assert not used(other, lambda: other.update(x[0], y[0]), monkeypatch)
+
+
+@numba_here
+def test_arrays_follow_buffers_that_are_replaced():
+    x, y = hard_stream(60)
+    gp = pair("all")[1]
+    gp.update(x[:40], y[:40])
+    copied, loaded = copy.deepcopy(gp), pair("all")[1]
+    loaded.update(x[:3], y[:3])
+    loaded.load_state_dict(copy.deepcopy(gp.state_dict()), assign=True)
+    gp.update(x[40:], y[40:])
+    for other in (copied, loaded):
+        before = other(x[0]).clone()
+        other.update(x[40:], y[40:])
+        assert not torch.equal(other(x[0]), before)
+        assert torch.equal(other(x[0]), gp(x[0]))
+    gp.kernel.log_lengthscale.data = gp.kernel.log_lengthscale + 0.3
+    gp.refresh()
+    torch.testing.assert_close(gp(x[:1])[0], gp(x[0]), atol=1e-11, rtol=0)  # many by torch, one compiled
+
+
+def test_without_numba_torch_does_it_all(monkeypatch):
+    x, y = hard_stream(120)
+    reference = pair("all")[0]
+    reference.update(x, y)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    for name in ("numba_drift", "numba_kernels"):
+        monkeypatch.delitem(sys.modules, f"torch_ekm.residual.sparse_gp.{name}", raising=False)
+        monkeypatch.delattr(sys.modules["torch_ekm.residual.sparse_gp"], name, raising=False)
+    compiled.load_kernels.cache_clear()
+    try:
+        assert compiled.load_kernels() is None
+        gp = pair("all")[1]
+        gp.update(x, y)
+        assert torch.equal(gp(x), reference(x))
+        assert torch.equal(gp(x[0]), reference(x[0]))
+    finally:
+        compiled.load_kernels.cache_clear()
+
+
+@numba_here
+def test_drifted_caches_are_rebuilt_at_once_and_sound_ones_late():
+    x, y = hard_stream(400)
+    gp = SparseOnlineGP(D, M, capacity=12, noise_variance=0.1)
+    rebuilt = []
+    refresh = gp.refresh
+    gp.refresh = lambda: (rebuilt.append(gp.n_samples), refresh())
+    gp.update(x[:300], y[:300])
+    assert rebuilt == [256]
+    gp.posterior.moments[1].mul_(1.0 + 1e-6)
+    gp.update(x[300:330], y[300:330])
+    assert rebuilt == [256, 320]
+
+
+@numba_here
+def test_where_numba_can_write_no_cache_torch_does_it_all():
+    code = (
+        "import numba.core.caching as caching, torch; caching.CacheImpl._locator_classes = []\n"
+        "from torch_ekm import SparseOnlineGP\n"
+        "from torch_ekm.residual.sparse_gp.compiled import load_kernels\n"
+        "x = torch.ones(3).double(); gp = SparseOnlineGP(3, 1); gp.update(x, x[:1])\n"
+        "assert load_kernels() is None and float(gp(x)) > 0.9"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,73 @@
+"""``save`` and ``load``: a learner, or an enhanced model with its encoding, in one file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from torch import nn
+
+from .._recorded import describe
+from ..exceptions import FileFormatError, NoStateError, ParameterError
+from ..kinematics.grasp_state import GraspState
+from ..residual.base import ResidualLearner
+from ..residual.files import known_classes, read, rebuild, write
+from .enhanced_model import EnhancedModel
+from .trust_region import TrustOptions
+
+
+def save(learner: ResidualLearner | EnhancedModel, path: str | os.PathLike) -> None:
+    """Write what it was made with, and all that it has learned; for an enhanced model without f itself.
+
+    The file is a zip archive of a JSON header and arrays. It appears whole or not at all.
+
+    Raises:
+        NoStateError: it holds something that is no plain figure, such as a function for ``encode`` or another
+            library's objects; the message names it.
+    """
+    if isinstance(learner, EnhancedModel):
+        described = describe(learner)
+        described["arguments"].pop("model")
+        state = {name: one for name, one in learner.state_dict().items() if not name.startswith("model.")}
+    elif isinstance(learner, ResidualLearner):
+        described, state = describe(learner), learner.state_dict()
+    else:
+        raise NoStateError(type(learner).__name__, "it is neither a ResidualLearner nor an EnhancedModel")
+    write(path, described, state)
+
+
+def load(
+    path: str | os.PathLike,
+    *,
+    model: Callable[[Any, Any], Any] | None = None,
+    classes: Iterable[type] = (),
+) -> Any:
+    """What :func:`save` wrote, made anew and in the state it had. Nothing in the file is ever run.
+
+    Args:
+        model: f, if an enhanced model was saved.
+        classes: learners, kernels or parts of your own that occur in the file.
+
+    Returns:
+        The ResidualLearner or EnhancedModel.
+
+    Raises:
+        FileFormatError: it is no such file, or damaged.
+        StateMismatchError: state and description do not go together.
+        ParameterError: a class is not known, or f is missing (or given for a learner).
+    """
+    described, state = read(path)
+    known = known_classes(classes) | {"GraspState": GraspState, "TrustOptions": TrustOptions}
+    enhanced = isinstance(described, dict) and described.get("class") == "EnhancedModel"
+    if enhanced != (model is not None):
+        valid = "f, since the file holds an EnhancedModel" if enhanced else "None for a learner"
+        raise ParameterError("model", model, valid)
+    if model is not None:
+        known["EnhancedModel"] = lambda **arguments: EnhancedModel(model, **arguments)
+        if isinstance(model, nn.Module):
+            state |= {f"model.{name}": one for name, one in model.state_dict().items()}
+    made = rebuild(path, described, state, known)
+    if not isinstance(made, ResidualLearner | EnhancedModel):
+        raise FileFormatError(path, f"holds a {type(made).__name__}, no learner")
+    return made

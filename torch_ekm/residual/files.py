@@ -1,0 +1,149 @@
+"""Learners in files: what they were made with and all figures of their state, and nothing that could run."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from .._recorded import Recorded, check_state, make, opaque_arguments
+from ..exceptions import EKMError, FileFormatError, NoStateError
+
+_FORMAT = "torch_ekm learner 1"
+_HEADER = "header.json"
+_LARGEST_HEADER = 10_000_000  # bytes
+
+
+def write(path: str | os.PathLike, described: Mapping[str, Any], state: Mapping[str, Any]) -> None:
+    """A zip file of a JSON header and one ``.npy`` for each tensor, in place at once or not at all.
+
+    Args:
+        described: what the learner was made with.
+        state: a state dict; nested values of it must be plain or tensors.
+
+    Raises:
+        NoStateError: an argument or an entry has no plain terms.
+    """
+    wrong = opaque_arguments(described)
+    if wrong:
+        raise NoStateError(str(described.get("class")), f"no plain values: {', '.join(wrong)}")
+    tensors: dict[str, torch.Tensor] = {}
+    packed = {name: _pack(value, tensors, str(described.get("class"))) for name, value in state.items()}
+    header = {"format": _FORMAT, "made_with": described, "state": packed}
+    path = Path(path)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+                archive.writestr(_HEADER, json.dumps(header))
+                for name, tensor in tensors.items():
+                    with archive.open(name, "w", force_zip64=True) as entry:
+                        array = np.ascontiguousarray(tensor.detach().cpu().numpy()).reshape(tensor.shape)
+                        np.lib.format.write_array(entry, array, allow_pickle=False)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def read(path: str | os.PathLike) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What :func:`write` wrote: the description and the state.
+
+    Raises:
+        FileFormatError: it is no such file, or damaged.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+                raise FileFormatError(path, "compressed entries, which no learner's file has")
+            if archive.getinfo(_HEADER).file_size > _LARGEST_HEADER:
+                raise FileFormatError(path, "a header that is too large")
+            header = json.loads(archive.read(_HEADER))
+            if not isinstance(header, dict) or header.get("format") != _FORMAT:
+                raise FileFormatError(path, f"not a file of format '{_FORMAT}'")
+            tensors = {}
+            for entry in entries:
+                if entry.filename != _HEADER:
+                    with archive.open(entry) as file:
+                        array = np.lib.format.read_array(file, allow_pickle=False)
+                    if array.nbytes > entry.file_size:
+                        raise FileFormatError(path, f"'{entry.filename}' is larger than the file says")
+                    tensors[entry.filename] = torch.from_numpy(array.copy())
+            return header["made_with"], {name: _unpack(one, tensors) for name, one in header["state"].items()}
+    except (OSError, EKMError):
+        raise
+    except Exception as error:  # whatever a damaged file makes of zip, JSON and npy
+        raise FileFormatError(path, f"cannot be read ({type(error).__name__}: {error})") from None
+
+
+def rebuild(
+    path: str | os.PathLike, described: Any, state: Mapping[str, Any], known: Mapping[str, Any]
+) -> nn.Module:
+    """The object described, made of the classes ``known``, in this state.
+
+    Raises:
+        FileFormatError: it cannot be made.
+        StateMismatchError: the state is not one of it.
+    """
+    try:
+        made = make(described, known)
+    except EKMError:
+        raise
+    except Exception as error:
+        raise FileFormatError(path, f"describes nothing that can be made ({error})") from None
+    if not isinstance(made, nn.Module):
+        raise FileFormatError(path, "describes no learner")
+    check_state(made, state)
+    made.load_state_dict(state)
+    return made
+
+
+def known_classes(classes: Iterable[type] = ()) -> dict[str, Any]:
+    """Classes of this package that record what they were made with, and those given, by name."""
+    found = {
+        kind.__name__: kind for kind in _subclasses(Recorded) if kind.__module__.startswith("torch_ekm.")
+    }
+    return found | {kind.__name__: kind for kind in classes}
+
+
+def _subclasses(kind: type) -> Iterator[type]:
+    for one in kind.__subclasses__():
+        yield one
+        yield from _subclasses(one)
+
+
+def _pack(value: Any, tensors: dict[str, torch.Tensor], learner: str) -> Any:
+    if value is None or isinstance(value, bool | int | float | str):
+        return {"value": value}
+    if isinstance(value, torch.Tensor):
+        if value.dtype == torch.bfloat16:
+            raise NoStateError(learner, "numpy has no bfloat16")
+        name = f"{len(tensors)}.npy"
+        tensors[name] = value
+        return {"tensor": name}
+    if isinstance(value, list | tuple):
+        return {"list": [_pack(one, tensors, learner) for one in value]}
+    if isinstance(value, Mapping):
+        return {"dict": [[key, _pack(one, tensors, learner)] for key, one in value.items()]}
+    raise NoStateError(learner, f"its state holds a {type(value).__name__}")
+
+
+def _unpack(packed: Any, tensors: Mapping[str, torch.Tensor]) -> Any:
+    if "tensor" in packed:
+        return tensors[packed["tensor"]]
+    if "list" in packed:
+        return [_unpack(one, tensors) for one in packed["list"]]
+    if "dict" in packed:
+        return {key: _unpack(one, tensors) for key, one in packed["dict"]}
+    return packed["value"]

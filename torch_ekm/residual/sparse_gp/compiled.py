@@ -1,0 +1,246 @@
+"""Which of a learner's work compiled loops can do, and the learner's buffers as they see them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cache
+from types import ModuleType
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch._C import _len_torch_dispatch_stack
+from torch._C._functorch import is_functorch_wrapped_tensor
+from torch.autograd.forward_ad import unpack_dual
+
+from ...typing import Array, Tensor
+from ..kernels.action_linear import ActionLinearKernel
+from ..kernels.kernel import Kernel
+from ..kernels.stationary import Matern32, Matern52, SquaredExponential
+from ..report import UpdateReport
+from .monitor import RobustWeight
+from .part import Host, Part
+from .recursion import Absorbed
+
+_PRUNING = {"kl": 0, "mean": 1, "freeze": 2}
+
+
+@cache
+def load_kernels() -> tuple[ModuleType, ModuleType] | None:
+    """The compiled loops; None where numba is missing, does not fit numpy, or cannot write its cache."""
+    try:
+        from . import numba_drift, numba_kernels
+    except (ImportError, RuntimeError):
+        return None
+    return numba_kernels, numba_drift
+
+
+class Learner(Host, Protocol):
+    """What compiled loops ask of a learner beside."""
+
+    batch_shape: torch.Size
+    weighing: tuple[Part, ...]
+    """Parts that weigh samples."""
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of x and y."""
+        ...
+
+    def modules(self) -> Iterator[torch.nn.Module]:
+        """It and all in it."""
+        ...
+
+
+class CompiledLoops:
+    """A learner's buffers as arrays that share their memory, and the compiled calls on them.
+
+    The arrays are made at the first call, and anew whenever a buffer is another one: the learner was moved,
+    or loaded with other tensors. A call returns None where torch must do the work: without numba, on another
+    device, in float32, where a gradient is to be carried, inside of a transformation or of torch.compile, and
+    with parts that weigh samples in ways that are not known here.
+    """
+
+    def __init__(self) -> None:
+        self._kernel: Kernel | None = None
+        self._sources: list[tuple[dict, str, Tensor, int]] = []
+        self._usable = False
+
+    def __deepcopy__(self, memo: dict) -> CompiledLoops:
+        return CompiledLoops()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return CompiledLoops, ()
+
+    # -- calls ----------------------------------------------------------------------------------
+
+    def accept(self, gp: Learner, x: Tensor, y: Tensor) -> bool:
+        """Whether this is one good sample for each model, and a call for :meth:`absorb`."""
+        if not self._takes(gp, x) or not _is_plain(y, (*self._batch, self._m)):
+            return False
+        return self._have_squares(x.numpy().reshape(-1), y.numpy().reshape(-1))
+
+    def absorb(self, gp: Learner, x: Tensor, y: Tensor, on: Tensor | None) -> Absorbed | None:
+        """One checked sample per model where ``on``; None, and nothing changed, if torch must do it."""
+        if not self._takes(gp, x) or not _is_plain(y, (*self._batch, self._m)):
+            return None
+        posterior, flags, n_models, m = self._posterior, self._flags, self._n_models, self._m
+        flags[2], flags[3] = posterior.projection == "fitc", _PRUNING[posterior.pruning]
+        k, prior, mask = self._none2, self._none1, self._all
+        if self._given:
+            x, y = gp.units.inputs(x), gp.units.targets(y)
+            with torch.no_grad():
+                k = gp.kernel.vector(x, posterior.basis).reshape(n_models, -1).numpy()
+                prior = np.ascontiguousarray(gp.kernel.diagonal(x).reshape(-1).numpy())
+        event, told, errors = np.zeros(n_models, np.int64), np.zeros((4, n_models)), np.zeros(n_models * m)
+        if on is not None:
+            mask = (on > 0).reshape(-1).numpy()
+            told[2] = 1.0
+        self._absorb(
+            flags, mask, x.numpy().reshape(-1), y.numpy().reshape(-1), k, prior, *self._state, *self._hyper,
+            self._noise, *self._units, self._robust, posterior.novelty_threshold, posterior.jitter,
+            event, told, errors,
+        )  # fmt: skip
+        batch = self._batch
+        novelty, nis, weight, variance = torch.from_numpy(told.reshape(4, *batch)).unbind()
+        report = UpdateReport(torch.from_numpy(event.reshape(batch)), novelty, nis, weight)
+        return Absorbed(report, torch.from_numpy(errors.reshape(*batch, m)), variance)
+
+    def query(
+        self, gp: Learner, x: Tensor, *, variance: bool = False, slopes: bool = False
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
+        """Mean, variance and both derivatives of one query per model; what is not wanted is empty."""
+        if not self._takes(gp, x) or self._given:
+            return None
+        n, nd = self._n_models * self._m, self._n_models * self._m * self._d
+        mean, v = np.empty(n), np.empty(n if variance else 0)
+        J, dv = np.empty(nd if slopes else 0), np.empty(nd if slopes and variance else 0)
+        basis, active, _, _, moments, vectors = self._state
+        self._query(
+            self._flags, x.numpy().reshape(-1), basis, active, moments, vectors, *self._hyper, *self._units,
+            variance, slopes, mean, v, J, dv,
+        )  # fmt: skip
+        one, two = (*self._batch, self._m), (*self._batch, self._m, self._d)
+        shapes = one, one if variance else (0,), two if slopes else (0,), two if slopes and variance else (0,)
+        results = (torch.from_numpy(a.reshape(s)) for a, s in zip((mean, v, J, dv), shapes, strict=True))
+        return tuple(results)  # type: ignore[return-value]
+
+    def drift(self, gp: Learner) -> float | None:
+        """See ``SparsePosterior.drift``; None: torch must tell."""
+        if torch.compiler.is_compiling() or not self._is_bound(gp) or self._given:
+            return None
+        basis, active, _, _, moments, vectors = self._state
+        jitter = self._posterior.jitter
+        return self._drift(self._flags, basis, active, moments, vectors, *self._hyper, self._noise, jitter)
+
+    # -- what they work on ----------------------------------------------------------------------
+
+    def _takes(self, gp: Learner, x: Tensor) -> bool:
+        """Whether this call is one for compiled loops; prepares the arrays."""
+        if torch.compiler.is_compiling() or not _is_plain(x, (*gp.batch_shape, gp.in_features)):
+            return False
+        if not self._is_bound(gp):
+            return False
+        return not (torch.is_grad_enabled() and any(p.requires_grad for p in self._parameters))
+
+    def _is_bound(self, gp: Learner) -> bool:
+        """Whether the arrays, made anew if need be, are of use."""
+        if vars(gp)["_modules"]["kernel"] is not self._kernel or not self._is_current():
+            self._bind(gp)
+        return self._usable
+
+    def _is_current(self) -> bool:
+        """Whether all tensors are those that were bound, at the same place in memory."""
+        for owner, name, tensor, pointer in self._sources:
+            if owner.get(name) is not tensor or tensor.data_ptr() != pointer:
+                return False
+        return True
+
+    def _bind(self, gp: Learner) -> None:
+        self._kernel, self._posterior, self._usable = gp.kernel, gp.posterior, False
+        self._batch, self._d, self._m = tuple(gp.batch_shape), gp.in_features, gp.out_features
+        self._n_models = n = gp.batch_shape.numel()
+        posterior = gp.posterior
+        state = (
+            posterior.basis, posterior.active, posterior.count, posterior.slot, posterior.moments,
+            posterior.vectors,
+        )  # fmt: skip
+        own, units = _known(gp.kernel, self._batch), gp.units.affine()
+        self._parameters = tuple(own[1] if own is not None else gp.kernel.parameters())
+        tensors = (*state, gp.log_noise_variance, *self._parameters, *(units or ()))
+        self._sources = _sources(gp, tensors)
+        on_host = all(t.is_cpu and t.is_contiguous() for t in tensors) and gp.dtype == torch.float64
+        modules = load_kernels() if on_host else None
+        robust = [part.threshold for part in gp.weighing if type(part) is RobustWeight]
+        if modules is None or len(robust) < len(gp.weighing):
+            return
+        kernels, drift = modules
+        self._given = own is None or units is None
+        kind, n_actions = (kernels.GIVEN, 0) if self._given or own is None else own[0]
+        self._flags, self._robust = np.array([kind, n_actions, 0, 0]), np.array(robust)
+        self._none1, self._none2, self._all = np.empty(0), np.empty((0, 0)), np.ones(n, np.bool_)
+        self._state = tuple(t.numpy().reshape(n, *t.shape[len(self._batch) :]) for t in state)
+        self._noise = gp.log_noise_variance.detach().numpy().reshape(n, -1)
+        self._hyper: tuple[Array, ...] = np.zeros((1, 0)), np.zeros(1), np.zeros((1, 0))
+        self._units: tuple[Array, ...] = (
+            np.zeros((1, self._d)), np.ones((1, self._d)), np.zeros((1, self._m)), np.ones((1, self._m))
+        )  # fmt: skip
+        if not self._given and own is not None:
+            lengthscale, variance, *action = (p.detach().numpy() for p in self._parameters)
+            rows = variance.reshape(-1)
+            action = action[0] if action else np.zeros((len(rows), 0))
+            self._hyper = lengthscale.reshape(len(rows), -1), rows, action.reshape(len(rows), -1)
+            if units:
+                self._units = tuple(t.numpy().reshape(n, -1) for t in units)
+        self._absorb: Callable = kernels.absorb_fleet
+        self._query: Callable = kernels.query_fleet
+        self._drift: Callable = drift.drift_fleet
+        self._have_squares: Callable = kernels.have_squares
+        self._usable = True
+
+
+def _is_plain(x: Any, shape: tuple[int, ...]) -> bool:
+    """Whether x is an ordinary tensor whose memory can be read without losing a derivative."""
+    return (
+        type(x) is Tensor
+        and x.shape == shape
+        and x.dtype is torch.float64
+        and x.is_cpu
+        and not x.requires_grad
+        and x.is_contiguous()
+        and unpack_dual(x).tangent is None
+        and not is_functorch_wrapped_tensor(x)
+        and not _len_torch_dispatch_stack()  # somebody records what torch is asked to do
+        and not torch.jit.is_tracing()
+    )
+
+
+_KINDS = {SquaredExponential: 0, Matern32: 1, Matern52: 2}
+
+
+def _known(kernel: Kernel, batch: tuple[int, ...]) -> tuple[tuple[int, int], list[Tensor]] | None:
+    """(kind, width of the action) and the parameters of a kernel that the loops know themselves."""
+    state = kernel.state_kernel if type(kernel) is ActionLinearKernel else kernel
+    kind = _KINDS.get(type(state))  # a subclass may compute something else
+    if kind is None:
+        return None
+    parameters: list[Tensor] = [state.log_lengthscale, state.log_variance]  # type: ignore[list-item]
+    n_actions = 0
+    if isinstance(kernel, ActionLinearKernel):
+        parameters.append(kernel.log_action_variance)
+        n_actions = kernel.action_features
+    variance = parameters[1]
+    shapes = [tuple(p.shape[:-1]) for p in (parameters[0], *parameters[2:])]
+    alike = all(shape == tuple(variance.shape) for shape in shapes) and variance.shape in ((), batch)
+    return ((kind, n_actions), parameters) if alike else None
+
+
+def _sources(gp: Learner, tensors: tuple[Tensor, ...]) -> list[tuple[dict, str, Tensor, int]]:
+    """Where in the learner each of these tensors is kept, and its place in memory."""
+    wanted = {id(tensor) for tensor in tensors}
+    found = []
+    for module in gp.modules():
+        for owner in (vars(module)["_parameters"], vars(module)["_buffers"]):
+            kept = ((name, t) for name, t in owner.items() if t is not None and id(t) in wanted)
+            found += [(owner, name, t, t.data_ptr()) for name, t in kept]
+    return found
