@@ -195,7 +195,9 @@ def test_the_pace_grows_where_the_model_is_right_and_shrinks_where_it_is_not() -
     other.load_state_dict(trust.state_dict())
     assert other.pace == options.largest
     trust.restart()
-    assert trust.pace == options.smallest
+    assert trust.pace == options.smallest / 2
+    trust.slower()
+    assert trust.pace == options.smallest / 2
 
 
 @pytest.mark.parametrize(

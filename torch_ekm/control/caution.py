@@ -20,15 +20,15 @@ _DEG = math.pi / 180
 class Caution:
     """What tells of a loss before it comes, and what is done then; the same for every controller.
 
-    Signs: the model refuses the state in ``looks`` further readings as well; the object has turned off the
-    focus by ``off_rotation``; a link without a pad comes to bear on the object. The hand then goes back
-    along the way that was come, motion by motion, until the signs are gone: these states are known to hold.
-    It grips by ``tighten`` more and tries again at a smaller pace, ``retreats`` times; at the next sign it
+    Signs: the model refuses the state; the object has turned off the focus by ``off_rotation``; a link
+    without a pad comes to bear on the object. One that ``looks`` further readings show as well is heeded:
+    the hand goes back along the way that was come, motion by motion, until the signs are gone, for these
+    states are known to hold. It grips by ``tighten`` more and tries again at a smaller pace, ``retreats`` times; at the next sign it
     goes back once more and gives up. Where going back does not help, it gives up at once.
     """
 
     looks: int = 2
-    """Further readings of a state that the model refuses."""
+    """Further readings before a sign is believed."""
     off_rotation: float = 8 * _DEG
     """[rad]"""
     off_further: float = 4 * _DEG

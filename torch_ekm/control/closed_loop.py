@@ -181,8 +181,7 @@ class ClosedLoop:
             reason = self.rule.judge(turn.errors, turn.limited)
             if reason is not StopReason.RUNNING:
                 return Stop(reason, seen)
-            seen, decision, seconds = self._decide(seen, turn)
-            sign = self._sign(turn, seen, decision)
+            seen, decision, sign, seconds = self._decide(seen, turn)
             if sign and turn.way and decision.status is not StopReason.OBJECT_LOST:
                 turn.alarms += 1
                 turn.off_allowed = max(turn.off_allowed, turn.off_rotation(seen) + self.caution.off_further)
@@ -199,17 +198,17 @@ class ClosedLoop:
             yield step
             seen, turn.limited = step.after, decision.limited
 
-    def _decide(self, seen: Observation, turn: _Turn) -> tuple[Observation, Decision, float]:
-        """A decision; a state that the model refuses is looked at again, and the last look counts."""
-        began = time.perf_counter()
-        decision = self.controller.decide(seen.state, seen.a, turn.target, seen.fingertip_force)
-        seconds = time.perf_counter() - began
-        for _ in range(self.caution.looks):
-            if decision.status is StopReason.RUNNING or seen.status is not PlantStatus.HELD:
-                break
-            seen = self.plant.observe()
+    def _decide(self, seen: Observation, turn: _Turn) -> tuple[Observation, Decision, str, float]:
+        """A decision, and what speaks for a loss to come in this reading and in all further looks."""
+        looks = self.caution.looks
+        while True:
+            began = time.perf_counter()
             decision = self.controller.decide(seen.state, seen.a, turn.target, seen.fingertip_force)
-        return seen, decision, seconds
+            seconds = time.perf_counter() - began
+            sign = self._sign(turn, seen, decision)
+            if not sign or looks == 0 or seen.status is not PlantStatus.HELD:
+                return seen, decision, sign, seconds
+            seen, looks = self.plant.observe(), looks - 1
 
     def _sign(self, turn: _Turn, seen: Observation, decision: Decision) -> str:
         """What speaks for a loss to come; empty: nothing."""
@@ -231,8 +230,8 @@ class ClosedLoop:
             seen = step.after
             if seen.status is PlantStatus.LOST:
                 break
-            seen, decision, _ = self._decide(seen, turn)
-            if not self._sign(turn, seen, decision):
+            seen, decision, sign, _ = self._decide(seen, turn)
+            if not sign:
                 return seen, True
         return seen, False
 

@@ -113,11 +113,12 @@ class TrustRegion(Recorded, nn.Module):
 
     def slower(self) -> None:
         """Shrink once."""
-        self.value.mul_(self.options.shrink).clamp_(min=self.options.smallest)
+        least = min(self.pace, self.options.smallest)
+        self.value.mul_(self.options.shrink).clamp_(min=least)
 
     def restart(self) -> None:
-        """Begin again with the smallest steps: something went wrong."""
-        self.value.fill_(self.options.smallest)
+        """Begin again with half the smallest steps: something went wrong, and is near."""
+        self.value.fill_(self.options.smallest / 2)
 
     def extra_repr(self) -> str:
         return f"pace={self.pace:.3g}"
