@@ -23,8 +23,9 @@ class Caution:
     Signs: the model refuses the state; the object has turned off the focus by ``off_rotation``; a link
     without a pad comes to bear on the object. One that ``looks`` further readings show as well is heeded:
     the hand goes back along the way that was come, motion by motion, until the signs are gone, for these
-    states are known to hold. It grips by ``tighten`` more and tries again at a smaller pace, ``retreats`` times; at the next sign it
-    goes back once more and gives up. Where going back does not help, it gives up at once.
+    states are known to hold. It grips by ``tighten`` more and tries again at a smaller pace, ``retreats``
+    times; at the next sign it goes back once more and gives up. Where going back does not help, it gives up
+    at once.
     """
 
     looks: int = 2
