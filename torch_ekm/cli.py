@@ -69,10 +69,10 @@ def hands() -> None:
 @app.command()
 def objects() -> None:
     """List the objects that come with the package."""
-    from .description import list_objects, load_object
+    from .description import list_cylinders, list_objects, load_object
 
     rows = []
-    for name in list_objects():
+    for name in (*list_objects(), *list_cylinders()):
         obj = load_object(name)
         figures = f"{1e3 * obj.mass:.0f}", f"{obj.friction:g}", f"{1e3 * obj.grasp_width:.0f}"
         rows.append((name, *figures, ", ".join(shape.kind for shape in obj.shapes)))

@@ -1,5 +1,7 @@
 """The six everyday objects: dimensions, masses, friction. Chosen by us; only their names are the paper's.
 
+The cylinders have the diameters of those that a Yale T42 was recorded with, and its pads' friction.
+
 Object frame: origin at the geometric centre, x along the longest side, y the direction in which the
 fingers press, z = x cross y. A part is a solid with its mass, of uniform density.
 """
@@ -96,6 +98,18 @@ OBJECTS = (
         0.7,
         colour="0.75 0.15 0.15 1",
     ),
+)
+CYLINDERS = tuple(
+    Thing(
+        f"cylinder_{diameter}mm",
+        f"a printed cylinder of {diameter} mm diameter, as the Yale T42 was recorded with",
+        ((Rod((-0.030, 0, 0), (0.030, 0, 0), diameter / 2000, round=False), 0.030),),
+        diameter / 1000,
+        0.030,
+        1.16,
+        colour="0.85 0.82 0.70 1",
+    )
+    for diameter in (20, 30, 35, 45)
 )
 
 
