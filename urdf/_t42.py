@@ -89,9 +89,7 @@ moment_arms = {inline(arms)}
 tendon = true
 stiffness = {round(SERIES * SPRINGS[0], 6)}
 backlash = {PLAY}""")
-    out.append(
-        "\n# The flat of the distal link and the arc at its end: a capsule exactly [m, link frame]."
-    )
+    out.append("\n# The flat of the distal link and the arc at its end: a capsule exactly [m, link frame].")
     for finger, (_, sign) in FINGERS.items():
         out.append(f"""
 [[pads]]

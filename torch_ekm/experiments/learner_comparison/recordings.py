@@ -53,9 +53,9 @@ def load_t42() -> list[Stream]:
 
     ``t42_hand/t42_testpaths.npz`` holds, for each object and path, states ``(n, 13)`` and actions
     ``(n, 2)``. A sample every ten steps: input the state and the mean action over these, output the change
-    of (x, y, angle). The red hand's servos are numbered the other way round: its two columns are exchanged, so
-    that a column is a finger in all recordings. The Jacobian is the least-squares map from actions to outputs
-    on one object, which also gives the units; the other objects follow in alphabetical order.
+    of (x, y, angle). The red hand's servos are numbered the other way round: its two columns are exchanged,
+    so that a column is a finger in all recordings. The Jacobian is the least-squares map from actions to
+    outputs on one object, which also gives the units; the other objects follow in alphabetical order.
 
     Raises:
         DescriptionError: there is no such file.
