@@ -172,18 +172,20 @@ def test_the_page_has_its_tables_and_pictures(result, tmp_path):
         result.row("an oracle", 50)
 
 
+def save(folder, key, states):
+    arrays = {f"{key}/S": states, f"{key}/A": np.zeros((len(states), 2))}
+    np.savez(folder / "t42_testpaths.npz", allow_pickle=False, **arrays)  # type: ignore[arg-type]
+
+
 def test_what_is_wrong_is_told(tmp_path, folder):
     with pytest.raises(DescriptionError, match="t42_testpaths"):
         read_recordings(tmp_path)
     with pytest.raises(UnknownNameError, match="SOGP mixture"):
         predict_recorded_hand(folder, learners=["oracle"])
-    np.savez(
-        tmp_path / "t42_testpaths.npz",
-        **{"cyl30_d_v0/0/S": np.zeros((9, 13)), "cyl30_d_v0/0/A": np.zeros((9, 2))},
-    )
+    save(tmp_path, "cyl30_d_v0/0", np.zeros((9, 13)))
     with pytest.raises(DescriptionError, match="cyl45_d_v0"):
         predict_recorded_hand(tmp_path)
-    np.savez(tmp_path / "t42_testpaths.npz", **{"a/0/S": np.zeros((9, 12)), "a/0/A": np.zeros((9, 2))})
+    save(tmp_path, "a/0", np.zeros((9, 12)))
     with pytest.raises(DescriptionError, match=r"\(n, 13\)"):
         read_recordings(tmp_path)
     with pytest.raises(CalibrationError, match="20"):
