@@ -165,7 +165,7 @@ def test_the_page_has_its_tables_and_pictures(result, tmp_path):
     assert (tmp_path / "index.html").stat().st_size > 10_000
     assert {figure.path for figure in report.figures} == {"paths.svg", "horizons.svg"}
     names = {table.name for table in report.tables}
-    assert names == {"paired"} | {
+    assert names == {"paired", "objects"} | {
         f"scores_{h}_{s}" for h in (10, 50) for s in ("all", "first", "first_smooth", "changed")
     }
     with pytest.raises(UnknownNameError, match="no model"):

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ...description import HandDescription
+from ...kinematics import GraspState
 from ...kinematics.play import Play
 from ...model import KinematicModel
 from ...model.calibration import Calibration, calibrate
@@ -173,6 +174,8 @@ def action_of(nominal: Nominal, samples: Samples) -> Array:
 
 @dataclass(frozen=True)
 class _Rest:
+    """What :class:`~torch_ekm.model.calibration.Recording` asks of an observation."""
+
     q: torch.Tensor
     position: torch.Tensor
     rotation: torch.Tensor
@@ -181,9 +184,7 @@ class _Rest:
     fingertip_force: None = None
 
     @property
-    def state(self) -> Any:
-        from ...kinematics import GraspState
-
+    def state(self) -> GraspState:
         return GraspState(self.q, self.position, self.rotation)
 
 

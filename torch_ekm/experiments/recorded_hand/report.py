@@ -14,7 +14,7 @@ from ..reporting.tables import Target, targets_table
 from .benchmark import CURVE, HORIZONS, LEARNER, SUBSETS, RecordedHandResult
 from .nominal import NOMINALS
 from .recordings import APART, STEP
-from .scores import COORDINATES, compare_errors
+from .scores import COORDINATES, compare_errors, score
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,7 +50,7 @@ def write_report(result: RecordedHandResult, folder: str | Path) -> Report:
         save(plot_horizons(result), name="horizons", caption="Error of the models alone, by horizon."),
     ]
     tables = [score_table(result, h, subset) for h in HORIZONS for subset in SUBSETS]
-    tables.append(paired_table(result))
+    tables += [paired_table(result), object_table(result)]
     if not result.quick:
         tables.insert(0, targets_table(targets(result)))
     report = Report(
@@ -97,7 +97,7 @@ def score_table(result: RecordedHandResult, horizon: int, subset: str) -> Table:
     note = (
         "rms error over rms motion, both cut at their 99 % quantile, 95 % interval over objects; 1: as if "
         "nothing moved. Last two: of all three coordinates in units of their spread, not cut, mean over "
-        "objects."
+        "objects (the median of those that move in more than half of the samples)."
     )
     return Table(
         f"scores_{horizon}_{subset.replace(', ', '_')}",
@@ -127,6 +127,32 @@ def paired_table(result: RecordedHandResult) -> Table:
     return Table(
         "paired", "Pairs on the same samples, all", columns, rows, "95 % interval over objects, paired."
     )
+
+
+def object_table(result: RecordedHandResult) -> Table:
+    """Each object: what could be seen of it, and the models alone at the longer horizon."""
+    horizon, models = HORIZONS[-1], (_PUBLISHED, _CALIBRATED)
+    rows: list[list[Cell]] = []
+    for name in result.reported:
+        states, taken = result.states[name], {name: result.samples[horizon][name]}
+        markers = np.concatenate([path.markers for path in result.paths[name]])
+        hidden = np.isnan(markers).any((1, 2)).mean()
+        errors = [
+            score(m, horizon, "all", taken, {name: result.predicted[m, horizon][name]}, np.ones(3)).ratio
+            for m in models
+        ]
+        row: list[Cell] = [name, float(hidden), float(states.found.mean())]
+        row.append(1e3 * float(np.median(states.diameter)))
+        rows.append([*row, *(ratio[c].mean for c in ("x", "y") for ratio in errors)])
+    columns = [
+        "object",
+        Column("a marker hidden [%]", ".0f", percent=True),
+        Column("both pads brought to touch [%]", ".0f", percent=True),
+        Column("diameter [mm]", ".0f"),
+        *(Column(f"{c}: {kind}", ".2f") for c in ("x", "y") for kind in ("published", "calibrated")),
+    ]
+    caption = f"Object by object, {horizon * STEP:g} s ahead, with play, no learner"
+    return Table("objects", caption, columns, rows, "Errors cut at each object's own 99 % quantile.")
 
 
 def targets(result: RecordedHandResult) -> list[Target]:

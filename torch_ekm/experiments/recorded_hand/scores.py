@@ -32,7 +32,7 @@ class Row(NamedTuple):
     rms: float
     """rms error of all coordinates in units of their spread, over that of the motion: mean over objects."""
     median: float
-    """The same of the median absolute values."""
+    """The same of the median absolute values, of objects that move in more than half of the samples."""
 
 
 def subsets(samples: Mapping[str, Samples]) -> dict[str, dict[str, NDArray[np.bool_]]]:
@@ -73,8 +73,11 @@ def score(
     }
     used = [key for key in samples if len(motion[key])]
     rms = [np.sqrt(np.mean((error[k] / unit) ** 2) / np.mean((motion[k] / unit) ** 2)) for k in used]
-    median = [np.median(np.abs(error[k] / unit)) / np.median(np.abs(motion[k] / unit)) for k in used]
-    return Row(name, horizon, subset, ratio, float(np.mean(rms)), float(np.mean(median)))
+    middle = [[np.median(np.abs(parts[k] / unit)) for parts in (error, motion)] for k in used]
+    median = [ours / theirs for ours, theirs in middle if theirs > 0]
+    return Row(
+        name, horizon, subset, ratio, float(np.mean(rms)), float(np.mean(median)) if median else np.nan
+    )
 
 
 def compare_errors(
