@@ -69,10 +69,10 @@ def hands() -> None:
 @app.command()
 def objects() -> None:
     """List the objects that come with the package."""
-    from .description import list_objects, load_object
+    from .description import list_cylinders, list_objects, load_object
 
     rows = []
-    for name in list_objects():
+    for name in (*list_objects(), *list_cylinders()):
         obj = load_object(name)
         figures = f"{1e3 * obj.mass:.0f}", f"{obj.friction:g}", f"{1e3 * obj.grasp_width:.0f}"
         rows.append((name, *figures, ", ".join(shape.kind for shape in obj.shapes)))
@@ -202,6 +202,32 @@ def compare(
             on_done=advance,
         )
     _print_report(compared.write(out), out, notes=True)
+
+
+@app.command()
+def recorded_hand(
+    data: Annotated[
+        Path | None, Option(help="t42_testpaths.npz or its folder; a small synthetic one if left out.")
+    ] = None,
+    learners: Annotated[str, Option(help="Names, separated by commas.")] = "SOGP mixture",
+    out: Annotated[Path, Option(help="Folder for the report.")] = Path("recorded_hand_output"),
+    jobs: Jobs = 2,
+    quick: Annotated[bool, Option(help="Two paths of four objects: to see that it works.")] = False,
+) -> None:
+    """Predict the recorded motions of a Yale T42 with its kinematic model, with and without learners.
+
+    The recordings (Sintov et al., GitHub avishais/t42_autonomous_system) are read in place; the documentation
+    tells how to save them as npz. Interrupted, it goes on where it stopped.
+    """
+    from .experiments.recorded_hand.benchmark import count_jobs, predict_recorded_hand
+    from .experiments.recorded_hand.report import write_report
+
+    chosen = _names(learners)
+    with _progress("predicting", count_jobs(data, len(chosen), quick=quick)) as advance:
+        result = predict_recorded_hand(
+            data, learners=chosen, folder=out / "runs", processes=jobs, quick=quick, on_done=advance
+        )
+    _print_report(write_report(result, out), out, notes=True)
 
 
 @app.command()

@@ -1,6 +1,8 @@
 """Everyday objects: dimensions, masses, friction, all chosen by us. The names of the first six are the
 paper's; the other six reach from 15 to 66 mm and from 0.03 to 0.3 kg, and nothing is tuned on them.
 
+The cylinders have the diameters of those that a Yale T42 was recorded with, and its pads' friction.
+
 Object frame: origin at the geometric centre, x along the longest side, y the direction in which the
 fingers press, z = x cross y. A part is a solid with its mass, of uniform density.
 """
@@ -154,6 +156,18 @@ OBJECTS = (
         0.9,
         colour="0.85 0.75 0.60 1",
     ),
+)
+CYLINDERS = tuple(
+    Thing(
+        f"cylinder_{diameter}mm",
+        f"a printed cylinder of {diameter} mm diameter, as the Yale T42 was recorded with",
+        ((Rod((-0.030, 0, 0), (0.030, 0, 0), diameter / 2000, round=False), 0.030),),
+        diameter / 1000,
+        0.030,
+        1.16,
+        colour="0.85 0.82 0.70 1",
+    )
+    for diameter in (20, 30, 35, 45)
 )
 
 

@@ -3,10 +3,11 @@
     python urdf/generate.py            # write
     python urdf/generate.py --check    # exit with 1 if a file is not what would be written
 
-The figures live in ``_icub.py``, ``_planar.py`` and ``_objects.py``; README.md tells where each one
-comes from. Sources: iKin (icub-main, BSD-3-Clause) and the iCub documentation (BSD-3-Clause) for the
-kinematics, robots-configuration and icub-firmware for limits, actuators and Hall sensors, icub-models
-for masses and for dimensions measured on its meshes. Only figures were taken, no text and no mesh.
+The figures live in ``_icub.py``, ``_planar.py``, ``_t42.py`` and ``_objects.py``; README.md tells
+where each one comes from. Sources: iKin (icub-main, BSD-3-Clause) and the iCub documentation
+(BSD-3-Clause) for the kinematics, robots-configuration and icub-firmware for limits, actuators and Hall
+sensors, icub-models for masses and for dimensions measured on its meshes, openhand-hardware for the T42.
+Only figures were taken, no text and no mesh.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from pathlib import Path
 import _icub
 import _objects
 import _planar
+import _t42
 
 FOLDER = Path(__file__).resolve().parent
 
@@ -30,7 +32,9 @@ def files() -> dict[Path, str]:
         texts[Path(f"icub_{side}_hand.transmission.toml")] = _icub.transmission_text(left=side == "left")
     texts[Path("planar_two_finger.urdf")] = _planar.urdf_text()
     texts[Path("planar_two_finger.transmission.toml")] = _planar.transmission_text()
-    for thing in _objects.OBJECTS:
+    texts[Path("yale_t42.urdf")] = _t42.urdf_text()
+    texts[Path("yale_t42.transmission.toml")] = _t42.transmission_text()
+    for thing in (*_objects.OBJECTS, *_objects.CYLINDERS):
         texts[Path("objects", f"{thing.name}.urdf")] = _objects.urdf_text(thing)
         texts[Path("objects", f"{thing.name}.object.toml")] = _objects.object_text(thing)
     return texts

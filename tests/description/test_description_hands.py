@@ -178,3 +178,25 @@ def test_data_of_an_installed_package(tmp_path: Path, monkeypatch: pytest.Monkey
     (package.parent / "_urdf" / "objects").rmdir()
     with pytest.raises(DescriptionError, match="not installed"):
         urdf_folder()
+
+
+def test_the_t42_has_its_published_figures() -> None:
+    """Straight fingers: pads face each other, their flats 52 - 2 * 11.95 mm apart, tips 110.475 mm out."""
+    torch = pytest.importorskip("torch")
+    from torch_ekm.kinematics import HandKinematics
+
+    hand = load_hand("yale_t42")
+    assert hand.planar_normal == (0.0, 0.0, 1.0)
+    np.testing.assert_allclose(hand.actuation_jacobian, np.kron(np.eye(2), [[8 / 10.5] * 2]), atol=1e-6)
+    np.testing.assert_allclose(hand.actuator_backlash, 0.04)
+    np.testing.assert_allclose(hand.spring_stiffness[1::2] / hand.spring_stiffness[::2], 2.0)
+    poses = HandKinematics(hand)(torch.zeros(4, dtype=torch.float64))
+    flat = [
+        (poses.of(pad.link).numpy() @ [*(np.array(pad.end) + pad.radius * np.array(pad.direction)), 1])[:3]
+        for pad in hand.pads
+    ]
+    np.testing.assert_allclose(flat[1] - flat[0], [0.052 - 2 * 0.01195, 0, 0], atol=1e-12)
+    tips = [poses.of(f"{finger}_tip").numpy()[:3, 3] for finger in ("left", "right")]
+    np.testing.assert_allclose(
+        tips, [[-0.026, 0.0625 + 0.047975, 0], [0.026, 0.0625 + 0.047975, 0]], atol=1e-9
+    )

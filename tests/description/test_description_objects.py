@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torch_ekm.description import Shape, list_objects, load_object
+from torch_ekm.description import Shape, list_cylinders, list_objects, load_object
 from torch_ekm.description.shape import merge_capsules
 
 
@@ -96,3 +96,10 @@ def test_a_cylinder_with_two_balls_is_a_capsule() -> None:
     assert [s.kind for s in merge_capsules((rod, caps[0]))] == ["cylinder", "sphere"]
     other = Shape("sphere", (0.011,), down)
     assert [s.kind for s in merge_capsules((rod, caps[0], other))] == ["cylinder", "sphere", "sphere"]
+
+
+def test_cylinders_go_by_their_diameter() -> None:
+    for name in list_cylinders():
+        obj, diameter = load_object(name), float(name[len("cylinder_") : -len("mm")]) / 1000
+        assert [(shape.kind, shape.size) for shape in obj.shapes] == [("cylinder", (diameter / 2, 0.06))]
+        assert obj.grasp_width == diameter

@@ -188,6 +188,10 @@ def test_command_line(folder, tmp_path):
     done = runner.invoke(app, ["show", "planar_two_finger", "--object", "box", "--html", str(page)])
     assert done.exit_code == 0, done.output
     assert page.exists()
+    page.unlink()
+    done = runner.invoke(app, ["show", "yale_t42", "--object", "cylinder_45mm", "--html", str(page)])
+    assert done.exit_code == 0, done.output
+    assert page.exists()
     failed = runner.invoke(app, ["replay", str(tmp_path / "nothing")])
     assert isinstance(failed.exception, DescriptionError)
     made = tmp_path / "made"

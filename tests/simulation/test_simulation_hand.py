@@ -22,6 +22,7 @@ from torch_ekm.exceptions import (
     ShapeError,
     UnknownNameError,
 )
+from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Plant, PlantStatus
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand, preset
 
@@ -213,6 +214,23 @@ def test_other_hands_hold_too(hand, gravity):
     moved, turned = motion(before, plant.observe())
     assert moved.norm() < 1e-5
     assert turned.norm() < 0.01 * DEG
+
+
+@pytest.mark.parametrize("name", ["cylinder_30mm", "cylinder_45mm"])
+def test_the_t42_pinches_and_turns_a_cylinder_as_its_model_says(name):
+    """3 to 5 mm sideways, once the play is taken up, and a turn; both within 3 % of the model."""
+    plant = SimulatedHand("yale_t42", name)
+    before = plant.reset(0)
+    push = torch.tensor([-0.04, 0.04], dtype=torch.float64)
+    before = plant.command(push)  # takes up the play
+    linear = KinematicModel(plant.hand, plant.object).linearize(before.truth.state)
+    after = plant.command(push)
+    assert after.status is PlantStatus.HELD
+    moved, expected = after.truth.state.minus(before.truth.state), linear.step(push)
+    assert -0.0050 < float(moved[4]) < -0.0030
+    assert abs(float(moved[-1])) > 1.2 * DEG
+    for at in (4, -1):  # x, angle
+        assert float(moved[at]) == pytest.approx(float(expected[at]), rel=0.03)
 
 
 def test_bad_commands_are_refused_and_move_nothing(plant, grasped):

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from .hand import Actuator, ContactPad, HallSensor, HandDescription
 from .objects import ObjectDescription
-from .registry import hand_paths, list_hands, list_objects, load_hand, load_object, object_paths, urdf_folder
+from .registry import (
+    hand_paths,
+    list_cylinders,
+    list_hands,
+    list_objects,
+    load_hand,
+    load_object,
+    object_paths,
+    urdf_folder,
+)
 from .shape import Shape
 from .transmission_file import write_transmission
 from .urdf import UrdfJoint, UrdfLink, UrdfModel, read_urdf
@@ -21,6 +30,7 @@ __all__ = [
     "UrdfModel",
     "urdf_folder",
     "hand_paths",
+    "list_cylinders",
     "list_hands",
     "list_objects",
     "load_hand",

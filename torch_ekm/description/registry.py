@@ -14,11 +14,13 @@ _HANDS = {
     "icub_right": "icub_right_hand.urdf",
     "icub_left": "icub_left_hand.urdf",
     "planar_two_finger": "planar_two_finger.urdf",
+    "yale_t42": "yale_t42.urdf",
 }
 _OBJECTS = (
     "toothpaste", "applier", "box", "weighted_box", "bottle", "can",
     "pen_case", "flashlight", "charger", "tea_tin", "jar", "carton",
 )  # fmt: skip
+_CYLINDERS = ("cylinder_20mm", "cylinder_30mm", "cylinder_35mm", "cylinder_45mm")
 
 
 def urdf_folder() -> Path:
@@ -36,8 +38,13 @@ def list_hands() -> tuple[str, ...]:
 
 
 def list_objects() -> tuple[str, ...]:
-    """Names that :func:`load_object` knows."""
+    """The everyday objects that experiments take; :func:`load_object` knows the cylinders too."""
     return _OBJECTS
+
+
+def list_cylinders() -> tuple[str, ...]:
+    """Cylinders by diameter, which :func:`load_object` knows: those that a Yale T42 was recorded with."""
+    return _CYLINDERS
 
 
 def load_hand(name: str | Path) -> HandDescription:
@@ -80,7 +87,7 @@ def object_paths(name: str | Path) -> tuple[Path, Path]:
         UnknownNameError: as :func:`load_object`.
     """
     folder = urdf_folder() / "objects"
-    path = _resolve("object", name, {key: folder / f"{key}.urdf" for key in _OBJECTS})
+    path = _resolve("object", name, {key: folder / f"{key}.urdf" for key in (*_OBJECTS, *_CYLINDERS)})
     return path, path.with_suffix(".object.toml")
 
 

@@ -19,6 +19,7 @@ LIMIT = 1500  #: samples of a recording that are used if nobody says otherwise
 
 _T42 = "t42_hand/t42_testpaths.npz"
 _T42_NOMINAL, _T42_SKIPPED = "cyl45_d_v0", "str40_d_v1"
+_T42_EXCHANGED = "_red_"  # in the names of recordings whose columns of actions are exchanged
 _T42_HORIZON = 10  # [steps] of the log in one sample
 
 
@@ -52,8 +53,9 @@ def load_t42() -> list[Stream]:
 
     ``t42_hand/t42_testpaths.npz`` holds, for each object and path, states ``(n, 13)`` and actions
     ``(n, 2)``. A sample every ten steps: input the state and the mean action over these, output the change
-    of (x, y, angle). The Jacobian is the least-squares map from actions to outputs on one object, which
-    also gives the units; the other objects follow in alphabetical order.
+    of (x, y, angle). The red hand's servos are numbered the other way round: its two columns are exchanged,
+    so that a column is a finger in all recordings. The Jacobian is the least-squares map from actions to
+    outputs on one object, which also gives the units; the other objects follow in alphabetical order.
 
     Raises:
         DescriptionError: there is no such file.
@@ -62,6 +64,8 @@ def load_t42() -> list[Stream]:
     samples: dict[str, list[tuple[Array, Array, Array]]] = {}
     for key in sorted(k[:-2] for k in file.files if k.endswith("/S")):
         states, actions = file[key + "/S"], file[key + "/A"]
+        if _T42_EXCHANGED in key:
+            actions = actions[:, ::-1]
         pose = np.column_stack([states[:, :2], np.unwrap(states[:, 2])])
         starts = np.arange(0, len(states) - _T42_HORIZON, _T42_HORIZON)
         action = np.array([actions[t : t + _T42_HORIZON].mean(0) for t in starts])

@@ -1,0 +1,1 @@
+"""Predicting the recorded motions of a real hand: the Yale T42."""
