@@ -32,13 +32,13 @@ def trajectory(start: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:
 def make(options: argparse.Namespace, deep: bool) -> SparseOnlineGP:
     """The learner under test."""
     dtype = torch.float32 if options.float32 else torch.float64
-    common = {"capacity": options.capacity, "dtype": dtype}
+    common = {"capacity": options.capacity, "dtype": dtype, "standardize": False}
     if options.deep:
         if deep:
-            return DeepKernelSOGP(4, 2, noise_variance=0.1, **common)
-        return SparseOnlineGP(4, 2, noise_variance=0.1, parts=[LearnHyperparameters()], **common)
+            return DeepKernelSOGP(4, 2, base=SquaredExponential(4), parts=(), **common)
+        return SparseOnlineGP(4, 2, kernel=SquaredExponential(4), parts=[LearnHyperparameters()], **common)
     kernel = SquaredExponential(4, lengthscale=1.0)
-    return SparseOnlineGP(4, 2, kernel=kernel, noise_variance=1e-4, **common)
+    return SparseOnlineGP(4, 2, kernel=kernel, noise_variance=1e-4, parts=(), **common)
 
 
 def soak(gp: SparseOnlineGP, samples: int) -> None:

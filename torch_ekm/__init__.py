@@ -47,6 +47,7 @@ from .residual import (
     UpdateReport,
     WindowGP,
     ZeroResidual,
+    default_learner,
 )
 
 try:
@@ -60,5 +61,5 @@ __all__ = [
     "MissingExtraError", "MixtureResidual", "NonFiniteError", "ParameterError", "ProcessNoise",
     "RandomFeatureRLS", "RecursiveLeastSquares", "ReplayMLP", "ResidualLearner", "RobustWeight", "ShapeError",
     "SparseOnlineGP", "SquaredExponential", "Standardize", "UnknownNameError", "UpdateEvent", "UpdateReport",
-    "WindowGP", "ZeroResidual", "__version__", "exceptions",
+    "WindowGP", "ZeroResidual", "__version__", "default_learner", "exceptions",
 ]  # fmt: skip

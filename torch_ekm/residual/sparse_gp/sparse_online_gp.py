@@ -14,9 +14,10 @@ from ...typing import Bool, Float, Tensor
 from ..base import DoubleStateLearner
 from ..checks import check_count, check_finite
 from ..kernels.kernel import Kernel, check_kernel, log_parameter
-from ..kernels.stationary import SquaredExponential
+from ..kernels.stationary import Matern32
 from ..report import UpdateReport
-from .part import P, Part, Sample, Units, copy_parts
+from .defaults import chosen_parts
+from .part import P, Part, Sample, Units
 from .posterior import SparsePosterior
 from .recursion import absorb, compiled_absorb
 
@@ -84,12 +85,14 @@ class SparseOnlineGP(DoubleStateLearner):
         *,
         capacity: int = 100,
         kernel: Kernel | None = None,
-        noise_variance: float | Tensor = 0.01,
+        noise_variance: float | Tensor = 0.1,
         novelty_threshold: float = 1e-4,
         jitter: float = 1e-6,
         projection: Literal["kl", "fitc"] = "kl",
         pruning: Literal["kl", "mean", "freeze"] = "kl",
-        parts: Iterable[nn.Module] = (),
+        parts: Iterable[nn.Module] | None = None,
+        standardize: bool = True,
+        output_offset: Literal["zero", "learned"] = "zero",
         refresh_every: int = 32,
         compile_step: bool = False,
         **options: Any,
@@ -100,7 +103,7 @@ class SparseOnlineGP(DoubleStateLearner):
         self.compile_step = bool(compile_step)
         shape, double = self.batch_shape, {"dtype": torch.float64, "device": self.device}
         if kernel is None:
-            kernel = SquaredExponential(self.in_features, batch_shape=shape, **double)
+            kernel = Matern32(self.in_features, batch_shape=shape, **double)
         self.kernel = check_kernel(kernel, self.in_features, shape).to(**double)
         noise_shape = (*shape, self.out_features)
         self.log_noise_variance = log_parameter("noise_variance", noise_variance, noise_shape, **double)
@@ -119,7 +122,7 @@ class SparseOnlineGP(DoubleStateLearner):
         self.pending = nn.Buffer(torch.zeros(shape, **double))
         self.n_samples = 0  # on the host, so that the rhythm of rebuilds never asks the GPU
         self._parts: tuple[Part, ...] = ()
-        for part in copy_parts(parts):
+        for part in chosen_parts(parts, standardize, output_offset):
             part.bind(self)
             self._parts += (part,)
         self.parts = nn.ModuleList(self._parts)
@@ -127,6 +130,8 @@ class SparseOnlineGP(DoubleStateLearner):
         # not as a second child: its buffers would be in the state dict twice
         object.__setattr__(self, "units", units)
         self._weighing = tuple(part for part in self._parts if type(part).weigh is not Part.weigh)
+        first = (part for part in self._parts if type(part).before_update is not Part.before_update)
+        self._before_update = tuple(first)
 
     # -- predictions ----------------------------------------------------------------------------
 
@@ -248,6 +253,8 @@ class SparseOnlineGP(DoubleStateLearner):
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         on = None if mask is None else mask.to(x.dtype)
+        for part in self._before_update:
+            part.before_update(self, x, y, on)
         step = compiled_absorb(x.device.type) if self.compile_step else absorb
         report, innovation, variance = self._learn(x, y, on, step)
         sample = Sample(x, y, on, innovation, variance, report)
@@ -265,6 +272,16 @@ class SparseOnlineGP(DoubleStateLearner):
     ) -> tuple[UpdateReport, Tensor, Tensor]:
         z, t = self.units.inputs(x), self.units.targets(y)
         return step(self.posterior, z, t, self.kernel, self.shared_noise(), on, self._weighing)
+
+    def learn_anew(
+        self, x: Float[Tensor, "*batch n in"], y: Float[Tensor, "*batch n out"], on: Float[Tensor, "*batch n"]
+    ) -> None:
+        """Empty basis; then these samples, where ``on``."""
+        if x.shape[-2]:
+            self.posterior.reset()
+            for x_t, y_t, on_t in zip(x.unbind(-2), y.unbind(-2), on.unbind(-1), strict=True):
+                self._learn(x_t, y_t, on_t)
+            self.refresh()
 
     def start_anew(
         self,
