@@ -30,7 +30,7 @@ SMALL = {
     "krls_t": lambda **o: KRLSTracker(3, 2, capacity=30, **o),
     "window": lambda **o: WindowGP(3, 2, window=40, **o),
     "local": lambda **o: LocalGPs(3, 2, experts=5, window=30, **o),
-    "mlp": lambda **o: ReplayMLP(3, 2, hidden=(16,), **o),
+    "mlp": lambda **o: ReplayMLP(3, 2, hidden=(16,), members=2, **o),
 }
 EVERY = pytest.mark.parametrize("make", SMALL.values(), ids=SMALL)
 #: Their g can take the shape of what is learned here: a linear one cannot, and a network is slow.

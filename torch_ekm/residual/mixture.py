@@ -24,7 +24,7 @@ _FREEDOM = 10.0  # of the t law that judges the experts: an outlier must not dec
 _LEVEL_DECAY, _TREND_DECAY = 0.995, 0.98
 _SLOW = 0.2  # largest rate of a level that outlives the end of a trajectory
 _YOUNG = 4  # samples that are not judged by: learners do not know their units yet
-_RMS_SHARE = 0.5  # of the running rms, by which experts are judged at least
+_RMS_SHARE = 0.5, 6.0  # of the running rms, by which experts are judged; at most so many typical scales
 _RATE = 0.01  # of the running variance
 
 
@@ -241,15 +241,17 @@ class MixtureResidual(ResidualLearner):
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         mean, deviation, means = self._standard(x)
-        # outliers have little say in the scale, but the few large samples of a stream that mostly rests do
-        typical = torch.maximum(self.tails.typical(), _RMS_SHARE * self.inflation.sqrt())
-        scale = (deviation * typical).unsqueeze(-1)
-
+        # what is carried over is cut by a scale in which outliers have little say; what experts are judged by
+        # heeds the few large samples of a stream that mostly rests, too
+        typical = self.tails.typical()
+        share, most = _RMS_SHARE
+        judged_by = typical * (share * self.inflation.sqrt() / typical).clamp(1.0, most)
         innovation = y.unsqueeze(-1) - self._means(means)
-        r = (innovation / scale).square()
+        r = (innovation / (deviation * judged_by).unsqueeze(-1)).square()
         evidence = self.memory * self.evidence - 0.5 * (_FREEDOM + 1.0) * torch.log1p(r / _FREEDOM)
         evidence = evidence - evidence.amax(-1, keepdim=True)
-        innovation = innovation / (1.0 + r / self._experts[4].square())
+        far = (innovation / (deviation * typical).unsqueeze(-1)).square()
+        innovation = innovation / (1.0 + far / self._experts[4].square())
         trend = _TREND_DECAY * self.trend + self._experts[3] * innovation
         level = _LEVEL_DECAY * self.level + self._experts[2] * innovation + trend
         z = (y - mean) / deviation

@@ -8,18 +8,22 @@ from torch import nn
 from ..typing import Float, Tensor
 
 BLOCK = 32  #: samples of a block; those before the first one is full count from the first on
-_CLIP = 6.0  # of the trimmed rms, 4.5 deviations of a normal law
+_TRIMMED = (8.0, 4.0)  # an eighth, or a fourth of a block
+_SPIKES = (
+    0.03  # below this share of what the eighth leaves in, the rest stands still and these are no outliers
+)
+_CLIP = 5.5  # of the trimmed rms, 3.3 deviations of a normal law
 _REST = 0.1, 0.05  # a block that varies less than this share of all before has this weight: it stands still
 
 
 class RunningScale(nn.Module):
     """``z = (x - shift) / scale`` of columns whose units nobody told; columns may be exempt from the shift.
 
-    Of each block of samples the eighth that lies farthest from its median is cut to six times the rms of the
-    others; mean and spread of what is left are pooled over the last ``memory`` samples (Chan, Golub &
-    LeVeque, 1979). So an outlier decides nothing, a stream that starts at rest gets its units when it moves,
-    one that comes to rest keeps them, and slow changes are followed. A column that has not varied keeps
-    scale 1.
+    Of each block of samples the fourth that lies farthest from its median is cut to what a normal law like
+    that of the others would hold (the eighth, where the others hardly move: these are no outliers). Mean and
+    root of the spread of what is left are pooled over the last ``memory`` samples. So outliers decide
+    nothing, a stream that starts at rest gets its units when it moves, one that comes to rest keeps them,
+    and slow changes are followed. A column that has not varied keeps scale 1.
     Exempt columns are scaled by their root mean square. Nothing is squared before it is divided by the
     largest: 1e150 is a number like others.
 
@@ -106,8 +110,9 @@ class RunningScale(nn.Module):
         part = count / weight.clamp_min(torch.finfo(count.dtype).tiny)
         gap = (centre - self.centre).where(before > 0, 0.0)
         most = torch.stack([gap.abs(), self.spread, spread]).amax(0).clamp_min(torch.finfo(count.dtype).tiny)
-        variance = (1.0 - part) * ((self.spread / most).square() + part * (gap / most).square())
-        variance = variance + part * (spread / most).square()
+        # mean of roots: a block full of outliers does not decide either
+        inside = (1.0 - part) * (self.spread / most).sqrt() + part * (spread / most).sqrt()
+        variance = inside.pow(4) + (1.0 - part) * part * (gap / most).square()
         start = torch.where(before > 0, self.centre, centre)
         return weight, start + part * gap, most * variance.sqrt()
 
@@ -122,11 +127,14 @@ class RunningScale(nn.Module):
         away = torch.where(on, self.block - middle, 0.0)
         most = away.abs().amax(-2, keepdim=True).clamp_min(torch.finfo(away.dtype).tiny)
         away = away / most
-        # the eighth that lies farthest out is left out of the measure by which it is cut
+        # those farthest out are left out of the measure by which they are cut
         squares = torch.where(on, away.square(), -1.0).sort(dim=-2, descending=True).values
-        rank = torch.arange(BLOCK, device=away.device).unsqueeze(-1)
-        kept = ((rank >= (count / 8.0).ceil().unsqueeze(-2)) & (squares >= 0)).to(away.dtype)
-        typical = ((squares * kept).sum(-2) / kept.sum(-2).clamp_min(1.0)).sqrt().unsqueeze(-2)
+        rank, n = torch.arange(BLOCK, device=away.device).unsqueeze(-1), count.unsqueeze(-2)
+        few, many = (
+            ((squares * kept).sum(-2) / kept.sum(-2).clamp_min(1.0)).sqrt().unsqueeze(-2)
+            for kept in ((rank >= (n / part).ceil()) & (squares >= 0) for part in _TRIMMED)
+        )
+        typical = torch.where(many > _SPIKES * few, many, few)
         bound = torch.where(typical > 0, _CLIP * typical, 1.0)
         away = torch.minimum(torch.maximum(away, -bound), bound)
         n = count.clamp_min(1.0)

@@ -111,7 +111,7 @@ class ReplayMLP(ScaledLearner, SingleLearner):
         self.noise.mul_(ratio_t.square())
         start = [self.get_buffer(f"start_{i}") for i in range(len(self.theta))]
         for theta, shift in (([p.data for p in self.theta], offset_t), (start, 0.0)):
-            theta[1].sub_(offset @ theta[0])
+            theta[1].sub_(offset.unsqueeze(-2) @ theta[0])
             theta[0].div_(ratio.unsqueeze(-1))
             theta[-2].mul_(ratio_t)
             theta[-1].add_(shift).mul_(ratio_t)
