@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import nn
 from torch.distributions import Normal
 
 from ..exceptions import ParameterError
-from ..typing import Tensor
+from ..typing import Float, Tensor
 from .base import ResidualLearner
 from .report import UpdateReport
+from .sparse_gp.sparse_online_gp import Prediction
 
 
 class LastResidual(ResidualLearner):
@@ -48,6 +49,19 @@ class LastResidual(ResidualLearner):
         """f's slope by x."""
         mean, slope = self.learner.linearize(self._with_last(self._check_query(x)))
         return mean, slope[..., : self.in_features]
+
+    def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> Prediction:
+        """f's mean and variance, and their derivatives by x.
+
+        Raises:
+            ParameterError: f does not give its own in closed form.
+        """
+        if not hasattr(self.learner, "predict_with_jacobians"):
+            valid = "one with predict_with_jacobians, such as SparseOnlineGP"
+            raise ParameterError("learner", type(self.learner).__name__, valid)
+        n, f = self.in_features, cast("Any", self.learner)
+        p: Prediction = f.predict_with_jacobians(self._with_last(self._check_query(x)))
+        return Prediction(p.mean, p.variance, p.mean_jacobian[..., :n], p.variance_jacobian[..., :n])
 
     def reset(self) -> None:
         """f back to its prior, no last sample."""
