@@ -129,6 +129,7 @@ def test_the_learner_helps_on_a_real_hand():
     assert all(0.85 < c < 0.95 for s in scores for c in s.coverage)
 
 
+@pytest.mark.slow
 def test_the_benchmark_of_the_default_learner_runs(capsys):
     default_learner.main(["--quick"])
     told = capsys.readouterr().out
