@@ -159,9 +159,9 @@ def test_units_of_a_model_with_masks_are_those_of_its_own_samples():
     units.output.settle(settled=0.0)
     for i, j in itertools.product(range(2), range(3)):
         own_x, own_y = x[mask[:, i, j], i, j], y[mask[:, i, j], i, j]
-        torch.testing.assert_close(units.input.shift[i, j], own_x.mean(0))  # no outliers here
-        torch.testing.assert_close(units.input.scale[i, j], own_x.std(0, correction=0))
-        torch.testing.assert_close(units.output.scale[i, j], own_y.square().mean(0).sqrt())
+        torch.testing.assert_close(units.input.shift[i, j], own_x.mean(0), atol=0.05, rtol=0)
+        torch.testing.assert_close(units.input.scale[i, j], own_x.std(0, correction=0), atol=0, rtol=0.1)
+        torch.testing.assert_close(units.output.scale[i, j], own_y.square().mean(0).sqrt(), atol=0, rtol=0.1)
 
 
 def test_one_kernel_for_a_fleet_as_large_as_the_inputs_are_wide():

@@ -7,6 +7,7 @@ import os
 import sys
 from pathlib import Path
 
+import default_learner
 import numpy as np
 import pytest
 import torch
@@ -126,3 +127,17 @@ def test_the_learner_helps_on_a_real_hand():
     scores = score_objects(make, recordings, kept=True)
     assert all(s.rms < 1.0 for s in scores)
     assert all(0.85 < c < 0.95 for s in scores for c in s.coverage)
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_the_default_learner_runs(capsys):
+    default_learner.main(["--quick"])
+    told = capsys.readouterr().out
+    for row in (
+        "| smooth |",
+        "| pure noise, error",
+        "| jump of 3 sd",
+        "| arm at 100 Hz",
+        "| DeepKernelSOGP |",
+    ):
+        assert row in told

@@ -15,7 +15,7 @@ from ..report import UpdateReport
 from ..running_scale import BLOCK, RunningScale
 
 _FAR = 2.3  # logarithm of a change of units after which a learner starts again
-_CUT = 10.0  # largest target in its own units
+_CUT = 6.0  # largest target in its own units
 
 
 class ScaledLearner(ResidualLearner):
@@ -23,8 +23,8 @@ class ScaledLearner(ResidualLearner):
 
     Units are those of :class:`~torch_ekm.residual.running_scale.RunningScale`. They are adopted after 1, 2,
     4, 8, 16 samples, which are then learned anew, and from 32 samples on every 32, by what a subclass does
-    in ``_follow``; after a change by a factor of ten the last 31 are learned anew. Targets beyond 10 units
-    count as 10: one outlier does not spoil a learner that trusts all samples alike.
+    in ``_follow``; after a change by a factor of ten the last 31 are learned anew. Targets beyond 6 units
+    count as 6: one outlier does not spoil a learner that trusts all samples alike.
 
     A subclass implements f: ``_mean``, ``_law``, ``_slopes``, ``_learn``, ``_clear`` and ``_follow``.
 
