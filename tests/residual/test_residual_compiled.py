@@ -64,6 +64,7 @@ OPTIONS = {
     "mean": lambda shape: {"pruning": "mean", "novelty_threshold": 0.0, "jitter": 1e-4},
     "freeze": lambda shape: {"pruning": "freeze", "noise_variance": torch.tensor([0.1, 0.3]).double()},
     "wanders": lambda shape: {"parts": [ProcessNoise(0.01), RobustWeight(2.0)], "refresh_every": 8},
+    "offset": lambda shape: {"parts": [Standardize(output_offset="learned"), RobustWeight(3.0)]},
     "all": lambda shape: {"parts": all_parts(), "projection": "fitc"},
 }
 
