@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from .. import residual
+from .._recorded import describe
 from ..enhanced.grasp_learner import NOISE_VARIANCE, grasp_kernel
 from ..exceptions import UnknownNameError
 from ..residual import ResidualLearner
@@ -184,24 +185,5 @@ def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -
 
 
 def learner_figures(name: str, capacity: int, **options: Any) -> dict[str, Any]:
-    """Kind, kernel, parts and switches of a learner as plain figures, by one with one state and action."""
-    learner = make_learner(name, 1, 1, capacity, **options)
-    figures = _plain(learner)
-    kernel = getattr(learner, "kernel", None)
-    if kernel is not None:
-        parameters = {k: p.tolist() for k, p in kernel.named_parameters() if "log_" in k}
-        figures["kernel"] = {"kind": type(kernel).__name__, **parameters}
-    figures["parts"] = [_plain(part) for part in getattr(learner, "parts", ())]
-    noise = getattr(learner, "noise_variance", None)
-    if noise is not None:
-        figures["noise_variance"] = torch.as_tensor(noise).tolist()
-    return figures
-
-
-def _plain(module: torch.nn.Module) -> dict[str, Any]:
-    plain = {
-        key: value
-        for key, value in vars(module).items()
-        if not key.startswith("_") and isinstance(value, bool | int | float | str | tuple | None)
-    }
-    return {"kind": type(module).__name__, **plain}
+    """What a learner is made with, defaults included, by one with one state and action."""
+    return describe(make_learner(name, 1, 1, capacity, **options))
