@@ -22,6 +22,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,7 +52,13 @@ def stream(n: int, m: int, shape: tuple[int, ...] = (), seed: int = 0) -> tuple[
     return x, y
 
 
+def as_published(shape: tuple[int, ...] = ()) -> dict[str, Any]:
+    """What the reference in C does: x and y as they are, and no part."""
+    return {"kernel": SquaredExponential(D, batch_shape=shape), "parts": (), "standardize": False}
+
+
 def filled(capacity: int, m: int, shape: tuple[int, ...] = (), **options) -> SparseOnlineGP:
+    options = {**as_published(shape), **options}
     gp = SparseOnlineGP(D, m, capacity=capacity, batch_shape=shape, **options)
     gp.update(*stream(capacity + 3, m, shape, seed=1))
     return gp

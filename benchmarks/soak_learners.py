@@ -57,13 +57,19 @@ def trajectory(start: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:
 def make(options: argparse.Namespace, deep: bool) -> SparseOnlineGP:
     """The learner under test."""
     dtype = torch.float32 if options.float32 else torch.float64
-    common = {"capacity": options.capacity, "dtype": dtype}
+    common = {"capacity": options.capacity, "dtype": dtype, "standardize": False}
     if options.deep:
         if deep:
-            return DeepKernelSOGP(4, 2, noise_variance=0.1, **common)
-        return SparseOnlineGP(4, 2, noise_variance=0.1, parts=[LearnHyperparameters()], **common)
+            return DeepKernelSOGP(4, 2, base=SquaredExponential(4), parts=(), **common)
+        return SparseOnlineGP(4, 2, kernel=SquaredExponential(4), parts=[LearnHyperparameters()], **common)
     kernel = SquaredExponential(4, lengthscale=1.0)
-    return SparseOnlineGP(4, 2, kernel=kernel, noise_variance=1e-4, backend=options.backend, **common)
+    return SparseOnlineGP(
+        4, 2, kernel=kernel, noise_variance=1e-4, parts=(), backend=options.backend, **common
+    )
+
+
+#: As published: no parts, no units.
+BARE: dict[str, Any] = {"parts": (), "standardize": False}
 
 
 def options_of_all_kinds() -> dict[str, dict[str, Any]]:
@@ -103,7 +109,9 @@ def compare(samples: int, capacity: int, only: str | None) -> None:
         if only not in (None, name):
             continue
         trio = [
-            SparseOnlineGP(4, 2, capacity=capacity, noise_variance=0.01, backend=backend, **options)
+            SparseOnlineGP(
+                4, 2, capacity=capacity, noise_variance=0.01, backend=backend, **{**BARE, **options}
+            )
             for backend in ("torch", "auto", "torch")
         ]
         worst, largest, begin = [0.0, 0.0], 0.0, time.perf_counter()

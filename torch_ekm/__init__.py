@@ -50,6 +50,7 @@ from .residual import (
     UpdateReport,
     WindowGP,
     ZeroResidual,
+    default_learner,
 )
 
 try:
@@ -64,5 +65,6 @@ __all__ = [
     "ProcessNoise",
     "RandomFeatureRLS", "RecursiveLeastSquares", "ReplayMLP", "ResidualLearner", "RobustWeight", "ShapeError",
     "SparseOnlineGP", "SquaredExponential", "Standardize", "UnknownNameError", "UpdateEvent", "UpdateReport",
-    "StateMismatchError", "WindowGP", "ZeroResidual", "__version__", "exceptions", "load", "save",
+    "StateMismatchError", "WindowGP", "ZeroResidual", "__version__", "default_learner", "exceptions", "load",
+    "save",
 ]  # fmt: skip

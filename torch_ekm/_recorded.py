@@ -34,6 +34,8 @@ class Recorded:
         kinds = inspect.signature(cls.__init__).parameters
         arguments: dict[str, Any] = {}
         for name, value in given:
+            if kinds[name].kind is inspect.Parameter.VAR_POSITIONAL and not value:
+                continue  # of a constructor that is nn.Module's own
             if kinds[name].kind is inspect.Parameter.VAR_KEYWORD:
                 arguments |= {key: plain(one) for key, one in value.items()}
             else:

@@ -19,6 +19,7 @@ from torch_ekm.residual import (
     DetectChanges,
     ForgettingFactor,
     KRLSTracker,
+    LastResidual,
     LearnerFleet,
     LearnHyperparameters,
     LocalGPs,
@@ -33,6 +34,7 @@ from torch_ekm.residual import (
     Standardize,
     WindowGP,
     ZeroResidual,
+    default_learner,
 )
 from torch_ekm.testing import check_residual_learner
 
@@ -57,6 +59,9 @@ LEARNERS = {
     "mlp": lambda **o: ReplayMLP(3, 2, hidden=(8,), **o),
     "ensemble": lambda **o: ReplayMLP(3, 2, hidden=(8,), members=3, **o),
     "sogp": sogp,
+    "default": lambda **o: default_learner(3, 2, capacity=8, **o),
+    "last_residual": lambda **o: LastResidual(SparseOnlineGP(5, 2, capacity=8, **o)),
+    "rls_as_given": lambda **o: RecursiveLeastSquares(3, 2, standardize=False, **o),
     "sogp_all": lambda **o: sogp(
         refresh_every=4,
         projection="fitc",
@@ -170,8 +175,8 @@ class _StateOutside(RecursiveLeastSquares):
         self.extra = getattr(self, "extra", 0.0) + float(y.sum())
         return super()._absorb(x, y, mask)
 
-    def forward(self, x):
-        return super().forward(x) + getattr(self, "extra", 0.0)
+    def _mean(self, z):
+        return super()._mean(z) + getattr(self, "extra", 0.0)
 
     def predict(self, x, *, observation=False):
         return torch.distributions.Normal(self(x), super().predict(x, observation=observation).stddev)

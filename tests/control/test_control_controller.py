@@ -284,7 +284,7 @@ def taught(grasp) -> EnhancedModel:
     plant, model, _, state = grasp
     n_q, n_a = plant.hand.n_q, plant.hand.n_a
     kernel = ActionLinearKernel(6 + n_a, n_a, action_variance=0.1)
-    learner = SparseOnlineGP(6 + n_a, 6, kernel=kernel, noise_variance=0.05)
+    learner = SparseOnlineGP(6 + n_a, 6, kernel=kernel, noise_variance=0.05, parts=(), standardize=False)
     scale = torch.tensor([1e3] * 3 + [1 / DEG] * 3, dtype=torch.float64)
     enhanced = EnhancedModel(
         model,

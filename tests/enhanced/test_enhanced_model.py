@@ -36,7 +36,9 @@ def enhanced(linear: bool = False, **options) -> EnhancedModel:
     n_x = N_S + N_A
     n_out = len(options.get("outputs") or range(3))
     kernel = ActionLinearKernel(n_x, N_A) if linear else None
-    learner = SparseOnlineGP(n_x, n_out, capacity=80, kernel=kernel, noise_variance=1e-4)
+    learner = SparseOnlineGP(
+        n_x, n_out, capacity=80, kernel=kernel, noise_variance=1e-4, parts=(), standardize=False
+    )
     return EnhancedModel(model, learner, **options)
 
 

@@ -16,6 +16,7 @@ from torch_ekm.residual import (
     ReplayMLP,
     ResidualLearner,
     SparseOnlineGP,
+    SquaredExponential,
     Standardize,
     ZeroResidual,
 )
@@ -25,7 +26,8 @@ N_S, N_A, N_OUT = 3, 2, 3
 
 def linear_learner(**options) -> SparseOnlineGP:
     kernel = ActionLinearKernel(N_S + N_A, N_A, action_variance=[0.5, 2.0])
-    return SparseOnlineGP(N_S + N_A, N_OUT, capacity=20, kernel=kernel, noise_variance=0.05, **options)
+    chosen = {"capacity": 20, "kernel": kernel, "noise_variance": 0.05, "parts": (), "standardize": False}
+    return SparseOnlineGP(N_S + N_A, N_OUT, **{**chosen, **options})
 
 
 def train(learner: ResidualLearner, generator: torch.Generator, n: int = 40) -> ResidualLearner:
@@ -87,7 +89,9 @@ def test_other_learners_by_differentiation(name: str, generator: torch.Generator
 
 def test_curvature_is_the_convex_part(generator: torch.Generator) -> None:
     """Between two samples the variance of a squared exponential is a hill: no curvature along it."""
-    learner = SparseOnlineGP(2, 1, noise_variance=1e-4)
+    learner = SparseOnlineGP(
+        2, 1, kernel=SquaredExponential(2), noise_variance=1e-4, parts=(), standardize=False
+    )
     learner.update(
         torch.tensor([[0.0, -1.5], [0.0, 1.5]], dtype=torch.float64), torch.zeros(2, 1, dtype=torch.float64)
     )

@@ -21,6 +21,7 @@ from torch_ekm import (
     SparseOnlineGP,
     SquaredExponential,
     Standardize,
+    default_learner,
 )
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.interop import to_casadi
@@ -45,6 +46,7 @@ LEARNERS = {
     "action-linear": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=ActionLinearKernel(3, 1)),
     "product": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=SquaredExponential(3) * Matern32(3)),
     "deep": deep,
+    "default": lambda: default_learner(3, 2, capacity=12),
     "mixture": lambda: MixtureResidual([deep(), wandering()]),
 }
 
@@ -83,7 +85,7 @@ def test_jacobians_of_a_mixture_are_those_of_autograd() -> None:
         torch.testing.assert_close(getattr(prediction, field), slope, rtol=1e-8, atol=1e-9)
 
 
-@pytest.mark.parametrize(("name", "format"), [("plain", "pt2"), ("mixture", "onnx")])
+@pytest.mark.parametrize(("name", "format"), [("plain", "pt2"), ("default", "onnx")])
 def test_an_exported_learner_says_the_same(name: str, format: str, tmp_path: Path) -> None:
     learner = trained(name)
     if format == "onnx":

@@ -21,7 +21,8 @@ NOISE = 0.05
 
 def learner(**options: Any) -> SparseOnlineGP:
     kernel = ActionLinearKernel(N_S + N_A, N_A, state_kernel=SquaredExponential(N_S, lengthscale=10.0))
-    return SparseOnlineGP(N_S + N_A, N_OUT, capacity=20, kernel=kernel, noise_variance=NOISE**2, **options)
+    chosen = {"capacity": 20, "kernel": kernel, "noise_variance": NOISE**2, "parts": (), "standardize": False}
+    return SparseOnlineGP(N_S + N_A, N_OUT, **{**chosen, **options})
 
 
 class World:
@@ -195,7 +196,9 @@ def test_discount_keeps_the_mean_and_widens_the_variance() -> None:
     world = World(1, seed=0)
     # a state kernel this long is linear regression: all uncertainty is of data, none of the basis
     kernel = ActionLinearKernel(N_S + N_A, N_A, state_kernel=SquaredExponential(N_S, lengthscale=1e3))
-    model = SparseOnlineGP(N_S + N_A, N_OUT, capacity=20, kernel=kernel, noise_variance=NOISE**2)
+    model = SparseOnlineGP(
+        N_S + N_A, N_OUT, capacity=20, kernel=kernel, noise_variance=NOISE**2, parts=(), standardize=False
+    )
     feed(model, *world.episode(0, 200))
     x, _ = world.episode(0, 30)
     before = model.predict(x)

@@ -132,7 +132,8 @@ def test_posterior_of_a_new_signature() -> None:
 
 def learner(**options: Any) -> SparseOnlineGP:
     kernel = ActionLinearKernel(1 + N_A, N_A, state_kernel=SquaredExponential(1, lengthscale=10.0))
-    return SparseOnlineGP(1 + N_A, 2, capacity=12, kernel=kernel, noise_variance=0.01, **options)
+    chosen = {"capacity": 12, "kernel": kernel, "noise_variance": 0.01, "parts": (), "standardize": False}
+    return SparseOnlineGP(1 + N_A, 2, **{**chosen, **options})
 
 
 def samples(k: int, n: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:

@@ -8,12 +8,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from as_published import deep_sogp, sogp
 
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.learner_comparison.prequential import run_prequential
 from torch_ekm.residual import (
     DeepKernel,
-    DeepKernelSOGP,
     DetectChanges,
     ForgettingFactor,
     LearnHyperparameters,
@@ -67,7 +67,7 @@ def loss_by_dense_algebra(gp: SparseOnlineGP, queries: Queries, robust: float | 
     z2 = ((queries.y - k.mT @ alpha) * left_out.unsqueeze(-1)).square() / variance
     misfit = z2 if robust is None else (robust**2 + 1.0) * torch.log1p(z2 / robust**2)
     density = 0.5 * (misfit + variance.log() + math.log(2 * math.pi)).mean(-1)
-    on = (queries.weight > 0).to(density.dtype)
+    on = queries.weight
     return (density * on).sum(-1) / on.sum(-1)
 
 
@@ -80,7 +80,7 @@ def test_gradients_in_closed_form_are_those_of_autograd(kind, robust, fleet, fad
     if kind is DeepKernel:
         kernel = DeepKernel(kernel, hidden=(8, 8), features=3)
     weight = [] if robust is None else [RobustWeight(robust)]
-    gp = SparseOnlineGP(
+    gp = sogp(
         4, 2, capacity=20, kernel=kernel, noise_variance=0.05, refresh_every=16, batch_shape=fleet,
         parts=[*weight, *fading, Standardize(), LearnHyperparameters(memory=50)],
     )  # fmt: skip
@@ -111,7 +111,7 @@ def test_gradients_in_closed_form_are_those_of_autograd(kind, robust, fleet, fad
 
 def test_lagged_loss_is_the_density_of_the_old_state():
     x, y = system(4, 64)
-    gp = SparseOnlineGP(4, 2, capacity=20, refresh_every=16, parts=[LearnHyperparameters()])
+    gp = sogp(4, 2, capacity=20, refresh_every=16, parts=[LearnHyperparameters()])
     gp.update(x[:48], y[:48])
     law = gp.predict(x[48:63], observation=True)
     expected = -law.log_prob(y[48:63]).mean(-1).mean()
@@ -123,7 +123,7 @@ def test_lagged_loss_is_the_density_of_the_old_state():
 
 def test_a_replayed_sample_is_predicted_by_the_exact_gp_of_all_others():
     x, y = system(7, 24)
-    gp = SparseOnlineGP(
+    gp = sogp(
         4,
         2,
         capacity=24,
@@ -151,7 +151,7 @@ def test_a_replayed_sample_is_predicted_by_the_exact_gp_of_all_others():
 
 
 def filled_memory(n: int, capacity: int, horizon: float = math.inf) -> ReplayMemory:
-    posterior = SparseOnlineGP(1, 1, capacity=2).posterior
+    posterior = sogp(1, 1, capacity=2).posterior
     memory = ReplayMemory(posterior, capacity, horizon)
     for i in range(n):
         value = torch.tensor([float(i)], dtype=torch.float64)
@@ -207,7 +207,7 @@ def test_adaptation_beats_a_wrong_start():
     errors, nll = [], []
     for adapt in (False, True):
         parts = [LearnHyperparameters()] if adapt else []
-        gp = SparseOnlineGP(4, 2, **copy.deepcopy(wrong), parts=parts, refresh_every=8)
+        gp = sogp(4, 2, **copy.deepcopy(wrong), parts=parts, refresh_every=8)
         run = run_prequential(gp, x, y)
         errors.append(float(run.error[600:].square().mean().sqrt()))
         nll.append(run.nll(600))
@@ -222,7 +222,7 @@ def test_each_output_finds_its_own_noise():
     sd = torch.tensor([0.05, 0.4], dtype=torch.float64)
     y = y + sd * torch.randn(y.shape, generator=generator, dtype=torch.float64)
     parts = [LearnHyperparameters()]
-    gp = SparseOnlineGP(4, 2, capacity=50, noise_variance=0.05, refresh_every=8, parts=parts)
+    gp = sogp(4, 2, capacity=50, noise_variance=0.05, refresh_every=8, parts=parts)
     gp.update(x, y)
     found = gp.noise_variance.sqrt()
     assert 0.03 < float(found[0]) < 0.15
@@ -237,7 +237,7 @@ def test_deep_kernel_starts_as_the_plain_one_and_does_not_collapse():
         DeepKernel(SquaredExponential(4), hidden=(16,), initial_scale=1e-6),
         DeepKernel(SquaredExponential(4), hidden=(16,)),
     ):
-        gp = SparseOnlineGP(4, 2, capacity=40, kernel=kernel, parts=[LearnHyperparameters()])
+        gp = sogp(4, 2, capacity=40, kernel=kernel, parts=[LearnHyperparameters()])
         gp.update(x[:31], y[:31])
         early = gp(x[:31])
         gp.update(x[31:], y[31:])
@@ -254,7 +254,7 @@ def test_features_learned_from_the_past_beat_those_of_the_last_samples():
     errors = []
     for memory in (0, 1000):
         parts = [LearnHyperparameters(steps=2, memory=memory)]
-        gp = DeepKernelSOGP(6, 1, capacity=40, noise_variance=0.1, parts=parts)
+        gp = deep_sogp(6, 1, capacity=40, noise_variance=0.1, parts=parts)
         gp.update(x[:2000], y[:2000])
         errors.append(float((gp(x[2000:]) - y[2000:]).square().mean().sqrt()))
     assert errors[1] < 0.85 * errors[0]
@@ -263,7 +263,7 @@ def test_features_learned_from_the_past_beat_those_of_the_last_samples():
 def test_deep_kernel_gradient_is_autograds():
     x, y = system(12, 60)
     kernel = DeepKernel(SquaredExponential(4))
-    gp = SparseOnlineGP(4, 2, capacity=20, kernel=kernel, parts=[Standardize()])
+    gp = sogp(4, 2, capacity=20, kernel=kernel, parts=[Standardize()])
     gp.update(x, y)
     p = gp.predict_with_jacobians(x[:5])
     torch.testing.assert_close(
@@ -278,7 +278,7 @@ def test_a_learner_with_a_memory_goes_on_after_a_reload_as_if_nothing_had_been()
     options = {"hidden": (8,), "features": 2, "capacity": 15}
     options["parts"] = [Standardize(), LearnHyperparameters(steps=2, memory=150)]
     options["refresh_every"] = 8  # so that a turn is a part of the memory
-    whole, first, second = (DeepKernelSOGP(4, 2, **options) for _ in range(3))
+    whole, first, second = (deep_sogp(4, 2, **options) for _ in range(3))
     whole.update(x, y)
     first.update(x[:238], y[:238])
     second.load_state_dict(first.state_dict())
@@ -293,7 +293,7 @@ def test_after_a_change_the_memory_holds_the_new_system_only():
     x, y = system(14, 700, noise=0.02)
     y = torch.cat([y[:400], -2.0 * y[400:]])
     parts = [RobustWeight(3.0), DetectChanges(), LearnHyperparameters(memory=200)]
-    gp = SparseOnlineGP(4, 2, capacity=40, noise_variance=0.01, parts=parts)
+    gp = sogp(4, 2, capacity=40, noise_variance=0.01, parts=parts)
     gp.update(x, y)
     memory = past_of(gp)
     kept = memory.x[memory.weight > 0]
@@ -303,7 +303,7 @@ def test_after_a_change_the_memory_holds_the_new_system_only():
 
 
 def test_where_g_wanders_there_is_no_memory():
-    assert learning_of(DeepKernelSOGP(4, 2, parts=[ProcessNoise(0.003)])).past is None
-    assert learning_of(DeepKernelSOGP(4, 2)).past is not None
+    assert learning_of(deep_sogp(4, 2, parts=[ProcessNoise(0.003)])).past is None
+    assert learning_of(deep_sogp(4, 2)).past is not None
     with pytest.raises(ParameterError, match="another g"):
-        SparseOnlineGP(4, 2, parts=[ProcessNoise(0.003), LearnHyperparameters(memory=100)])
+        sogp(4, 2, parts=[ProcessNoise(0.003), LearnHyperparameters(memory=100)])

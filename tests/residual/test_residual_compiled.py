@@ -64,12 +64,13 @@ OPTIONS = {
     "mean": lambda shape: {"pruning": "mean", "novelty_threshold": 0.0, "jitter": 1e-4},
     "freeze": lambda shape: {"pruning": "freeze", "noise_variance": torch.tensor([0.1, 0.3]).double()},
     "wanders": lambda shape: {"parts": [ProcessNoise(0.01), RobustWeight(2.0)], "refresh_every": 8},
+    "offset": lambda shape: {"parts": [Standardize(output_offset="learned"), RobustWeight(3.0)]},
     "all": lambda shape: {"parts": all_parts(), "projection": "fitc"},
 }
 
 
 def pair(name: str, shape: tuple[int, ...] = ()) -> list[SparseOnlineGP]:
-    common = {"capacity": 12, "batch_shape": shape, "noise_variance": 0.1}
+    common = {"capacity": 12, "batch_shape": shape, "noise_variance": 0.1, "parts": (), "standardize": False}
     return [
         SparseOnlineGP(D, M, **{**common, "backend": backend, **OPTIONS[name](shape)})
         for backend in ("torch", "auto")
@@ -202,7 +203,7 @@ def test_without_numba_torch_does_it_all(monkeypatch):
 @numba_here
 def test_drifted_caches_are_rebuilt_at_once_and_sound_ones_late():
     x, y = hard_stream(400)
-    gp = SparseOnlineGP(D, M, capacity=12, noise_variance=0.1)
+    gp = SparseOnlineGP(D, M, capacity=12, noise_variance=0.1, parts=(), standardize=False)
     rebuilt = []
     refresh = gp.refresh
     gp.refresh = lambda: (rebuilt.append(gp.n_samples), refresh())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from as_published import sogp
 
 from torch_ekm.residual import (
     CalibrateNoise,
@@ -12,7 +13,6 @@ from torch_ekm.residual import (
     LearnHyperparameters,
     RecursiveLeastSquares,
     RobustWeight,
-    SparseOnlineGP,
     SquaredExponential,
     Standardize,
 )
@@ -27,11 +27,11 @@ def make(name: str, device: str):
     options |= {"capacity": 12, "refresh_every": 8}
     parts = [RobustWeight(3.0), ForgettingFactor(0.99)]
     if name == "plain":
-        return SparseOnlineGP(4, 2, parts=parts, **options)
+        return sogp(4, 2, parts=parts, **options)
     kernel = SquaredExponential(4, batch_shape=(16,), device=device)
     kernel = DeepKernel(kernel, hidden=(8,)) if name == "deep" else kernel
     parts += [CalibrateNoise(), Standardize(), LearnHyperparameters()]
-    return SparseOnlineGP(4, 2, kernel=kernel, parts=parts, **options)
+    return sogp(4, 2, kernel=kernel, parts=parts, **options)
 
 
 @pytest.mark.parametrize("name", ["rls", "plain", "adaptive", "deep"])

@@ -7,6 +7,7 @@ import itertools
 
 import pytest
 import torch
+from as_published import deep_sogp, sogp
 
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
 from torch_ekm.residual import (
@@ -39,7 +40,7 @@ def stream(n: int, *shape: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tens
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: SparseOnlineGP(3, 2, capacity=30),
+        lambda: sogp(3, 2, capacity=30),
         lambda: WindowGP(3, 2, window=40),
         lambda: KRLSTracker(3, 2, capacity=30),
     ],
@@ -69,9 +70,9 @@ def test_least_squares_far_from_the_origin(offset, bound):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda **o: SparseOnlineGP(3, 2, capacity=8, parts=[Standardize()], **o),
+        lambda **o: sogp(3, 2, capacity=8, parts=[Standardize()], **o),
         lambda **o: RecursiveLeastSquares(3, 2, **o),
-        lambda **o: MixtureResidual(SparseOnlineGP(3, 2, capacity=8, **o), **o),
+        lambda **o: MixtureResidual(sogp(3, 2, capacity=8, **o), **o),
     ],
 )
 def test_numbers_without_a_square_are_refused(make, value):
@@ -98,7 +99,7 @@ def test_numbers_without_a_square_are_refused(make, value):
 def test_a_step_without_a_sample_leaves_no_trace_even_when_a_rebuild_is_due(part):
     x, y = stream(40)
     for on_invalid in ("raise", "skip"):
-        g = SparseOnlineGP(3, 2, capacity=10, refresh_every=8, on_invalid=on_invalid, parts=[part])
+        g = sogp(3, 2, capacity=10, refresh_every=8, on_invalid=on_invalid, parts=[part])
         g.update(x[:7], y[:7])
         other = copy.deepcopy(g)
         if on_invalid == "raise":
@@ -119,9 +120,9 @@ def test_a_query_may_ask_all_models_of_a_fleet(shape):
         RecursiveLeastSquares(3, 2, batch_shape=(5,)),
         RandomFeatureRLS(3, 2, n_frequencies=9, batch_shape=(5,)),
         WindowGP(3, 2, window=9, batch_shape=(5,)),
-        SparseOnlineGP(3, 2, capacity=6, batch_shape=(5,)),
-        DeepKernelSOGP(3, 2, capacity=6, hidden=(4,), features=2, batch_shape=(5,)),
-        MixtureResidual(SparseOnlineGP(3, 2, capacity=6, batch_shape=(5,))),
+        sogp(3, 2, capacity=6, batch_shape=(5,)),
+        deep_sogp(3, 2, capacity=6, hidden=(4,), features=2, batch_shape=(5,)),
+        MixtureResidual(sogp(3, 2, capacity=6, batch_shape=(5,))),
     ]
     x, y = stream(12, 5)
     query = torch.randn(shape, dtype=torch.float64)
@@ -139,32 +140,33 @@ def test_a_fleet_that_detects_changes_with_a_memory_is_so_many_single_models():
         "capacity": 12, "noise_variance": 0.01,
         "parts": [RobustWeight(3.0), DetectChanges(), LearnHyperparameters(memory=50)],
     }  # fmt: skip
-    fleet = SparseOnlineGP(3, 2, batch_shape=(3,), **options)
+    fleet = sogp(3, 2, batch_shape=(3,), **options)
     fleet.update(x, y)
     for i in range(3):
-        single = SparseOnlineGP(3, 2, **options)
+        single = sogp(3, 2, **options)
         single.update(x[:, i], y[:, i])
         torch.testing.assert_close(fleet(x[:9])[:, i], single(x[:9, i]), atol=1e-9, rtol=0)
 
 
 def test_units_of_a_model_with_masks_are_those_of_its_own_samples():
-    x, y = stream(60, 2, 3)
-    mask = torch.rand(60, 2, 3, generator=torch.Generator().manual_seed(1)) < 0.7
-    fleet = SparseOnlineGP(3, 2, capacity=12, batch_shape=(2, 3), parts=[Standardize(samples=100)])
+    x, y = stream(64, 2, 3)
+    mask = torch.rand(64, 2, 3, generator=torch.Generator().manual_seed(1)) < 0.7
+    fleet = sogp(3, 2, capacity=12, batch_shape=(2, 3), parts=[Standardize()])
     fleet.update(x, y, mask)
-    fleet.refresh()
     units = fleet.part(Standardize)
     assert units is not None
+    units.input.settle(settled=0.0)
+    units.output.settle(settled=0.0)
     for i, j in itertools.product(range(2), range(3)):
         own_x, own_y = x[mask[:, i, j], i, j], y[mask[:, i, j], i, j]
-        torch.testing.assert_close(units.input.shift[i, j], own_x.mean(0))
-        torch.testing.assert_close(units.input.scale[i, j], own_x.std(0, correction=0))
-        torch.testing.assert_close(units.output.scale[i, j], own_y.square().mean(0).sqrt())
+        torch.testing.assert_close(units.input.shift[i, j], own_x.mean(0), atol=0.05, rtol=0)
+        torch.testing.assert_close(units.input.scale[i, j], own_x.std(0, correction=0), atol=0, rtol=0.1)
+        torch.testing.assert_close(units.output.scale[i, j], own_y.square().mean(0).sqrt(), atol=0, rtol=0.1)
 
 
 def test_one_kernel_for_a_fleet_as_large_as_the_inputs_are_wide():
     x, y = stream(64, 3)
-    gp = SparseOnlineGP(
+    gp = sogp(
         3,
         2,
         capacity=8,
@@ -178,7 +180,7 @@ def test_one_kernel_for_a_fleet_as_large_as_the_inputs_are_wide():
 
 
 def test_no_action_is_not_novel():
-    gp = SparseOnlineGP(3, 2, capacity=5, kernel=ActionLinearKernel(3, 1))
+    gp = sogp(3, 2, capacity=5, kernel=ActionLinearKernel(3, 1))
     x, y = stream(10)
     x[0, -1] = 0.0
     report = gp.update(x, y)
@@ -187,7 +189,7 @@ def test_no_action_is_not_novel():
 
 
 def test_a_basis_must_be_finite():
-    gp = SparseOnlineGP(3, 2, capacity=5)
+    gp = sogp(3, 2, capacity=5)
     x, y = stream(10)
     gp.update(x, y)
     before = gp(x)
@@ -221,13 +223,13 @@ def test_parameters_that_cannot_be_are_named(kind, options):
 
 
 def test_the_same_learner_twice_is_no_mixture():
-    gp = SparseOnlineGP(3, 2, capacity=5)
+    gp = sogp(3, 2, capacity=5)
     with pytest.raises(ParameterError, match="twice"):
         MixtureResidual([gp, gp])
 
 
 def test_masks_may_be_lists_of_bools_only():
-    gp = SparseOnlineGP(3, 2, capacity=5, batch_shape=(2,))
+    gp = sogp(3, 2, capacity=5, batch_shape=(2,))
     x, y = stream(1, 2)
     report = gp.update(x[0], y[0], [True, False])
     assert report.accepted.tolist() == [True, False]

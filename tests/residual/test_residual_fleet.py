@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from as_published import sogp
 
 from torch_ekm.exceptions import ParameterError, ShapeError
 from torch_ekm.residual import (
@@ -43,8 +44,8 @@ def test_fleet_equals_single_learners_with_masks() -> None:
 
 def test_fleet_equals_the_learner_that_is_one_itself() -> None:
     x, y = stream(30, 4)
-    slow = LearnerFleet(SparseOnlineGP, 3, 2, batch_shape=(4,), capacity=8)
-    fast = SparseOnlineGP(3, 2, capacity=8, batch_shape=(4,))
+    slow = LearnerFleet(sogp, 3, 2, batch_shape=(4,), capacity=8)
+    fast = sogp(3, 2, capacity=8, batch_shape=(4,))
     for learner in (slow, fast):
         learner.update(x, y)
     torch.testing.assert_close(slow(x), fast(x), rtol=0, atol=1e-10)
@@ -56,7 +57,7 @@ def test_heavy_tails_stay() -> None:
     x, y = stream(60, 2)
 
     def kind(n_in: int, n_out: int, **options) -> MixtureResidual:
-        return MixtureResidual(SparseOnlineGP(n_in, n_out, capacity=8, parts=[RobustWeight(3.0)], **options))
+        return MixtureResidual(sogp(n_in, n_out, capacity=8, parts=[RobustWeight(3.0)], **options))
 
     fleet = LearnerFleet(kind, 3, 2, batch_shape=(2,))
     fleet.update(x, y)

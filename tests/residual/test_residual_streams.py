@@ -7,9 +7,11 @@ import os
 import sys
 from pathlib import Path
 
+import default_learner
 import numpy as np
 import pytest
 import torch
+from as_published import sogp
 
 from torch_ekm.exceptions import DescriptionError, UnknownNameError
 from torch_ekm.experiments.learner_comparison.prequential import Prequential, run_prequential
@@ -20,7 +22,6 @@ from torch_ekm.residual import (
     ForgettingFactor,
     RecursiveLeastSquares,
     RobustWeight,
-    SparseOnlineGP,
     ZeroResidual,
 )
 
@@ -69,8 +70,8 @@ def test_kept_and_fresh_differ_only_from_the_second_object_on():
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(60, 3, generator=generator, dtype=torch.float64)
     objects = [Stream(n, x, torch.sin(x[:, :2])) for n in ("a", "b")]
-    kept = score_objects(lambda: SparseOnlineGP(3, 2), objects, kept=True)
-    fresh = score_objects(lambda: SparseOnlineGP(3, 2), objects, kept=False)
+    kept = score_objects(lambda: sogp(3, 2), objects, kept=True)
+    fresh = score_objects(lambda: sogp(3, 2), objects, kept=False)
     assert kept[0] == fresh[0] == dataclasses.replace(fresh[1], name="a")
     assert kept[1].rms < 0.5 * fresh[1].rms
 
@@ -121,8 +122,22 @@ def test_the_learner_helps_on_a_real_hand():
 
     def make():
         parts = [RobustWeight(3.0), CalibrateNoise(), ForgettingFactor(0.99)]
-        return SparseOnlineGP(15, 3, noise_variance=0.3, parts=parts)
+        return sogp(15, 3, noise_variance=0.3, parts=parts)
 
     scores = score_objects(make, recordings, kept=True)
     assert all(s.rms < 1.0 for s in scores)
     assert all(0.85 < c < 0.95 for s in scores for c in s.coverage)
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_the_default_learner_runs(capsys):
+    default_learner.main(["--quick"])
+    told = capsys.readouterr().out
+    for row in (
+        "| smooth |",
+        "| pure noise, error",
+        "| jump of 3 sd",
+        "| arm at 100 Hz",
+        "| DeepKernelSOGP |",
+    ):
+        assert row in told

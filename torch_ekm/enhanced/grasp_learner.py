@@ -25,7 +25,8 @@ def grasp_learner(n_s: int, n_a: int, capacity: int = 60, n_out: int = 6) -> Spa
     parts = [RobustWeight(3.0), ForgettingFactor(0.995)]
     kernel = grasp_kernel(n_s, n_a)
     options = {"capacity": capacity, "kernel": kernel, "noise_variance": NOISE_VARIANCE}
-    return SparseOnlineGP(n_s + n_a, n_out, **options, parts=parts)
+    # the kernel's figures are in the units of a grasp
+    return SparseOnlineGP(n_s + n_a, n_out, **options, parts=parts, standardize=False)
 
 
 def grasp_kernel(n_s: int, n_a: int) -> ActionLinearKernel:

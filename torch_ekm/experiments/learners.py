@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from .. import residual
+from .._recorded import describe
 from ..enhanced.grasp_learner import NOISE_VARIANCE, grasp_kernel
 from ..exceptions import UnknownNameError
 from ..residual import ResidualLearner
@@ -18,30 +19,60 @@ N_OUT = 6
 Factory = Callable[..., ResidualLearner]
 
 
-def _kind(make: Factory, capacity_is: str = "", **figures: Any) -> Factory:
-    """A kind of learner; ``capacity_is`` names that of its arguments which is a capacity."""
+class _Written(str):
+    """Code, not a text."""
+
+    __repr__ = str.__str__
+
+
+_KERNEL = _Written("SquaredExponential(d)")
+#: Inputs and outputs of the order of 1 are taken as they are.
+_AS_GIVEN: dict[str, Any] = {"noise_variance": NOISE_VARIANCE, "standardize": False}
+
+
+def constructor_call(factory: Factory) -> str:
+    """How a user makes the learner of this factory, of d inputs and m outputs; "" where it does not tell."""
+    return getattr(factory, "call", "")
+
+
+def _told(factory: Factory, make: Factory, **figures: Any) -> Factory:
+    """The factory, with the call that it stands for."""
+    arguments = ["d", "m", *(f"{name}={value!r}" for name, value in figures.items())]
+    vars(factory)["call"] = f"{make.__name__}({', '.join(arguments)})"
+    return factory
+
+
+def _kind(make: Factory, capacity_is: str = "", kernel_is: str = "", **figures: Any) -> Factory:
+    """A kind of learner; ``capacity_is``, ``kernel_is`` name those of its arguments which are such."""
 
     def factory(
         d: int, m: int, *, n_actions: int = 0, capacity: int = 100, **options: Any
     ) -> ResidualLearner:
-        size = {capacity_is: capacity} if capacity_is else {}
-        return make(d, m, **{**figures, **size, **options})
+        size: dict[str, Any] = {capacity_is: capacity} if capacity_is else {}
+        kernel = {kernel_is: residual.SquaredExponential(d)} if kernel_is else {}
+        return make(d, m, **{**figures, **size, **kernel, **options})
 
-    return factory
+    size = {capacity_is: 100} if capacity_is else {}
+    return _told(factory, make, **{**figures, **size, **({kernel_is: _KERNEL} if kernel_is else {})})
 
 
-def _sogp(make: Factory = residual.SparseOnlineGP, **figures: Any) -> Factory:
+def _sogp(make: Factory = residual.SparseOnlineGP, kernel_is: str = "kernel", **figures: Any) -> Factory:
     """A sparse online GP that distrusts and forgets by two figures, and has other parts."""
 
     def factory(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearner:
         chosen = {"capacity": 100, "noise_variance": NOISE_VARIANCE, "robust": None, "forgetting_factor": 1.0}
-        chosen |= {"parts": (), **figures, **options}
+        chosen |= {"parts": (), "standardize": False, kernel_is: residual.SquaredExponential(d)}
+        chosen |= {**figures, **options}
         robust, factor, parts = (chosen.pop(name) for name in ("robust", "forgetting_factor", "parts"))
         weight = [] if robust is None else [residual.RobustWeight(robust)]
         fading = [] if factor == 1.0 else [residual.ForgettingFactor(factor)]
         return make(d, m, parts=[*weight, *fading, *parts], **chosen)
 
-    return factory
+    told = {"capacity": 100, **_AS_GIVEN, kernel_is: _KERNEL, **figures}
+    robust, factor, parts = (told.pop(name, None) for name in ("robust", "forgetting_factor", "parts"))
+    named = [f"RobustWeight({robust})"] if robust else []
+    named += [f"ForgettingFactor({factor})"] if factor else []
+    return _told(factory, make, **told, parts=_Written(f"[{', '.join([*named, *map(repr, parts or ())])}]"))
 
 
 def _rbf(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearner:
@@ -57,30 +88,36 @@ def _action_linear(d: int, m: int, *, n_actions: int = 0, **options: Any) -> Res
     return _sogp(robust=3.0, forgetting_factor=0.995, kernel=kernel)(d, m, **options)
 
 
+_STILL = _sogp(residual.DeepKernelSOGP, "base", robust=3.0)
+_WANDERING = _sogp(robust=3.0, parts=[residual.ProcessNoise(0.003), residual.LearnHyperparameters()])
+
+
 def _mixture(d: int, m: int, **options: Any) -> ResidualLearner:
     """One that stands still and learns features, one that wanders: evidence decides."""
-    still = _sogp(residual.DeepKernelSOGP, robust=3.0)
-    wandering = _sogp(robust=3.0, parts=[residual.ProcessNoise(0.003), residual.LearnHyperparameters()])
-    return residual.MixtureResidual([still(d, m, **options), wandering(d, m, **options)])
+    return residual.MixtureResidual([_STILL(d, m, **options), _WANDERING(d, m, **options)])
 
 
-_FRESH: dict[str, Any] = {"noise_variance": NOISE_VARIANCE, "forgetting_factor": 0.99, "robust": 3.0}
+vars(_mixture)["call"] = f"MixtureResidual([{constructor_call(_STILL)}, {constructor_call(_WANDERING)}])"
+
+
+_FRESH: dict[str, Any] = {**_AS_GIVEN, "forgetting_factor": 0.99, "robust": 3.0}
 _LEARNING = [residual.LearnHyperparameters()]
 
 #: Name -> ``factory(in_features, out_features, n_actions=0, capacity=100, **options)``; the last n_actions
-#: inputs are an action. Inputs and outputs are of the order of 1; all but the first two start from the same
+#: inputs are an action. Inputs and outputs are of the order of 1; all but the first three start from the same
 #: generic prior: lengthscale sqrt(d), unit variance, and about 100 of whatever they keep.
 LEARNERS: dict[str, Factory] = {
+    "default": _kind(residual.default_learner, "capacity"),
     "action-linear": _action_linear,
     "rbf": _rbf,
     "model alone": _kind(residual.ZeroResidual),
     "linear RLS": _kind(residual.RecursiveLeastSquares, **_FRESH),
     "random features": _kind(residual.RandomFeatureRLS, "n_frequencies", **_FRESH),
-    "window GP": _kind(residual.WindowGP, "window", noise_variance=NOISE_VARIANCE, robust=3.0),
-    "local GPs": _kind(residual.LocalGPs, "window", experts=40, noise_variance=NOISE_VARIANCE),
-    "KRLS-T": _kind(residual.KRLSTracker, "capacity", noise_variance=NOISE_VARIANCE, forgetting_factor=0.99),
-    "MLP": _kind(residual.ReplayMLP),
-    "MLP ensemble": _kind(residual.ReplayMLP, members=3),
+    "window GP": _kind(residual.WindowGP, "window", "kernel", robust=3.0, **_AS_GIVEN),
+    "local GPs": _kind(residual.LocalGPs, "window", "kernel", experts=40, **_AS_GIVEN),
+    "KRLS-T": _kind(residual.KRLSTracker, "capacity", "kernel", forgetting_factor=0.99, **_AS_GIVEN),
+    "MLP": _kind(residual.ReplayMLP, standardize=False),
+    "MLP ensemble": _kind(residual.ReplayMLP, members=3, standardize=False),
     "SOGP plain": _sogp(),  # as in the paper: nothing forgotten, every sample trusted
     "SOGP": _sogp(forgetting_factor=0.99, robust=3.0),
     "SOGP adaptive": _sogp(forgetting_factor=0.99, robust=3.0, parts=[residual.CalibrateNoise(), *_LEARNING]),
@@ -89,7 +126,10 @@ LEARNERS: dict[str, Factory] = {
     ),
     # no forgetting: what features are learned from is the past
     "SOGP deep": _sogp(
-        residual.DeepKernelSOGP, robust=3.0, parts=[residual.CalibrateNoise(), residual.DetectChanges()]
+        residual.DeepKernelSOGP,
+        "base",
+        robust=3.0,
+        parts=[residual.CalibrateNoise(), residual.DetectChanges()],
     ),
     "SOGP mixture": _mixture,
     "river forest": _kind(residual.RiverResidual),
@@ -145,24 +185,5 @@ def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -
 
 
 def learner_figures(name: str, capacity: int, **options: Any) -> dict[str, Any]:
-    """Kind, kernel, parts and switches of a learner as plain figures, by one with one state and action."""
-    learner = make_learner(name, 1, 1, capacity, **options)
-    figures = _plain(learner)
-    kernel = getattr(learner, "kernel", None)
-    if kernel is not None:
-        parameters = {k: p.tolist() for k, p in kernel.named_parameters() if "log_" in k}
-        figures["kernel"] = {"kind": type(kernel).__name__, **parameters}
-    figures["parts"] = [_plain(part) for part in getattr(learner, "parts", ())]
-    noise = getattr(learner, "noise_variance", None)
-    if noise is not None:
-        figures["noise_variance"] = torch.as_tensor(noise).tolist()
-    return figures
-
-
-def _plain(module: torch.nn.Module) -> dict[str, Any]:
-    plain = {
-        key: value
-        for key, value in vars(module).items()
-        if not key.startswith("_") and isinstance(value, bool | int | float | str | tuple | None)
-    }
-    return {"kind": type(module).__name__, **plain}
+    """What a learner is made with, defaults included, by one with one state and action."""
+    return describe(make_learner(name, 1, 1, capacity, **options))

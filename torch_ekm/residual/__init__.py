@@ -12,11 +12,13 @@ from .baselines.local_gps import LocalGPs
 from .baselines.replay_mlp import ReplayMLP
 from .baselines.window_gp import WindowGP
 from .baselines.zero import ZeroResidual
+from .default import default_learner
 from .fleet import LearnerFleet
 from .kernels.action_linear import ActionLinearKernel, action_covariance, action_jacobian
 from .kernels.deep import DeepKernel
 from .kernels.kernel import Kernel, ProductKernel, SumKernel
 from .kernels.stationary import Matern32, Matern52, SquaredExponential
+from .last_residual import LastResidual
 from .mixture import MixtureResidual
 from .report import UpdateEvent, UpdateReport
 from .sparse_gp.deep import DeepKernelSOGP
@@ -30,9 +32,9 @@ from .sparse_gp.units import Standardize
 __all__ = [
     "ActionLinearKernel", "CalibrateNoise", "DeepKernel", "DeepKernelSOGP", "DetectChanges",
     "ForgettingFactor", "GPyTorchSVGP", "GPyTorchWindow", "KRLSTracker", "Kernel", "LearnHyperparameters",
-    "LearnerFleet", "LocalGPs", "Matern32", "Matern52", "MixtureResidual", "Part",
+    "LastResidual", "LearnerFleet", "LocalGPs", "Matern32", "Matern52", "MixtureResidual", "Part",
     "Prediction", "ProcessNoise", "ProductKernel", "RandomFeatureRLS", "RecursiveLeastSquares", "ReplayMLP",
     "ResidualLearner", "RiverResidual", "RobustWeight", "SparseOnlineGP", "SquaredExponential", "Standardize",
     "SumKernel", "UpdateEvent", "UpdateReport", "WindowGP", "ZeroResidual", "action_covariance",
-    "action_jacobian",
+    "action_jacobian", "default_learner",
 ]  # fmt: skip

@@ -14,30 +14,38 @@ from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import ResidualLearner
 from .checks import check_factor
+from .last_residual import LastResidual
 from .report import UpdateReport
 from .sparse_gp.sparse_online_gp import Prediction
 from .tails import ScaleMixture
 
 _PRIOR = 0.8  # belief that a learner is to be taken at its word
 _FREEDOM = 10.0  # of the t law that judges the experts: an outlier must not decide alone
-_LEVEL_DECAY = 0.995
+_LEVEL_DECAY, _TREND_DECAY = 0.995, 0.98
+_SLOW = 0.2  # largest rate of a level that outlives the end of a trajectory
+_YOUNG = 4  # samples that are not judged by: learners do not know their units yet
+_RMS_SHARE = 0.5, 6.0  # of the running rms, by which experts are judged; at most so many typical scales
 _RATE = 0.01  # of the running variance
 
 
 class MixtureResidual(ResidualLearner):
-    """A weighted mean of experts e = (learner b, share h, carry kappa, level rho, cap c), per output::
+    """A weighted mean of experts e = (learner b, share h, carry kappa, level rho, trend beta, cap c)::
 
         mean_e = h m_b(x) - kappa w_e + l_e
-        i_e = y - mean_e,   w_e <- i_e / (1 + (i_e / c s)^2),   l_e <- .995 l_e + rho w_e
+        i_e = y - mean_e,   w_e <- i_e / (1 + (i_e / c s)^2)
+        d_e <- .98 d_e + beta w_e,   l_e <- .995 l_e + rho w_e + d_e
         p_e ~ prior_e exp(sum_i memory^i log t_10(i_e(t-i) / s))
 
     Differences of a noisy pose carry noise over: what one sample has too much, the next one lacks, so
     innovations correlate by up to -1/2 and ``kappa`` (the pose's share of the noise: the moving average
-    of order one that a Kalman filter would use) takes it away. ``l`` follows a slowly wandering offset.
+    of order one that a Kalman filter would use) takes it away. ``l`` follows a wandering offset: slowly with
+    a small rho, and with rho = 1 it is what the last sample left, which on a smooth stream tells a lot; d
+    goes on as it went (Holt's double exponential smoothing).
     ``h`` below 1 trusts the model more than the learner, so an output on which nothing can be learned
     costs next to nothing. Which of it holds is decided by predictive evidence alone (dynamic model
     averaging, Raftery et al., Technometrics 52, 2010), for each output and model of a fleet. The
-    learners are trained on y without what is carried over.
+    learners learn y itself: what is carried over changes with the weights, and would be another function
+    to learn each time.
 
     It predicts the *next* sample: a constant carry is part of the mean until another sample comes.
     Call :meth:`new_sequence` where one trajectory ends and another begins.
@@ -47,7 +55,8 @@ class MixtureResidual(ResidualLearner):
 
     Args:
         learners: one or more of the same shapes; they belong to the mixture from now on.
-        shares, carries, levels, caps: values of h, kappa, rho and c to choose from.
+        shares, carries, levels, trends, caps: values of h, kappa, rho, beta and c to choose from; a
+            trend goes with levels that are larger.
         memory: forgetting factor of the evidence.
         on_invalid: see ResidualLearner.
 
@@ -62,6 +71,7 @@ class MixtureResidual(ResidualLearner):
         shares: Sequence[float] = (0.0, 0.5, 1.0),
         carries: Sequence[float] = (-0.3, 0.0, 0.2, 0.4, 0.6, 0.8),
         levels: Sequence[float] = (0.0, 0.03, 0.1),
+        trends: Sequence[float] = (0.0,),
         caps: Sequence[float] = (3.0, 30.0),
         memory: float = 0.99,
         **options: Any,
@@ -71,13 +81,16 @@ class MixtureResidual(ResidualLearner):
         shape = {"batch_shape": tuple(first.batch_shape), "dtype": first.dtype, "device": first.device}
         super().__init__(first.in_features, first.out_features, **{**shape, **options})
         choices = ("shares", shares, 0, 1), ("carries", carries, -1, 1), ("levels", levels, 0, 1)
+        choices = *choices, ("trends", trends, 0, 1)
         for name, values, low, high in (*choices, ("caps", caps, 1e-3, 1e6)):
             if not values or not all(low <= value <= high for value in values):
                 raise ParameterError(name, values, f"one or more numbers in [{low:g}, {high:g}]")
         self.learners = nn.ModuleList(members)
         self.memory = check_factor("memory", memory)
-        experts = itertools.product(range(len(members)), shares, carries, levels, caps)
-        owner, *values = zip(*experts, strict=True)
+        rises = [(rho, beta) for rho in levels for beta in trends if beta == 0 or beta < rho]
+        experts = itertools.product(range(len(members)), shares, carries, rises, caps)
+        flat = [(b, h, kappa, *rise, c) for b, h, kappa, rise, c in experts]
+        owner, *values = zip(*flat, strict=True)
         factory = {"dtype": self.dtype, "device": self.device}
         self._experts = nn.Buffer(torch.tensor(values, **factory), persistent=False)
         members_of = torch.nn.functional.one_hot(torch.tensor(owner), len(members))
@@ -91,6 +104,7 @@ class MixtureResidual(ResidualLearner):
         self.evidence = nn.Buffer(torch.zeros(wide, **factory))
         self.innovation = nn.Buffer(torch.zeros(wide, **factory))
         self.level = nn.Buffer(torch.zeros(wide, **factory))
+        self.trend = nn.Buffer(torch.zeros(wide, **factory))
         # what a query needs of the weights: sum p h per learner, and sum p (l - kappa w)
         self.gain = nn.Buffer(torch.zeros(*wide[:-1], len(members), **factory))
         self.offset = nn.Buffer(torch.zeros(wide[:-1], **factory))
@@ -208,7 +222,7 @@ class MixtureResidual(ResidualLearner):
         """Everything back to the prior."""
         for learner in self.members:
             learner.reset()
-        for buffer in (self.evidence, self.innovation, self.level, self.count, self.n_refused):
+        for buffer in (self.evidence, self.innovation, self.level, self.trend, self.count, self.n_refused):
             buffer.zero_()
         self.inflation.fill_(1.0)
         self.tails.reset()
@@ -218,35 +232,46 @@ class MixtureResidual(ResidualLearner):
     def new_sequence(self) -> None:
         """The next sample does not follow on the last one: nothing is carried over."""
         self.innovation.zero_()
+        self.trend.zero_()
+        self.level.mul_(self._experts[2] <= _SLOW)
+        for learner in self.members:
+            if isinstance(learner, LastResidual):
+                learner.new_sequence()
         self._settle()
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         mean, deviation, means = self._standard(x)
-        scale = (deviation * self.tails.typical()).unsqueeze(-1)
-        target = y - self.offset
-
+        # what is carried over is cut by a scale in which outliers have little say; what experts are judged by
+        # heeds the few large samples of a stream that mostly rests, too
+        typical = self.tails.typical()
+        share, most = _RMS_SHARE
+        judged_by = typical * (share * self.inflation.sqrt() / typical).clamp(1.0, most)
         innovation = y.unsqueeze(-1) - self._means(means)
-        r = (innovation / scale).square()
+        r = (innovation / (deviation * judged_by).unsqueeze(-1)).square()
         evidence = self.memory * self.evidence - 0.5 * (_FREEDOM + 1.0) * torch.log1p(r / _FREEDOM)
         evidence = evidence - evidence.amax(-1, keepdim=True)
-        innovation = innovation / (1.0 + r / self._experts[3].square())
-        level = _LEVEL_DECAY * self.level + self._experts[2] * innovation
+        far = (innovation / (deviation * typical).unsqueeze(-1)).square()
+        innovation = innovation / (1.0 + far / self._experts[4].square())
+        trend = _TREND_DECAY * self.trend + self._experts[3] * innovation
+        level = _LEVEL_DECAY * self.level + self._experts[2] * innovation + trend
         z = (y - mean) / deviation
-        rate = (1.0 / (self.count + 2.0)).clamp_min(_RATE).unsqueeze(-1)
+        rate = (1.0 / (self.count - _YOUNG + 2.0).clamp_min(1.0)).clamp_min(_RATE).unsqueeze(-1)
         inflation = (self.inflation + rate * (z.square() - self.inflation)).clamp_min(1e-12)
         news = {
-            "evidence": evidence, "innovation": innovation, "level": level, "inflation": inflation
+            "evidence": evidence, "innovation": innovation, "level": level, "trend": trend,
+            "inflation": inflation,
         }  # fmt: skip
+        judged = self.count >= _YOUNG
+        if mask is not None:
+            judged = judged & mask
         for name, value in news.items():
             buffer = self.get_buffer(name)
-            if mask is not None:
-                on = mask[(..., *(None,) * (value.dim() - mask.dim()))]
-                value = torch.where(on, value, buffer)
-            buffer.copy_(value)
+            on = judged[(..., *(None,) * (value.dim() - judged.dim()))]
+            buffer.copy_(torch.where(on, value, buffer))
         nis = (z.square() / self.inflation).mean(-1)
-        self.tails.observe(z, self.count, mask)
+        self.tails.observe(z, (self.count - _YOUNG).clamp_min(0.0), judged)
         self.count += 1.0 if mask is None else mask.to(self.count.dtype)
-        reports = [learner.update(x, target, mask) for learner in self.members]
+        reports = [learner.update(x, y, mask) for learner in self.members]
         report = reports[0]
         self._settle()
         return UpdateReport(report.event, report.novelty, nis, report.weight)

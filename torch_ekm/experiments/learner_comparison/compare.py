@@ -16,7 +16,7 @@ from ...exceptions import MissingExtraError, NoStateError, ParameterError, Shape
 from ...residual import ResidualLearner
 from ...typing import Array
 from ..jobs import run_jobs
-from ..learners import COMPARED, Factory, learner_factory
+from ..learners import COMPARED, Factory, constructor_call, learner_factory
 from .fingerprint import fingerprint
 from .prequential import Z90, run_prequential
 from .recordings import LIMIT, load_recording
@@ -86,7 +86,8 @@ def compare(
         errors[stream.name, name] = squared
         rms = block_bootstrap(squared, alone, blocks_of(stream))
         scores[stream.name, name] = Score(stream.name, name, rms, **result)
-    return ComparisonReport(tuple(streams), tuple(factories), scores, errors)
+    calls = {name: constructor_call(factory) for name, factory in factories.items()}
+    return ComparisonReport(tuple(streams), tuple(factories), scores, errors, calls)
 
 
 def run_one(stream: Stream, factory: Factory) -> dict[str, Any]:

@@ -18,9 +18,10 @@ class ComparisonReport(Comparison):
     """A comparison that prints as a table and can be written."""
 
     def tables(self) -> list[Table]:
-        """One for each stream; of several streams an overview first."""
+        """One for each stream; of several streams an overview first, how the learners are made last."""
         tables = [score_table(self, stream.name) for stream in self.streams]
-        return [overview_table(self), *tables] if len(tables) > 1 else tables
+        made = [constructor_table(self)] if any(self.calls.values()) else []
+        return [overview_table(self), *tables, *made] if len(tables) > 1 else [*tables, *made]
 
     def __str__(self) -> str:
         return "\n".join([str(self.tables()[0]), *self.verdicts()])
@@ -90,6 +91,15 @@ def overview_table(comparison: Comparison) -> Table:
         note += f" Mean ranks closer than {difference:.1f} cannot be told apart (Nemenyi, 5 %)."
     columns = ["learner", *names, Column("mean rank", ".1f")]
     return Table("overview", "rms error / that of the model alone", columns, rows, note)
+
+
+def constructor_table(comparison: Comparison) -> Table:
+    """How a user makes each learner."""
+    rows: list[list[Cell]] = [
+        [name, call] for name in comparison.learners if (call := comparison.calls.get(name, ""))
+    ]
+    note = "d inputs, m outputs. The streams above are in units of their own first samples."
+    return Table("learners", "How they are made", ["learner", "call"], rows, note)
 
 
 def curve_learners(comparison: Comparison, stream: str, most: int = 6) -> Sequence[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,8 @@ class Comparison:
     """(stream, learner) -> score."""
     errors: dict[tuple[str, str], Array]
     """(stream, learner) -> squared error of each scored sample, mean over the outputs."""
+    calls: dict[str, str] = field(default_factory=dict)
+    """learner -> how a user makes it, of d inputs and m outputs, where that is known."""
 
     def stream(self, name: str) -> Stream:
         """The stream of that name."""

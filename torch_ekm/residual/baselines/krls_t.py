@@ -6,17 +6,17 @@ from typing import Any
 
 import torch
 from torch import nn
-from torch.distributions import Normal
 
 from ...typing import Tensor
 from ..base import DoubleStateLearner, SingleLearner
 from ..checks import check_count, check_factor, check_positive
 from ..kernels.kernel import Kernel
-from ..kernels.stationary import SquaredExponential
+from ..kernels.stationary import Matern32
 from ..report import UpdateEvent, UpdateReport
+from .scaled import ScaledLearner
 
 
-class KRLSTracker(SingleLearner, DoubleStateLearner):
+class KRLSTracker(ScaledLearner, SingleLearner, DoubleStateLearner):
     """Posterior of f at the basis, ``N(mu, Sigma)``, forgotten back to the prior at every step::
 
         Sigma <- lam Sigma + (1 - lam) K,   mu <- sqrt(lam) mu
@@ -27,11 +27,11 @@ class KRLSTracker(SingleLearner, DoubleStateLearner):
 
     Args:
         capacity: largest number of basis points.
-        kernel: default squared exponential with lengthscale sqrt(in_features).
+        kernel: default Matern 3/2 with lengthscale sqrt(in_features).
         noise_variance: s2.
         forgetting_factor: lam in (0, 1].
         jitter: nugget relative to k**, also the tolerance below which a sample is not novel.
-        options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
+        options: see ScaledLearner; ``batch_shape`` must be (): several are a ``LearnerFleet``.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class KRLSTracker(SingleLearner, DoubleStateLearner):
         *,
         capacity: int = 100,
         kernel: Kernel | None = None,
-        noise_variance: float = 0.01,
+        noise_variance: float = 0.1,
         forgetting_factor: float = 1.0,
         jitter: float = 1e-6,
         **options: Any,
@@ -52,31 +52,43 @@ class KRLSTracker(SingleLearner, DoubleStateLearner):
         self.forgetting_factor = check_factor("forgetting_factor", forgetting_factor)
         self.jitter = check_positive("jitter", jitter)
         factory = {"dtype": torch.float64, "device": self.device}
-        self.kernel = SquaredExponential(in_features, **factory) if kernel is None else kernel.double()
+        self.kernel = Matern32(in_features, **factory) if kernel is None else kernel.double()
         M = self.capacity + 1
         self.basis = nn.Buffer(torch.zeros(M, self.in_features, **factory))
         self.mu = nn.Buffer(torch.zeros(M, self.out_features, **factory))
         self.Sigma = nn.Buffer(torch.zeros(M, M, **factory))
         self.Q = nn.Buffer(torch.zeros(M, M, **factory))
         self.active = nn.Buffer(torch.zeros(M, dtype=torch.bool, device=self.device))
+        self._make_units(self.kernel.shift_invariant(self.in_features), torch.float64)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """``k'Q mu``."""
-        k = self._cross(self._check_query(x).double())
-        return (k @ self.Q @ self.mu).to(self.dtype)
+    def _mean(self, z: Tensor) -> Tensor:
+        return self._cross(z) @ self.Q @ self.mu
 
-    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+    def _law(self, z: Tensor, observation: bool) -> tuple[Tensor, Tensor]:
         """``k** - k'Qk + (Qk)'Sigma(Qk)``, plus s2 on request."""
-        z = self._check_query(x).double()
         k = self._cross(z)
         e = k @ self.Q
         v = (self.kernel.diagonal(z) - (e * k).sum(-1)).clamp_min(0.0) + ((e @ self.Sigma) * e).sum(-1)
         v = v + self.noise_variance if observation else v.clamp_min(torch.finfo(v.dtype).eps)
-        mean = (e @ self.mu).to(self.dtype)
-        return Normal(mean, v.sqrt().unsqueeze(-1).expand_as(mean).to(self.dtype), validate_args=False)
+        return e @ self.mu, v.unsqueeze(-1)
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        x, y, lam = x.double(), y.double(), self.forgetting_factor
+    def _clear(self) -> None:
+        for buffer in (self.basis, self.mu, self.Sigma, self.Q, self.active):
+            buffer.zero_()
+
+    def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
+        """The same beliefs at the same places, in other numbers."""
+        (offset, ratio), (offset_t, ratio_t) = change, change_t
+        self.basis.add_(offset).mul_(ratio)
+        self.mu.add_(offset_t).mul_(ratio_t).mul_(self.active[:, None])
+        self.Sigma.mul_(ratio_t.square().mean())
+        K = self.kernel(self.basis, self.basis) * (self.active[:, None] & self.active)
+        K.diagonal().copy_(torch.where(self.active, K.diagonal() * (1.0 + self.jitter), 1.0))
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(K)[0])
+        self.Q.copy_(inverse * (self.active[:, None] & self.active))
+
+    def _learn(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        lam = self.forgetting_factor
         if lam < 1.0:
             on = self.active.double()
             K = self.kernel(self.basis, self.basis) * on[:, None] * on
@@ -125,6 +137,9 @@ class KRLSTracker(SingleLearner, DoubleStateLearner):
             matrix[i] = 0.0
             matrix[:, i] = 0.0
         self.mu[i] = 0.0
+
+    def _cast(self, x: Tensor) -> Tensor:
+        return torch.as_tensor(x, dtype=torch.float64, device=self.device)
 
     def _cross(self, z: Tensor) -> Tensor:
         return self.kernel.vector(z, self.basis) * self.active

@@ -8,16 +8,16 @@ from typing import Any
 
 import torch
 from torch import nn
-from torch.distributions import Normal
 
 from ...typing import Float, Tensor
-from ..base import ResidualLearner
 from ..checks import check_count, check_factor, check_positive
 from ..kernels.kernel import log_parameter
 from ..report import UpdateReport
+from ..running_scale import BLOCK
+from .scaled import ScaledLearner
 
 
-class LinearInFeatures(ResidualLearner):
+class LinearInFeatures(ScaledLearner):
     """``g(x) = w' phi(x)``, ``w ~ N(0, v I)``, ``y = g + noise``: exact posterior, O(f^2) a sample::
 
         P = (A/s2 + I/v)^-1,  w = P b/s2,   A = sum lam^(t-i) phi phi',  b = sum lam^(t-i) phi y'
@@ -32,7 +32,7 @@ class LinearInFeatures(ResidualLearner):
         forgetting_factor: lam in (0, 1], see ForgettingFactor.
         refresh_every: samples between two rebuilds.
         robust: c of the weight ``1 / (1 + z2/c^2)`` on a sample's noise; None: weight 1.
-        options: see ResidualLearner.
+        options: see ScaledLearner and ResidualLearner.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class LinearInFeatures(ResidualLearner):
         out_features: int,
         n_phi: int,
         *,
-        noise_variance: float = 0.01,
+        noise_variance: float = 0.1,
         weight_variance: float = 1.0,
         forgetting_factor: float = 1.0,
         robust: float | None = None,
@@ -61,34 +61,33 @@ class LinearInFeatures(ResidualLearner):
         self.covariance = nn.Buffer(prior.expand(*self.batch_shape, f, f).clone())
         self.weights = nn.Buffer(zeros(*self.batch_shape, f, self.out_features))
         self.pending = nn.Buffer(zeros(self.batch_shape))
-        self._n_samples = 0
+        self._make_units(self._shifted(), self.dtype)
+
+    def _shifted(self) -> list[bool]:
+        """Columns of x whose origin does not matter."""
+        return [True] * self.in_features
 
     @abstractmethod
     def features(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any f"]:
         """phi(x), differentiable."""
 
-    def forward(self, x: Tensor) -> Tensor:
-        """``w' phi(x)``."""
-        phi = self.features(self._check_query(x))
-        return (phi.unsqueeze(-2) @ self.weights).squeeze(-2)
+    def _mean(self, z: Tensor) -> Tensor:
+        return (self.features(z).unsqueeze(-2) @ self.weights).squeeze(-2)
 
-    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+    def _law(self, z: Tensor, observation: bool) -> tuple[Tensor, Tensor]:
         """Variance ``phi' P phi``, plus s2 on request; the same for all outputs."""
-        phi = self.features(self._check_query(x)).unsqueeze(-2)
-        mean = (phi @ self.weights).squeeze(-2)
+        phi = self.features(z).unsqueeze(-2)
         v = (phi @ self.covariance @ phi.mT).squeeze(-1).clamp_min(torch.finfo(phi.dtype).tiny)
-        v = v + self.noise_variance if observation else v
-        return Normal(mean, v.sqrt().expand_as(mean), validate_args=False)
+        return (phi @ self.weights).squeeze(-2), v + self.noise_variance if observation else v
 
-    def reset(self) -> None:
+    def _clear(self) -> None:
         """Back to w ~ N(0, v I)."""
-        for buffer in (self.information, self.target, self.weights, self.pending, self.n_refused):
+        for buffer in (self.information, self.target, self.weights, self.pending):
             buffer.zero_()
         self.covariance.zero_()
         self.covariance.diagonal(dim1=-2, dim2=-1).fill_(self.weight_variance)
-        self._n_samples = 0
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def _learn(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         s2, column = self.noise_variance, self.features(x).unsqueeze(-1)
         Pphi = self.covariance @ column
         v = (column.mT @ Pphi).squeeze(-1).squeeze(-1)
@@ -106,8 +105,7 @@ class LinearInFeatures(ResidualLearner):
         self.information += share * (column @ column.mT)
         self.target += share * (column @ y.unsqueeze(-2))
         self.pending += 1.0 if mask is None else mask
-        self._n_samples += 1
-        if self._n_samples % self.refresh_every == 0:
+        if self.n_samples % self.refresh_every == 0:
             self._rebuild()
         return self._report(nis, mask, weight=weight)
 
@@ -129,13 +127,6 @@ class LinearInFeatures(ResidualLearner):
         target = d.unsqueeze(-1) * self.target.double() / self.noise_variance
         self.weights.copy_(d.unsqueeze(-1) * torch.cholesky_solve(target, factor))
 
-    def get_extra_state(self) -> dict[str, Any]:
-        """Number of samples seen: the rhythm of rebuilds continues after a reload."""
-        return {**super().get_extra_state(), "n_samples": self._n_samples}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        self._n_samples = int(state["n_samples"])
-
 
 class RecursiveLeastSquares(LinearInFeatures):
     """``g(x) = W' [x, 1]``: Bayesian recursive least squares with forgetting.
@@ -146,17 +137,35 @@ class RecursiveLeastSquares(LinearInFeatures):
     """
 
     def __init__(self, in_features: int, out_features: int, *, bias: bool = True, **options: Any) -> None:
+        self._bias = bool(bias)  # the units ask for it
         super().__init__(in_features, out_features, in_features + bias, **options)
-        self.bias = bool(bias)
+
+    @property
+    def bias(self) -> bool:
+        """Whether the constant 1 is among the features."""
+        return self._bias
+
+    def _shifted(self) -> list[bool]:
+        return [self.bias] * self.in_features
 
     def features(self, x: Tensor) -> Tensor:
         return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1) if self.bias else x
 
-    def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def _slopes(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """The slope is W itself, everywhere."""
-        x = self._check_query(x)
         slope = self.weights.mT[..., : self.in_features]
-        return self(x), slope.expand(*x.shape[:-1], *slope.shape[-2:])
+        return self._mean(z), slope.expand(*z.shape[:-1], *slope.shape[-2:])
+
+    def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
+        """``new phi = T phi``: ``A <- T A T'``, ``b <- T (b + A 1 o) r``, 1 being the bias' place."""
+        (offset, ratio), (offset_t, ratio_t) = change, change_t
+        T = torch.diag_embed(torch.cat([ratio, torch.ones_like(ratio[..., :1])], -1) if self.bias else ratio)
+        if self.bias:
+            T[..., :-1, -1] = offset * ratio
+            self.target += self.information[..., -1:] * offset_t.unsqueeze(-2)
+        self.information.copy_(T @ self.information @ T.mT)
+        self.target.copy_(T @ self.target * ratio_t.unsqueeze(-2))
+        self._rebuild()
 
 
 class RandomFeatureRLS(LinearInFeatures):
@@ -195,9 +204,15 @@ class RandomFeatureRLS(LinearInFeatures):
         angle = x @ self.frequencies.mT
         return torch.cat([angle.cos(), angle.sin()], dim=-1) / math.sqrt(len(self.frequencies))
 
-    def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    settled = 1.0  # frequencies are of one unit: only a much better one is worth starting again
+
+    def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
+        """Features of other units are others: the block is learned anew, but for the sample that comes."""
+        self._learn_block(BLOCK - 1)
+
+    def _slopes(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """``dphi/dx = sqrt(1/D) [-sin(.) Omega; cos(.) Omega]``."""
-        phi = self.features(self._check_query(x))
+        phi = self.features(z)
         cos, sin = phi.chunk(2, dim=-1)
         slope = torch.cat([-sin, cos], dim=-1).unsqueeze(-1) * self.frequencies.repeat(2, 1)
         return (phi.unsqueeze(-2) @ self.weights).squeeze(-2), self.weights.mT @ slope

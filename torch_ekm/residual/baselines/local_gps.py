@@ -6,18 +6,18 @@ from typing import Any
 
 import torch
 from torch import nn
-from torch.distributions import Normal
 
 from ...exceptions import ParameterError
 from ...typing import Tensor
 from ..base import SingleLearner
 from ..checks import check_count, check_positive
 from ..kernels.kernel import Kernel
-from ..kernels.stationary import SquaredExponential
+from ..kernels.stationary import Matern32
 from ..report import UpdateEvent, UpdateReport
+from .scaled import ScaledLearner
 
 
-class LocalGPs(SingleLearner):
+class LocalGPs(ScaledLearner, SingleLearner):
     """Experts with centres ``c_e`` and windows of their own; the nearest few are averaged::
 
         mean = sum_e w_e mean_e / sum_e w_e,   w_e = k(x, c_e)
@@ -33,7 +33,7 @@ class LocalGPs(SingleLearner):
         neighbours: experts averaged in a prediction.
         spread: correlation with the nearest centre below which an expert is opened.
         kernel, noise_variance: of all experts.
-        options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
+        options: see ScaledLearner; ``batch_shape`` must be (): several are a ``LearnerFleet``.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class LocalGPs(SingleLearner):
         neighbours: int = 4,
         spread: float = 0.7,
         kernel: Kernel | None = None,
-        noise_variance: float = 0.01,
+        noise_variance: float = 0.1,
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
@@ -57,7 +57,7 @@ class LocalGPs(SingleLearner):
             raise ParameterError("spread", spread, "in (0, 1)")
         self.spread, self.noise_variance = float(spread), check_positive("noise_variance", noise_variance)
         factory = {"dtype": self.dtype, "device": self.device}
-        self.kernel = SquaredExponential(in_features, **factory) if kernel is None else kernel.to(self._like)
+        self.kernel = Matern32(in_features, **factory) if kernel is None else kernel.to(self._like)
         zeros = self._like.new_zeros
         self.centres = nn.Buffer(zeros(E, self.in_features))
         self.inputs = nn.Buffer(zeros(E, n, self.in_features))
@@ -65,16 +65,31 @@ class LocalGPs(SingleLearner):
         self.count = nn.Buffer(torch.zeros(E, dtype=torch.int64, device=self.device))
         self.solution = nn.Buffer(zeros(E, n, self.out_features))
         self.inverse = nn.Buffer(zeros(E, n, n))
+        self._make_units(self.kernel.shift_invariant(self.in_features), self.dtype)
 
-    def forward(self, x: Tensor) -> Tensor:
+    def _mean(self, z: Tensor) -> Tensor:
         """Mean of the nearest experts' means."""
-        return self._mixture(self._check_query(x))[0]
+        return self._mixture(z)[0]
 
-    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+    def _law(self, z: Tensor, observation: bool) -> tuple[Tensor, Tensor]:
         """Moments of the mixture of the nearest experts."""
-        mean, v = self._mixture(self._check_query(x))
-        v = v + self.noise_variance if observation else v
-        return Normal(mean, v.sqrt(), validate_args=False)
+        mean, v = self._mixture(z)
+        return mean, v + self.noise_variance if observation else v
+
+    def _clear(self) -> None:
+        for buffer in (
+            self.centres, self.inputs, self.targets, self.count, self.solution, self.inverse
+        ):  # fmt: skip
+            buffer.zero_()
+
+    def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
+        """All windows in new units, and solved again."""
+        for kept, (offset, ratio) in (
+            (self.centres, change), (self.inputs, change), (self.targets, change_t)
+        ):  # fmt: skip
+            kept.add_(offset).mul_(ratio)
+        for e in range(int((self.count > 0).sum())):
+            self._solve(e)
 
     def _mixture(self, x: Tensor) -> tuple[Tensor, Tensor]:
         near = self.kernel(x.unsqueeze(-2), self.centres).squeeze(-2) * (self.count > 0)
@@ -93,7 +108,7 @@ class LocalGPs(SingleLearner):
         variance = (w * (v + (means - mean.unsqueeze(-2)).square())).sum(-2)
         return mean, torch.where(self.count.sum() > 0, variance, prior)
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def _learn(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         mean, v = self._mixture(x)
         v = v + self.noise_variance
         nis = ((y - mean).square() / v).mean(-1)
@@ -109,11 +124,14 @@ class LocalGPs(SingleLearner):
         place = int(self.count[e]) % self.window
         self.inputs[e, place], self.targets[e, place] = x, y
         self.count[e] += 1
+        self._solve(e)
+        event = torch.tensor(int(UpdateEvent.ADDED if opened else UpdateEvent.ABSORBED), device=self.device)
+        return UpdateReport(event, 1.0 - near[e] / prior if not opened else one, nis, one)
+
+    def _solve(self, e: int) -> None:
         n = min(int(self.count[e]), self.window)
         K = self.kernel(self.inputs[e, :n], self.inputs[e, :n]).double()
         K.diagonal().add_(self.noise_variance)
         inverse = torch.linalg.inv(torch.linalg.cholesky_ex(K)[0])
-        self.inverse[e, :n, :n] = inverse.to(x.dtype)
-        self.solution[e, :n] = (inverse.mT @ (inverse @ self.targets[e, :n].double())).to(x.dtype)
-        event = torch.tensor(int(UpdateEvent.ADDED if opened else UpdateEvent.ABSORBED), device=self.device)
-        return UpdateReport(event, 1.0 - near[e] / prior if not opened else one, nis, one)
+        self.inverse[e, :n, :n] = inverse.to(self.dtype)
+        self.solution[e, :n] = (inverse.mT @ (inverse @ self.targets[e, :n].double())).to(self.dtype)

@@ -8,16 +8,16 @@ from typing import Any
 
 import torch
 from torch import nn
-from torch.distributions import Normal
 
 from ...typing import Tensor
 from ..adam import Adam
 from ..base import SingleLearner
 from ..checks import check_count, check_counts, check_positive
 from ..report import UpdateReport
+from .scaled import ScaledLearner
 
 
-class ReplayMLP(SingleLearner):
+class ReplayMLP(ScaledLearner, SingleLearner):
     """``g(x) = mean_i (net_i(x; theta_i) - net_i(x; theta_i0))``: exactly 0 before the first sample.
 
     Each sample brings ``steps`` Adam steps on itself and a minibatch from the last ``memory`` ones.
@@ -32,7 +32,7 @@ class ReplayMLP(SingleLearner):
         minibatch, steps, rate: of Adam.
         prior_variance: of g before the first sample, and start of the running noise estimate.
         seed: of weights and minibatches.
-        options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
+        options: see ScaledLearner; ``batch_shape`` must be (): several are a ``LearnerFleet``.
     """
 
     def __init__(
@@ -69,29 +69,29 @@ class ReplayMLP(SingleLearner):
         for i, p in enumerate(self.theta):
             self.register_buffer(f"start_{i}", torch.zeros_like(p))
         self.adam = Adam(self.theta)
-        self.reset()
+        self._clear()
+        self._make_units([True] * self.in_features, self.dtype)
 
-    def forward(self, x: Tensor) -> Tensor:
+    def _mean(self, z: Tensor) -> Tensor:
         """Mean of the members."""
-        return self._members(self._check_query(x)).mean(-2)
+        return self._members(z).mean(-2)
 
-    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+    def _law(self, z: Tensor, observation: bool) -> tuple[Tensor, Tensor]:
         """Spread of the members, plus the running noise on request."""
-        members = self._members(self._check_query(x))
+        members = self._members(z)
         mean = members.mean(-2)
         if self.members > 1:
             # before the first sample all members are 0 and so is their spread: then it is the prior
             v = members.var(-2).where(self.count > 0, self.prior_variance)
             v = v.clamp_min(torch.finfo(v.dtype).eps)
-            v = v + self.noise if observation else v
-        else:
-            v = self.noise.expand_as(mean)
-        return Normal(mean, v.sqrt(), validate_args=False)
+            return mean, v + self.noise if observation else v
+        return mean, self.noise.expand_as(mean)
 
-    def reset(self) -> None:
+    def _clear(self) -> None:
         """New weights from the seed, empty memory."""
-        for buffer in self.buffers():
+        for buffer in (self.inputs, self.targets, self.count):
             buffer.zero_()
+        self.adam.reset()
         generator = torch.Generator().manual_seed(self.seed)
         for i, p in enumerate(self.theta):
             if i % 2 == 0:
@@ -101,6 +101,20 @@ class ReplayMLP(SingleLearner):
                 p.data.zero_()
             self.get_buffer(f"start_{i}").copy_(p.data)
         self.noise.fill_(self.prior_variance)
+
+    def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
+        """The same functions of x: first and last layer take the change."""
+        (offset, ratio), (offset_t, ratio_t) = change, change_t
+        n = min(int(self.count), self.memory)
+        self.inputs[:n].add_(offset).mul_(ratio)
+        self.targets[:n].add_(offset_t).mul_(ratio_t)
+        self.noise.mul_(ratio_t.square())
+        start = [self.get_buffer(f"start_{i}") for i in range(len(self.theta))]
+        for theta, shift in (([p.data for p in self.theta], offset_t), (start, 0.0)):
+            theta[1].sub_(offset.unsqueeze(-2) @ theta[0])
+            theta[0].div_(ratio.unsqueeze(-1))
+            theta[-2].mul_(ratio_t)
+            theta[-1].add_(shift).mul_(ratio_t)
 
     def _net(self, x: Tensor, theta: Sequence[Tensor]) -> Tensor:
         """x ``(..., members or 1, n, in)`` through all members."""
@@ -113,11 +127,11 @@ class ReplayMLP(SingleLearner):
         start = [self.get_buffer(f"start_{i}") for i in range(len(self.theta))]
         return (self._net(x, list(self.theta)) - self._net(x, start)).squeeze(-2)
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        law = self.predict(x, observation=True)
-        nis = ((y - law.mean) / law.stddev).square().mean(-1)
+    def _learn(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        mean, variance = self._law(x, True)
+        nis = ((y - mean) / variance.sqrt()).square().mean(-1)
         n = int(self.count)
-        self.noise.lerp_((y - law.mean).square(), max(0.02, 1.0 / (n + 2)))
+        self.noise.lerp_((y - mean).square(), max(0.02, 1.0 / (n + 2)))
         self.inputs[n % self.memory], self.targets[n % self.memory] = x, y
         self.count += 1
         start = [self.get_buffer(f"start_{i}") for i in range(len(self.theta))]

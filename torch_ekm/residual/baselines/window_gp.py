@@ -6,27 +6,26 @@ from typing import Any
 
 import torch
 from torch import nn
-from torch.distributions import Normal
 
 from ...typing import Tensor
-from ..base import ResidualLearner
 from ..checks import check_count, check_positive
 from ..kernels.kernel import Kernel
-from ..kernels.stationary import SquaredExponential
+from ..kernels.stationary import Matern32
 from ..report import UpdateReport
+from .scaled import ScaledLearner
 
 
-class WindowGP(ResidualLearner):
+class WindowGP(ScaledLearner):
     """``mean = k'(K + s2 I)^-1 y``, ``var = k** - k'(K + s2 I)^-1 k`` on a sliding window.
 
     O(window^3) per sample: one Cholesky. What left the window is gone.
 
     Args:
         window: samples kept.
-        kernel: default squared exponential with lengthscale sqrt(in_features).
+        kernel: default Matern 3/2 with lengthscale sqrt(in_features).
         noise_variance: s2.
         robust: c; a surprising sample gets the noise ``s2 (1 + z2/c^2)``.
-        options: see ResidualLearner.
+        options: see ScaledLearner and ResidualLearner.
     """
 
     def __init__(
@@ -36,7 +35,7 @@ class WindowGP(ResidualLearner):
         *,
         window: int = 100,
         kernel: Kernel | None = None,
-        noise_variance: float = 0.01,
+        noise_variance: float = 0.1,
         robust: float | None = None,
         **options: Any,
     ) -> None:
@@ -45,7 +44,7 @@ class WindowGP(ResidualLearner):
         self.noise_variance = check_positive("noise_variance", noise_variance)
         self.robust = None if robust is None else check_positive("robust", robust)
         fleet = {"batch_shape": self.batch_shape, "device": self.device, "dtype": self.dtype}
-        self.kernel = SquaredExponential(in_features, **fleet) if kernel is None else kernel.to(self._like)
+        self.kernel = Matern32(in_features, **fleet) if kernel is None else kernel.to(self._like)
         zeros, shape, n = self._like.new_zeros, self.batch_shape, self.window
         self.inputs = nn.Buffer(zeros(*shape, n, self.in_features))
         self.targets = nn.Buffer(zeros(*shape, n, self.out_features))
@@ -53,29 +52,35 @@ class WindowGP(ResidualLearner):
         self.count = nn.Buffer(torch.zeros(shape, dtype=torch.int64, device=self.device))
         self.solution = nn.Buffer(zeros(*shape, n, self.out_features))
         self.inverse = nn.Buffer(zeros(*shape, n, n))  # L^-1 of K + s2 I = LL'
+        self._make_units(self.kernel.shift_invariant(self.in_features), self.dtype)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """``k'(K + s2 I)^-1 y``."""
-        k = self.kernel.vector(self._check_query(x), self.inputs)
+    def _mean(self, z: Tensor) -> Tensor:
+        k = self.kernel.vector(z, self.inputs)
         return (k.unsqueeze(-2) @ self.solution).squeeze(-2)
 
-    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+    def _law(self, z: Tensor, observation: bool) -> tuple[Tensor, Tensor]:
         """``k** - |L^-1 k|^2``, plus s2 on request."""
-        x = self._check_query(x)
-        u = (self.inverse @ self.kernel.vector(x, self.inputs).unsqueeze(-1)).squeeze(-1)
-        v = (self.kernel.diagonal(x) - u.square().sum(-1)).clamp_min(torch.finfo(x.dtype).eps)
-        v = v + self.noise_variance if observation else v
-        mean = self(x)
-        return Normal(mean, v.sqrt().unsqueeze(-1).expand_as(mean), validate_args=False)
+        u = (self.inverse @ self.kernel.vector(z, self.inputs).unsqueeze(-1)).squeeze(-1)
+        v = (self.kernel.diagonal(z) - u.square().sum(-1)).clamp_min(torch.finfo(z.dtype).eps)
+        return self._mean(z), (v + self.noise_variance if observation else v).unsqueeze(-1)
 
-    def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def _slopes(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """``dk/dx'(K + s2 I)^-1 y``."""
-        k, dk = self.kernel.with_gradient(self._check_query(x), self.inputs)
+        k, dk = self.kernel.with_gradient(z, self.inputs)
         return (k.unsqueeze(-2) @ self.solution).squeeze(-2), self.solution.mT @ dk
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        law = self.predict(x, observation=True)
-        nis = ((y - law.mean) / law.stddev).square().mean(-1)
+    def _clear(self) -> None:
+        for buffer in (self.inputs, self.targets, self.noise, self.count, self.solution, self.inverse):
+            buffer.zero_()
+
+    def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
+        """The window in new units; its solution comes with the next sample."""
+        for kept, (offset, ratio) in ((self.inputs, change), (self.targets, change_t)):
+            kept.add_(offset.unsqueeze(-2)).mul_(ratio.unsqueeze(-2))
+
+    def _learn(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        mean, variance = self._law(x, True)
+        nis = ((y - mean) / variance.sqrt()).square().mean(-1)
         weight = torch.ones_like(nis)
         if self.robust is not None:
             weight = 1.0 / (1.0 + nis / self.robust**2)
@@ -95,5 +100,5 @@ class WindowGP(ResidualLearner):
         inverse = inverse * on.mT.double()
         self.solution.copy_(inverse.mT @ (inverse @ self.targets.double()))
         self.inverse.copy_(inverse)
-        novelty = (law.variance[..., 0] - self.noise_variance) / self.kernel.diagonal(x)
+        novelty = (variance[..., 0] - self.noise_variance) / self.kernel.diagonal(x)
         return self._report(nis, mask, novelty=novelty, weight=weight)

@@ -8,9 +8,10 @@ from typing import Any
 from torch import nn
 
 from ..kernels.deep import DeepKernel
-from ..kernels.stationary import SquaredExponential
+from ..kernels.stationary import Matern32, StationaryKernel
 from .forgetting import ProcessNoise
 from .hyperparameters import LearnHyperparameters
+from .monitor import DetectChanges, RobustWeight
 from .part import copy_parts
 from .sparse_online_gp import SparseOnlineGP
 
@@ -22,7 +23,8 @@ def DeepKernelSOGP(  # noqa: N802  a kind of learner, called like the others
     hidden: Sequence[int] | None = None,
     features: int | None = None,
     seed: int = 0,
-    parts: Iterable[nn.Module] = (),
+    base: StationaryKernel | None = None,
+    parts: Iterable[nn.Module] | None = None,
     **options: Any,
 ) -> SparseOnlineGP:
     """A SparseOnlineGP on ``[x / L, net(x)]``, network and kernel learned online in constant memory.
@@ -37,13 +39,15 @@ def DeepKernelSOGP(  # noqa: N802  a kind of learner, called like the others
     Args:
         hidden, features: of the network; (64, 64) and 16, or (32, 32) and 6 without a memory.
         seed: of its weights.
-        parts: as of SparseOnlineGP; ``LearnHyperparameters`` is added if it is not among them.
+        base: kernel on inputs and features, Matern 3/2 by default.
+        parts: as of SparseOnlineGP, by default ``[RobustWeight(3.0), DetectChanges()]``;
+            ``LearnHyperparameters`` is added if it is not among them.
         options: see SparseOnlineGP (without ``kernel``).
 
     Raises:
         ParameterError: from SparseOnlineGP and DeepKernel.
     """
-    own = copy_parts(parts)
+    own = [RobustWeight(3.0), DetectChanges()] if parts is None else copy_parts(parts)
     learning = next((part for part in own if isinstance(part, LearnHyperparameters)), None)
     if learning is None:
         wanders = any(isinstance(part, ProcessNoise) for part in own)
@@ -51,7 +55,7 @@ def DeepKernelSOGP(  # noqa: N802  a kind of learner, called like the others
         own.append(learning)
     fleet = {name: options[name] for name in ("batch_shape", "device") if name in options}
     kernel = DeepKernel(
-        SquaredExponential(in_features, **fleet),
+        Matern32(in_features, **fleet) if base is None else base,
         hidden=hidden if hidden is not None else (64, 64) if learning.memory else (32, 32),
         features=features if features is not None else 16 if learning.memory else 6,
         seed=seed,

@@ -48,6 +48,8 @@ class LearnHyperparameters(Part):
         memory: samples of the past to learn from, too (ReplayMemory); 0: the last k only. Not with
             :class:`ProcessNoise`: where g wanders the past is another g.
         network_rate: Adam's first step on parameters that are no logarithms (a deep kernel's weights).
+        network_decay: the part of these that goes with each step, times the noise's share of y (and shrinking
+            as steps do): features of noise do not stay (decoupled as in Loshchilov & Hutter, ICLR 2019).
 
     Raises:
         ParameterError: a figure is outside its range.
@@ -56,11 +58,20 @@ class LearnHyperparameters(Part):
     stands_last = True
 
     def __init__(
-        self, *, rate: float = 0.03, steps: int = 1, memory: int = 0, network_rate: float = 0.015
+        self,
+        *,
+        rate: float = 0.03,
+        steps: int = 1,
+        memory: int = 0,
+        network_rate: float = 0.015,
+        network_decay: float = 0.25,
     ) -> None:
         super().__init__()
         self.rate = check_positive("rate", rate)
         self.network_rate = check_positive("network_rate", network_rate)
+        if not 0 <= network_decay < 1:
+            raise ParameterError("network_decay", network_decay, "in [0, 1)")
+        self.network_decay = float(network_decay)
         self.steps, self.memory = check_count("steps", steps), check_count("memory", memory, least=0)
 
     def bind(self, learner: Host) -> None:
@@ -89,9 +100,10 @@ class LearnHyperparameters(Part):
         place, mask, weight = learner.n_samples % self.window, sample.mask, sample.report.weight
         self.window_x[..., place, :] = sample.x
         self.window_y[..., place, :] = sample.y
-        self.window_on[..., place] = 1.0 if mask is None else mask
+        weight = weight if mask is None else weight * mask
+        self.window_on[..., place] = weight
         if self.past is not None:
-            self.past.offer(sample.x, sample.y, weight if mask is None else weight * mask)
+            self.past.offer(sample.x, sample.y, weight)
         if place == self.window - 1:
             self.descend(learner)
         return False
@@ -144,6 +156,7 @@ class LearnHyperparameters(Part):
         self.n_steps += on
         n = self.n_steps.clamp_min(1.0)
         correction = self.adam.correction(n) * _shrink(n)
+        noise = on * parameters["log_noise"].mean(-1).exp().clamp_max(1.0)
         for i, ((name, p), gradient) in enumerate(zip(parameters.items(), gradients, strict=True)):
             if gradient is None:
                 continue
@@ -151,6 +164,8 @@ class LearnHyperparameters(Part):
             shared = self.shared_kernel and name != "log_noise"
             good = gradient.isfinite() & (_spread(on, p, shared) > 0)
             rate = (self.rate if logarithm else self.network_rate) * _spread(correction, p, shared)
+            if not logarithm and self.network_decay:
+                p.mul_(1.0 - self.network_decay * _spread(noise * _shrink(n), p, shared))
             self.adam.move(i, p, gradient.where(good, 0.0), rate, good)
             if logarithm:  # far beyond what standardised data can mean
                 p.clamp_(-14.0 if name == "log_noise" else -7.0, 7.0)

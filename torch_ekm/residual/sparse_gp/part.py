@@ -93,6 +93,14 @@ class Host(Protocol):
         """The part of that kind, if there is one (in :meth:`Part.bind`: among those before)."""
         ...
 
+    def refresh(self) -> None:
+        """Rebuild the caches."""
+        ...
+
+    def learn_anew(self, x: Tensor, y: Tensor, on: Tensor) -> None:
+        """Empty basis; then the samples ``x (*batch, n, in)``, ``y (*batch, n, out)`` where ``on``."""
+        ...
+
     def start_anew(self, models: Tensor, x: Tensor, y: Tensor, used: Tensor) -> None:
         """These models forget all and learn the n samples ``used`` ``(n, *batch_shape)``."""
         ...
@@ -105,9 +113,10 @@ class Part(Recorded, nn.Module):
     specification may serve several learners. From then on it has buffers, which travel with the learner.
     The learner calls all its parts in their order:
 
-    1. :meth:`weigh` within an update, on the gain;
-    2. :meth:`after_update` after each sample;
-    3. :meth:`on_rebuild` every ``refresh_every`` samples, before the caches are made anew from the natural
+    1. :meth:`before_update` with each sample before it is learned;
+    2. :meth:`weigh` within an update, on the gain;
+    3. :meth:`after_update` after each sample;
+    4. :meth:`on_rebuild` every ``refresh_every`` samples, before the caches are made anew from the natural
        form, and :meth:`after_rebuild` thereafter.
 
     A subclass implements what it needs; none of it may look at data on a GPU, or updates wait for it.
@@ -118,6 +127,9 @@ class Part(Recorded, nn.Module):
 
     def bind(self, learner: Host) -> None:
         """Make buffers for this learner; raises ParameterError if the parts before do not go with it."""
+
+    def before_update(self, learner: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
+        """Take note of a sample, in its own units, before it is learned; ``mask`` as in :class:`Sample`."""
 
     def weigh(self, nis: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """Weight of a sample's gain by its normalised innovation squared."""

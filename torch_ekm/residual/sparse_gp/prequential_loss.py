@@ -127,8 +127,8 @@ class PrequentialLoss(nn.Module):
         robust = self.robust
         misfit = z2 if robust is None else (robust**2 + 1.0) * torch.log1p(z2 / robust**2)
         density = 0.5 * (misfit + variance.log() + math.log(2 * math.pi)).mean(-1)
-        on = (queries.weight > 0).to(density.dtype)
-        loss = (density * on).sum(-1) / on.sum(-1).clamp_min(1.0)
+        on = queries.weight
+        loss = (density * on).sum(-1) / on.sum(-1).clamp_min(torch.finfo(on.dtype).tiny)
         return loss.detach(), _Slopes(*torch.autograd.grad(loss.sum(), leaves, materialize_grads=True))
 
     def _left_out(self, p: Tensor, u: Tensor, s2: Tensor, queries: Queries) -> Tensor:

@@ -14,10 +14,11 @@ from ...typing import Bool, Float, Tensor
 from ..base import DoubleStateLearner
 from ..checks import check_count, check_finite
 from ..kernels.kernel import Kernel, check_kernel, log_parameter
-from ..kernels.stationary import SquaredExponential
+from ..kernels.stationary import Matern32
 from ..report import UpdateReport
 from .compiled import CompiledLoops
-from .part import P, Part, Sample, Units, copy_parts
+from .defaults import chosen_parts
+from .part import P, Part, Sample, Units
 from .posterior import SparsePosterior
 from .recursion import Absorbed, absorb, compiled_absorb
 
@@ -93,12 +94,14 @@ class SparseOnlineGP(DoubleStateLearner):
         *,
         capacity: int = 100,
         kernel: Kernel | None = None,
-        noise_variance: float | Tensor = 0.01,
+        noise_variance: float | Tensor = 0.1,
         novelty_threshold: float = 1e-4,
         jitter: float = 1e-6,
         projection: Literal["kl", "fitc"] = "kl",
         pruning: Literal["kl", "mean", "freeze"] = "kl",
-        parts: Iterable[nn.Module] = (),
+        parts: Iterable[nn.Module] | None = None,
+        standardize: bool = True,
+        output_offset: Literal["zero", "learned"] = "zero",
         refresh_every: int = 32,
         backend: Literal["auto", "torch", "inductor"] = "auto",
         **options: Any,
@@ -111,7 +114,7 @@ class SparseOnlineGP(DoubleStateLearner):
         self.refresh_every = check_count("refresh_every", refresh_every)
         shape, double = self.batch_shape, {"dtype": torch.float64, "device": self.device}
         if kernel is None:
-            kernel = SquaredExponential(self.in_features, batch_shape=shape, **double)
+            kernel = Matern32(self.in_features, batch_shape=shape, **double)
         self.kernel = check_kernel(kernel, self.in_features, shape).to(**double)
         noise_shape = (*shape, self.out_features)
         self.log_noise_variance = log_parameter("noise_variance", noise_variance, noise_shape, **double)
@@ -131,7 +134,7 @@ class SparseOnlineGP(DoubleStateLearner):
         self.drifts = False  # the last look at the caches found them less exact than rounding would have it
         self.n_samples = 0  # on the host, so that the rhythm of rebuilds never asks the GPU
         self._parts: tuple[Part, ...] = ()
-        for part in copy_parts(parts):
+        for part in chosen_parts(parts, standardize, output_offset):
             part.bind(self)
             self._parts += (part,)
         self.parts = nn.ModuleList(self._parts)
@@ -142,6 +145,7 @@ class SparseOnlineGP(DoubleStateLearner):
         self._noting = _overriding(self._parts, "after_update")
         self._rebuilding = _overriding(self._parts, "on_rebuild", "after_rebuild")
         self._loops = CompiledLoops() if backend == "auto" else None
+        self._preparing = _overriding(self._parts, "before_update")
 
     # -- predictions ----------------------------------------------------------------------------
 
@@ -282,6 +286,10 @@ class SparseOnlineGP(DoubleStateLearner):
 
     def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         on = None if mask is None else mask.to(x.dtype)
+        if self._preparing:
+            with torch.no_grad():
+                for part in self._preparing:
+                    part.before_update(self, x, y, on)
         done = self._learn(x, y, on)
         n = self.n_samples + 1
         if self._rebuilding or self.device.type != "cpu":  # on a GPU looking would mean waiting
@@ -316,6 +324,16 @@ class SparseOnlineGP(DoubleStateLearner):
         drift = self.posterior.drift(self.kernel, self.shared_noise()) if drift is None else drift
         vars(self)["drifts"] = drift > 0.01 * _DRIFT
         return drift > _DRIFT
+
+    def learn_anew(
+        self, x: Float[Tensor, "*batch n in"], y: Float[Tensor, "*batch n out"], on: Float[Tensor, "*batch n"]
+    ) -> None:
+        """Empty basis; then these samples, where ``on``."""
+        if x.shape[-2]:
+            self.posterior.reset()
+            for x_t, y_t, on_t in zip(x.unbind(-2), y.unbind(-2), on.unbind(-1), strict=True):
+                self._learn(x_t, y_t, on_t)
+            self.refresh()
 
     def start_anew(
         self,

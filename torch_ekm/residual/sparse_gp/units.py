@@ -1,56 +1,70 @@
-"""The units in which a learner works, learned from the first samples of a stream."""
+"""The units in which a learner works, learned from the stream."""
 
 from __future__ import annotations
 
-import torch
-from torch import nn
+from typing import Literal
 
-from ...typing import Float, Tensor
+from ...exceptions import ParameterError
+from ...typing import Tensor
 from ..checks import check_count
-from .part import Host, Part, Sample, Units
+from ..running_scale import BLOCK, RunningScale
+from .part import Host, Part, Units
+
+_DOUBLING = 1024  # samples up to which units are adopted after 1, 2, 4, 8, ... samples, too
 
 
 class Standardize(Part, Units):
-    """``z = (x - shift) / scale_x``, ``t = y / scale_y``, learned from the first samples.
+    """``z = (x - shift) / scale_x``, ``t = (y - offset) / scale_y``, from robust moments of the stream.
 
-    Inputs are centred where the kernel is shift invariant; outputs are only scaled, so that 0 stays 0.
+    Inputs are centred where the kernel is shift invariant; outputs are only scaled, so that 0 stays 0, unless
+    their offset is to be learned. See :class:`~torch_ekm.residual.running_scale.RunningScale` for what the
+    moments bear.
 
-    New units are adopted when the caches are rebuilt, which happens after 1, 2, 4, 8, ... samples too, since
-    units are rough at first.
+    New units are adopted when the caches are rebuilt, and after 1, 2, 4, 8, ... samples, since units are
+    rough at first: the sample that comes counts in its own units. The basis follows exactly, and so does
+    ``h <- (h + Omega 1 o) r`` for ``new t = (t + o) r``. Up to 32 samples all are learned anew, so that one
+    of the first that lies far out is judged by those that follow.
 
     Args:
-        samples: after so many the units stand still.
+        samples: over so many of the last the moments reach.
+        output_offset: ``"zero"``: g is 0 far from all samples, as a model's residual wants it;
+            ``"learned"``: the mean of y.
 
     Raises:
-        ParameterError: not a positive integer.
+        ParameterError: not a positive integer, or an unknown offset.
     """
 
-    def __init__(self, samples: int = 1000) -> None:
+    def __init__(self, samples: int = 2000, output_offset: Literal["zero", "learned"] = "zero") -> None:
         super().__init__()
         self.samples = check_count("samples", samples)
+        if output_offset not in ("zero", "learned"):
+            raise ParameterError("output_offset", output_offset, "'zero' or 'learned'")
+        self.output_offset = output_offset
 
     def bind(self, learner: Host) -> None:
         """Running moments of x and y."""
         like = learner.posterior.basis
         fleet = {"batch_shape": learner.posterior.batch_shape, "dtype": like.dtype, "device": like.device}
         shifted = learner.kernel.shift_invariant(learner.in_features)
-        self.input = RunningScale(learner.in_features, shifted, **fleet)
-        self.output = RunningScale(learner.out_features, **fleet)
+        centred = [self.output_offset == "learned"] * learner.out_features
+        self.input = RunningScale(learner.in_features, shifted, memory=self.samples, **fleet)
+        self.output = RunningScale(learner.out_features, centred, memory=self.samples, **fleet)
 
     def inputs(self, x: Tensor) -> Tensor:
         return self.input(x)
 
     def targets(self, y: Tensor) -> Tensor:
-        return y / self.output.scale
+        return self.output(y)
 
     def of_sets(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        z = (x - self.input.shift.unsqueeze(-2)) / self.input.scale.unsqueeze(-2)
-        return z, y / self.output.scale.unsqueeze(-2)
+        return self.input.of_sets(x), self.output.of_sets(y)
 
     def sets_as_given(self, z: Tensor) -> Tensor:
         return z * self.input.scale.unsqueeze(-2) + self.input.shift.unsqueeze(-2)
 
     def value(self, value: Tensor, power: int) -> Tensor:
+        if power == 1 and self.output_offset == "learned":
+            return value * self.output.scale + self.output.shift
         return value * self._scale(power)
 
     def slope(self, slope: Tensor, power: int) -> Tensor:
@@ -68,94 +82,36 @@ class Standardize(Part, Units):
     def affine(self) -> tuple[Tensor, ...]:
         return self.input.shift, self.input.scale, self.output.shift, self.output.scale
 
-    def after_update(self, learner: Host, sample: Sample) -> bool:
-        """Take x in where there is a sample, y with the sample's weight too."""
+    def before_update(self, learner: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
+        """Take the sample in; while units are rough, adopt them before it is learned."""
         n = learner.n_samples
-        if n <= self.samples:
-            weight = sample.report.weight
-            used = torch.ones_like(weight) if sample.mask is None else sample.mask
-            self.input.observe(sample.x, used)
-            self.output.observe(sample.y, weight * used)
-        return n < self.samples and (n + 1) & n == 0
+        self.input.observe(n, x, mask)
+        self.output.observe(n, y, mask)
+        if n & (n + 1) == 0 and n < _DOUBLING:
+            if n + 1 < BLOCK:
+                self._adopt(learner, young=True)
+                learner.learn_anew(self.input.block[..., :n, :], self.output.block[..., :n, :], self._on(n))
+            elif (n + 1) % learner.refresh_every:  # else it comes of itself
+                learner.refresh()
 
     def on_rebuild(self, learner: Host) -> None:
-        """Adopt the moments: ``new z = (old z + offset) ratio``, ``new t = old t ratio_t``."""
-        if learner.n_samples <= self.samples:
-            offset, ratio = self.input.settle()
-            ratio_t = self.output.settle()[1]
-            learner.posterior.basis.add_(offset.unsqueeze(-2)).mul_(ratio.unsqueeze(-2))
-            learner.posterior.information.mul_(ratio_t.unsqueeze(-2))
+        """Adopt the moments: ``new z = (old z + offset) ratio``, ``new t = (old t + offset_t) ratio_t``."""
+        if learner.n_samples >= BLOCK - 1:
+            self._adopt(learner)
+
+    def _adopt(self, learner: Host, young: bool = False) -> None:
+        posterior = learner.posterior
+        offset, ratio = self.input.settle(young=young)
+        offset_t, ratio_t = self.output.settle(young=young)
+        posterior.basis.add_(offset.unsqueeze(-2)).mul_(ratio.unsqueeze(-2))
+        if self.output_offset == "learned":
+            posterior.information.add_(posterior.precision.sum(-1, keepdim=True) * offset_t.unsqueeze(-2))
+        posterior.information.mul_(ratio_t.unsqueeze(-2))
+
+    def _on(self, n: int) -> Tensor:
+        return self.input.block_on[..., :n, 0]
 
     def reset(self) -> None:
         """Back to z = x, t = y."""
         self.input.reset()
         self.output.reset()
-
-
-class RunningScale(nn.Module):
-    """``z = (x - shift) / scale`` from running moments; columns may be exempt from the shift.
-
-    :meth:`observe` takes samples in, :meth:`settle` adopts the moments found so far. In between
-    ``shift`` and ``scale`` stand still, so that what was computed with them stays valid. A column
-    that has not varied keeps scale 1. Exempt columns are scaled by their root mean square.
-
-    Args:
-        features: width of x.
-        shifted: columns that are centred (none by default).
-        batch_shape: shape of the fleet.
-    """
-
-    def __init__(
-        self,
-        features: int,
-        shifted: list[bool] | None = None,
-        *,
-        batch_shape: tuple[int, ...] = (),
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
-    ) -> None:
-        super().__init__()
-        shape = (*batch_shape, features)
-        factory = {"dtype": dtype, "device": device}
-        self.shift = nn.Buffer(torch.zeros(shape, **factory))
-        self.scale = nn.Buffer(torch.ones(shape, **factory))
-        self.total = nn.Buffer(torch.zeros(*batch_shape, 1, **factory))
-        self.mean = nn.Buffer(torch.zeros(shape, **factory))
-        self.spread = nn.Buffer(torch.zeros(shape, **factory))  # weighted sum of squares
-        columns = torch.tensor(shifted or [False] * features, dtype=dtype, device=device)
-        self.shifted = nn.Buffer(columns)
-
-    def forward(self, x: Float[Tensor, "*batch features"]) -> Float[Tensor, "*batch features"]:
-        """x, or its first columns, in the learner's units."""
-        n = x.shape[-1]
-        return (x - self.shift[..., :n]) / self.scale[..., :n]
-
-    def observe(self, x: Float[Tensor, "*batch features"], weight: Float[Tensor, "*batch"]) -> None:
-        """Add one weighted sample per model (West's update of mean and sum of squares)."""
-        weight = weight.unsqueeze(-1)
-        self.total += weight
-        away = x - self.mean
-        # Exempt columns keep mean 0: their spread is then the sum of squares about the origin.
-        gain = weight / self.total.clamp_min(torch.finfo(x.dtype).tiny)
-        self.mean += gain * away * self.shifted
-        self.spread += weight * away * (x - self.mean)
-
-    def settle(self) -> tuple[Tensor, Tensor]:
-        """Adopt the moments; returns the change as ``(offset, ratio)``: new z = (old z + offset) * ratio."""
-        variance = self.spread / self.total.clamp_min(torch.finfo(self.mean.dtype).tiny)
-        floor = (100 * torch.finfo(self.mean.dtype).eps * self.mean).square()
-        usable = (variance > floor) & (variance > torch.finfo(self.mean.dtype).tiny)
-        scale = torch.where(usable, variance, 1.0).sqrt()
-        offset, ratio = (self.shift - self.mean) / self.scale, self.scale / scale
-        self.shift.copy_(self.mean)
-        self.scale.copy_(scale)
-        return offset, ratio
-
-    def reset(self) -> None:
-        """Back to z = x."""
-        for buffer in (self.shift, self.total, self.mean, self.spread):
-            buffer.zero_()
-        self.scale.fill_(1.0)
-
-    def extra_repr(self) -> str:
-        return f"features={self.scale.shape[-1]}, shifted={self.shifted.bool().tolist()}"

@@ -1,0 +1,166 @@
+"""A learner in units of its own: what baselines share."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, Literal
+
+import torch
+from torch.distributions import Normal
+
+from ...exceptions import ParameterError
+from ...typing import Bool, Float, Tensor
+from ..base import ResidualLearner
+from ..report import UpdateReport
+from ..running_scale import BLOCK, RunningScale
+
+_FAR = 2.3  # logarithm of a change of units after which a learner starts again
+_CUT = 6.0  # largest target in its own units
+
+
+class ScaledLearner(ResidualLearner):
+    """``g(x) = scale_y f((x - shift) / scale_x) + offset``, f learned where x and y are of the order of 1.
+
+    Units are those of :class:`~torch_ekm.residual.running_scale.RunningScale`. They are adopted after 1, 2,
+    4, 8, 16 samples, which are then learned anew, and from 32 samples on every 32, by what a subclass does
+    in ``_follow``; after a change by a factor of ten the last 31 are learned anew. Targets beyond 6 units
+    count as 6: one outlier does not spoil a learner that trusts all samples alike.
+
+    A subclass implements f: ``_mean``, ``_law``, ``_slopes``, ``_learn``, ``_clear`` and ``_follow``.
+
+    Args:
+        standardize: whether it learns units; else x and y are taken as they are.
+        output_offset: ``"zero"``, or ``"learned"``: y is centred too.
+        options: see ResidualLearner.
+    """
+
+    settled = 0.1  #: relative change of units that is not worth adopting
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        standardize: bool = True,
+        output_offset: Literal["zero", "learned"] = "zero",
+        **options: Any,
+    ) -> None:
+        super().__init__(in_features, out_features, **options)
+        if output_offset not in ("zero", "learned"):
+            raise ParameterError("output_offset", output_offset, "'zero' or 'learned'")
+        self.standardize, self.output_offset = bool(standardize), output_offset
+        self.n_samples = 0
+
+    def _make_units(self, shifted: list[bool], dtype: torch.dtype) -> None:
+        """Last in a constructor."""
+        options = {"batch_shape": self.batch_shape, "dtype": dtype, "device": self.device}
+        if self.standardize:
+            centred = [self.output_offset == "learned"] * self.out_features
+            self.input = RunningScale(self.in_features, shifted, **options)
+            self.output = RunningScale(self.out_features, centred, **options)
+
+    # -- f, in its own units --------------------------------------------------------------------
+
+    @abstractmethod
+    def _mean(self, z: Tensor) -> Tensor:
+        """f(z)."""
+
+    @abstractmethod
+    def _law(self, z: Tensor, observation: bool) -> tuple[Tensor, Tensor]:
+        """Mean and variance of f(z), or of t."""
+
+    def _slopes(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """f(z) and df/dz; autograd here."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def _learn(self, z: Tensor, t: Tensor, mask: Bool[Tensor, "*batch"] | None) -> UpdateReport:
+        """One sample per model."""
+
+    @abstractmethod
+    def _clear(self) -> None:
+        """f as it was made."""
+
+    @abstractmethod
+    def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
+        """f in new units: ``new z = (z + offset) ratio``, and t the same."""
+
+    # -- g, in those of x and y -----------------------------------------------------------------
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Mean of g."""
+        return self._value(self._mean(self._inputs(self._check_query(x))))
+
+    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+        """Mean and deviation of g, or of y."""
+        mean, variance = self._law(self._inputs(self._check_query(x)), observation)
+        deviation = variance.sqrt().expand_as(mean)
+        if self.standardize:
+            deviation = deviation * self.output.scale
+        return Normal(self._value(mean), deviation.to(self.dtype), validate_args=False)
+
+    def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean of g and its derivative."""
+        if type(self)._slopes is ScaledLearner._slopes:
+            return super().linearize(x)
+        mean, slope = self._slopes(self._inputs(self._check_query(x)))
+        if self.standardize:
+            slope = slope * self.output.scale.unsqueeze(-1) / self.input.scale.unsqueeze(-2)
+        return self._value(mean), slope.to(self.dtype)
+
+    def reset(self) -> None:
+        """Forget all samples and units."""
+        self.n_refused.zero_()
+        self.n_samples = 0
+        self._clear()
+        if self.standardize:
+            self.input.reset()
+            self.output.reset()
+
+    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        if self.standardize:
+            self._observe(x, y, mask)
+        self.n_samples += 1
+        return self._learn(self._inputs(x), self._targets(y), mask)
+
+    def _observe(self, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
+        n, on = self.n_samples, None if mask is None else mask.to(x.dtype)
+        self.input.observe(n, x, on)
+        self.output.observe(n, y, on)
+        if n + 1 < BLOCK and n & (n + 1) == 0:
+            self.input.settle(young=True)
+            self.output.settle(young=True)
+            self._learn_block(n)
+        elif (n + 1) % BLOCK == 0:
+            changes = self.input.settle(settled=self.settled), self.output.settle(settled=self.settled)
+            ratios = torch.cat([changes[0][1], changes[1][1]], dim=-1).log().abs()
+            if bool((ratios > _FAR).any()):  # what was learned so far was of another order
+                self._learn_block(BLOCK - 1)
+            elif bool((ratios > 0).any() or (changes[0][0] != 0).any() or (changes[1][0] != 0).any()):
+                self._follow(*changes)
+
+    def _learn_block(self, n: int) -> None:
+        """Anew, from the first n samples of the present block only."""
+        self._clear()
+        for i in range(n):
+            on = self.input.block_on[..., i, 0] > 0 if self.batch_shape else None
+            x, y = self.input.block[..., i, :], self.output.block[..., i, :]
+            self._learn(self._inputs(x), self._targets(y), on)
+
+    def _inputs(self, x: Float[Tensor, "*any in"]) -> Tensor:
+        return self.input(x) if self.standardize else x
+
+    def _targets(self, y: Float[Tensor, "*batch out"]) -> Tensor:
+        return self.output(y).clamp(-_CUT, _CUT) if self.standardize else y
+
+    def _value(self, mean: Float[Tensor, "*any out"]) -> Tensor:
+        if self.standardize:
+            mean = mean * self.output.scale + self.output.shift
+        return mean.to(self.dtype)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Number of samples seen: the rhythm continues after a reload."""
+        return {**super().get_extra_state(), "n_samples": self.n_samples}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self.n_samples = int(state["n_samples"])

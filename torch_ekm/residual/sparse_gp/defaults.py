@@ -1,0 +1,33 @@
+"""The parts of a sparse online GP that is told nothing but its sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Literal
+
+from torch import nn
+
+from .forgetting import ProcessNoise
+from .hyperparameters import LearnHyperparameters
+from .monitor import DetectChanges, RobustWeight
+from .part import Part, Units, copy_parts
+from .units import Standardize
+
+
+def default_parts() -> list[Part]:
+    """What bears outliers, slow and abrupt changes, and learns kernel and noise."""
+    return [RobustWeight(3.0), DetectChanges(), ProcessNoise(0.001), LearnHyperparameters()]
+
+
+def chosen_parts(
+    parts: Iterable[nn.Module] | None, standardize: bool, output_offset: Literal["zero", "learned"]
+) -> list[Part]:
+    """Copies of ``parts``, or the default ones, with units in front where they have none.
+
+    Raises:
+        ParameterError: parts do not go together.
+    """
+    own = default_parts() if parts is None else copy_parts(parts)
+    if standardize and not any(isinstance(part, Units) for part in own):
+        own.insert(0, Standardize(output_offset=output_offset))
+    return own
