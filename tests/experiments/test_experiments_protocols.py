@@ -21,7 +21,7 @@ from torch_ekm.control import (
     StepBound,
 )
 from torch_ekm.description import object_paths
-from torch_ekm.exceptions import ParameterError, UnknownNameError
+from torch_ekm.exceptions import NoContactError, ParameterError, UnknownNameError
 from torch_ekm.experiments.camera_off import CameraOff
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
 from torch_ekm.experiments.learners import HAND_LEARNERS, LEARNERS, make_learner
@@ -207,6 +207,12 @@ def test_without_the_camera_the_prediction_is_all_there_is() -> None:
     assert angle(plant.command(step)) == pytest.approx(0.5)  # believed; really 0.6
     assert stage.angle == pytest.approx(0.6)
     assert plant.observe().status is PlantStatus.HELD
+
+    def refuse(*_):
+        raise NoContactError("the model knows nothing of this state")
+
+    plant.predict = refuse
+    assert angle(plant.command(step)) == pytest.approx(0.5)  # the pose that was believed last
 
 
 def test_impossible_protocols_are_refused() -> None:

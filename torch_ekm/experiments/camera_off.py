@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 
 from ..control import PoseTarget
+from ..exceptions import GraspError
 from ..kinematics import GraspState
 from ..plant import Observation, Plant, PlantStatus, PlantWrapper
 from ..typing import Float, Tensor
@@ -53,9 +55,9 @@ class CameraOff(PlantWrapper):
         """Move the actuators by ``delta_a`` [rad], wait, read the sensors that are on."""
         before, after = self._a, self.plant.command(delta_a)
         if self.dark and self._state is not None and before is not None:
-            self._state = self._state.plus(
-                self.predict(self._state, delta_a if self.by_commands else after.a - before)
-            )
+            moved = delta_a if self.by_commands else after.a - before
+            with contextlib.suppress(GraspError):  # a state that the model refuses: the pose stays
+                self._state = self._state.plus(self.predict(self._state, moved))
         return self.observation(after)
 
     def observation(self, seen: Observation) -> Observation:
