@@ -217,7 +217,7 @@ def test_figures_outside_their_range_are_refused(kind, figures) -> None:
 
 def test_learned_forces_correct_the_rows_of_the_grip(held) -> None:
     """Two pads answer to actuator 3 by 2 N/rad more than the model says: so do the rows after a while."""
-    from torch_ekm.control.situation import LinearizedModel, pad_indices
+    from torch_ekm.control.situation import LinearizedModel
     from torch_ekm.enhanced import GraspEncoding, grasp_learner
 
     plant, model, seen = held
@@ -225,7 +225,7 @@ def test_learned_forces_correct_the_rows_of_the_grip(held) -> None:
     learner = grasp_learner(encode.n_features, plant.hand.n_a, n_out=len(plant.hand.pads))
     enhanced = EnhancedModel.for_grasp(model, seen.state, encode=encode, force_learner=learner)
     lin = model.linearize(seen.state)
-    pads = pad_indices(plant.hand, lin.contacts.finger)
+    pads = plant.hand.pad_indices(lin.contacts.finger)
     generator = torch.Generator().manual_seed(0)
     for _ in range(40):
         moved = 0.05 * torch.randn(plant.hand.n_a, dtype=torch.float64, generator=generator)

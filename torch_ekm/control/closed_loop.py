@@ -20,7 +20,6 @@ from .caution import Caution
 from .controller import Decision, LookAndMoveController
 from .focus import FocusedPose, PoseTarget
 from .limiting import contact_lever
-from .situation import pad_indices
 from .termination import StoppingRule, StopReason
 
 
@@ -195,6 +194,7 @@ class ClosedLoop:
             if decision.status is not StopReason.RUNNING:
                 return Stop(decision.status, seen, decision.message)
             step = self._move(seen, decision, turn, seconds)
+            turn.way.append(step.after.a - seen.a)
             yield step
             seen, turn.limited = step.after, decision.limited
 
@@ -225,7 +225,6 @@ class ClosedLoop:
         for _ in range(min(self.caution.way_back, len(turn.way))):
             back = -turn.way.pop()
             step = self._move(seen, self.controller.retreat(decision, back), turn)
-            turn.way.pop()  # that motion is no way forward
             yield step
             seen = step.after
             if seen.status is PlantStatus.LOST:
@@ -249,7 +248,6 @@ class ClosedLoop:
         began = time.perf_counter()
         report = self._learn(seen, decision, after, increment)
         seconds += time.perf_counter() - began
-        turn.way.append(after.a - seen.a)
         turn.errors.append(turn.focus.error(turn.target, after.state))
         return Step(seen, decision, after, increment, report, seconds)
 
@@ -279,16 +277,18 @@ class ClosedLoop:
         """How far each contact's normal force is from what was foretold [N]; None: not all pads measure."""
         if seen.fingertip_force is None or after.fingertip_force is None:
             return None
-        pads = pad_indices(self.controller.kinematic.hand, lin.contacts.finger)
+        pads = self.controller.kinematic.hand.pad_indices(lin.contacts.finger)
         before, now = seen.fingertip_force[pads], after.fingertip_force[pads]
         if bool((torch.minimum(before, now) < self.controller.kinematic.options.forces.normal_std).any()):
             return None  # a pad that reads so little may be dead, or has let go
         wrong = now - before - lin.normal_force_sensitivity @ moved
         correction = enhanced.force_correction(seen.state, moved)
+        if correction is None:
+            return wrong
         y = torch.zeros_like(seen.fingertip_force)
         y[pads] = wrong
         enhanced.update_forces(seen.state, moved, y)
-        return wrong if correction is None else wrong - correction[0][pads]
+        return wrong - correction[0][pads]
 
 
 class _Turn:

@@ -234,16 +234,8 @@ class LookAndMoveController:
         nominal = lin.manipulation_jacobian @ da
         slack = float(np.abs(solution.slack).max(initial=0.0))
         limited = slack > 0.05 * float(desired.abs().max()) and self._at_limit(a, da, problem)
-        figures = {"share": share, "limited": limited, "slack": slack}
         return Decision(
-            da,
-            StopReason.RUNNING,
-            desired,
-            predicted,
-            nominal,
-            **figures,
-            linearization=lin,
-            solution=solution,
+            da, StopReason.RUNNING, desired, predicted, nominal, share, limited, slack, lin, solution
         )
 
     def _solve(
@@ -263,14 +255,10 @@ class LookAndMoveController:
             da = best if done else da + self.sqp_damping * change
             if done:
                 break
-        if enhanced is None or linear:
-            return da, model.offset + model.jacobian @ da, problem, solution
-        return (
-            da,
-            enhanced.linearize(seen.state, da, lin.manipulation_jacobian, encoded)[0],
-            problem,
-            solution,
-        )
+        predicted = model.offset + model.jacobian @ da
+        if enhanced is not None and not linear:
+            predicted = enhanced.linearize(seen.state, da, lin.manipulation_jacobian, encoded)[0]
+        return da, predicted, problem, solution
 
     def _wanted_grip(self, lin: Linearization, seen: Situation) -> float | None:
         grips = (task for task in self.tasks if isinstance(task, GripForceTask))

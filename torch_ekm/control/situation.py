@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -50,7 +50,7 @@ class Situation:
         estimated = as_array(kinematic.forces.normal) if kinematic.forces.solved else None
         if self.fingertip_force is None:
             return estimated
-        measured = as_array(self.fingertip_force)[pad_indices(self.hand, kinematic.contacts.finger)]
+        measured = as_array(self.fingertip_force)[self.hand.pad_indices(kinematic.contacts.finger)]
         return np.where(np.isnan(measured), 0.0 if estimated is None else estimated, measured)
 
 
@@ -91,7 +91,7 @@ class LinearizedModel:
         offset, S = 0.0, as_array(kinematic.normal_force_sensitivity)
         forces = enhanced.force_correction(state, action, encoded)
         if forces is not None:
-            pads = pad_indices(enhanced.model.hand, kinematic.contacts.finger)
+            pads = enhanced.model.hand.pad_indices(kinematic.contacts.finger)
             mean, slope = (as_array(part)[pads] for part in forces)
             offset, S = mean - slope @ as_array(action), S + slope
         variance = partial(enhanced.variance, state, action)
@@ -102,9 +102,3 @@ class LinearizedModel:
         """``(c, S)`` of ``f_n' = f_n + c + S u`` [N], [N/rad]."""
         S = self.force_jacobian
         return self.force_offset, as_array(self.kinematic.normal_force_sensitivity) if S is None else S
-
-
-def pad_indices(hand: HandDescription, fingers: Sequence[str]) -> list[int]:
-    """Place of each contact's pad among those of the hand."""
-    names = [pad.name for pad in hand.pads]
-    return [names.index(finger) for finger in fingers]

@@ -6,6 +6,7 @@ transmission file beside it by :func:`torch_ekm.description.load_hand`.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -145,6 +146,15 @@ class HandDescription:
     @property
     def n_a(self) -> int:
         return len(self.actuators)
+
+    def pad_indices(self, names: Iterable[str]) -> list[int]:
+        """Places of the pads of these names among :attr:`pads`.
+
+        Raises:
+            ValueError: there is no such pad.
+        """
+        pads = [pad.name for pad in self.pads]
+        return [pads.index(name) for name in names]
 
     @property
     def actuator_names(self) -> tuple[str, ...]:

@@ -138,8 +138,7 @@ class Evidence:
     def _equilibrium(self, lin: Linearization, rest: Rest) -> dict[str, Tensor]:
         parts = [lin.forces.residual[self._moving(lin)] / self.model.options.forces.torque_std]
         if rest.force is not None:
-            pads = [pad.name for pad in self.model.hand.pads]
-            measured = rest.force[[pads.index(name) for name in lin.contacts.finger]]
+            measured = rest.force[self.model.hand.pad_indices(lin.contacts.finger)]
             known = torch.isfinite(measured)
             parts.append((lin.forces.normal - measured)[known] / self.model.options.forces.normal_std)
         return {"equilibrium": torch.cat(parts)}
