@@ -1,0 +1,8 @@
+"""The whole turn planned on f + g: what a sequence of motions does, and which sequence to begin with."""
+
+from __future__ import annotations
+
+from .prediction import Prediction
+from .rollout import Rollout
+
+__all__ = ["Prediction", "Rollout"]
