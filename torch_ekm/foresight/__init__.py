@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
+from .horizon_controller import HorizonController
 from .prediction import Prediction
 from .rollout import Rollout
 
-__all__ = ["Prediction", "Rollout"]
+__all__ = ["HorizonController", "Prediction", "Rollout"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,7 +13,7 @@ from ..exceptions import ShapeError
 from ..kinematics.grasp_state import GraspState
 from ..kinematics.tensors import as_tensors, check_finite
 from ..typing import Float, Tensor
-from .configuration import Configuration, moved, stack
+from .configuration import Configuration, change, moved, settled, stack
 from .prediction import Prediction
 
 if TYPE_CHECKING:
@@ -24,8 +25,9 @@ class Rollout:
 
     z is state, contacts and forces. f is taken half a motion later; g, which was learned of whole motions, at
     their beginnings: ``ds = J_m(s_m) w + g(s, w)``. Contacts roll along
-    (:func:`~torch_ekm.foresight.configuration.moved`), no collision query is made within the horizon, and the
-    forces are those of contacts that stick.
+    (:func:`~torch_ekm.foresight.configuration.change`), no collision query is made on the way. Forces are
+    those of contacts that stick throughout a motion; a contact that was asked for more than its cone begins the
+    next motion on it.
 
     Args:
         model: a kinematic model, or an enhanced one around it.
@@ -83,15 +85,18 @@ class Rollout:
             way.append(z)
             variance.append(unsure)
         every = stack(way)
-        lin = self._linearize(every)
+        lin = dataclasses.replace(self._linearize(settled(every)), forces=every.forces)
         return Prediction(self.kinematic, actions, lin, torch.stack(variance, dim=-2))
 
     def _motion(self, z: Configuration, action: Tensor) -> tuple[Configuration, Tensor]:
         """One motion by the midpoint rule, and the learner's variance of it."""
         g, variance = self._correction(z.state, action)
         half = None if g is None else g / 2
-        middle = moved(self.kinematic, z, self._linearize(z), self._contacts(z), action / 2, half)
-        return moved(self.kinematic, z, self._linearize(middle), self._contacts(middle), action, g), variance
+        z = settled(z)
+        dz = change(self._linearize(z), self._contacts(z), action / 2, half)
+        middle = settled(moved(self.kinematic, z, dz))
+        dz = change(self._linearize(middle), self._contacts(middle), action, g)
+        return moved(self.kinematic, z, dz), variance
 
     def _linearize(self, z: Configuration) -> Linearization:
         return self.kinematic.linearize(z.state, z.contacts, forces=z.forces, on_unstable="flag")
