@@ -22,7 +22,7 @@ from ..control import (
 )
 from ..control.limiting import contact_travel
 from ..control.qp import DEGREE, as_array
-from ..exceptions import GraspError, ParameterError
+from ..exceptions import GraspError, ParameterError, SolverError
 from ..typing import Float, Tensor
 from .configuration import Configuration, settled, stack
 from .limits import SlipLimit
@@ -40,6 +40,10 @@ _PACE = 1e4
 """Penalty of a motion that is longer than the pace allows, per degree: above that of the goal."""
 
 
+_Step = tuple[Tensor, Tensor, ControlProblem, ControlSolution]
+
+_DOUBTFUL = 0.7
+"""Where the step bound would make a smaller share of a first motion, a single step may be better."""
 _SHORT = 0.05 * DEGREE
 """A goal that a program misses by more is brought nearer [unit of the focus]."""
 _REACH = 8.0
@@ -91,13 +95,16 @@ class HorizonController(LookAndMoveController):
         self.paths = PathModel(self.kinematic, self.enhanced)
         self.plan: Path | None = None
         """The last decision's; None: there was none, or the grasp could not be foreseen."""
-        self._before: tuple[Rates, Tensor] | None = None  # of the decision before
-        self._now: tuple[Path, Rates, list[MotionRows]] | None = None
+        self._before: tuple[Rates, Tensor] | None = (
+            None  # of the decision before, and what it left of the error
+        )
+        self._now: tuple[Rates, Tensor] | None = None
+        self._first: tuple[_Step, Tensor] | None = None  # this decision's, and what it was asked for
 
     def reset(self) -> None:
         """Forget the plan as well."""
         super().reset()
-        self.plan = self._before = self._now = None
+        self.plan = self._before = self._now = self._first = None
 
     def decide(
         self,
@@ -107,9 +114,9 @@ class HorizonController(LookAndMoveController):
         fingertip_force: Float[Tensor, " n_pads"] | None = None,
     ) -> Decision:
         """The first motion of a plan; see :meth:`LookAndMoveController.decide`."""
-        self._now = self.plan = None
+        self.plan = self._now = self._first = None
         decision = super().decide(state, a, target, fingertip_force)
-        self._before = None if self._now is None else (self._now[1], self._left)
+        self._before = self._now
         return decision
 
     def retreat(self, at: Decision, delta_a: Float[Tensor, " n_a"]) -> Decision:
@@ -117,38 +124,48 @@ class HorizonController(LookAndMoveController):
         self._before = None
         return super().retreat(at, delta_a)
 
-    def _solve(
-        self, lin: Linearization, seen: Situation
-    ) -> tuple[Tensor, Tensor, ControlProblem, ControlSolution]:
-        try:
-            return self._planned(lin, seen)
-        except GraspError:  # somewhere on the way: one step is foreseen as ever
-            self._now = self.plan = None
-            return super()._solve(lin, seen)
+    def _solve(self, lin: Linearization, seen: Situation) -> _Step:
+        if self._first is not None:  # the same decision, asked for less
+            step, desired = self._first
+            return self._cut(lin, step, float(seen.desired.norm() / desired.norm().clamp_min(1e-12)))
+        K, left = self._motions_left(lin, seen)
+        if K > 1:
+            try:
+                step = self._planned(lin, seen, K, left)
+            except (GraspError, SolverError):  # somewhere on the way: one step is foreseen as ever
+                step = super()._solve(lin, seen)
+            grip = self._wanted_grip(lin, seen)
+            share = self.bound.share(lin, step[0], step[1], seen, grip)
+            if share < _DOUBTFUL:
+                single = super()._solve(lin, seen)
+                if self.bound.share(lin, single[0], single[1], seen, grip) > share:
+                    self.plan = self._now = None
+                    return single
+            self._first = step, seen.desired
+            return step
+        return super()._solve(lin, seen)
 
-    def _planned(
-        self, lin: Linearization, seen: Situation
-    ) -> tuple[Tensor, Tensor, ControlProblem, ControlSolution]:
-        start, K, left = Configuration.of(lin), *self._motions_left(lin, seen)
-        if K == 1:
-            self._now = self.plan = None
-            return super()._solve(lin, seen)
+    def _cut(self, lin: Linearization, step: _Step, share: float) -> _Step:
+        """A part of a motion."""
+        da, _, problem, solution = step
+        da = share * da
+        return da, self.foretell(lin, da)[0], problem, dataclasses.replace(solution, u=as_array(da))
+
+    def _planned(self, lin: Linearization, seen: Situation, K: int, left: Tensor) -> _Step:
+        """The first motion of the best plan."""
+        start = Configuration.of(lin)
         asked = PlanRows(self.tasks, (*self.limits, *self.along), self.limiting, self.pace, self.enhanced)
-        if self._now is not None:  # the same decision, asked for less: of the first motion
-            path, rates, motions = self._now
-            motions = [*asked.about(seen, path, rates, left, [0]), *motions[1:]]
+        path = self._guess(lin, seen, K, left)
+        for _ in range(self.sqp_iterations):
+            rates = self.paths.linearize(path)
+            motions = asked.about(seen, path, rates, left)
             path, solution = self._best(start, rates, motions)
-        else:
-            path = self._guess(lin, seen, K, left)
-            for _ in range(self.sqp_iterations):
-                rates = self.paths.linearize(path)
-                motions = asked.about(seen, path, rates, left, range(K))
-                path, solution = self._best(start, rates, motions)
-                if float((path.actions[0] - rates.actions[0]).abs().max()) <= self.sqp_tolerance:
-                    break
-        self._now, self._left, self.plan = (path, rates, motions), left, path
+            if float((path.actions[0] - rates.actions[0]).abs().max()) <= self.sqp_tolerance:
+                break
+        self._now, self.plan = (rates, left), path
         da = path.actions[0]
-        return da, self.foretell(lin, da)[0], motions[0].motion, dataclasses.replace(solution, u=as_array(da))
+        first = dataclasses.replace(solution, u=as_array(da))
+        return da, self.foretell(lin, da)[0], motions[0].motion, first
 
     def _motions_left(self, lin: Linearization, seen: Situation) -> tuple[int, Tensor]:
         """K, and what of the focused error will be left after as many motions."""
@@ -179,7 +196,7 @@ class HorizonController(LookAndMoveController):
         return self.paths.follow(start, rates, actions), solution
 
     def _guess(self, lin: Linearization, seen: Situation, K: int, left: Tensor) -> Path:
-        """The rest of the last plan, from where the grasp is now; at first, single steps one after the other."""
+        """The rest of the last plan, from where the grasp is now; at first, single steps in a row."""
         start = Configuration.of(lin)
         if self._before is not None:
             rates, rest = self._before

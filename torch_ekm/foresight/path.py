@@ -16,7 +16,7 @@ from ..enhanced import EnhancedModel
 from ..kinematics.grasp_state import GraspState
 from ..model import GraspForces, KinematicModel, Linearization
 from ..typing import Float, Tensor
-from .configuration import Change, Configuration, chained, change, moved, settled
+from .configuration import Change, Configuration, chained, change, moved, settled, stack
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,17 @@ class PathModel:
     def __init__(self, kinematic: KinematicModel, enhanced: EnhancedModel | None) -> None:
         self.kinematic, self.enhanced = kinematic, enhanced
 
+    def repeated(self, start: Configuration, lin: Linearization, actions: Float[Tensor, "K n_a"]) -> Path:
+        """The way of actions by the rates of the start alone: where to begin."""
+        nodes, middles, increments = [start], [], []
+        for action in actions:
+            z = nodes[-1]
+            kin, dz = self.kinematic.contact_kinematics(z.state, z.contacts), lin.step(action)
+            middles.append(moved(self.kinematic, z, change(lin, kin, action / 2)))
+            nodes.append(moved(self.kinematic, z, change(lin, kin, action)))
+            increments.append(dz)
+        return Path(actions, stack(nodes), stack(middles), torch.stack(increments))
+
     def linearize(self, path: Path) -> Rates:
         """Rates at all configurations of a path."""
         K = len(path.actions)
@@ -85,16 +96,15 @@ class PathModel:
         g = rates.correction
         if rates.slope is not None:
             g = g + (rates.slope @ (actions - rates.actions)[..., None])[..., 0]
-        nodes, middles = (
-            [_tree(part, lambda x, at=at: x[at]) for part in (rates.linearization, rates.contacts)]
-            for at in (slice(0, K), slice(K + 1, 2 * K + 1))
-        )
-        steps = change(*middles, actions, g)
-        ends = joined(
-            start.expand(1), moved(self.kinematic, start, chained(steps, start.contacts, start.forces))
-        )
-        amid = moved(self.kinematic, settled(ends.of_first(slice(0, K))), change(*nodes, actions / 2, g / 2))
-        return Path(actions, ends, amid, steps.ds)
+        before, amid = slice(0, K), slice(K + 1, 2 * K + 1)
+        lin, kin = (_tree(part, lambda x: x[amid]) for part in (rates.linearization, rates.contacts))
+        steps = change(lin, kin, actions, g)
+        whole = chained(steps, start.contacts, start.forces)
+        nodes = joined(start.expand(1), moved(self.kinematic, start, whole))
+        lin, kin = (_tree(part, lambda x: x[before]) for part in (rates.linearization, rates.contacts))
+        half = change(lin, kin, actions / 2, g / 2)
+        middles = moved(self.kinematic, settled(nodes.of_first(before)), half)
+        return Path(actions, nodes, middles, steps.ds)
 
     def step(
         self, z: Configuration, lin: Linearization, action: Float[Tensor, " n_a"], ds: Float[Tensor, " n_s"]
@@ -120,12 +130,12 @@ class PathModel:
 
 
 def continued(rates: Rates, motions: int, share: float) -> Rates:
-    """The rest of a plan whose first motion is done, in other motions: its actions, and the nearest old rates.
+    """The rest of a plan whose first motion is done: its actions in other motions, and the nearest old rates.
 
     Args:
         motions: of the new path.
-        share: length of its motions, as a share of the old ones'. What it goes beyond the old path, it goes as
-            in the last old motion.
+        share: length of its motions, as a share of the old ones'. Beyond the old path it goes on as in the
+            last old motion.
     """
     old = rates.actions
     K = len(old)
@@ -149,7 +159,7 @@ _SHARED = ("friction", "torsional_friction")
 
 
 def _tree(value: Any, pick: Callable[[Tensor], Tensor]) -> Any:
-    """``pick`` of every batched tensor in a dataclass of dataclasses, which were checked when they were made."""
+    """``pick`` of every batched tensor in a dataclass of dataclasses; none of them is checked again."""
     changed = copy.copy(value)
     for name, part in vars(value).items():
         if isinstance(part, Tensor):

@@ -15,8 +15,8 @@ from ..control.qp import DEGREE, ControlProblem, ControlSolution
 from ..typing import Array
 
 _BOUND = 1e4
-"""Price of an actuator's bound in a motion that is not made yet, per degree: a path from another start may break
-it. Those of the first motion always hold."""
+"""Price of an actuator's bound in a motion that is not made yet, per degree: a path from another start may
+break it. Those of the first motion always hold."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,8 @@ def plan_problem(motions: Sequence[MotionRows], reach: float) -> tuple[ControlPr
 def nearer_goal(problem: ControlProblem, path: Array, solution: ControlSolution) -> ControlProblem:
     """The same program with a goal at nine tenths of the way that its solution found towards it.
 
-    Where the goal is beyond what the bounds of an iteration let it reach, its penalty outweighs every wish, and
-    the program lives on differences between the rates of its motions that are none. Source: the relaxed
+    Where the goal is beyond what the bounds of an iteration let it reach, its penalty outweighs every wish,
+    and the program lives on differences between the rates of its motions that are none. Source: the relaxed
     equalities of Byrd and Omojokun; Nocedal and Wright, Numerical Optimization (2006), section 18.5.
 
     Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -68,10 +68,10 @@ def situation(
 class PlanRows:
     """Rows of tasks and limits about a path, motion by motion.
 
-    A task sees motion k as it would see a single step from z_k: ``(f + g)(s_k, u) ~ offset + jacobian u``, with
-    the forces that are foreseen there. Its rows then count in ``u = c_k - before_k``, for where the earlier
-    motions leave the actuators decides where motion k begins (see :func:`plan_problem`); rows of tasks that are
-    ``per_motion`` count in w_k.
+    A task sees motion k as it would see a single step from z_k: ``(f + g)(s_k, u) ~ offset + jacobian u``,
+    with the forces that are foreseen there. Its rows then count in ``u = c_k - before_k``, for where the
+    earlier motions leave the actuators decides where motion k begins (see :func:`plan_problem`); bounds, and
+    rows of tasks that are ``per_motion``, count in w_k.
 
     ``dz_{k+1}/dw_j = (dz/da)(z_{k+1})`` for every j <= k: what the actuators do first and what later makes no
     difference where contacts do not roll about their normals, as in a plane. In space it makes one of second
@@ -85,9 +85,9 @@ class PlanRows:
     enhanced: EnhancedModel | None
 
     def about(
-        self, seen: Situation, path: Path, rates: Rates, left: Float[Tensor, " n_x"], which: Iterable[int]
+        self, seen: Situation, path: Path, rates: Rates, left: Float[Tensor, " n_x"]
     ) -> list[MotionRows]:
-        """Rows of some motions.
+        """Rows of all motions.
 
         Args:
             seen: where the path begins; its ``desired`` bounds the first motion.
@@ -101,7 +101,7 @@ class PlanRows:
         before = torch.cat([path.actions.new_zeros(1, n_a), path.actions.cumsum(0)])
         pads = torch.tensor(seen.hand.pad_indices(path.nodes.contacts.finger))
         motions = []
-        for k in which:
+        for k in range(len(path.actions)):
             here = rates.at(k)
             desired = M @ errors[k] - left
             now = situation(seen, here.state, before[k], errors[k], desired, pads, normal[k] - normal[0])
