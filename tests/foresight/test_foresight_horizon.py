@@ -25,7 +25,7 @@ from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.foresight import HorizonController, Rollout
 from torch_ekm.foresight.configuration import Configuration
-from torch_ekm.foresight.path import PathModel
+from torch_ekm.foresight.path import Path, PathModel, joined
 
 F64 = torch.float64
 DEG = math.pi / 180
@@ -41,11 +41,12 @@ def test_linearizing_a_whole_path_at_once_gives_the_way_of_the_loop():
     actions = w + 0.3 * DEG * torch.randn(8, len(w), dtype=F64, generator=torch.Generator().manual_seed(0))
     expected = Rollout(enhanced).predict(at.state, actions, start=lin)
     paths, start = PathModel(model, enhanced), Configuration.of(lin)
-    path, errors = paths.repeated(start, lin, actions), []
-    for _ in range(6):
+    middles, nodes = paths.steps(start, lin, 8 * w, lin.step(8 * w), 8)  # a straight guess
+    path, errors = Path(actions, joined(start.expand(1), nodes), middles, torch.zeros(8, at.state.n_s)), []
+    for _ in range(8):
         path = paths.follow(start, paths.linearize(path), actions)
         errors.append(float((path.nodes.state.position - expected.states.position).abs().max()))
-    assert errors[0] < 1e-4  # [m], after one batched linearization
+    assert errors[0] < 1e-3  # [m], after one batched linearization
     assert errors[-1] < 1e-8
     assert (path.nodes.forces.force - expected.force).abs().max() < 1e-5
     assert (path.nodes.contacts.point - expected.contacts.point).abs().max() < 1e-8

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 
 from ..control import (
+    Bounds,
     ControlProblem,
     ControlSolution,
     Limit,
@@ -19,14 +21,15 @@ from ..control import (
     Situation,
     StepBound,
     Task,
+    build_qp,
 )
 from ..control.limiting import contact_travel
 from ..control.qp import DEGREE, as_array
 from ..exceptions import GraspError, ParameterError, SolverError
 from ..typing import Float, Tensor
-from .configuration import Configuration, settled, stack
+from .configuration import Configuration, settled
 from .limits import SlipLimit
-from .path import Path, PathModel, Rates, continued
+from .path import Path, PathModel, Rates, continued, joined
 from .plan_problem import MotionRows, nearer_goal, plan_problem
 from .plan_rows import PlanRows, error_of, situation
 
@@ -46,6 +49,8 @@ _DOUBTFUL = 0.7
 """Where the step bound would make a smaller share of a first motion, a single step may be better."""
 _SHORT = 0.05 * DEGREE
 """A goal that a program misses by more is brought nearer [unit of the focus]."""
+_STRIDES = 4
+"""Single steps of which a first guess is made, each worth several motions."""
 _REACH = 8.0
 """How far an iteration may bring an actuator from where the last path has it [deg]."""
 
@@ -64,6 +69,8 @@ class HorizonController(LookAndMoveController):
     Args:
         horizon: motions that are foreseen at most. Fewer where the goal is nearer; where one is enough, it is
             the look-and-move controller's.
+        sqp_iterations: quadratic programs of the first plan at most.
+        receding_iterations: and of those that go on from the last one.
         along: limits on the way, beside those of every step.
 
     The others are those of :class:`LookAndMoveController`.
@@ -80,6 +87,7 @@ class HorizonController(LookAndMoveController):
         horizon: int = 12,
         along: Sequence[Limit] = (SlipLimit(),),
         sqp_iterations: int = 3,
+        receding_iterations: int = 1,
         sqp_damping: float = 0.6,
         sqp_tolerance: float = 0.1 * DEGREE,
         bound: StepBound | None = None,
@@ -91,7 +99,7 @@ class HorizonController(LookAndMoveController):
         )  # fmt: skip
         if not horizon >= 1:
             raise ParameterError("horizon", horizon, "at least one motion")
-        self.horizon, self.along = horizon, tuple(along)
+        self.horizon, self.receding_iterations, self.along = horizon, receding_iterations, tuple(along)
         self.paths = PathModel(self.kinematic, self.enhanced)
         self.plan: Path | None = None
         """The last decision's; None: there was none, or the grasp could not be foreseen."""
@@ -99,7 +107,7 @@ class HorizonController(LookAndMoveController):
             None  # of the decision before, and what it left of the error
         )
         self._now: tuple[Rates, Tensor] | None = None
-        self._first: tuple[_Step, Tensor] | None = None  # this decision's, and what it was asked for
+        self._first: _Step | None = None  # this decision's
 
     def reset(self) -> None:
         """Forget the plan as well."""
@@ -126,8 +134,9 @@ class HorizonController(LookAndMoveController):
 
     def _solve(self, lin: Linearization, seen: Situation) -> _Step:
         if self._first is not None:  # the same decision, asked for less
-            step, desired = self._first
-            return self._cut(lin, step, float(seen.desired.norm() / desired.norm().clamp_min(1e-12)))
+            longest = torch.linalg.vector_norm(seen.desired)
+            way = torch.linalg.vector_norm(self.focus.matrix @ self._first[1][-6:])
+            return self._cut(lin, self._first, min(1.0, float(longest / way.clamp_min(1e-12))))
         K, left = self._motions_left(lin, seen)
         if K > 1:
             try:
@@ -141,7 +150,7 @@ class HorizonController(LookAndMoveController):
                 if self.bound.share(lin, single[0], single[1], seen, grip) > share:
                     self.plan = self._now = None
                     return single
-            self._first = step, seen.desired
+            self._first = step
             return step
         return super()._solve(lin, seen)
 
@@ -156,16 +165,17 @@ class HorizonController(LookAndMoveController):
         start = Configuration.of(lin)
         asked = PlanRows(self.tasks, (*self.limits, *self.along), self.limiting, self.pace, self.enhanced)
         path = self._guess(lin, seen, K, left)
-        for _ in range(self.sqp_iterations):
+        for _ in range(self.sqp_iterations if self._before is None else self.receding_iterations):
             rates = self.paths.linearize(path)
             motions = asked.about(seen, path, rates, left)
             path, solution = self._best(start, rates, motions)
             if float((path.actions[0] - rates.actions[0]).abs().max()) <= self.sqp_tolerance:
                 break
         self._now, self.plan = (rates, left), path
-        da = path.actions[0]
+        da, rows = path.actions[0], motions[0].motion
         first = dataclasses.replace(solution, u=as_array(da))
-        return da, self.foretell(lin, da)[0], motions[0].motion, first
+        problem = build_qp(len(da), [Bounds(*(DEGREE * x for x in (rows.lower, rows.upper)))])
+        return da, self.foretell(lin, da)[0], problem, first
 
     def _motions_left(self, lin: Linearization, seen: Situation) -> tuple[int, Tensor]:
         """K, and what of the focused error will be left after as many motions."""
@@ -196,7 +206,7 @@ class HorizonController(LookAndMoveController):
         return self.paths.follow(start, rates, actions), solution
 
     def _guess(self, lin: Linearization, seen: Situation, K: int, left: Tensor) -> Path:
-        """The rest of the last plan, from where the grasp is now; at first, single steps in a row."""
+        """The rest of the last plan, from where the grasp is now; at first, single steps."""
         start = Configuration.of(lin)
         if self._before is not None:
             rates, rest = self._before
@@ -204,22 +214,24 @@ class HorizonController(LookAndMoveController):
             rates = continued(rates, K, share)
             return self.paths.follow(start, rates, rates.actions)
         pads = torch.tensor(seen.hand.pad_indices(lin.contacts.finger))
-        z, moved_by = start, torch.zeros_like(seen.a)
-        nodes, middles, actions, increments = [z], [], [], []
-        for k in range(K):
+        z, moved_by, at = start, torch.zeros_like(seen.a), 0
+        parts, actions, increments = [], [], []
+        while at < K:
+            count = min(-(-K // _STRIDES), K - at)
             error = error_of(z.state, seen)
-            desired = (self.focus.matrix @ error - left) / (K - k)
+            desired = (self.focus.matrix @ error - left) * count / (K - at)
             now = situation(
                 seen, z.state, moved_by, error, desired, pads, z.forces.normal - start.forces.normal
             )
             da, ds, _, _ = super()._solve(lin, now)
-            amid, z = self.paths.step(z, lin, da, ds)
-            nodes.append(z)
-            middles.append(amid)
-            actions.append(da)
-            increments.append(ds)
-            moved_by = moved_by + da
-            if k < K - 1:
+            amid, after = self.paths.steps(z, lin, da, ds, count)
+            parts.append((after, amid))
+            actions += [da / count] * count
+            increments += [ds / count] * count
+            z, moved_by, at = after.select(-1), moved_by + da, at + count
+            if at < K:
                 held = settled(z)
                 lin = self.kinematic.linearize(z.state, z.contacts, forces=held.forces, on_unstable="flag")
-        return Path(torch.stack(actions), stack(nodes), stack(middles), torch.stack(increments))
+        after, middles = (functools.reduce(joined, part) for part in zip(*parts, strict=True))
+        nodes = joined(start.expand(1), after)
+        return Path(torch.stack(actions), nodes, middles, torch.stack(increments))

@@ -16,7 +16,7 @@ from ..enhanced import EnhancedModel
 from ..kinematics.grasp_state import GraspState
 from ..model import GraspForces, KinematicModel, Linearization
 from ..typing import Float, Tensor
-from .configuration import Change, Configuration, chained, change, moved, settled, stack
+from .configuration import Change, Configuration, chained, change, moved, settled
 
 
 @dataclass(frozen=True)
@@ -69,17 +69,6 @@ class PathModel:
     def __init__(self, kinematic: KinematicModel, enhanced: EnhancedModel | None) -> None:
         self.kinematic, self.enhanced = kinematic, enhanced
 
-    def repeated(self, start: Configuration, lin: Linearization, actions: Float[Tensor, "K n_a"]) -> Path:
-        """The way of actions by the rates of the start alone: where to begin."""
-        nodes, middles, increments = [start], [], []
-        for action in actions:
-            z = nodes[-1]
-            kin, dz = self.kinematic.contact_kinematics(z.state, z.contacts), lin.step(action)
-            middles.append(moved(self.kinematic, z, change(lin, kin, action / 2)))
-            nodes.append(moved(self.kinematic, z, change(lin, kin, action)))
-            increments.append(dz)
-        return Path(actions, stack(nodes), stack(middles), torch.stack(increments))
-
     def linearize(self, path: Path) -> Rates:
         """Rates at all configurations of a path."""
         K = len(path.actions)
@@ -106,18 +95,23 @@ class PathModel:
         middles = moved(self.kinematic, settled(nodes.of_first(before)), half)
         return Path(actions, nodes, middles, steps.ds)
 
-    def step(
-        self, z: Configuration, lin: Linearization, action: Float[Tensor, " n_a"], ds: Float[Tensor, " n_s"]
+    def steps(
+        self,
+        z: Configuration,
+        lin: Linearization,
+        action: Float[Tensor, " n_a"],
+        ds: Float[Tensor, " n_s"],
+        count: int,
     ) -> tuple[Configuration, Configuration]:
-        """Amid and after one motion, by the rates before it.
+        """Amid and after each of ``count`` equal motions, by the rates before them.
 
         Args:
-            ds: what f + g foretell of it.
+            action, ds: of all together, and what f + g foretell of it.
         """
         kin, g = self.kinematic.contact_kinematics(z.state, z.contacts), ds - lin.step(action)
-        whole, half = change(lin, kin, action, g), change(lin, kin, action / 2, g / 2)
-        z = settled(z)
-        return moved(self.kinematic, z, half), moved(self.kinematic, z, whole)
+        share = torch.arange(1, 2 * count + 1, dtype=action.dtype)[:, None] / (2 * count)
+        every = moved(self.kinematic, settled(z), change(lin, kin, share * action, share * g))
+        return every.of_first(slice(0, None, 2)), every.of_first(slice(1, None, 2))
 
     def _corrected(
         self, state: GraspState, actions: Tensor, J: Tensor
