@@ -145,14 +145,18 @@ class HorizonController(LookAndMoveController):
                 step = super()._solve(lin, seen)
             grip = self._wanted_grip(lin, seen)
             share = self.bound.share(lin, step[0], step[1], seen, grip)
-            if share < _DOUBTFUL:
+            if share < _DOUBTFUL or self._buckles():
                 single = super()._solve(lin, seen)
-                if self.bound.share(lin, single[0], single[1], seen, grip) > share:
+                if self._buckles() or self.bound.share(lin, single[0], single[1], seen, grip) > share:
                     self.plan = self._now = None
                     return single
             self._first = step
             return step
         return super()._solve(lin, seen)
+
+    def _buckles(self) -> bool:
+        """The grasp would, on the way of the plan."""
+        return self._now is not None and float(self._now[0].linearization.stability.min()) <= 0
 
     def _cut(self, lin: Linearization, step: _Step, share: float) -> _Step:
         """A part of a motion."""
