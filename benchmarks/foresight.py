@@ -2,11 +2,11 @@
 
     python benchmarks/foresight.py --objects box,can --seeds 1000:1010
 
-A turn of 20 deg is foreseen in 12 motions before anything moves, with the plant's own parameters, and then
-made in SAPIEN without feedback. Per grasp: rms error about the axis over the whole turn; rms and largest error
-of the pads' normal forces until the first foreseen slip; at which motion that is; and how far the rolled
-contacts are from those that the detector finds at the end. Times are CPU times of one thread, medians: a single
-decision of the look-and-move controller, a first plan of 12 motions, and one that goes on from it.
+A turn of 20 deg is foreseen in 12 motions before anything moves, with the own parameters of the plant, and
+then made in SAPIEN without feedback. Per grasp: rms error about the axis over the whole turn; rms and largest
+error of the normal forces of the pads until the first foreseen slip; at which motion that is; and how far the
+rolled contacts are from those that the detector finds at the end. Times are CPU times of one thread, medians:
+a single decision of the look-and-move controller, a first plan of 12 motions, and one that goes on from it.
 """
 
 from __future__ import annotations
