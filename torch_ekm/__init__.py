@@ -6,7 +6,8 @@ f, the learners g and the exceptions. The packages, in the order in which data f
 :mod:`~torch_ekm.model`, :mod:`~torch_ekm.residual` (knows nothing of robots), :mod:`~torch_ekm.enhanced`,
 :mod:`~torch_ekm.object_memory`, :mod:`~torch_ekm.plant`, :mod:`~torch_ekm.control`,
 :mod:`~torch_ekm.sensing`, :mod:`~torch_ekm.simulation`, :mod:`~torch_ekm.rendering`,
-:mod:`~torch_ekm.interop` (learners in other libraries' words), :mod:`~torch_ekm.experiments`.
+:mod:`~torch_ekm.foresight` (whole turns foreseen and planned), :mod:`~torch_ekm.interop` (learners in other
+libraries' words), :mod:`~torch_ekm.experiments`.
 """
 
 from __future__ import annotations

@@ -34,5 +34,4 @@ def test_contacts_have_more_to_spare_where_the_turn_is_planned():
         assert len(done.steps) <= 14
         margins = [float(step.decision.linearization.margins.min()) for step in done.steps]
         least[kind] = sorted(margins)[len(margins) // 2]
-        print(kind.__name__, len(done.steps), margins)
     assert least[HorizonController] > least[LookAndMoveController] + 0.2  # [N], the median motion's

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -25,6 +26,7 @@ from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.foresight import HorizonController, Rollout
 from torch_ekm.foresight.configuration import Configuration
+from torch_ekm.foresight.limits import SlipLimit
 from torch_ekm.foresight.path import Path, PathModel, joined
 
 F64 = torch.float64
@@ -157,3 +159,17 @@ def test_the_plan_goes_as_far_as_its_horizon_and_is_as_long_as_the_way():
     assert controller.plan is None
     with pytest.raises(ParameterError, match="horizon"):
         plan(horizon=0)
+
+
+def test_a_plan_finds_a_way_on_which_contacts_do_not_slide():
+    model, solver, at, lin = started()
+    lin = dataclasses.replace(lin, contacts=lin.contacts.replace(finger=("thumb", "index", "middle")))
+    target = PoseTarget.turned(at.state, AXIS, degrees=8)
+    least = []
+    for along in ((), (SlipLimit(),)):
+        controller = HorizonController(model, AXIS, along=along)
+        controller._linearize = lambda *_: lin  # the exact forces
+        controller.decide(at.state, solver.actuators(at.state), target)
+        least.append(float(Rollout(model).predict(at.state, controller.plan.actions, start=lin).margin.min()))
+    assert least[0] < -0.5  # [N]; measured -1.2
+    assert least[1] > -0.1  # measured -.01

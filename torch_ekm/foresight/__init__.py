@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from .horizon_controller import HorizonController
+from .limits import SlipLimit
 from .prediction import Prediction
 from .rollout import Rollout
 
-__all__ = ["HorizonController", "Prediction", "Rollout"]
+__all__ = ["HorizonController", "Prediction", "Rollout", "SlipLimit"]
