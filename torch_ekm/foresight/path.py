@@ -182,6 +182,3 @@ def joined(first: Configuration, second: Configuration) -> Configuration:
         return dataclasses.replace(a, **changes)
 
     return join(first, second)
-
-
-__all__ = ["Change", "Path", "PathModel", "Rates", "continued"]
