@@ -16,7 +16,7 @@ from ..enhanced import EnhancedModel
 from ..kinematics.grasp_state import GraspState
 from ..model import GraspForces, KinematicModel, Linearization
 from ..typing import Float, Tensor
-from .configuration import Change, Configuration, chained, change, moved, settled
+from .configuration import Configuration, chained, change, moved, settled
 
 
 @dataclass(frozen=True)
