@@ -12,6 +12,7 @@ import torch
 from torch._C import _len_torch_dispatch_stack
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.autograd.forward_ad import unpack_dual
+from torch.autograd.graph import increment_version
 
 from ...typing import Array, Tensor
 from ..kernels.action_linear import ActionLinearKernel
@@ -101,6 +102,8 @@ class CompiledLoops:
             self._noise, *self._units, self._robust, self._levels,
             posterior.novelty_threshold, posterior.jitter, event, told, errors,
         )  # fmt: skip
+        if self._given:  # a kernel may remember what it made of the basis
+            increment_version(posterior.basis)
         batch = self._batch
         novelty, nis, weight, variance = torch.from_numpy(told.reshape(4, *batch)).unbind()
         report = UpdateReport(torch.from_numpy(event.reshape(batch)), novelty, nis, weight)
