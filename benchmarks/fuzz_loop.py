@@ -71,9 +71,9 @@ class Session:
     """Farthest set-point outside the actuators' range [rad]."""
     force: float = 0.0
     """Largest true normal force [N]."""
-    error: float = 0.0
+    error: float = math.nan
     """Of the clean turns [deg], rms over motions."""
-    unfaulted: float = 0.0
+    unfaulted: float = math.nan
     """[deg]"""
 
 
@@ -117,7 +117,7 @@ def turn(plant, sight, ekm: EnhancedModel, grasp: int, session: Session | None) 
 
 
 def fuzz(seed: int, observations: int, chance: float = 0.15, clean: tuple[int, ...] = CLEAN) -> Session:
-    """One session."""
+    """One session; without ``clean`` turns nothing is compared."""
     parameters = preset("nominal").replace(hardware_seed=seed)
     plant = Checked(SimulatedHand("icub_right", "box", parameters=parameters))
     sight, session, turns = FuzzedPlant(plant, chance, seed=seed), Session(seed), 0
@@ -132,6 +132,8 @@ def fuzz(seed: int, observations: int, chance: float = 0.15, clean: tuple[int, .
     session.observations, session.faults = sight.observations, sight.faults
     session.commands, session.largest, session.beyond = plant.commands, plant.largest, plant.beyond
     session.force = plant.force
+    if not clean:
+        return session
     for k in range(turns):
         turn(plant, plant, untaught, 1000 * seed + k, None)
     session.error = error_of_clean_turns(plant.plant, ekm, clean)
@@ -143,12 +145,14 @@ def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     arguments.add_argument("--observations", type=int, default=10_000)
     arguments.add_argument("--each", type=int, default=250, help="observations of a session")
+    arguments.add_argument("--compare", type=int, default=1, help="clean turns after each so many sessions")
     arguments.add_argument("--seed", type=int, default=1000, help="of the first session")
     options = arguments.parse_args()
     torch.set_num_threads(1)
     sessions: list[Session] = []
     while sum(s.observations for s in sessions) < options.observations:
-        s = fuzz(options.seed + len(sessions), options.each)
+        clean = () if len(sessions) % options.compare else CLEAN
+        s = fuzz(options.seed + len(sessions), options.each, clean=clean)
         sessions.append(s)
         print(
             f"seed {s.seed}: {s.observations} observations, {s.commands} commands up to {s.largest / DEG:.1f} "
@@ -160,8 +164,11 @@ def main() -> None:
     for s in sessions:
         total += s.reasons
     faults = sum((s.faults for s in sessions), Counter[str]())
-    error, unfaulted = (math.sqrt(sum(getattr(s, name) ** 2 for s in sessions) / len(sessions))
-                        for name in ("error", "unfaulted"))  # fmt: skip
+    compared = [s for s in sessions if math.isfinite(s.error)]
+    error, unfaulted = (
+        math.sqrt(sum(getattr(s, name) ** 2 for s in compared) / len(compared))
+        for name in ("error", "unfaulted")
+    )
     print(
         f"observations {sum(s.observations for s in sessions)}, spoilt {sum(faults.values())}: {dict(faults)}"
     )
