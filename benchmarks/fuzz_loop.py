@@ -22,7 +22,7 @@ from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import EKMError, GraspError
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantWrapper
-from torch_ekm.simulation import FuzzedPlant, SimulatedHand, preset
+from torch_ekm.simulation import FuzzedPlant, PlantConfig, SimulatedHand, preset
 
 DEG = math.pi / 180
 STEP = 16 * DEG  # of ActuatorLimit
@@ -119,7 +119,7 @@ def turn(plant, sight, ekm: EnhancedModel, grasp: int, session: Session | None) 
 def fuzz(seed: int, observations: int, chance: float = 0.15, clean: tuple[int, ...] = CLEAN) -> Session:
     """One session; without ``clean`` turns nothing is compared."""
     parameters = preset("nominal").replace(hardware_seed=seed)
-    plant = Checked(SimulatedHand("icub_right", "box", parameters=parameters))
+    plant = Checked(SimulatedHand("icub_right", "box", PlantConfig(time_step=2e-3), parameters))
     sight, session, turns = FuzzedPlant(plant, chance, seed=seed), Session(seed), 0
     first = plant.reset(0)
     model = KinematicModel(plant.hand, plant.object)
@@ -155,9 +155,9 @@ def main() -> None:
         s = fuzz(options.seed + len(sessions), options.each, clean=clean)
         sessions.append(s)
         print(
-            f"seed {s.seed}: {s.observations} observations, {s.commands} commands up to {s.largest / DEG:.1f} "
-            f"of {s.allowed / DEG:.1f} deg, {s.beyond / DEG:.1f} deg beyond the range, {s.force:.1f} N; clean "
-            f"turn {s.error:.3f} deg, unfaulted {s.unfaulted:.3f} deg",
+            f"seed {s.seed}: {s.observations} observations, {s.commands} commands up to "
+            f"{s.largest / DEG:.1f} of {s.allowed / DEG:.1f} deg, {s.beyond / DEG:.1f} deg beyond the range, "
+            f"{s.force:.1f} N; clean turn {s.error:.3f} deg, unfaulted {s.unfaulted:.3f} deg",
             flush=True,
         )
     total = Counter[str]()
@@ -173,7 +173,7 @@ def main() -> None:
         f"observations {sum(s.observations for s in sessions)}, spoilt {sum(faults.values())}: {dict(faults)}"
     )
     print(f"ends: {dict(total.most_common())}")
-    print(f"commands above what is allowed: {sum(s.largest > s.allowed for s in sessions)} sessions")
+    print(f"sessions with a command above what is allowed: {sum(s.largest > s.allowed for s in sessions)}")
     print(f"clean turn: {error:.3f} deg, unfaulted {unfaulted:.3f} deg, ratio {error / unfaulted:.3f}")
 
 

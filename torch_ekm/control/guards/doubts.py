@@ -75,6 +75,11 @@ class Doubts:
     def _age(self, seen: Observation, before: Observation | None = None) -> Doubt | None:
         """Stale, repeated or missing readings."""
         taken, repeats = seen.taken, self._repeats(seen, before)
+        if before is not None and all(self._same(seen).values()) and torch.equal(seen.a, before.a):
+            message = (
+                "encoders, joints and pose are the same bit by bit after a motion: look after the driver"
+            )
+            return Doubt(StopReason.STALE_SENSOR, message)
         for k, sensor in enumerate(taken._fields[:3]):  # fingertips: another reading stands in
             age, oldest = seen.time - taken[k], self.guards.max_age[k]
             problem = ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 _HOLDS = 1.0  # [N] by two pads: an object is between them
 _PRESSED = 3.0  # [N] by the model: a pad that reads nothing then is dead
+_SURPRISE = 3.0  # [N] above the model: joints and springs are asked
 _JOINT_STD = 0.75  # [N] of a normal force by joints and springs alone
 _JOINT_SHARE = 0.25  # and as a share of it: springs are not as described
 
@@ -78,13 +80,14 @@ class FingertipWatch:
         repeats = self._frozen(force, float((seen.a - before.a).abs().max()))
         expected = self._by_model(decision)
         faults = {i: f"reads {float(force[i]):.2f} N again and again" for i in repeats if i in expected}
-        high = [i for i in range(len(self.pads)) if i not in faults and force[i] > self.guards.force_ceiling]
+        high = [i for i in range(len(self.pads)) if i not in faults and self._surprising(i, force, expected)]
         alone = self._by_joints(seen) if high else {}
         for i in high:
             other = alone.get(i)
-            if other is None or not self._contradicts(float(force[i]), other):
+            if other is not None and self._contradicts(float(force[i]), other):
+                faults[i] = f"reads {float(force[i]):.2f} N where joints and springs speak for {other:.2f} N"
+            elif force[i] > self.guards.force_ceiling:
                 return Felt(force, halt=self._too_hard(self.pads[i], float(force[i]), "as measured"))
-            faults[i] = f"reads {float(force[i]):.2f} N where joints and springs speak for {other:.2f} N"
         told = [f"fingertip '{self.pads[i]}' {problem}" for i, problem in sorted(faults.items())]
         if len(faults) > self.guards.faulty_pads:
             message = (
@@ -125,6 +128,10 @@ class FingertipWatch:
     def _normal(self, lin: Linearization) -> dict[int, float]:
         pads = self.controller.kinematic.hand.pad_indices(lin.contacts.finger)
         return dict(zip(pads, lin.forces.normal.tolist(), strict=True)) if lin.forces.solved else {}
+
+    def _surprising(self, i: int, force: Tensor, expected: dict[int, float]) -> bool:
+        """Above the ceiling, or far above what the model had before the motion."""
+        return float(force[i]) > min(self.guards.force_ceiling, expected.get(i, math.inf) + _SURPRISE)
 
     def _contradicts(self, force: float, expected: float) -> bool:
         variance = self.least**2 + _JOINT_STD**2 + (_JOINT_SHARE * expected) ** 2

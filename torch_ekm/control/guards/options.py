@@ -49,7 +49,7 @@ class Guards:
     """An older reading is stale [s]; less than the hand rests after a motion."""
     blind_motions: int = 2
     """In succession, without a pose that is seen; the next one is not made."""
-    unchanged: float = 3 * _DEG
+    unchanged: float = 1 * _DEG
     """A sensor that repeats its reading bit by bit while the encoders go so far is frozen [rad]."""
     gate: float = 4.0
     """Standard deviations."""
@@ -65,8 +65,8 @@ class Guards:
     """An encoder goes so much further than it was told, or so far back [rad]."""
     joint_jump: float = 20 * _DEG
     """Of a joint, away from what was foretold of one motion [rad]."""
-    rotation_jump: float = 30 * _DEG
-    """Of the object, likewise [rad]."""
+    rotation_jump: float = 60 * _DEG
+    """Of the object, likewise [rad]. Objects that slip out of a pinch do turn by 40 deg."""
     translation_jump: float = 0.03
     """[m]"""
     beyond: float = 15 * _DEG
