@@ -83,6 +83,9 @@ class Doubts:
         for k, sensor in enumerate(taken._fields[:3]):  # fingertips: another reading stands in
             age, oldest = seen.time - taken[k], self.guards.max_age[k]
             problem = ""
+            if before is not None and sensor == "pose" and seen.status is PlantStatus.NOT_SEEN:
+                message = "the camera does not find the object: clear its view, or light it"
+                return Doubt(StopReason.BLIND, message, blind=True)
             if sensor in repeats:
                 problem = f"is the same bit by bit while the encoders moved {deg(repeats[sensor])}"
             elif not seen.dated:
@@ -94,9 +97,6 @@ class Doubts:
             if problem:
                 message = f"{_NAMES[k]} {problem}: look after its driver or its time stamps"
                 return Doubt(StopReason.STALE_SENSOR, message, blind=sensor == "pose" and before is not None)
-        if before is not None and seen.status is PlantStatus.NOT_SEEN:
-            message = "the camera does not find the object: clear its view, or light it"
-            return Doubt(StopReason.BLIND, message, blind=True)
         return None
 
     def _repeats(self, seen: Observation, before: Observation | None) -> dict[str, float]:
