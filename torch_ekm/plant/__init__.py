@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .frames_at_rest import FramesAtRest
-from .observation import Observation, PlantStatus, Truth
+from .observation import Observation, PlantStatus, Stamps, Truth
 from .plant import Plant
 from .play_compensation import PlayCompensation
 from .recording_plant import RecordingPlant
@@ -23,6 +23,7 @@ __all__ = [
     "RecordingPlant",
     "ReplayedPlant",
     "ServoInverse",
+    "Stamps",
     "Trajectory",
     "TrialEntry",
     "TrialLog",

@@ -15,7 +15,7 @@ import torch
 from .._extras import require
 from ..exceptions import DescriptionError, ParameterError
 from ..typing import Tensor
-from .observation import Observation, PlantStatus, Truth
+from .observation import Observation, PlantStatus, Stamps, Truth
 
 FORMAT = "torch_ekm trial 1"
 _FIELDS = ("q", "a", "position", "rotation")
@@ -100,6 +100,7 @@ class Trajectory:
         """
         names = (*_FIELDS, "commands", *((_FORCE,) if _FORCE in arrays else ()))
         sensors = {name: torch.from_numpy(arrays[name]) for name in names}
+        stamps = arrays.get("stamps")
         times, words, events = (arrays[name].tolist() for name in ("time", "status", "events"))
         groups: dict[str, dict[str, Tensor]] = {}
         for place, value in arrays.items():
@@ -114,9 +115,11 @@ class Trajectory:
                 info["events"] = tuple(happened)
             told = None if truth is None else Truth(**_row(truth, k))
             status = PlantStatus(words[k].decode())
-            observations.append(
-                Observation(**_row(sensors, k), time=time, status=status, info=info, truth=told)
+            taken = None if stamps is None else Stamps(*stamps[k].tolist())
+            seen = Observation(
+                **_row(sensors, k), time=time, status=status, info=info, truth=told, stamps=taken
             )
+            observations.append(seen)
         return cls(seed, commands, observations, about)
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -136,6 +139,8 @@ class Trajectory:
             ),
         }
         arrays |= {name: _stack(name, [getattr(o, name) for o in seen]) for name in _FIELDS}
+        if any(o.stamps is not None for o in seen):
+            arrays["stamps"] = np.array([o.taken for o in seen], dtype=np.float64)
         for group in ("", "truth", *_GROUPS):
             named = [o.info.get(group, {}) for o in seen]
             if group == "":

@@ -17,6 +17,9 @@ _BURST_CLIP = 10.0  # times as much for columns whose large samples come in comp
 _COMPANY = 0.5  # of what chance would leave alone
 _DOUBT = 2.0  # so many large ones are taken to be alone beforehand
 _REST = 0.1, 0.05  # a block that varies less than this share of all before has this weight: it stands still
+_ALIEN = (
+    1e-20  # a variation below this share is no rest either (rounding is 1e-16): what was before was wrong
+)
 
 
 class RunningScale(nn.Module):
@@ -30,7 +33,7 @@ class RunningScale(nn.Module):
     nothing, a stream that starts at rest gets its units when it moves, one that comes to rest keeps them,
     and slow changes are followed. A column that has not varied keeps scale 1.
     Exempt columns are scaled by their root mean square. Nothing is squared before it is divided by the
-    largest: 1e150 is a number like others.
+    largest: 1e150 is a number like others. A past that is 1e20 times as large as what comes is forgotten.
 
     :meth:`observe` takes samples in, :meth:`settle` adopts what was found. In between ``shift`` and ``scale``
     stand still, so that what was computed with them stays valid.
@@ -111,14 +114,15 @@ class RunningScale(nn.Module):
         """Weight, centre, spread and large samples of the past and the block together."""
         count, centre, spread, large = self._of_block()
         share, drop = _REST
-        count = count * torch.where(spread < share * self.spread, drop, 1.0)
-        before = self.weight.clamp_max(self.memory)
+        past = self.spread.where((spread == 0) | (spread > _ALIEN * self.spread), 0.0)
+        count = count * torch.where(spread < share * past, drop, 1.0)
+        before = self.weight.clamp_max(self.memory).where(past == self.spread, 0.0)
         weight = before + count
         part = count / weight.clamp_min(torch.finfo(count.dtype).tiny)
         gap = (centre - self.centre).where(before > 0, 0.0)
-        most = torch.stack([gap.abs(), self.spread, spread]).amax(0).clamp_min(torch.finfo(count.dtype).tiny)
+        most = torch.stack([gap.abs(), past, spread]).amax(0).clamp_min(torch.finfo(count.dtype).tiny)
         # mean of roots: a block full of outliers does not decide either
-        inside = (1.0 - part) * (self.spread / most).sqrt() + part * (spread / most).sqrt()
+        inside = (1.0 - part) * (past / most).sqrt() + part * (spread / most).sqrt()
         variance = inside.pow(4) + (1.0 - part) * part * (gap / most).square()
         start = torch.where(before > 0, self.centre, centre)
         return weight, start + part * gap, most * variance.sqrt(), large
