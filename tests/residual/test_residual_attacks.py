@@ -18,7 +18,6 @@ MAKE = {
     "mixture": lambda d, m: MixtureResidual([SparseOnlineGP(d, m)]),
     "default": default_learner,
 }
-SINGLE = ["sogp", "deep", "rls", "features"]
 EVERY = pytest.mark.parametrize("kind", MAKE)
 HUGE = 0.99 * torch.finfo(torch.float64).max ** 0.5
 
@@ -35,9 +34,7 @@ def error(learner) -> float:
     return float((learner(x) - y).square().mean().sqrt())
 
 
-@pytest.mark.parametrize(
-    ("kind", "value"), [*((kind, 1e6) for kind in MAKE), *((kind, HUGE) for kind in SINGLE)]
-)
+@pytest.mark.parametrize(("kind", "value"), [(kind, value) for kind in MAKE for value in (1e6, HUGE)])
 def test_one_wrong_target_among_clean_ones_leaves_no_trace(kind, value):
     """Without it the error is 0.05 to 0.2; without robust units 1e6 leaves 5e3 after 1500 clean samples."""
     x, y = stream(120)
@@ -50,9 +47,9 @@ def test_one_wrong_target_among_clean_ones_leaves_no_trace(kind, value):
     assert error(attacked) < 1.3 * error(clean) + 0.1
 
 
-@pytest.mark.parametrize("kind", SINGLE)
+@EVERY
 def test_scales_that_alternate_are_forgotten(kind):
-    x, y = stream(224)
+    x, y = stream(364)
     learner = MAKE[kind](3, 2)
     y[:64:2] *= 1e140
     y[1:64:2] *= 1e-140

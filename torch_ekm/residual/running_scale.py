@@ -17,9 +17,7 @@ _BURST_CLIP = 10.0  # times as much for columns whose large samples come in comp
 _COMPANY = 0.5  # of what chance would leave alone
 _DOUBT = 2.0  # so many large ones are taken to be alone beforehand
 _REST = 0.1, 0.05  # a block that varies less than this share of all before has this weight: it stands still
-_ALIEN = (
-    1e-20  # a variation below this share is no rest either (rounding is 1e-16): what was before was wrong
-)
+ALIEN = 1e-20  #: a variation below this share is no rest either: what was before was wrong
 
 
 class RunningScale(nn.Module):
@@ -114,7 +112,7 @@ class RunningScale(nn.Module):
         """Weight, centre, spread and large samples of the past and the block together."""
         count, centre, spread, large = self._of_block()
         share, drop = _REST
-        past = self.spread.where((spread == 0) | (spread > _ALIEN * self.spread), 0.0)
+        past = self.spread.where((spread == 0) | (spread > ALIEN * self.spread), 0.0)
         count = count * torch.where(spread < share * past, drop, 1.0)
         before = self.weight.clamp_max(self.memory).where(past == self.spread, 0.0)
         weight = before + count
