@@ -9,7 +9,7 @@ from .exceptions import MissingExtraError
 
 _BRINGS = {
     "robot": ("pytorch_kinematics", "yourdfpy", "trimesh", "coal", "qpsolvers", "clarabel", "scipy"),
-    "sim": ("sapien", "cv2", "gymnasium", "h5py"),
+    "sim": ("sapien", "cv2", "gymnasium", "h5py", "filelock"),
     "experiments": ("joblib", "matplotlib", "mpl_toolkits", "jinja2", "pyvista", "viser", "typer", "rich"),
     "notebooks": ("IPython", "pyarrow"),
     "peers": ("gpytorch", "river"),

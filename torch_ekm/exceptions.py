@@ -244,6 +244,51 @@ class FileFormatError(EKMError, ValueError):
         super().__init__(f"{path}: {problem}")
 
 
+class OutputError(EKMError):
+    """A file cannot be written: the disk is full, or the folder may not be written to.
+
+    Attributes:
+        path: of the file or folder.
+        problem: what the system says.
+    """
+
+    def __init__(self, path: object, problem: object) -> None:
+        self.path, self.problem = str(path), str(problem)
+        super().__init__(f"{path} cannot be written: {problem}; name a folder that can be written to")
+
+
+class FolderInUseError(EKMError):
+    """Another writer is at work in a folder that takes one at a time.
+
+    Attributes:
+        folder: which.
+        holder: number of the process (pid) that writes there; None: it did not leave it.
+    """
+
+    def __init__(self, folder: object, holder: int | None) -> None:
+        self.folder, self.holder = str(folder), holder
+        by = "another process" if holder is None else f"process {holder}"
+        super().__init__(
+            f"{folder} is being written to by {by}; wait until it has ended, or name another folder"
+        )
+
+
+class WorkerDiedError(EKMError):
+    """The process that ran a job ended without a word, as often as the job was tried.
+
+    Attributes:
+        job: its name.
+        tries: how often it was run.
+    """
+
+    def __init__(self, job: str, tries: int) -> None:
+        self.job, self.tries = job, tries
+        super().__init__(
+            f"the job '{job}' was run {tries} times, and its process was killed each time; look for "
+            "a lack of memory, or run it alone with one process"
+        )
+
+
 # -- solvers and control --------------------------------------------------------------------
 
 
