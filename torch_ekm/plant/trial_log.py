@@ -226,7 +226,7 @@ def index_lines(entries: Mapping[int, TrialEntry]) -> bytes:
     text = io.StringIO()
     rows = (TrialEntry._fields, *(entries[trial] for trial in sorted(entries)))
     csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode()
+    return text.getvalue().encode(errors="backslashreplace")  # JSON holds texts that UTF-8 does not
 
 
 def compare(there: Mapping[str, Any], wanted: Mapping[str, Any], place: object) -> None:

@@ -12,4 +12,5 @@ def as_html(lines: Iterable[object]) -> str:
     viser's Markdown would render HTML that it finds, which can hold scripts.
     """
     style = "margin: 0.3em 1em; font-size: 0.85em; overflow-wrap: anywhere"
-    return "".join(f'<p style="{style}">{html.escape(str(line))}</p>' for line in lines)
+    text = (str(line).encode(errors="backslashreplace").decode() for line in lines)
+    return "".join(f'<p style="{style}">{html.escape(line)}</p>' for line in text)
