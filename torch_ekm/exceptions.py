@@ -11,6 +11,9 @@ from collections.abc import Iterable
 from typing import Any
 
 
+_LONGEST = 2000  # characters of a message
+
+
 class EKMError(Exception):
     """Root of all errors raised by torch_ekm. They survive pickling, to cross process boundaries whole."""
 
@@ -69,6 +72,8 @@ class DescriptionError(EKMError, ValueError):
     """A URDF or transmission file cannot be used; the message names the file and the place."""
 
     def __init__(self, source: object, problem: str) -> None:
+        if len(problem) > _LONGEST:  # of a file that holds a name of a million letters
+            problem = f"{problem[:_LONGEST]}..."
         self.source, self.problem = str(source), problem
         super().__init__(f"{source}: {problem}")
 
