@@ -5,12 +5,14 @@ from __future__ import annotations
 import copy
 import pickle
 from abc import abstractmethod
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import torch
 from torch import nn
 from torch.distributions import Normal
 
+from ..._recorded import ill_formed
 from ...typing import Float, Tensor
 from ..base import SingleLearner
 from ..report import UpdateReport
@@ -90,6 +92,22 @@ class GPyTorchLearner(SingleLearner):
         peer = {type(part).__name__: part.state_dict() for part in self._peer}
         return {**super().get_extra_state(), "count": self._count, **peer}
 
+    def state_problems(self, state: dict[str, Any]) -> list[str]:
+        """What GPyTorch refuses is tried on another model: it would leave this one half loaded."""
+        extra = state["_extra_state"]
+        try:
+            for part in self._build():
+                given = extra[type(part).__name__]
+                if isinstance(part, nn.Module) and (wrong := ill_formed(part.state_dict(), given)):
+                    return wrong
+                part.load_state_dict(copy.deepcopy(given))
+                averages = [] if isinstance(part, nn.Module) else list(_tensors(given))  # of an optimizer
+                if not all(bool(one.isfinite().all()) for one in averages):
+                    return [f"{type(part).__name__} holds something that is not a number"]
+        except Exception as error:
+            return [f"not a state of GPyTorch's model: {type(error).__name__}: {error}"]
+        return []
+
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self._count = int(state["count"])
         self._peer = self._build()
@@ -117,3 +135,11 @@ def _rebuild(kind: type[SingleLearner], n_in: int, n_out: int, options: dict[str
     learner = kind(n_in, n_out, **options)
     learner.load_state_dict(state)
     return learner
+
+
+def _tensors(value: Any) -> Iterator[Tensor]:
+    if isinstance(value, Tensor) and value.is_floating_point():
+        yield value
+    elif isinstance(value, Mapping):
+        for one in value.values():
+            yield from _tensors(one)
