@@ -181,6 +181,8 @@ def test_a_state_is_loaded_whole_or_not_at_all(name: str) -> None:
     paths = list(leaves(state))
     for path, value in paths[:: max(len(paths) // 40, 1)]:
         for bad in hostile_values(value):
+            if torch.is_tensor(bad) and torch.is_tensor(value) and torch.equal(bad, value):
+                continue  # a limit at infinity
             hostile = copy.deepcopy(state)
             inner = hostile
             for key in path[:-1]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import torch
@@ -101,9 +101,8 @@ class GPyTorchLearner(SingleLearner):
                 if isinstance(part, nn.Module) and (wrong := ill_formed(part.state_dict(), given)):
                     return wrong
                 part.load_state_dict(copy.deepcopy(given))
-                averages = [] if isinstance(part, nn.Module) else list(_tensors(given))  # of an optimizer
-                if not all(bool(one.isfinite().all()) for one in averages):
-                    return [f"{type(part).__name__} holds something that is not a number"]
+                if isinstance(part, torch.optim.Optimizer) and (wrong := _optimizer_problems(part, given)):
+                    return wrong
         except Exception as error:
             return [f"not a state of GPyTorch's model: {type(error).__name__}: {error}"]
         return []
@@ -137,9 +136,16 @@ def _rebuild(kind: type[SingleLearner], n_in: int, n_out: int, options: dict[str
     return learner
 
 
-def _tensors(value: Any) -> Iterator[Tensor]:
-    if isinstance(value, Tensor) and value.is_floating_point():
-        yield value
-    elif isinstance(value, Mapping):
-        for one in value.values():
-            yield from _tensors(one)
+def _optimizer_problems(optimizer: torch.optim.Optimizer, given: Mapping[str, Any]) -> list[str]:
+    """An optimizer takes whatever it is given, and fails at its next step."""
+    if given["param_groups"] != optimizer.state_dict()["param_groups"]:
+        return ["the optimizer's options are others"]
+    parameters = [one for group in optimizer.param_groups for one in group["params"]]
+    for place, averages in given["state"].items():
+        for name, value in averages.items():
+            shape, dtype = parameters[place].shape, parameters[place].dtype
+            if name == "step":
+                shape, dtype = torch.Size(), torch.float32
+            if value.shape != shape or value.dtype != dtype or not bool(value.isfinite().all()):
+                return [f"the optimizer's {name} of parameter {place} is not a {tuple(shape)} of {dtype}"]
+    return []
