@@ -64,8 +64,8 @@ def record_command(folder: Path, seeds: int, sensing: bool) -> list[str]:
 
 
 def reproduce_command(folder: Path) -> list[str]:
-    online = ["online", "--quick", "--seeds", "0:2", "--no-sensing", "--jobs", "2"]
-    return [*COMMAND, "reproduce", *online, "--out", str(folder)]
+    small = ["generalize", "--quick", "--objects", "box", "--angles", "3", "--seeds", "0:2", "--no-sensing"]
+    return [*COMMAND, "reproduce", *small, "--jobs", "2", "--out", str(folder)]
 
 
 def kill_often(
