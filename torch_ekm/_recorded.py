@@ -154,7 +154,7 @@ def check_state(module: nn.Module, state: Mapping[str, Any]) -> None:
             counts below 0, or of a learner that was made otherwise.
     """
     own = module.state_dict()
-    wrong = _made_otherwise(module, own, state) or ill_formed(own, state) or _impossible(module, state)
+    wrong = _made_otherwise(module, own, state) or ill_formed(own, state) or _impossible(module, own, state)
     if wrong:
         raise StateMismatchError(wrong)
 
@@ -188,10 +188,8 @@ def ill_formed(own: Mapping[str, Any], state: Mapping[str, Any]) -> list[str]:
         elif theirs.shape != ours.shape or theirs.dtype != ours.dtype:
             here = f"{tuple(ours.shape)} of {ours.dtype} here"
             wrong.append(f"{name}: {tuple(theirs.shape)} of {theirs.dtype} in the state, {here}")
-        elif bool(theirs.isnan().any()) or bool((theirs.isinf() & ours.isfinite()).any()):
-            wrong.append(f"{name} holds something that is not a number, or not finite")  # a limit may be inf
-        elif not theirs.is_floating_point() and bool((theirs < 0).any()):
-            wrong.append(f"{name} counts, and is below 0")
+        elif bool(theirs.isnan().any()):
+            wrong.append(f"{name} holds something that is not a number")
     return wrong
 
 
@@ -211,12 +209,26 @@ def _ill_formed_values(name: str, ours: Any, theirs: Any) -> list[str]:
     return []
 
 
-def _impossible(module: nn.Module, state: Mapping[str, Any]) -> list[str]:
+def _impossible(module: nn.Module, own: Mapping[str, Any], state: Mapping[str, Any]) -> list[str]:
+    """Entries of the right form, with values that no module of this package comes to."""
     wrong: list[str] = []
     for prefix, one in module.named_modules():
+        lead = f"{prefix}." if prefix else ""
+        inner = {name[len(lead) :]: value for name, value in state.items() if name.startswith(lead)}
+        if type(one).__module__.startswith(("torch_ekm.", "torch.nn.")):
+            free = getattr(one, "unbounded", ())  # entries that may be infinite, or below 0
+            kept = (*one.named_parameters(recurse=False), *one.named_buffers(recurse=False))
+            for name, ours in kept:
+                if name not in free and name in inner and not in_bounds(inner[name], ours):
+                    wrong.append(f"{lead}{name} is infinite, or counts and is below 0")
         ask = getattr(one, "state_problems", None)
-        if ask is not None:
-            lead = f"{prefix}." if prefix else ""
-            inner = {name[len(lead) :]: value for name, value in state.items() if name.startswith(lead)}
+        if ask is not None and not wrong:  # it may count on what was looked at here
             wrong += [f"{lead}{text}" for text in ask(inner)]
     return wrong
+
+
+def in_bounds(theirs: torch.Tensor, ours: torch.Tensor) -> bool:
+    """Finite where ours is, and no count below 0."""
+    if theirs.is_floating_point():  # a limit may be infinite
+        return not bool((theirs.isinf() & ours.isfinite()).any())
+    return theirs.dtype == torch.bool or not bool((theirs < 0).any())

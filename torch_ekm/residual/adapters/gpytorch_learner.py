@@ -12,7 +12,7 @@ import torch
 from torch import nn
 from torch.distributions import Normal
 
-from ..._recorded import ill_formed
+from ..._recorded import ill_formed, in_bounds
 from ...typing import Float, Tensor
 from ..base import SingleLearner
 from ..report import UpdateReport
@@ -98,8 +98,12 @@ class GPyTorchLearner(SingleLearner):
         try:
             for part in self._build():
                 given = extra[type(part).__name__]
-                if isinstance(part, nn.Module) and (wrong := ill_formed(part.state_dict(), given)):
-                    return wrong
+                if isinstance(part, nn.Module):
+                    own = part.state_dict()
+                    wrong = ill_formed(own, given)
+                    wrong += [name for name in own if not wrong and not in_bounds(given[name], own[name])]
+                    if wrong:
+                        return wrong
                 part.load_state_dict(copy.deepcopy(given))
                 if isinstance(part, torch.optim.Optimizer) and (wrong := _optimizer_problems(part, given)):
                     return wrong
