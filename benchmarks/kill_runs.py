@@ -102,7 +102,7 @@ def kill_often(
             shutil.rmtree(folder)
         else:
             tally.finished += len(there)
-            print(f"  kill {tally.kills}: {len(there)} of {len(whole)} are there", flush=True)
+            print(f"  {len(there)} of {len(whole)} are there; {tally}", flush=True)
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     tally.rounds += 1
     there = finished(folder)

@@ -231,4 +231,4 @@ def in_bounds(theirs: torch.Tensor, ours: torch.Tensor) -> bool:
     """Finite where ours is, and no count below 0."""
     if theirs.is_floating_point():  # a limit may be infinite
         return not bool((theirs.isinf() & ours.isfinite()).any())
-    return theirs.dtype == torch.bool or not bool((theirs < 0).any())
+    return theirs.dtype == torch.bool or not bool(((theirs < 0) & (ours >= 0)).any())

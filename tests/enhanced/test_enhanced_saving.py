@@ -75,6 +75,8 @@ def test_a_file_holds_learner_and_options(name: str, tmp_path: Path) -> None:
         loaded.predict(x, observation=True).stddev, learner.predict(x, observation=True).stddev
     )
     assert os.listdir(tmp_path) == ["learner"]  # nothing half-written stays
+    with pytest.raises(exceptions.OutputError, match="cannot be written"):
+        torch_ekm.save(learner, tmp_path / "nowhere" / "learner")
 
 
 def test_a_fleet_of_single_learners_and_a_learner_of_ones_own(tmp_path: Path) -> None:

@@ -111,7 +111,7 @@ def log_to_mcap(log: TrialLog, folder: str | Path) -> list[Path]:
         MissingExtraError: ``rosbags`` is not installed.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     return [trajectory_to_mcap(log.read(trial), folder / f"trial_{trial:06d}") for trial in log.trials]
 
 
