@@ -11,7 +11,7 @@ from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import DescriptionError
 
 HAND, BOX = load_hand("planar_two_finger"), load_object("box")
-_PATIENCE = 5.0  # [s]
+_PATIENCE = 5.0  # [s] of CPU: the machine may be busy
 
 TOML = {
     "nested arrays": "x = " + "[" * 100_000,
@@ -42,12 +42,12 @@ def test_toml(name: str, tmp_path: Path) -> None:
     whole = BOX.urdf_path.with_suffix(".object.toml").read_bytes()
     for content in (hostile, hostile + b"\n" + whole, whole + b"\n[notes]\n" + hostile):
         about.write_bytes(content)
-        start, told = time.monotonic(), "in notes"
+        start, told = time.process_time(), "in notes"
         try:
             load_object(urdf)
         except DescriptionError as error:
             told = str(error)
-        assert time.monotonic() - start < _PATIENCE
+        assert time.process_time() - start < _PATIENCE
         assert len(told) < 3000
         assert told != "in notes" or name in ("float", "many keys")  # which may be any text
     transmission.write_bytes(hostile)
@@ -99,14 +99,14 @@ def test_urdf(name: str, tmp_path: Path) -> None:
     urdf.write_text(URDF[name])
     (tmp_path / "my.object.toml").write_bytes(BOX.urdf_path.with_suffix(".object.toml").read_bytes())
     (tmp_path / "my.transmission.toml").write_bytes(HAND.transmission_path.read_bytes())
-    start = time.monotonic()
+    start = time.process_time()
     with pytest.raises(DescriptionError) as told:
         load_hand(urdf)
     assert len(str(told.value)) < 3000
     if name != "2000 capsules":  # one body of that many shapes is an object
         with pytest.raises(DescriptionError):
             load_object(urdf)
-    assert time.monotonic() - start < _PATIENCE
+    assert time.process_time() - start < _PATIENCE
 
 
 def test_the_longest_hand_that_is_read(tmp_path: Path) -> None:
@@ -122,7 +122,7 @@ def test_the_longest_hand_that_is_read(tmp_path: Path) -> None:
         "start = [0, 0, 0]\nradius = 0.01\n"
     )
     (tmp_path / "my.transmission.toml").write_text(text)
-    start = time.monotonic()
+    start = time.process_time()
     hand = load_hand(tmp_path / "my.urdf")
     assert hand.n_q == n - 1
-    assert time.monotonic() - start < _PATIENCE
+    assert time.process_time() - start < _PATIENCE

@@ -61,6 +61,9 @@ def test_a_result_is_that_of_its_job(tmp_path: Path) -> None:
         with pytest.warns(UserWarning, match=r"a\.json.*run again"):
             assert run_jobs(square, jobs, tmp_path) == whole
         assert (tmp_path / "a.json").read_bytes() == mine
+    (tmp_path / "a.json").write_bytes(other)
+    with pytest.raises(ValueError, match="another job, 'b'"):
+        read_result(tmp_path / "a.json", "a")
     for bit in range(0, 8 * len(mine), 5):
         flipped = bytearray(mine)
         flipped[bit // 8] ^= 1 << bit % 8
