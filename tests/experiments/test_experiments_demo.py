@@ -96,9 +96,9 @@ def test_same_seed_same_run_and_resume(records: list[TrialRecord], folder: Path)
         assert new.errors_deg == old.errors_deg
         assert list(new.poses) == list(old.poses)
         assert len(new.poses) == new.steps + 1
-    before = {path: path.stat().st_mtime_ns for path in (folder / "runs").iterdir()}
+    before = {path: path.stat().st_mtime_ns for path in (folder / "runs").glob("*.json")}
     reproduce(EXPERIMENT, folder)
-    assert {path: path.stat().st_mtime_ns for path in (folder / "runs").iterdir()} == before
+    assert {path: path.stat().st_mtime_ns for path in (folder / "runs").glob("*.json")} == before
 
 
 def test_the_demo_is_a_preset_of_generalize(records: list[TrialRecord]) -> None:
