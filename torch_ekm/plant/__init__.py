@@ -11,9 +11,11 @@ from .replayed_plant import ReplayedPlant
 from .servo_inverse import ServoInverse
 from .trajectory import Trajectory
 from .trial_log import TrialEntry, TrialLog
+from .verification import Finding, verify_log
 from .wrapper import PlantWrapper
 
 __all__ = [
+    "Finding",
     "FramesAtRest",
     "Observation",
     "Plant",
@@ -28,4 +30,5 @@ __all__ = [
     "TrialEntry",
     "TrialLog",
     "Truth",
+    "verify_log",
 ]
