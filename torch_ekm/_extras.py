@@ -9,8 +9,11 @@ from .exceptions import MissingExtraError
 
 _BRINGS = {
     "robot": ("pytorch_kinematics", "yourdfpy", "trimesh", "coal", "qpsolvers", "clarabel", "scipy"),
-    "sim": ("sapien", "cv2", "gymnasium", "h5py"),
-    "experiments": ("joblib", "matplotlib", "mpl_toolkits", "jinja2", "pyvista", "viser", "typer", "rich"),
+    "sim": ("sapien", "cv2", "gymnasium", "h5py", "filelock"),
+    "experiments": (
+        *("joblib", "matplotlib", "mpl_toolkits", "jinja2", "pyvista"),
+        *("viser", "websockets", "typer", "rich"),
+    ),
     "notebooks": ("IPython", "pyarrow"),
     "peers": ("gpytorch", "river"),
     "fast": ("numba",),

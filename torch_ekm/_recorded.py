@@ -146,34 +146,89 @@ def _short(value: Any) -> str:
 def check_state(module: nn.Module, state: Mapping[str, Any]) -> None:
     """That a state dict is one of this module, before anything of it is written.
 
+    A module in it with a method ``state_problems(state) -> list of texts`` is asked for what is wrong with
+    its own entries, once their shapes are right: counts and places that lie outside of its memory, say.
+
     Raises:
-        StateMismatchError: entries are missing or too many, of other shapes or dtypes, not numbers (NaN), or
-            of a learner that was made otherwise.
+        StateMismatchError: entries are missing or too many, of other shapes or dtypes, NaN or infinite,
+            counts below 0, or of a learner that was made otherwise.
     """
     own = module.state_dict()
+    wrong = _made_otherwise(module, own, state) or ill_formed(own, state) or _impossible(module, own, state)
+    if wrong:
+        raise StateMismatchError(wrong)
+
+
+def _made_otherwise(module: nn.Module, own: Mapping[str, Any], state: Mapping[str, Any]) -> list[str]:
     wrong: list[str] = []
     starts = {type(one).__name__: one.starts for one in module.modules() if isinstance(one, Recorded)}
     for name, ours in own.items():
         theirs = state.get(name)
         if isinstance(ours, dict) and isinstance(theirs, dict) and "made_with" in ours:
-            made = theirs.get("made_with")
-            if made is not None:
-                wrong += differences(made, ours["made_with"], starts, name.removesuffix("_extra_state")[:-1])
-    if wrong:
-        raise StateMismatchError(wrong)
-    wrong += [f"{name} is missing" for name in own if name not in state]
+            place = name.removesuffix("_extra_state")[:-1]
+            try:
+                wrong += differences(theirs["made_with"], ours["made_with"], starts, place)
+            except Exception as error:  # whatever a strange description makes of it
+                wrong.append(f"{name}: what it was made with cannot be read ({type(error).__name__})")
+    return wrong
+
+
+def ill_formed(own: Mapping[str, Any], state: Mapping[str, Any]) -> list[str]:
+    """What is wrong with the entries of ``state``, beside those of a state dict of the same module."""
+    wrong = [f"{name} is missing" for name in own if name not in state]
     wrong += [f"{name} does not belong here" for name in state if name not in own]
-    parameters = dict(module.named_parameters())
     for name, ours in own.items():
-        theirs = state.get(name)
-        if theirs is None or not isinstance(ours, torch.Tensor):
+        if name not in state:
             continue
-        if not isinstance(theirs, torch.Tensor):
+        theirs = state[name]
+        if not isinstance(ours, torch.Tensor):
+            wrong += _ill_formed_values(name, ours, theirs)
+        elif not isinstance(theirs, torch.Tensor):
             wrong.append(f"{name} is no tensor")
         elif theirs.shape != ours.shape or theirs.dtype != ours.dtype:
             here = f"{tuple(ours.shape)} of {ours.dtype} here"
             wrong.append(f"{name}: {tuple(theirs.shape)} of {theirs.dtype} in the state, {here}")
-        elif bool(theirs.isnan().any()) or (name in parameters and not bool(theirs.isfinite().all())):
+        elif bool(theirs.isnan().any()):
             wrong.append(f"{name} holds something that is not a number")
-    if wrong:
-        raise StateMismatchError(wrong)
+    return wrong
+
+
+def _ill_formed_values(name: str, ours: Any, theirs: Any) -> list[str]:
+    """Of what is no tensor: counts, marks, and mappings of those."""
+    if isinstance(ours, dict) and isinstance(theirs, dict):
+        wrong = [f"{name}.{key} is missing" for key in ours if key not in theirs]
+        wrong += [f"{name}.{key} does not belong here" for key in theirs if key not in ours]
+        pairs = [(key, ours[key], theirs[key]) for key in ours if key in theirs and key != "made_with"]
+        # another library's own mappings are looked at by the module that holds them
+        flat = [(key, a, b) for key, a, b in pairs if not (isinstance(a, dict) and isinstance(b, dict))]
+        return wrong + [text for key, a, b in flat for text in _ill_formed_values(f"{name}.{key}", a, b)]
+    if isinstance(ours, dict) or type(ours) is not type(theirs):
+        return [f"{name}: {type(theirs).__name__} in the state, {type(ours).__name__} here"]
+    if isinstance(ours, int) and not 0 <= theirs < 2**53:
+        return [f"{name} counts, and is below 0 or beyond 2^53"]
+    return []
+
+
+def _impossible(module: nn.Module, own: Mapping[str, Any], state: Mapping[str, Any]) -> list[str]:
+    """Entries of the right form, with values that no module of this package comes to."""
+    wrong: list[str] = []
+    for prefix, one in module.named_modules():
+        lead = f"{prefix}." if prefix else ""
+        inner = {name[len(lead) :]: value for name, value in state.items() if name.startswith(lead)}
+        if type(one).__module__.startswith(("torch_ekm.", "torch.nn.")):
+            free = getattr(one, "unbounded", ())  # entries that may be infinite, or below 0
+            kept = (*one.named_parameters(recurse=False), *one.named_buffers(recurse=False))
+            for name, ours in kept:
+                if name not in free and name in inner and not in_bounds(inner[name], ours):
+                    wrong.append(f"{lead}{name} is infinite, or counts and is below 0")
+        ask = getattr(one, "state_problems", None)
+        if ask is not None and not wrong:  # it may count on what was looked at here
+            wrong += [f"{lead}{text}" for text in ask(inner)]
+    return wrong
+
+
+def in_bounds(theirs: torch.Tensor, ours: torch.Tensor) -> bool:
+    """Finite where ours is, and no count below 0."""
+    if theirs.is_floating_point():  # a limit may be infinite
+        return not bool((theirs.isinf() & ours.isfinite()).any())
+    return theirs.dtype == torch.bool or not bool(((theirs < 0) & (ours >= 0)).any())

@@ -4,25 +4,14 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from ._extras import require
-from .exceptions import EKMError, MissingExtraError, ParameterError
+from ._terminal import print_report, print_table, progress, say, say_error  # first: needs the extra
+from .exceptions import EKMError, ParameterError
 
-try:
-    typer = require("typer")
-    require("rich")
-except MissingExtraError as error:
-    raise SystemExit(f"torch-ekm: {error}") from None
-
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table as RichTable
-from typer import Argument, Option
+import typer  # isort: skip
+from typer import Argument, Option  # isort: skip
 
 if TYPE_CHECKING:
     from .experiments.reporting.report import Report
@@ -36,7 +25,6 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,  # rich would take "[deg]" for a style and drop it
 )
-console = Console(markup=False)  # the units of a table are no styles either
 
 Hand = Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")]
 Preset = Annotated[str, Option(help="none, nominal, worn or hostile.")]
@@ -48,11 +36,12 @@ _AN_OBJECT = "An object (see 'torch-ekm objects') or a path to a URDF."
 
 
 def main() -> None:
-    """Entry point: errors that torch_ekm raises on purpose are told in one line, without a traceback."""
+    """Entry point: what torch_ekm refuses on purpose, and what the system refuses (a full disk, say), is told
+    in one line, without a traceback."""
     try:
         app()
-    except EKMError as error:
-        Console(stderr=True).print(f"[bold red]torch-ekm:[/] {escape(str(error))}", highlight=False)
+    except (EKMError, OSError) as error:
+        say_error(error)
         sys.exit(1)
 
 
@@ -63,7 +52,7 @@ def hands() -> None:
 
     found = [load_hand(name) for name in list_hands()]
     rows = [(hand.name, hand.n_q, hand.n_a, len(hand.pads), hand.urdf_path.name) for hand in found]
-    _print_table(("hand", "joints", "actuators", "contact pads", "URDF"), rows)
+    print_table(("hand", "joints", "actuators", "contact pads", "URDF"), rows)
 
 
 @app.command()
@@ -76,7 +65,7 @@ def objects() -> None:
         obj = load_object(name)
         figures = f"{1e3 * obj.mass:.0f}", f"{obj.friction:g}", f"{1e3 * obj.grasp_width:.0f}"
         rows.append((name, *figures, ", ".join(shape.kind for shape in obj.shapes)))
-    _print_table(("object", "mass [g]", "friction", "grasp width [mm]", "shapes"), rows)
+    print_table(("object", "mass [g]", "friction", "grasp width [mm]", "shapes"), rows)
 
 
 @app.command()
@@ -92,7 +81,7 @@ def check(
     from .experiments.check import Check, check_hand
 
     rows = check_hand(hand, object, picture)
-    _print_table(Check._fields, rows, hand)
+    print_table(Check._fields, rows, hand)
     if any(row.state == "error" for row in rows):
         raise typer.Exit(1)
 
@@ -117,7 +106,7 @@ def demo(
     protocol, chosen = Demo(Setting(hand=hand), (object,)), parse_seeds(seeds)
     planned = Experiment(protocol.quick(), chosen[:2]) if quick else Experiment(protocol, chosen)
     for figure in _run("manipulating", planned, out, jobs).figures:
-        console.print(f"           {(out / figure.path).resolve()}", soft_wrap=True)
+        say(f"           {(out / figure.path).resolve()}")
 
 
 @app.command()
@@ -191,7 +180,7 @@ def compare(
     from .experiments.learners import COMPARED
 
     chosen = _names(learners) or COMPARED
-    with _progress("comparing", len(data) * len(chosen)) as advance:
+    with progress("comparing", len(data) * len(chosen)) as advance:
         compared = run(
             data,
             chosen,
@@ -201,7 +190,7 @@ def compare(
             processes=jobs,
             on_done=advance,
         )
-    _print_report(compared.write(out), out, notes=True)
+    print_report(compared.write(out), out, notes=True)
 
 
 @app.command()
@@ -223,11 +212,11 @@ def recorded_hand(
     from .experiments.recorded_hand.report import write_report
 
     chosen = _names(learners)
-    with _progress("predicting", count_jobs(data, len(chosen), quick=quick)) as advance:
+    with progress("predicting", count_jobs(data, len(chosen), quick=quick)) as advance:
         result = predict_recorded_hand(
             data, learners=chosen, folder=out / "runs", processes=jobs, quick=quick, on_done=advance
         )
-    _print_report(write_report(result, out), out, notes=True)
+    print_report(write_report(result, out), out, notes=True)
 
 
 @app.command()
@@ -253,9 +242,9 @@ def record(
     setting = Setting(hand=hand, preset=preset, sensing=sensing)
     config = RecordConfig(setting, object, controller, _numbers("angles", angles), images)
     chosen = parse_seeds(seeds)
-    with _progress("recording", len(chosen) * len(config.angles_deg)) as advance:
+    with progress("recording", len(chosen) * len(config.angles_deg)) as advance:
         made = run(config, chosen, log, on_trial=advance)
-    console.print(f"{len(made)} trials in {made.folder.resolve()}", soft_wrap=True)
+    say(f"{len(made)} trials in {made.folder.resolve()}")
 
 
 @app.command()
@@ -290,8 +279,24 @@ def replay(
 
     shown = LogShow(log, trial, estimates)
     if shown.log is not None:
-        _print_table(TrialEntry._fields, shown.log.index, str(log))
+        print_table(TrialEntry._fields, shown.log.index, str(log))
+        for number, problem in shown.log.damaged.items():
+            say(f"trial {number}: {problem}")
     _look(shown, html, port)
+
+
+@app.command()
+def verify(log: Annotated[Path, Argument(help="Folder of the log.")]) -> None:
+    """Check every byte of a log, its index, and the files of hand and object that it was made from.
+
+    Ends with 1 if a file is wrong, with 0 if not. "torch-ekm record" makes damaged trials again.
+    """
+    from .plant import Finding, verify_log
+
+    found = verify_log(log)
+    print_table(Finding._fields, found, str(log))
+    if any(one.state == "wrong" for one in found):
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -304,7 +309,7 @@ def notebooks(
 
     found = sorted(notebook_folder().glob("[0-9]*.ipynb"))
     for path in found if copy is None else copy_notebooks(copy, overwrite=overwrite):
-        console.print(str(path), soft_wrap=True, highlight=False)
+        say(str(path))
 
 
 @app.command()
@@ -313,15 +318,15 @@ def version() -> None:
     from .experiments.reporting.report import versions
 
     for package, number in versions().items():
-        console.print(f"{package} {number}", highlight=False)
+        say(f"{package} {number}")
 
 
 def _run(what: str, planned: Experiment, folder: Path, jobs: int, address: str | None = None) -> Report:
     from .experiments.reproduce import reproduce as run
 
-    with _progress(what, len(planned.jobs)) as advance:
+    with progress(what, len(planned.jobs)) as advance:
         report = run(planned, folder, jobs, advance, address)
-    _print_report(report, folder)
+    print_report(report, folder)
     return report
 
 
@@ -330,37 +335,9 @@ def _look(show: Show, html: Path | None, port: int) -> None:
     from .experiments.viewer.serve import save_page, serve
 
     if html is not None:
-        console.print(f"Page:      {save_page(show, html).resolve()}", soft_wrap=True)
+        say(f"Page:      {save_page(show, html).resolve()}")
         return
-    serve(show, port=port, on_ready=lambda address: console.print(f"Open {address} (Ctrl-C ends)"))
-
-
-@contextmanager
-def _progress(what: str, total: int) -> Iterator[Callable[[object], None]]:
-    """What, a bar, how many of how many, and for how long; gives what is to be called after each."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task(what, total=total)
-        yield lambda _: progress.advance(task)
-
-
-def _print_report(report: Report, folder: Path, notes: bool = False) -> None:
-    for table in report.tables:
-        _print_table(table.header, table.text(), table.caption, table.note if notes else None)
-    console.print(report.summary)
-    console.print(f"Report:    {(folder / 'index.html').resolve()}", soft_wrap=True)
-
-
-def _print_table(
-    header: Iterable[str], rows: Iterable[Iterable[object]], title: str | None = None, note: str | None = None
-) -> None:
-    table = RichTable(*header, title=title, caption=note)
-    for row in rows:
-        table.add_row(*map(str, row))
-    for column in table.columns:
-        column.overflow = "fold"  # figures are never cut short
-    # a file or a pipe has no width of its own
-    (console if console.is_terminal else Console(width=1000, markup=False)).print(table)
+    serve(show, port=port, on_ready=lambda address: say(f"Open {address} (Ctrl-C ends)"))
 
 
 def _numbers(name: str, text: str) -> tuple[float, ...]:

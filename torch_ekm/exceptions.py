@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+_LONGEST = 2000  # characters of a message
+
 
 class EKMError(Exception):
     """Root of all errors raised by torch_ekm. They survive pickling, to cross process boundaries whole."""
@@ -69,6 +71,8 @@ class DescriptionError(EKMError, ValueError):
     """A URDF or transmission file cannot be used; the message names the file and the place."""
 
     def __init__(self, source: object, problem: str) -> None:
+        if len(problem) > _LONGEST:  # of a file that holds a name of a million letters
+            problem = f"{problem[:_LONGEST]}..."
         self.source, self.problem = str(source), problem
         super().__init__(f"{source}: {problem}")
 
@@ -242,6 +246,51 @@ class FileFormatError(EKMError, ValueError):
     def __init__(self, path: object, problem: str) -> None:
         self.path, self.problem = str(path), problem
         super().__init__(f"{path}: {problem}")
+
+
+class OutputError(EKMError):
+    """A file cannot be written: the disk is full, or the folder may not be written to.
+
+    Attributes:
+        path: of the file or folder.
+        problem: what the system says.
+    """
+
+    def __init__(self, path: object, problem: object) -> None:
+        self.path, self.problem = str(path), str(problem)
+        super().__init__(f"{path} cannot be written: {problem}; name a folder that can be written to")
+
+
+class FolderInUseError(EKMError):
+    """Another writer is at work in a folder that takes one at a time.
+
+    Attributes:
+        folder: which.
+        holder: number of the process (pid) that writes there; None: it did not leave it.
+    """
+
+    def __init__(self, folder: object, holder: int | None) -> None:
+        self.folder, self.holder = str(folder), holder
+        by = "another process" if holder is None else f"process {holder}"
+        super().__init__(
+            f"{folder} is being written to by {by}; wait until it has ended, or name another folder"
+        )
+
+
+class WorkerDiedError(EKMError):
+    """The process that ran a job ended without a word, as often as the job was tried.
+
+    Attributes:
+        job: its name.
+        tries: how often it was run.
+    """
+
+    def __init__(self, job: str, tries: int) -> None:
+        self.job, self.tries = job, tries
+        super().__init__(
+            f"the job '{job}' was run {tries} times, and its process was killed each time; look for "
+            "a lack of memory, or run it alone with one process"
+        )
 
 
 # -- solvers and control --------------------------------------------------------------------

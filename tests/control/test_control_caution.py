@@ -42,7 +42,10 @@ class Sliding:
     def observe(self) -> Observation:
         self.looks += 1
         angle = self.off[min(len(self.commands), len(self.off) - 1)] * DEG
-        return dataclasses.replace(self.seen, rotation=exp(angle * self.across) @ self.seen.rotation)
+        o, q = self.seen.position + 1e-9 * self.looks, self.seen.q + 1e-9 * self.looks
+        time = self.seen.time + len(self.commands)
+        R = exp(angle * self.across) @ self.seen.rotation
+        return dataclasses.replace(self.seen, q=q, position=o, rotation=R, time=time, stamps=None)
 
     def command(self, delta_a: torch.Tensor) -> Observation:
         self.commands.append(delta_a)

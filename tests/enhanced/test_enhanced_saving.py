@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import os
+import random
 import zipfile
 from pathlib import Path
 
@@ -74,6 +75,8 @@ def test_a_file_holds_learner_and_options(name: str, tmp_path: Path) -> None:
         loaded.predict(x, observation=True).stddev, learner.predict(x, observation=True).stddev
     )
     assert os.listdir(tmp_path) == ["learner"]  # nothing half-written stays
+    with pytest.raises(exceptions.OutputError, match="cannot be written"):
+        torch_ekm.save(learner, tmp_path / "nowhere" / "learner")
 
 
 def test_a_fleet_of_single_learners_and_a_learner_of_ones_own(tmp_path: Path) -> None:
@@ -141,6 +144,102 @@ def test_a_state_of_another_learner_is_refused_by_name(other, named: str) -> Non
         learner.load_state_dict(state.state_dict())
     with pytest.raises(exceptions.StateMismatchError, match=named):
         tree.load_state_dict({f"0.{name}": one for name, one in state.state_dict().items()})
+
+
+def leaves(value, path=()):
+    """All that is in a state, with the way to it."""
+    if isinstance(value, dict):
+        for key in value:
+            if key != "made_with":
+                yield from leaves(value[key], (*path, key))
+    else:
+        yield path, value
+
+
+def hostile_values(value):
+    if not isinstance(value, torch.Tensor):
+        yield from ("x", None, -5, 10**400, [1], {}, float("nan"))
+        return
+    yield from ("x", None, value.new_zeros((*value.shape, 2)), value.to(torch.complex64))
+    if value.is_floating_point() and value.numel():
+        yield from (torch.full_like(value, number) for number in (float("nan"), float("inf")))
+    elif value.dtype == torch.int64 and value.numel():
+        yield torch.full_like(value, -7)
+
+
+@pytest.mark.parametrize("name", ["sogp", "learns", "mixture", "local", "network", "svgp"])
+def test_a_state_is_loaded_whole_or_not_at_all(name: str) -> None:
+    """Each of its entries in turn is a hostile one."""
+    if name == "svgp":
+        pytest.importorskip("gpytorch")
+    from torch_ekm.residual import GPyTorchSVGP
+
+    make = {**LEARNERS, "svgp": lambda: GPyTorchSVGP(3, 2, inducing=4)}[name]
+    x, y = stream()
+    other, learner = make(), make()
+    other.update(x[:20], y[:20])
+    learner.update(x[20:], y[20:])
+    state, before, mean = other.state_dict(), copy.deepcopy(learner.state_dict()), learner(x)
+    paths = list(leaves(state))
+    for path, value in paths[:: max(len(paths) // 40, 1)]:
+        for bad in hostile_values(value):
+            if torch.is_tensor(bad) and torch.is_tensor(value) and torch.equal(bad, value):
+                continue  # a limit at infinity
+            hostile = copy.deepcopy(state)
+            inner = hostile
+            for key in path[:-1]:
+                inner = inner[key]
+            inner[path[-1]] = bad
+            with pytest.raises(exceptions.StateMismatchError):
+                learner.load_state_dict(hostile)
+    for made in ({}, [], {"class": "SparseOnlineGP"}, None):
+        hostile = {**state, "_extra_state": {**state["_extra_state"], "made_with": made}}
+        with pytest.raises(exceptions.StateMismatchError):
+            learner.load_state_dict(hostile)
+    after = dict(leaves(learner.state_dict()))
+    for path, value in leaves(before):
+        assert torch.equal(value, after[path]) if torch.is_tensor(value) else value == after[path], path
+    assert torch.equal(learner(x), mean)
+
+
+@pytest.mark.parametrize(
+    ("entry", "value"), [("slot", 10**12), ("count", 9), ("count", 1), ("slot", 7), ("active", 1.0)]
+)
+def test_counts_that_lead_out_of_the_memory_are_refused(entry: str, value: float) -> None:
+    """Compiled loops write where they lead."""
+    x, y = stream()
+    learner, other = sogp(), sogp()
+    other.update(x[:4], y[:4])
+    state = other.state_dict()
+    state[f"posterior.{entry}"] = torch.full_like(state[f"posterior.{entry}"], value)
+    with pytest.raises(exceptions.StateMismatchError, match="posterior"):
+        learner.load_state_dict(state)
+    assert not learner(x).any()
+
+
+def test_flipped_bits_and_cuts_of_a_file(tmp_path: Path) -> None:
+    x, y = stream()
+    learner, path = sogp(), tmp_path / "learner"
+    learner.update(x, y)
+    torch_ekm.save(learner, path)
+    whole, draw = path.read_bytes(), random.Random(0)
+    refused = 0
+    for _ in range(150):
+        bit = draw.randrange(8 * len(whole))
+        flipped = bytearray(whole)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        try:
+            read = torch_ekm.load(path)
+        except exceptions.EKMError:
+            refused += 1
+        else:  # a date, say, which nobody reads
+            assert torch.equal(read(x), learner(x))
+    assert refused > 100
+    for _ in range(30):
+        path.write_bytes(whole[: draw.randrange(len(whole))])
+        with pytest.raises(exceptions.FileFormatError):
+            torch_ekm.load(path)
 
 
 def test_what_only_starts_a_state_may_differ() -> None:

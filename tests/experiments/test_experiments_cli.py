@@ -9,8 +9,10 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from torch_ekm.cli import _print_report, app
+from torch_ekm._terminal import as_printed, print_report
+from torch_ekm.cli import app, main
 from torch_ekm.experiments.reporting.report import Report, Table
+from torch_ekm.plant import Trajectory, TrialLog
 
 COMMANDS = typer.main.get_command(app).commands
 
@@ -41,7 +43,48 @@ def test_units_of_a_table_are_printed(capsys: pytest.CaptureFixture[str]) -> Non
     table = Table(
         "errors", "Errors [deg]", ["case", "KM [deg]"], [["box", "0.5 [0.4, 0.6]"]], "per turn [deg]"
     )
-    _print_report(Report("", "", [table]), Path(), notes=True)
+    print_report(Report("", "", [table]), Path(), notes=True)
     printed = capsys.readouterr().out
     for text in ("Errors [deg]", "KM [deg]", "0.5 [0.4, 0.6]", "per turn [deg]"):
         assert text in printed
+
+
+HOSTILE = "\x1b]0;owned\x07 \x1b[31m[red]x[/] \u202egnp \x9b2J \ud800"
+
+
+def test_text_of_a_file_is_no_command_to_the_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert as_printed("0.5 ± 0.1 µm\n[deg]") == "0.5 ± 0.1 µm\n[deg]"
+    print_report(Report("", HOSTILE, [Table("t", HOSTILE, [HOSTILE], [[HOSTILE]], HOSTILE)]), tmp_path, True)
+    (tmp_path / "hand.urdf").write_text(f'<robot><link name="{HOSTILE[1:8]}&#x9b;2J[/]\\"/></robot>')
+    monkeypatch.setattr("sys.argv", ["torch-ekm", "show", str(tmp_path / "hand.urdf")])
+    with pytest.raises(SystemExit):
+        main()
+    printed = "".join(capsys.readouterr())
+    assert printed.count("[red]x[/]") == 5
+    assert not {"\x1b", "\x07", "\x9b", "\u202e", "\ud800"} & {*printed}
+
+
+def test_what_the_system_refuses_is_told_in_a_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    nowhere = str(tmp_path / "file" / "log")
+    for arguments in (["record", nowhere], ["reproduce", "online", "--quick", "--out", nowhere]):
+        monkeypatch.setattr("sys.argv", ["torch-ekm", *arguments])
+        with pytest.raises(SystemExit):
+            main()
+        assert "cannot be written" in capsys.readouterr().err
+
+
+def test_verify(tmp_path: Path) -> None:
+    with TrialLog(tmp_path, {}) as log:
+        log.write(0, Trajectory(), {"reason": HOSTILE})
+    right = CliRunner().invoke(app, ["verify", str(tmp_path)])
+    assert right.exit_code == 0, right.output
+    assert "\x1b" not in right.output
+    (tmp_path / "index.csv").write_text("")
+    wrong = CliRunner().invoke(app, ["verify", str(tmp_path)])
+    assert wrong.exit_code == 1
+    assert re.search(r"index\.csv.*wrong", wrong.output)

@@ -10,7 +10,8 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from torch_ekm.cli import _print_report, app
+from torch_ekm._terminal import print_report
+from torch_ekm.cli import app
 from torch_ekm.exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.experiments import compare
 from torch_ekm.experiments.learner_comparison.compare import run_one
@@ -110,12 +111,12 @@ def test_block_bootstrap_covers() -> None:
 
 def test_what_is_finished_is_not_run_again(tmp_path: Path) -> None:
     first = compare(linear(60), ["linear RLS"], folder=tmp_path)
-    times = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    times = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*.json")}
     again = compare(linear(60), ["linear RLS"], folder=tmp_path)
     assert again.scores == first.scores  # to the microsecond: it was read
-    assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == times
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("*.json")} == times
     compare(linear(60, seed=5), ["linear RLS"], folder=tmp_path)  # other data: not the same job
-    assert len(list(tmp_path.iterdir())) == 2
+    assert len(list(tmp_path.glob("*.json"))) == 2
 
 
 def test_what_cannot_be_compared() -> None:
@@ -144,7 +145,7 @@ def test_every_contender_runs(name: str) -> None:
 def test_wide_tables_are_printed_whole_into_a_file(capsys: pytest.CaptureFixture[str]) -> None:
     cell = "0.123 [0.100, 0.200]"
     table = Table("wide", "Wide", [f"recording {k}" for k in range(12)], [[cell] * 12], "")
-    _print_report(Report("", "", [table]), Path())
+    print_report(Report("", "", [table]), Path())
     assert capsys.readouterr().out.count(cell) == 12
 
 

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from torch_ekm.cli import app, parse_seeds
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.config import Setting
+from torch_ekm.experiments.jobs import read_result
 from torch_ekm.experiments.protocols.demo import Demo
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.report import Report
@@ -36,7 +37,7 @@ def report(folder: Path) -> Report:
 
 @pytest.fixture(scope="module")
 def records(report: Report, folder: Path) -> list[TrialRecord]:
-    kept = [json.loads(path.read_text()) for path in sorted((folder / "runs").glob("*.json"))]
+    kept = [read_result(path, path.stem) for path in sorted((folder / "runs").glob("*.json"))]
     found = [TrialRecord.from_json(figures) for session in kept for figures in session]
     return [record for record in found if isinstance(record, TrialRecord)]
 
@@ -95,9 +96,9 @@ def test_same_seed_same_run_and_resume(records: list[TrialRecord], folder: Path)
         assert new.errors_deg == old.errors_deg
         assert list(new.poses) == list(old.poses)
         assert len(new.poses) == new.steps + 1
-    before = {path: path.stat().st_mtime_ns for path in (folder / "runs").iterdir()}
+    before = {path: path.stat().st_mtime_ns for path in (folder / "runs").glob("*.json")}
     reproduce(EXPERIMENT, folder)
-    assert {path: path.stat().st_mtime_ns for path in (folder / "runs").iterdir()} == before
+    assert {path: path.stat().st_mtime_ns for path in (folder / "runs").glob("*.json")} == before
 
 
 def test_the_demo_is_a_preset_of_generalize(records: list[TrialRecord]) -> None:

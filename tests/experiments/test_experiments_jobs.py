@@ -11,11 +11,12 @@ from collections.abc import Iterator
 from operator import truediv
 from pathlib import Path
 
+import psutil
 import pytest
 
-from torch_ekm.exceptions import MissingExtraError, ParameterError
+from torch_ekm.exceptions import MissingExtraError, ParameterError, WorkerDiedError
 from torch_ekm.experiments import jobs as module
-from torch_ekm.experiments.jobs import run_jobs
+from torch_ekm.experiments.jobs import read_result, run_jobs
 
 
 def square(x: int) -> dict[str, float]:
@@ -45,9 +46,30 @@ def test_interrupted_run_resumes(tmp_path: Path) -> None:
         return square(x)
 
     (tmp_path / "c.json").write_text('{"x": 2, "squ')  # killed while writing, by something less careful
-    result = run_jobs(counted, {"a": (1,), "b": (3,), "c": (2,)}, tmp_path)
+    with pytest.warns(UserWarning, match=r"c\.json: no JSON"):
+        result = run_jobs(counted, {"a": (1,), "b": (3,), "c": (2,)}, tmp_path)
     assert calls == [3, 2]
     assert result["b"]["square"] == 9
+
+
+def test_a_result_is_that_of_its_job(tmp_path: Path) -> None:
+    jobs = {"a": (1,), "b": (2,)}
+    whole = run_jobs(square, jobs, tmp_path)
+    mine, other = ((tmp_path / f"{name}.json").read_bytes() for name in "ab")
+    for wrong in (b"{}", b"null", b"[]", b'{"x": 1, "square": 1}', other, b"[" * 100_000):
+        (tmp_path / "a.json").write_bytes(wrong)
+        with pytest.warns(UserWarning, match=r"a\.json.*run again"):
+            assert run_jobs(square, jobs, tmp_path) == whole
+        assert (tmp_path / "a.json").read_bytes() == mine
+    (tmp_path / "a.json").write_bytes(other)
+    with pytest.raises(ValueError, match="another job, 'b'"):
+        read_result(tmp_path / "a.json", "a")
+    for bit in range(0, 8 * len(mine), 5):
+        flipped = bytearray(mine)
+        flipped[bit // 8] ^= 1 << bit % 8
+        (tmp_path / "a.json").write_bytes(flipped)
+        with pytest.raises(ValueError, match=r"JSON|result|digest"):
+            read_result(tmp_path / "a.json", "a")
 
 
 def die(x: int) -> int:
@@ -82,9 +104,24 @@ def test_workers_are_fresh_and_take_lambdas(tmp_path: Path, monkeypatch: pytest.
     assert results == {"job_0": [0, 10.0], "job_1": [3, 10.0]}
 
 
-def test_a_dead_worker_ends_the_run(tmp_path: Path) -> None:
-    with pytest.raises(Exception, match="unexpectedly terminated"):
+def test_a_job_that_kills_its_process_is_named(tmp_path: Path) -> None:
+    with pytest.raises(WorkerDiedError, match="'job_0' was run 3 times"):
         run_jobs(die, {f"job_{x}": (x,) for x in range(4)}, tmp_path, processes=2)
+
+
+def die_once(folder: str, x: int) -> int:
+    """Every job is killed from outside the first time."""
+    trace = Path(folder) / str(x)
+    if not trace.exists():
+        trace.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return x
+
+
+def test_a_job_whose_process_was_killed_is_run_again(tmp_path: Path) -> None:
+    (tmp_path / "traces").mkdir()
+    jobs = {f"job_{x}": (str(tmp_path / "traces"), x) for x in range(3)}
+    assert run_jobs(die_once, jobs, tmp_path / "runs", processes=2) == {"job_0": 0, "job_1": 1, "job_2": 2}
 
 
 SLEEPERS = """
@@ -114,10 +151,38 @@ def test_ctrl_c_leaves_what_is_finished_and_nothing_hangs(tmp_path: Path) -> Non
         assert run.stdout is not None
         assert {run.stdout.readline().strip(), run.stdout.readline().strip()} == {"job_0", "job_1"}
         time.sleep(0.5)
+        workers = children(run.pid)
+        assert len(workers) >= 2
+        start = time.monotonic()
         os.killpg(run.pid, signal.SIGINT)
         _, errors = run.communicate(timeout=20)
+        assert time.monotonic() - start < 2
     assert "KeyboardInterrupt" in errors
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["job_0.json", "job_1.json"]
+    assert ended(workers)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", "job_0.json", "job_1.json"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="parents of processes")
+def test_processes_end_with_their_parent(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", SLEEPERS, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as run:
+        assert run.stdout is not None
+        run.stdout.readline()
+        workers = children(run.pid)
+        assert len(workers) >= 2
+        run.kill()
+    assert ended(workers)
+    with pytest.raises(FileNotFoundError):  # nothing is written after its end
+        read_result(tmp_path / "job_5.json", "job_5")
+
+
+def children(pid: int) -> list[psutil.Process]:
+    return psutil.Process(pid).children(recursive=True)
+
+
+def ended(processes: list[psutil.Process]) -> bool:
+    """Within three seconds."""
+    return not psutil.wait_procs(processes, timeout=3)[1]
 
 
 # -- clusters ----------------------------------------------------------------------------------------
@@ -150,12 +215,12 @@ def dask_address() -> Iterator[str]:
 def check_cluster(address: str, folder: Path) -> None:
     """Results come back and are written here; a failure is the job's own and leaves what is done."""
     done: list[str] = []
-    (folder / "a.json").write_text("-1.0")  # from an earlier run
+    run_jobs(lambda x, y: -1.0, {"a": DIVISIONS["a"]}, folder)  # an earlier run
     results = run_jobs(truediv, DIVISIONS, folder, on_done=done.append, address=address)
     assert results == {"a": -1.0, "b": 0.25, "c": 0.0}
     assert done[0] == "a"
     assert sorted(done) == ["a", "b", "c"]
-    assert (folder / "b.json").read_text() == "0.25"
+    assert read_result(folder / "b.json", "b") == 0.25
     with pytest.raises(ZeroDivisionError):
         run_jobs(truediv, {**DIVISIONS, "d": (1, 0)}, folder, address=address)
     assert not (folder / "d.json").exists()
@@ -175,7 +240,7 @@ def test_dead_dask_worker_ends_the_run(tmp_path: Path) -> None:
         distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
     ):
         address = cluster.scheduler_address.replace("tcp://", "dask://")
-        with pytest.raises(distributed.KilledWorker):
+        with pytest.raises(WorkerDiedError, match="was run 1 times"):
             run_jobs(die, {f"job_{x}": (x,) for x in range(2)}, tmp_path, address=address)
 
 

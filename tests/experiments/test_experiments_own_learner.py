@@ -76,7 +76,7 @@ def test_own_learners_give_the_same_in_processes(tmp_path: Path) -> None:
 def test_an_own_learner_is_run_anew_when_it_changes(tmp_path: Path) -> None:
     def run(factory: Callable[[int, int], ResidualLearner]) -> tuple[float, int]:
         report = compare(stream(), {"mine": factory}, folder=tmp_path)
-        return report.scores["linear", "mine"].rms.mean, len(list(tmp_path.iterdir()))
+        return report.scores["linear", "mine"].rms.mean, len(list(tmp_path.glob("*.json")))
 
     first = run(lambda d, m: damped_class(0.5)(d, m))
     assert run(damped_class(0.5)) == first  # the same learner in other words
@@ -90,7 +90,7 @@ def test_an_own_learner_is_run_anew_when_it_changes(tmp_path: Path) -> None:
 
     assert run(Damped)[1] == 4  # its code
     assert compare(stream(), {"other": Damped}, folder=tmp_path)
-    assert len(list(tmp_path.iterdir())) == 5
+    assert len(list(tmp_path.glob("*.json"))) == 5
 
 
 class Part:
@@ -155,7 +155,7 @@ def test_what_makes_no_learner_is_refused_by_name_before_anything_runs(tmp_path:
     ):
         with pytest.raises(ParameterError, match=rf"(?s)learners\['bad'\].*{problem}"):
             compare(stream(), {**good, "bad": factory}, folder=tmp_path)
-    assert not list(tmp_path.iterdir())
+    assert not list(tmp_path.glob("*.json"))
 
 
 def test_nothing_of_the_caller_is_left_changed() -> None:

@@ -8,11 +8,12 @@ import hashlib
 import pytest
 import torch
 
+from torch_ekm.description import object_paths
 from torch_ekm.exceptions import ParameterError, SolverError, UnknownNameError
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.protocols.record import RecordConfig, record
 from torch_ekm.experiments.runner import Bench
-from torch_ekm.plant import TrialLog
+from torch_ekm.plant import Trajectory, TrialLog
 from torch_ekm.sensing import MarkerTracker
 
 pytest.importorskip("sapien")
@@ -87,3 +88,20 @@ def test_impossible_records_are_refused():
             RecordConfig(angles_deg=angles)
     with pytest.raises(ParameterError, match="camera"):
         RecordConfig(Setting(sensing=False), images=True)
+
+
+def test_a_log_knows_the_files_that_it_was_made_from(tmp_path):
+    for source, suffix in zip(object_paths("box"), (".urdf", ".object.toml"), strict=True):
+        (tmp_path / f"mine{suffix}").write_bytes(source.read_bytes())
+    mine = RecordConfig(object=str(tmp_path / "mine.urdf"))
+    before = mine.configuration
+    assert [name.partition(".")[0] for name in before["files"]] == ["hand icub_right_hand"] * 2 + [
+        "object mine"
+    ] * 2
+    TrialLog(tmp_path / "log", before).close()
+    with TrialLog(tmp_path / "log", before) as log:
+        log.write(0, Trajectory())
+    with (tmp_path / "mine.object.toml").open("a") as file:
+        file.write("# corrected")
+    with pytest.raises(ParameterError, match=r"configuration\['files'\]"):
+        TrialLog(tmp_path / "log", mine.configuration)

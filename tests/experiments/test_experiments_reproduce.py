@@ -71,8 +71,8 @@ def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def read(folder: Path) -> dict[str, bytes]:
-    names = [path for path in folder.iterdir() if path.suffix in (".csv", ".html", ".json")]
-    return {path.name: path.read_bytes() for path in names}
+    """The report: all that is not kept of single jobs."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
 @pytest.mark.usefixtures("made_up")
@@ -122,6 +122,7 @@ def test_killed_run_resumes_to_the_same_report(tmp_path: Path) -> None:
     after = {path.name: path.stat().st_mtime_ns for path in (broken / "runs").glob("*.json")}
     assert {name: after[name] for name in half} == half  # nothing was run twice
     assert read(broken) == read(whole)
+    assert {path.suffix for path in whole.iterdir()} >= {".csv", ".html", ".json", ".png", ".svg"}
 
 
 def test_objects_of_a_user(tmp_path: Path) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import urllib.request
+import html
+import http.client
+import urllib.parse
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,15 +14,16 @@ from typer.testing import CliRunner
 
 from torch_ekm.cli import app
 from torch_ekm.description import load_hand
-from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
+from torch_ekm.exceptions import DescriptionError, OutputError, ParameterError, UnknownNameError
 from torch_ekm.experiments.viewer.hand import GraspShow
 from torch_ekm.experiments.viewer.serve import choose_show, save_page, serve
 from torch_ekm.experiments.viewer.trial import LogShow
 from torch_ekm.plant import RecordingPlant, Trajectory, TrialLog
-from torch_ekm.rendering import make_scene
+from torch_ekm.rendering import make_scene, start_server
+from torch_ekm.rendering.web_guard import WebGuard
 from torch_ekm.simulation import SimulatedHand
 
-pytest.importorskip("viser")
+viser = pytest.importorskip("viser")
 pytest.importorskip("sapien")
 
 
@@ -43,7 +46,7 @@ class Gui:
     def __getattr__(self, name):
         def add(label, *args, initial_value=None, **more):
             control = Control(value=initial_value, content=label, **more)
-            self.controls[label if name != "add_markdown" else "note"] = control
+            self.controls[label if name != "add_html" else "note"] = control
             return control
 
         return add
@@ -112,7 +115,7 @@ def test_a_log_is_played_from_command_to_command(folder):
     gui.controls["command"].value = 2
     np.testing.assert_allclose(show.update(), show.scene().transforms[2])
     words = gui.controls["note"].content
-    assert "**held**" in words
+    assert ", held, " in words
     assert "+1.7" in words  # 0.03 rad
     assert "ended: stalled" in words
     gui.controls["trial"].value = "0"
@@ -130,19 +133,68 @@ def test_a_page_stands_alone(folder, tmp_path):
     page = save_page(LogShow(folder), tmp_path / "log.html").read_text(encoding="utf-8")
     assert len(page) > 500_000
     assert 'src="http' not in page
-    with pytest.raises(DescriptionError, match="cannot be written"):
+    with pytest.raises(OutputError, match="cannot be written"):
         save_page(LogShow(folder), tmp_path / "nowhere" / "log.html")
 
 
-def test_served_it_answers(folder):
-    answers = []
+def test_served_it_answers_who_has_the_address(folder):
+    connect = pytest.importorskip("websockets.sync.client").connect
+    refused = pytest.importorskip("websockets.exceptions").InvalidStatus
+    answers, turned_away = {}, []
 
-    def fetch(address):
-        with urllib.request.urlopen(address, timeout=20) as answer:
-            answers.append(answer.status)
+    def ask(address):
+        where = urllib.parse.urlsplit(address)
+        secret, port = where.path.strip("/"), where.port
+        assert where.hostname == "127.0.0.1"
+        assert len(secret) >= 32
 
-    serve(choose_show(str(folder)), port=8931, on_ready=fetch, stop=lambda: bool(answers))
-    assert answers == [200]
+        def status(path, host=where.netloc):
+            link = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+            link.request("GET", path, headers={"Host": host})
+            return link.getresponse().status
+
+        answers["page"] = status(f"/{secret}/"), status(f"/{secret}/?darkMode")
+        answers["no secret"] = status("/"), status("/index.html"), status(f"/{secret[:-1]}x/"), status("//")
+        answers["another name for this machine"] = status(f"/{secret}/", f"evil.example:{port}")
+        version = [f"viser-v{viser.__version__}"]
+        mine, theirs = f"http://127.0.0.1:{port}", "http://evil.example"
+        with connect(f"ws://127.0.0.1:{port}/{secret}", origin=mine, subprotocols=version) as socket:
+            answers["socket"] = len(socket.recv(timeout=20)) > 0
+        for path, origin in ((f"/{secret}", theirs), ("/", mine), (f"/{secret}", None), ("/", theirs)):
+            with pytest.raises(refused, match="403"):
+                connect(f"ws://127.0.0.1:{port}{path}", origin=origin, subprotocols=version)
+            turned_away.append(path)
+
+    serve(choose_show(str(folder)), port=8931, on_ready=ask, stop=lambda: bool(turned_away))
+    assert answers["page"] == (200, 200)
+    assert answers["no secret"] == (403,) * 4
+    assert answers["another name for this machine"] == 403
+    assert answers["socket"]
+    assert len(turned_away) == 4
+
+
+def test_a_server_that_cannot_be_guarded_is_not_started(monkeypatch):
+    monkeypatch.setattr(WebGuard, "_before", lambda self, process_request: process_request)
+    with pytest.raises(ParameterError, match="viser"):
+        start_server()
+
+
+def test_no_text_of_a_log_becomes_a_part_of_the_page(folder, tmp_path):
+    """What viser's Markdown would have run."""
+    script = "<iframe srcdoc='<script>parent.alert(1)</script>'></iframe> [x](javascript:alert(1)) **bold**"
+    recording = TrialLog.open(folder).read(0)
+    recording.observations[0].info["events"] = (script,)
+    recording.about["outcome"]["reason"] = script
+    recording.observations = recording.observations[:1]
+    recording.commands = []
+    show, gui = LogShow(recording.save(tmp_path / "trial.h5")), Gui()
+    show.add_controls(gui)
+    words = gui.controls["note"].content
+    assert f"event: {html.escape(script)}" in words
+    assert f"ended: {html.escape(script)}" in words
+    assert "<iframe" not in words
+    page = save_page(show, tmp_path / "log.html").read_text(encoding="utf-8")
+    assert "<iframe srcdoc" not in page
 
 
 def test_what_cannot_be_shown_is_named(folder, tmp_path):

@@ -51,6 +51,7 @@ def test_a_log_comes_back_byte_by_byte(tmp_path: Path) -> None:
     for trial in range(2):
         log.write(trial, trajectory(trial, forces=trial == 0), {"reason": "done"})
     log.write(2, Trajectory(7), {"reason": "not grasped"})
+    log.close()
     bags = log_to_mcap(log, tmp_path / "bags")
     assert [bag.name for bag in bags] == ["trial_000000", "trial_000001", "trial_000002"]
     again = log_from_mcap(tmp_path / "bags", tmp_path / "again")

@@ -307,3 +307,18 @@ def test_where_g_wanders_there_is_no_memory():
     assert learning_of(deep_sogp(4, 2)).past is not None
     with pytest.raises(ParameterError, match="another g"):
         sogp(4, 2, parts=[ProcessNoise(0.003), LearnHyperparameters(memory=100)])
+
+
+def test_a_robust_weight_alone_does_not_lock_another_system_out():
+    """Samples that are distrusted in a row are believed; outliers that come alone are not."""
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(700, 2, generator=generator, dtype=torch.float64)
+    y = torch.sin(x[:, :1]) + 0.02 * torch.randn(700, 1, generator=generator, dtype=torch.float64)
+    y[400:] += 3.0
+    parts = [RobustWeight(3.0), ForgettingFactor(0.99)]
+    learner = SparseOnlineGP(2, 1, capacity=40, parts=parts, noise_variance=0.01)
+    reports = [learner.update(x_t, y_t) for x_t, y_t in zip(x[:400], y[:400], strict=True)]
+    outlier = learner.update(x[0], y[0] + 5.0)
+    assert float(outlier.weight) < 0.1 < min(float(r.weight) for r in reports[100:])
+    learner.update(x[400:], y[400:])
+    assert float((learner(x[-50:]) - y[-50:]).square().mean().sqrt()) < 0.5

@@ -186,7 +186,7 @@ class _Spy(Part):
     def bind(self, learner):
         self.calls.append(f"{self.name} bind")
 
-    def weigh(self, nis):
+    def weigh(self, nis, mask):
         self.calls.append(f"{self.name} weigh")
         return torch.full_like(nis, 0.5)
 
@@ -237,7 +237,7 @@ def test_weights_multiply():
 class _Cautious(Part):
     """A part of somebody else's: twice the noise, half the trust, a rebuild after each sample."""
 
-    def weigh(self, nis):
+    def weigh(self, nis, mask):
         return torch.full_like(nis, 0.5)
 
     def after_update(self, learner, sample):

@@ -176,3 +176,21 @@ def test_units_are_told_and_kept():
     learner.update(x * 1e3, y)
     assert "scale=" in repr(learner)
     assert math.isclose(float(learner.state_dict()["parts.0.input.scale"][0]), 1e3, rel_tol=0.3)
+
+
+def test_bursts_are_no_outliers():
+    """What comes in company belongs to the stream; as many large samples that come alone do not."""
+    generator = torch.Generator().manual_seed(0)
+    small = 0.01 * torch.randn(640, 1, generator=generator, dtype=torch.float64)
+    large = torch.randn(640, 1, generator=generator, dtype=torch.float64)
+    burst = (torch.arange(640) % 64 < 6).unsqueeze(-1)
+    alone = burst[torch.randperm(640, generator=generator)]
+    found = []
+    for on in (burst, alone):
+        scale = RunningScale(1)
+        for n, x in enumerate(torch.where(on, large, small)):
+            scale.observe(n, x, None)
+        scale.settle()
+        found.append(float(scale.scale))
+    assert found[0] > 0.04
+    assert found[1] < 0.03

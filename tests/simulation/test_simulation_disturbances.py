@@ -383,6 +383,8 @@ def test_the_first_frame_of_a_grasp_is_never_lost():
     assert first.status is PlantStatus.HELD
     assert torch.equal(first.position, truth(first, "position"))
     assert plant.observe().status is PlantStatus.NOT_SEEN
+    later = plant.command(torch.zeros(plant.hand.n_a))
+    assert later.taken == (later.time, later.time, first.time, later.time)  # the pose is as old as it is
 
 
 def test_a_stuck_channel_stays_where_it_was(exact):

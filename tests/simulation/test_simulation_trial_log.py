@@ -39,6 +39,7 @@ def run(folder, trials, plant=None):
         for sign in (1, -1):
             plant.command(sign * torch.tensor([0.02, 0.01]))
         log.write(trial, plant.trajectory, {"reason": "done"})
+    log.close()
     return log
 
 
@@ -69,17 +70,18 @@ def test_a_trial_says_all_about_itself(unbroken):
 def test_one_configuration_gives_one_log_byte_by_byte(unbroken, tmp_path):
     run(tmp_path, 4)
     assert digests(tmp_path) == digests(unbroken)
-    assert len(set(digests(unbroken).values())) == 5  # and the trials differ
+    assert len(set(digests(unbroken).values())) == 6  # and the trials differ
 
 
 def test_a_run_in_pieces_gives_the_same_log(unbroken, tmp_path):
     run(tmp_path, 2)
     (tmp_path / "trial_000002.h5.part").write_bytes(b"killed while this was written")
+    (tmp_path / "trial_000077.h5.part").write_bytes(b"killed in a longer run")
     run(tmp_path, 4)
     assert digests(tmp_path) == digests(unbroken)
 
 
-@pytest.mark.parametrize("index", [None, b"", b"trial,se", "half", "reversed", "one more"])
+@pytest.mark.parametrize("index", [None, b"", b"trial,se", "half", "reversed", "one more", "another seed"])
 def test_the_index_is_made_from_the_files(unbroken, tmp_path, index):
     for path in unbroken.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
@@ -94,17 +96,21 @@ def test_the_index_is_made_from_the_files(unbroken, tmp_path, index):
             "half": b"".join(lines)[:-9],
             "reversed": b"".join(lines[::-1]),
             "one more": b"".join(lines) + b"9,9,2,0.5,held,done\n",
+            "another seed": b"".join(lines).replace(b"3,3,2", b"3,8,2"),
         }
         place.write_bytes(text[index])
-    assert [entry.trial for entry in TrialLog.open(tmp_path).index] == [0, 1, 2, 3]
+    written = None if index is None else place.read_bytes()
+    assert TrialLog.open(tmp_path).index == TrialLog.open(unbroken).index
+    assert (place.read_bytes() if place.exists() else None) == written  # reading changes nothing
+    TrialLog(tmp_path, CONFIGURATION).close()
     assert digests(tmp_path) == digests(unbroken)
 
 
-def test_trials_of_another_process_are_seen(unbroken, tmp_path):
-    log = TrialLog(tmp_path, CONFIGURATION)
-    assert log.index == ()
+def test_trials_that_are_written_meanwhile_are_seen(unbroken, tmp_path):
     run(tmp_path, 1)
-    assert [entry.trial for entry in log.index] == [0]
+    log = TrialLog.open(tmp_path)
+    run(tmp_path, 2)
+    assert [entry.trial for entry in log.index] == [0, 1]
 
 
 def test_killed_while_writing_loses_the_current_trial_only(unbroken, tmp_path):
@@ -157,10 +163,14 @@ def test_what_is_no_log_of_this_run_is_refused(unbroken, tmp_path):
     log = TrialLog.open(unbroken)
     with pytest.raises(DescriptionError, match=r"no trial 9; there are 0, 1, 2, 3"):
         log.read(9)
+    with pytest.raises(ParameterError, match="opened with"):
+        log.write(9, Trajectory())
+    log = TrialLog(unbroken, CONFIGURATION)
     with pytest.raises(ParameterError, match="not in the log yet"):
         log.write(3, Trajectory())
     with pytest.raises(ParameterError, match="trial"):
         log.write(-1, Trajectory())
+    log.close()
     assert digests(unbroken) == before
 
 
@@ -171,8 +181,13 @@ def test_a_damaged_trial_is_named(unbroken, tmp_path):
     torn.write_bytes(torn.read_bytes()[:2000])
     log = TrialLog.open(tmp_path)
     assert log.read(2).seed == 2
-    with pytest.raises(DescriptionError, match=r"trial_000001\.h5: damaged.*delete"):
+    with pytest.raises(DescriptionError, match=r"trial_000001\.h5: damaged"):
         log.read(1)
-    torn.unlink()
-    assert run(tmp_path, 4).trials == (0, 1, 2, 3)
+    assert [entry.trial for entry in log.index] == [0, 2, 3]
+    before = torn.read_bytes()
+    with pytest.warns(UserWarning, match=r"trial_000001\.h5: damaged.*kept as trial_000001\.h5\.damaged"):
+        assert run(tmp_path, 4).trials == (0, 1, 2, 3)
+    aside = tmp_path / "trial_000001.h5.damaged"
+    assert aside.read_bytes() == before
+    aside.unlink()
     assert digests(tmp_path) == digests(unbroken)

@@ -19,6 +19,7 @@ from ..typing import Float, Tensor
 from .caution import Caution
 from .controller import Decision, LookAndMoveController
 from .focus import FocusedPose, PoseTarget
+from .guards import Guards, Halt, Watch
 from .limiting import contact_lever
 from .termination import StoppingRule, StopReason
 
@@ -36,6 +37,8 @@ class Step:
     """Of the learner; None where nothing was learned."""
     seconds: float
     """Decision and training, without the plant [s]."""
+    note: str = ""
+    """What a guard objects to in this motion, see :class:`~torch_ekm.control.Guards`."""
 
     @property
     def retreat(self) -> bool:
@@ -95,6 +98,7 @@ class ClosedLoop:
         rule: when to stop.
         learn: False leaves the learner as it is.
         caution: when to look again, to go back and to give up.
+        guards: which readings may move the hand and teach, and what the hand must never do.
 
     An enhanced model with a ``servo`` commands through a :class:`~torch_ekm.plant.ServoInverse`, and
     it learns from what the encoders did. One without learns from the commands.
@@ -108,11 +112,13 @@ class ClosedLoop:
         *,
         learn: bool = True,
         caution: Caution | None = None,
+        guards: Guards | None = None,
     ) -> None:
         self.plant, self.controller = plant, controller
         self.rule = StoppingRule() if rule is None else rule
         self.learn = learn
         self.caution = Caution() if caution is None else caution
+        self.guards = Guards() if guards is None else guards
         servo = None if controller.enhanced is None else controller.enhanced.servo
         if servo is not None and not isinstance(plant, ServoInverse):
             self.plant = ServoInverse(plant, controller.kinematic.hand, servo)
@@ -165,10 +171,14 @@ class ClosedLoop:
 
     def _motions(self, target: PoseTarget) -> Generator[Step, None, Stop]:
         started = time.monotonic()
-        seen = self.plant.observe()
+        watch = Watch(self.guards, self.controller)
+        seen, _, halt, _ = watch.first(self.plant.observe(), self.plant.observe)
         self.controller.reset()
-        turn = _Turn(target, self.controller.focus, seen, self.caution.off_rotation)
+        turn = _Turn(target, self.controller.focus, seen, self.caution.off_rotation, watch, halt)
         while True:
+            if turn.halt is not None:
+                self.hold()
+                return Stop(turn.halt.reason, seen, turn.halt.message)
             if seen.status is PlantStatus.LOST:
                 return Stop(StopReason.OBJECT_LOST, seen)
             if turn.off_rotation(seen) > self.rule.off_limit:
@@ -185,6 +195,8 @@ class ClosedLoop:
                 turn.alarms += 1
                 turn.off_allowed = max(turn.off_allowed, turn.off_rotation(seen) + self.caution.off_further)
                 seen, clear = yield from self._go_back(seen, decision, turn)
+                if turn.halt is not None:
+                    continue
                 if seen.status is PlantStatus.LOST:
                     return Stop(StopReason.OBJECT_LOST, seen, sign)
                 if not clear or turn.alarms > self.caution.retreats:
@@ -193,6 +205,9 @@ class ClosedLoop:
                 continue
             if decision.status is not StopReason.RUNNING:
                 return Stop(decision.status, seen, decision.message)
+            turn.halt = watch.command(decision, seen)
+            if turn.halt is not None:
+                continue
             step = self._move(seen, decision, turn, seconds)
             turn.way.append(step.after.a - seen.a)
             yield step
@@ -208,7 +223,7 @@ class ClosedLoop:
             sign = self._sign(turn, seen, decision)
             if not sign or looks == 0 or seen.status is not PlantStatus.HELD:
                 return seen, decision, sign, seconds
-            seen, looks = self.plant.observe(), looks - 1
+            seen, looks = turn.watch.rest(seen, self.plant.observe()), looks - 1
 
     def _sign(self, turn: _Turn, seen: Observation, decision: Decision) -> str:
         """What speaks for a loss to come; empty: nothing."""
@@ -227,7 +242,7 @@ class ClosedLoop:
             step = self._move(seen, self.controller.retreat(decision, back), turn)
             yield step
             seen = step.after
-            if seen.status is PlantStatus.LOST:
+            if seen.status is PlantStatus.LOST or turn.halt is not None:
                 break
             seen, decision, sign, _ = self._decide(seen, turn)
             if not sign:
@@ -243,13 +258,23 @@ class ClosedLoop:
 
     def _move(self, seen: Observation, decision: Decision, turn: _Turn, seconds: float = 0.0) -> Step:
         """Command, observe, learn."""
-        after = self.plant.command(decision.delta_a)
-        increment = after.state.minus(seen.state)
+        first = self.plant.command(decision.delta_a)
         began = time.perf_counter()
-        report = self._learn(seen, decision, after, increment)
+        servo = self.plant if isinstance(self.plant, ServoInverse) else None
+        stuck = () if servo is None else servo.stuck
+        after, teaches, turn.halt, note = turn.watch.motion(seen, decision, first, self.plant.observe, stuck)
+        if servo is not None and turn.halt is not None:
+            if turn.halt.reason is not StopReason.ACTUATOR_STUCK:  # this one the servo model itself says
+                servo.correct(None)
+        elif servo is not None and after is not first:
+            servo.correct(after)
+        increment = after.state.minus(seen.state)
+        report = self._learn(seen, decision, after, increment) if teaches else None
         seconds += time.perf_counter() - began
-        turn.errors.append(turn.focus.error(turn.target, after.state))
-        return Step(seen, decision, after, increment, report, seconds)
+        error = turn.focus.error(turn.target, after.state)
+        # a goal that nobody saw is not reached
+        turn.errors.append(max(error, 1.001 * self.rule.tolerance) if turn.watch.blind else error)
+        return Step(seen, decision, after, increment, report, seconds, note)
 
     def _learn(
         self, seen: Observation, decision: Decision, after: Observation, increment: Tensor
@@ -294,8 +319,17 @@ class ClosedLoop:
 class _Turn:
     """How far a manipulation has come."""
 
-    def __init__(self, target: PoseTarget, focus: FocusedPose, seen: Observation, off: float) -> None:
+    def __init__(
+        self,
+        target: PoseTarget,
+        focus: FocusedPose,
+        seen: Observation,
+        off: float,
+        watch: Watch,
+        halt: Halt | None,
+    ) -> None:
         self.target, self.focus, self.start = target, focus, seen.state
+        self.watch, self.halt = watch, halt
         self.off_allowed = off
         """[rad]"""
         self.errors = [focus.error(target, seen.state)]

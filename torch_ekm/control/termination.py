@@ -24,6 +24,18 @@ class StopReason(Enum):
     TIME_OUT = "time-out"
     STOPPED = "stopped"
     """By :meth:`ClosedLoop.stop`."""
+    STALE_SENSOR = "stale sensor"
+    """This and what follows: see :class:`~torch_ekm.control.Guards`."""
+    BLIND = "object not seen"
+    ENCODER_JUMP = "encoder jump"
+    JOINT_JUMP = "joint jump"
+    POSE_JUMP = "pose jump"
+    OUT_OF_RANGE = "reading out of range"
+    FINGERTIP_FAULT = "fingertip fault"
+    ACTUATOR_STUCK = "actuator stuck"
+    COMMAND_CEILING = "command ceiling"
+    SPEED_CEILING = "speed ceiling"
+    FORCE_CEILING = "force ceiling"
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from .digests import file_digests
 from .hand import Actuator, ContactPad, HallSensor, HandDescription
 from .objects import ObjectDescription
 from .registry import (
@@ -38,4 +39,5 @@ __all__ = [
     "object_paths",
     "read_urdf",
     "write_transmission",
+    "file_digests",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,20 +12,67 @@ from typing import Any
 from ..exceptions import DescriptionError
 
 _NOTHING = object()
+# what a description of a hand or an object never needs: a file may be a stranger's
+_LARGEST_FILE = 64 * 1024  # bytes
+_LONGEST_LINE = 4096  # characters: a dotted key stands on one line, and tomllib takes its square in time
+_DEEPEST = 8  # tables and lists in each other
+LARGEST_FIGURE = 1e9
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
-    """The whole file as a dict.
+    """The whole file as a dict, nested eight deep at most, with integers of 64 bits.
 
     Raises:
-        DescriptionError: no such file, or not TOML.
+        DescriptionError: no such file, not TOML, larger than 64 KiB, a line of more than 4096
+            characters, or nested deeper.
+    """
+    content = read_bounded(path, what, _LARGEST_FILE)
+    try:
+        text = content.decode()
+    except UnicodeDecodeError as error:
+        raise DescriptionError(path, f"not well-formed TOML: {error}") from None
+    for number, line in enumerate(text.split("\n"), 1):
+        if len(line) > _LONGEST_LINE:
+            raise DescriptionError(path, f"line {number} has more than {_LONGEST_LINE} characters")
+    try:
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # also an integer of too many digits, and too deep lists
+        raise DescriptionError(path, f"not well-formed TOML: {error}") from None
+    _check_depth(path, data)
+    return data
+
+
+def read_bounded(path: Path, what: str, largest: int) -> bytes:
+    """The contents of a file of at most ``largest`` bytes.
+
+    Raises:
+        DescriptionError: no such file, a larger one, or one that cannot be read.
     """
     if not path.is_file():
         raise DescriptionError(path, f"no such {what}")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DescriptionError(path, f"not well-formed TOML: {error}") from None
+        with path.open("rb") as file:
+            content = file.read(largest + 1)
+    except OSError as error:
+        raise DescriptionError(path, f"cannot be read: {error.strerror}") from None
+    if len(content) > largest:
+        raise DescriptionError(path, f"a {what} has at most {largest} bytes, this one is larger")
+    return content
+
+
+def _check_depth(path: Path, data: dict[str, Any]) -> None:
+    """Level by level, since a recursion would end where the file wants it to."""
+    level: list[Any] = [data]
+    for _ in range(_DEEPEST):
+        inside = []
+        for value in level:
+            if isinstance(value, dict | list):
+                inside += value.values() if isinstance(value, dict) else value
+            elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+                raise DescriptionError(path, "an integer does not fit into 64 bits")
+        level = inside
+    if level:
+        raise DescriptionError(path, f"lists and tables are nested more than {_DEEPEST} deep")
 
 
 class TomlTable:
@@ -35,7 +83,7 @@ class TomlTable:
         if data is None:
             raise self.error("the table is missing")
         if not isinstance(data, dict):
-            raise self.error(f"must be a table, got {data!r}")
+            raise self.error(f"must be a table, got {_shown(data)}")
         self.data: dict[str, Any] = data
         valid = tuple(valid)
         for key in data:
@@ -55,13 +103,13 @@ class TomlTable:
     def text(self, key: str, default: Any = _NOTHING) -> str:
         value = self._get(key, default)
         if not isinstance(value, str) or not value:
-            raise self.error(f"'{key}' must be a non-empty string, got {value!r}")
+            raise self.error(f"'{key}' must be a non-empty string, got {_shown(value)}")
         return value
 
     def flag(self, key: str, default: bool) -> bool:
         value = self._get(key, default)
         if not isinstance(value, bool):
-            raise self.error(f"'{key}' must be true or false, got {value!r}")
+            raise self.error(f"'{key}' must be true or false, got {_shown(value)}")
         return value
 
     def number(
@@ -86,7 +134,7 @@ class TomlTable:
     def vector(self, key: str, size: int, default: Any = _NOTHING) -> tuple[float, ...]:
         value = self._get(key, default)
         if not isinstance(value, list | tuple) or len(value) != size:
-            raise self.error(f"'{key}' must be a list of {size} numbers, got {value!r}")
+            raise self.error(f"'{key}' must be a list of {size} numbers, got {_shown(value)}")
         return tuple(self._finite(key, entry) for entry in value)
 
     def angles(self, key: str, size: int, default: Any = _NOTHING) -> tuple[float, ...]:
@@ -99,14 +147,14 @@ class TomlTable:
         """The free text of the table ``[notes]``, if there is one."""
         value = self._get("notes", {})
         if not isinstance(value, dict):
-            raise self.error(f"'notes' must be a table, got {value!r}")
+            raise self.error(f"'notes' must be a table, got {_shown(value)}")
         return {name: str(text) for name, text in value.items()}
 
     def weights(self, key: str) -> dict[str, float]:
         """A table of numbers, e.g. moment arms by joint name; not empty."""
         value = self._get(key, _NOTHING)
         if not isinstance(value, dict) or not value:
-            raise self.error(f"'{key}' must be a table of joint = number, got {value!r}")
+            raise self.error(f"'{key}' must be a table of joint = number, got {_shown(value)}")
         return {name: self._finite(f"{key}.{name}", entry) for name, entry in value.items()}
 
     def _in_degrees(self, key: str) -> bool:
@@ -117,5 +165,14 @@ class TomlTable:
 
     def _finite(self, key: str, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise self.error(f"'{key}' must be a finite number, got {value!r}")
+            raise self.error(f"'{key}' must be a finite number, got {_shown(value)}")
+        if abs(value) > LARGEST_FIGURE:
+            raise self.error(f"'{key}' must be at most {LARGEST_FIGURE:g} in size, got {value:g}")
         return float(value)
+
+
+def _shown(value: Any) -> str:
+    """What stands in the file, not all of it."""
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = 80
+    return short.repr(value)

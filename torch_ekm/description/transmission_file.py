@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 from pathlib import Path
 from typing import Any
 
+from .._files import write_whole
 from ..exceptions import DescriptionError
 from ._toml import read_toml
 from .hand import HandDescription
@@ -27,6 +27,7 @@ def write_transmission(hand: HandDescription, path: str | Path) -> Path:
 
     Raises:
         DescriptionError: another ending, or the file that the hand was read from is gone.
+        OutputError: the folder cannot be written to.
     """
     path = Path(path)
     if not path.name.endswith(_ENDING):
@@ -49,10 +50,10 @@ def write_transmission(hand: HandDescription, path: str | Path) -> Path:
         for key in ("offset", "backlash"):
             if getattr(actuator, key):
                 table[key] = float(getattr(actuator, key))
-    path.write_text(_document(data), encoding="utf-8")
+    write_whole(path, _document(data))
     urdf = path.with_name(path.name.removesuffix(_ENDING) + ".urdf")
     if not urdf.exists():
-        shutil.copyfile(hand.urdf_path, urdf)
+        write_whole(urdf, hand.urdf_path.read_bytes())
     return path
 
 

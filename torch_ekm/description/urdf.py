@@ -19,7 +19,12 @@ import numpy as np
 from .._extras import require
 from ..exceptions import DescriptionError
 from ..typing import Array
+from ._toml import LARGEST_FIGURE, read_bounded
 from .shape import Shape, merge_capsules
+
+# what no hand and no object needs: a file may be a stranger's
+_LARGEST_FILE = 4 << 20  # bytes
+_MOST = {"link": 400, "joint": 400, "collision": 2000}
 
 MOVING = ("revolute", "continuous")
 _SHAPES = ("box", "cylinder", "sphere", "capsule", "mesh")
@@ -99,17 +104,21 @@ def read_urdf(path: str | Path) -> UrdfModel:
     """Parse the URDF at ``path``.
 
     Raises:
-        DescriptionError: no such file, malformed XML, a missing or non-finite figure, an unknown
-            joint type, ``<mimic>``, reversed limits, or links that do not form one tree.
+        DescriptionError: no such file, malformed XML, a missing or non-finite figure or one above 1e9, an
+            unknown joint type, ``<mimic>``, reversed limits, links that do not form one tree, or more than
+            4 MiB, 400 links, 400 joints or 2000 collision shapes.
         MissingExtraError: yourdfpy is not installed.
     """
     path = Path(path)
-    if not path.is_file():
-        raise DescriptionError(path, "no such URDF file")
+    content = read_bounded(path, "URDF file", _LARGEST_FILE)
     try:
-        root = ET.parse(path).getroot()  # fetches no external entity, refuses those that blow up
-    except ET.ParseError as error:
+        root = ET.fromstring(content)  # fetches no external entity, refuses those that blow up
+    except (ET.ParseError, ValueError, LookupError) as error:  # also an encoding that Python does not know
         raise DescriptionError(path, f"not well-formed XML: {error}") from None
+    for tag, most in _MOST.items():
+        there = sum(1 for _ in root.iter(tag))
+        if there > most:
+            raise DescriptionError(path, f"at most {most} elements <{tag}> are read, this file has {there}")
     if root.tag != "robot":
         raise DescriptionError(path, f"the root element must be <robot>, found <{root.tag}>")
     strict = ET.Element("robot", name=root.get("name", path.stem))
@@ -178,11 +187,13 @@ def _figures(path: Path, what: str, text: str, triple: bool) -> str:
         raise DescriptionError(path, f"{what} must be three numbers, got '{text}'")
     for word in words:
         try:
-            finite = math.isfinite(float(word))
+            size = abs(float(word))
         except ValueError:
-            finite = False
-        if not finite:
+            size = math.nan
+        if not math.isfinite(size):
             raise DescriptionError(path, f"{what} must be a finite number, got '{word}'")
+        if size > LARGEST_FIGURE:
+            raise DescriptionError(path, f"{what} must be at most {LARGEST_FIGURE:g} in size, got '{word}'")
     return " ".join(repr(float(word)) for word in words)
 
 

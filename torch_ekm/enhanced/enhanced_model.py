@@ -277,6 +277,18 @@ class EnhancedModel(Recorded, nn.Module):
         mean, deviation = (value / self.output_scale for value in (g.mean, g.stddev))
         return torch.distributions.Normal(nominal + mean.to(nominal), deviation.abs().to(nominal))
 
+    @torch.no_grad()
+    def deviation(
+        self, state: Any, action: Float[Tensor, "*batch n_a"], like: Float[Tensor, "*batch n_s"]
+    ) -> Float[Tensor, "*batch n_s"]:
+        """Standard deviation of g, in the increment's unit; 0 for outputs that are not learned.
+
+        Args:
+            like: an increment, for shape and dtype.
+        """
+        spread = self.learner.predict(self.features(state, action)).stddev
+        return self._scatter((spread / self.output_scale).abs(), like)
+
     def variance(self, state: Any, action: Float[Tensor, " n_a"], weight: Float[Tensor, " n_s"]) -> Quadratic:
         """``sum_j weight_j Var[ds_j]`` about one action, as a convex quadratic in the action.
 

@@ -25,6 +25,7 @@ def save(learner: ResidualLearner | EnhancedModel, path: str | os.PathLike) -> N
     Raises:
         NoStateError: it holds something that is no plain figure, such as a function for ``encode`` or another
             library's objects; the message names it.
+        OutputError: the file cannot be written.
     """
     if isinstance(learner, EnhancedModel):
         described = describe(learner)

@@ -72,4 +72,5 @@ class CameraOff(PlantWrapper):
         self._state = GraspState(seen.q, position, rotation)
         # a dark camera cannot say that it does not see the object
         status = PlantStatus.HELD if seen.status is PlantStatus.NOT_SEEN else seen.status
-        return dataclasses.replace(seen, position=position, rotation=rotation, status=status)
+        stamps = seen.taken._replace(pose=seen.time)  # foretold for now
+        return dataclasses.replace(seen, position=position, rotation=rotation, status=status, stamps=stamps)

@@ -28,7 +28,7 @@ from ..control import (
     StoppingRule,
     UncertaintyTask,
 )
-from ..description import hand_paths, list_hands, object_paths
+from ..description import file_digests, list_hands
 from ..enhanced import TrustOptions, TrustRegion
 from ..exceptions import ParameterError, UnknownNameError
 from ..model import ModelOptions
@@ -184,8 +184,7 @@ def digest(setting: Setting, objects: Iterable[str | Path], *more: Any) -> str:
     the objects (names or paths): neither a version of the package with other defaults nor an object that was
     corrected takes up old results. ``more`` decides the results as well.
     """
-    files = [*hand_paths(setting.hand), *(path for item in objects for path in object_paths(item))]
-    contents = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
+    contents = list(file_digests(setting.hand, objects).values())
     figures = [dataclasses.asdict(setting), setting.figures(), contents, more]
     text = json.dumps(figures, sort_keys=True, default=_plain)
     return hashlib.sha256(text.encode()).hexdigest()[:10]

@@ -1,28 +1,37 @@
 """Run independent jobs in processes or on a cluster, with progress, and resume what was interrupted.
 
 Processes are joblib's (loky): fresh ones, since a forked copy of PhysX or of a thread pool is not safe to
-use, and they take lambdas and classes of a notebook. A cluster is asked directly, because joblib's Dask
-backend waits for ever when a worker dies.
+use, and they take lambdas and classes of a notebook. Each has a pool of its own, so that it is known which
+job a process died of. A cluster is asked directly, because joblib's Dask backend waits for ever when a worker
+dies.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import threading
+import time
+import warnings
+from collections import deque
 from collections.abc import Callable, Generator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from .._extras import require
-from ..exceptions import ParameterError
+from .._files import WriterLock, make_folder, write_whole
+from ..exceptions import ParameterError, WorkerDiedError
 
 Jobs = Mapping[str, tuple[Any, ...]]
 Outcomes = Generator[tuple[str, Any], None, None]
 
 _PATIENCE = 10.0  # [s] for a scheduler to answer
+_TRIES = 3  # of a job whose process dies
+_WATCH = 0.25  # [s] between a process's looks at whether its parent lives
 _one_at_a_time = threading.Lock()
 
 
@@ -37,8 +46,10 @@ def run_jobs(
     """``{name: function(*arguments)}`` for all jobs, each result kept in ``folder/name.json``.
 
     A job whose file exists is not run again, so an interrupted run goes on where it stopped. A file appears
-    whole or not at all, and is written here, wherever the job ran. When a job fails, or the caller stops
-    asking, what has not begun is cancelled.
+    whole or not at all, and is written here, wherever the job ran; it has the job's name and a digest in it,
+    and one that is not what it should be is told in a warning, and the job run again. When a job fails, or
+    the caller stops asking, what has not begun is cancelled. A job whose process is killed is run again,
+    three times at most; processes end with this one, however it ends.
 
     Args:
         function: with results that JSON can hold; on a cluster, importable there.
@@ -50,11 +61,32 @@ def run_jobs(
 
     Raises:
         ParameterError: ``address`` is no such address, or nobody answers there.
+        WorkerDiedError: a job's process was killed each time it was tried; the message names the job.
+        FolderInUseError: somebody else runs jobs into this folder; the message names the process.
+        OutputError: a result cannot be written.
         MissingExtraError: joblib, or distributed, is not installed.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    tell = on_done or (lambda name: None)
-    results = {name: read for name in jobs if (read := _read(folder / f"{name}.json")) is not None}
+    make_folder(folder)
+    with WriterLock(folder):
+        return _run_all(function, jobs, folder, processes, on_done or (lambda name: None), address)
+
+
+def _run_all(
+    function: Callable[..., Any],
+    jobs: Jobs,
+    folder: Path,
+    processes: int,
+    tell: Callable[[str], None],
+    address: str | None,
+) -> dict[str, Any]:
+    results = {}
+    for name in jobs:
+        path = folder / f"{name}.json"
+        if path.exists():
+            try:
+                results[name] = read_result(path, name)
+            except ValueError as error:
+                warnings.warn(f"{path}: {error}; the job is run again", stacklevel=3)
     for name in results:
         tell(name)
     waiting = {name: arguments for name, arguments in jobs.items() if name not in results}
@@ -62,22 +94,63 @@ def run_jobs(
     run = partial(_in_processes, processes) if address is None else partial(_on_dask, address)
     with closing(run(function, waiting)) as outcomes:
         for name, result in outcomes:
-            results[name] = _write(folder / f"{name}.json", result)
+            results[name] = _write(folder / f"{name}.json", name, result)
             tell(name)
     return {name: results[name] for name in jobs}
 
 
 def _in_processes(processes: int, function: Callable[..., Any], jobs: Jobs) -> Outcomes:
-    joblib, processes = require("joblib"), max(min(processes, len(jobs)), 1)
-    run = joblib.Parallel(
-        processes, backend="loky", return_as="generator_unordered", batch_size=1, max_nbytes=None
-    )
+    if min(processes, len(jobs)) <= 1:
+        yield from ((name, function(*arguments)) for name, arguments in jobs.items())
+        return
+    loky = require("joblib.externals.loky")
+    died = require("joblib.externals.loky.process_executor").TerminatedWorkerError
+    n = min(processes, len(jobs))
+    threads = str(max((os.cpu_count() or 1) // n, 1))
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    env = {name: os.environ.get(name, threads) for name in names}
+
+    def new() -> Any:
+        return loky.ProcessPoolExecutor(1, env=env, initializer=_end_with, initargs=(os.getpid(),))
+
+    pools, idle = [new() for _ in range(n)], list(range(n))
+    waiting = deque((name, 1) for name in jobs)
+    running: dict[Future, tuple[int, str, int]] = {}
     try:
-        with closing(run(joblib.delayed(_named)(name, function, job) for name, job in jobs.items())) as done:
-            yield from done
+        while waiting or running:
+            while idle and waiting:
+                place, (name, tries) = idle.pop(), waiting.popleft()
+                running[pools[place].submit(function, *jobs[name])] = place, name, tries
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                place, name, tries = running.pop(future)
+                idle.append(place)
+                try:
+                    result = future.result()
+                except died:
+                    if tries == _TRIES:
+                        raise WorkerDiedError(name, tries) from None
+                    pools[place].shutdown(kill_workers=True)
+                    pools[place] = new()
+                    waiting.appendleft((name, tries + 1))
+                    continue
+                yield name, result
     finally:
-        if processes > 1:  # idle workers would keep what they have imported: SAPIEN, code edited since
-            require("joblib.externals.loky").get_reusable_executor(reuse=True).shutdown(kill_workers=True)
+        for pool in pools:
+            pool.shutdown(wait=False, kill_workers=True)
+        for pool in pools:
+            pool.shutdown(kill_workers=True)
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent has: killed, a parent tells nobody."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_WATCH)
+        os._exit(1)
+
+    if os.name != "nt":  # there a process keeps the number of a parent that is gone
+        threading.Thread(target=watch, daemon=True).start()
 
 
 def _on_dask(address: str, function: Callable[..., Any], jobs: Jobs) -> Outcomes:
@@ -93,11 +166,11 @@ def _on_dask(address: str, function: Callable[..., Any], jobs: Jobs) -> Outcomes
         # pure=False: a name is what a job is known by, not a hash of its arguments
         futures = {client.submit(_alone, function, job, pure=False): name for name, job in jobs.items()}
         for future in distributed.as_completed(futures, loop=client.loop):
-            yield futures[future], future.result()
-
-
-def _named(name: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[str, Any]:
-    return name, function(*arguments)
+            try:
+                result = future.result()
+            except distributed.KilledWorker as error:  # after as many tries as the scheduler allows
+                raise WorkerDiedError(futures[future], error.allowed_failures + 1) from None
+            yield futures[future], result
 
 
 def _alone(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
@@ -107,16 +180,33 @@ def _alone(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
         return function(*arguments)
 
 
-def _read(path: Path) -> Any:
+def read_result(path: Path, name: str) -> Any:
+    """What the job of this name left in a file of :func:`run_jobs`.
+
+    Raises:
+        ValueError: the file is not, byte by byte, one that was written for this job.
+    """
+    content = path.read_bytes()
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, json.JSONDecodeError):
-        return None
+        kept = json.loads(content)
+    except (ValueError, RecursionError):
+        raise ValueError("no JSON, so no result of a job") from None
+    if not isinstance(kept, dict) or "result" not in kept or "job" not in kept:
+        raise ValueError("no result of a job")
+    if kept["job"] != name:
+        raise ValueError(f"the result of another job, {kept['job']!r}")
+    if _text(name, kept["result"]).encode() != content:
+        raise ValueError("damaged: its digest (SHA-256) is another")
+    return kept["result"]
 
 
-def _write(path: Path, result: Any) -> Any:
+def _write(path: Path, name: str, result: Any) -> Any:
     """``result`` in the types that a resumed run reads."""
-    part, text = path.with_suffix(".part"), json.dumps(result)
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)
-    return json.loads(text)
+    text = _text(name, result)
+    write_whole(path, text)
+    return json.loads(text)["result"]
+
+
+def _text(name: str, result: Any) -> str:
+    digest = hashlib.sha256(json.dumps([name, result], sort_keys=True).encode()).hexdigest()
+    return json.dumps({"job": name, "result": result, "sha256": digest}, sort_keys=True)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._extras import require
+from .._files import WriterLock, make_folder
 from ..exceptions import DescriptionError, ParameterError
 from ..kinematics import se3
 from ..plant import Trajectory, TrialLog
@@ -110,7 +111,7 @@ def log_to_mcap(log: TrialLog, folder: str | Path) -> list[Path]:
         MissingExtraError: ``rosbags`` is not installed.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     return [trajectory_to_mcap(log.read(trial), folder / f"trial_{trial:06d}") for trial in log.trials]
 
 
@@ -127,13 +128,16 @@ def log_from_mcap(folder: str | Path, target: str | Path) -> TrialLog:
             folder, "no recording: there is no folder named trial_000000 or the like in it"
         )
     target = Path(target)
-    target.mkdir(parents=True, exist_ok=True)
-    for recording in found:
-        path = target / f"{recording.stem}.h5"
-        if path.exists():
-            raise ParameterError("target", str(path), "a log without this trial")
-        trajectory_from_mcap(recording).save(path)
-    return TrialLog.open(target)
+    make_folder(target)
+    with WriterLock(target):
+        for recording in found:
+            path = target / f"{recording.stem}.h5"
+            if path.exists():
+                raise ParameterError("target", str(path), "a log without this trial")
+            trajectory = trajectory_from_mcap(recording)
+            trajectory.save(path)
+    with TrialLog(target, trajectory.about.get("configuration", {})) as log:  # makes the index
+        return log
 
 
 class _Messages:

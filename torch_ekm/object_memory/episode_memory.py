@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import nn
 
@@ -17,6 +19,9 @@ class EpisodeMemory(nn.Module):
     Fixed buffers, so that ``state_dict`` holds all of it. The last row is the grasp that goes on now.
     Where there is no room the oldest grasp of the model that has most is given up: what is rare is kept.
     """
+
+    unbounded: ClassVar[tuple[str, ...]] = ("label",)
+    """Entries of a state that may be below 0."""
 
     def __init__(
         self, like: ResidualLearner, models: int, features: int, episodes: int, samples: int

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import nn
@@ -78,6 +78,9 @@ class ModelBank(SingleLearner):
     Raises:
         ParameterError: a figure outside its range, or the factory's learners are a fleet.
     """
+
+    unbounded: ClassVar[tuple[str, ...]] = ("log_prior", "log_evidence", "lead")
+    """Entries of a state that may be infinite."""
 
     def __init__(
         self,

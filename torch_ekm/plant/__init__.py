@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .frames_at_rest import FramesAtRest
-from .observation import Observation, PlantStatus, Truth
+from .observation import Observation, PlantStatus, Stamps, Truth
 from .plant import Plant
 from .play_compensation import PlayCompensation
 from .recording_plant import RecordingPlant
@@ -11,9 +11,11 @@ from .replayed_plant import ReplayedPlant
 from .servo_inverse import ServoInverse
 from .trajectory import Trajectory
 from .trial_log import TrialEntry, TrialLog
+from .verification import Finding, verify_log
 from .wrapper import PlantWrapper
 
 __all__ = [
+    "Finding",
     "FramesAtRest",
     "Observation",
     "Plant",
@@ -23,8 +25,10 @@ __all__ = [
     "RecordingPlant",
     "ReplayedPlant",
     "ServoInverse",
+    "Stamps",
     "Trajectory",
     "TrialEntry",
     "TrialLog",
     "Truth",
+    "verify_log",
 ]

@@ -54,11 +54,12 @@ class FramesAtRest(PlantWrapper):
             return readings[-1]
         shown = [o for o in readings if o.status is PlantStatus.HELD]
         last = readings[-1]
-        position, rotation, status = last.position, last.rotation, PlantStatus.NOT_SEEN
+        position, rotation, status, stamps = last.position, last.rotation, PlantStatus.NOT_SEEN, last.stamps
         covariance = last.q.new_full((6, 6), torch.nan)
         if shown:
             status = PlantStatus.HELD
             position, rotation, covariance = _mean_pose(shown)
+            stamps = last.taken._replace(pose=min(o.taken.pose for o in shown))  # no newer than any of them
         forces = [o.fingertip_force for o in readings if o.fingertip_force is not None]
         info = {**last.info, **{name: seen.info[name] for name in ("events",) if name in seen.info}}
         info["estimate"] = {**info.get("estimate", {}), "pose_covariance": covariance}
@@ -70,6 +71,7 @@ class FramesAtRest(PlantWrapper):
             fingertip_force=torch.stack(forces).mean(0) if forces else None,
             status=status,
             info=info,
+            stamps=stamps if last.dated else None,
         )
 
 

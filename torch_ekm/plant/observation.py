@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..kinematics import GraspState
 from ..kinematics.tensors import check_finite
@@ -50,9 +50,22 @@ class Truth:
         return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
 
 
+class Stamps(NamedTuple):
+    """When each sensor took its reading [s], by the clock of ``Observation.time``."""
+
+    encoders: float
+    joints: float
+    pose: float
+    """When the picture was taken; a pose that is repeated keeps its old stamp."""
+    fingertips: float
+
+
 @dataclass(frozen=True)
 class Observation:
     """What the sensors say, in SI units and the hand frame.
+
+    A driver that tells neither ``time`` nor ``stamps`` is undated: nobody can see that it repeats itself
+    but by equal readings.
 
     Raises:
         NonFiniteError: any entry is NaN or infinite.
@@ -69,18 +82,30 @@ class Observation:
     fingertip_force: Float[Tensor, " n_pads"] | None = None
     """Normal force of each contact pad [N], in the order of ``HandDescription.pads``; None: no sensors."""
     time: float = 0.0
-    """[s]"""
+    """When this was put together [s], by a clock that does not go back."""
     status: PlantStatus = PlantStatus.HELD
     info: dict[str, Any] = field(default_factory=dict)
     """Anything else, such as raw readings for a log."""
     truth: Truth | None = None
     """Of a simulation: for reports only."""
+    stamps: Stamps | None = None
+    """When each sensor took its reading; None: all at ``time``."""
 
     def __post_init__(self) -> None:
         for name in ("q", "a", "position", "rotation", "fingertip_force"):
             if (value := getattr(self, name)) is None:  # the forces
                 continue
             check_finite(f"Observation.{name}", value)
+
+    @property
+    def taken(self) -> Stamps:
+        """When each sensor took its reading [s]."""
+        return Stamps(*(self.time,) * 4) if self.stamps is None else self.stamps
+
+    @property
+    def dated(self) -> bool:
+        """The driver told a time."""
+        return self.time != 0.0 or self.stamps is not None
 
     @property
     def state(self) -> GraspState:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from typing import Any
+
 import torch
 
 from ..description import HandDescription
@@ -34,6 +37,7 @@ class ServoInverse(PlantWrapper):
         self.servo = ServoModel(hand.actuator_names) if servo is None else servo
         self._range = [torch.from_numpy(edge) for edge in (hand.actuator_lower, hand.actuator_upper)]
         self._seen: Observation | None = None
+        self._motion: tuple[Tensor, Tensor, dict[str, Any]] | None = None
 
     @property
     def stuck(self) -> tuple[str, ...]:
@@ -49,12 +53,30 @@ class ServoInverse(PlantWrapper):
         seen = self.observe() if self._seen is None else self._seen
         v = self.servo.command(delta_a)
         after = super().command(v)
+        self._motion = seen.a, v, copy.deepcopy(dict(self.servo.named_buffers()))
+        self._learn(after)
+        return after
+
+    def correct(self, after: Observation | None) -> None:
+        """What was learned of the last motion is taken back; it is learned anew from ``after``, if any.
+
+        Of a motion without any encoder reading that can be believed nothing is learned.
+        """
+        if self._motion is None:
+            return
+        for name, value in self.servo.named_buffers():
+            value.copy_(self._motion[2][name])
+        if after is not None:
+            self._learn(after)
+
+    def _learn(self, after: Observation) -> None:
+        assert self._motion is not None
+        start, v, _ = self._motion
         lower, upper = self._range
         free = torch.ones_like(v, dtype=torch.bool)
-        for a in (seen.a + v, after.a):  # a stop of the range is not a dead zone
+        for a in (start + v, after.a):  # a stop of the range is not a dead zone
             free &= (a > lower + self.servo.moved_from) & (a < upper - self.servo.moved_from)
-        self.servo.update(v, after.a - seen.a, free)
-        return after
+        self.servo.update(v, after.a - start, free)
 
     def observation(self, seen: Observation) -> Observation:
         """Remembered as the start of the next motion."""

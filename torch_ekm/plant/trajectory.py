@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,12 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from .._extras import require
 from ..exceptions import DescriptionError, ParameterError
 from ..typing import Tensor
-from .observation import Observation, PlantStatus, Truth
+from .observation import Observation, PlantStatus, Stamps, Truth
+from .trial_file import read_trial, write_trial
 
-FORMAT = "torch_ekm trial 1"
 _FIELDS = ("q", "a", "position", "rotation")
 _FORCE = "fingertip_force"  # missing where nothing measures it
 _GROUPS = ("raw", "estimate")  # what is kept of Observation.info, and "events"
@@ -43,23 +41,15 @@ class Trajectory:
         """Write an HDF5 file, whole or not at all; equal recordings give equal files, byte by byte.
 
         ``commands (n, n_a)`` [rad], each sensor ``(n + 1, ...)`` [SI], groups ``truth``, ``raw`` and
-        ``estimate``, checksums on all of it. Without fingertip sensors there is no ``fingertip_force``.
+        ``estimate``; a SHA-256 of all its bytes. Without fingertip sensors there is no ``fingertip_force``.
 
         Raises:
             ParameterError: ``about`` is nothing that JSON can hold, or the forces or an array of ``info``
                 change their shape or come and go; nothing is written.
+            OutputError: the file cannot be written.
         """
         path = Path(path)
-        about = json.dumps(plain(self.about))
-        arrays = self.arrays()
-        part = path.with_name(path.name + ".part")
-        # version 1.10 of the format has checksums on its own records too
-        with require("h5py").File(part, "w", libver=("v110", "v110")) as file:
-            file.attrs["format"], file.attrs["seed"], file.attrs["about"] = FORMAT, self.seed, about
-            for name, value in arrays.items():
-                large = {"fletcher32": True, "compression": "gzip"} if value.size else {}
-                file.create_dataset(name, data=value, track_times=False, **large)
-        publish(part, path)
+        write_trial(path, self.seed, plain(self.about), self.arrays())
         return path
 
     @classmethod
@@ -70,26 +60,11 @@ class Trajectory:
             DescriptionError: no such file, not a recording, or a damaged one.
         """
         path = Path(path)
-        if not path.is_file():
-            raise DescriptionError(path, "no such recording")
-        h5py = require("h5py")
+        seed, about, arrays = read_trial(path)
         try:
-            with h5py.File(path, "r") as file:
-                if file.attrs.get("format") != FORMAT:
-                    raise DescriptionError(path, "this HDF5 file is not a recording of torch_ekm")
-                seed, about = int(file.attrs["seed"]), json.loads(file.attrs["about"])
-                arrays: dict[str, np.ndarray] = {}
-
-                def take(place: str, item: Any) -> None:
-                    if hasattr(item, "shape"):
-                        arrays[place] = item[()]
-
-                file.visititems(take)
             return cls.from_arrays(seed, about, arrays)
-        except DescriptionError:
-            raise
-        except Exception as error:  # a damaged file fails in any way that HDF5 can think of
-            raise DescriptionError(path, f"damaged recording: {error}") from None
+        except Exception as error:  # its digest is right and its contents are not: nobody's recording
+            raise DescriptionError(path, f"damaged recording: {type(error).__name__}: {error}") from None
 
     @classmethod
     def from_arrays(cls, seed: int, about: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Trajectory:
@@ -100,6 +75,7 @@ class Trajectory:
         """
         names = (*_FIELDS, "commands", *((_FORCE,) if _FORCE in arrays else ()))
         sensors = {name: torch.from_numpy(arrays[name]) for name in names}
+        stamps = arrays.get("stamps")
         times, words, events = (arrays[name].tolist() for name in ("time", "status", "events"))
         groups: dict[str, dict[str, Tensor]] = {}
         for place, value in arrays.items():
@@ -114,9 +90,11 @@ class Trajectory:
                 info["events"] = tuple(happened)
             told = None if truth is None else Truth(**_row(truth, k))
             status = PlantStatus(words[k].decode())
-            observations.append(
-                Observation(**_row(sensors, k), time=time, status=status, info=info, truth=told)
+            taken = None if stamps is None else Stamps(*stamps[k].tolist())
+            seen = Observation(
+                **_row(sensors, k), time=time, status=status, info=info, truth=told, stamps=taken
             )
+            observations.append(seen)
         return cls(seed, commands, observations, about)
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -136,6 +114,8 @@ class Trajectory:
             ),
         }
         arrays |= {name: _stack(name, [getattr(o, name) for o in seen]) for name in _FIELDS}
+        if any(o.stamps is not None for o in seen):
+            arrays["stamps"] = np.array([o.taken for o in seen], dtype=np.float64)
         for group in ("", "truth", *_GROUPS):
             named = [o.info.get(group, {}) for o in seen]
             if group == "":
@@ -182,19 +162,3 @@ def _as_plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     raise TypeError(f"a {type(value).__name__}")
-
-
-def publish(part: Path, path: Path) -> None:
-    """Give a finished file its name, once it is safe on the disk."""
-    _sync(part)
-    os.replace(part, path)
-    _sync(path.parent)
-
-
-def _sync(path: Path) -> None:
-    """Wait until a file, or a folder's list of names, is on the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -6,16 +6,22 @@ import csv
 import io
 import os
 import re
+import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from .._files import WriterLock, make_folder, told_as_output_error, write_whole
 from .._versions import versions_of
 from ..exceptions import DescriptionError, ParameterError
-from .trajectory import Trajectory, plain, publish
+from .trajectory import Trajectory, plain
+from .trial_file import read_trial
 
+INDEX = "index.csv"
+DAMAGED = ".damaged"
 _NAME = re.compile(r"trial_(\d{6,})\.h5")
 _PACKAGES = ("torch_ekm", "torch", "numpy", "sapien", "opencv-python")
+_TOLD = ("commands", "time", "status")  # arrays that an entry is made of
 
 
 class TrialEntry(NamedTuple):
@@ -32,26 +38,17 @@ class TrialEntry(NamedTuple):
     reason: str
     """Why the trial ended: ``outcome["reason"]``, if there is one."""
 
-    @classmethod
-    def of(cls, trial: int, trajectory: Trajectory) -> TrialEntry:
-        last = trajectory.observations[-1] if trajectory.observations else None
-        return cls(
-            trial,
-            trajectory.seed,
-            len(trajectory.commands),
-            0.0 if last is None else round(last.time, 6),
-            "not grasped" if last is None else last.status.value,
-            str(trajectory.about.get("outcome", {}).get("reason", "")),
-        )
-
 
 class TrialLog:
     """One HDF5 file for each trial, ``trial_000012.h5``, and ``index.csv``.
 
     A trial's file appears whole or not at all, so a run that is killed loses the current trial and
     nothing else; started again it asks for :meth:`missing` trials and ends with the same bytes as a run
-    that was never stopped, if a trial depends on its configuration and seeds alone. The index is made
-    from the files, and made again whenever it does not list exactly those.
+    that was never stopped, if a trial depends on its configuration and seeds alone. Each file has a digest
+    of all its bytes; one that is damaged is told in a warning, renamed to ``trial_000012.h5.damaged``, and
+    missing. The index is made from the files, whatever it says.
+
+    One writer at a time: a log is locked until :meth:`close`, the end of a ``with``, or of its process.
 
     Args:
         folder: made if it is not there.
@@ -60,7 +57,9 @@ class TrialLog:
 
     Raises:
         ParameterError: the log in ``folder`` is of another configuration; the message says where.
-        DescriptionError: ``folder`` is a file, or its log is damaged.
+        DescriptionError: ``folder`` is a file.
+        FolderInUseError: somebody else writes this log; the message names the process.
+        OutputError: the folder cannot be written to.
     """
 
     def __init__(self, folder: str | Path, configuration: Mapping[str, Any]) -> None:
@@ -68,37 +67,51 @@ class TrialLog:
         self.configuration: dict[str, Any] = plain(dict(configuration))
         if self.folder.exists() and not self.folder.is_dir():
             raise DescriptionError(self.folder, "this is a file; a log is a folder")
-        self.folder.mkdir(parents=True, exist_ok=True)
-        trials = self.trials
-        if trials:
-            _compare(self.read(trials[0]).about.get("configuration", {}), self.configuration, self.folder)
-        self._index = self._reconciled(trials)
+        make_folder(self.folder)
+        self._lock: WriterLock | None = WriterLock(self.folder)
+        try:
+            self._index, self.damaged = _entries(self.folder, self.configuration)
+            with told_as_output_error(self.folder):
+                self._clear_up()
+            self._write_index()
+        except BaseException:
+            self.close()
+            raise
 
     @classmethod
     def open(cls, folder: str | Path) -> TrialLog:
-        """A log that is there already, with its own configuration.
+        """A log that is there already, with its own configuration, to be read: nothing in it is changed.
 
         Raises:
-            DescriptionError: there is none, or it is damaged.
+            DescriptionError: there is none, or none of its trials can be read.
         """
         folder = Path(folder)
         if not folder.is_dir():
             raise DescriptionError(folder, "no such log: it is a folder with files named trial_000000.h5 ...")
-        first = next(iter(_trials(folder)), None)
-        if first is None:
+        log = cls.__new__(cls)
+        log.folder, log._lock = folder, None
+        log._index, log.damaged = _entries(folder, None)
+        if not log._index and not log.damaged:
             raise DescriptionError(folder, "no log: there is no file named trial_000000.h5 or the like in it")
-        return cls(folder, Trajectory.load(_path(folder, first)).about.get("configuration", {}))
+        if not log._index:
+            raise DescriptionError(folder, f"no trial of this log can be read: {min(log.damaged.items())[1]}")
+        _, about, _ = read_trial(log.path(min(log._index)), lambda place: False)
+        log.configuration = about.get("configuration", {})
+        return log
+
+    damaged: dict[int, str]
+    """Trials whose files were damaged when the log was opened, and what is wrong with each."""
 
     @property
     def trials(self) -> tuple[int, ...]:
         """Numbers of all trials that are there, in order."""
-        return _trials(self.folder)
+        return trials_in(self.folder)
 
     @property
     def index(self) -> tuple[TrialEntry, ...]:
-        """A line for each trial, in order."""
-        if tuple(sorted(self._index)) != self.trials:  # another process wrote, too
-            self._index = self._reconciled(self.trials)
+        """A line for each trial that can be read, in order."""
+        if not {*self._index, *self.damaged} >= {*self.trials}:  # another process wrote
+            self._index, self.damaged = _entries(self.folder, None)
         return tuple(self._index[trial] for trial in sorted(self._index))
 
     def __len__(self) -> int:
@@ -113,7 +126,7 @@ class TrialLog:
 
     def path(self, trial: int) -> Path:
         """Where a trial is, or will be."""
-        return _path(self.folder, trial)
+        return trial_path(self.folder, trial)
 
     def read(self, trial: int) -> Trajectory:
         """One trial.
@@ -124,19 +137,18 @@ class TrialLog:
         if trial not in self:
             there = ", ".join(map(str, self.trials[:8])) + (", ..." if len(self) > 8 else "")
             raise DescriptionError(self.folder, f"no trial {trial}; there are {there or 'none'}")
-        try:
-            return Trajectory.load(self.path(trial))
-        except DescriptionError as error:
-            raise DescriptionError(
-                error.source, f"{error.problem}; delete the file to have the trial run again"
-            ) from None
+        return Trajectory.load(self.path(trial))
 
     def write(self, trial: int, trajectory: Trajectory, outcome: Mapping[str, Any] | None = None) -> Path:
         """Keep a finished trial; ``outcome`` says what came of it (no wall-clock times).
 
         Raises:
-            ParameterError: there is such a trial already, or ``outcome`` is nothing that JSON can hold.
+            ParameterError: there is such a trial already, ``outcome`` is nothing that JSON can hold, or the
+                log was opened to be read, or closed.
+            OutputError: the file cannot be written; the log is what it was.
         """
+        if self._lock is None:
+            raise ParameterError("log", str(self.folder), "opened with TrialLog(folder, configuration)")
         if trial < 0 or trial in self:
             raise ParameterError("trial", trial, "0 or more, and not in the log yet")
         about = {
@@ -148,64 +160,104 @@ class TrialLog:
         }
         kept = Trajectory(trajectory.seed, trajectory.commands, trajectory.observations, plain(about))
         path = kept.save(self.path(trial))
-        entry = TrialEntry.of(trial, kept)
-        last = max(self._index, default=-1)
-        self._index[trial] = entry
-        if trial < last:
-            self._index = self._reconciled(self.trials)
-        else:
-            with self._index_path.open("ab") as stream:  # at once: whole lines even from several processes
-                stream.write(_lines([entry]))
+        self._index[trial] = _entry(trial, *read_trial(path, _TOLD.__contains__))
+        self._write_index()
         return path
 
-    @property
-    def _index_path(self) -> Path:
-        return self.folder / "index.csv"
+    def close(self) -> None:
+        """Let others write; the log can still be read."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
 
-    def _reconciled(self, trials: tuple[int, ...]) -> dict[int, TrialEntry]:
-        """The index, made again unless it lists exactly these trials, in order."""
-        written = self._index_path.read_bytes() if self._index_path.exists() else b""
-        known = _parsed(written)
-        entries = [known.get(trial) or TrialEntry.of(trial, self.read(trial)) for trial in trials]
-        right = _lines([TrialEntry._fields, *entries])
-        if right != written:
-            part = self._index_path.with_suffix(".part")
-            part.write_bytes(right)
-            publish(part, self._index_path)
-        return {entry.trial: entry for entry in entries}
+    def __enter__(self) -> TrialLog:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _clear_up(self) -> None:
+        """Move damaged files aside, and remove those that were never finished."""
+        for trial, problem in self.damaged.items():
+            aside = self.path(trial).with_name(self.path(trial).name + DAMAGED)
+            os.replace(self.path(trial), aside)
+            told = f"{problem}; kept as {aside.name}, and missing from the log"
+            warnings.warn(f"{aside.with_suffix('')}: {told}", stacklevel=4)
+        for path in self.folder.glob("*.part"):
+            if path.stem == INDEX or _NAME.fullmatch(path.stem):
+                path.unlink()
+
+    def _write_index(self) -> None:
+        path, right = self.folder / INDEX, index_lines(self._index)
+        if not path.exists() or path.read_bytes() != right:
+            write_whole(path, right)
 
 
-def _path(folder: Path, trial: int) -> Path:
+def trial_path(folder: Path, trial: int) -> Path:
+    """Of a trial's file."""
     return folder / f"trial_{trial:06d}.h5"
 
 
-def _trials(folder: Path) -> tuple[int, ...]:
+def trials_in(folder: Path) -> tuple[int, ...]:
+    """Numbers of the trials that have a file, in order."""
     found = (_NAME.fullmatch(name) for name in os.listdir(folder))
     return tuple(sorted(int(match[1]) for match in found if match))
 
 
-def _lines(rows: Iterable[Iterable[object]]) -> bytes:
+def read_entry(folder: Path, trial: int) -> tuple[TrialEntry, dict[str, Any]]:
+    """A trial's line of the index and its configuration, from its file.
+
+    Raises:
+        DescriptionError: the file is damaged, or holds another trial.
+    """
+    path = trial_path(folder, trial)
+    seed, about, arrays = read_trial(path, _TOLD.__contains__)
+    if about.get("trial", trial) != trial:
+        raise DescriptionError(path, f"holds trial {about['trial']!r}")
+    configuration = about.get("configuration", {})
+    try:
+        return _entry(trial, seed, about, arrays), dict(configuration)
+    except (AttributeError, KeyError, TypeError, ValueError, UnicodeDecodeError) as error:
+        raise DescriptionError(path, f"no trial: {type(error).__name__}: {error}") from None
+
+
+def index_lines(entries: Mapping[int, TrialEntry]) -> bytes:
+    """The index as it is written."""
     text = io.StringIO()
+    rows = (TrialEntry._fields, *(entries[trial] for trial in sorted(entries)))
     csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode()
+    return text.getvalue().encode(errors="backslashreplace")  # JSON holds texts that UTF-8 does not
 
 
-def _parsed(written: bytes) -> dict[int, TrialEntry]:
-    """Lines that are whole; a run may have been killed in the middle of the last one."""
-    found = {}
-    whole = written[: written.rfind(b"\n") + 1].decode(errors="replace")
-    for row in csv.reader(io.StringIO(whole)):
-        try:
-            trial, seed, commands, time, status, reason = row
-            entry = TrialEntry(int(trial), int(seed), int(commands), float(time), status, reason)
-        except ValueError:  # the header, or a line that was never finished
-            continue
-        found[entry.trial] = entry
-    return found
+def compare(there: Mapping[str, Any], wanted: Mapping[str, Any], place: object) -> None:
+    """That a trial's configuration is the wanted one.
 
-
-def _compare(there: Mapping[str, Any], wanted: Mapping[str, Any], folder: Path) -> None:
+    Raises:
+        ParameterError: it is not; the message names the first difference.
+    """
     for name in sorted({*there, *wanted}):
         if there.get(name) != wanted.get(name):
-            valid = f"{there.get(name)!r} as in the log at {folder}, or another folder"
+            valid = f"{there.get(name)!r} as in the log at {place}, or another folder"
             raise ParameterError(f"configuration[{name!r}]", wanted.get(name), valid)
+
+
+def _entry(trial: int, seed: int, about: Mapping[str, Any], arrays: Mapping[str, Any]) -> TrialEntry:
+    times, words = arrays["time"], arrays["status"]
+    time, status = (round(float(times[-1]), 6), words[-1].decode()) if len(times) else (0.0, "not grasped")
+    reason = str(about.get("outcome", {}).get("reason", ""))
+    return TrialEntry(trial, seed, len(arrays["commands"]), time, status, reason)
+
+
+def _entries(folder: Path, wanted: Mapping[str, Any] | None) -> tuple[dict[int, TrialEntry], dict[int, str]]:
+    """What can be read, and what is wrong with the others."""
+    entries: dict[int, TrialEntry] = {}
+    damaged: dict[int, str] = {}
+    for trial in trials_in(folder):
+        try:
+            entries[trial], configuration = read_entry(folder, trial)
+        except DescriptionError as error:
+            damaged[trial] = error.problem
+            continue
+        if wanted is not None:
+            compare(configuration, wanted, folder)
+    return entries, damaged

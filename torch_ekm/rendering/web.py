@@ -10,35 +10,44 @@ from typing import Any
 import numpy as np
 
 from .._extras import require
+from .._files import write_whole
 from ..typing import Array
 from .scene import Scene, shape_mesh
+from .web_guard import HOST, WebGuard
 
 
 def save_animation(scene: Scene, path: Path) -> Path:
     """Write the frames as one stand-alone HTML page that can be turned and zoomed (viser)."""
-    server = start_server()
+    server, _ = start_server()
     try:
         serializer = server.get_scene_serializer()
         nodes = draw(server, scene)
         for frame in scene.transforms:
             place(server, nodes, frame)
             serializer.insert_sleep(0.25)  # [s] for each frame
-        path.write_text(serializer.as_html(), encoding="utf-8")
+        page = serializer.as_html()
     finally:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
+    write_whole(path, page)
     return path
 
 
-def start_server(port: int = 0) -> Any:
-    """A viser server for this machine that keeps quiet: the caller says what address is to be opened.
+def start_server(port: int = 0) -> tuple[Any, str]:
+    """A viser server for this machine, and the address to be opened: only who has it gets an answer.
+
+    Args:
+        port: the next free one is taken if it is not.
 
     Raises:
         MissingExtraError: viser is not installed.
+        ParameterError: this version of viser cannot be guarded.
     """
-    viser = require("viser")
-    with contextlib.redirect_stdout(io.StringIO()):
-        return viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
+    viser, guard = require("viser"), WebGuard()
+    with contextlib.redirect_stdout(io.StringIO()):  # the caller says what is to be opened
+        server = guard.start(lambda: viser.ViserServer(host=HOST, port=port, verbose=False))
+    server.gui.configure_theme(show_share_button=False)  # it would open the viewer to the internet
+    return server, guard.address(server.get_port())
 
 
 def draw(server: Any, scene: Scene) -> list[Any]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
+from .kernels.stationary import Matern32
 from .last_residual import LastResidual
 from .mixture import MixtureResidual
 from .sparse_gp.deep import DeepKernelSOGP
@@ -21,27 +23,35 @@ def default_learner(
     output_offset: Literal["zero", "learned"] = "zero",
     **options: Any,
 ) -> MixtureResidual:
-    """What we recommend to somebody who tells us nothing: a mixture of three, in constant memory.
+    """What we recommend to somebody who tells us nothing: a mixture of four, in constant memory.
 
-    One learner keeps the past and learns features, one lets g wander, one forgets and is told the last
-    residual; the model alone, and the last residual alone, are among the experts. Evidence decides, for each
+    Two learners keep the past and learn features, of which one distrusts large samples and one does not (rare
+    ones may be outliers, or what is worth learning); one lets g wander; one forgets and is told the last
+    residual. The model alone, and the last residual alone, are among the experts. Evidence decides, for each
     output. It predicts the *next* sample: see MixtureResidual.
 
     Args:
-        capacity: basis points of each of the three.
+        capacity: basis points of each of the four.
         output_offset: ``"learned"`` if y is no residual but has a mean of its own.
         options: see ResidualLearner.
 
     Raises:
         ParameterError: a figure is outside its range.
     """
+    d, m = in_features, out_features
     common: dict[str, Any] = {"capacity": capacity, "output_offset": output_offset, **options}
+    fleet = {name: options[name] for name in ("batch_shape", "device") if name in options}
     wanders = [RobustWeight(3.0), ProcessNoise(0.003), LearnHyperparameters()]
     forgets = [RobustWeight(3.0), DetectChanges(), ForgettingFactor(0.99), LearnHyperparameters()]
-    d, m = in_features, out_features
     members = [
-        DeepKernelSOGP(d, m, **common),
+        DeepKernelSOGP(d, m, base=_long(d, fleet), **common),
+        DeepKernelSOGP(d, m, parts=[DetectChanges()], **common),
         SparseOnlineGP(d, m, parts=wanders, **common),
-        LastResidual(SparseOnlineGP(d + m, m, parts=forgets, **common)),
+        LastResidual(SparseOnlineGP(d + m, m, kernel=_long(d + m, fleet), parts=forgets, **common)),
     ]
     return MixtureResidual(members, levels=(0.0, 0.03, 0.1, 1.0), trends=(0.0, 0.5), **options)
+
+
+def _long(d: int, fleet: dict[str, Any]) -> Matern32:
+    """A kernel that reaches twice as far as that of the others: nobody knows how smooth g is."""
+    return Matern32(d, lengthscale=2.0 * math.sqrt(d), **fleet)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
-import tempfile
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from .._files import write_whole
 from .._recorded import Recorded, check_state, make, opaque_arguments
 from ..exceptions import EKMError, FileFormatError, NoStateError
 
@@ -31,6 +32,7 @@ def write(path: str | os.PathLike, described: Mapping[str, Any], state: Mapping[
 
     Raises:
         NoStateError: an argument or an entry has no plain terms.
+        OutputError: the file cannot be written.
     """
     wrong = opaque_arguments(described)
     if wrong:
@@ -38,22 +40,14 @@ def write(path: str | os.PathLike, described: Mapping[str, Any], state: Mapping[
     tensors: dict[str, torch.Tensor] = {}
     packed = {name: _pack(value, tensors, str(described.get("class"))) for name, value in state.items()}
     header = {"format": _FORMAT, "made_with": described, "state": packed}
-    path = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-                archive.writestr(_HEADER, json.dumps(header))
-                for name, tensor in tensors.items():
-                    with archive.open(name, "w", force_zip64=True) as entry:
-                        array = np.ascontiguousarray(tensor.detach().cpu().numpy()).reshape(tensor.shape)
-                        np.lib.format.write_array(entry, array, allow_pickle=False)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    memory = io.BytesIO()
+    with zipfile.ZipFile(memory, "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr(_HEADER, json.dumps(header))
+        for name, tensor in tensors.items():
+            with archive.open(name, "w", force_zip64=True) as entry:
+                array = np.ascontiguousarray(tensor.detach().cpu().numpy()).reshape(tensor.shape)
+                np.lib.format.write_array(entry, array, allow_pickle=False)
+    write_whole(Path(path), memory.getvalue())
 
 
 def read(path: str | os.PathLike) -> tuple[dict[str, Any], dict[str, Any]]:

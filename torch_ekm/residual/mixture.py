@@ -26,6 +26,8 @@ _SLOW = 0.2  # largest rate of a level that outlives the end of a trajectory
 _YOUNG = 4  # samples that are not judged by: learners do not know their units yet
 _RMS_SHARE = 0.5, 6.0  # of the running rms, by which experts are judged; at most so many typical scales
 _RATE = 0.01  # of the running variance
+_FARTHEST = 1e6  # standard deviations
+_LEAST = -50.0  # log evidence: nobody is ruled out for good
 
 
 class MixtureResidual(ResidualLearner):
@@ -247,14 +249,17 @@ class MixtureResidual(ResidualLearner):
         share, most = _RMS_SHARE
         judged_by = typical * (share * self.inflation.sqrt() / typical).clamp(1.0, most)
         innovation = y.unsqueeze(-1) - self._means(means)
-        r = (innovation / (deviation * judged_by).unsqueeze(-1)).square()
+        scale = (deviation * typical).unsqueeze(-1)
+        far = _bounded(innovation / scale)
+        r = (far * (typical / judged_by).unsqueeze(-1)).square()
         evidence = self.memory * self.evidence - 0.5 * (_FREEDOM + 1.0) * torch.log1p(r / _FREEDOM)
-        evidence = evidence - evidence.amax(-1, keepdim=True)
-        far = (innovation / (deviation * typical).unsqueeze(-1)).square()
-        innovation = innovation / (1.0 + far / self._experts[4].square())
+        evidence = (evidence - evidence.amax(-1, keepdim=True)).clamp_min(_LEAST)
+        innovation = scale * far / (1.0 + (far / self._experts[4]).square())
         trend = _TREND_DECAY * self.trend + self._experts[3] * innovation
         level = _LEVEL_DECAY * self.level + self._experts[2] * innovation + trend
-        z = (y - mean) / deviation
+        sane = level.abs() <= _FARTHEST * scale  # else it is of a time when y was another size
+        trend, level = trend.where(sane, 0.0), level.where(sane, 0.0)
+        z = _bounded((y - mean) / deviation)
         rate = (1.0 / (self.count - _YOUNG + 2.0).clamp_min(1.0)).clamp_min(_RATE).unsqueeze(-1)
         inflation = (self.inflation + rate * (z.square() - self.inflation)).clamp_min(1e-12)
         news = {
@@ -300,6 +305,11 @@ class MixtureResidual(ResidualLearner):
         variances = torch.stack([law.variance for law in laws], dim=-1).to(x.dtype)
         mean = (self.gain * means).sum(-1) + self.offset
         return mean, (self.weights * variances).sum(-1).sqrt(), means
+
+
+def _bounded(z: Tensor) -> Tensor:
+    """Squares stay finite; what is farther off tells nothing more."""
+    return z.nan_to_num(_FARTHEST).clamp(-_FARTHEST, _FARTHEST)
 
 
 def _same_shapes(members: list[ResidualLearner]) -> ResidualLearner:

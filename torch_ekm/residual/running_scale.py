@@ -13,7 +13,11 @@ _SPIKES = (
     0.03  # below this share of what the eighth leaves in, the rest stands still and these are no outliers
 )
 _CLIP = 5.5  # of the trimmed rms, 3.3 deviations of a normal law
+_BURST_CLIP = 10.0  # times as much for columns whose large samples come in company
+_COMPANY = 0.5  # of what chance would leave alone
+_DOUBT = 2.0  # so many large ones are taken to be alone beforehand
 _REST = 0.1, 0.05  # a block that varies less than this share of all before has this weight: it stands still
+ALIEN = 1e-20  #: a variation below this share is no rest either: what was before was wrong
 
 
 class RunningScale(nn.Module):
@@ -21,11 +25,13 @@ class RunningScale(nn.Module):
 
     Of each block of samples the fourth that lies farthest from its median is cut to what a normal law like
     that of the others would hold (the eighth, where the others hardly move: these are no outliers). Mean and
-    root of the spread of what is left are pooled over the last ``memory`` samples. So outliers decide
+    root of the spread of what is left are pooled over the last ``memory`` samples. Where large samples
+    come in company, next to each other in time much more often than chance has it, they are bursts of motion
+    and ten times as much is left. So outliers decide
     nothing, a stream that starts at rest gets its units when it moves, one that comes to rest keeps them,
     and slow changes are followed. A column that has not varied keeps scale 1.
     Exempt columns are scaled by their root mean square. Nothing is squared before it is divided by the
-    largest: 1e150 is a number like others.
+    largest: 1e150 is a number like others. A past that is 1e20 times as large as what comes is forgotten.
 
     :meth:`observe` takes samples in, :meth:`settle` adopts what was found. In between ``shift`` and ``scale``
     stand still, so that what was computed with them stays valid.
@@ -55,6 +61,7 @@ class RunningScale(nn.Module):
         self.centre = nn.Buffer(torch.zeros(shape, **factory))
         self.spread = nn.Buffer(torch.zeros(shape, **factory))
         self.weight = nn.Buffer(torch.zeros(shape, **factory))
+        self.large = nn.Buffer(torch.zeros(*shape, 2, **factory))  # large samples, and those of them alone
         self.block = nn.Buffer(torch.zeros(*batch_shape, BLOCK, features, **factory))
         self.block_on = nn.Buffer(torch.zeros(*batch_shape, BLOCK, 1, **factory))
         columns = torch.tensor(shifted or [False] * features, dtype=dtype, device=device)
@@ -77,8 +84,9 @@ class RunningScale(nn.Module):
         self.block[..., place, :] = x
         self.block_on[..., place, 0] = 1.0 if on is None else on
         if place == BLOCK - 1:
-            for kept, found in zip((self.weight, self.centre, self.spread), self._pooled(), strict=True):
-                kept.copy_(found)
+            kept = self.weight, self.centre, self.spread, self.large
+            for buffer, found in zip(kept, self._pooled(), strict=True):
+                buffer.copy_(found)
 
     def settle(self, *, young: bool = False, settled: float = 0.1) -> tuple[Tensor, Tensor]:
         """Adopt what was found; returns the change as ``(offset, ratio)``: new z = (old z + offset) * ratio.
@@ -87,7 +95,7 @@ class RunningScale(nn.Module):
             young: the block that is not yet full counts, and every change is worth new units.
             settled: relative change of a scale (of a shift in units of it) that is not worth new units.
         """
-        weight, centre, spread = self._pooled() if young else (self.weight, self.centre, self.spread)
+        weight, centre, spread = self._pooled()[:3] if young else (self.weight, self.centre, self.spread)
         floor = 100 * torch.finfo(spread.dtype).eps * centre.abs()
         usable = (spread > floor) & (spread > torch.finfo(spread.dtype).tiny)
         scale = torch.where(usable, spread, 1.0)
@@ -100,24 +108,25 @@ class RunningScale(nn.Module):
         self.scale.copy_(scale)
         return offset, ratio
 
-    def _pooled(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Weight, centre and spread of the past and the block together."""
-        count, centre, spread = self._of_block()
+    def _pooled(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Weight, centre, spread and large samples of the past and the block together."""
+        count, centre, spread, large = self._of_block()
         share, drop = _REST
-        count = count * torch.where(spread < share * self.spread, drop, 1.0)
-        before = self.weight.clamp_max(self.memory)
+        past = self.spread.where((spread == 0) | (spread > ALIEN * self.spread), 0.0)
+        count = count * torch.where(spread < share * past, drop, 1.0)
+        before = self.weight.clamp_max(self.memory).where(past == self.spread, 0.0)
         weight = before + count
         part = count / weight.clamp_min(torch.finfo(count.dtype).tiny)
         gap = (centre - self.centre).where(before > 0, 0.0)
-        most = torch.stack([gap.abs(), self.spread, spread]).amax(0).clamp_min(torch.finfo(count.dtype).tiny)
+        most = torch.stack([gap.abs(), past, spread]).amax(0).clamp_min(torch.finfo(count.dtype).tiny)
         # mean of roots: a block full of outliers does not decide either
-        inside = (1.0 - part) * (self.spread / most).sqrt() + part * (spread / most).sqrt()
+        inside = (1.0 - part) * (past / most).sqrt() + part * (spread / most).sqrt()
         variance = inside.pow(4) + (1.0 - part) * part * (gap / most).square()
         start = torch.where(before > 0, self.centre, centre)
-        return weight, start + part * gap, most * variance.sqrt()
+        return weight, start + part * gap, most * variance.sqrt(), large
 
-    def _of_block(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Number of samples, centre and spread of the block without its outliers."""
+    def _of_block(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Number of samples, centre and spread of the block without its outliers; large ones up to now."""
         on = self.block_on > 0
         count = self.block_on.sum(-2)
         last = (count.to(torch.int64) - 1).clamp_min(0)
@@ -136,16 +145,29 @@ class RunningScale(nn.Module):
         )
         typical = torch.where(many > _SPIKES * few, many, few)
         bound = torch.where(typical > 0, _CLIP * typical, 1.0)
+        large, bursts = self._in_company(away.abs() > bound, count)
+        bound = bound * torch.where(bursts, _BURST_CLIP, 1.0).unsqueeze(-2)
         away = torch.minimum(torch.maximum(away, -bound), bound)
         n = count.clamp_min(1.0)
         mean = (away.sum(-2) / n) * self.shifted
         spread = ((away - mean.unsqueeze(-2)).square() * self.block_on).sum(-2) / n
         most, middle = most.squeeze(-2), middle.squeeze(-2)
-        return count.expand_as(mean), middle + most * mean, most * spread.sqrt()
+        return count.expand_as(mean), middle + most * mean, most * spread.sqrt(), large
+
+    def _in_company(self, large: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+        """Counts of large samples with those of this block, and whether they come in bursts."""
+        beside = torch.nn.functional.pad(large, (0, 0, 1, 1))
+        alone = large & ~(beside[..., :-2, :] | beside[..., 2:, :])
+        found = torch.stack([large.sum(-2), alone.sum(-2)], dim=-1).to(self.large)
+        counts = self.large * (1.0 - BLOCK / self.memory) + found
+        share = counts[..., 0] / (self.weight.clamp_max(self.memory) + count)
+        by_chance = (1.0 - share.clamp_max(1.0)).square()
+        return counts, counts[..., 1] + _DOUBT < _COMPANY * by_chance * (counts[..., 0] + _DOUBT)
 
     def reset(self) -> None:
         """Back to z = x."""
-        for buffer in (self.shift, self.centre, self.spread, self.weight, self.block, self.block_on):
+        kept = self.shift, self.centre, self.spread, self.weight, self.large, self.block, self.block_on
+        for buffer in kept:
             buffer.zero_()
         self.scale.fill_(1.0)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from .config import PlantConfig
 from .disturbances import Change, DisturbedPlant, Tug
+from .fuzzed_plant import FuzzedPlant
 from .grasp_planning.pinch import PinchPlan
 from .hall_sensors import HallQuality, HallSensors, Stuck
 from .imaging.card_scene import CardScene, ConvexBody, PlacedCard
@@ -20,6 +21,7 @@ __all__ = [
     "Change",
     "ConvexBody",
     "DisturbedPlant",
+    "FuzzedPlant",
     "GraspView",
     "HallQuality",
     "HallSensors",

@@ -96,7 +96,7 @@ class SensedPlant(PlantWrapper):
         self._view: GraspView | None = None
         self._video: SimulatedVideo | None = None
         self._frames = 0
-        self._last: tuple[Tensor, Tensor] | None = None
+        self._last: tuple[Tensor, Tensor, float] | None = None
 
     def reset(self, seed: int) -> Observation:
         """Grasp anew, and set up the camera so that it sees both boards alike.
@@ -131,7 +131,7 @@ class SensedPlant(PlantWrapper):
         track, image = self._look()
         status = seen.status
         if track.ok:
-            self._last = track.pose()
+            self._last = *track.pose(), seen.taken.pose
         elif self._last is None:
             raise ObjectLostError(
                 f"none of {self.looks} frames shows both boards ({track.status.value}): another camera "
@@ -147,9 +147,12 @@ class SensedPlant(PlantWrapper):
             q = self.joints(raw["hall"], seen.a).q
         unknown = torch.full((6, 6), torch.nan, dtype=torch.float64)
         estimate = {"pose_covariance": unknown if track.covariance is None else track.covariance}
-        position, rotation = self._last
+        position, rotation, taken = self._last
+        stamps = seen.taken._replace(pose=taken)
         info = {**seen.info, "track": track, "raw": raw, "estimate": estimate}
-        return dataclasses.replace(seen, q=q, position=position, rotation=rotation, status=status, info=info)
+        return dataclasses.replace(
+            seen, q=q, position=position, rotation=rotation, status=status, info=info, stamps=stamps
+        )
 
     def _look(self) -> tuple[Track, NDArray[np.uint8]]:
         """The first frame that shows both boards, or the last one tried; a dropped frame is black."""

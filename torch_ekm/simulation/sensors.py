@@ -55,7 +55,7 @@ class Sensors:
     def forget(self) -> None:
         """A new grasp: no old frames, no hysteresis."""
         self._frames: deque[TimedState] = deque()
-        self._seen: tuple[Array, Array] | None = None
+        self._seen: tuple[Array, Array, float] | None = None
         self._felt = np.zeros(self.n_pads)
         self._stuck_at: Array | None = None
 
@@ -76,21 +76,20 @@ class Sensors:
             self._stuck_at = reading.copy()
         return np.where(self._stuck, self._stuck_at, reading)
 
-    def pose(
-        self, position: Array, rotation: Array, generator: np.random.Generator
-    ) -> tuple[Array, Array, bool]:
-        """Estimated object pose in the hand frame [m], and whether the camera saw it this time.
+    def pose(self, picture: TimedState, generator: np.random.Generator) -> tuple[Array, Array, float, bool]:
+        """Estimated object pose in the hand frame [m], when its picture was taken [s], and whether the camera
+        saw it this time.
 
         Args:
-            position, rotation: as :meth:`pictured`.
+            picture: as :meth:`pictured`.
         """
         p = self._p
         noise, turn, luck = generator.standard_normal(3), generator.standard_normal(3), generator.random()
         if self._seen is not None and luck < p.frame_loss:  # the first frame of a grasp is waited for
-            return self._seen[0], self._seen[1], False
-        shaken = exp(torch.from_numpy(p.rotation_noise * turn)).numpy() @ rotation
-        self._seen = (position + p.position_noise * noise, shaken)
-        return self._seen[0], self._seen[1], True
+            return *self._seen, False
+        shaken = exp(torch.from_numpy(p.rotation_noise * turn)).numpy() @ picture.rotation
+        self._seen = (picture.position + p.position_noise * noise, shaken, picture.time)
+        return *self._seen, True
 
     def forces(self, normal: Array, generator: np.random.Generator) -> Array:
         """Estimated normal force of each pad ``(n_pads,)`` [N]."""

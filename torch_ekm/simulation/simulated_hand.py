@@ -12,7 +12,7 @@ import torch
 from ..description import HandDescription, ObjectDescription, load_hand, load_object
 from ..exceptions import EquilibriumError, GraspError, ParameterError
 from ..kinematics import GraspState
-from ..plant import Observation, PlantStatus, Truth
+from ..plant import Observation, PlantStatus, Stamps, Truth
 from ..typing import Array, Float, Tensor
 from .config import PlantConfig
 from .grasp_planning.pinch import PinchPlan, pinch_hint, pinch_problem, plan_pinch, turning_axis
@@ -139,7 +139,7 @@ class SimulatedHand:
         status = self.status
         joints = self._sensors.joints(q, draw)
         picture = self._sensors.pictured(TimedState(rig.time, q, position, rotation))
-        seen_position, seen_rotation, seen = self._sensors.pose(picture.position, picture.rotation, draw)
+        seen_position, seen_rotation, taken, seen = self._sensors.pose(picture, draw)
         force = self._sensors.forces(rig.normal, draw)
         if not seen and status is PlantStatus.HELD:
             status = PlantStatus.NOT_SEEN
@@ -151,6 +151,7 @@ class SimulatedHand:
             time=rig.time,
             status=status,
             truth=Truth(*_tensors(q, position, rotation, rig.normal, torque), pictured=pictured),
+            stamps=Stamps(rig.time, rig.time, taken, rig.time),
         )
 
     def close(self) -> None:

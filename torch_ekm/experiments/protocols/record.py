@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ...description import load_hand
+from ...description import file_digests, load_hand
 from ...exceptions import EKMError, ParameterError
 from ...plant import RecordingPlant, TrialLog
 from ..config import Setting
@@ -45,7 +45,10 @@ class RecordConfig:
         plant = self.setting.plant_config(self.controller)
         parameters = dataclasses.asdict(self.setting.parameters())
         gravity = plant.gravity or load_hand(self.setting.hand).gravity
-        return {"hand": self.setting.hand, "gravity": gravity, "parameters": parameters, **figures}
+        files = file_digests(self.setting.hand, [self.object])
+        return {
+            "hand": self.setting.hand, "gravity": gravity, "parameters": parameters, "files": files, **figures
+        }  # fmt: skip
 
 
 def record(
@@ -63,9 +66,18 @@ def record(
         on_trial: called with the number of each trial that is there, earlier ones too.
 
     Raises:
-        ParameterError, DescriptionError: ``folder`` has a log of another configuration, or none.
+        ParameterError, DescriptionError: ``folder`` has a log of another configuration, or is a file.
+        FolderInUseError: somebody else records there; the message names the process.
+        OutputError: the log cannot be written.
     """
-    log = TrialLog(folder, config.configuration)
+    with TrialLog(folder, config.configuration) as log:
+        _fill(log, config, seeds, on_trial)
+    return log
+
+
+def _fill(
+    log: TrialLog, config: RecordConfig, seeds: tuple[int, ...], on_trial: Callable[[int], None] | None
+) -> None:
     n = len(config.angles_deg)
     for seed in seeds:
         trials = range(seed * n, seed * n + n)
@@ -81,7 +93,6 @@ def record(
                 on_trial(trial)
         if bench is not None:
             bench.close()
-    return log
 
 
 def _turn(bench: Bench, log: TrialLog, seed: int, trial: int, angle: float) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..._extras import require
+from ..._files import make_folder, told_as_output_error
 from ...exceptions import ShapeError
 from ...typing import Array
 from .report import FigureFile
@@ -39,9 +40,12 @@ def new_figure(width: float, height: float, columns: int = 1, rows: int = 1, sha
 
 def save_figure(figure: Figure, folder: Path, name: str, caption: str = "") -> FigureFile:
     """Write ``name.svg`` and ``name.png`` into ``folder``, which is made if it is not there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    figure.savefig(folder / f"{name}.svg", metadata={"Date": None})  # the same figure gives the same file
-    figure.savefig(folder / f"{name}.png", dpi=150)
+    make_folder(folder)
+    # the same figure gives the same files: identifiers of an SVG would be drawn at random, and dated
+    steady = require("matplotlib").rc_context({"svg.hashsalt": "torch_ekm"})
+    with told_as_output_error(folder / f"{name}.svg"), steady:
+        figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+        figure.savefig(folder / f"{name}.png", dpi=150)
     return FigureFile(f"{name}.svg", caption)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..._extras import require
+from ..._files import make_folder, told_as_output_error
 from ..._versions import versions_of
 from .statistics import Estimate, Rate
 
@@ -128,8 +129,16 @@ class Report:
     configuration: dict[str, Any] = field(default_factory=dict)
 
     def write(self, folder: Path) -> Path:
-        """Write everything into ``folder`` and return the page's path."""
-        folder.mkdir(parents=True, exist_ok=True)
+        """Write everything into ``folder`` and return the page's path; equal reports give equal files.
+
+        Raises:
+            OutputError: the folder cannot be written to.
+        """
+        make_folder(folder)
+        with told_as_output_error(folder):
+            return self._write(folder)
+
+    def _write(self, folder: Path) -> Path:
         configuration = json.dumps({**self.configuration, "versions": versions()}, indent=2, sort_keys=True)
         (folder / "configuration.json").write_text(configuration + "\n", encoding="utf-8")
         for table in self.tables:

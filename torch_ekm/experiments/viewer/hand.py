@@ -14,6 +14,7 @@ from ...plant import PlantStatus
 from ...rendering.scene import Scene, make_scene
 from ...simulation import PlantConfig, SimulatedHand
 from ...typing import Array
+from .words import as_html
 
 _FRAMES = 10  # of one actuator's way through its range
 _STEP_DEG = 3.0  # most that the grasp's actuators are moved at once: the object has time to follow
@@ -99,7 +100,7 @@ class GraspShow:
             self._clicked = True
 
         gui.add_button("Grasp again").on_click(click)
-        self._note = gui.add_markdown(self._words())
+        self._note = gui.add_html(self._words())
 
     def update(self) -> Array | None:
         """Move the actuators towards the sliders; where everything is now, None if nothing has moved."""
@@ -128,7 +129,7 @@ class GraspShow:
             forces = zip(self.plant.hand.pads, force.tolist(), strict=True)
             felt = ", ".join(f"{pad.name} {force:.1f} N" for pad, force in forces if force > 0)
         status = "lost" if self._seen.status is PlantStatus.LOST else "held"
-        return f"The object is **{status}**; fingertips: {felt or 'nothing'}."
+        return as_html([f"The object is {status}; fingertips: {felt or 'nothing'}."])
 
 
 def _in_plane(normal: Array) -> Array:

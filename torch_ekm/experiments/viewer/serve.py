@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ...description import list_hands, load_hand
-from ...exceptions import DescriptionError, ParameterError, UnknownNameError
+from ...exceptions import OutputError, ParameterError, UnknownNameError
 from ...rendering import draw, place, save_animation, start_server
 from .hand import GraspShow, HandShow
 from .trial import LogShow
@@ -45,10 +45,10 @@ def save_page(show: Show, path: Path) -> Path:
     """Write a stand-alone page that any browser shows, without a network.
 
     Raises:
-        DescriptionError: ``path`` cannot be written.
+        OutputError: ``path`` cannot be written.
     """
     if path.is_dir() or not path.resolve().parent.is_dir():
-        raise DescriptionError(path, "cannot be written: name a file in a folder that is there")
+        raise OutputError(path, "there is no such folder, or a folder of this name")
     return save_animation(show.scene(), path)
 
 
@@ -60,12 +60,15 @@ def serve(
 ) -> None:
     """Serve an interactive view to this machine until ``stop()`` or an interrupt.
 
+    The server listens on 127.0.0.1 and answers who has the address with its secret, which is another one
+    each time.
+
     Args:
         port: the next free one is taken if it is not.
         on_ready: called with the address to be opened.
         stop: asked 30 times a second.
     """
-    server = start_server(port)
+    server, address = start_server(port)
     try:
         scene = show.scene()
         nodes = draw(server, scene)
@@ -73,7 +76,7 @@ def serve(
         server.gui.set_panel_label(show.title)
         show.add_controls(server.gui)
         if on_ready is not None:
-            on_ready(f"http://{server.get_host()}:{server.get_port()}")
+            on_ready(address)
         while not stop():
             moved = show.update()
             if moved is not None:

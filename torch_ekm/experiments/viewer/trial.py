@@ -16,6 +16,7 @@ from ...kinematics.se3 import log as rotation_vector
 from ...plant import Trajectory, TrialLog
 from ...rendering import Scene, make_scene
 from ...typing import Array
+from .words import as_html
 
 _FRAME_SECONDS = 0.25
 
@@ -76,7 +77,7 @@ class LogShow:
         self._choice = gui.add_dropdown("trial", names, initial_value=str(self.trial)) if names else None
         self._slider = gui.add_slider("command", min=0, max=max(1, self._last), step=1, initial_value=0)
         self._play = gui.add_checkbox("play", initial_value=True)
-        self._note = gui.add_markdown(self._words(0))
+        self._note = gui.add_html(self._words(0))
         self._due = time.monotonic()
 
     def update(self) -> Array | None:
@@ -86,7 +87,7 @@ class LogShow:
             try:
                 self.open(chosen)
             except EKMError as error:  # a damaged trial among others
-                self.trial, self._note.content = chosen, str(error)
+                self.trial, self._note.content = chosen, as_html([error])
                 return None
             self._slider.max, self._slider.value = max(1, self._last), 0
             self._frame = -1
@@ -120,7 +121,7 @@ class LogShow:
         """What is known of one moment."""
         first, seen = self.trajectory.observations[0], self.trajectory.observations[frame]
         turned = math.degrees(float(rotation_vector(seen.rotation @ first.rotation.mT).norm()))
-        lines = [f"{seen.time:.2f} s, **{seen.status.value}**, turned by {turned:.1f} deg"]
+        lines = [f"{seen.time:.2f} s, {seen.status.value}, turned by {turned:.1f} deg"]
         if seen.truth is not None:
             wrong = math.degrees(float(rotation_vector(seen.rotation @ seen.truth.rotation.mT).norm()))
             lines.append(f"measured rotation wrong by {wrong:.2f} deg")
@@ -132,4 +133,4 @@ class LogShow:
         lines += [f"event: {event}" for event in seen.info.get("events", ())]
         if frame == self._last and (reason := self.trajectory.about.get("outcome", {}).get("reason")):
             lines.append(f"ended: {reason}")
-        return "\n\n".join(lines)
+        return as_html(lines)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import copy
 import pickle
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import torch
 from torch import nn
 from torch.distributions import Normal
 
+from ..._recorded import ill_formed, in_bounds
 from ...typing import Float, Tensor
 from ..base import SingleLearner
 from ..report import UpdateReport
@@ -90,6 +92,25 @@ class GPyTorchLearner(SingleLearner):
         peer = {type(part).__name__: part.state_dict() for part in self._peer}
         return {**super().get_extra_state(), "count": self._count, **peer}
 
+    def state_problems(self, state: dict[str, Any]) -> list[str]:
+        """What GPyTorch refuses is tried on another model: it would leave this one half loaded."""
+        extra = state["_extra_state"]
+        try:
+            for part in self._build():
+                given = extra[type(part).__name__]
+                if isinstance(part, nn.Module):
+                    own = part.state_dict()
+                    wrong = ill_formed(own, given)
+                    wrong += [name for name in own if not wrong and not in_bounds(given[name], own[name])]
+                    if wrong:
+                        return wrong
+                part.load_state_dict(copy.deepcopy(given))
+                if isinstance(part, torch.optim.Optimizer) and (wrong := _optimizer_problems(part, given)):
+                    return wrong
+        except Exception as error:
+            return [f"not a state of GPyTorch's model: {type(error).__name__}: {error}"]
+        return []
+
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self._count = int(state["count"])
         self._peer = self._build()
@@ -117,3 +138,18 @@ def _rebuild(kind: type[SingleLearner], n_in: int, n_out: int, options: dict[str
     learner = kind(n_in, n_out, **options)
     learner.load_state_dict(state)
     return learner
+
+
+def _optimizer_problems(optimizer: torch.optim.Optimizer, given: Mapping[str, Any]) -> list[str]:
+    """An optimizer takes whatever it is given, and fails at its next step."""
+    if given["param_groups"] != optimizer.state_dict()["param_groups"]:
+        return ["the optimizer's options are others"]
+    parameters = [one for group in optimizer.param_groups for one in group["params"]]
+    for place, averages in given["state"].items():
+        for name, value in averages.items():
+            shape, dtype = parameters[place].shape, parameters[place].dtype
+            if name == "step":
+                shape, dtype = torch.Size(), torch.float32
+            if value.shape != shape or value.dtype != dtype or not bool(value.isfinite().all()):
+                return [f"the optimizer's {name} of parameter {place} is not a {tuple(shape)} of {dtype}"]
+    return []

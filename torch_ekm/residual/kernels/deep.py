@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import nn
+from torch._C._functorch import is_functorch_wrapped_tensor
 
 from ...exceptions import ParameterError
 from ...typing import Float, Tensor
@@ -54,6 +55,7 @@ class DeepKernel(Kernel):
         fleet, generator = like.shape[:-1], torch.Generator().manual_seed(seed)
         widths = [like.shape[-1], *check_counts("hidden", hidden), check_count("features", features)]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        self._remembered: tuple[tuple[Tensor, ...], list, Tensor] | None = None
         for layer, (n_in, n_out) in enumerate(itertools.pairwise(widths)):
             scale = (initial_scale if layer == len(widths) - 2 else 1.0) / n_in**0.5
             # every model of a fleet starts with the same weights, as a single model would
@@ -84,6 +86,21 @@ class DeepKernel(Kernel):
         w = self.base.log_lengthscale.neg().exp().unsqueeze(-2)
         return torch.cat([x * w, self.net(x)], dim=-1)
 
+    def _net_of_set(self, z: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n features"]:
+        """:meth:`net`, remembered: between two samples each query asks for the same basis."""
+        plain = not torch.compiler.is_compiling() and type(z) is Tensor and not z.is_inference()
+        if not plain or z.requires_grad or is_functorch_wrapped_tensor(z):
+            return self.net(z)
+        layers = (*self.weights, *self.biases)
+        if any(layer.requires_grad or is_functorch_wrapped_tensor(layer) for layer in layers):
+            return self.net(z)
+        tensors = (z, *layers)
+        marks = [(t._version, t.data_ptr()) for t in tensors]
+        kept = self._remembered
+        if kept is None or kept[1] != marks or any(a is not b for a, b in zip(kept[0], tensors, strict=True)):
+            self._remembered = kept = tensors, marks, self.net(z)
+        return kept[2]
+
     def forward(self, x: Tensor, z: Tensor) -> Tensor:
         a, b = self.embed(x), self.embed(z)
         centre = b[..., :1, :].detach()  # see StationaryKernel
@@ -91,7 +108,9 @@ class DeepKernel(Kernel):
         return self.base.log_variance.exp()[..., None, None] * self.base.phi(d2)
 
     def vector(self, x: Tensor, z: Tensor) -> Tensor:
-        d2 = (self.embed(z) - self.embed(x.unsqueeze(-2))).square().sum(-1)
+        w = self.base.log_lengthscale.neg().exp().unsqueeze(-2)
+        row = x.unsqueeze(-2)
+        d2 = ((z - row) * w).square().sum(-1) + (self._net_of_set(z) - self.net(row)).square().sum(-1)
         return self.base.log_variance.exp().unsqueeze(-1) * self.base.phi(d2)
 
     def diagonal(self, x: Tensor) -> Tensor:
@@ -101,7 +120,7 @@ class DeepKernel(Kernel):
         w = self.base.log_lengthscale.neg().exp().unsqueeze(-2)
         value, slope = self.net_jacobian(x)
         near = (z - x.unsqueeze(-2)) * w
-        far = self.net(z) - value.unsqueeze(-2)
+        far = self._net_of_set(z) - value.unsqueeze(-2)
         phi, psi = self.base.phi_psi(near.square().sum(-1) + far.square().sum(-1))
         v = self.base.log_variance.exp().unsqueeze(-1)
         return v * phi, (v * psi).unsqueeze(-1) * (near * w + far @ slope.mT)

@@ -12,6 +12,7 @@ import torch
 from torch._C import _len_torch_dispatch_stack
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.autograd.forward_ad import unpack_dual
+from torch.autograd.graph import increment_version
 
 from ...typing import Array, Tensor
 from ..kernels.action_linear import ActionLinearKernel
@@ -29,10 +30,10 @@ _PRUNING = {"kl": 0, "mean": 1, "freeze": 2}
 def load_kernels() -> tuple[ModuleType, ModuleType] | None:
     """The compiled loops; None where numba is missing, does not fit numpy, or cannot write its cache."""
     try:
-        from . import numba_drift, numba_kernels
+        from . import numba_checks, numba_kernels
     except (ImportError, RuntimeError):
         return None
-    return numba_kernels, numba_drift
+    return numba_kernels, numba_checks
 
 
 class Learner(Host, Protocol):
@@ -98,9 +99,11 @@ class CompiledLoops:
             told[2] = 1.0
         self._absorb(
             flags, mask, x.numpy().reshape(-1), y.numpy().reshape(-1), k, prior, *self._state, *self._hyper,
-            self._noise, *self._units, self._robust, posterior.novelty_threshold, posterior.jitter,
-            event, told, errors,
+            self._noise, *self._units, self._robust, self._levels,
+            posterior.novelty_threshold, posterior.jitter, event, told, errors,
         )  # fmt: skip
+        if self._given:  # a kernel may remember what it made of the basis
+            increment_version(posterior.basis)
         batch = self._batch
         novelty, nis, weight, variance = torch.from_numpy(told.reshape(4, *batch)).unbind()
         report = UpdateReport(torch.from_numpy(event.reshape(batch)), novelty, nis, weight)
@@ -167,17 +170,20 @@ class CompiledLoops:
         )  # fmt: skip
         own, units = _known(gp.kernel, self._batch), gp.units.affine()
         self._parameters = tuple(own[1] if own is not None else gp.kernel.parameters())
-        tensors = (*state, gp.log_noise_variance, *self._parameters, *(units or ()))
+        levels = [part.level for part in gp.weighing if type(part) is RobustWeight]
+        tensors = (*state, gp.log_noise_variance, *self._parameters, *(units or ()), *levels)
         self._sources = _sources(gp, tensors)
         on_host = all(t.is_cpu and t.is_contiguous() for t in tensors) and gp.dtype == torch.float64
         modules = load_kernels() if on_host else None
-        robust = [part.threshold for part in gp.weighing if type(part) is RobustWeight]
+        robust = [part for part in gp.weighing if type(part) is RobustWeight]
         if modules is None or len(robust) < len(gp.weighing):
             return
-        kernels, drift = modules
+        kernels, checks = modules
         self._given = own is None or units is None
         kind, n_actions = (kernels.GIVEN, 0) if self._given or own is None else own[0]
-        self._flags, self._robust = np.array([kind, n_actions, 0, 0]), np.array(robust)
+        self._flags = np.array([kind, n_actions, 0, 0])
+        self._robust = np.array([part.threshold**2 for part in robust])
+        self._levels = levels[0].numpy().reshape(n) if levels else np.empty(0)
         self._none1, self._none2, self._all = np.empty(0), np.empty((0, 0)), np.ones(n, np.bool_)
         self._state = tuple(t.numpy().reshape(n, *t.shape[len(self._batch) :]) for t in state)
         self._noise = gp.log_noise_variance.detach().numpy().reshape(n, -1)
@@ -194,8 +200,8 @@ class CompiledLoops:
                 self._units = tuple(t.numpy().reshape(n, -1) for t in units)
         self._absorb: Callable = kernels.absorb_fleet
         self._query: Callable = kernels.query_fleet
-        self._drift: Callable = drift.drift_fleet
-        self._have_squares: Callable = kernels.have_squares
+        self._drift: Callable = checks.drift_fleet
+        self._have_squares: Callable = checks.have_squares
         self._usable = True
 
 

@@ -10,15 +10,20 @@ from ..checks import check_positive
 from .part import Host, Part, Sample
 
 _Z90_SQUARED = 1.6448536269514722**2
-_RATE, _MEMORY = 1 / 8, 24  # of the alarm; samples kept, of which those since the change are replayed
+RATE = 1 / 8  #: of the shares of samples that do not fit
+_MEMORY = 24  # samples kept, of which those since the change are replayed
 _ALARM, _LARGE, _ONSET, _COOL = 0.6, 5.0, 0.12, -2.0
+DISTRUSTED, DISTRUSTED_MOST = 0.25, 0.6  #: shares of distrusted samples
 
 
 class RobustWeight(Part):
-    """Weight ``min(1, c^2/z2)`` on a sample's gain, z2 its normalised innovation squared.
+    """Weight ``w = min(1, c^2/z2)^t`` on a sample's gain, z2 its normalised innovation squared::
+
+        a += ([z2 > c^2] - a)/8,   t = 1 up to a = 0.25, 0 from a = 0.6 on
 
     After Altamirano et al., ICML 2024, centred on the prediction. The gain itself is weighted,
-    ``v/(s2 + v)``: where v is large, a larger s2 alone would let outliers in.
+    ``v/(s2 + v)``: where v is large, a larger s2 alone would let outliers in. Outliers come alone: samples
+    that are distrusted in a row are a burst of motion, or another system, and t lets them in.
 
     Args:
         threshold: c [standard deviations], 2 to 3.
@@ -31,9 +36,21 @@ class RobustWeight(Part):
         super().__init__()
         self.threshold = check_positive("threshold", threshold)
 
-    def weigh(self, nis: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """``min(1, c^2/z2)``."""
-        return (self.threshold**2 / nis).clamp_max(1.0)
+    def bind(self, learner: Host) -> None:
+        """a = 0."""
+        self.level = nn.Buffer(learner.posterior.basis.new_zeros(learner.posterior.batch_shape))
+
+    def weigh(self, nis: Tensor, mask: Tensor | None) -> Float[Tensor, "*batch"]:
+        """``min(1, c^2/z2)^t``; a takes the sample in."""
+        most = self.threshold**2
+        trust = ((DISTRUSTED_MOST - self.level) / (DISTRUSTED_MOST - DISTRUSTED)).clamp(0.0, 1.0)
+        step = RATE * ((nis > most).to(nis.dtype) - self.level)
+        self.level += step if mask is None else step * mask
+        return (most / nis).clamp_max(1.0).pow(trust)
+
+    def forget(self, models: Tensor) -> None:
+        """What was distrusted belonged to the old system."""
+        self.level.masked_fill_(models, 0.0)
 
 
 class CalibrateNoise(Part):
@@ -97,7 +114,7 @@ class DetectChanges(Part):
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Take a sample in; models that face another system start anew."""
         nis, mask = sample.report.nis, sample.mask
-        step = _RATE * ((nis > _LARGE).to(nis.dtype) - self.level)
+        step = RATE * ((nis > _LARGE).to(nis.dtype) - self.level)
         self.level += step if mask is None else step * mask
         level = self.level if mask is None else self.level.where(mask > 0, torch.inf)  # inf: no sample
         for kept, new in ((self.inputs, sample.x), (self.targets, sample.y), (self.levels, level)):

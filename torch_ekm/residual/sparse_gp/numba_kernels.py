@@ -17,6 +17,7 @@ import math
 import numpy as np
 from numba import njit, types
 
+from .monitor import DISTRUSTED, DISTRUSTED_MOST, RATE
 from .recursion import TIE, TIE_KL
 
 #: what a kernel's ``kind`` means; GIVEN: its values come with the call
@@ -172,10 +173,13 @@ def _add_and_prune(moments, vectors, s, p, work_c, work_q, gain, grow, i, w):
         vectors[r, i, :] = 0.0
 
 
-@njit(types.int64(_I1, _A1, _A1, _F, _F, _A1, _A2, _A1, _I1, _I1, _A3, _A3, _A1, _F, _F, _A1, _A1), **_COMMON)
+@njit(
+    types.int64(_I1, _A1, _A1, _F, _F, _A1, _A2, _A1, _I1, _I1, _A3, _A3, _A1, _A1, _F, _F, _A1, _A1),
+    **_COMMON,
+)
 def _absorb(
-    flags, z, t, prior, s2, k, basis, active, count, slot_, moments, vectors, robust, threshold, jitter,
-    told, error,
+    flags, z, t, prior, s2, k, basis, active, count, slot_, moments, vectors, robust, level, threshold,
+    jitter, told, error,
 ):  # fmt: skip
     """One sample of one model, see ``absorb``; returns the event."""
     M, m = k.shape[0], t.shape[0]
@@ -199,8 +203,11 @@ def _absorb(
     nis /= m * (s2 + v)
     noise, weight = s2, 1.0
     if robust.shape[0] > 0:
-        for c in robust:
-            weight *= min(c * c / nis, 1.0)
+        distrusted = 1.0 if nis > robust[0] else 0.0
+        if distrusted:
+            trust = (DISTRUSTED_MOST - level[0]) / (DISTRUSTED_MOST - DISTRUSTED)
+            weight = (robust[0] / nis) ** min(max(trust, 0.0), 1.0)
+        level[0] += RATE * (distrusted - level[0])
         noise = (s2 + v) / weight - v
     full = count[0] == capacity
     novel = gamma > threshold * prior and not (flags[PRUNING] == FREEZE and full)
@@ -274,22 +281,11 @@ def _slopes(alpha, dk, out):
                 row[j] += a * dk[i, j]
 
 
-@njit(types.boolean(_A1, _A1), **_COMMON)
-def have_squares(x, y):
-    """Whether all squares are finite. (``isfinite`` is x - x == x - x, which reassociation may call true.)"""
-    total = 0.0
-    for value in x:
-        total += value * value
-    for value in y:
-        total += value * value
-    return total < np.inf
-
-
 @njit(
     types.void(
         _I1, types.boolean[::1], _A1, _A1, _A2, _A1,
         _A3, _A2, _I1, _I1, _A4, _A4,
-        *_HYPER, _A2, *_UNITS, _A1, _F, _F, _I1, _A2, _A1,
+        *_HYPER, _A2, *_UNITS, _A1, _A1, _F, _F, _I1, _A2, _A1,
     ),
     **_COMMON,
 )  # fmt: skip
@@ -297,7 +293,7 @@ def absorb_fleet(
     flags, on, x, y, given_k, given_prior,
     basis, active, count, slot, moments, vectors,
     log_lengthscale, log_variance, log_action, log_noise, shift, scale, shift_y, scale_y,
-    robust, threshold, jitter, event, told, errors,
+    robust, levels, threshold, jitter, event, told, errors,
 ):  # fmt: skip
     """One sample per model where ``on``.
 
@@ -305,7 +301,7 @@ def absorb_fleet(
         flags: kind of kernel, width of the action, FITC, pruning.
         x, y, errors: one model's after the other's.
         given_k, given_prior: k and k** of a kernel that is not known here, in the learner's units.
-        robust: thresholds of the weights that multiply.
+        robust, levels: square of a robust weight's threshold, share of samples distrusted; or empty.
         told: novelty, nis, weight and latent variance of each model; as they are where not ``on``.
         errors: innovations.
     """
@@ -335,7 +331,7 @@ def absorb_fleet(
             )  # fmt: skip
         event[b] = _absorb(
             flags, z, t, prior, s2, k, basis[b], active[b], count[b : b + 1], slot[b : b + 1], moments[b],
-            vectors[b], robust, threshold, jitter, heard, errors[b * m : (b + 1) * m],
+            vectors[b], robust, levels[b : b + 1], threshold, jitter, heard, errors[b * m : (b + 1) * m],
         )  # fmt: skip
         told[:, b] = heard
 

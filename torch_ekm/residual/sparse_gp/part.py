@@ -131,8 +131,10 @@ class Part(Recorded, nn.Module):
     def before_update(self, learner: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
         """Take note of a sample, in its own units, before it is learned; ``mask`` as in :class:`Sample`."""
 
-    def weigh(self, nis: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Weight of a sample's gain by its normalised innovation squared."""
+    def weigh(
+        self, nis: Float[Tensor, "*batch"], mask: Float[Tensor, "*batch"] | None
+    ) -> Float[Tensor, "*batch"]:
+        """Weight of a sample's gain by its normalised innovation squared; ``mask`` as in :class:`Sample`."""
         return torch.ones_like(nis)
 
     def after_update(self, learner: Host, sample: Sample) -> bool:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from torch import nn
 
@@ -76,6 +79,18 @@ class SparsePosterior(nn.Module):
     def precision(self) -> Float[Tensor, "*batch slots slots"]:
         """Omega: how often, and with which weight, each direction of f was seen."""
         return self.moments[..., 2, :, :]
+
+    def state_problems(self, state: Mapping[str, Any]) -> list[str]:
+        """What is wrong with a state of these shapes: compiled loops write where its counts lead them."""
+        count, slot, active = (state[name] for name in ("count", "slot", "active"))
+        if bool((count > self.capacity).any() | (slot > self.capacity).any()):
+            return [f"count and slot: beyond the capacity of {self.capacity}"]
+        if bool(((count < self.capacity) & (slot != count)).any()):
+            return ["slot: not the first free one"]
+        taken = active.gather(-1, slot.unsqueeze(-1)).squeeze(-1)
+        if bool(((active != 0) & (active != 1)).any() | (active.sum(-1) != count).any() | (taken != 0).any()):
+            return ["active: not as many points as count says, or one where slot is"]
+        return []
 
     def reset(self) -> None:
         """Back to the prior, no basis."""

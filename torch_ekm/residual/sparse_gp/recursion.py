@@ -70,7 +70,7 @@ def absorb(
 
     noise = s2
     nis = innovation.square().mean(-1) / (s2 + v)
-    weight = _weight(weighing, nis)
+    weight = _weight(weighing, nis, mask)
     if weighing:
         noise = (s2 + v) / weight - v
     full = posterior.count == posterior.capacity
@@ -199,12 +199,12 @@ def _add_products(target: Tensor, left: Tensor, right: Tensor) -> None:
     flat.baddbmm_(left.reshape(-1, *left.shape[-2:]), right.reshape(-1, *right.shape[-2:]).mT)
 
 
-def _weight(weighing: Sequence[Part], nis: Tensor) -> Tensor:
+def _weight(weighing: Sequence[Part], nis: Tensor, mask: Tensor | None) -> Tensor:
     if not weighing:
         return torch.ones_like(nis)
-    weight = weighing[0].weigh(nis)
+    weight = weighing[0].weigh(nis, mask)
     for part in weighing[1:]:
-        weight = weight * part.weigh(nis)
+        weight = weight * part.weigh(nis, mask)
     return weight
 
 

@@ -161,14 +161,18 @@ class SparseOnlineGP(DoubleStateLearner):
         if self._loops is not None and (found := self._loops.query(self, x, variance=True)) is not None:
             return found[1]
         z = self.units.inputs(self._check_query(x))
-        k = self._cross(z).unsqueeze(-1)
-        v = self.kernel.diagonal(z) + (k.mT @ (self.posterior.covariance @ k)).squeeze(-1).squeeze(-1)
-        return self._out(v.clamp_min(0.0).unsqueeze(-1), 2)
+        return self._latent(z, self._cross(z))
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """N(mean, var), with the observation noise added on request."""
         found = None if self._loops is None else self._loops.query(self, x, variance=True)
-        mean, variance = (self(x), self.variance(x)) if found is None else found[:2]
+        if found is None:
+            z = self.units.inputs(self._check_query(x))
+            k = self._cross(z)
+            mean = self._out((k.unsqueeze(-2) @ self.posterior.alpha).squeeze(-2), 1)
+            variance = self._latent(z, k)
+        else:
+            mean, variance = found[:2]
         if observation:
             variance = variance + self.noise_variance.to(self.dtype)
         return Normal(mean, variance.sqrt(), validate_args=False)
@@ -365,6 +369,11 @@ class SparseOnlineGP(DoubleStateLearner):
         """``(*any, out or 1, columns)``: derivative by the last columns of x."""
         slope = self.units.slope(slope, power)
         return slope.expand(*slope.shape[:-2], self.out_features, slope.shape[-1]).to(self.dtype)
+
+    def _latent(self, z: Tensor, k: Tensor) -> Tensor:
+        k = k.unsqueeze(-1)
+        v = self.kernel.diagonal(z) + (k.mT @ (self.posterior.covariance @ k)).squeeze(-1).squeeze(-1)
+        return self._out(v.clamp_min(0.0).unsqueeze(-1), 2)
 
     def _cross(self, z: Tensor) -> Tensor:
         return self.kernel.vector(z, self.posterior.basis) * self.posterior.active

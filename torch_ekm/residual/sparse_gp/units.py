@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Literal
 
+import torch
+
 from ...exceptions import ParameterError
 from ...typing import Tensor
 from ..checks import check_count
-from ..running_scale import BLOCK, RunningScale
+from ..running_scale import ALIEN, BLOCK, RunningScale
 from .part import Host, Part, Units
 
 _DOUBLING = 1024  # samples up to which units are adopted after 1, 2, 4, 8, ... samples, too
@@ -103,6 +105,9 @@ class Standardize(Part, Units):
         posterior = learner.posterior
         offset, ratio = self.input.settle(young=young)
         offset_t, ratio_t = self.output.settle(young=young)
+        alien = (torch.cat([ratio, ratio_t], dim=-1) > 1.0 / ALIEN).any(-1)
+        if alien.is_cuda or bool(alien.any()):  # what is of another size would stay for good
+            posterior.forget(alien)
         posterior.basis.add_(offset.unsqueeze(-2)).mul_(ratio.unsqueeze(-2))
         if self.output_offset == "learned":
             posterior.information.add_(posterior.precision.sum(-1, keepdim=True) * offset_t.unsqueeze(-2))

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from ..._files import write_whole
 from ...exceptions import DescriptionError, ParameterError, ShapeError
 from ...kinematics.tensors import check_finite
 from ...typing import Bool, Float, Tensor
@@ -142,7 +143,7 @@ class HallCalibration:
         """Write the calibration as JSON; :meth:`load` gives it back to the last bit."""
         channels = [asdict(channel) for channel in self.channels]
         table = {"format": "torch_ekm.HallCalibration", "version": 1, "channels": channels}
-        Path(path).write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+        write_whole(Path(path), json.dumps(table, indent=1) + "\n")
 
     @classmethod
     def load(cls, path: str | Path) -> HallCalibration:

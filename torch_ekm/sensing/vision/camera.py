@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..._extras import require
+from ..._files import write_whole
 from ...exceptions import DescriptionError, ParameterError
 from ...typing import Array
 
@@ -79,7 +80,7 @@ class PinholeCamera:
 
     def save(self, path: str | Path) -> None:
         """Write the parameters as JSON."""
-        Path(path).write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
+        write_whole(Path(path), json.dumps(asdict(self), indent=2) + "\n")
 
     @classmethod
     def load(cls, path: str | Path) -> PinholeCamera:

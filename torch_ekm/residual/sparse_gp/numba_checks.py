@@ -1,13 +1,13 @@
-"""The drift of the caches as a compiled loop, see :mod:`~torch_ekm.residual.sparse_gp.numba_kernels`."""
+"""Checks of samples and of caches as compiled loops, see the module ``numba_kernels`` beside."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from numba import njit
+from numba import njit, types
 
-from .numba_kernels import _A2, _A3, _A4, _COMMON, _F, _HYPER, _I1, _TINY, _kernel, _times
+from .numba_kernels import _A1, _A2, _A3, _A4, _COMMON, _F, _HYPER, _I1, _TINY, _kernel, _times
 
 
 @njit(_F(_I1, _A3, _A2, _A4, _A4, *_HYPER, _A2, _F), **_COMMON)
@@ -63,3 +63,14 @@ def drift_fleet(
         if not (wrong / most <= largest and inverse <= largest):
             largest = max(wrong / most, inverse) if wrong + inverse < np.inf else np.inf
     return largest
+
+
+@njit(types.boolean(_A1, _A1), **_COMMON)
+def have_squares(x, y):
+    """Whether all squares are finite. (``isfinite`` is x - x == x - x, which reassociation may call true.)"""
+    total = 0.0
+    for value in x:
+        total += value * value
+    for value in y:
+        total += value * value
+    return total < np.inf

@@ -1,0 +1,128 @@
+"""Files of strangers: whatever their size, depth and figures, an answer within seconds, and a typed one."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from torch_ekm.description import load_hand, load_object
+from torch_ekm.exceptions import DescriptionError
+
+HAND, BOX = load_hand("planar_two_finger"), load_object("box")
+_PATIENCE = 5.0  # [s] of CPU: the machine may be busy
+
+TOML = {
+    "nested arrays": "x = " + "[" * 100_000,
+    "nested arrays on many lines": "x = " + "[\n" * 100_000,
+    "closed nested arrays": "x = " + "[\n" * 300 + "]\n" * 300,
+    "nested tables": "x = " + "{a=" * 1000 + "1" + "}" * 1000,
+    "dotted key": ".".join("a" * 100_000) + " = 1",
+    "dotted keys": "\n".join(f"b{k}." + ".".join("a" * 2000) + " = 1" for k in range(15)),
+    "dotted tables": "\n".join(f"[b{k}." + ".".join("a" * 2000) + "]" for k in range(15)),
+    "long integer": "x = " + "9" * 1_000_000,
+    "integer": "x = " + "9" * 4000,
+    "hexadecimal": "x = 0x" + "f" * 4000,
+    "float": "x = 1" + "0" * 4000 + ".0",
+    "many keys": "\n".join(f"k{i} = 1" for i in range(4000)),
+    "large": "# " + "x\n# " * 1_000_000,
+    "bytes": "\x00",
+    "not UTF-8": "\udcff",
+}
+
+
+@pytest.mark.parametrize("name", TOML)
+def test_toml(name: str, tmp_path: Path) -> None:
+    urdf, about = tmp_path / "my.urdf", tmp_path / "my.object.toml"
+    hand, transmission = tmp_path / "hand.urdf", tmp_path / "hand.transmission.toml"
+    urdf.write_bytes(BOX.urdf_path.read_bytes())
+    hand.write_bytes(HAND.urdf_path.read_bytes())
+    hostile = TOML[name].encode(errors="surrogateescape")
+    whole = BOX.urdf_path.with_suffix(".object.toml").read_bytes()
+    for content in (hostile, hostile + b"\n" + whole, whole + b"\n[notes]\n" + hostile):
+        about.write_bytes(content)
+        start, told = time.process_time(), "in notes"
+        try:
+            load_object(urdf)
+        except DescriptionError as error:
+            told = str(error)
+        assert time.process_time() - start < _PATIENCE
+        assert len(told) < 3000
+        assert told != "in notes" or name in ("float", "many keys")  # which may be any text
+    transmission.write_bytes(hostile)
+    with pytest.raises(DescriptionError):
+        load_hand(hand)
+
+
+def chain(n: int) -> str:
+    links = "".join(f'<link name="l{k}"/>' for k in range(n))
+    joint = (
+        '<joint name="j{0}" type="revolute"><parent link="l{0}"/><child link="l{1}"/>'
+        '<axis xyz="0 0 1"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint>'
+    )
+    joints = "".join(joint.format(k, k + 1) for k in range(n - 1))
+    return f'<robot name="r">{links}{joints}</robot>'
+
+
+def shaped(shape: str, n: int = 1) -> str:
+    mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"/></inertial>'
+    collision = f"<collision><geometry>{shape}</geometry></collision>"
+    return f'<robot name="r"><link name="l">{mass}{collision * n}</link></robot>'
+
+
+URDF = {
+    "10000 links": chain(10_000),
+    "400 links": chain(400),
+    "nested": "<robot>" + "<link>" * 200_000 + "</link>" * 200_000 + "</robot>",
+    "nested in a link": '<robot><link name="l">' + "<a>" * 100_000 + "</a>" * 100_000 + "</link></robot>",
+    "long number": shaped(f'<sphere radius="{"9" * 1_000_000}"/>'),
+    "number": shaped('<sphere radius="1e300"/>'),
+    "long name": shaped("<a/>").replace('name="l"', f'name="{"l" * 1_000_000}"'),
+    "many shapes": shaped('<sphere radius="0.1"/>', 5000),
+    "2000 capsules": shaped('<capsule radius="0.1" length="0.2"/>', 2000),
+    "many attributes": "<robot " + " ".join(f'a{k}="1"' for k in range(100_000)) + "/>",
+    "large": "<robot>" + " " * 5_000_000 + "</robot>",
+    "entities": '<!DOCTYPE r [<!ENTITY a "'
+    + "a" * 1000
+    + '">'
+    + "".join(f'<!ENTITY {chr(98 + k)} "{f"&{chr(97 + k)};" * 10}">' for k in range(9))
+    + ']><robot name="&j;"/>',
+    "external entity": '<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]><robot name="r">&a;</robot>',
+    "encoding": '<?xml version="1.0" encoding="nonsense"?><robot/>',
+}
+
+
+@pytest.mark.parametrize("name", URDF)
+def test_urdf(name: str, tmp_path: Path) -> None:
+    urdf = tmp_path / "my.urdf"
+    urdf.write_text(URDF[name])
+    (tmp_path / "my.object.toml").write_bytes(BOX.urdf_path.with_suffix(".object.toml").read_bytes())
+    (tmp_path / "my.transmission.toml").write_bytes(HAND.transmission_path.read_bytes())
+    start = time.process_time()
+    with pytest.raises(DescriptionError) as told:
+        load_hand(urdf)
+    assert len(str(told.value)) < 3000
+    if name != "2000 capsules":  # one body of that many shapes is an object
+        with pytest.raises(DescriptionError):
+            load_object(urdf)
+    assert time.process_time() - start < _PATIENCE
+
+
+def test_the_longest_hand_that_is_read(tmp_path: Path) -> None:
+    """As deep as a file may be: planes are checked link by link."""
+    n = 400
+    (tmp_path / "my.urdf").write_text(chain(n))
+    names = [f"j{k}" for k in range(n - 1)]
+    joints = "\n".join(f"{name} = {{ spring = 1.0 }}" for name in names)
+    text = (
+        f'[hand]\nname = "long"\nbase_link = "l0"\nplanar_normal = [0, 0, 1]\n[joints]\n{joints}\n'
+        "[[actuators]]\n"
+        'name = "a"\nrange = [0, 1]\nmoment_arms = { j0 = 1.0 }\n[[pads]]\nname = "p"\nlink = "l9"\n'
+        "start = [0, 0, 0]\nradius = 0.01\n"
+    )
+    (tmp_path / "my.transmission.toml").write_text(text)
+    start = time.process_time()
+    hand = load_hand(tmp_path / "my.urdf")
+    assert hand.n_q == n - 1
+    assert time.process_time() - start < _PATIENCE

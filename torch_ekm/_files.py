@@ -1,0 +1,121 @@
+"""Files that are whole or not there, and folders with one writer at a time."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from ._extras import require
+from .exceptions import FolderInUseError, OutputError
+
+LOCK = ".lock"
+"""Name of the file that a folder's writer holds; it stays, empty."""
+
+
+@contextlib.contextmanager
+def told_as_output_error(path: str | Path) -> Iterator[None]:
+    """What the system refuses while ``path`` is written is an OutputError."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(path, error.strerror or error) from error
+
+
+def make_folder(folder: Path) -> None:
+    """With those above it, if it is not there.
+
+    Raises:
+        OutputError: it cannot be made.
+    """
+    with told_as_output_error(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+
+
+def write_whole(path: Path, content: bytes | str) -> None:
+    """Write a file that appears whole or not at all, and is safe on the disk when this returns.
+
+    Raises:
+        OutputError: it cannot be written; the file is what it was.
+    """
+    part = path.with_name(path.name + ".part")
+    with told_as_output_error(path):
+        try:
+            with part.open("wb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(part, path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
+            raise
+        _sync(path.parent)
+
+
+def _sync(folder: Path) -> None:
+    """Wait until a folder's list of names is on the disk."""
+    if os.name == "nt":  # a folder cannot be opened there
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class WriterLock:
+    """The right to write in a folder; the system takes it back when its process ends, however it ends.
+
+    Raises:
+        FolderInUseError: somebody else has it; the message names the process.
+        OutputError: the folder cannot be written to.
+        MissingExtraError: filelock is not installed.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        filelock = require("filelock")
+        self._path = folder / LOCK
+        lock = filelock.FileLock(self._path, thread_local=False)
+        with told_as_output_error(folder):
+            try:
+                lock.acquire(blocking=False)
+            except filelock.Timeout:  # an OSError, too
+                raise FolderInUseError(folder, self._holder()) from None
+        _note(self._path, str(os.getpid()))
+        self._end = weakref.finalize(self, _release, lock, self._path)  # at the end of the process, too
+
+    @property
+    def held(self) -> bool:
+        """Not released yet."""
+        return self._end.alive
+
+    def release(self) -> None:
+        """Let others write; more than once does nothing."""
+        self._end()
+
+    def __enter__(self) -> WriterLock:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.release()
+
+    def _holder(self) -> int | None:
+        try:
+            return int(self._path.read_text(encoding="ascii"))
+        except (OSError, ValueError):
+            return None
+
+
+def _release(lock: Any, path: Path) -> None:
+    if lock.is_locked:
+        _note(path, "")  # equal runs leave equal folders
+        lock.release()
+
+
+def _note(path: Path, text: str) -> None:
+    with contextlib.suppress(OSError):  # the lock holds without: this only tells others whose it is
+        path.write_text(text, encoding="ascii")

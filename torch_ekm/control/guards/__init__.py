@@ -1,0 +1,8 @@
+"""WHAT a closed loop believes of its sensors, and where it ends rather than go on."""
+
+from __future__ import annotations
+
+from .options import Guards, Halt
+from .watch import Verdict, Watch
+
+__all__ = ["Guards", "Halt", "Verdict", "Watch"]

@@ -1,0 +1,242 @@
+"""What speaks against a reading: age, range, jumps, and its innovation against the covariance."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+
+from ...plant import Observation, PlantStatus
+from ...typing import Float, Tensor
+from ..controller import Decision, LookAndMoveController
+from ..termination import StopReason
+from .fingertips import hold
+from .options import Guards
+
+_DEG = math.pi / 180
+_NAMES = ("the encoders' reading", "the joints' reading", "the object's pose")
+_LEVER = 0.03  # [m] a rotation that is foretold wrong carries the object's point so much
+
+
+class Doubt(NamedTuple):
+    """An objection."""
+
+    reason: StopReason
+    message: str
+    blind: bool = False
+    """The pose is not known; the rest is."""
+    gated: bool = False
+    """Surprising, but possible."""
+
+
+class Doubts:
+    """Tests of readings against :class:`~torch_ekm.control.Guards`.
+
+    Args:
+        guards: limits.
+        controller: foretells motions.
+    """
+
+    def __init__(self, guards: Guards, controller: LookAndMoveController) -> None:
+        self.guards, self.controller, self.hand = guards, controller, controller.kinematic.hand
+        self._raw: Observation | None = None
+        self._path = {"joints": 0.0, "pose": 0.0}
+        self._limits = [
+            ("encoder", self.hand.actuator_names, self.hand.actuator_lower, self.hand.actuator_upper),
+            ("joint", self.hand.joint_names, self.hand.joint_lower, self.hand.joint_upper),
+        ]
+
+    def at_rest(self, seen: Observation, before: Observation | None = None) -> Doubt | None:
+        """Of a reading without a motion since ``before``."""
+        doubt = self._age(seen) or self._range(seen)
+        if before is None or doubt is not None:
+            return doubt
+        ds, still = seen.state.minus(before.state), torch.zeros_like(before.a)
+        return self._encoders(before, still, seen) or self._jump(ds, torch.zeros_like(ds), seen)
+
+    def after_motion(
+        self, before: Observation, decision: Decision, seen: Observation, blind: int
+    ) -> Doubt | None:
+        """Of a reading after a motion, the worst first; ``blind`` motions without a pose came before."""
+        doubt = self._age(seen, before) or self._range(seen) or self._encoders(before, decision.delta_a, seen)
+        doubt = self._speed(before, seen) if doubt is None else doubt
+        if doubt is not None and not doubt.blind:
+            return doubt
+        lin, moved = decision.linearization, seen.a - before.a
+        if lin is None:
+            return doubt
+        ds, foretold = seen.state.minus(before.state), self.controller.foretell(lin, moved)[0]
+        if doubt is not None:  # blind: the joints are still looked at
+            ds[-6:] = foretold[-6:]
+            return self._jump(ds, foretold, seen) or doubt
+        return self._jump(ds, foretold, seen) or self._gate(before, moved, ds, foretold, seen, blind)
+
+    def _age(self, seen: Observation, before: Observation | None = None) -> Doubt | None:
+        """Stale, repeated or missing readings."""
+        taken, repeats = seen.taken, self._repeats(seen, before)
+        if before is not None and all(self._same(seen).values()) and torch.equal(seen.a, before.a):
+            message = (
+                "encoders, joints and pose are the same bit by bit after a motion: look after the driver"
+            )
+            return Doubt(StopReason.STALE_SENSOR, message)
+        for k, sensor in enumerate(taken._fields[:3]):  # fingertips: another reading stands in
+            age, oldest = seen.time - taken[k], self.guards.max_age[k]
+            problem = ""
+            if before is not None and sensor == "pose" and seen.status is PlantStatus.NOT_SEEN:
+                message = "the camera does not find the object: clear its view, or light it"
+                return Doubt(StopReason.BLIND, message, blind=True)
+            if sensor in repeats:
+                problem = f"is the same bit by bit while the encoders moved {deg(repeats[sensor])}"
+            elif not seen.dated:
+                continue
+            elif before is not None and before.dated and taken[k] <= before.time:
+                problem = f"was read at {taken[k]:.3f} s, before the motion that began at {before.time:.3f} s"
+            elif abs(age) > oldest:
+                problem = f"is {age:.3f} s old, Guards.max_age is {oldest:g} s"
+            if problem:
+                message = f"{_NAMES[k]} {problem}: look after its driver or its time stamps"
+                return Doubt(StopReason.STALE_SENSOR, message, blind=sensor == "pose" and before is not None)
+        return None
+
+    def _repeats(self, seen: Observation, before: Observation | None) -> dict[str, float]:
+        """Sensors that stand still bit by bit, and how far the encoders went meanwhile [rad]."""
+        if before is None:
+            return {}
+        moved, same = float((seen.a - before.a).abs().max()), self._same(seen)
+        path = {sensor: way + moved for sensor, way in self._path.items() if same[sensor]}
+        return {sensor: way for sensor, way in path.items() if way > self.guards.unchanged}
+
+    def _range(self, seen: Observation) -> Doubt | None:
+        for (what, names, lower, upper), value in zip(self._limits, (seen.a, seen.q), strict=True):
+            value = value.detach().cpu().double().numpy()
+            beyond = (lower - value).clip(min=value - upper)
+            i = int(beyond.argmax())
+            if beyond[i] > self.guards.beyond:
+                message = (
+                    f"{what} '{names[i]}' reads {deg(value[i])}, its range is {deg(lower[i])} "
+                    f"to {deg(upper[i])} (Guards.beyond is {deg(self.guards.beyond)}): look after it"
+                )
+                return Doubt(StopReason.OUT_OF_RANGE, message)
+        return None
+
+    def _encoders(self, before: Observation, told: Tensor, seen: Observation) -> Doubt | None:
+        """Jumps and speeds."""
+        moved, none = seen.a - before.a, torch.zeros_like(told)
+        away = torch.maximum(torch.minimum(told, none) - moved, moved - torch.maximum(told, none))
+        i, names = int(away.argmax()), self.hand.actuator_names
+        if away[i] > self.guards.encoder_jump:
+            message = (
+                f"encoder '{names[i]}' went {deg(moved[i])} where {deg(told[i])} were commanded "
+                f"(Guards.encoder_jump is {deg(self.guards.encoder_jump)}): look after its cable and zero"
+            )
+            return Doubt(StopReason.ENCODER_JUMP, message)
+        return None
+
+    def _speed(self, before: Observation, seen: Observation) -> Doubt | None:
+        moved, names = seen.a - before.a, self.hand.actuator_names
+        seconds, i = seen.taken.encoders - before.taken.encoders, int(moved.abs().argmax())
+        if seen.dated and before.dated and moved[i].abs() > self.guards.speed * max(seconds, 0.0):
+            message = (
+                f"encoder '{names[i]}' went {deg(moved[i])} in {seconds:.3g} s (Guards.speed is "
+                f"{deg(self.guards.speed)}/s): the driver must wait for the end of a motion, and date it"
+            )
+            return Doubt(StopReason.SPEED_CEILING, message)
+        return None
+
+    def _jump(self, ds: Tensor, foretold: Tensor, seen: Observation) -> Doubt | None:
+        """What no motion does."""
+        guards, n_q = self.guards, self.hand.n_q
+        off = ds - foretold
+        i = int(off[:n_q].abs().argmax())
+        if off[i].abs() > guards.joint_jump:
+            message = (
+                f"joint '{self.hand.joint_names[i]}' turned {deg(ds[i])} where {deg(foretold[i])} "
+                f"were foretold (Guards.joint_jump is {deg(guards.joint_jump)}): look after its sensor"
+            )
+            return Doubt(StopReason.JOINT_JUMP, message)
+        way, turn = (float(torch.linalg.vector_norm(part)) for part in (off[-6:-3], off[-3:]))
+        if (way > guards.translation_jump or turn > guards.rotation_jump) and hold(seen):
+            message = (
+                f"the pose is {1e3 * way:.1f} mm and {deg(turn)} away from what was foretold, while "
+                f"the fingertips hold the object (Guards allow jumps of {1e3 * guards.translation_jump:g} mm "
+                f"and {deg(guards.rotation_jump)}): look after camera and markers"
+            )
+            return Doubt(StopReason.POSE_JUMP, message)
+        return None
+
+    def _gate(
+        self, before: Observation, moved: Tensor, ds: Tensor, foretold: Tensor, seen: Observation, blind: int
+    ) -> Doubt | None:
+        """The innovation against its covariance."""
+        sigma = self.deviation(before, moved, foretold, seen, blind)
+        z = (ds - foretold).abs() / sigma
+        i, n_q = int(z.argmax()), self.hand.n_q
+        if z[i] <= self.guards.gate:
+            return None
+        if i < n_q:
+            what, unit, name = f"joint '{self.hand.joint_names[i]}' turned", _DEG, "deg"
+        elif i < n_q + 3:
+            what, unit, name = f"the object went along {'xyz'[i - n_q]}", 1e-3, "mm"
+        else:
+            what, unit, name = f"the object turned about {'xyz'[i - n_q - 3]}", _DEG, "deg"
+        message = (
+            f"{what} {float(ds[i]) / unit:.2f} {name} where {float(foretold[i]) / unit:.2f} ± "
+            f"{float(sigma[i]) / unit:.2f} {name} were foretold (Guards.gate is {self.guards.gate:g})"
+        )
+        return Doubt(StopReason.BLIND, message, gated=True)
+
+    def deviation(
+        self, before: Observation, moved: Tensor, foretold: Tensor, seen: Observation, blind: int = 0
+    ) -> Float[Tensor, " n_s"]:
+        """sigma of each entry of an increment, see :class:`~torch_ekm.control.Guards`."""
+        guards, n_q = self.guards, self.hand.n_q
+        variance = foretold.new_zeros(foretold.shape)
+        variance[:n_q] = 2 * guards.joint_noise**2
+        for reading in (before, seen):
+            variance[n_q:] += self._stated(reading)
+        # blind motions before this one left the pose as unsure as the model is
+        share = guards.relative * (1 + blind)
+        parts = foretold[:n_q], foretold[-6:-3], foretold[-3:]
+        way, turn = torch.linalg.vector_norm(parts[1]), torch.linalg.vector_norm(parts[2])
+        along, about = way + _LEVER * turn, turn + way / _LEVER
+        size = torch.cat([parts[0].abs().amax().expand(n_q), along.expand(3), about.expand(3)])
+        variance += (share * size).square()
+        if self.controller.enhanced is not None:
+            variance += self.controller.enhanced.deviation(before.state, moved, foretold).square()
+        return variance.sqrt()
+
+    def _stated(self, reading: Observation) -> Float[Tensor, " 6"]:
+        """Variances of a pose: as stated, and no less than what the guards allow."""
+        o, R = self.guards.translation_noise**2, self.guards.rotation_noise**2
+        least = reading.q.new_tensor([o, o, o, R, R, R])
+        stated = reading.info.get("estimate", {}).get("pose_covariance")
+        if stated is None:
+            return least
+        return torch.maximum(torch.nan_to_num(stated.diagonal()), least)
+
+    def follow(self, before: Observation | None, seen: Observation) -> None:
+        """Remember a reading, and how far the encoders went since joints and pose changed."""
+        same, moved = self._same(seen), 0.0 if before is None else float((seen.a - before.a).abs().max())
+        self._path = {sensor: way + moved if same[sensor] else 0.0 for sensor, way in self._path.items()}
+        self._raw = seen
+
+    def _same(self, seen: Observation) -> dict[str, bool]:
+        """Sensors that read what they read before, bit by bit."""
+        last = self._raw
+        if last is None:
+            return {"joints": False, "pose": False}
+        stands = torch.equal(seen.position, last.position) and torch.equal(seen.rotation, last.rotation)
+        return {"joints": torch.equal(seen.q, last.q), "pose": stands}
+
+
+def deg(angle: float | Tensor) -> str:
+    """An angle [rad] as a text in degrees."""
+    return f"{float(angle) / _DEG:.3g} deg"
+
+
+def agree(one: Observation, other: Observation, guards: Guards) -> bool:
+    """Two readings of a hand at rest show the same."""
+    ds = other.state.minus(one.state)
+    noise = [guards.joint_noise] * len(one.q) + [guards.translation_noise] * 3 + [guards.rotation_noise] * 3
+    return bool((ds.abs() <= math.sqrt(2) * guards.gate * ds.new_tensor(noise)).all())

@@ -1,0 +1,147 @@
+"""Which fingertips are believed, and whether the hand presses too hard."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+
+from ...exceptions import GraspError
+from ...plant import Observation
+from ...typing import Float, Tensor
+from ..controller import Decision, LookAndMoveController
+from ..termination import StopReason
+from .options import Guards, Halt
+
+if TYPE_CHECKING:
+    from ...model import Linearization
+
+_HOLDS = 1.0  # [N] by two pads: an object is between them
+_PRESSED = 3.0  # [N] by the model: a pad that reads nothing then is dead
+_SURPRISE = 3.0  # [N] above the model: joints and springs are asked
+_JOINT_STD = 0.75  # [N] of a normal force by joints and springs alone
+_JOINT_SHARE = 0.25  # and as a share of it: springs are not as described
+
+
+class Felt(NamedTuple):
+    """What is believed of the fingertips."""
+
+    force: Float[Tensor, " n_pads"] | None
+    """[N]; 0 where a pad is not believed, and the model's estimate stands in."""
+    note: str = ""
+    halt: Halt | None = None
+
+
+def hold(seen: Observation) -> bool:
+    """The fingertips feel an object between them."""
+    return seen.fingertip_force is not None and int((seen.fingertip_force > _HOLDS).sum()) > 1
+
+
+class FingertipWatch:
+    """Dead, frozen, saturated and stale fingertips, and forces above the ceiling."""
+
+    def __init__(self, guards: Guards, controller: LookAndMoveController) -> None:
+        self.guards, self.controller = guards, controller
+        self.pads = [pad.name for pad in controller.kinematic.hand.pads]
+        self.least = controller.kinematic.options.forces.normal_std
+        self._last: Tensor | None = None
+        self._repeats = torch.zeros(len(self.pads), dtype=torch.long)
+        self._way = torch.zeros(len(self.pads), dtype=torch.float64)
+
+    def high(self, seen: Observation) -> bool:
+        """A reading above the ceiling."""
+        force = seen.fingertip_force
+        return force is not None and bool((force > self.guards.force_ceiling).any())
+
+    def before(self, decision: Decision, seen: Observation) -> Halt | None:
+        """Pads that do not measure press too hard, by the model's estimate."""
+        lin = decision.linearization
+        if lin is None or not lin.forces.solved or decision.share == 0.0:  # the way back is no new motion
+            return None
+        estimate = lin.forces.normal
+        if float(estimate.max()) <= self.guards.force_ceiling:
+            return None
+        if seen.fingertip_force is not None:
+            pads = self.controller.kinematic.hand.pad_indices(lin.contacts.finger)
+            estimate = estimate.where(seen.fingertip_force[pads] < self.least, 0.0)
+        i = int(estimate.argmax())
+        return self._too_hard(lin.contacts.finger[i], float(estimate[i]), "by the model's estimate")
+
+    def judge(self, before: Observation, decision: Decision, seen: Observation) -> Felt:
+        """What is believed after a motion."""
+        force, dated = seen.fingertip_force, seen.dated and before.dated
+        if force is None:
+            return Felt(None)
+        taken = seen.taken.fingertips
+        if dated and not (taken > before.time and abs(seen.time - taken) <= self.guards.max_age.fingertips):
+            note = f"the fingertips were read at {taken:.3f} s: the model's estimate stands in"
+            return Felt(None, note)
+        repeats = self._frozen(force, float((seen.a - before.a).abs().max()))
+        expected = self._by_model(decision)
+        faults = {i: f"reads {float(force[i]):.2f} N again and again" for i in repeats if i in expected}
+        high = [i for i in range(len(self.pads)) if i not in faults and self._surprising(i, force, expected)]
+        alone = self._by_joints(seen) if high else {}
+        for i in high:
+            other = alone.get(i)
+            if other is not None and self._contradicts(float(force[i]), other):
+                faults[i] = f"reads {float(force[i]):.2f} N where joints and springs speak for {other:.2f} N"
+            elif force[i] > self.guards.force_ceiling:
+                return Felt(force, halt=self._too_hard(self.pads[i], float(force[i]), "as measured"))
+        told = [f"fingertip '{self.pads[i]}' {problem}" for i, problem in sorted(faults.items())]
+        if len(faults) > self.guards.faulty_pads:
+            message = (
+                f"{'; '.join(told)} (Guards.faulty_pads is {self.guards.faulty_pads}): look after range and "
+                "cable of the fingertips, or of the joints' sensors if several fingertips disagree with them"
+            )
+            return Felt(force, halt=Halt(StopReason.FINGERTIP_FAULT, message))
+        told += [
+            f"fingertip '{self.pads[i]}' reads {float(force[i]):.2f} N where the model has {other:.2f} N"
+            for i, other in expected.items()
+            if other > _PRESSED and force[i] < self.least
+        ]
+        if faults:
+            force = force.clone()
+            force[list(faults)] = 0.0
+        return Felt(force, f"{'; '.join(told)}: the model's estimate stands in" if told else "")
+
+    def _frozen(self, force: Tensor, moved: float) -> list[int]:
+        """Pads that read the same again and again while the encoders move."""
+        same = (force >= self.least) & (force == (0 * force if self._last is None else self._last))
+        self._repeats = torch.where(same, self._repeats + 1, 0 * self._repeats)
+        self._way = torch.where(same, self._way + moved, 0 * self._way)
+        self._last = force
+        found = (self._repeats >= self.guards.fingertip_repeats) & (self._way > self.guards.unchanged)
+        return found.nonzero().flatten().tolist()
+
+    def _by_joints(self, seen: Observation) -> dict[int, float]:
+        """Normal force of each pad in contact by joints and springs alone [N]; empty: unknown."""
+        try:
+            return self._normal(self.controller.kinematic.linearize(seen.state))
+        except GraspError:
+            return {}
+
+    def _by_model(self, decision: Decision) -> dict[int, float]:
+        """That of the last decision, by all that is known [N]."""
+        return {} if decision.linearization is None else self._normal(decision.linearization)
+
+    def _normal(self, lin: Linearization) -> dict[int, float]:
+        pads = self.controller.kinematic.hand.pad_indices(lin.contacts.finger)
+        return dict(zip(pads, lin.forces.normal.tolist(), strict=True)) if lin.forces.solved else {}
+
+    def _surprising(self, i: int, force: Tensor, expected: dict[int, float]) -> bool:
+        """Above the ceiling, or far above what the model had before the motion."""
+        return float(force[i]) > min(self.guards.force_ceiling, expected.get(i, math.inf) + _SURPRISE)
+
+    def _contradicts(self, force: float, expected: float) -> bool:
+        variance = self.least**2 + _JOINT_STD**2 + (_JOINT_SHARE * expected) ** 2
+        return (force - expected) ** 2 > self.guards.gate**2 * variance
+
+    def _too_hard(self, pad: str, force: float, how: str) -> Halt | None:
+        if force <= self.guards.force_ceiling:
+            return None
+        message = (
+            f"fingertip '{pad}' presses with {force:.1f} N {how}, Guards.force_ceiling is "
+            f"{self.guards.force_ceiling:g} N: free the object, or lower GripForceTask.force"
+        )
+        return Halt(StopReason.FORCE_CEILING, message)

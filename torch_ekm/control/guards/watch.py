@@ -1,0 +1,153 @@
+"""Whether a reading may move the hand or teach: what :class:`Guards` say of each motion of a closed loop."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+
+from ...plant import Observation, PlantStatus
+from ..controller import Decision, LookAndMoveController
+from ..termination import StopReason
+from .doubts import Doubts, agree, deg
+from .fingertips import FingertipWatch
+from .options import Guards, Halt
+
+_DEG = math.pi / 180
+_STILL = 0.05 * _DEG  # an encoder that moves less stands
+_TOLD = 0.5 * _DEG  # a smaller command to a motor that was stuck before does not show whether it still is
+
+
+class Verdict(NamedTuple):
+    """What is believed after a motion."""
+
+    seen: Observation
+    """The reading to go on with; of a blind motion with the pose that the model foretold."""
+    teaches: bool
+    """Both ends of the motion were measured, and nothing speaks against them."""
+    halt: Halt | None = None
+    """Why the manipulation must end here."""
+    note: str = ""
+    """What a guard objects to where the loop goes on."""
+
+
+class Watch:
+    """The guards of one manipulation.
+
+    Args:
+        guards: limits.
+        controller: foretells motions.
+    """
+
+    def __init__(self, guards: Guards, controller: LookAndMoveController) -> None:
+        self.guards, self.controller, self.hand = guards, controller, controller.kinematic.hand
+        self.doubts, self.fingertips = Doubts(guards, controller), FingertipWatch(guards, controller)
+        self.blind = 0
+        """Motions in succession without a pose."""
+        self.gated = 0
+        """Motions in succession that nothing but the gate objects to."""
+        self._still = torch.zeros(self.hand.n_a, dtype=torch.long)
+
+    def first(self, seen: Observation, look: Callable[[], Observation]) -> Verdict:
+        """The reading before the first motion; further ones from ``look`` where it is in doubt."""
+        doubt = None
+        for left in range(self.guards.looks, -1, -1):
+            doubt = None if seen.status is PlantStatus.LOST else self.doubts.at_rest(seen)
+            if left == 0 or (doubt is None and seen.status is not PlantStatus.NOT_SEEN):
+                break
+            seen = look()
+        self.doubts.follow(None, seen)
+        self.blind = int(seen.status is PlantStatus.NOT_SEEN)
+        return Verdict(seen, doubt is None, None if doubt is None else Halt(doubt.reason, doubt.message))
+
+    def command(self, decision: Decision, seen: Observation) -> Halt | None:
+        """What speaks against a motion before it is made; None: nothing."""
+        size = decision.delta_a.abs()
+        i = int(size.argmax())
+        if size[i] <= self.guards.increment:
+            return self.fingertips.before(decision, seen)
+        message = (
+            f"a command of {deg(size[i])} to actuator '{self.hand.actuator_names[i]}', Guards.increment is "
+            f"{deg(self.guards.increment)}: mend the controller, or allow more"
+        )
+        return Halt(StopReason.COMMAND_CEILING, message)
+
+    def motion(
+        self,
+        before: Observation,
+        decision: Decision,
+        after: Observation,
+        look: Callable[[], Observation],
+        stuck: tuple[str, ...] = (),
+    ) -> Verdict:
+        """Judge a motion; where its reading is in doubt, ``look`` gives another.
+
+        Args:
+            stuck: actuators that the servo model calls so.
+        """
+        seen, last, doubt = after, None, None
+        for left in range(self.guards.looks, -1, -1):
+            if seen.status is PlantStatus.LOST:
+                return Verdict(seen, False)
+            doubt = self.doubts.after_motion(before, decision, seen, self.blind)
+            if left == 0 or (doubt is None and not self.fingertips.high(seen)):
+                break
+            last, seen = seen, look()
+        if doubt is not None and not (doubt.blind or doubt.gated):
+            return Verdict(seen, False, Halt(doubt.reason, doubt.message))
+        if doubt is not None and doubt.gated and (last is None or not agree(last, seen, self.guards)):
+            doubt = doubt._replace(blind=True)
+        felt = self.fingertips.judge(before, decision, seen)
+        halt = self._stuck(before, decision, seen, stuck) or felt.halt
+        self.doubts.follow(before, seen)
+        if felt.force is not seen.fingertip_force:
+            seen = dataclasses.replace(seen, fingertip_force=felt.force)
+        measured = self.blind == 0
+        if doubt is not None and doubt.blind:
+            self.blind += 1
+            seen, most = self._foretold(before, decision, seen), self.guards.blind_motions
+            if self.blind > most:
+                more = f"{doubt.message} ({self.blind} motions running, Guards.blind_motions is {most})"
+                halt = halt or Halt(doubt.reason, more)
+            return Verdict(seen, False, halt, doubt.message)
+        self.blind = 0
+        if doubt is None:
+            self.gated = 0
+            return Verdict(seen, measured and halt is None, halt, felt.note)
+        self.gated += 1  # what is seen again and again is the truth, and the model is wrong
+        again = self.gated > self.guards.blind_motions
+        return Verdict(seen, measured and again and halt is None, halt, doubt.message)
+
+    def rest(self, before: Observation, seen: Observation) -> Observation:
+        """A further reading of a hand at rest, or ``before`` where it cannot be one."""
+        if seen.status is PlantStatus.LOST:
+            return seen
+        doubtful = seen.status is PlantStatus.NOT_SEEN or self.doubts.at_rest(seen, before) is not None
+        return before if doubtful else seen
+
+    def _stuck(
+        self, before: Observation, decision: Decision, seen: Observation, stuck: tuple[str, ...]
+    ) -> Halt | None:
+        """Actuators that do not move, however they are commanded."""
+        size, still = decision.delta_a.abs(), (seen.a - before.a).abs() < _STILL
+        again = still & (size > self.guards.stuck_command)
+        self._still = torch.where(again, self._still + 1, 0 * self._still)
+        told = torch.tensor([name in stuck for name in self.hand.actuator_names])
+        found = (self._still > 1) | (told & still & (size > _TOLD))
+        if not bool(found.any()):
+            return None
+        names = ", ".join(f"'{self.hand.actuator_names[i]}'" for i in found.nonzero().flatten().tolist())
+        message = f"actuator {names} does not move however it is commanded: look after motor and tendon"
+        return Halt(StopReason.ACTUATOR_STUCK, message)
+
+    def _foretold(self, before: Observation, decision: Decision, seen: Observation) -> Observation:
+        """With the pose that the model foretells for what the encoders did."""
+        pose = before.state
+        if decision.linearization is not None:
+            pose = pose.plus(self.controller.foretell(decision.linearization, seen.a - before.a)[0])
+        return dataclasses.replace(
+            seen, position=pose.position, rotation=pose.rotation, status=PlantStatus.NOT_SEEN
+        )

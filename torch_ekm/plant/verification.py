@@ -1,0 +1,101 @@
+"""Whether a log is what was written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from ..description import file_digests
+from ..exceptions import EKMError, ParameterError
+from .trajectory import Trajectory
+from .trial_log import DAMAGED, INDEX, TrialEntry, compare, index_lines, read_entry, trial_path, trials_in
+
+
+class Finding(NamedTuple):
+    """What was found of one file."""
+
+    file: str
+    state: Literal["ok", "wrong", "left over"]
+    """"left over": of a run that was killed, or set aside because it was damaged; no part of the log."""
+    what: str
+
+
+def verify_log(folder: str | Path) -> list[Finding]:
+    """Check every byte of a log: each trial, the index, and the hand's and object's files it was made from.
+
+    A trial is right if its SHA-256 is, it can be read, it is the one that its name says, and its
+    configuration is that of the others. The digests tell of damage, not of somebody who changes a file
+    and its digest.
+
+    Returns:
+        A finding for each file; the log is right if none is "wrong".
+    """
+    folder = Path(folder)
+    trials = trials_in(folder) if folder.is_dir() else ()
+    if not trials:
+        return [
+            Finding(str(folder), "wrong", "no log: there is no file named trial_000000.h5 or the like in it")
+        ]
+    entries: dict[int, TrialEntry] = {}
+    shared: dict[str, Any] | None = None
+    found = []
+    for trial in trials:
+        path = trial_path(folder, trial)
+        try:
+            entry, configuration = read_entry(folder, trial)
+            recording = Trajectory.load(path)
+            shared = configuration if shared is None else shared
+            compare(shared, configuration, folder)
+            if len(recording.observations) not in (len(recording.commands) + 1, 0):
+                sizes = f"{len(recording.commands)} commands and {len(recording.observations)} observations"
+                raise ParameterError("recording", sizes, "one observation more than commands")
+            entries[trial] = entry
+            found.append(
+                Finding(path.name, "ok", f"{entry.commands} commands, {entry.reason or entry.status}")
+            )
+        except EKMError as error:
+            found.append(Finding(path.name, "wrong", str(error).removeprefix(f"{path}: ")))
+    found += [_index(folder, entries, len(trials)), *_sources(shared or {})]
+    for path in sorted([*folder.glob("*.part"), *folder.glob(f"*{DAMAGED}")]):
+        found.append(
+            Finding(path.name, "left over", "no part of the log; the next run clears up unfinished files")
+        )
+    return found
+
+
+def _index(folder: Path, entries: Mapping[int, TrialEntry], n_trials: int) -> Finding:
+    try:
+        written = (folder / INDEX).read_bytes()
+    except OSError:
+        return Finding(INDEX, "wrong", "missing; the next run makes it from the files")
+    right = index_lines(entries)
+    if written == right:
+        return Finding(INDEX, "ok", f"lists {len(entries)} trials")
+    listed = {line.partition(b",")[0] for line in written.splitlines()[1:]}
+    if (
+        len(entries) < n_trials
+        and {*right.splitlines()} <= {*written.splitlines()}
+        and len(listed) == n_trials
+    ):
+        return Finding(INDEX, "ok", f"lists {n_trials} trials, the damaged ones too")
+    return Finding(INDEX, "wrong", "does not say what the files say; the next run makes it from them")
+
+
+def _sources(configuration: Mapping[str, Any]) -> list[Finding]:
+    """Files of hand and object: those here beside those that the log was made from."""
+    told = configuration.get("files")
+    if not isinstance(told, dict):
+        what = "the configuration has no digests of the hand's and the object's files"
+        return [Finding("(sources)", "ok", f"{what}; nothing to compare")]
+    try:
+        here = file_digests(str(configuration.get("hand")), [str(configuration.get("object"))])
+    except EKMError as error:
+        return [Finding("(sources)", "wrong", f"not here: {error}")]
+    found = []
+    for name in sorted({*told, *here}):
+        if told.get(name) == here.get(name):
+            found.append(Finding(name, "ok", "the file here is the one that the log was made from"))
+        else:
+            found.append(Finding(name, "wrong", "the file here is not the one that the log was made from"))
+    return found
