@@ -95,6 +95,8 @@ class ClosedLoop:
         rule: when to stop.
         learn: False leaves the learner as it is.
         caution: when to look again, to go back and to give up.
+        decline: is asked before anything moves, with what is seen and the target; a text ends the
+            manipulation as out of reach (:class:`~torch_ekm.foresight.BeyondReach`). None: nothing is declined.
 
     An enhanced model with a ``servo`` commands through a :class:`~torch_ekm.plant.ServoInverse`, and
     it learns from what the encoders did. One without learns from the commands.
@@ -108,8 +110,10 @@ class ClosedLoop:
         *,
         learn: bool = True,
         caution: Caution | None = None,
+        decline: Callable[[Observation, PoseTarget], str] | None = None,
     ) -> None:
         self.plant, self.controller = plant, controller
+        self.decline = decline
         self.rule = StoppingRule() if rule is None else rule
         self.learn = learn
         self.caution = Caution() if caution is None else caution
@@ -168,6 +172,10 @@ class ClosedLoop:
         seen = self.plant.observe()
         self.controller.reset()
         turn = _Turn(target, self.controller.focus, seen, self.caution.off_rotation)
+        if self.decline is not None and seen.status is not PlantStatus.LOST:
+            against = self.decline(seen, target)
+            if against:
+                return Stop(StopReason.OUT_OF_REACH, seen, against)
         while True:
             if seen.status is PlantStatus.LOST:
                 return Stop(StopReason.OBJECT_LOST, seen)

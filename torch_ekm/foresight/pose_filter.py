@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -131,7 +131,10 @@ class PoseFilter:
         self._update(None, fingertip_force)
 
     def move(
-        self, moved: Float[Tensor, " n_a"], fingertip_force: Float[Tensor, " n_pads"] | None = None
+        self,
+        moved: Float[Tensor, " n_a"],
+        fingertip_force: Float[Tensor, " n_pads"] | None = None,
+        lin: Linearization | None = None,
     ) -> None:
         """Carry the state along with a motion. A state that the model refuses has no foretold motion, but one
         that may be as large as the actuators', as far as contacts that roll allow.
@@ -139,14 +142,18 @@ class PoseFilter:
         Args:
             moved: w [rad].
             fingertip_force: before it [N].
+            lin: the model at the state, where it is known; joints that it holds then do not move at all.
         """
-        lin = self._linearize(moved, fingertip_force)
+        held = None if lin is None else lin.held_joints
+        lin = self._linearize(moved, fingertip_force) if lin is None else lin
         ds = torch.zeros_like(self.covariance[0])
         if lin is not None:
             ds = lin.step(moved)
             if self.enhanced is not None:
                 ds = self.enhanced.linearize(self.state, moved, lin.manipulation_jacobian)[0]
         Q = self._motion_covariance(moved, ds if lin is not None else None)
+        if held is not None:
+            Q[range(len(held)), range(len(held))] *= ~held
         middle = self.state.plus(0.5 * ds)
         with contextlib.suppress(NoContactError):
             contacts = self._touching(middle, fingertip_force)
@@ -164,6 +171,16 @@ class PoseFilter:
         joints = torch.eye(len(q), len(self.covariance), dtype=q.dtype)
         variance = self.options.joint**2 * torch.eye(len(q), dtype=q.dtype)
         self._update(Measurement(joints, lambda at: q - at.q, variance), fingertip_force)
+
+    def close_gaps(self, fingertip_force: Float[Tensor, " n_pads"] | None = None) -> None:
+        """Close the gaps of pads that press."""
+        self._update(None, fingertip_force)
+
+    def hold(self, joints: Sequence[int], q: Float[Tensor, " n_joints"]) -> None:
+        """Some joints stand at known angles [rad], such as stops."""
+        H = torch.eye(len(self.covariance), dtype=self.covariance.dtype)[list(joints)]
+        exactly = 1e-12 * torch.eye(len(H), dtype=H.dtype)
+        self._update(Measurement(H, lambda at: q - at.q[..., list(joints)], exactly), None)
 
     def look(self, seen: GraspState, pose_covariance: Float[Tensor, "6 6"] | None = None) -> None:
         """What the camera says; the joints of ``seen`` are not used. See :meth:`start`."""
