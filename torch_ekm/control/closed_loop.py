@@ -95,8 +95,8 @@ class ClosedLoop:
         rule: when to stop.
         learn: False leaves the learner as it is.
         caution: when to look again, to go back and to give up.
-        decline: is asked before anything moves, with what is seen and the target; a text ends the
-            manipulation as out of reach (:class:`~torch_ekm.foresight.BeyondReach`). None: nothing is declined.
+        decline: is asked before anything moves; a text ends the manipulation as out of reach, with the object
+            in the hand (:class:`~torch_ekm.foresight.BeyondReach`). None: nothing is declined.
 
     An enhanced model with a ``servo`` commands through a :class:`~torch_ekm.plant.ServoInverse`, and
     it learns from what the encoders did. One without learns from the commands.

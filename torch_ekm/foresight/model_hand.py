@@ -81,11 +81,14 @@ class ModelHand:
         """There is nothing to give back."""
 
     def at_stops(self, push: float = 0.0) -> list[str]:
-        """Joints at a stop that bears more than ``push`` [N m]."""
+        """Joints of the fingers that touch, at a stop that bears more than ``push`` [N m]."""
         lin = self.linearization
         q, near = self.filter.state.q, self.filter.kinematic.options.stop_tolerance
         touching = (self._q_max > self._q_min) & ((q <= self._q_min + near) | (q >= self._q_max - near))
         if lin is not None:
+            kinematics = self.filter.kinematic.kinematics
+            links = [self.filter.kinematic.link_names.index(link) for link in lin.contacts.link]
+            touching &= kinematics.upstream[links].any(0)  # type: ignore[index]
             touching &= lin.forces.stop_torque.abs() >= push
         return [self.hand.joint_names[j] for j in torch.nonzero(touching).flatten().tolist()]
 
@@ -113,8 +116,12 @@ class ModelHand:
             except GraspError as error:
                 self.failure = str(error)
                 return
-        if beyond:
-            f.hold(beyond, f.state.q.clamp(self._q_min, self._q_max)[beyond])
+        stopped: set[int] = set()
+        while set(beyond) - stopped:  # one that is brought back may push another
+            stopped |= set(beyond)
+            joints = sorted(stopped)
+            f.hold(joints, f.state.q.clamp(self._q_min, self._q_max)[joints])
+            beyond = self._beyond()
         self.a = self.a + w
         self._balance({"expected": lin.forces_after(w), "previous": lin})
 

@@ -19,7 +19,7 @@ from .model_hand import ModelHand
 def own_controller(
     model: LookAndMoveController | KinematicModel | EnhancedModel, axis: Tensor | None
 ) -> LookAndMoveController:
-    """A controller apart from the given one: with its own pace, without servos, about ``axis`` if there is one.
+    """A controller apart from the given one, with its own pace and without servos.
 
     Raises:
         ParameterError: a model without an axis.
