@@ -53,13 +53,12 @@ def test_joints_keep_their_stops_and_encoders_their_ranges(grasp) -> None:
     plant, seen, controller = grasp
     model = ModelHand(controller.kinematic, seen.state, seen.a, seen.fingertip_force)
     hand, push = plant.hand, torch.zeros(plant.hand.n_a, dtype=torch.float64)
-    push[hand.actuator_names.index("thumb_distal")] = -0.6
-    push[hand.actuator_names.index("index_distal")] = 0.6
+    push[hand.actuator_names.index("thumb_proximal")] = -0.5
     assert not model.at_stops()
     seen = model.command(push)
-    assert model.at_stops()
-    assert bool((seen.q >= torch.from_numpy(hand.joint_lower) - 1e-6).all())
-    assert bool((seen.q <= torch.from_numpy(hand.joint_upper) + 1e-6).all())
+    assert "thumb_1" in model.at_stops()
+    assert bool((seen.q >= torch.from_numpy(hand.joint_lower) - 1e-4).all())
+    assert bool((seen.q <= torch.from_numpy(hand.joint_upper) + 1e-4).all())
     assert bool((seen.a >= torch.from_numpy(hand.actuator_lower)).all())
     if model.failure:
         assert seen.status is PlantStatus.LOST

@@ -127,7 +127,7 @@ class PoseFilter:
         P = seen.q.new_zeros(n_q + 6, n_q + 6)
         P[:n_q, :n_q] = self.options.joint**2 * torch.eye(n_q, dtype=P.dtype)
         P[n_q:, n_q:] = self._seen_covariance(pose_covariance, P)
-        self.state, self.covariance, self._last = seen, P, None
+        self.state, self.covariance, self._last = seen, self._permitted(P), None
         self._update(None, fingertip_force)
 
     def move(
@@ -153,7 +153,8 @@ class PoseFilter:
                 ds = self.enhanced.linearize(self.state, moved, lin.manipulation_jacobian)[0]
         Q = self._motion_covariance(moved, ds if lin is not None else None)
         if held is not None:
-            Q[range(len(held)), range(len(held))] *= ~held
+            moves = torch.cat([~held, held.new_ones(6)]).to(Q)
+            Q = Q * moves * moves[:, None]
         middle = self.state.plus(0.5 * ds)
         with contextlib.suppress(NoContactError):
             contacts = self._touching(middle, fingertip_force)
@@ -224,7 +225,13 @@ class PoseFilter:
             rows = list(range(len(ds))) if outputs is None else outputs
             stated = self.enhanced.learner.predict(self.enhanced.features(self.state, moved)).stddev
             variance[rows] += (stated / self.enhanced.output_scale).square().to(variance)
-        return torch.diag(variance)
+        return self._permitted(torch.diag(variance))
+
+    def _permitted(self, covariance: Tensor) -> Tensor:
+        """Conditioned on couplings, joints that do not move, and the plane of a planar hand:
+        ``Z (Z^T P^-1 Z)^-1 Z^T``, increments ``Z dz``."""
+        Z = self.kinematic.reduction.basis.to(covariance)
+        return Z @ torch.linalg.inv(Z.mT @ torch.linalg.solve(covariance, Z)) @ Z.mT
 
     def _touching(self, state: GraspState, fingertip_force: Tensor | None) -> ContactSet:
         """Contacts of the pads that press.
