@@ -122,7 +122,9 @@ def demo(
 
 @app.command()
 def reproduce(
-    experiment: Annotated[str, Argument(help="online, generalize, ablation, adapt or foresight.")] = "generalize",
+    experiment: Annotated[
+        str, Argument(help="online, generalize, ablation, adapt or foresight.")
+    ] = "generalize",
     seeds: Annotated[str, Option(help="FIRST:END; each seed is an independent run.")] = "1000:1020",
     jobs: Jobs = 2,
     out: Annotated[Path | None, Option(help="Folder for the report [reproduce_<experiment>].")] = None,

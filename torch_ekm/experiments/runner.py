@@ -14,7 +14,7 @@ from ..control import ClosedLoop, LookAndMoveController, Manipulation, PoseTarge
 from ..description import ObjectDescription
 from ..enhanced import EnhancedModel, GraspEncoding, grasp_learner
 from ..exceptions import EquilibriumError, GraspError
-from ..foresight import BlindPose
+from ..foresight import BlindPose, Reach, reachable
 from ..kinematics import GraspState, ServoModel
 from ..model import KinematicModel
 from ..plant import FramesAtRest, Plant, ServoInverse
@@ -155,6 +155,18 @@ class Bench:
         loop = self._loop(plant, self._controller(axis, {}), self.setting.stopping_rule(), learn)
         self.last = loop.run(target)
         return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
+
+    def reach(self, angle_deg: float) -> Reach | None:
+        """How far the model says that the grasp turns, up to ``angle_deg``; None: it refuses the grasp."""
+        axis = self.hand.rotation_axis
+        options = {"caution": None, "rule": self.setting.stopping_rule()}
+        sign, limit = (1 if angle_deg > 0 else -1), abs(angle_deg) * _DEG
+        try:
+            return reachable(
+                self._controller(axis, {}), self.plant.observe(), sign=sign, limit=limit, **options
+            )
+        except GraspError:
+            return None
 
     def long_step(self, seed: int, trial: int, step_deg: float) -> Record:
         """One motion of ``step_deg`` from a fresh grasp: how far from it does the object come to rest?

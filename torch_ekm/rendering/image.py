@@ -41,13 +41,16 @@ class Picture:
         self._plotter: Any = pyvista.Plotter(
             off_screen=True, shape=(1, n), border=False, window_size=(n * size[0], size[1])
         )
-        meshes = [(pyvista.wrap(shape_mesh(shape)), colour) for shape, colour in scene.shapes]
+        meshes = [
+            (pyvista.wrap(shape_mesh(shape)), colour, scene.opacity(i))
+            for i, (shape, colour) in enumerate(scene.shapes)
+        ]
         look = {"smooth_shading": True, "split_sharp_edges": True, "specular": 0.3, "specular_power": 15}
         self._actors = []
         for k in range(n):
             self._plotter.subplot(0, k)
             self._plotter.set_background("white")
-            self._actors.append([self._plotter.add_mesh(mesh, color=c, **look) for mesh, c in meshes])
+            self._actors.append([self._plotter.add_mesh(m, color=c, opacity=o, **look) for m, c, o in meshes])
             if smooth:
                 self._plotter.enable_anti_aliasing("ssaa")
 

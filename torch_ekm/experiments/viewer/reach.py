@@ -51,7 +51,9 @@ class ReachShow:
     def add_controls(self, gui: Any) -> None:
         """A slider for the angle [deg], and what ends the turn."""
         low, high = float(self.angles_deg[0]), float(self.angles_deg[-1])
-        self._slider = gui.add_slider("angle [deg]", min=low, max=max(high, low + 1), step=0.5, initial_value=0.0)
+        self._slider = gui.add_slider(
+            "angle [deg]", min=low, max=max(high, low + 1), step=0.5, initial_value=0.0
+        )
         gui.add_markdown("\n\n".join(f"**{angle} deg**: {end}" for _, angle, end in self.rows()))
 
     def update(self) -> Array | None:
@@ -64,5 +66,8 @@ class ReachShow:
 
     def _scene(self, states: list[GraspState]) -> Scene:
         plant = self._grasp.plant
-        parts = (np.stack([getattr(s, name).numpy() for s in states]) for name in ("q", "position", "rotation"))
-        return make_scene(plant.hand, plant.object, *parts, np.array(plant.gravity))
+        q, position, rotation = (
+            np.stack([getattr(state, name).numpy() for state in states])
+            for name in ("q", "position", "rotation")
+        )
+        return make_scene(plant.hand, plant.object, q, position, rotation, np.array(plant.gravity))
