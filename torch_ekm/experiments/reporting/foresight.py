@@ -197,8 +197,8 @@ def beyond_table(results: Results) -> Table:
         Column("lost, not declined"): lambda mine: sum(r.lost for r in mine if not declined(r)),
     }
     note = (
-        f"Declined: more than {BEYOND_DEG:g} deg beyond the foretold reach. These turns were made all the same, "
-        "to see what declining them would have spared."
+        f"Declined: more than {BEYOND_DEG:g} deg beyond the foretold reach. These turns were made all the "
+        "same, to see what declining them would have spared."
     )
     items = {name: mine for name, mine in items.items() if mine}
     return Table.of("beyond", "Beyond Table I", "contender", items, columns, note)
