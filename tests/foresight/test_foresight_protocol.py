@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -75,11 +76,9 @@ def test_what_is_made_of_the_figures() -> None:
 
 
 def test_impossible_protocols_are_refused() -> None:
-    for wrong in (
-        {"objects": ()},
-        {"contenders": ("PID",)},
-        {"look_again_deg": 0.0},
-        {"blind_angle_deg": math.inf},
-    ):
+    impossible: list[dict[str, Any]] = [
+        {"objects": ()}, {"contenders": ("PID",)}, {"look_again_deg": 0.0}, {"blind_angle_deg": math.inf},
+    ]  # fmt: skip
+    for wrong in impossible:
         with pytest.raises(ParameterError):
             Foresight(**wrong)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 
 
 class Task(Protocol):
-    """A wish. One of your own needs no more than this method."""
+    """A wish. One of your own needs no more than this method.
+
+    A wish about a motion itself, and not about where it leads, has ``per_motion = True``: a plan of several
+    motions (:mod:`torch_ekm.foresight`) counts it motion by motion.
+    """
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Squares | Quadratic | Equality | None:
         """Rows in ``u = da`` [rad]; None: nothing is wished here."""
@@ -116,6 +120,8 @@ class GripForceTask:
 class EffortTask:
     """``w |u|^2``: of the steps that do as well, the smallest. It makes the best step unique."""
 
+    per_motion: ClassVar[bool] = True
+
     weight: float = 1e-2
     """w, per deg^2 of an actuator."""
 
@@ -131,6 +137,8 @@ class UncertaintyTask:
     Convex and exact with an action-linear kernel, ``u^T V(s) u`` for each output; for other learners gradient
     and the positive semidefinite part of the curvature. A kinematic model alone is never unsure.
     """
+
+    per_motion: ClassVar[bool] = True
 
     weight: float = 1.0
     """w, per deg^2 of the focused rotation, per mm^2 of a focused translation."""

@@ -255,6 +255,21 @@ class EnhancedModel(Recorded, nn.Module):
             return nominal, finite_differences(self.nominal, state, action)
         return nominal, checked_jacobian(self.jacobian(state, action), nominal, action)
 
+    def correction(
+        self, state: Any, action: Float[Tensor, "*batch n_a"], n_s: int
+    ) -> tuple[Float[Tensor, "*batch n_s"], Float[Tensor, "*batch n_s"]]:
+        """``g(s, da)`` and its variance, in the increment's unit and its square; 0 of what is not learned.
+
+        f is not evaluated.
+
+        Args:
+            n_s: entries of an increment.
+        """
+        g = self.learner.predict(self.features(state, action))
+        still = action.new_zeros(*action.shape[:-1], n_s)
+        mean, variance = g.mean / self.output_scale, g.variance / self.output_scale**2
+        return self._scatter(mean, still), self._scatter(variance, still)
+
     def predict(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> torch.distributions.Normal:
         """Distribution of the learned outputs' increment, in the increment's unit."""
         nominal = self._gather(self.nominal(state, action))

@@ -14,7 +14,7 @@ from ..control import ClosedLoop, LookAndMoveController, Manipulation, PoseTarge
 from ..description import ObjectDescription
 from ..enhanced import EnhancedModel, GraspEncoding, grasp_learner
 from ..exceptions import EquilibriumError, GraspError
-from ..foresight import BlindPose, Reach, reachable
+from ..foresight import BlindPose, HorizonController, Reach, reachable
 from ..kinematics import GraspState, ServoModel
 from ..model import KinematicModel
 from ..plant import FramesAtRest, Plant, ServoInverse
@@ -202,7 +202,10 @@ class Bench:
 
     def _controller(self, axis: torch.Tensor, changes: Mapping[str, Any]) -> LookAndMoveController:
         setting = self.setting.replace(control={**self.setting.control, **changes})
-        return LookAndMoveController(self._predictor, axis, **setting.controller_parts())
+        parts = setting.controller_parts()
+        if setting.horizon > 1:
+            return HorizonController(self._predictor, axis, horizon=setting.horizon, **parts)
+        return LookAndMoveController(self._predictor, axis, **parts)
 
     def _loop(
         self, plant: Plant, controller: LookAndMoveController, rule: StoppingRule, learn: bool

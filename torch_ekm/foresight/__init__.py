@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from .blind_pose import BlindPose
+from .horizon_controller import HorizonController
 from .model_hand import ModelHand
 from .pose_filter import BlindOptions, PoseFilter
+from .prediction import Prediction
 from .reach import BeyondReach, Reach, ReachEnd, reachable
+from .rollout import Rollout
 
 __all__ = [
     "BeyondReach",
     "BlindOptions",
     "BlindPose",
+    "HorizonController",
     "ModelHand",
     "PoseFilter",
+    "Prediction",
     "Reach",
     "ReachEnd",
+    "Rollout",
     "reachable",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 
 import torch
@@ -171,6 +172,7 @@ class KinematicModel(nn.Module):
         expected: ExpectedForces | None = None,
         previous: Linearization | None = None,
         locked: Sequence[str] = (),
+        on_unstable: str | None = None,
     ) -> Linearization:
         """Contacts, forces, ``J_m``, the force sensitivities and what speaks against them, at a state.
 
@@ -193,6 +195,7 @@ class KinematicModel(nn.Module):
                 no answer, its forces stand in, if the same fingers touch. A pad that touched then and is
                 left out now is a doubt.
             locked: joints that stick, by name.
+            on_unstable: in place of the option of this name.
 
         Raises:
             NoContactError: nothing touches the object.
@@ -227,6 +230,8 @@ class KinematicModel(nn.Module):
             )
 
         o = self.options
+        if on_unstable is not None and on_unstable != o.on_unstable:
+            o = dataclasses.replace(o, on_unstable=on_unstable)
         D = geometric_stiffness(
             kin,
             forces.force,
@@ -243,7 +248,9 @@ class KinematicModel(nn.Module):
 
         held = self.balance.held_by_stops(state.q, forces.stop_torque)
         held[..., lock] = True
-        J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held, self.balance.slack(forces))
+        J, dmu, dlam, stability = self.reduction.solve(
+            D, A, kin.rows, held, self.balance.slack(forces), o.on_unstable
+        )
         df, dn = force_change(kin, dmu), normal_motion(kin, J)
         normal = normal_sensitivity(kin, forces, df, dn)
         return Linearization(

@@ -79,6 +79,7 @@ class Reduction(nn.Module):
         rows: list[int],
         held: Bool[Tensor, "*batch n_q"],
         slack: Bool[Tensor, "*batch n_a"],
+        on_unstable: str | None = None,
     ) -> GraspResponse:
         """J_m, dmu/da and dlam/da in full coordinates; states that differ in what is held are grouped.
 
@@ -93,25 +94,29 @@ class Reduction(nn.Module):
             rows: which of the 6 n_c contact components are the rows of A.
             held: joints that do not move.
             slack: tendons that pull nothing.
+            on_unstable: in place of the option of this name.
         """
+        flag = self.options.on_unstable if on_unstable is None else on_unstable
         if held.dim() == 1:
-            return self._solve(D, A, rows, held, slack)
+            return self._solve(D, A, rows, held, slack, flag)
         n_q = held.shape[-1]
         pattern = torch.cat([held, slack], dim=-1).reshape(-1, n_q + slack.shape[-1])
         if len(pattern) == 1 or bool((pattern == pattern[0]).all()):
-            return self._solve(D, A, rows, pattern[0, :n_q], pattern[0, n_q:])
+            return self._solve(D, A, rows, pattern[0, :n_q], pattern[0, n_q:], flag)
         batch = held.shape[:-1]
         flat_D, flat_A = D.reshape(-1, *D.shape[-2:]), A.reshape(-1, *A.shape[-2:])
         parts: list[Tensor] = []
         for unique in torch.unique(pattern, dim=0):
             at = (pattern == unique).all(-1)
-            group = self._solve(flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:])
+            group = self._solve(flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], flag)
             parts = parts or [part.new_empty(len(pattern), *part.shape[1:]) for part in group]
             for whole, part in zip(parts, group, strict=True):
                 whole[at] = part
         return GraspResponse(*(part.reshape(*batch, *part.shape[1:]) for part in parts))
 
-    def _solve(self, D: Tensor, A: Tensor, rows: list[int], held: Tensor, slack: Tensor) -> GraspResponse:
+    def _solve(
+        self, D: Tensor, A: Tensor, rows: list[int], held: Tensor, slack: Tensor, on_unstable: str
+    ) -> GraspResponse:
         n_q, n_a, n_h, L = self.joint_basis.shape[0], self.actuation.shape[0], len(rows), self.options.length
         S = self.scaled_basis
         D = _left(S, D @ S)
@@ -145,7 +150,7 @@ class Reduction(nn.Module):
         R = D.new_zeros(E.shape[-2], n_a)
         R[n_h : n_h + len(rigid)] = eye[rigid] / arm
         try:
-            step = two_stage(D, E, R, F, on_unstable=self.options.on_unstable, actuators=self.actuators)
+            step = two_stage(D, E, R, F, on_unstable=on_unstable, actuators=self.actuators)
         except (SingularGraspError, UnstableGraspError) as error:
             if error.direction is not None:  # into state coordinates
                 direction = S @ error.direction[:n_z]

@@ -128,10 +128,10 @@ def _of_torque(joint_names: Sequence[str], forces: GraspForces, options: ModelOp
 
 
 def _of_friction(contacts: ContactSet, forces: GraspForces) -> list[Doubt]:
-    if float(forces.relative_margin.min()) > AT_LIMIT:
+    least = forces.relative_margin.detach().reshape(-1, contacts.n_c).amin(0)
+    if float(least.min()) > AT_LIMIT:
         return []
-    least = forces.relative_margin.reshape(-1, contacts.n_c).amin(0)
-    margin = forces.margin.reshape(-1, contacts.n_c).amin(0)
+    margin = forces.margin.detach().reshape(-1, contacts.n_c).amin(0)
     doubts = []
     for i, pad in enumerate(contacts.finger):
         if float(least[i]) <= AT_LIMIT and float(contacts.friction[i]) > 0:
@@ -151,7 +151,7 @@ def _of_sensors(
     for i, pad in enumerate(contacts.finger):
         if pad not in measured:
             continue
-        miss = (measured[pad] - forces.normal[..., i]).abs().nan_to_num(0.0)
+        miss = (measured[pad] - forces.normal[..., i]).detach().abs().nan_to_num(0.0)
         value = float(miss.max())
         if value > limit:
             message = (

@@ -1,0 +1,208 @@
+"""Look-and-move with foresight: the whole turn is planned, its first motion made, the rest planned anew."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from ..control import (
+    ControlProblem,
+    ControlSolution,
+    Limit,
+    LimitingFunction,
+    LookAndMoveController,
+    Situation,
+    StepBound,
+    Task,
+)
+from ..control.limiting import contact_travel
+from ..control.qp import DEGREE, as_array
+from ..exceptions import GraspError, ParameterError
+from ..typing import Float, Tensor
+from .configuration import Configuration, settled, stack
+from .limits import SlipLimit
+from .path import Path, PathModel, Rates, continued
+from .plan_problem import MotionRows, nearer_goal, plan_problem
+from .plan_rows import PlanRows, error_of, situation
+
+if TYPE_CHECKING:
+    from ..control import Decision, FocusedPose, PoseTarget
+    from ..enhanced import EnhancedModel
+    from ..kinematics import GraspState
+    from ..model import KinematicModel, Linearization
+
+_PACE = 1e4
+"""Penalty of a motion that is longer than the pace allows, per degree: above that of the goal."""
+
+
+_SHORT = 0.05 * DEGREE
+"""A goal that a program misses by more is brought nearer [unit of the focus]."""
+_REACH = 8.0
+"""How far an iteration may bring an actuator from where the last path has it [deg]."""
+
+
+class HorizonController(LookAndMoveController):
+    """Plans w_0 .. w_{K-1} and commands w_0.
+
+    ```
+    min  sum_k sum of the tasks' squares at motion k  +  rho |sl|_1
+    s.t. z_{k+1} = z_k (+) (dz/da)(z_k) w_k            state, contacts and forces, see Rollout
+         M_c e(z_K) + sl = 0                            the goal stands at the end
+         |M_c E_p ds_k| <= pace step_k                  no motion is longer than the limiting function allows
+         the limits, at every motion
+    ```
+
+    Args:
+        horizon: motions that are foreseen at most. Fewer where the goal is nearer; where one is enough, it is
+            the look-and-move controller's.
+        along: limits on the way, beside those of every step.
+
+    The others are those of :class:`LookAndMoveController`.
+    """
+
+    def __init__(
+        self,
+        model: KinematicModel | EnhancedModel,
+        focus: FocusedPose | Float[Tensor, 3],
+        tasks: Sequence[Task] | None = None,
+        limits: Sequence[Limit] | None = None,
+        limiting: LimitingFunction | None = None,
+        *,
+        horizon: int = 12,
+        along: Sequence[Limit] = (SlipLimit(),),
+        sqp_iterations: int = 3,
+        sqp_damping: float = 0.6,
+        sqp_tolerance: float = 0.1 * DEGREE,
+        bound: StepBound | None = None,
+        solver: str = "piqp",
+    ) -> None:
+        super().__init__(
+            model, focus, tasks, limits, limiting, sqp_iterations=sqp_iterations, sqp_damping=sqp_damping,
+            sqp_tolerance=sqp_tolerance, bound=bound, solver=solver,
+        )  # fmt: skip
+        if not horizon >= 1:
+            raise ParameterError("horizon", horizon, "at least one motion")
+        self.horizon, self.along = horizon, tuple(along)
+        self.paths = PathModel(self.kinematic, self.enhanced)
+        self.plan: Path | None = None
+        """The last decision's; None: there was none, or the grasp could not be foreseen."""
+        self._before: tuple[Rates, Tensor] | None = None  # of the decision before
+        self._now: tuple[Path, Rates, list[MotionRows]] | None = None
+
+    def reset(self) -> None:
+        """Forget the plan as well."""
+        super().reset()
+        self.plan = self._before = self._now = None
+
+    def decide(
+        self,
+        state: GraspState,
+        a: Float[Tensor, " n_a"],
+        target: PoseTarget,
+        fingertip_force: Float[Tensor, " n_pads"] | None = None,
+    ) -> Decision:
+        """The first motion of a plan; see :meth:`LookAndMoveController.decide`."""
+        self._now = self.plan = None
+        decision = super().decide(state, a, target, fingertip_force)
+        self._before = None if self._now is None else (self._now[1], self._left)
+        return decision
+
+    def retreat(self, at: Decision, delta_a: Float[Tensor, " n_a"]) -> Decision:
+        """The way back is none of the plan's."""
+        self._before = None
+        return super().retreat(at, delta_a)
+
+    def _solve(
+        self, lin: Linearization, seen: Situation
+    ) -> tuple[Tensor, Tensor, ControlProblem, ControlSolution]:
+        try:
+            return self._planned(lin, seen)
+        except GraspError:  # somewhere on the way: one step is foreseen as ever
+            self._now = self.plan = None
+            return super()._solve(lin, seen)
+
+    def _planned(
+        self, lin: Linearization, seen: Situation
+    ) -> tuple[Tensor, Tensor, ControlProblem, ControlSolution]:
+        start, K, left = Configuration.of(lin), *self._motions_left(lin, seen)
+        if K == 1:
+            self._now = self.plan = None
+            return super()._solve(lin, seen)
+        asked = PlanRows(self.tasks, (*self.limits, *self.along), self.limiting, self.pace, self.enhanced)
+        if self._now is not None:  # the same decision, asked for less: of the first motion
+            path, rates, motions = self._now
+            motions = [*asked.about(seen, path, rates, left, [0]), *motions[1:]]
+            path, solution = self._best(start, rates, motions)
+        else:
+            path = self._guess(lin, seen, K, left)
+            for _ in range(self.sqp_iterations):
+                rates = self.paths.linearize(path)
+                motions = asked.about(seen, path, rates, left, range(K))
+                path, solution = self._best(start, rates, motions)
+                if float((path.actions[0] - rates.actions[0]).abs().max()) <= self.sqp_tolerance:
+                    break
+        self._now, self._left, self.plan = (path, rates, motions), left, path
+        da = path.actions[0]
+        return da, self.foretell(lin, da)[0], motions[0].motion, dataclasses.replace(solution, u=as_array(da))
+
+    def _motions_left(self, lin: Linearization, seen: Situation) -> tuple[int, Tensor]:
+        """K, and what of the focused error will be left after as many motions."""
+        focused = self.focus.matrix @ seen.error
+        travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - seen.state.position)
+        steps = self.limiting.steps(focused, travel) / self.pace
+        if self.limiting.gain * steps <= 1:
+            return 1, 0 * focused
+        K = min(math.ceil(steps - 1e-9), self.horizon)
+        first = float(torch.linalg.vector_norm(seen.desired) / torch.linalg.vector_norm(focused))
+        return K, focused * max(0.0, 1 - first - (K - 1) / steps)
+
+    def _best(
+        self, start: Configuration, rates: Rates, motions: list[MotionRows]
+    ) -> tuple[Path, ControlSolution]:
+        """The path of the best actions, by the rates about which the rows were taken."""
+        problem, free = plan_problem(motions, _REACH)
+        solution = problem.solve(self.solver)
+        if np.abs(solution.slack).max(initial=0.0) > _SHORT:
+            path = np.concatenate([one.after[free] for one in motions])
+            solution = nearer_goal(problem, path, solution).solve(self.solver)
+        old = rates.actions
+        way = np.zeros(old.shape)
+        way[:, free] = solution.u.reshape(len(motions), -1)
+        actions = torch.as_tensor(np.diff(way, axis=0, prepend=0.0), dtype=old.dtype)
+        if not (self.enhanced is None or self.enhanced.affine):
+            actions = old + self.sqp_damping * (actions - old)
+        return self.paths.follow(start, rates, actions), solution
+
+    def _guess(self, lin: Linearization, seen: Situation, K: int, left: Tensor) -> Path:
+        """The rest of the last plan, from where the grasp is now; at first, single steps one after the other."""
+        start = Configuration.of(lin)
+        if self._before is not None:
+            rates, rest = self._before
+            share = 1.0 if bool(rest.abs().max() > 0) else max(len(rates.actions) - 1, 1) / K
+            rates = continued(rates, K, share)
+            return self.paths.follow(start, rates, rates.actions)
+        pads = torch.tensor(seen.hand.pad_indices(lin.contacts.finger))
+        z, moved_by = start, torch.zeros_like(seen.a)
+        nodes, middles, actions, increments = [z], [], [], []
+        for k in range(K):
+            error = error_of(z.state, seen)
+            desired = (self.focus.matrix @ error - left) / (K - k)
+            now = situation(
+                seen, z.state, moved_by, error, desired, pads, z.forces.normal - start.forces.normal
+            )
+            da, ds, _, _ = super()._solve(lin, now)
+            amid, z = self.paths.step(z, lin, da, ds)
+            nodes.append(z)
+            middles.append(amid)
+            actions.append(da)
+            increments.append(ds)
+            moved_by = moved_by + da
+            if k < K - 1:
+                held = settled(z)
+                lin = self.kinematic.linearize(z.state, z.contacts, forces=held.forces, on_unstable="flag")
+        return Path(torch.stack(actions), stack(nodes), stack(middles), torch.stack(increments))
