@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 
 import pytest
@@ -12,7 +13,7 @@ from torch_ekm.control import Caution, ClosedLoop, FocusedPose, LookAndMoveContr
 from torch_ekm.control.termination import StopReason
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NoContactError, ParameterError
-from torch_ekm.foresight import BeyondReach, ModelHand, ReachEnd, reachable
+from torch_ekm.foresight import BeyondReach, ModelHand, ReachEnd, friction_share, reachable
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantStatus
@@ -86,6 +87,22 @@ def test_a_turn_ends_where_the_model_said(grasp) -> None:
     assert "middle_2" in str(other)
 
 
+def test_the_share_of_friction_is_what_statics_say(grasp) -> None:
+    """At least the weight over all friction; with half the friction twice the share."""
+    _, seen, controller = grasp
+    model = controller.kinematic
+    lin = model.linearize(seen.state, fingertip_force=seen.fingertip_force)
+    share = friction_share(model, lin)
+    # the friction of all pads together bears the weight at least
+    least = float(model.weight.norm() / (lin.contacts.friction * (lin.forces.normal + 0.3)).sum())
+    assert least <= share < 0.6
+    half = dataclasses.replace(lin, contacts=lin.contacts.replace(friction=lin.contacts.friction / 2))
+    assert friction_share(model, half) == pytest.approx(2 * share, rel=1e-3)
+    reach = reachable(controller, seen, friction=1.01 * share)
+    assert reach.end is ReachEnd.FRICTION
+    assert abs(reach.angle) < reachable(controller, seen).angle
+
+
 def test_what_lies_within_reach_ends_by_nothing(grasp) -> None:
     plant, seen, controller = grasp
     reach = reachable(controller.kinematic, seen.state, plant.rotation_axis, limit=5 * DEG)
@@ -122,6 +139,8 @@ def test_what_cannot_be_asked_is_refused(grasp) -> None:
         reachable(controller.kinematic, seen)
     with pytest.raises(ParameterError, match="sign"):
         reachable(controller, seen, sign=0)
+    with pytest.raises(ParameterError, match="friction"):
+        reachable(controller, seen, friction=0.0)
     with pytest.raises(ParameterError, match="limit"):
         reachable(controller, seen, limit=4.0)
     away = GraspState(seen.q, seen.position + 0.2, seen.rotation)

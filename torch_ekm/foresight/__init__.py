@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .blind_pose import BlindPose
+from .friction_share import friction_share
 from .horizon_controller import HorizonController
 from .model_hand import ModelHand
 from .pose_filter import BlindOptions, PoseFilter
@@ -21,5 +22,6 @@ __all__ = [
     "Reach",
     "ReachEnd",
     "Rollout",
+    "friction_share",
     "reachable",
 ]

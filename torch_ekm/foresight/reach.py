@@ -17,6 +17,7 @@ from ..kinematics import GraspState
 from ..model import KinematicModel, Linearization
 from ..plant import Observation
 from ..typing import Float, Tensor
+from .friction_share import friction_share
 from .model_hand import ModelHand
 from .rehearsal import axis_of, hand_at, own_controller
 
@@ -75,6 +76,7 @@ def reachable(
     *,
     sign: int = 1,
     limit: float = 90 * _DEG,
+    friction: float = 0.7,
     caution: Caution | None = None,
     rule: StoppingRule | None = None,
 ) -> Reach:
@@ -90,19 +92,23 @@ def reachable(
         axis: about which it is to be turned, hand frame; None: the controller's focus.
         sign: 1 or -1, which way.
         limit: farthest angle that is tried [rad].
+        friction: largest share of its friction that the grasp may need to hold the object
+            (:func:`~torch_ekm.foresight.friction_share`); infinite: any.
         caution: signs of a loss; None: the usual ones, but a link bears only where it would lie 0.3 mm deep,
             which is when noisy readings tell of it.
         rule: as in :class:`~torch_ekm.control.ClosedLoop`.
 
     Raises:
-        ParameterError: no axis, a focus that is no single rotation, a sign that is none, or an angle outside
-            0 to 170 deg.
+        ParameterError: no axis, a focus that is no single rotation, a sign that is none, an angle outside 0
+            to 170 deg, or a share that is not positive.
         GraspError: the model refuses the grasp as it is.
     """
     if sign not in (1, -1):
         raise ParameterError("sign", sign, "1 or -1")
     if not 0 < limit <= 170 * _DEG:
         raise ParameterError("limit", limit, "above 0 and at most 170 deg [rad]")
+    if not friction > 0:
+        raise ParameterError("friction", friction, "greater than 0")
     controller = own_controller(model, axis)
     about = axis_of(controller.focus)
     hand = hand_at(controller, seen)
@@ -120,12 +126,19 @@ def reachable(
         except StopIteration as over:
             stop: Stop = over.value
             break
+        lin = hand.linearization
+        share = 0.0 if hand.failure or lin is None else friction_share(controller.kinematic, lin)
+        if share > friction:
+            said = f"the object needs {100 * share:.0f} % of the friction, more than {100 * friction:.0f} %"
+            stop = Stop(StopReason.GIVEN_UP, step.after, said)
+            break
         turned = float(about @ step.after.state.minus(start.state)[-3:])
         if not hand.failure and sign * turned > max(sign * angle for angle in angles):
             path.append(step.after.state)
             angles.append(turned)
             limits = [name for name in hand.at_limits() if name not in idle]
             standing = _Standing(hand.at_stops(_BEARS), limits, hand.linearization)
+    motions.close()
     end, what, message = _end(stop, hand, standing)
     return Reach(angles[-1], end, what, message, tuple(path), tuple(angles))
 
@@ -204,7 +217,7 @@ def _end(stop: Stop, hand: ModelHand, at: _Standing) -> tuple[ReachEnd, tuple[st
         return ReachEnd.STABILITY, (), said
     if "no finger touches" in said:
         return ReachEnd.CONTACT, (), said
-    if hand.failure:
+    if hand.failure or "of the friction" in said:
         return ReachEnd.FRICTION, tuple(at.sliding), said
     for end, found, verb in (
         (ReachEnd.ACTUATOR, at.actuators, "stands at the end of its range"),
