@@ -9,13 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.foresight_turn import ForesightTurn
-from torch_ekm.experiments.protocols.foresight import Foresight
+from torch_ekm.experiments.oracle import Omniscient
+from torch_ekm.experiments.protocols.foresight import CONTENDERS, Foresight
 from torch_ekm.experiments.reporting import foresight as report
 from torch_ekm.experiments.reproduce import Experiment, reproduce
+from torch_ekm.experiments.runner import Bench
+from torch_ekm.foresight import HorizonController
 
 pytest.importorskip("sapien")
 
@@ -42,6 +46,18 @@ def test_a_session_says_what_was_foretold_and_what_came(tmp_path: Path) -> None:
     assert names == ["targets", "far", "blind"]  # nothing ended, so nothing was foretold of an end
     assert (tmp_path / "animation.html").stat().st_size > 100_000
     assert "blind turn of 5 deg" in made.summary
+
+
+def test_contenders_are_what_they_are_called() -> None:
+    axis = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    for name, (changes, controller) in CONTENDERS.items():
+        bench = Bench(Setting(**changes), "box", controller)
+        made = bench._controller(axis, {})
+        assert isinstance(made, HorizonController) == name.startswith("horizon")
+        assert bench.learns == name.endswith("E-KM")
+        assert isinstance(bench.plant, Omniscient) == (name == "oracle")
+    with pytest.raises(ParameterError, match="horizon"):
+        Setting(horizon=0)
 
 
 def turn(**figures) -> ForesightTurn:
