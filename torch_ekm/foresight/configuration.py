@@ -128,9 +128,9 @@ def change(
     dq = dq[..., None, :, None]
     v_f, w_f = (kin.point_jacobian @ dq)[..., 0], (kin.spin_jacobian @ dq)[..., 0]
     w_o = w_o[..., None, :].expand_as(w_f)
-    v_o = do[..., None, :] + torch.linalg.cross(w_o, kin.lever)
+    v_o = do[..., None, :] + torch.linalg.cross(w_o, kin.lever.expand_as(w_o))
     run = -(kin.roll @ (w_f - w_o)[..., None])
-    n = kin.contacts.normal
+    n = kin.contacts.normal.expand_as(w_o)
     along_o = torch.linalg.cross(n, (kin.contacts.object_curvature @ run)[..., 0])
     along_f = -torch.linalg.cross(n, (kin.contacts.finger_curvature @ run)[..., 0])
     turns = exp(torch.stack([w_o + along_o, w_f + along_f]))

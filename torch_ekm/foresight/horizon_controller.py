@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 
 from ..control import (
+    Bounds,
     ControlProblem,
     ControlSolution,
     Limit,
@@ -19,14 +21,15 @@ from ..control import (
     Situation,
     StepBound,
     Task,
+    build_qp,
 )
 from ..control.limiting import contact_travel
 from ..control.qp import DEGREE, as_array
-from ..exceptions import GraspError, ParameterError
+from ..exceptions import GraspError, ParameterError, SolverError
 from ..typing import Float, Tensor
-from .configuration import Configuration, settled, stack
+from .configuration import Configuration, settled
 from .limits import SlipLimit
-from .path import Path, PathModel, Rates, continued
+from .path import Path, PathModel, Rates, continued, joined
 from .plan_problem import MotionRows, nearer_goal, plan_problem
 from .plan_rows import PlanRows, error_of, situation
 
@@ -40,8 +43,14 @@ _PACE = 1e4
 """Penalty of a motion that is longer than the pace allows, per degree: above that of the goal."""
 
 
+_Step = tuple[Tensor, Tensor, ControlProblem, ControlSolution]
+
+_DOUBTFUL = 0.7
+"""Where the step bound would make a smaller share of a first motion, a single step may be better."""
 _SHORT = 0.05 * DEGREE
 """A goal that a program misses by more is brought nearer [unit of the focus]."""
+_STRIDES = 4
+"""Single steps of which a first guess is made, each worth several motions."""
 _REACH = 8.0
 """How far an iteration may bring an actuator from where the last path has it [deg]."""
 
@@ -60,6 +69,8 @@ class HorizonController(LookAndMoveController):
     Args:
         horizon: motions that are foreseen at most. Fewer where the goal is nearer; where one is enough, it is
             the look-and-move controller's.
+        sqp_iterations: quadratic programs of the first plan at most.
+        receding_iterations: and of those that go on from the last one.
         along: limits on the way, beside those of every step.
 
     The others are those of :class:`LookAndMoveController`.
@@ -76,6 +87,7 @@ class HorizonController(LookAndMoveController):
         horizon: int = 12,
         along: Sequence[Limit] = (SlipLimit(),),
         sqp_iterations: int = 3,
+        receding_iterations: int = 1,
         sqp_damping: float = 0.6,
         sqp_tolerance: float = 0.1 * DEGREE,
         bound: StepBound | None = None,
@@ -87,17 +99,20 @@ class HorizonController(LookAndMoveController):
         )  # fmt: skip
         if not horizon >= 1:
             raise ParameterError("horizon", horizon, "at least one motion")
-        self.horizon, self.along = horizon, tuple(along)
+        self.horizon, self.receding_iterations, self.along = horizon, receding_iterations, tuple(along)
         self.paths = PathModel(self.kinematic, self.enhanced)
         self.plan: Path | None = None
         """The last decision's; None: there was none, or the grasp could not be foreseen."""
-        self._before: tuple[Rates, Tensor] | None = None  # of the decision before
-        self._now: tuple[Path, Rates, list[MotionRows]] | None = None
+        self._before: tuple[Rates, Tensor] | None = (
+            None  # of the decision before, and what it left of the error
+        )
+        self._now: tuple[Rates, Tensor] | None = None
+        self._first: _Step | None = None  # this decision's
 
     def reset(self) -> None:
         """Forget the plan as well."""
         super().reset()
-        self.plan = self._before = self._now = None
+        self.plan = self._before = self._now = self._first = None
 
     def decide(
         self,
@@ -107,9 +122,9 @@ class HorizonController(LookAndMoveController):
         fingertip_force: Float[Tensor, " n_pads"] | None = None,
     ) -> Decision:
         """The first motion of a plan; see :meth:`LookAndMoveController.decide`."""
-        self._now = self.plan = None
+        self.plan = self._now = self._first = None
         decision = super().decide(state, a, target, fingertip_force)
-        self._before = None if self._now is None else (self._now[1], self._left)
+        self._before = self._now
         return decision
 
     def retreat(self, at: Decision, delta_a: Float[Tensor, " n_a"]) -> Decision:
@@ -117,38 +132,50 @@ class HorizonController(LookAndMoveController):
         self._before = None
         return super().retreat(at, delta_a)
 
-    def _solve(
-        self, lin: Linearization, seen: Situation
-    ) -> tuple[Tensor, Tensor, ControlProblem, ControlSolution]:
-        try:
-            return self._planned(lin, seen)
-        except GraspError:  # somewhere on the way: one step is foreseen as ever
-            self._now = self.plan = None
-            return super()._solve(lin, seen)
+    def _solve(self, lin: Linearization, seen: Situation) -> _Step:
+        if self._first is not None:  # the same decision, asked for less
+            longest = torch.linalg.vector_norm(seen.desired)
+            way = torch.linalg.vector_norm(self.focus.matrix @ self._first[1][-6:])
+            return self._cut(lin, self._first, min(1.0, float(longest / way.clamp_min(1e-12))))
+        K, left = self._motions_left(lin, seen)
+        if K > 1:
+            try:
+                step = self._planned(lin, seen, K, left)
+            except (GraspError, SolverError):  # somewhere on the way: one step is foreseen as ever
+                step = super()._solve(lin, seen)
+            grip = self._wanted_grip(lin, seen)
+            share = self.bound.share(lin, step[0], step[1], seen, grip)
+            if share < _DOUBTFUL:
+                single = super()._solve(lin, seen)
+                if self.bound.share(lin, single[0], single[1], seen, grip) > share:
+                    self.plan = self._now = None
+                    return single
+            self._first = step
+            return step
+        return super()._solve(lin, seen)
 
-    def _planned(
-        self, lin: Linearization, seen: Situation
-    ) -> tuple[Tensor, Tensor, ControlProblem, ControlSolution]:
-        start, K, left = Configuration.of(lin), *self._motions_left(lin, seen)
-        if K == 1:
-            self._now = self.plan = None
-            return super()._solve(lin, seen)
+    def _cut(self, lin: Linearization, step: _Step, share: float) -> _Step:
+        """A part of a motion."""
+        da, _, problem, solution = step
+        da = share * da
+        return da, self.foretell(lin, da)[0], problem, dataclasses.replace(solution, u=as_array(da))
+
+    def _planned(self, lin: Linearization, seen: Situation, K: int, left: Tensor) -> _Step:
+        """The first motion of the best plan."""
+        start = Configuration.of(lin)
         asked = PlanRows(self.tasks, (*self.limits, *self.along), self.limiting, self.pace, self.enhanced)
-        if self._now is not None:  # the same decision, asked for less: of the first motion
-            path, rates, motions = self._now
-            motions = [*asked.about(seen, path, rates, left, [0]), *motions[1:]]
+        path = self._guess(lin, seen, K, left)
+        for _ in range(self.sqp_iterations if self._before is None else self.receding_iterations):
+            rates = self.paths.linearize(path)
+            motions = asked.about(seen, path, rates, left)
             path, solution = self._best(start, rates, motions)
-        else:
-            path = self._guess(lin, seen, K, left)
-            for _ in range(self.sqp_iterations):
-                rates = self.paths.linearize(path)
-                motions = asked.about(seen, path, rates, left, range(K))
-                path, solution = self._best(start, rates, motions)
-                if float((path.actions[0] - rates.actions[0]).abs().max()) <= self.sqp_tolerance:
-                    break
-        self._now, self._left, self.plan = (path, rates, motions), left, path
-        da = path.actions[0]
-        return da, self.foretell(lin, da)[0], motions[0].motion, dataclasses.replace(solution, u=as_array(da))
+            if float((path.actions[0] - rates.actions[0]).abs().max()) <= self.sqp_tolerance:
+                break
+        self._now, self.plan = (rates, left), path
+        da, rows = path.actions[0], motions[0].motion
+        first = dataclasses.replace(solution, u=as_array(da))
+        problem = build_qp(len(da), [Bounds(*(DEGREE * x for x in (rows.lower, rows.upper)))])
+        return da, self.foretell(lin, da)[0], problem, first
 
     def _motions_left(self, lin: Linearization, seen: Situation) -> tuple[int, Tensor]:
         """K, and what of the focused error will be left after as many motions."""
@@ -179,7 +206,7 @@ class HorizonController(LookAndMoveController):
         return self.paths.follow(start, rates, actions), solution
 
     def _guess(self, lin: Linearization, seen: Situation, K: int, left: Tensor) -> Path:
-        """The rest of the last plan, from where the grasp is now; at first, single steps one after the other."""
+        """The rest of the last plan, from where the grasp is now; at first, single steps."""
         start = Configuration.of(lin)
         if self._before is not None:
             rates, rest = self._before
@@ -187,22 +214,24 @@ class HorizonController(LookAndMoveController):
             rates = continued(rates, K, share)
             return self.paths.follow(start, rates, rates.actions)
         pads = torch.tensor(seen.hand.pad_indices(lin.contacts.finger))
-        z, moved_by = start, torch.zeros_like(seen.a)
-        nodes, middles, actions, increments = [z], [], [], []
-        for k in range(K):
+        z, moved_by, at = start, torch.zeros_like(seen.a), 0
+        parts, actions, increments = [], [], []
+        while at < K:
+            count = min(-(-K // _STRIDES), K - at)
             error = error_of(z.state, seen)
-            desired = (self.focus.matrix @ error - left) / (K - k)
+            desired = (self.focus.matrix @ error - left) * count / (K - at)
             now = situation(
                 seen, z.state, moved_by, error, desired, pads, z.forces.normal - start.forces.normal
             )
             da, ds, _, _ = super()._solve(lin, now)
-            amid, z = self.paths.step(z, lin, da, ds)
-            nodes.append(z)
-            middles.append(amid)
-            actions.append(da)
-            increments.append(ds)
-            moved_by = moved_by + da
-            if k < K - 1:
+            amid, after = self.paths.steps(z, lin, da, ds, count)
+            parts.append((after, amid))
+            actions += [da / count] * count
+            increments += [ds / count] * count
+            z, moved_by, at = after.select(-1), moved_by + da, at + count
+            if at < K:
                 held = settled(z)
                 lin = self.kinematic.linearize(z.state, z.contacts, forces=held.forces, on_unstable="flag")
-        return Path(torch.stack(actions), stack(nodes), stack(middles), torch.stack(increments))
+        after, middles = (functools.reduce(joined, part) for part in zip(*parts, strict=True))
+        nodes = joined(start.expand(1), after)
+        return Path(torch.stack(actions), nodes, middles, torch.stack(increments))

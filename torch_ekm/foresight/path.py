@@ -85,29 +85,33 @@ class PathModel:
         g = rates.correction
         if rates.slope is not None:
             g = g + (rates.slope @ (actions - rates.actions)[..., None])[..., 0]
-        nodes, middles = (
-            [_tree(part, lambda x, at=at: x[at]) for part in (rates.linearization, rates.contacts)]
-            for at in (slice(0, K), slice(K + 1, 2 * K + 1))
-        )
-        steps = change(*middles, actions, g)
-        ends = joined(
-            start.expand(1), moved(self.kinematic, start, chained(steps, start.contacts, start.forces))
-        )
-        amid = moved(self.kinematic, settled(ends.of_first(slice(0, K))), change(*nodes, actions / 2, g / 2))
-        return Path(actions, ends, amid, steps.ds)
+        before, amid = slice(0, K), slice(K + 1, 2 * K + 1)
+        lin, kin = (_tree(part, lambda x: x[amid]) for part in (rates.linearization, rates.contacts))
+        steps = change(lin, kin, actions, g)
+        whole = chained(steps, start.contacts, start.forces)
+        nodes = joined(start.expand(1), moved(self.kinematic, start, whole))
+        lin, kin = (_tree(part, lambda x: x[before]) for part in (rates.linearization, rates.contacts))
+        half = change(lin, kin, actions / 2, g / 2)
+        middles = moved(self.kinematic, settled(nodes.of_first(before)), half)
+        return Path(actions, nodes, middles, steps.ds)
 
-    def step(
-        self, z: Configuration, lin: Linearization, action: Float[Tensor, " n_a"], ds: Float[Tensor, " n_s"]
+    def steps(
+        self,
+        z: Configuration,
+        lin: Linearization,
+        action: Float[Tensor, " n_a"],
+        ds: Float[Tensor, " n_s"],
+        count: int,
     ) -> tuple[Configuration, Configuration]:
-        """Amid and after one motion, by the rates before it.
+        """Amid and after each of ``count`` equal motions, by the rates before them.
 
         Args:
-            ds: what f + g foretell of it.
+            action, ds: of all together, and what f + g foretell of it.
         """
         kin, g = self.kinematic.contact_kinematics(z.state, z.contacts), ds - lin.step(action)
-        whole, half = change(lin, kin, action, g), change(lin, kin, action / 2, g / 2)
-        z = settled(z)
-        return moved(self.kinematic, z, half), moved(self.kinematic, z, whole)
+        share = torch.arange(1, 2 * count + 1, dtype=action.dtype)[:, None] / (2 * count)
+        every = moved(self.kinematic, settled(z), change(lin, kin, share * action, share * g))
+        return every.of_first(slice(0, None, 2)), every.of_first(slice(1, None, 2))
 
     def _corrected(
         self, state: GraspState, actions: Tensor, J: Tensor
@@ -120,12 +124,12 @@ class PathModel:
 
 
 def continued(rates: Rates, motions: int, share: float) -> Rates:
-    """The rest of a plan whose first motion is done, in other motions: its actions, and the nearest old rates.
+    """The rest of a plan whose first motion is done: its actions in other motions, and the nearest old rates.
 
     Args:
         motions: of the new path.
-        share: length of its motions, as a share of the old ones'. What it goes beyond the old path, it goes as
-            in the last old motion.
+        share: length of its motions, as a share of the old ones'. Beyond the old path it goes on as in the
+            last old motion.
     """
     old = rates.actions
     K = len(old)
@@ -149,7 +153,7 @@ _SHARED = ("friction", "torsional_friction")
 
 
 def _tree(value: Any, pick: Callable[[Tensor], Tensor]) -> Any:
-    """``pick`` of every batched tensor in a dataclass of dataclasses, which were checked when they were made."""
+    """``pick`` of every batched tensor in a dataclass of dataclasses; none of them is checked again."""
     changed = copy.copy(value)
     for name, part in vars(value).items():
         if isinstance(part, Tensor):

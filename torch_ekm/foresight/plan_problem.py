@@ -11,21 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._extras import require
-from ..control.qp import DEGREE, ControlProblem, ControlSolution
+from ..control.qp import DEGREE, ControlProblem, ControlSolution, RowSum
 from ..typing import Array
 
 _BOUND = 1e4
-"""Price of an actuator's bound in a motion that is not made yet, per degree: a path from another start may break
-it. Those of the first motion always hold."""
+"""Price of an actuator's bound in a motion that is not made yet, per degree: a path from another start may
+break it. Those of the first motion always hold."""
 
 
 @dataclass(frozen=True)
 class MotionRows:
-    """What tasks and limits ask of one motion, as two small problems, u in degrees."""
+    """What tasks and limits ask of one motion, u in degrees."""
 
-    state: ControlProblem
+    state: RowSum
     """In u = what the actuators have moved when it is over, from where the path had them before it."""
-    motion: ControlProblem
+    motion: RowSum
     """In u = w_k; its bounds are those of the actuators."""
     before: Array
     """Where the path has the actuators before it, from the start [deg]."""
@@ -52,7 +52,7 @@ def plan_problem(motions: Sequence[MotionRows], reach: float) -> tuple[ControlPr
     Returns:
         The program over ``c_0 .. c_{K-1}`` of the actuators that may move, and which these are.
     """
-    bounds = np.array([one.motion.bounds for one in motions])
+    bounds = np.array([(one.motion.lower, one.motion.upper) for one in motions])
     free = np.flatnonzero((bounds != 0).any((0, 1)))
     m = len(free)
     size = len(motions) * m
@@ -64,12 +64,9 @@ def plan_problem(motions: Sequence[MotionRows], reach: float) -> tuple[ControlPr
         if k:
             D[:, (k - 1) * m : k * m] = -np.eye(m)
         for part, way, moved in ((one.state, here, one.before), (one.motion, D, 0.0 * one.before)):
-            n, qp = part.n_u, part.qp
-            P += way.T @ qp.P[:n, :n][np.ix_(free, free)] @ way
-            q += (qp.q[:n] - qp.P[:n, :n] @ moved)[free] @ way
-            if qp.G is not None:
-                rows = qp.G[:, :n]
-                soft.add(rows[:, free] @ way, qp.h + rows @ moved, qp.q[-len(rows) :])
+            P += way.T @ part.P[np.ix_(free, free)] @ way
+            q += (part.q - part.P @ moved)[free] @ way
+            soft.add(part.C[:, free] @ way, part.h + part.C @ moved, part.rho_t)
         lower, upper = bounds[k][:, free]
         if k:
             soft.add(np.vstack([D, -D]), np.concatenate([upper, -lower]), np.full(2 * m, _BOUND))
@@ -82,8 +79,8 @@ def plan_problem(motions: Sequence[MotionRows], reach: float) -> tuple[ControlPr
 def nearer_goal(problem: ControlProblem, path: Array, solution: ControlSolution) -> ControlProblem:
     """The same program with a goal at nine tenths of the way that its solution found towards it.
 
-    Where the goal is beyond what the bounds of an iteration let it reach, its penalty outweighs every wish, and
-    the program lives on differences between the rates of its motions that are none. Source: the relaxed
+    Where the goal is beyond what the bounds of an iteration let it reach, its penalty outweighs every wish,
+    and the program lives on differences between the rates of its motions that are none. Source: the relaxed
     equalities of Byrd and Omojokun; Nocedal and Wright, Numerical Optimization (2006), section 18.5.
 
     Args:
@@ -110,13 +107,11 @@ class _Rows:
 def _problem(
     last: MotionRows, free: NDArray[np.int64], P: Array, q: Array, soft: _Rows, box: Array
 ) -> ControlProblem:
-    size, m, n = len(q), len(free), last.state.n_u
-    goal = last.state.qp
-    n_e = 0 if goal.A is None else len(goal.b)
-    E, d, rho = np.zeros((n_e, size)), np.zeros(n_e), np.zeros(n_e)
-    if goal.A is not None:
-        rows = goal.A[:, :n]
-        E[:, size - m :], d, rho = rows[:, free], goal.b + rows @ last.before, goal.q[n : n + n_e]
+    size, m, goal = len(q), len(free), last.state
+    n_e = len(goal.d)
+    E = np.zeros((n_e, size))
+    E[:, size - m :] = goal.E[:, free]
+    d, rho = goal.d + goal.E @ last.before, goal.rho
     C, h, price = np.vstack(soft.C), np.concatenate(soft.h), np.concatenate(soft.price)
     n_t = len(h)
     width, e, t = size + 2 * n_e + n_t, np.arange(n_e), np.arange(n_t)

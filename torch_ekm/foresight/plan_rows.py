@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from ..control import Bounds, Inequality, Limit, LimitingFunction, LinearizedModel, Situation, Task, build_qp
-from ..control.limiting import contact_travel
-from ..control.qp import DEGREE, as_array
+from ..control import Bounds, Inequality, Limit, LimitingFunction, LinearizedModel, Situation, Task
+from ..control.qp import DEGREE, as_array, sum_rows
 from ..kinematics.se3 import exp, log
 from ..typing import Float, Int, Tensor
 from .path import Path, Rates
@@ -68,10 +67,10 @@ def situation(
 class PlanRows:
     """Rows of tasks and limits about a path, motion by motion.
 
-    A task sees motion k as it would see a single step from z_k: ``(f + g)(s_k, u) ~ offset + jacobian u``, with
-    the forces that are foreseen there. Its rows then count in ``u = c_k - before_k``, for where the earlier
-    motions leave the actuators decides where motion k begins (see :func:`plan_problem`); rows of tasks that are
-    ``per_motion`` count in w_k.
+    A task sees motion k as it would see a single step from z_k: ``(f + g)(s_k, u) ~ offset + jacobian u``,
+    with the forces that are foreseen there. Its rows then count in ``u = c_k - before_k``, for where the
+    earlier motions leave the actuators decides where motion k begins (see :func:`plan_problem`); bounds, and
+    rows of tasks that are ``per_motion``, count in w_k.
 
     ``dz_{k+1}/dw_j = (dz/da)(z_{k+1})`` for every j <= k: what the actuators do first and what later makes no
     difference where contacts do not roll about their normals, as in a plane. In space it makes one of second
@@ -85,9 +84,9 @@ class PlanRows:
     enhanced: EnhancedModel | None
 
     def about(
-        self, seen: Situation, path: Path, rates: Rates, left: Float[Tensor, " n_x"], which: Iterable[int]
+        self, seen: Situation, path: Path, rates: Rates, left: Float[Tensor, " n_x"]
     ) -> list[MotionRows]:
-        """Rows of some motions.
+        """Rows of all motions.
 
         Args:
             seen: where the path begins; its ``desired`` bounds the first motion.
@@ -100,8 +99,12 @@ class PlanRows:
         offsets = path.increments - (J @ path.actions[..., None])[..., 0]
         before = torch.cat([path.actions.new_zeros(1, n_a), path.actions.cumsum(0)])
         pads = torch.tensor(seen.hand.pad_indices(path.nodes.contacts.finger))
+        focused = M @ seen.error
+        ahead = (focused / torch.linalg.vector_norm(focused).clamp_min(1e-12)) @ M
+        least = _EVEN * float(torch.linalg.vector_norm(focused - left)) / len(path.actions)
+        longest = self._longest(seen, path)
         motions = []
-        for k in which:
+        for k in range(len(path.actions)):
             here = rates.at(k)
             desired = M @ errors[k] - left
             now = situation(seen, here.state, before[k], errors[k], desired, pads, normal[k] - normal[0])
@@ -119,25 +122,27 @@ class PlanRows:
             asked = [(part.rows(model, now), getattr(part, "per_motion", False)) for part in parts]
             single = [rows for rows, alone in asked if alone or isinstance(rows, Bounds)]
             others = [rows for rows, alone in asked if not (alone or isinstance(rows, Bounds))]
-            longest = self._longest(seen, model) if k else float(torch.linalg.vector_norm(seen.desired))
-            least = _EVEN * float(torch.linalg.vector_norm(M @ seen.error - left)) / len(path.actions)
-            pace = self._pace(M @ seen.error, M, model, longest, min(least, longest))
+            pace = self._pace(ahead, model, longest[k], min(least, longest[k]))
             ends = (as_array(before[at]) / DEGREE for at in (k, k + 1))
-            motions.append(MotionRows(build_qp(n_a, others), build_qp(n_a, [*single, *pace]), *ends))
+            motions.append(MotionRows(sum_rows(n_a, others), sum_rows(n_a, [*single, *pace]), *ends))
         return motions
 
-    def _longest(self, seen: Situation, model: LinearizedModel) -> float:
-        """The largest motion of the focused pose that the limiting function allows [unit of the focus]."""
-        focused, lin = seen.focus.matrix @ seen.error, model.kinematic
-        travel = contact_travel(seen.focus.matrix.mT @ focused, lin.contacts.point - lin.state.position)
+    def _longest(self, seen: Situation, path: Path) -> list[float]:
+        """The largest motions of the focused pose that the limiting function allows [unit of the focus]."""
+        M, focused = seen.focus.matrix, seen.focus.matrix @ seen.error
+        v, w = (M.mT @ focused).split(3)
+        lever = path.nodes.contacts.point - path.nodes.state.position[:, None, :]
+        carried = torch.linalg.vector_norm(v + torch.linalg.cross(w.expand_as(lever), lever), dim=-1).amax(-1)
         size = float(torch.linalg.vector_norm(focused))
-        return size * self.pace / max(self.limiting.steps(focused, travel), 1e-12)
+        steps = (self.limiting.steps(focused, travel) for travel in carried[:-1].tolist())
+        longest = [size * self.pace / max(count, 1e-12) for count in steps]
+        longest[0] = float(torch.linalg.vector_norm(seen.desired))
+        return longest
 
     def _pace(
-        self, focused: Tensor, M: Tensor, model: LinearizedModel, longest: float, least: float
+        self, ahead: Float[Tensor, 6], model: LinearizedModel, longest: float, least: float
     ) -> list[Inequality]:
-        """``least <= e^T M_c ds / |e| <= longest``, e the focused error."""
-        ahead = (focused / torch.linalg.vector_norm(focused).clamp_min(1e-12)) @ M
+        """``least <= ahead . ds <= longest``."""
         row, c = as_array(ahead @ model.jacobian[-6:])[None], float(ahead @ model.offset[-6:])
         return [
             Inequality(row, np.array([longest - c]), DEGREE, _PACE),

@@ -26,8 +26,8 @@ class Rollout:
     z is state, contacts and forces. f is taken half a motion later; g, which was learned of whole motions, at
     their beginnings: ``ds = J_m(s_m) w + g(s, w)``. Contacts roll along
     (:func:`~torch_ekm.foresight.configuration.change`), no collision query is made on the way. Forces are
-    those of contacts that stick throughout a motion; a contact that was asked for more than its cone begins the
-    next motion on it.
+    those of contacts that stick throughout a motion; a contact that was asked for more than its cone begins
+    the next motion on it.
 
     Args:
         model: a kinematic model, or an enhanced one around it.

@@ -1,0 +1,28 @@
+"""The packaged planar hand, two fingers and two tendons, holding a block in exact equilibrium."""
+
+from __future__ import annotations
+
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+
+sys.path.append(str(Path(__file__).parents[1] / "model"))
+from test_model_planar_hand import pinch
+
+from torch_ekm.model.equilibrium import EquilibriumSolver
+
+F64 = torch.float64
+
+
+@lru_cache(maxsize=1)
+def planar():
+    """Model, encoders, and the model linearized where it stands."""
+    model, state, contacts = pinch()
+    solver = EquilibriumSolver(model, state, contacts)
+    at = solver.find(torch.full((2,), 1.2, dtype=F64))
+    contacts = at.contacts.replace(finger=tuple(pad.name for pad in model.hand.pads))
+    model.detector = lambda *_: contacts
+    lin = model.linearize(at.state, contacts, forces=solver.forces(at))
+    return model, solver.actuators(at.state), lin
