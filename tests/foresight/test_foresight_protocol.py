@@ -33,13 +33,19 @@ def test_a_session_says_what_was_foretold_and_what_came(tmp_path: Path) -> None:
     (session,) = (tmp_path / "runs").glob("*.json")
     records = {r.kind: r for r in map(ForesightTurn.from_json, json.loads(session.read_text()))}
     assert list(records) == ["far", "blind", "blind, looks again", "blind, no touch"]
-    far, dark = records["far"], records["blind"]
+    far, dark, alone = (records[kind] for kind in ("far", "blind", "blind, no touch"))
+    assert isinstance(far, ForesightTurn)
+    assert isinstance(dark, ForesightTurn)
+    assert isinstance(alone, ForesightTurn)
     assert far.reach_end == "nothing"
     assert far.largest_deg == pytest.approx(8.0, abs=1.5)
     assert len(far.foretold) > 1
     assert far.axis_std_deg is None
     assert dark.reach_deg is None
-    assert 0.05 < dark.axis_std_deg < records["blind, no touch"].axis_std_deg
+    assert dark.axis_std_deg is not None
+    assert dark.estimate_error_deg is not None
+    assert alone.axis_std_deg is not None
+    assert 0.05 < dark.axis_std_deg < alone.axis_std_deg
     assert abs(dark.estimate_error_deg) < 3 * dark.axis_std_deg
     assert dark.looks == 0
     names = [table.name for table in made.tables]
