@@ -92,16 +92,17 @@ def _draw_matplotlib(scene: Scene, path: Path, size: int) -> None:
     collection = require("mpl_toolkits.mplot3d.art3d").Poly3DCollection
     n = len(scene.transforms)
     figure = require("matplotlib.figure").Figure(figsize=(size / 100 * n, size / 100))
-    meshes = [(shape_mesh(shape), colour) for shape, colour in scene.shapes]
+    meshes = [(shape_mesh(shape), colour, scene.opacity(i)) for i, (shape, colour) in enumerate(scene.shapes)]
     _, focus, up = scene.camera  # matplotlib's z is up in the picture: turn everything there
     forward = np.array([1.0, 0.0, 0.0]) - up[0] * up
     forward /= np.linalg.norm(forward)
     turn = np.stack([forward, np.cross(up, forward), up])
     for k, transforms in enumerate(scene.transforms):
         axis = figure.add_subplot(1, n, k + 1, projection="3d")
-        for (mesh, colour), T in zip(meshes, transforms, strict=True):
+        for (mesh, colour, opacity), T in zip(meshes, transforms, strict=True):
             vertices = (mesh.vertices @ T[:3, :3].T + T[:3, 3]) @ turn.T
-            axis.add_collection3d(collection(vertices[mesh.faces], facecolors=colour, shade=True))
+            faces = collection(vertices[mesh.faces], facecolors=colour, shade=True, alpha=opacity)
+            axis.add_collection3d(faces)
         for name, middle in zip("xyz", turn @ focus, strict=True):
             getattr(axis, f"set_{name}lim")(middle - 0.06, middle + 0.06)
         axis.set_axis_off()
