@@ -47,6 +47,8 @@ _Step = tuple[Tensor, Tensor, ControlProblem, ControlSolution]
 
 _DOUBTFUL = 0.7
 """Where the step bound would make a smaller share of a first motion, a single step may be better."""
+_WAITS = 0.5
+"""Share of the mean motion below which a plan's first motion counts as waiting."""
 _SHORT = 0.05 * DEGREE
 """A goal that a program misses by more is brought nearer [unit of the focus]."""
 _STRIDES = 4
@@ -143,16 +145,29 @@ class HorizonController(LookAndMoveController):
                 step = self._planned(lin, seen, K, left)
             except (GraspError, SolverError):  # somewhere on the way: one step is foreseen as ever
                 step = super()._solve(lin, seen)
-            grip = self._wanted_grip(lin, seen)
-            share = self.bound.share(lin, step[0], step[1], seen, grip)
-            if share < _DOUBTFUL:
+            share, refused = self._share(lin, seen, step), self._buckles() or self._waits(seen, step, K, left)
+            if refused or share < _DOUBTFUL:
                 single = super()._solve(lin, seen)
-                if self.bound.share(lin, single[0], single[1], seen, grip) > share:
+                if refused or self._share(lin, seen, single) > share:
                     self.plan = self._now = None
                     return single
             self._first = step
             return step
         return super()._solve(lin, seen)
+
+    def _share(self, lin: Linearization, seen: Situation, step: _Step) -> float:
+        """Of a motion that the step bound would make."""
+        return self.bound.share(lin, step[0], step[1], seen, self._wanted_grip(lin, seen))
+
+    def _waits(self, seen: Situation, step: _Step, K: int, left: Tensor) -> bool:
+        """The plan puts off its motions: something is in the way, and will be, too, when it plans anew."""
+        focused = self.focus.matrix @ seen.error
+        way = float(focused @ (self.focus.matrix @ step[1][-6:]) / torch.linalg.vector_norm(focused))
+        return way < _WAITS * float(torch.linalg.vector_norm(focused - left)) / K
+
+    def _buckles(self) -> bool:
+        """The grasp would, on the way of the plan."""
+        return self._now is not None and float(self._now[0].linearization.stability.min()) <= 0
 
     def _cut(self, lin: Linearization, step: _Step, share: float) -> _Step:
         """A part of a motion."""
