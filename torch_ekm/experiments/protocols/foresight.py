@@ -35,7 +35,7 @@ CONTENDERS: dict[str, tuple[dict[str, Any], str]] = {
 
 @dataclass(frozen=True)
 class Foresight(Protocol):
-    """Each object with each contender on the same grasps: as far as it goes, beyond Table I, and blind.
+    """Each object with each contender on the same grasps: blind, as far as it goes, and beyond Table I.
 
     A session is one object, one contender and one seed. A learner begins it empty and has ``warm_up`` turns
     of ``blind_angle_deg`` on grasps that are not tested. Before each turn the model is asked how far it goes;
@@ -96,7 +96,7 @@ class Foresight(Protocol):
         }
 
     def session(self, object: str, contender: str, seed: int) -> list[Record]:
-        """Warm-up, as far as it goes, beyond Table I, and in the dark (not the oracle, which sees all)."""
+        """Warm-up, in the dark (not the oracle, which sees all), as far as it goes, beyond Table I."""
         changes, controller = CONTENDERS[contender]
         bench = Bench(self.setting.hardware_instance(seed).replace(**changes), object, controller)
         if bench.learns:
@@ -112,15 +112,15 @@ class Foresight(Protocol):
             return self._record(bench, contender, bench.turn(about, start, **options), reach)
 
         records = []
-        if self.far_deg:
-            records.append(turn("far", _FAR, self.far_deg, poses=True))
-        records += [turn("turn", trial, angle) for trial, angle in enumerate(self.angles_of(object))]
-        if contender != "oracle":
+        if contender != "oracle":  # before anything more is learned
             dark = {"learn": False, "blind_deg": math.inf}
             records.append(turn("blind", _BLIND, self.blind_angle_deg, touch=True, **dark))
             again = {"touch": True, "look_again_deg": self.look_again_deg}
             records.append(turn("blind, looks again", _BLIND, self.blind_angle_deg, **again, **dark))
             records.append(turn("blind, no touch", _BLIND, self.blind_angle_deg, **dark))
+        if self.far_deg:
+            records.append(turn("far", _FAR, self.far_deg, poses=True))
+        records += [turn("turn", trial, angle) for trial, angle in enumerate(self.angles_of(object))]
         bench.close()
         return records
 
