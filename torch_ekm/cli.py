@@ -111,7 +111,9 @@ def demo(
 
 @app.command()
 def reproduce(
-    experiment: Annotated[str, Argument(help="online, generalize, ablation or adapt.")] = "generalize",
+    experiment: Annotated[
+        str, Argument(help="online, generalize, ablation, adapt or foresight.")
+    ] = "generalize",
     seeds: Annotated[str, Option(help="FIRST:END; each seed is an independent run.")] = "1000:1020",
     jobs: Jobs = 2,
     out: Annotated[Path | None, Option(help="Folder for the report [reproduce_<experiment>].")] = None,
@@ -252,6 +254,7 @@ def show(
     what: Annotated[str, Argument(metavar="[HAND|LOG]", help="A hand, a URDF, or a log.")] = "icub_right",
     object: Annotated[str | None, Option(help="An object for the hand to hold.")] = None,
     seed: Annotated[int, Option(help="Which grasp of the object.")] = 0,
+    reach: Annotated[bool, Option(help="How far it can be turned, and what ends it.")] = False,
     html: Html = None,
     port: Port = 8080,
 ) -> None:
@@ -260,9 +263,12 @@ def show(
     A hand has a slider for each actuator, a grasp is simulated while its actuators are moved, a log is
     played.
     """
-    from .experiments.viewer.serve import choose_show
+    from .experiments.viewer.serve import ReachShow, choose_show
 
-    _look(choose_show(what, object, seed), html, port)
+    shown = choose_show(what, object, seed, reach)
+    if isinstance(shown, ReachShow):
+        _print_table(("direction", "angle [deg]", "ends by"), shown.rows(), shown.title)
+    _look(shown, html, port)
 
 
 @app.command()

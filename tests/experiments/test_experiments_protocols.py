@@ -17,12 +17,10 @@ from torch_ekm.control import (
     FrictionMarginLimit,
     LimitingFunction,
     OffAxisTask,
-    PoseTarget,
     StepBound,
 )
 from torch_ekm.description import object_paths
-from torch_ekm.exceptions import NoContactError, ParameterError, UnknownNameError
-from torch_ekm.experiments.camera_off import CameraOff
+from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
 from torch_ekm.experiments.learners import HAND_LEARNERS, LEARNERS, make_learner
 from torch_ekm.experiments.protocols.ablation import DISTURBANCES, Ablation, variants
@@ -31,9 +29,6 @@ from torch_ekm.experiments.protocols.object_memory import ObjectMemory
 from torch_ekm.experiments.protocols.online import Online
 from torch_ekm.experiments.records import NotGrasped, TrialRecord
 from torch_ekm.experiments.runner import Bench
-from torch_ekm.kinematics import GraspState
-from torch_ekm.kinematics.se3 import exp
-from torch_ekm.plant import Observation, PlantStatus
 from torch_ekm.simulation import preset
 
 ONLINE = Online(trials=2, angle_range_deg=(4.0, 5.0), dislocations=(2,), tendons_replaced=2)
@@ -159,60 +154,6 @@ def test_ablation_covers_every_disturbance_of_the_nominal_plant() -> None:
     jobs = protocol.jobs((0,))
     # alike variants share their jobs
     assert len(jobs) < sum(len(v.controllers) for v in variants(protocol.setting))
-
-
-class Stage:
-    """A plant that turns about z by what it is told, and is seen exactly."""
-
-    def __init__(self) -> None:
-        self.angle = 0.0
-
-    def reset(self, seed: int) -> Observation:
-        self.angle = 0.0
-        return self.observe()
-
-    def observe(self) -> Observation:
-        z = torch.tensor([0.0, 0.0, self.angle], dtype=torch.float64)
-        zeros = torch.zeros(3, dtype=torch.float64)
-        return Observation(zeros[:1], z[2:], zeros, exp(z), zeros[:1])
-
-    def command(self, delta_a: torch.Tensor) -> Observation:
-        self.angle += float(delta_a[0])
-        return self.observe()
-
-    def close(self) -> None: ...
-
-
-def test_without_the_camera_the_prediction_is_all_there_is() -> None:
-    stage = Stage()
-    start = GraspState(
-        torch.zeros(1, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), torch.eye(3).double()
-    )
-    axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    target = PoseTarget.turned(start, axis, 0.5)
-    tilt = exp(torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64))  # off the axis: no help for it
-    target = PoseTarget(target.position, tilt @ target.rotation)
-    half = torch.tensor([0.0] * 6 + [0.5], dtype=torch.float64)  # a model that predicts half of every turn
-    plant = CameraOff(stage, lambda _, delta_a: half * delta_a, target, axis, switch_off=0.25)
-    plant.reset(0)
-    step = torch.tensor([0.2], dtype=torch.float64)
-
-    def angle(seen: Observation) -> float:
-        return float(torch.atan2(seen.rotation[1, 0], seen.rotation[0, 0]))
-
-    assert angle(plant.command(step)) == pytest.approx(0.2)  # seen: 0.3 rad to go
-    assert not plant.dark
-    assert angle(plant.command(step)) == pytest.approx(0.4)  # seen, and then the camera goes dark
-    assert plant.dark
-    assert angle(plant.command(step)) == pytest.approx(0.5)  # believed; really 0.6
-    assert stage.angle == pytest.approx(0.6)
-    assert plant.observe().status is PlantStatus.HELD
-
-    def refuse(*_):
-        raise NoContactError("the model knows nothing of this state")
-
-    plant.predict = refuse
-    assert angle(plant.command(step)) == pytest.approx(0.5)  # the pose that was believed last
 
 
 def test_impossible_protocols_are_refused() -> None:

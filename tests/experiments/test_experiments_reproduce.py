@@ -15,6 +15,8 @@ from typer.testing import CliRunner
 from torch_ekm.cli import app
 from torch_ekm.description import object_paths
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
+from torch_ekm.experiments.foresight_turn import ForesightTurn
+from torch_ekm.experiments.protocols.foresight import Foresight
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.protocols.object_memory import MemoryTurn, ObjectMemory
 from torch_ekm.experiments.protocols.online import Online
@@ -62,12 +64,25 @@ def made_up_memory(protocol: ObjectMemory, seed: int) -> list[MemoryTurn]:
     return records
 
 
+def made_up_foresight(protocol: Foresight, item: str, contender: str, seed: int) -> list[ForesightTurn]:
+    record, known = made_up_turn("E-KM", seed, 0, 70.0, item), {"contender": contender}
+    far = dataclasses.replace(record, kind="far", reason="given up")
+    dark = {"axis_std_deg": 0.4, "estimate_error_deg": 0.1 * seed, **known}
+    reached = {"largest_deg": 30.0 + seed, "reach_deg": 31.0, "reach_end": "link: thumb_2", **known}
+    return [
+        ForesightTurn(**vars(far), **reached),
+        ForesightTurn(**vars(made_up_turn("E-KM", seed, 1, 34.0, item)), **reached),
+        ForesightTurn(**{**vars(record), "kind": "blind", "angle_deg": 15.0}, **dark),
+    ]
+
+
 @pytest.fixture
 def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sessions without a simulation."""
     monkeypatch.setattr(Online, "session", made_up_online)
     monkeypatch.setattr(Generalize, "session", made_up_generalize)  # and with it the ablation's
     monkeypatch.setattr(ObjectMemory, "session", made_up_memory)
+    monkeypatch.setattr(Foresight, "session", made_up_foresight)
 
 
 def read(folder: Path) -> dict[str, bytes]:

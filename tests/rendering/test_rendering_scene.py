@@ -25,6 +25,19 @@ def test_the_object_is_where_it_is_said_to_be():
     np.testing.assert_allclose(scene.down, [0, 0, 1])
 
 
+def test_a_ghost_stands_where_it_was_planned_and_can_be_seen_through():
+    hand, obj, one = load_hand("icub_right"), load_object("box"), np.eye(3)[None]
+    here, there = np.array([[0.05, 0.0, 0.06]]), np.array([[0.06, 0.0, 0.06]])
+    q = hand.spring_rest[None]
+    scene = make_scene(hand, obj, q, here, one, PALM_DOWN, ghost=(there, one))
+    n = len(obj.shapes)
+    hidden = [scene.opacity(i) is None for i in range(len(scene.shapes))]
+    assert hidden == [True] * (len(hidden) - n) + [False] * n
+    moved = scene.transforms[0, -n:, :3, 3] - scene.transforms[0, -2 * n : -n, :3, 3]
+    np.testing.assert_allclose(moved, [[0.01, 0, 0]] * n, atol=1e-12)
+    assert scene_of("icub_right", PALM_DOWN).ghosts == 0
+
+
 def test_hands_are_seen_from_the_side_of_the_index_finger():
     views = {name: scene_of(name, PALM_DOWN).camera for name in ("icub_right", "icub_left")}
     for name, (position, focus, up) in views.items():

@@ -99,6 +99,8 @@ class ClosedLoop:
         learn: False leaves the learner as it is.
         caution: when to look again, to go back and to give up.
         guards: which readings may move the hand and teach, and what the hand must never do.
+        decline: is asked before anything moves; a text ends the manipulation as out of reach, with the object
+            in the hand (:class:`~torch_ekm.foresight.BeyondReach`). None: nothing is declined.
 
     An enhanced model with a ``servo`` commands through a :class:`~torch_ekm.plant.ServoInverse`, and
     it learns from what the encoders did. One without learns from the commands.
@@ -113,8 +115,10 @@ class ClosedLoop:
         learn: bool = True,
         caution: Caution | None = None,
         guards: Guards | None = None,
+        decline: Callable[[Observation, PoseTarget], str] | None = None,
     ) -> None:
         self.plant, self.controller = plant, controller
+        self.decline = decline
         self.rule = StoppingRule() if rule is None else rule
         self.learn = learn
         self.caution = Caution() if caution is None else caution
@@ -175,6 +179,10 @@ class ClosedLoop:
         seen, _, halt, _ = watch.first(self.plant.observe(), self.plant.observe)
         self.controller.reset()
         turn = _Turn(target, self.controller.focus, seen, self.caution.off_rotation, watch, halt)
+        if self.decline is not None and halt is None and seen.status is not PlantStatus.LOST:
+            against = self.decline(seen, target)
+            if against:
+                return Stop(StopReason.OUT_OF_REACH, seen, against)
         while True:
             if turn.halt is not None:
                 self.hold()

@@ -20,6 +20,8 @@ class StopReason(Enum):
     UNSTABLE_GRASP = "unstable grasp"
     GIVEN_UP = "given up"
     """With the object in the hand, see :class:`~torch_ekm.control.Caution`."""
+    OUT_OF_REACH = "out of reach"
+    """Declined before anything moved, see ``decline`` of :class:`~torch_ekm.control.ClosedLoop`."""
     OBJECT_LOST = "object lost"
     TIME_OUT = "time-out"
     STOPPED = "stopped"

@@ -78,6 +78,9 @@ class Setting:
     """The E-KM commands through one; without it the dead zone is learned together with the hand."""
     force_learner: bool = False
     """The E-KM learns the normal forces, too, and grips by what it learned."""
+    horizon: int = 1
+    """Motions that the controller foresees; more than one: a
+    :class:`~torch_ekm.foresight.HorizonController`."""
     oracle: bool = False
     """The model is the plant's own, and pose, joints and forces are the true ones: what physics allows."""
     learner: str = DEFAULT_LEARNER
@@ -95,7 +98,7 @@ class Setting:
             raise UnknownNameError("hand", self.hand, list_hands())
         if self.learner not in LEARNERS:
             raise UnknownNameError("learner", self.learner, LEARNERS)
-        for name in ("capacity", "frames", "tolerance_deg", "max_steps"):
+        for name in ("capacity", "frames", "horizon", "tolerance_deg", "max_steps"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
         self.parameters()

@@ -13,6 +13,7 @@ from ..exceptions import ParameterError, UnknownNameError
 from .config import FIRST_REPORTED, Setting
 from .jobs import run_jobs
 from .protocols.ablation import Ablation
+from .protocols.foresight import Foresight
 from .protocols.generalize import Generalize
 from .protocols.object_memory import ObjectMemory
 from .protocols.online import Online
@@ -24,6 +25,7 @@ PROTOCOLS: dict[str, type[Protocol]] = {
     "generalize": Generalize,
     "ablation": Ablation,
     "adapt": ObjectMemory,
+    "foresight": Foresight,
 }
 #: Seeds that nobody tuned on, at least twenty for each case.
 REPORTED_SEEDS = tuple(range(FIRST_REPORTED, FIRST_REPORTED + 20))

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..control import ClosedLoop, LookAndMoveController, PoseTarget, StoppingRule
+from ..control import ClosedLoop, LookAndMoveController, Manipulation, PoseTarget, StoppingRule
 from ..description import ObjectDescription
 from ..enhanced import EnhancedModel, GraspEncoding, grasp_learner
 from ..exceptions import EquilibriumError, GraspError
+from ..foresight import BlindPose, HorizonController, Reach, reachable
 from ..kinematics import GraspState, ServoModel
 from ..model import KinematicModel
 from ..plant import FramesAtRest, Plant, ServoInverse
 from ..residual import ResidualLearner
 from ..simulation import Change, DisturbedPlant, SimulatedHand, Tug
-from .camera_off import CameraOff
 from .config import Setting, object_name
 from .learners import make_learner
 from .oracle import Omniscient, true_model
@@ -70,6 +70,8 @@ class Bench:
         self.enhanced: EnhancedModel | None = None
         self.no_grasp = ""
         """Why the last grasp that failed did."""
+        self.last: Manipulation | None = None
+        """Of the last :meth:`turn`."""
         self._ever_held, self._failed = False, 0  # trials without a grasp
 
     @property
@@ -118,6 +120,8 @@ class Bench:
         learn: bool = True,
         events: Sequence[Tug | Change] = (),
         blind_deg: float = 0.0,
+        touch: bool = False,
+        look_again_deg: float = math.inf,
         poses: bool = False,
     ) -> TrialRecord:
         """Turn the object that is held.
@@ -126,7 +130,9 @@ class Bench:
             start: from where, as measured.
             learn: train after every motion (an E-KM only).
             events: what happens on the way; ``at`` counts this trial's commands from 0.
-            blind_deg: the camera is off for this last part of the turn [deg].
+            blind_deg: the camera is off for this last part of the turn [deg]; infinite: for all of it.
+            touch: in the dark joints and fingertips correct the pose; else the prediction is all there is.
+            look_again_deg: of :class:`~torch_ekm.foresight.BlindPose` [deg].
             poses: keep the true poses, for pictures.
         """
         self.disturbed.events = tuple(
@@ -136,11 +142,31 @@ class Bench:
         target = PoseTarget.turned(start, axis, about.angle_deg * _DEG)
         plant = self.plant
         if blind_deg:
-            commands = self.learns and not self.setting.servo_inverse
-            plant = CameraOff(plant, self._predictor, target, axis, blind_deg * _DEG, commands)
+            plant = BlindPose(
+                plant,
+                self._predictor,
+                axis,
+                look_again=look_again_deg * _DEG,
+                # rotation off the axis does not keep the camera on: a model that tilts is not to be helped
+                switch_off=lambda seen: abs(float(axis @ target.error(seen.state)[3:])) <= blind_deg * _DEG,
+                touch=touch,
+                by_commands=self.learns and not self.setting.servo_inverse,
+            )
         loop = self._loop(plant, self._controller(axis, {}), self.setting.stopping_rule(), learn)
-        done = loop.run(target)
-        return TrialRecord.of(about, done, axis, learns=self.learns, poses=poses)
+        self.last = loop.run(target)
+        return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
+
+    def reach(self, angle_deg: float) -> Reach | None:
+        """How far the model says that the grasp turns, up to ``angle_deg``; None: it refuses the grasp."""
+        axis = self.hand.rotation_axis
+        options = {"caution": None, "rule": self.setting.stopping_rule()}
+        sign, limit = (1 if angle_deg > 0 else -1), abs(angle_deg) * _DEG
+        try:
+            return reachable(
+                self._controller(axis, {}), self.plant.observe(), sign=sign, limit=limit, **options
+            )
+        except GraspError:
+            return None
 
     def long_step(self, seed: int, trial: int, step_deg: float) -> Record:
         """One motion of ``step_deg`` from a fresh grasp: how far from it does the object come to rest?
@@ -176,7 +202,10 @@ class Bench:
 
     def _controller(self, axis: torch.Tensor, changes: Mapping[str, Any]) -> LookAndMoveController:
         setting = self.setting.replace(control={**self.setting.control, **changes})
-        return LookAndMoveController(self._predictor, axis, **setting.controller_parts())
+        parts = setting.controller_parts()
+        if setting.horizon > 1:
+            return HorizonController(self._predictor, axis, horizon=setting.horizon, **parts)
+        return LookAndMoveController(self._predictor, axis, **parts)
 
     def _loop(
         self, plant: Plant, controller: LookAndMoveController, rule: StoppingRule, learn: bool

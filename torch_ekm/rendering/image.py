@@ -41,13 +41,16 @@ class Picture:
         self._plotter: Any = pyvista.Plotter(
             off_screen=True, shape=(1, n), border=False, window_size=(n * size[0], size[1])
         )
-        meshes = [(pyvista.wrap(shape_mesh(shape)), colour) for shape, colour in scene.shapes]
+        meshes = [
+            (pyvista.wrap(shape_mesh(shape)), colour, scene.opacity(i))
+            for i, (shape, colour) in enumerate(scene.shapes)
+        ]
         look = {"smooth_shading": True, "split_sharp_edges": True, "specular": 0.3, "specular_power": 15}
         self._actors = []
         for k in range(n):
             self._plotter.subplot(0, k)
             self._plotter.set_background("white")
-            self._actors.append([self._plotter.add_mesh(mesh, color=c, **look) for mesh, c in meshes])
+            self._actors.append([self._plotter.add_mesh(m, color=c, opacity=o, **look) for m, c, o in meshes])
             if smooth:
                 self._plotter.enable_anti_aliasing("ssaa")
 
@@ -89,16 +92,17 @@ def _draw_matplotlib(scene: Scene, path: Path, size: int) -> None:
     collection = require("mpl_toolkits.mplot3d.art3d").Poly3DCollection
     n = len(scene.transforms)
     figure = require("matplotlib.figure").Figure(figsize=(size / 100 * n, size / 100))
-    meshes = [(shape_mesh(shape), colour) for shape, colour in scene.shapes]
+    meshes = [(shape_mesh(shape), colour, scene.opacity(i)) for i, (shape, colour) in enumerate(scene.shapes)]
     _, focus, up = scene.camera  # matplotlib's z is up in the picture: turn everything there
     forward = np.array([1.0, 0.0, 0.0]) - up[0] * up
     forward /= np.linalg.norm(forward)
     turn = np.stack([forward, np.cross(up, forward), up])
     for k, transforms in enumerate(scene.transforms):
         axis = figure.add_subplot(1, n, k + 1, projection="3d")
-        for (mesh, colour), T in zip(meshes, transforms, strict=True):
+        for (mesh, colour, opacity), T in zip(meshes, transforms, strict=True):
             vertices = (mesh.vertices @ T[:3, :3].T + T[:3, 3]) @ turn.T
-            axis.add_collection3d(collection(vertices[mesh.faces], facecolors=colour, shade=True))
+            faces = collection(vertices[mesh.faces], facecolors=colour, shade=True, alpha=opacity)
+            axis.add_collection3d(faces)
         for name, middle in zip("xyz", turn @ focus, strict=True):
             getattr(axis, f"set_{name}lim")(middle - 0.06, middle + 0.06)
         axis.set_axis_off()

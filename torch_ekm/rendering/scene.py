@@ -16,6 +16,7 @@ from ..typing import Array
 Colour = tuple[float, float, float]
 
 _PALM, _PHALANX, _TIP, _OBJECT = (0.45, 0.47, 0.50), (0.72, 0.74, 0.77), (0.00, 0.45, 0.70), (0.90, 0.62, 0.0)
+_GHOST = (0.0, 0.62, 0.45)
 _DISTANCE = 0.34  # [m] of the camera
 
 
@@ -30,6 +31,12 @@ class Scene:
     """Down in the picture: the direction of gravity, hand frame."""
     side: Array
     """Direction from which the hand is looked at, hand frame."""
+    ghosts: int = 0
+    """So many of the last shapes are see-through."""
+
+    def opacity(self, shape: int) -> float | None:
+        """Of a shape; None: it hides what is behind it."""
+        return 0.35 if shape >= len(self.shapes) - self.ghosts else None
 
     @property
     def camera(self) -> tuple[Array, Array, Array]:
@@ -46,6 +53,7 @@ def make_scene(
     position: Array | None,
     rotation: Array | None,
     gravity: Array,
+    ghost: tuple[Array, Array] | None = None,
 ) -> Scene:
     """Place the shapes of the hand, and of the object if there is one, for each frame.
 
@@ -54,6 +62,7 @@ def make_scene(
         position: ``(n_frames, 3)`` [m].
         rotation: ``(n_frames, 3, 3)``.
         gravity: ``(3,)`` [m/s^2], hand frame.
+        ghost: position and rotation of the object once more, where it was planned to be, say.
     """
     links = HandKinematics(hand)(torch.as_tensor(q, dtype=torch.float64))
     pads = {pad.link for pad in hand.pads}
@@ -71,7 +80,13 @@ def make_scene(
     for shape in obj.shapes if obj is not None else ():
         shapes.append((shape, _OBJECT))
         transforms.append(pose @ shape.transform)
-    return Scene(shapes, np.stack(transforms, axis=1), *_view(hand, gravity))
+    ghosts = obj.shapes if obj is not None and ghost is not None else ()
+    if obj is not None and ghost is not None:
+        planned = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
+        planned[:, :3, 3], planned[:, :3, :3] = ghost
+        shapes += [(shape, _GHOST) for shape in ghosts]
+        transforms += [planned @ shape.transform for shape in ghosts]
+    return Scene(shapes, np.stack(transforms, axis=1), *_view(hand, gravity), ghosts=len(ghosts))
 
 
 def _view(hand: HandDescription, gravity: Array) -> tuple[Array, Array]:

@@ -63,6 +63,7 @@ def draw(server: Any, scene: Scene) -> list[Any]:
                 np.asarray(mesh.faces, dtype=np.uint32),
                 color=tuple(int(255 * c) for c in colour),
                 flat_shading=shape.kind == "box",
+                opacity=scene.opacity(i),
             )
         )
     position, focus, up = scene.camera

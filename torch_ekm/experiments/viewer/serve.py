@@ -10,25 +10,27 @@ from ...description import list_hands, load_hand
 from ...exceptions import OutputError, ParameterError, UnknownNameError
 from ...rendering import draw, place, save_animation, start_server
 from .hand import GraspShow, HandShow
+from .reach import ReachShow
 from .trial import LogShow
 
 _RATE = 30.0  # [Hz] at which controls are looked at
 
 
 #: Something to look at, with controls.
-Show = HandShow | GraspShow | LogShow
+Show = HandShow | GraspShow | ReachShow | LogShow
 
 
-def choose_show(what: str, object: str | None = None, seed: int = 0) -> Show:
+def choose_show(what: str, object: str | None = None, seed: int = 0, reach: bool = False) -> Show:
     """A hand (name or URDF), alone or holding an object, or a log (folder, or one trial's file).
 
     Args:
         object: name or URDF.
         seed: which grasp of it.
+        reach: how far it can be turned.
 
     Raises:
         UnknownNameError: no such hand, and no log of that name; the message lists the hands.
-        ParameterError: an object was given to a log.
+        ParameterError: an object was given to a log, or none to a hand whose reach is asked for.
         DescriptionError: the log is damaged or has nothing to show.
     """
     path = Path(what)
@@ -38,7 +40,11 @@ def choose_show(what: str, object: str | None = None, seed: int = 0) -> Show:
         if object is not None:
             raise ParameterError("object", object, "left out with a log, which knows its own")
         return LogShow(path)
-    return HandShow(load_hand(what)) if object is None else GraspShow(what, object, seed)
+    if object is None:
+        if reach:
+            raise ParameterError("reach", reach, "False without an object: it is that of a grasp")
+        return HandShow(load_hand(what))
+    return (ReachShow if reach else GraspShow)(what, object, seed)
 
 
 def save_page(show: Show, path: Path) -> Path:

@@ -1,0 +1,152 @@
+"""How far a grasp can be turned, by the model: against the simulated hand without mismatch."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from torch_ekm.control import Caution, ClosedLoop, FocusedPose, LookAndMoveController, PoseTarget
+from torch_ekm.control.termination import StopReason
+from torch_ekm.enhanced import EnhancedModel
+from torch_ekm.exceptions import NoContactError, ParameterError
+from torch_ekm.foresight import BeyondReach, ModelHand, ReachEnd, friction_share, reachable
+from torch_ekm.kinematics import GraspState
+from torch_ekm.model import KinematicModel
+from torch_ekm.plant import Observation, PlantStatus
+from torch_ekm.simulation import SimulatedHand
+
+DEG = math.pi / 180
+
+
+@pytest.fixture(scope="module")
+def grasp() -> tuple[SimulatedHand, Observation, LookAndMoveController]:
+    """A wide tin in the hand as described."""
+    plant = SimulatedHand("icub_right", "tea_tin", preset="none")
+    seen = plant.reset(0)
+    return plant, seen, LookAndMoveController(KinematicModel(plant.hand, plant.object), plant.rotation_axis)
+
+
+def turned(axis: torch.Tensor, start: GraspState, now: GraspState) -> float:
+    return float(axis @ now.minus(start)[-3:])
+
+
+def test_the_model_hand_goes_where_the_simulated_one_goes(grasp) -> None:
+    plant, _, controller = grasp
+    seen = plant.reset(0)
+    model = ModelHand(controller.kinematic, seen.state, seen.a, seen.fingertip_force)
+    target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=10)
+    controller.reset()
+    for _ in range(5):
+        foretold = model.observe()
+        da = controller.decide(foretold.state, foretold.a, target, foretold.fingertip_force).delta_a
+        foretold, seen = model.command(da), plant.command(da)
+    error = foretold.state.minus(seen.truth.state)[-6:]
+    assert float(error[3:].norm()) < 1.0 * DEG
+    assert float(error[:3].norm()) < 1.0e-3
+    assert float((foretold.fingertip_force - seen.truth.fingertip_force).abs().max()) < 0.6
+
+
+def test_joints_keep_their_stops_and_encoders_their_ranges(grasp) -> None:
+    plant, seen, controller = grasp
+    model = ModelHand(controller.kinematic, seen.state, seen.a, seen.fingertip_force)
+    hand, push = plant.hand, torch.zeros(plant.hand.n_a, dtype=torch.float64)
+    push[hand.actuator_names.index("thumb_proximal")] = -0.5
+    assert not model.at_stops()
+    seen = model.command(push)
+    assert "thumb_1" in model.at_stops()
+    assert bool((seen.q >= torch.from_numpy(hand.joint_lower) - 1e-4).all())
+    assert bool((seen.q <= torch.from_numpy(hand.joint_upper) + 1e-4).all())
+    assert bool((seen.a >= torch.from_numpy(hand.actuator_lower)).all())
+    if model.failure:
+        assert seen.status is PlantStatus.LOST
+        assert torch.equal(model.command(-push).q, seen.q)  # nothing is foretold of what was lost
+    assert model.reset(0).status is PlantStatus.HELD
+
+
+def test_a_turn_ends_where_the_model_said(grasp) -> None:
+    plant, _, controller = grasp
+    seen = plant.reset(0)
+    reach = reachable(controller, seen, caution=Caution())
+    assert reach.end is ReachEnd.LINK
+    assert reach.what == ("thumb_2",)
+    assert reach.angles == tuple(sorted(reach.angles))
+    assert len(reach.path) == len(reach.angles)
+    assert turned(plant.rotation_axis, reach.path[0], reach.path[-1]) == pytest.approx(reach.angle)
+    done = ClosedLoop(plant, controller).run(PoseTarget.turned(seen.state, plant.rotation_axis, degrees=60))
+    real = max(turned(plant.rotation_axis, seen.state, step.after.state) for step in done.steps)
+    assert done.reason is StopReason.GIVEN_UP
+    assert "thumb_2" in done.stop.message
+    assert abs(reach.angle - real) < 3 * DEG
+    other = reachable(controller, plant.reset(0), sign=-1)
+    assert other.angle <= 0
+    assert other.angle > -10 * DEG
+    assert "middle_2" in str(other)
+
+
+def test_the_share_of_friction_is_what_statics_say(grasp) -> None:
+    """At least the weight over all friction; with half the friction twice the share."""
+    _, seen, controller = grasp
+    model = controller.kinematic
+    lin = model.linearize(seen.state, fingertip_force=seen.fingertip_force)
+    share = friction_share(model, lin)
+    # the friction of all pads together bears the weight at least
+    least = float(model.weight.norm() / (lin.contacts.friction * (lin.forces.normal + 0.3)).sum())
+    assert least <= share < 0.6
+    half = dataclasses.replace(lin, contacts=lin.contacts.replace(friction=lin.contacts.friction / 2))
+    assert friction_share(model, half) == pytest.approx(2 * share, rel=1e-3)
+    reach = reachable(controller, seen, friction=1.01 * share)
+    assert reach.end is ReachEnd.FRICTION
+    assert abs(reach.angle) < reachable(controller, seen).angle
+
+
+def test_what_lies_within_reach_ends_by_nothing(grasp) -> None:
+    plant, seen, controller = grasp
+    reach = reachable(controller.kinematic, seen.state, plant.rotation_axis, limit=5 * DEG)
+    assert reach.end is ReachEnd.NOTHING
+    assert reach.angle == pytest.approx(5 * DEG, abs=0.3 * DEG)
+
+
+def test_nothing_of_the_controller_changes(grasp) -> None:
+    plant, seen, _ = grasp
+    ekm = EnhancedModel.for_grasp(KinematicModel(plant.hand, plant.object), seen.state)
+    controller = LookAndMoveController(ekm, plant.rotation_axis)
+    before = copy.deepcopy(ekm.state_dict()["trust.value"]), controller.tighter, ekm.servo
+    assert reachable(controller, seen).end is not ReachEnd.NOTHING
+    assert (ekm.state_dict()["trust.value"], controller.tighter, ekm.servo) == before
+    assert controller.enhanced is ekm
+
+
+def test_a_target_out_of_reach_is_declined_and_the_object_stays(grasp) -> None:
+    plant, _, controller = grasp
+    seen = plant.reset(0)
+    loop = ClosedLoop(plant, controller, decline=BeyondReach(controller))
+    far, near = (PoseTarget.turned(seen.state, plant.rotation_axis, degrees=angle) for angle in (45, 6))
+    done = loop.run(far)
+    assert done.reason is StopReason.OUT_OF_REACH
+    assert not done.steps
+    assert "thumb_2" in done.stop.message
+    assert done.stop.final.status is PlantStatus.HELD
+    assert loop.run(near).reason is StopReason.REACHED
+
+
+def test_what_cannot_be_asked_is_refused(grasp) -> None:
+    _, seen, controller = grasp
+    with pytest.raises(ParameterError, match="axis"):
+        reachable(controller.kinematic, seen)
+    with pytest.raises(ParameterError, match="sign"):
+        reachable(controller, seen, sign=0)
+    with pytest.raises(ParameterError, match="friction"):
+        reachable(controller, seen, friction=0.0)
+    with pytest.raises(ParameterError, match="limit"):
+        reachable(controller, seen, limit=4.0)
+    away = GraspState(seen.q, seen.position + 0.2, seen.rotation)
+    with pytest.raises(NoContactError):
+        reachable(controller, away)
+    whole = copy.copy(controller)
+    whole.focus = FocusedPose(torch.eye(6, dtype=torch.float64))
+    with pytest.raises(ParameterError, match="one axis"):
+        reachable(whole, seen)

@@ -1,0 +1,300 @@
+"""The report on foresight: reach, turns beyond Table I, turns in the dark."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ...control import StopReason
+from ...description import load_hand, load_object
+from ...rendering import make_scene, save_animation
+from ..config import Setting
+from ..foresight_turn import ForesightTurn
+from ..records import Record
+from . import statistics as stats
+from .plots import COLOURS, new_figure, save_figure
+from .report import Cell, Column, FigureFile, Report, Table
+from .tables import Target, targets_table, which_seeds
+
+Turns = Sequence[ForesightTurn]
+Results = Mapping[str, Sequence[Record]]
+
+#: A target is declined where it lies this far beyond the foretold reach [deg].
+BEYOND_DEG = 2.0
+_NINETY = 1.645  # standard deviations on either side that hold 90 % of a Gaussian
+ONE_STEP = "one-step E-KM"
+_FREE = "nothing"
+
+
+def turns_of(results: Results, **wanted: object) -> list[ForesightTurn]:
+    """Turns of grasped objects with these entries."""
+    found = (r for session in results.values() for r in session if isinstance(r, ForesightTurn))
+    return [r for r in found if all(getattr(r, key) == value for key, value in wanted.items())]
+
+
+def reach_errors(turns: Turns) -> np.ndarray:
+    """Foretold end less the real one [deg], of turns that ended and of which an end was foretold."""
+    ended = [r for r in turns if r.reach_deg is not None and r.reason != StopReason.REACHED.value]
+    return np.array([abs(r.reach_deg or 0.0) - r.largest_deg for r in ended])
+
+
+def declined(turn: ForesightTurn) -> bool:
+    """The model said that the target is out of reach."""
+    if turn.reach_deg is None or turn.reach_end == _FREE:
+        return False
+    return abs(turn.angle_deg) > abs(turn.reach_deg) + BEYOND_DEG
+
+
+def covered(turns: Turns) -> list[bool]:
+    """The error of the estimate lies within the stated 90 % interval."""
+    return [
+        abs(r.estimate_error_deg) <= _NINETY * r.axis_std_deg
+        for r in turns
+        if r.estimate_error_deg is not None and r.axis_std_deg is not None
+    ]
+
+
+def contenders_of(results: Results) -> list[str]:
+    """In the order in which they appear, the one-step controller first."""
+    names = dict.fromkeys(r.contender for r in turns_of(results))
+    return sorted(names, key=lambda name: name != ONE_STEP)
+
+
+def paired_ratio(results: Results, contender: str) -> float | None:
+    """Median of the largest angle over that of the one-step controller, on the same grasps."""
+    ours, theirs = (
+        {(r.object, r.seed): r.largest_deg for r in turns_of(results, kind="far", contender=name)}
+        for name in (contender, ONE_STEP)
+    )
+    ratios = [ours[unit] / theirs[unit] for unit in ours if theirs.get(unit, 0.0) > 1.0]
+    return float(np.median(ratios)) if ratios else None
+
+
+def foresight_targets(results: Results) -> list[Target]:
+    """What was aimed at."""
+    found: list[Target] = []
+    errors = reach_errors(turns_of(results, kind="far", contender=ONE_STEP))
+    if errors.size:
+        within = 100 * float(np.mean(np.abs(errors) <= 2))
+        found.append(Target("reach foretold within 2 deg [% of grasps]", within, least=90))
+    blind = turns_of(results, kind="blind", contender=ONE_STEP)
+    if blind:
+        median = float(np.median([r.true_error_deg for r in blind]))
+        found.append(Target("blind turn with touch, median error [deg]", median, most=0.5))
+        found.append(Target("its 90 % interval holds [%]", 100 * float(np.mean(covered(blind))), least=90))
+    for name in contenders_of(results):
+        ratio = paired_ratio(results, name)
+        if name.startswith("horizon") and ratio is not None:
+            found.append(Target(f"largest angle, {name} : one-step E-KM, median", ratio, least=1.3))
+            lost, before = (
+                sum(r.lost for r in turns_of(results, kind="turn", contender=n)) for n in (name, ONE_STEP)
+            )
+            if before:
+                found.append(
+                    Target(f"objects lost beyond Table I, {name} : one-step", lost / before, most=0.5)
+                )
+    return found
+
+
+def foresight_report(setting: Setting, seeds: Sequence[int], results: Results, folder: Path) -> Report:
+    """The answer, the tables, two figures and an animation."""
+    found = foresight_targets(results)
+    tables = [
+        targets_table(found) if found else None,
+        far_table(results),
+        reach_table(results),
+        beyond_table(results),
+        blind_table(results),
+    ]
+    figures = [*_plots(results, folder), *_animation(setting, results, folder)]
+    shown = [table for table in tables if table is not None and table.rows]
+    title = "Foresight: how far, and what ends it; a turn in the dark"
+    return Report(title, f"{_answer(results)} {which_seeds(seeds)}", shown, figures)
+
+
+def _answer(results: Results) -> str:
+    parts = []
+    errors = np.abs(reach_errors(turns_of(results, kind="far", contender=ONE_STEP)))
+    if errors.size:
+        share = 100 * np.mean(errors <= 2)
+        parts.append(
+            f"The end of a turn is foretold to {np.median(errors):.1f} deg (median), within 2 deg in "
+            f"{share:.0f} % of {errors.size} grasps."
+        )
+    blind = turns_of(results, kind="blind", contender=ONE_STEP)
+    if blind:
+        middle = np.median([r.true_error_deg for r in blind])
+        hold = 100 * np.mean(covered(blind))
+        parts.append(
+            f"A blind turn of {blind[0].angle_deg:g} deg ends {middle:.2f} deg off (median of {len(blind)}); "
+            f"the stated 90 % interval holds {hold:.0f} % of the estimates."
+        )
+    for name in contenders_of(results):
+        ratio = paired_ratio(results, name)
+        if name != ONE_STEP and ratio is not None:
+            parts.append(f"{name} turns {ratio:.2f} times as far as the one-step E-KM (median).")
+    return " ".join(parts) or "Nothing was grasped."
+
+
+def far_table(results: Results) -> Table:
+    """The largest angle of each contender."""
+    items = {name: turns_of(results, kind="far", contender=name) for name in contenders_of(results)}
+    columns: dict[Column, Callable[[Turns], Cell]] = {
+        Column("largest angle [deg]", ".1f"): lambda mine: stats.bootstrap_mean(
+            np.array([r.largest_deg for r in mine])
+        ),
+        Column("median", ".1f"): lambda mine: float(np.median([r.largest_deg for r in mine])),
+        Column(f"paired, {ONE_STEP} = 1"): lambda mine: paired_ratio(results, mine[0].contender),
+        Column("given up"): lambda mine: stats.rate(r.given_up for r in mine),
+        Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
+    }
+    note = "The target is farther than any grasp goes; the largest true angle before the turn ended."
+    items = {name: mine for name, mine in items.items() if mine}
+    return Table.of("far", "As far as it goes", "contender", items, columns, note)
+
+
+def reach_table(results: Results) -> Table:
+    """How well the end was foretold, for each object and how the turn ended."""
+    far = [r for r in turns_of(results, kind="far") if r.reach_deg is not None]
+    items: dict[str, Turns] = {}
+    for name in contenders_of(results):
+        mine = [r for r in far if r.contender == name]
+        items |= {
+            f"{name}, {item}": [r for r in mine if r.object == item] for item in {r.object: 0 for r in mine}
+        }
+        items |= {
+            f"{name}, {reason}": [r for r in mine if r.reason == reason]
+            for reason in {r.reason: 0 for r in mine}
+        }
+        items[f"{name}, all"] = mine
+    columns: dict[Column, Callable[[Turns], Cell]] = {
+        Column("grasps"): lambda mine: len(reach_errors(mine)),
+        Column("median |error|", ".1f"): lambda mine: float(np.median(np.abs(reach_errors(mine)))),
+        Column("mean error", "+.1f"): lambda mine: float(reach_errors(mine).mean()),
+        Column("within 2 deg"): lambda mine: stats.rate((np.abs(reach_errors(mine)) <= 2).tolist()),
+        Column("within 5 deg"): lambda mine: stats.rate((np.abs(reach_errors(mine)) <= 5).tolist()),
+        Column("ends by (foretold)"): lambda mine: _most(r.reach_end for r in mine),
+    }
+    items = {name: mine for name, mine in items.items() if len(reach_errors(mine))}
+    note = "Foretold less real largest angle [deg]; how a turn really ended is in the rows below the objects."
+    return Table.of("reach", "Foretold ends of turns", "", items, columns, note)
+
+
+def beyond_table(results: Results) -> Table:
+    """Turns beyond Table I, and what declining would have spared."""
+    items = {name: turns_of(results, kind="turn", contender=name) for name in contenders_of(results)}
+    columns: dict[Column, Callable[[Turns], Cell]] = {
+        Column("turns"): len,
+        Column("reached"): lambda mine: stats.rate(r.reason == StopReason.REACHED.value for r in mine),
+        Column("given up"): lambda mine: stats.rate(r.given_up for r in mine),
+        Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
+        Column("declined"): lambda mine: sum(declined(r) for r in mine),
+        Column("of these lost or given up"): lambda mine: sum(
+            r.lost or r.given_up for r in mine if declined(r)
+        ),
+        Column("lost, not declined"): lambda mine: sum(r.lost for r in mine if not declined(r)),
+    }
+    note = (
+        f"Declined: more than {BEYOND_DEG:g} deg beyond the foretold reach. These turns were made all the "
+        "same, to see what declining them would have spared."
+    )
+    items = {name: mine for name, mine in items.items() if mine}
+    return Table.of("beyond", "Beyond Table I", "contender", items, columns, note)
+
+
+def blind_table(results: Results) -> Table:
+    """Turns in the dark."""
+    items: dict[str, Turns] = {}
+    for name in contenders_of(results):
+        for kind in ("blind", "blind, looks again", "blind, no touch"):
+            mine = turns_of(results, kind=kind, contender=name)
+            items |= {
+                f"{name}: {kind}, {item}": [r for r in mine if r.object == item]
+                for item in {r.object: 0 for r in mine}
+            }
+            items[f"{name}: {kind}, all"] = mine
+    columns: dict[Column, Callable[[Turns], Cell]] = {
+        Column("turns"): len,
+        Column("median error [deg]"): lambda mine: float(np.median([r.true_error_deg for r in mine])),
+        Column("mean"): lambda mine: float(np.mean([r.true_error_deg for r in mine])),
+        Column("largest"): lambda mine: float(max(r.true_error_deg for r in mine)),
+        Column("of the estimate, rms"): lambda mine: _rms([r.estimate_error_deg for r in mine]),
+        Column("stated sd"): lambda mine: _rms([r.axis_std_deg for r in mine]),
+        Column("90 % interval holds"): lambda mine: stats.rate(covered(mine)) if covered(mine) else None,
+        Column("looks", ".1f"): lambda mine: float(np.mean([r.looks for r in mine])),
+        Column("lost"): lambda mine: sum(r.lost for r in mine),
+    }
+    items = {name: mine for name, mine in items.items() if mine}
+    note = (
+        "The camera is off from the first reading on. True error about the axis at the end; error of the "
+        "estimate and its stated standard deviation likewise. 'No touch': the prediction alone."
+    )
+    return Table.of("blind", "Whole turns in the dark", "", items, columns, note)
+
+
+def _most(names) -> str:
+    found = list(names)
+    return max(set(found), key=lambda name: (found.count(name), name)) if found else ""
+
+
+def _rms(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.sqrt(np.mean(np.square(known)))) if known else None
+
+
+def _plots(results: Results, folder: Path) -> list[FigureFile]:
+    """Foretold against real ends, and errors of blind turns."""
+    figures = []
+    far = [r for r in turns_of(results, kind="far", contender=ONE_STEP) if r.reach_deg is not None]
+    if far:
+        figure, (axis,) = new_figure(4.5, 4.2)
+        top = 5 + max(max(abs(r.reach_deg or 0.0), r.largest_deg) for r in far)
+        axis.plot([0, top], [0, top], color=COLOURS["KM"], linewidth=1)
+        for k, name in enumerate(dict.fromkeys(r.object for r in far)):
+            mine = [r for r in far if r.object == name]
+            x, y = [r.largest_deg for r in mine], [abs(r.reach_deg or 0.0) for r in mine]
+            axis.plot(x, y, "osD^v*PX"[k % 8], label=name.replace("_", " "), markersize=5)
+        axis.set(xlabel="real end [deg]", ylabel="foretold end [deg]", xlim=(0, top), ylim=(0, top))
+        axis.legend(frameon=False, fontsize=8)
+        caption = "Where turns ended, and where the model said so before anything moved."
+        figures.append(save_figure(figure, folder, "reach", caption))
+    kinds = {
+        kind: turns_of(results, kind=kind) for kind in ("blind", "blind, looks again", "blind, no touch")
+    }
+    if any(kinds.values()):
+        figure, (axis,) = new_figure(5.0, 3.2)
+        for k, mine in enumerate(kinds.values()):
+            errors = sorted(r.true_error_deg for r in mine if not r.lost)
+            spread = np.linspace(-0.25, 0.25, len(errors)) if len(errors) > 1 else np.zeros(len(errors))
+            axis.plot(k + spread, errors, "o", color=COLOURS["E-KM"], markersize=3.5)
+            if errors:
+                axis.plot([k - 0.3, k + 0.3], [np.median(errors)] * 2, color=COLOURS["limit"])
+        axis.set_xticks(range(len(kinds)), list(kinds))
+        axis.set(ylabel="true error [deg]", ylim=(0, None))
+        figures.append(
+            save_figure(figure, folder, "blind", "Whole turns in the dark: each turn, and the median.")
+        )
+    return figures
+
+
+def _animation(setting: Setting, results: Results, folder: Path) -> list[FigureFile]:
+    """The farthest turn that was foretold, with the foretold object as a ghost."""
+    turns = [r for r in turns_of(results, kind="far") if r.poses and r.foretold and not r.lost]
+    if not turns:
+        return []
+    turn = max(turns, key=lambda r: r.largest_deg)
+    hand, obj = load_hand(setting.hand), load_object(turn.object)
+    n = len(turn.poses)
+    foretold = [turn.foretold[min(k, len(turn.foretold) - 1)] for k in range(n)]
+    q, position, rotation = (np.array(part) for part in zip(*turn.poses, strict=True))
+    _, ghost_position, ghost_rotation = (np.array(part) for part in zip(*foretold, strict=True))
+    scene = make_scene(
+        hand, obj, q, position, rotation, np.array(hand.gravity), ghost=(ghost_position, ghost_rotation)
+    )
+    save_animation(scene, folder / "animation.html")
+    what = f"{turn.object.replace('_', ' ')}, {turn.contender}, seed {turn.seed}"
+    return [
+        FigureFile("animation.html", f"As far as it goes ({what}); see-through: as the model foretold it.")
+    ]

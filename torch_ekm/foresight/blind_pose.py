@@ -1,0 +1,123 @@
+"""A plant whose camera is off: the pose is foretold, corrected by touch, and looked at when it must be."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import torch
+
+from ..enhanced import EnhancedModel
+from ..exceptions import ParameterError
+from ..model import KinematicModel
+from ..plant import Observation, Plant, PlantStatus, PlantWrapper
+from ..typing import Float, Tensor
+from .pose_filter import BlindOptions, PoseFilter
+
+
+class BlindPose(PlantWrapper):
+    """``(q, o, R)`` of a :class:`PoseFilter` in place of the camera's pose, from ``switch_off`` on.
+
+    Joint angles, encoders and fingertip forces go on being measured. The camera is asked again where the
+    standard deviation of the rotation about the axis exceeds ``look_again``; what it then sees is one more
+    measurement. ``info["estimate"]`` of an observation in the dark has ``pose_covariance`` of the error twist
+    ``(v; w)`` [m, rad], ``axis_std`` [rad] and ``looked``. Train nothing meanwhile
+    (``ClosedLoop(..., learn=False)``): increments are estimates, too. ::
+
+        plant = BlindPose(plant, ekm, axis, look_again=math.radians(1))
+        ClosedLoop(plant, controller, learn=False).run(target)
+
+    Args:
+        plant: sees until then.
+        model: foretells.
+        axis: about which the object turns, hand frame.
+        look_again: [rad]; infinite: never.
+        switch_off: the camera goes off with the first observation for which this is true; None: with the
+            first one.
+        touch: False leaves the pose to the prediction alone (the test that the paper leaves for the future,
+            section VI).
+        by_commands: predict from what was commanded, for a model that has learned from commands.
+        options: standard deviations.
+
+    Raises:
+        ParameterError: ``axis`` has no direction, or ``look_again`` is not positive.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        model: KinematicModel | EnhancedModel,
+        axis: Float[Tensor, " 3"],
+        *,
+        look_again: float = math.inf,
+        switch_off: Callable[[Observation], bool] | None = None,
+        touch: bool = True,
+        by_commands: bool = False,
+        options: BlindOptions | None = None,
+    ) -> None:
+        if not float(torch.linalg.vector_norm(axis)) > 1e-9:
+            raise ParameterError("axis", axis.tolist(), "a vector of non-zero length")
+        if not look_again > 0:
+            raise ParameterError("look_again", look_again, "greater than 0 [rad]; infinite: never")
+        super().__init__(plant)
+        self.filter = PoseFilter(model, options, touch=touch)
+        self.axis = axis / torch.linalg.vector_norm(axis)
+        self.look_again, self.by_commands = look_again, by_commands
+        self._switch_off = switch_off
+        self.dark, self.looks = False, 0
+        """The camera is off; how often it was asked since."""
+        self._before: Observation | None = None
+        """As measured, last."""
+
+    @property
+    def axis_std(self) -> float:
+        """Standard deviation of the rotation about the axis [rad]."""
+        return math.sqrt(max(float(self.axis @ self.filter.pose_covariance[3:, 3:] @ self.axis), 0.0))
+
+    def reset(self, seed: int) -> Observation:
+        """Grasp anew, camera on."""
+        self.dark, self.looks, self._before = False, 0, None
+        return super().reset(seed)
+
+    def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
+        """Move the actuators by ``delta_a`` [rad], wait, read the sensors that are on."""
+        before, after = self._before, self.plant.command(delta_a)
+        if self.dark and before is not None:
+            self.filter.move(delta_a if self.by_commands else after.a - before.a, before.fingertip_force)
+        return self.observation(after)
+
+    def observation(self, seen: Observation) -> Observation:
+        """``seen``, in the dark with the estimated state."""
+        self._before = seen
+        if not self.dark:
+            self.dark = self._switch_off is None or self._switch_off(seen)
+            if self.dark:
+                self.filter.start(seen.state, seen.fingertip_force, _covariance(seen))
+            return seen
+        self.filter.feel(seen.q, seen.fingertip_force)
+        looked = self.axis_std > self.look_again and seen.status is PlantStatus.HELD
+        if looked:
+            self.looks += 1
+            self.filter.look(seen.state, _covariance(seen))
+        at = self.filter.state
+        known = {
+            "pose_covariance": self.filter.pose_covariance, "axis_std": self.axis_std, "looked": looked,
+        }  # fmt: skip
+        # a dark camera cannot say that it does not see the object
+        status = PlantStatus.HELD if seen.status is PlantStatus.NOT_SEEN else seen.status
+        # estimated for now: it is no stale picture
+        stamps = None if seen.stamps is None else seen.stamps._replace(pose=seen.time, joints=seen.time)
+        return dataclasses.replace(
+            seen,
+            q=at.q,
+            position=at.position,
+            rotation=at.rotation,
+            status=status,
+            stamps=stamps,
+            info={**seen.info, "estimate": {**seen.info.get("estimate", {}), **known}},
+        )
+
+
+def _covariance(seen: Observation) -> Tensor | None:
+    return seen.info.get("estimate", {}).get("pose_covariance")

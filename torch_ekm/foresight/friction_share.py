@@ -1,0 +1,59 @@
+"""How much of its friction a grasp needs to hold the object."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .._extras import require
+from ..contact import grasp_matrix
+from ..model import KinematicModel, Linearization
+
+_SIDES = 12  # of the pyramid inside a friction cone
+_NORMAL = 0.3  # [N] by which a normal force may be off
+
+
+def friction_share(model: KinematicModel, lin: Linearization) -> float:
+    """``min_f max_i |f_t,i| / (mu_i f_n,i)`` over all contact forces f that balance the object's weight.
+
+    The normal forces are those of ``lin``, give or take 0.3 N; how the fingers push each other along the
+    object is free. Above 1 no force within the cones holds it, whatever the fingers do; infinite: none at
+    all. A linear program, with a pyramid of 12 sides inside each cone; moments of soft fingers are left out.
+
+    A contact that creeps at its friction limit has a margin of 0 for as long as it creeps. This figure tells
+    whether the others still hold what it lets go of.
+
+    Args:
+        lin: of one state, with its forces.
+    """
+    optimize = require("scipy.optimize")
+    contacts, n, L = lin.contacts, lin.contacts.n_c, model.options.length
+    kin = model.contact_kinematics(lin.state, contacts)
+    parts = [divmod(row, 6) for row in kin.rows]
+    # columns: the components of mu, then the share
+    G, load = grasp_matrix(kin).numpy().copy(), model.potential(lin.state)[0][-6:].numpy().copy()
+    G[3:] /= L
+    load[3:] /= L
+    normal = lin.forces.normal.clamp_min(0.0).tolist()
+    cost, bounds, inside = np.zeros(len(parts) + 1), [], []
+    cost[-1] = 1.0
+    for contact, part in parts:
+        low, high = max(normal[contact] - _NORMAL, 0.0), normal[contact] + _NORMAL
+        bounds.append((low, high) if part == 0 else (None, None) if part < 3 else (0.0, 0.0))
+    for i in range(n):
+        tangents = [column for column, at in enumerate(parts) if at in ((i, 1), (i, 2))]
+        for angle in np.arange(_SIDES) * (2 * math.pi / _SIDES):
+            side = np.zeros(len(parts) + 1)
+            side[tangents] = [math.cos(angle), math.sin(angle)][: len(tangents)]
+            side[-1] = -float(contacts.friction[i]) * normal[i] * math.cos(math.pi / _SIDES)
+            inside.append(side)
+    found = optimize.linprog(
+        cost,
+        np.array(inside),
+        np.zeros(len(inside)),
+        np.column_stack([G, np.zeros(6)]),
+        load,
+        bounds=[*bounds, (0, None)],
+    )
+    return float(found.x[-1]) if found.status == 0 else math.inf

@@ -1,0 +1,278 @@
+"""Where the object is while nobody looks: predicted by the model, corrected by joints and touch."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+
+from ..contact import ContactSet, constraint_matrix
+from ..enhanced import EnhancedModel
+from ..exceptions import GraspError, NoContactError, ParameterError
+from ..kinematics import GraspState
+from ..model import KinematicModel, Linearization
+from ..typing import Float, Tensor
+
+_DEG = math.pi / 180
+_ITERATIONS = 3  # of an update: gaps are not linear in the state
+
+
+class Measurement(NamedTuple):
+    """``H ds = miss(s) +- noise``."""
+
+    H: Float[Tensor, "n_m n_s"]
+    miss: Callable[[GraspState], Float[Tensor, " n_m"]]
+    """What was measured less what a state says."""
+    noise: Float[Tensor, "n_m n_m"]
+    """Covariance."""
+
+
+@dataclass(frozen=True)
+class BlindOptions:
+    """Standard deviations of what a :class:`PoseFilter` is told and foretells.
+
+    Raises:
+        ParameterError: one is not positive.
+    """
+
+    joint: float = 0.3 * _DEG
+    """Of a measured joint angle [rad]."""
+    position: float = 0.2e-3
+    """Of the object's point as the camera sees it, where the plant states no covariance [m]."""
+    rotation: float = 0.15 * _DEG
+    """Of its orientation, likewise [rad]."""
+    gap: float = 0.05e-3
+    """Of the gap of a pad that feels a force [m]."""
+    joint_drift: float = 0.5
+    """Of a joint's foretold motion, as a share of the largest motion of an actuator: a kinematic model with
+    tendons of another radius foretells joints badly."""
+    pose_drift: float = 0.02
+    """Of the object's foretold motion, as a share of it, on top of what the learner states."""
+    model_drift: float = 0.3
+    """The same of a kinematic model alone, which states nothing."""
+    slip: float = 0.05
+    """Of the slide of a contact, as a share of its way."""
+    least_force: float = 0.3
+    """A pad that feels less touches nothing, or is dead [N]."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (math.isfinite(value) and value > 0):
+                raise ParameterError(name, value, "finite and greater than 0")
+
+
+class PoseFilter:
+    """Extended Kalman filter of ``s = (q, o, R)`` with the covariance P of its error ``[dq; do; dphi]``::
+
+        motion    s <- s (+) ds,  P <- P + Q         ds = (f + g)(s, w),  w what the encoders did
+        rolling   A ds = 0 +- slip |way|             at the middle of the motion; conditions ds and Q
+        joints    q_measured = q +- joint
+        touch     gap_i(s) = 0 +- gap                pads i that feel a force
+        camera    (o, R) as seen                     when it is asked
+
+    Q is diagonal: ``joint_drift``, ``pose_drift``, and the variance that the learner states. Contacts that
+    roll tie the object's motion to that of the fingers, so measured joints and closed gaps correct the pose,
+    too. The update is iterated, since gaps are not linear (Bell and Cathey, IEEE TAC 38(2), 1993).
+
+    Args:
+        model: foretells; of an enhanced model the learner tells how unsure it is.
+        options: standard deviations.
+        touch: False leaves the pose to the prediction alone, without rolling and gaps.
+    """
+
+    state: GraspState
+    """The most likely one."""
+    covariance: Float[Tensor, "n_s n_s"]
+    """P [rad, m, rad], hand axes."""
+
+    def __init__(
+        self,
+        model: KinematicModel | EnhancedModel,
+        options: BlindOptions | None = None,
+        *,
+        touch: bool = True,
+    ) -> None:
+        self.enhanced = model if isinstance(model, EnhancedModel) else None
+        self.kinematic: KinematicModel = model.model if isinstance(model, EnhancedModel) else model
+        self.options, self.touch = BlindOptions() if options is None else options, touch
+        self._detector = copy.copy(self.kinematic.detector)
+        if hasattr(self._detector, "margin"):  # a pad that presses touches, however far off it seems
+            self._detector.margin = math.inf  # type: ignore[attr-defined]
+        self._last: tuple[Linearization, Tensor] | None = None
+
+    @property
+    def pose_covariance(self) -> Float[Tensor, "6 6"]:
+        """Of the object's error twist ``(v; w)``, hand axes [m, rad]."""
+        return self.covariance[-6:, -6:]
+
+    def start(
+        self,
+        seen: GraspState,
+        fingertip_force: Float[Tensor, " n_pads"] | None = None,
+        pose_covariance: Float[Tensor, "6 6"] | None = None,
+    ) -> None:
+        """Begin with what camera, joints and fingertips say.
+
+        Args:
+            seen: joints and pose as measured.
+            fingertip_force: normal force of each pad [N]; None: the pads near the object touch it.
+            pose_covariance: of the pose's error twist [m, rad]; None or NaN: that of the options.
+        """
+        n_q = seen.q.shape[-1]
+        P = seen.q.new_zeros(n_q + 6, n_q + 6)
+        P[:n_q, :n_q] = self.options.joint**2 * torch.eye(n_q, dtype=P.dtype)
+        P[n_q:, n_q:] = self._seen_covariance(pose_covariance, P)
+        self.state, self.covariance, self._last = seen, self._permitted(P), None
+        self._update(None, fingertip_force)
+
+    def move(
+        self,
+        moved: Float[Tensor, " n_a"],
+        fingertip_force: Float[Tensor, " n_pads"] | None = None,
+        lin: Linearization | None = None,
+    ) -> None:
+        """Carry the state along with a motion. A state that the model refuses has no foretold motion, but one
+        that may be as large as the actuators', as far as contacts that roll allow.
+
+        Args:
+            moved: w [rad].
+            fingertip_force: before it [N].
+            lin: the model at the state, where it is known; joints that it holds then do not move at all.
+        """
+        held = None if lin is None else lin.held_joints
+        lin = self._linearize(moved, fingertip_force) if lin is None else lin
+        ds = torch.zeros_like(self.covariance[0])
+        if lin is not None:
+            ds = lin.step(moved)
+            if self.enhanced is not None:
+                ds = self.enhanced.linearize(self.state, moved, lin.manipulation_jacobian)[0]
+        Q = self._motion_covariance(moved, ds if lin is not None else None)
+        if held is not None:
+            moves = torch.cat([~held, held.new_ones(6)]).to(Q)
+            Q = Q * moves * moves[:, None]
+        middle = self.state.plus(0.5 * ds)
+        with contextlib.suppress(NoContactError):
+            contacts = self._touching(middle, fingertip_force)
+            kin = self.kinematic.contact_kinematics(middle, contacts)
+            A, v, w = constraint_matrix(kin), *ds[-6:].split(3)
+            way = torch.linalg.vector_norm(v + torch.linalg.cross(w.expand_as(kin.lever), kin.lever), dim=-1)
+            slide = (self.options.slip * way + 1e-5)[[row // 6 for row in kin.rows]]
+            gain = torch.linalg.solve(A @ Q @ A.mT + torch.diag(slide.square()), A @ Q).mT
+            ds, Q = ds - gain @ (A @ ds), Q - gain @ A @ Q
+        self.state = self.state.plus(ds)
+        self.covariance = self.covariance + 0.5 * (Q + Q.mT)
+
+    def feel(self, q: Float[Tensor, " n_q"], fingertip_force: Float[Tensor, " n_pads"] | None = None) -> None:
+        """What measured joints [rad] and fingertips [N] say at rest."""
+        joints = torch.eye(len(q), len(self.covariance), dtype=q.dtype)
+        variance = self.options.joint**2 * torch.eye(len(q), dtype=q.dtype)
+        self._update(Measurement(joints, lambda at: q - at.q, variance), fingertip_force)
+
+    def close_gaps(self, fingertip_force: Float[Tensor, " n_pads"] | None = None) -> None:
+        """Close the gaps of pads that press."""
+        self._update(None, fingertip_force)
+
+    def hold(self, joints: Sequence[int], q: Float[Tensor, " n_joints"]) -> None:
+        """Some joints stand at known angles [rad], such as stops."""
+        H = torch.eye(len(self.covariance), dtype=self.covariance.dtype)[list(joints)]
+        exactly = 1e-12 * torch.eye(len(H), dtype=H.dtype)
+        self._update(Measurement(H, lambda at: q - at.q[..., list(joints)], exactly), None)
+
+    def look(self, seen: GraspState, pose_covariance: Float[Tensor, "6 6"] | None = None) -> None:
+        """What the camera says; the joints of ``seen`` are not used. See :meth:`start`."""
+        pose = torch.eye(len(self.covariance), dtype=self.covariance.dtype)[-6:]
+        variance = self._seen_covariance(pose_covariance, self.covariance)
+        self._update(Measurement(pose, lambda at: seen.minus(at)[-6:], variance), None, gaps=False)
+
+    def _seen_covariance(self, stated: Tensor | None, like: Tensor) -> Tensor:
+        o = self.options
+        if stated is not None and bool(torch.isfinite(stated).all()):
+            return stated.to(like)
+        return torch.diag(like.new_tensor([o.position] * 3 + [o.rotation] * 3).square())
+
+    def _linearize(self, moved: Tensor, fingertip_force: Tensor | None) -> Linearization | None:
+        """The model at the state, with forces carried along from motion to motion; None: it refuses."""
+        last, expected = None, None
+        if self._last is not None:
+            last, expected = self._last[0], self._last[0].forces_after(self._last[1])
+        try:
+            lin = self.kinematic.linearize(
+                self.state, fingertip_force=fingertip_force, expected=expected, previous=last
+            )
+        except GraspError:
+            return None
+        self._last = (lin, moved) if lin.forces.solved else None
+        return lin
+
+    def _motion_covariance(self, moved: Tensor, ds: Tensor | None) -> Tensor:
+        """Q before the contacts have their say."""
+        o, n_q = self.options, self.state.q.shape[-1]
+        largest = moved.abs().max()
+        unit = moved.new_tensor([self.kinematic.options.length] * 3 + [1.0] * 3)
+        share, size = 1.0, largest
+        if ds is not None:
+            share = o.model_drift if self.enhanced is None else o.pose_drift
+            size = torch.linalg.vector_norm(ds[n_q:] / unit)
+        std = torch.cat([o.joint_drift * largest.expand(n_q), share * size * unit])
+        variance = std.square() + 1e-14
+        if self.enhanced is not None and ds is not None:
+            outputs = self.enhanced.outputs
+            rows = list(range(len(ds))) if outputs is None else outputs
+            stated = self.enhanced.learner.predict(self.enhanced.features(self.state, moved)).stddev
+            variance[rows] += (stated / self.enhanced.output_scale).square().to(variance)
+        return self._permitted(torch.diag(variance))
+
+    def _permitted(self, covariance: Tensor) -> Tensor:
+        """Conditioned on couplings, joints that do not move, and the plane of a planar hand:
+        ``Z (Z^T P^-1 Z)^-1 Z^T``, increments ``Z dz``."""
+        Z = self.kinematic.reduction.basis.to(covariance)
+        return Z @ torch.linalg.inv(Z.mT @ torch.linalg.solve(covariance, Z)) @ Z.mT
+
+    def _touching(self, state: GraspState, fingertip_force: Tensor | None) -> ContactSet:
+        """Contacts of the pads that press.
+
+        Raises:
+            NoContactError: none does, or touch does not count.
+        """
+        if not self.touch:
+            raise NoContactError("touch does not count")
+        contacts: ContactSet = self._detector(state.q, state.position, state.rotation)  # type: ignore[operator]
+        if fingertip_force is None:
+            pressing = contacts.gap <= self.kinematic.options.contact_margin
+        else:
+            pads = self.kinematic.hand.pad_indices(contacts.finger)
+            pressing = fingertip_force[pads] >= self.options.least_force
+        rows = torch.nonzero(pressing).flatten().tolist()
+        if not rows:
+            raise NoContactError("no pad feels a force")
+        return contacts.select(rows)
+
+    def _update(
+        self, measured: Measurement | None, fingertip_force: Tensor | None, *, gaps: bool = True
+    ) -> None:
+        """Condition on a measurement ``H ds = miss(s) +- noise``, and on the gaps of pads that press."""
+        prior, P = self.state, self.covariance
+        ds, H, gain, noise = torch.zeros_like(P[0]), P[:0], P[:, :0], P[:0, :0]
+        for _ in range(_ITERATIONS):
+            at = prior.plus(ds)
+            H, miss, noise = P[:0], P[0, :0], P[:0, :0]
+            if measured is not None:
+                H, miss, noise = measured.H, measured.miss(at), measured.noise
+            if gaps:
+                with contextlib.suppress(NoContactError):
+                    contacts = self._touching(at, fingertip_force)
+                    kin = self.kinematic.contact_kinematics(at, contacts)
+                    closing = constraint_matrix(kin)[kin.normal_rows]  # gap(s + ds) = gap - closing ds
+                    H, miss = torch.cat([H, closing]), torch.cat([miss, contacts.gap])
+                    gap = P.new_full((len(closing),), self.options.gap).square()
+                    noise = torch.block_diag(noise, torch.diag(gap))
+            gain = torch.linalg.solve(H @ P @ H.mT + noise, H @ P).mT
+            ds = gain @ (miss + H @ ds)
+        keep = torch.eye(len(P), dtype=P.dtype) - gain @ H
+        self.state = prior.plus(ds)
+        self.covariance = keep @ P @ keep.mT + gain @ noise @ gain.mT

@@ -1,0 +1,229 @@
+"""How far a grasp can be turned, and what ends it, before anything moves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import torch
+
+from ..control import Caution, ClosedLoop, LookAndMoveController, PoseTarget, StoppingRule
+from ..control.closed_loop import Stop
+from ..control.termination import StopReason
+from ..enhanced import EnhancedModel
+from ..exceptions import GraspError, ParameterError
+from ..kinematics import GraspState
+from ..model import KinematicModel, Linearization
+from ..plant import Observation
+from ..typing import Float, Tensor
+from .friction_share import friction_share
+from .model_hand import ModelHand
+from .rehearsal import axis_of, hand_at, own_controller
+
+_DEG = math.pi / 180
+_BEARS = 0.01  # [N m] of a stop that ends a turn
+_PRESSED = -0.3e-3
+"""Gap of a link that bears on the object [m]: links sink in here, where real ones push; noise hides less."""
+
+
+class ReachEnd(Enum):
+    """What ends a turn."""
+
+    NOTHING = "nothing"
+    """It goes on beyond the angle that was asked about."""
+    LINK = "link"
+    """A link without a pad comes to bear on the object."""
+    FRICTION = "friction"
+    """A finger's friction margin is used up: it slides, or no forces balance the object any more."""
+    JOINT_STOP = "joint stop"
+    ACTUATOR = "actuator"
+    STABILITY = "stability"
+    """The grasp buckles."""
+    CONTACT = "contact lost"
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far an object can be turned about an axis, by the model."""
+
+    angle: float
+    """Largest on the way, with the sign that was asked about [rad]."""
+    end: ReachEnd
+    what: tuple[str, ...]
+    """Names of the links, pads, joints or actuators that end it; the likeliest first."""
+    message: str
+    """The same in a sentence."""
+    path: tuple[GraspState, ...]
+    """Before the first motion and after each, up to the largest angle."""
+    angles: tuple[float, ...]
+    """Turned at each state of the path [rad]."""
+
+    @property
+    def ends_by(self) -> str:
+        """End and names in a few words."""
+        return f"{self.end.value}: {', '.join(self.what)}" if self.what else self.end.value
+
+    def __str__(self) -> str:
+        return f"{self.angle / _DEG:.1f} deg ({self.ends_by})"
+
+
+@torch.no_grad()
+def reachable(
+    model: LookAndMoveController | KinematicModel | EnhancedModel,
+    seen: Observation | GraspState,
+    axis: Float[Tensor, " 3"] | None = None,
+    *,
+    sign: int = 1,
+    limit: float = 90 * _DEG,
+    friction: float = 0.7,
+    caution: Caution | None = None,
+    rule: StoppingRule | None = None,
+) -> Reach:
+    """``max |angle|`` of the closed loop on a :class:`ModelHand`: the controller's own programs, limits and
+    signs of a loss, on f + g in place of the plant.
+
+    Nothing moves, nothing is learned, and the controller stays as it is. The answer holds for this controller
+    and this grasp; it is no better than the model's contacts and forces, and knows nothing of noise.
+
+    Args:
+        model: a controller, or a model for one with default tasks and limits.
+        seen: the grasp. Of a bare state encoders and forces follow from the model.
+        axis: about which it is to be turned, hand frame; None: the controller's focus.
+        sign: 1 or -1, which way.
+        limit: farthest angle that is tried [rad].
+        friction: largest share of its friction that the grasp may need to hold the object
+            (:func:`~torch_ekm.foresight.friction_share`); infinite: any.
+        caution: signs of a loss; None: the usual ones, but a link bears only where it would lie 0.3 mm deep,
+            which is when noisy readings tell of it.
+        rule: as in :class:`~torch_ekm.control.ClosedLoop`.
+
+    Raises:
+        ParameterError: no axis, a focus that is no single rotation, a sign that is none, an angle outside 0
+            to 170 deg, or a share that is not positive.
+        GraspError: the model refuses the grasp as it is.
+    """
+    if sign not in (1, -1):
+        raise ParameterError("sign", sign, "1 or -1")
+    if not 0 < limit <= 170 * _DEG:
+        raise ParameterError("limit", limit, "above 0 and at most 170 deg [rad]")
+    if not friction > 0:
+        raise ParameterError("friction", friction, "greater than 0")
+    controller = own_controller(model, axis)
+    about = axis_of(controller.focus)
+    hand = hand_at(controller, seen)
+    start = hand.observe()
+    idle = set(hand.at_limits())
+    path, angles = [start.state], [0.0]
+    standing = _Standing([], [], hand.linearization)
+    caution = Caution(link_gap=_PRESSED) if caution is None else caution
+    motions = ClosedLoop(hand, controller, rule, learn=False, caution=caution).steps(
+        PoseTarget.turned(start.state, about, sign * limit)
+    )
+    while True:
+        try:
+            step = next(motions)
+        except StopIteration as over:
+            stop: Stop = over.value
+            break
+        lin = hand.linearization
+        share = 0.0 if hand.failure or lin is None else friction_share(controller.kinematic, lin)
+        if share > friction:
+            said = f"the object needs {100 * share:.0f} % of the friction, more than {100 * friction:.0f} %"
+            stop = Stop(StopReason.GIVEN_UP, step.after, said)
+            break
+        turned = float(about @ step.after.state.minus(start.state)[-3:])
+        if not hand.failure and sign * turned > max(sign * angle for angle in angles):
+            path.append(step.after.state)
+            angles.append(turned)
+            limits = [name for name in hand.at_limits() if name not in idle]
+            standing = _Standing(hand.at_stops(_BEARS), limits, hand.linearization)
+    motions.close()
+    end, what, message = _end(stop, hand, standing)
+    return Reach(angles[-1], end, what, message, tuple(path), tuple(angles))
+
+
+class BeyondReach:
+    """Declines targets that the model does not reach::
+
+        loop = ClosedLoop(plant, controller, decline=BeyondReach(controller))
+        loop.run(target).reason                                  # StopReason.OUT_OF_REACH; nothing has moved
+
+    Args:
+        controller: of the loop.
+        beyond: a target this far beyond the reach is tried nonetheless [rad]; negative: one that is nearer to
+            the end is declined, too.
+        caution, rule: of the loop.
+    """
+
+    def __init__(
+        self,
+        controller: LookAndMoveController,
+        beyond: float = 2 * _DEG,
+        *,
+        caution: Caution | None = None,
+        rule: StoppingRule | None = None,
+    ) -> None:
+        self.controller, self.beyond, self.caution, self.rule = controller, beyond, caution, rule
+        self.reach: Reach | None = None
+        """The last that was found."""
+
+    def __call__(self, seen: Observation, target: PoseTarget) -> str:
+        """Why a target is declined; empty: it is not.
+
+        Raises:
+            ParameterError: the focus is no rotation about one axis.
+        """
+        about = axis_of(self.controller.focus)
+        asked = float(about @ target.error(seen.state)[3:])
+        options = {"caution": self.caution, "rule": self.rule}
+        sign, limit = (1 if asked >= 0 else -1), min(max(abs(asked), 1 * _DEG), 170 * _DEG)
+        try:
+            self.reach = reachable(self.controller, seen, sign=sign, limit=limit, **options)
+        except GraspError:  # the loop will say so itself
+            return ""
+        if self.reach.end is ReachEnd.NOTHING or abs(asked) <= abs(self.reach.angle) + self.beyond:
+            return ""
+        return f"{asked / _DEG:.1f} deg are out of reach: this grasp turns {self.reach}; grasp it anew"
+
+
+@dataclass(frozen=True)
+class _Standing:
+    """What stood at its limit at the largest angle."""
+
+    stops: list[str]
+    actuators: list[str]
+    linearization: Linearization | None
+
+    @property
+    def sliding(self) -> list[str]:
+        """Pads in the order of their margins, those that have none to spare."""
+        lin = self.linearization
+        if lin is None or not lin.forces.solved:
+            return []
+        left = sorted(zip(lin.forces.relative_margin.tolist(), lin.contacts.finger, strict=True))
+        return [pad for share, pad in left if share < 0.05]
+
+
+def _end(stop: Stop, hand: ModelHand, at: _Standing) -> tuple[ReachEnd, tuple[str, ...], str]:
+    """Kind, names and sentence."""
+    said = hand.failure or stop.message
+    if stop.reason is StopReason.REACHED:
+        return ReachEnd.NOTHING, (), "nothing ends it within the limit"
+    names = [link for link in hand.hand.link_names if f"link '{link}'" in said]
+    if names:
+        return ReachEnd.LINK, tuple(names), said
+    if "buckles" in said:
+        return ReachEnd.STABILITY, (), said
+    if "no finger touches" in said:
+        return ReachEnd.CONTACT, (), said
+    if hand.failure or "of the friction" in said:
+        return ReachEnd.FRICTION, tuple(at.sliding), said
+    for end, found, verb in (
+        (ReachEnd.ACTUATOR, at.actuators, "stands at the end of its range"),
+        (ReachEnd.JOINT_STOP, at.stops, "stands at its stop"),
+        (ReachEnd.FRICTION, at.sliding, "slides"),
+    ):
+        if found:
+            return end, tuple(found), f"{found[0]} {verb}" + (f"; {said}" if said else "")
+    return ReachEnd.FRICTION, (), said or stop.reason.value
