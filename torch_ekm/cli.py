@@ -267,7 +267,7 @@ def show(
 
     shown = choose_show(what, object, seed, reach)
     if isinstance(shown, ReachShow):
-        _print_table(("direction", "angle [deg]", "ends by"), shown.rows(), shown.title)
+        print_table(("direction", "angle [deg]", "ends by"), shown.rows(), shown.title)
     _look(shown, html, port)
 
 
