@@ -31,7 +31,7 @@ QUICK = dataclasses.replace(
 def test_a_session_says_what_was_foretold_and_what_came(tmp_path: Path) -> None:
     made = reproduce(Experiment(QUICK, (0,)), tmp_path)
     (session,) = (tmp_path / "runs").glob("*.json")
-    records = {r.kind: r for r in map(ForesightTurn.from_json, json.loads(session.read_text()))}
+    records = {r.kind: r for r in map(ForesightTurn.from_json, json.loads(session.read_text())["result"])}
     assert list(records) == ["blind", "blind, looks again", "blind, no touch", "far"]
     far, dark, alone = (records[kind] for kind in ("far", "blind", "blind, no touch"))
     assert isinstance(far, ForesightTurn)
