@@ -26,6 +26,10 @@ _TAILS: dict[str, tuple[int, ...]] = {
     "friction": (),
     "torsional_friction": (),
 }
+#: Fields that do not vary over a batch.
+SHARED = ("friction", "torsional_friction")
+#: The others, with the number of their dimensions for one contact set.
+VARYING = {name: 1 + len(tail) for name, tail in _TAILS.items() if name not in SHARED}
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ..enhanced import EnhancedModel
+from ..enhanced.enhanced_model import kinematic_and_enhanced
 from ..exceptions import GraspError, NoContactError, ShapeError
 from ..kinematics import GraspState
 from ..model import ModelStatus
@@ -103,8 +104,7 @@ class LookAndMoveController:
         bound: StepBound | None = None,
         solver: str = "piqp",
     ) -> None:
-        self.enhanced = model if isinstance(model, EnhancedModel) else None
-        self.kinematic: KinematicModel = model.model if isinstance(model, EnhancedModel) else model
+        self.kinematic, self.enhanced = kinematic_and_enhanced(model)
         self.focus = focus if isinstance(focus, FocusedPose) else FocusedPose.rotation_about(focus)
         self.tasks = DEFAULT_TASKS if tasks is None else tuple(tasks)
         self.limits = DEFAULT_LIMITS if limits is None else tuple(limits)

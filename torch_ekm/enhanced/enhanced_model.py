@@ -338,6 +338,13 @@ class EnhancedModel(Recorded, nn.Module):
         return out.index_copy(-1, index, values.to(like.dtype))
 
 
+def kinematic_and_enhanced(
+    model: KinematicModel | EnhancedModel,
+) -> tuple[KinematicModel, EnhancedModel | None]:
+    """f, and f + g around it; None: nothing is learned."""
+    return (model.model, model) if isinstance(model, EnhancedModel) else (model, None)
+
+
 def _check_arguments(model: Any, learner: Any, encode: Any, outputs: Any, servo: Any, jacobian: Any) -> None:
     checks = (
         ("model", model, callable(model), "a callable f(state, action) -> increment"),

@@ -11,7 +11,7 @@ import torch
 
 from ..contact.contact_kinematics import ContactKinematics, contact_frames
 from ..contact.contact_model import contact_models, selected_rows
-from ..contact.contact_set import ContactSet
+from ..contact.contact_set import VARYING, ContactSet
 from ..contact.forces.balance import ForceStatus
 from ..kinematics.grasp_state import GraspState
 from ..kinematics.se3 import exp, log
@@ -21,7 +21,6 @@ from ..typing import Float, Tensor
 if TYPE_CHECKING:
     from ..model import KinematicModel, Linearization
 
-_VARYING = ("point", "normal", "gap", "finger_curvature", "object_curvature")
 _FORCES = (
     "mu", "lam", "force", "spin_moment", "normal", "residual", "stop_torque", "margin", "relative_margin",
     "violation",
@@ -56,9 +55,8 @@ class Configuration:
     def _each(self, change: Callable[[Tensor, int], Tensor]) -> Configuration:
         s = self.state
         state = GraspState(change(s.q, 1), change(s.position, 1), change(s.rotation, 2))
-        tails = {"point": 2, "normal": 2, "gap": 1, "finger_curvature": 3, "object_curvature": 3}
         contacts = self.contacts.replace(
-            **{name: change(getattr(self.contacts, name), tail) for name, tail in tails.items()}
+            **{name: change(getattr(self.contacts, name), tail) for name, tail in VARYING.items()}
         )
         tail = {"force": 2, "violation": 0}
         parts = {name: change(getattr(self.forces, name), tail.get(name, 1)) for name in _FORCES}
@@ -74,7 +72,7 @@ def stack(parts: Sequence[Configuration]) -> Configuration:
         return torch.stack([pick(part) for part in parts], dim=batch)
 
     state = GraspState(*(join(lambda z, n=n: getattr(z.state, n)) for n in ("q", "position", "rotation")))
-    varying = {n: join(lambda z, n=n: getattr(z.contacts, n)) for n in _VARYING}
+    varying = {n: join(lambda z, n=n: getattr(z.contacts, n)) for n in VARYING}
     forces = {n: join(lambda z, n=n: getattr(z.forces, n)) for n in _FORCES}
     return Configuration(
         state, first.contacts.replace(**varying), _with(first.forces, state.q.shape[:-1], forces)

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from ..contact.contact_kinematics import ContactKinematics
-from ..contact.contact_set import ContactSet
+from ..contact.contact_set import SHARED, ContactSet
 from ..enhanced import EnhancedModel
 from ..kinematics.grasp_state import GraspState
 from ..model import GraspForces, KinematicModel, Linearization
@@ -148,16 +148,12 @@ def continued(rates: Rates, motions: int, share: float) -> Rates:
     return Rates(lin, kin, rates.jacobian[ends], actions, g, slope)
 
 
-#: Fields without a batch dimension.
-_SHARED = ("friction", "torsional_friction")
-
-
 def _tree(value: Any, pick: Callable[[Tensor], Tensor]) -> Any:
     """``pick`` of every batched tensor in a dataclass of dataclasses; none of them is checked again."""
     changed = copy.copy(value)
     for name, part in vars(value).items():
         if isinstance(part, Tensor):
-            if name not in _SHARED:
+            if name not in SHARED:
                 object.__setattr__(changed, name, pick(part))
         elif isinstance(part, (GraspState, ContactSet, GraspForces)):
             object.__setattr__(changed, name, _tree(part, pick))
@@ -171,7 +167,7 @@ def joined(first: Configuration, second: Configuration) -> Configuration:
         changes = {}
         for field in dataclasses.fields(a):
             one, other = getattr(a, field.name), getattr(b, field.name)
-            if field.name in _SHARED:
+            if field.name in SHARED:
                 continue
             if isinstance(one, Tensor):
                 changes[field.name] = torch.cat([one, other])

@@ -13,6 +13,7 @@ import torch
 
 from ..contact import ContactSet, constraint_matrix
 from ..enhanced import EnhancedModel
+from ..enhanced.enhanced_model import kinematic_and_enhanced
 from ..exceptions import GraspError, NoContactError, ParameterError
 from ..kinematics import GraspState
 from ..model import KinematicModel, Linearization
@@ -97,8 +98,7 @@ class PoseFilter:
         *,
         touch: bool = True,
     ) -> None:
-        self.enhanced = model if isinstance(model, EnhancedModel) else None
-        self.kinematic: KinematicModel = model.model if isinstance(model, EnhancedModel) else model
+        self.kinematic, self.enhanced = kinematic_and_enhanced(model)
         self.options, self.touch = BlindOptions() if options is None else options, touch
         self._detector = copy.copy(self.kinematic.detector)
         if hasattr(self._detector, "margin"):  # a pad that presses touches, however far off it seems

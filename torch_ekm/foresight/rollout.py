@@ -9,6 +9,7 @@ import torch
 
 from ..contact.contact_set import ContactSet
 from ..enhanced import EnhancedModel
+from ..enhanced.enhanced_model import kinematic_and_enhanced
 from ..exceptions import ShapeError
 from ..kinematics.grasp_state import GraspState
 from ..kinematics.tensors import as_tensors, check_finite
@@ -34,8 +35,7 @@ class Rollout:
     """
 
     def __init__(self, model: KinematicModel | EnhancedModel) -> None:
-        self.enhanced = model if isinstance(model, EnhancedModel) else None
-        self.kinematic: KinematicModel = model.model if isinstance(model, EnhancedModel) else model
+        self.kinematic, self.enhanced = kinematic_and_enhanced(model)
 
     def predict(
         self,

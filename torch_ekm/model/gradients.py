@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from .._extras import require
-from ..contact.contact_set import ContactSet
+from ..contact.contact_set import VARYING, ContactSet
 from ..contact.forces.balance import BalanceEquations, ForceSolution
 from ..contact.forces.options import ForceOptions
 from ..contact.forces.problem import force_cost, force_problem
@@ -76,8 +76,7 @@ def following(
         asked += list(range(n_q + 3, here.n_s))
     if not asked:
         return contacts
-    names = ("point", "normal", "gap", "finger_curvature", "object_curvature")
-    columns: dict[str, list[Tensor]] = {name: [] for name in names}
+    columns: dict[str, list[Tensor]] = {name: [] for name in VARYING}
     for j in asked:
         ds = here.q.new_zeros(here.n_s)
         ds[j] = _STEP
@@ -88,13 +87,13 @@ def following(
             except NoContactError:
                 ends.append(contacts.replace(finger=()) if contacts.n_c == 0 else None)
         same = all(end is not None and end.finger == contacts.finger for end in ends)
-        for name in names:
+        for name in VARYING:
             zero = torch.zeros_like(getattr(contacts, name))
             change = (getattr(ends[0], name) - getattr(ends[1], name)) / (2 * _STEP) if same else zero
             columns[name].append(change)
     ds = state.minus(here)[asked]  # 0, with the derivative of the state
     return contacts.replace(
-        **{name: getattr(contacts, name) + torch.stack(columns[name], dim=-1) @ ds for name in names}
+        **{name: getattr(contacts, name) + torch.stack(columns[name], dim=-1) @ ds for name in VARYING}
     )
 
 

@@ -9,6 +9,7 @@ from .kernels.stationary import Matern32
 from .last_residual import LastResidual
 from .mixture import MixtureResidual
 from .sparse_gp.deep import DeepKernelSOGP
+from .sparse_gp.defaults import fleet_options
 from .sparse_gp.forgetting import ForgettingFactor, ProcessNoise
 from .sparse_gp.hyperparameters import LearnHyperparameters
 from .sparse_gp.monitor import DetectChanges, RobustWeight
@@ -40,7 +41,7 @@ def default_learner(
     """
     d, m = in_features, out_features
     common: dict[str, Any] = {"capacity": capacity, "output_offset": output_offset, **options}
-    fleet = {name: options[name] for name in ("batch_shape", "device") if name in options}
+    fleet = fleet_options(options)
     wanders = [RobustWeight(3.0), ProcessNoise(0.003), LearnHyperparameters()]
     forgets = [RobustWeight(3.0), DetectChanges(), ForgettingFactor(0.99), LearnHyperparameters()]
     members = [

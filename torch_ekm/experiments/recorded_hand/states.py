@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...contact import ContactSet
+from ...contact.contact_set import VARYING
 from ...description import HandDescription, ObjectDescription, Shape, load_object
 from ...exceptions import EKMError
 from ...kinematics import GraspState
@@ -37,7 +38,6 @@ _BEYOND = 0.35  # [rad] of a joint's limits: what a misread marker may make of a
 _UNSEEN = 0.2  # [rad] standard deviation of an angle whose marker is hidden
 _DIAMETERS, _USUAL = (0.01, 0.1), 0.045  # [m] that are believed, and one where nothing was seen yet
 _UPRIGHT = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]], dtype=torch.float64)
-_FIELDS = ("point", "normal", "gap", "finger_curvature", "object_curvature")
 
 
 class States(NamedTuple):
@@ -69,7 +69,7 @@ class States(NamedTuple):
 
     def contact_set(self, friction: float) -> ContactSet:
         """As a batch."""
-        fields = {name: torch.from_numpy(self.contacts[name]) for name in _FIELDS}
+        fields = {name: torch.from_numpy(self.contacts[name]) for name in VARYING}
         two = torch.full((2,), friction, dtype=torch.float64)
         return ContactSet(
             finger=("left", "right"),
@@ -141,10 +141,10 @@ def estimate_states(
                 last = now or last
                 state, contacts = now or _as_measured(model, measured)
                 at = state.q.numpy(), state.position[:2].numpy(), angle[k], camera, diameter, now is not None
-                rows.append((number, step, *at, *(getattr(contacts, field).numpy() for field in _FIELDS)))
+                rows.append((number, step, *at, *(getattr(contacts, field).numpy() for field in VARYING)))
     columns = [np.array(column) for column in zip(*rows, strict=True)]
     first = len(States._fields) - 1
-    return States(*columns[:first], contacts=dict(zip(_FIELDS, columns[first:], strict=True)))
+    return States(*columns[:first], contacts=dict(zip(VARYING, columns[first:], strict=True)))
 
 
 def _epochs(

@@ -170,12 +170,12 @@ class CompiledLoops:
         )  # fmt: skip
         own, units = _known(gp.kernel, self._batch), gp.units.affine()
         self._parameters = tuple(own[1] if own is not None else gp.kernel.parameters())
-        levels = [part.level for part in gp.weighing if type(part) is RobustWeight]
+        robust = [part for part in gp.weighing if type(part) is RobustWeight]
+        levels = [part.level for part in robust]
         tensors = (*state, gp.log_noise_variance, *self._parameters, *(units or ()), *levels)
         self._sources = _sources(gp, tensors)
         on_host = all(t.is_cpu and t.is_contiguous() for t in tensors) and gp.dtype == torch.float64
         modules = load_kernels() if on_host else None
-        robust = [part for part in gp.weighing if type(part) is RobustWeight]
         if modules is None or len(robust) < len(gp.weighing):
             return
         kernels, checks = modules

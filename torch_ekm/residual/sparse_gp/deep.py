@@ -9,6 +9,7 @@ from torch import nn
 
 from ..kernels.deep import DeepKernel
 from ..kernels.stationary import Matern32, StationaryKernel
+from .defaults import fleet_options
 from .forgetting import ProcessNoise
 from .hyperparameters import LearnHyperparameters
 from .monitor import DetectChanges, RobustWeight
@@ -53,7 +54,7 @@ def DeepKernelSOGP(  # noqa: N802  a kind of learner, called like the others
         wanders = any(isinstance(part, ProcessNoise) for part in own)
         learning = LearnHyperparameters() if wanders else LearnHyperparameters(steps=2, memory=2000)
         own.append(learning)
-    fleet = {name: options[name] for name in ("batch_shape", "device") if name in options}
+    fleet = fleet_options(options)
     kernel = DeepKernel(
         Matern32(in_features, **fleet) if base is None else base,
         hidden=hidden if hidden is not None else (64, 64) if learning.memory else (32, 32),

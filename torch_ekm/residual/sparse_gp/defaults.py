@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Literal
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
 
 from torch import nn
 
@@ -17,6 +17,11 @@ from .units import Standardize
 def default_parts() -> list[Part]:
     """What bears outliers, slow and abrupt changes, and learns kernel and noise."""
     return [RobustWeight(3.0), DetectChanges(), ProcessNoise(0.001), LearnHyperparameters()]
+
+
+def fleet_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """What a kernel must be told of a learner's options."""
+    return {name: options[name] for name in ("batch_shape", "device") if name in options}
 
 
 def chosen_parts(

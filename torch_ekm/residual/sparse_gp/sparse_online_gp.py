@@ -153,8 +153,7 @@ class SparseOnlineGP(DoubleStateLearner):
         """``alpha' k(X, x)``, differentiable in x."""
         if self._loops is not None and (found := self._loops.query(self, x)) is not None:
             return found[0]
-        k = self._cross(self.units.inputs(self._check_query(x)))
-        return self._out((k.unsqueeze(-2) @ self.posterior.alpha).squeeze(-2), 1)
+        return self._mean(self._cross(self.units.inputs(self._check_query(x))))
 
     def variance(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any out"]:
         """Latent variance ``k** + k'Ck`` of each output, differentiable in x."""
@@ -169,8 +168,7 @@ class SparseOnlineGP(DoubleStateLearner):
         if found is None:
             z = self.units.inputs(self._check_query(x))
             k = self._cross(z)
-            mean = self._out((k.unsqueeze(-2) @ self.posterior.alpha).squeeze(-2), 1)
-            variance = self._latent(z, k)
+            mean, variance = self._mean(k), self._latent(z, k)
         else:
             mean, variance = found[:2]
         if observation:
@@ -369,6 +367,9 @@ class SparseOnlineGP(DoubleStateLearner):
         """``(*any, out or 1, columns)``: derivative by the last columns of x."""
         slope = self.units.slope(slope, power)
         return slope.expand(*slope.shape[:-2], self.out_features, slope.shape[-1]).to(self.dtype)
+
+    def _mean(self, k: Tensor) -> Tensor:
+        return self._out((k.unsqueeze(-2) @ self.posterior.alpha).squeeze(-2), 1)
 
     def _latent(self, z: Tensor, k: Tensor) -> Tensor:
         k = k.unsqueeze(-1)
