@@ -6,7 +6,7 @@ JOBS ?= 2
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test notebooks notebooks-smoke lint types imports check install clean
+.PHONY: demo test docs notebooks notebooks-smoke lint types imports check install clean
 
 install: $(VENV)/installed
 
@@ -22,6 +22,10 @@ demo: install
 
 test: install
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+
+# the site, docs/_build/html/index.html; a warning is an error
+docs: install
+	$(BIN)/python -m sphinx -E -W -n --keep-going docs docs/_build/html
 
 # 01 to 03 are run, 04 to 06 keep their outputs: they are the evidence
 notebooks: install
@@ -45,4 +49,4 @@ imports: install
 check: lint types imports test
 
 clean:
-	rm -rf $(VENV) demo_output .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo_output .pytest_cache .ruff_cache .hypothesis docs/_build docs/reference/api/generated docs/tutorials/notebooks

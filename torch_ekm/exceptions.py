@@ -10,6 +10,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+__all__ = [
+    "CalibrationError", "DescriptionError", "EKMError", "EquilibriumError", "FileFormatError",
+    "FolderInUseError", "GraspError", "JointMismatchError", "MissingExtraError", "NoContactError",
+    "NoDerivativeError", "NoStateError", "NonFiniteError", "NonMonotoneFitError", "ObjectLostError",
+    "OutputError", "ParameterError", "PenetrationError", "ShapeError", "SingularGraspError", "SolverError",
+    "StateMismatchError", "UnknownNameError", "UnstableGraspError", "WorkerDiedError",
+]  # fmt: skip
+
 _LONGEST = 2000  # characters of a message
 
 

@@ -18,6 +18,8 @@ from torch.distributions import Normal
 from .exceptions import EKMError, NonFiniteError, NoStateError, ShapeError, StateMismatchError
 from .residual.base import ResidualLearner, UpdateReport
 
+__all__ = ["check_residual_learner"]
+
 QUERY_SHAPES = ((), (1,), (5,), (2, 3))
 
 

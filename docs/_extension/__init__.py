@@ -1,0 +1,14 @@
+"""What Sphinx is told of this package: where a name is documented, and how docstrings are written."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Connect the parts."""
+    from . import docstrings, names
+
+    docstrings.setup(app)
+    names.setup(app)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,65 @@
+"""The documentation site: ``make docs``. Nothing in it is loaded from a network."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent
+sys.path[:0] = [str(HERE), str(ROOT)]
+
+import torch_ekm
+from _extension.packages import pages
+
+project = "torch_ekm"
+author = "The torch_ekm developers"
+copyright = author
+version = release = torch_ekm.__version__
+
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",
+    "sphinx_copybutton",
+    "myst_nb",
+    "_extension",
+]
+exclude_patterns = ["_build", "_extension", "_templates"]
+templates_path = ["_templates"]
+nitpicky = True
+suppress_warnings = ["toc.empty_glob"]  # pages that are not written yet
+
+html_theme = "furo"
+html_title = f"torch_ekm {version}"
+html_show_sphinx = False
+html_copy_source = False
+python_maximum_signature_line_length = 100
+toc_object_entries_show_parents = "hide"
+
+myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath", "fieldlist"]
+myst_heading_anchors = 4
+
+# notebooks are pages, with the outputs that are stored in them; they lie outside of this folder
+nb_execution_mode = "off"
+nb_ipywidgets_js: dict[str, dict[str, str]] = {}
+nb_merge_streams = True
+NOTEBOOKS = HERE / "tutorials" / "notebooks"
+shutil.rmtree(NOTEBOOKS, ignore_errors=True)
+NOTEBOOKS.mkdir(parents=True)
+for notebook in sorted((ROOT / "notebooks").glob("[0-9]*.ipynb")):
+    shutil.copy2(notebook, NOTEBOOKS)
+
+# one generated page for each public package
+autosummary_generate = True
+autosummary_context = {"pages": pages()}
+shutil.rmtree(HERE / "reference" / "api" / "generated", ignore_errors=True)
+autodoc_default_options = {"members": True, "member-order": "bysource", "show-inheritance": True}
+autodoc_preserve_defaults = True
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
