@@ -37,6 +37,7 @@ html_theme = "furo"
 html_title = f"torch_ekm {version}"
 html_show_sphinx = False
 html_copy_source = False
+add_module_names = False
 python_maximum_signature_line_length = 100
 toc_object_entries_show_parents = "hide"
 
@@ -57,9 +58,12 @@ for notebook in sorted((ROOT / "notebooks").glob("[0-9]*.ipynb")):
 autosummary_generate = True
 autosummary_context = {"pages": pages()}
 shutil.rmtree(HERE / "reference" / "api" / "generated", ignore_errors=True)
-autodoc_default_options = {"members": True, "member-order": "bysource", "show-inheritance": True}
+autodoc_default_options = {"members": True, "member-order": "bysource", "no-value": True}
+autodoc_inherit_docstrings = False
+autodoc_type_aliases = {"Array": "torch_ekm.typing.Array"}
 autodoc_preserve_defaults = True
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
+napoleon_attr_annotations = False

@@ -23,6 +23,11 @@ class Recorded:
     starts: ClassVar[tuple[str, ...]] = ()
     """Arguments that only start values which are part of the state."""
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        of_method = inspect.signature(cls.__init__)  # what help() shows; else it would be that of __new__
+        cls.__signature__ = of_method.replace(parameters=list(of_method.parameters.values())[1:])
+
     def __new__(cls, *args: Any, **options: Any):
         made = super().__new__(cls)
         try:

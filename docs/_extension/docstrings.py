@@ -1,24 +1,34 @@
 """Docstrings as they are written here: equations are plain text, so they are shown in fixed width.
 
-```` ``` ```` opens and closes a block of equations, as in Markdown; reStructuredText wants ``::``.
+```` ``` ```` opens and closes a block of equations, as in Markdown; reStructuredText has a directive for it.
 """
 
 from __future__ import annotations
 
+import ast
+import dataclasses
+import enum
+import inspect
+import textwrap
 from typing import Any
 
-from .packages import places
+from sphinx.util.inspect import signature, stringify_signature
+
+from .packages import data_comment, public_bases
 
 
 def setup(app: Any) -> None:
     """Connect."""
-    app.connect("autodoc-process-docstring", _fences, priority=100)  # before napoleon
+    app.connect("autodoc-process-docstring", _prepare, priority=100)  # before napoleon
+    app.connect("autodoc-process-signature", _signature)
+    app.connect("autodoc-process-bases", _bases)
     app.connect("autodoc-skip-member", _skip)
-    app.connect("autodoc-process-bases", _public_bases)
 
 
-def _fences(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Fenced blocks as literal blocks."""
+def _prepare(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Fenced blocks become literal blocks; comments become the text of constants."""
+    if what == "data":
+        lines[:] = data_comment(name.rpartition(".")[2], obj)
     result, inside = [], False
     for line in lines:
         if line.strip().startswith("```"):
@@ -26,19 +36,83 @@ def _fences(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[
             result += ["", line.replace(line.strip(), ".. code-block:: text"), ""] if inside else [""]
         else:
             result.append(f"   {line}" if inside else line)
+    if what in ("attribute", "data", "property"):
+        result.insert(0, "")  # napoleon takes what stands before a colon in the first line for a type
     lines[:] = result
 
 
+class _Source:
+    """A default as it stands in the source, ``16 * DEGREE`` rather than 0.27925."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    def __repr__(self) -> str:
+        return self.text
+
+
+def _signature(
+    app: Any, what: str, name: str, obj: Any, options: Any, text: str | None, returns: str | None
+) -> tuple[str, None] | None:
+    """Of dataclasses with defaults as written; none where a class is not made by calling it."""
+    if not inspect.isclass(obj):
+        return None
+    if issubclass(obj, enum.Enum) or getattr(obj, "_is_protocol", False):
+        return "", None
+    if not dataclasses.is_dataclass(obj) or "__init__" in _own(obj):
+        return None
+    written: dict[str, str] = {}
+    for one in reversed(obj.__mro__):
+        if dataclasses.is_dataclass(one):
+            written |= _defaults(one)
+    found = signature(obj, type_aliases=app.config.autodoc_type_aliases)
+    parameters = [
+        one.replace(default=_Source(written[one.name]))
+        if one.default is not one.empty and one.name in written
+        else one
+        for one in found.parameters.values()
+    ]
+    shown = found.replace(parameters=parameters, return_annotation=found.empty)
+    return stringify_signature(shown, unqualified_typehints=True), None
+
+
+def _own(kind: type) -> list[str]:
+    body = _body(kind)
+    return [node.name for node in body if isinstance(node, ast.FunctionDef)]
+
+
+def _defaults(kind: type) -> dict[str, str]:
+    """Field -> the default's source."""
+    found: dict[str, str] = {}
+    for node in _body(kind):
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value is not None:
+            found[node.target.id] = _value(node.value)
+    return found
+
+
+def _value(node: ast.expr) -> str:
+    """``field(default_factory=Kind)`` as ``Kind()``."""
+    if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("field"):
+        given = {one.arg: one.value for one in node.keywords}
+        if "default" in given:
+            return ast.unparse(given["default"])
+        if "default_factory" in given:
+            made = given["default_factory"]
+            return ast.unparse(made.body) if isinstance(made, ast.Lambda) else f"{ast.unparse(made)}()"
+    return ast.unparse(node)
+
+
+def _body(kind: type) -> list[ast.stmt]:
+    (parsed,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    assert isinstance(parsed, ast.ClassDef)
+    return parsed.body
+
+
+def _bases(app: Any, name: str, obj: Any, options: Any, bases: list[Any]) -> None:
+    bases[:] = public_bases(obj)
+
+
 def _skip(app: Any, what: str, name: str, obj: Any, skip: bool, options: Any) -> bool | None:
-    """Fields of named tuples that only say their number."""
-    return True if (getattr(obj, "__doc__", None) or "").startswith("Alias for field number") else None
-
-
-def _public_bases(app: Any, name: str, obj: Any, options: Any, bases: list[Any]) -> None:
-    """Bases that are public or another package's; the rest is how it is built."""
-    public = places()
-    bases[:] = [
-        base
-        for base in obj.__mro__[1:]
-        if id(base) in public or (base in obj.__bases__ and not base.__module__.startswith("torch_ekm"))
-    ][:1]
+    """Fields of named tuples that only say their number, and what learners' constructors note."""
+    numbered = (getattr(obj, "__doc__", None) or "").startswith("Alias for field number")
+    return True if numbered or name in ("starts", "stands_last") else None

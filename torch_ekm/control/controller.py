@@ -29,8 +29,10 @@ from .termination import StopReason
 if TYPE_CHECKING:
     from ..model import KinematicModel, Linearization
 
-#: What a step should do and must not do unless told otherwise; the figures suit the iCub hand.
+#: What a step should do unless told otherwise: effort, off-axis motion, grip force, focus. The figures suit
+#: the iCub hand.
 DEFAULT_TASKS: tuple[Task, ...] = (EffortTask(), OffAxisTask(), GripForceTask(), FocusTask())
+#: What a step must not do unless told otherwise: limits of actuators, normal forces and joints.
 DEFAULT_LIMITS: tuple[Limit, ...] = (ActuatorLimit(), NormalForceLimit(), JointLimit())
 
 
@@ -80,8 +82,8 @@ class LookAndMoveController:
     Args:
         model: a :class:`KinematicModel`, or an :class:`EnhancedModel` around one.
         focus: what of the pose must be reached, or the axis about which the object is to be turned.
-        tasks: what a step should do (:mod:`~torch_ekm.control.tasks`); None: :data:`DEFAULT_TASKS`.
-        limits: what it must not do (:mod:`~torch_ekm.control.limits`); None: :data:`DEFAULT_LIMITS`.
+        tasks: what a step should do (:class:`Task`); None: :data:`DEFAULT_TASKS`.
+        limits: what it must not do (:class:`Limit`); None: :data:`DEFAULT_LIMITS`.
         limiting: how much of the error a step asks for.
         sqp_iterations: at most so many quadratic programs, for a model that is not linear in the action.
         sqp_damping: share of each change that is made.

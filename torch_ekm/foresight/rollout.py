@@ -25,8 +25,8 @@ class Rollout:
     """``z' = z (+) (dz/da)(z_m) w``, ``z_m = z (+) (dz/da)(z) w/2``: the midpoint rule, motion after motion.
 
     z is state, contacts and forces. f is taken half a motion later; g, which was learned of whole motions, at
-    their beginnings: ``ds = J_m(s_m) w + g(s, w)``. Contacts roll along
-    (:func:`~torch_ekm.foresight.configuration.change`), no collision query is made on the way. Forces are
+    their beginnings: ``ds = J_m(s_m) w + g(s, w)``. Contacts roll along; no collision query is made on the
+    way. Forces are
     those of contacts that stick throughout a motion; a contact that was asked for more than its cone begins
     the next motion on it.
 

@@ -83,7 +83,17 @@ def to_casadi(learner: ResidualLearner, *, variance: bool = True) -> CasadiResid
 def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTable:
     """A recording of ROS (MCAP, sqlite3 or .bag) as a table: a row for each message of ``clock``.
 
-    See :func:`torch_ekm.interop.bags.read_bag`.
+    Other topics stand as they were last heard: nothing of the future enters a row. Rows before every topic was
+    heard once are left out, and so are texts, headers and fields of more than 64 numbers.
+
+    Args:
+        path: a folder of rosbag2, a single ``.mcap`` or ``.db3`` file, or a ``.bag`` of ROS 1.
+        clock: the topic that sets the rhythm, such as that of the commands.
+        topics: those that are read; all of them by default.
+
+    Returns:
+        ``names`` (``/topic.field.joint`` or ``/topic.field[0]``), ``time`` [s] ``(n,)`` from the first row on,
+        ``values`` ``(n, columns)`` in the messages' own units.
 
     Raises:
         MissingExtraError: ``rosbags`` is not installed.
@@ -96,7 +106,11 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
 
 
 def log_to_mcap(log: TrialLog, folder: str | Path) -> list[Path]:
-    """Every trial of a log as a rosbag2 recording in MCAP; see :mod:`torch_ekm.interop.mcap_log`.
+    """Every trial of a log as a rosbag2 recording in MCAP, one folder each; returns the folders.
+
+    A topic for each array, a message for each observation at its time: ``/q``, ``/a`` and ``/commands``
+    (increments [rad], at the time of the observation before them) as JointState, ``/object_pose`` as
+    PoseStamped in the frame ``hand``, all others as multi-arrays; ``/about`` says the rest.
 
     Raises:
         MissingExtraError: ``rosbags`` is not installed.

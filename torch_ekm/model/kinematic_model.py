@@ -37,7 +37,8 @@ class KinematicModel(nn.Module):
     [ B   0    0  ] [ dlam ]   [ da ]      D = dF/ds     springs, gravity, load-dependent geometry
     ```
 
-    Solved in the two-stage form (:func:`~torch_ekm.model.manipulation.two_stage`). Rigid couplings are
+    Solved in the two-stage form ``J_m = P - N (N^T D N)^-1 N^T D P``, ``N = null([A; B])``,
+    ``P = [A; B]^+ [0; I]``: only the stiffness with the actuators locked is inverted. Rigid couplings are
     reduced out, joints at a stop are held, contacts come from the detector, forces from
     :func:`~torch_ekm.contact.contact_forces`. Derived from the Lagrange multipliers of the
     quasi-static equilibrium; ``docs/kinematic_model.md`` has the whole of it.
@@ -178,7 +179,7 @@ class KinematicModel(nn.Module):
 
         Differentiable: with respect to the state, and to the buffers ``spring_stiffness``, ``spring_rest``,
         ``reduction.actuation``, ``reduction.stiffness``, ``weight`` and ``com`` (``requires_grad_()`` asks
-        for it). Forces and detected contacts move along (:mod:`~torch_ekm.model.gradients`). First
+        for it). Forces and detected contacts move along. First
         derivatives only; stability, margins, stop torques, and which joints are held, are constants.
 
         Args:

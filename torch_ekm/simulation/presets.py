@@ -46,6 +46,7 @@ _FIGURES: dict[str, tuple[Any, Any, Any]] = {  # nominal, worn, hostile
     "frame_loss": (0.0, 0.02, 0.1),
     "stuck_joints": ((), (), ("index_3",)),
 }
+#: Name -> parameters: "none", "nominal", "worn" and "hostile".
 PRESETS = {"none": PlantParameters()} | {
     name: PlantParameters(**{key: levels[k] for key, levels in _FIGURES.items()})
     for k, name in enumerate(("nominal", "worn", "hostile"))

@@ -24,7 +24,7 @@ from .imaging.grasp_view import GraspView
 from .imaging.simulated_camera import SimulatedCamera
 from .imaging.simulated_video import SimulatedVideo
 
-# the card's rim clears thumb and knuckles; 1 mm above the palm
+#: Pose of the palm's marker card in the iCub's palm frame ``(4, 4)`` [m]: its rim clears thumb and knuckles.
 ICUB_PALM_MOUNT = np.array([[1.0, 0, 0, -0.048], [0, 1, 0, 0], [0, 0, 1, 0.004], [0, 0, 0, 1]])
 
 

@@ -16,9 +16,9 @@ class ForceOptions:
     """
 
     force_weight: float = 1e-7
-    """eps: weight of |mu|^2 against the squared, whitened joint residual [1/N^2]."""
+    """``eps``: weight of ``|mu|^2`` against the squared, whitened joint residual [1/N^2]."""
     actuator_weight: float = 1.0
-    """k: weight of |lam r/L|^2 relative to |mu|^2, r the norm of the actuator's moment arms."""
+    """``k``: weight of ``|lam r/L|^2`` relative to ``|mu|^2``, r the norm of the actuator's moment arms."""
     torque_std: float = 0.01
     """Standard deviation of unmodelled joint torque, Sigma_tau^(1/2) [N m]."""
     normal_std: float = 0.3
@@ -28,9 +28,9 @@ class ForceOptions:
     start_std: float = 1.5
     """Standard deviation of a contact force of which nothing is known yet, per axis [N]."""
     drift_std: float = 0.15
-    """... and by how much it drifts from its prediction at every motion, per axis [N], ..."""
+    """Standard deviation of a contact force's drift from its prediction at every motion, per axis [N]."""
     change_std: float = 0.3
-    """... beside this share of the predicted change."""
+    """The same as a share of the predicted change; both add up."""
     friction_std: float = 0.05
     """Relative standard deviation of the friction coefficients, for the margins' standard deviation."""
     min_normal: float = 0.0

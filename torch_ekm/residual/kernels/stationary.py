@@ -125,7 +125,7 @@ _TINY = 1e-30
 
 
 class Matern32(StationaryKernel):
-    """``k = v (1 + sqrt(3) r) exp(-sqrt(3) r)``, r = |x - z|_L."""
+    """``k = v (1 + sqrt(3) r) exp(-sqrt(3) r)``, ``r = |x - z|_L``."""
 
     @staticmethod
     def phi(d2: Tensor) -> Tensor:
@@ -140,7 +140,7 @@ class Matern32(StationaryKernel):
 
 
 class Matern52(StationaryKernel):
-    """``k = v (1 + sqrt(5) r + 5/3 r^2) exp(-sqrt(5) r)``, r = |x - z|_L."""
+    """``k = v (1 + sqrt(5) r + 5/3 r^2) exp(-sqrt(5) r)``, ``r = |x - z|_L``."""
 
     @staticmethod
     def phi(d2: Tensor) -> Tensor:

@@ -46,9 +46,9 @@ class SparseOnlineGP(DoubleStateLearner):
     with the lowest score is pruned, the same way (Csato & Opper, Neural Computation 14, 2002).
 
     The state is kept in natural form and the caches that predict are rebuilt from it by Cholesky every
-    ``refresh_every`` samples (:class:`~torch_ekm.residual.sparse_gp.posterior.SparsePosterior`): the textbook
-    recursion, which never rebuilds, ends in NaN on smooth trajectories. The state is float64 whatever
-    ``dtype`` says, which is that of inputs and outputs: float32 cannot hold K^-1 of a smooth kernel.
+    ``refresh_every`` samples: the textbook recursion, which never rebuilds, ends in NaN on smooth
+    trajectories. The state is float64 whatever ``dtype`` says, which is that of inputs and outputs: float32
+    cannot hold K^-1 of a smooth kernel.
 
     The outputs share the basis and one noise-to-signal ratio in the gain; each has its own scale and
     its own observation noise.
@@ -186,9 +186,11 @@ class SparseOnlineGP(DoubleStateLearner):
         return self._out(mean, 1), self._out_slope(jacobian, 1)
 
     def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> Prediction:
-        """Mean, latent variance and both derivatives, in closed form::
+        """Mean, latent variance and both derivatives, in closed form.
 
+        ```
         d mean/dx = alpha' dk/dx,   d var/dx = dk(x,x)/dx + 2 (Ck)' dk/dx
+        ```
         """
         if self._loops is not None:
             found = self._loops.query(self, x, variance=True, slopes=True)

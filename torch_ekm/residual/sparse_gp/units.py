@@ -19,8 +19,7 @@ class Standardize(Part, Units):
     """``z = (x - shift) / scale_x``, ``t = (y - offset) / scale_y``, from robust moments of the stream.
 
     Inputs are centred where the kernel is shift invariant; outputs are only scaled, so that 0 stays 0, unless
-    their offset is to be learned. See :class:`~torch_ekm.residual.running_scale.RunningScale` for what the
-    moments bear.
+    their offset is to be learned. Outliers decide nothing; a column that has not varied keeps scale 1.
 
     New units are adopted when the caches are rebuilt, and after 1, 2, 4, 8, ... samples, since units are
     rough at first: the sample that comes counts in its own units. The basis follows exactly, and so does
