@@ -19,8 +19,9 @@ from torch_ekm import exceptions
 from torch_ekm._extras import _EXTRA_OF, require
 from torch_ekm.exceptions import EKMError, MissingExtraError
 
-# Run where every installed package is missing but torch, numpy and what torch itself asks for.
+# Run where every installed package is missing but torch, numpy, ALSO, and what these themselves ask for.
 _LIGHT = """
+ALSO = ()
 import importlib.machinery, importlib.metadata, re, sys
 
 def plain(name):
@@ -38,7 +39,9 @@ def needed(name, found):
                 needed(plain(line), found)
     return found
 
-allowed = needed("torch", {"torch_ekm"}) | needed("numpy", set())
+allowed = {"torch_ekm"}
+for name in ("torch", "numpy", *ALSO):
+    needed(name, allowed)
 owners = importlib.metadata.packages_distributions()
 found = {name for name, who in owners.items() if allowed & {plain(one) for one in who}}
 
@@ -111,6 +114,44 @@ for kind in (GPyTorchSVGP, GPyTorchWindow, RiverResidual):
 """
     done = subprocess.run([sys.executable, "-c", _LIGHT + made], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+_PLOTS = ("matplotlib", "jinja2", "typer", "rich")
+_HEAVY = {"sapien", "vtk", "pyvista", "h5py", "viser", "qpsolvers", "scipy", "trimesh", "cv2"}
+_COMMAND = f"""
+import sys
+from torch_ekm.cli import main
+
+try:
+    main()
+finally:
+    assert not {_HEAVY} & {{name.partition('.')[0] for name in sys.modules}}
+"""
+
+
+def test_the_command_line_compares_and_copies_with_the_extra_plots_alone(tmp_path: Path) -> None:
+    """A CSV needs no simulator; a command that needs more names the extra that brings all of it."""
+    rows = ["a,b,y", *(f"{k % 7},{k % 11},{k % 7 + k % 11}" for k in range(50))]
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.csv").write_text("\n".join(rows))
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        code = _LIGHT.replace("ALSO = ()", f"ALSO = {_PLOTS}") + _COMMAND
+        command = [sys.executable, "-c", code, *arguments]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    learners = ("--learners", "linear RLS,model alone", "--limit", "45", "--out", "out")
+    done = run("compare", "--data", "one.csv", "--data", "two.csv", *learners)
+    assert done.returncode == 0, done.stderr
+    assert "On the first 45 of 50 rows" in done.stdout
+    assert (tmp_path / "out" / "index.html").is_file()
+    done = run("notebooks", "--copy", "copies")
+    assert done.returncode == 0, done.stderr
+    assert len(list((tmp_path / "copies").glob("*.ipynb"))) >= 6
+    assert "torch-ekm" in run("--version").stdout
+    done = run("demo")
+    assert done.returncode == 1
+    assert "pip install 'torch_ekm[experiments]'" in done.stderr
 
 
 def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,10 +10,8 @@ from .exceptions import MissingExtraError
 _BRINGS = {
     "robot": ("pytorch_kinematics", "yourdfpy", "trimesh", "coal", "qpsolvers", "clarabel", "scipy"),
     "sim": ("sapien", "cv2", "gymnasium", "h5py", "filelock"),
-    "experiments": (
-        *("joblib", "matplotlib", "mpl_toolkits", "jinja2", "pyvista"),
-        *("viser", "websockets", "typer", "rich"),
-    ),
+    "plots": ("matplotlib", "mpl_toolkits", "jinja2", "typer", "rich"),
+    "experiments": ("joblib", "pyvista", "viser", "websockets"),
     "notebooks": ("IPython", "pyarrow"),
     "peers": ("gpytorch", "river"),
     "fast": ("numba",),

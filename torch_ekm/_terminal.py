@@ -62,10 +62,10 @@ def progress(what: str, total: int) -> Iterator[Callable[[object], None]]:
 
 
 def print_report(report: Report, folder: Path, notes: bool = False) -> None:
-    """Tables, summary, and where the page is."""
+    """What came of it, the tables, and where the page is."""
+    console.print(as_printed(report.summary))
     for table in report.tables:
         print_table(table.header, table.text(), table.caption, table.note if notes else None)
-    console.print(as_printed(report.summary))
     say(f"Report:    {(folder / 'index.html').resolve()}")
 
 

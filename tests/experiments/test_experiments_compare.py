@@ -17,7 +17,7 @@ from torch_ekm.experiments import compare
 from torch_ekm.experiments.learner_comparison.compare import run_one
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
 from torch_ekm.experiments.learner_comparison.report import ComparisonReport, overview_table, score_table
-from torch_ekm.experiments.learner_comparison.scores import Comparison, block_bootstrap
+from torch_ekm.experiments.learner_comparison.scores import Comparison, block_bootstrap, studentized_range
 from torch_ekm.experiments.learner_comparison.stream import Stream, in_own_units, load_table
 from torch_ekm.experiments.learner_comparison.table_file import read_table
 from torch_ekm.experiments.learners import COMPARED, LEARNERS, PEERS, learner_factory
@@ -83,6 +83,12 @@ def test_critical_difference_is_demsars() -> None:
     fourteen = tuple(linear(40, name=str(k)) for k in range(14))
     comparison = Comparison(fourteen, ("a", "b", "c", "d"), {}, {})
     assert comparison.critical_difference() == pytest.approx(2.569 * math.sqrt(4 * 5 / (6 * 14)), abs=1e-3)
+
+
+def test_studentized_range_is_scipys() -> None:
+    for k in (2, 10, 20):
+        expected = pytest.importorskip("scipy.stats").studentized_range.ppf(0.95, k, np.inf)
+        assert studentized_range(k) == pytest.approx(expected, rel=1e-9)
 
 
 def test_bootstrap_of_equals_is_one() -> None:
@@ -251,6 +257,15 @@ def test_targets_are_named_or_found(tmp_path: Path) -> None:
     assert load_table(path).y.shape == (60, 1)  # the last column
     assert load_table(path, ["a", "c"]).y.shape == (60, 2)
     assert load_table(write(tmp_path / "b.csv", values, "y1,a,y2,b")).y.shape == (60, 2)
+
+
+def test_how_many_of_how_many_rows_were_used_is_told(tmp_path: Path) -> None:
+    stream = load_table(write(tmp_path / "a.csv", table(60)), limit=50)
+    assert stream.used == "the first 50 of 60 rows"
+    report = compare(stream, ("default", "linear RLS"))
+    assert report.verdicts()[0].endswith("On the first 50 of 60 rows.")
+    assert "the default learner" in report.verdicts()[0] or "default is best" in report.verdicts()[0]
+    assert report.tables()[0].rows[0][0] in ("default", "default *")
 
 
 def test_units_come_from_the_warm_up_alone() -> None:

@@ -138,8 +138,8 @@ LEARNERS: dict[str, Factory] = {
 }
 #: Learners of other libraries: ten to a hundred times as slow, and in an extra of their own.
 PEERS = ("river forest", "GPyTorch window", "GPyTorch SVGP")
-#: The sparse online GP in its forms.
-OURS = tuple(name for name in LEARNERS if name.startswith("SOGP"))
+#: The default learner, and the sparse online GP in its forms.
+OURS = ("default", *(name for name in LEARNERS if name.startswith("SOGP")))
 #: What a comparison takes if nobody says otherwise: not those that want to know which inputs are an action.
 COMPARED = tuple(name for name in LEARNERS if name not in (*PEERS, "rbf", "action-linear"))
 #: What demo and experiments take unless told otherwise.

@@ -111,7 +111,7 @@ def load_regression(name: str) -> tuple[Array, Array]:
 
 def _regression(name: str, limit: int | None) -> Stream:
     x, y = load_regression(name)
-    return in_own_units(name, x[:limit], y[:limit], _REGRESSION[name][2])
+    return in_own_units(name, x, y, _REGRESSION[name][2], limit)
 
 
 def _t42(limit: int | None) -> Stream:
@@ -119,7 +119,8 @@ def _t42(limit: int | None) -> Stream:
     share = None if limit is None else max(limit // len(objects), 1)  # of each object, its first samples
     x, y = (torch.cat([getattr(one, part)[:share] for one in objects]).double() for part in "xy")
     about = f"Yale T42 hand moving {len(objects)} objects (Sintov et al.); alone: one constant Jacobian"
-    return Stream("t42", x, y, 0, tuple(len(one.x[:share]) for one in objects), about)
+    parts = tuple(len(one.x[:share]) for one in objects)
+    return Stream("t42", x, y, 0, parts, about, sum(map(len, objects)))
 
 
 def _icub_grasp(limit: int | None) -> Stream:
@@ -156,17 +157,17 @@ def _trial(path: Path) -> tuple[int, str]:
 
 def _series(name: str, limit: int | None) -> Stream:
     path, lags, about = _SERIES[name]
-    series = np.loadtxt(_need(path))[: None if limit is None else limit + lags]
+    series = np.loadtxt(_need(path))
     x = np.lib.stride_tricks.sliding_window_view(series, lags)[:-1]
-    return in_own_units(name, x, series[lags:, None], f"{about}, next value; alone: the mean")
+    return in_own_units(name, x, series[lags:, None], f"{about}, next value; alone: the mean", limit)
 
 
 def _mimo(limit: int | None) -> Stream:
     """Received signal from the last four sent ones, as in the Kernel Adaptive Filtering Toolbox."""
     sent, received = np.loadtxt(_need("streams/mimotestbed8K.dat"), delimiter=",").T
-    x = np.lib.stride_tricks.sliding_window_view(sent, 4)[:limit]
+    x = np.lib.stride_tricks.sliding_window_view(sent, 4)
     about = "a real 2x2 radio channel that changes (kafbox); alone: the mean"
-    return in_own_units("mimo", x, received[3:, None][:limit], about)
+    return in_own_units("mimo", x, received[3:, None], about, limit)
 
 
 def _need(path: str) -> Path:

@@ -29,15 +29,28 @@ class ComparisonReport(Comparison):
     def write(self, folder: str | Path) -> Report:
         """Tables as CSV, figures as SVG and PNG, and ``index.html`` with all of them, into ``folder``."""
         save = partial(save_figure, folder=Path(folder))
-        caption = "rms error over that of the model alone, 95 % intervals."
+        caption = (
+            "rms error over that of the model alone with 95 % intervals, left of 1 a learner helps. Blue: "
+            "the default learner and sparse online GPs; filled: the best of each stream."
+        )
         figures = [save(plot_scores(self), name="scores", caption=caption)]
         if len(self.streams) > 1:
-            caption = "Mean ranks; overlapping bars cannot be told apart."
+            caption = (
+                "Mean rank over the streams, 1 is best; learners whose bars overlap cannot be told apart."
+            )
             figures.append(save(plot_ranks(self), name="ranks", caption=caption))
-        figures.append(save(plot_cost(self), name="cost", caption="Accuracy against time."))
+        caption = "Error against the time of one prediction and one update: best at the lower left."
+        figures.append(save(plot_cost(self), name="cost", caption=caption))
         for stream in (s.name for s in self.streams):
-            figure = plot_learning_curves(self, stream, curve_learners(self, stream))
-            figures.append(save(figure, name=f"curve_{stream}", caption=f"Learning curves on {stream}."))
+            shown = curve_learners(self, stream)
+            caption = f"rms error on {stream} over time, each sample predicted before it is learned"
+            caption += (
+                f": {len(shown)} of {len(self.learners)} learners."
+                if len(shown) < len(self.learners)
+                else "."
+            )
+            figure = plot_learning_curves(self, stream, shown)
+            figures.append(save(figure, name=f"curve_{stream}", caption=caption))
         report = Report(
             title="Residual learners compared",
             summary=" ".join(self.verdicts()),
@@ -46,7 +59,13 @@ class ComparisonReport(Comparison):
             configuration={
                 "learners": list(self.learners),
                 "streams": {
-                    s.name: {"samples": len(s), "warm_up": s.warm_up, "about": s.about} for s in self.streams
+                    s.name: {
+                        "samples": len(s),
+                        "available": max(s.available, len(s)),
+                        "warm_up": s.warm_up,
+                        "about": s.about,
+                    }
+                    for s in self.streams
                 },
             },
         )
@@ -57,20 +76,24 @@ class ComparisonReport(Comparison):
 def score_table(comparison: Comparison, stream: str) -> Table:
     """Every learner on one stream."""
     columns: dict[Column, Callable[[Score], Cell]] = {
-        Column("rms / model", ".3f"): lambda score: score.rms.mean,
+        Column("rms / model alone", ".3f"): lambda score: score.rms.mean,
         Column("95 % interval"): lambda score: f"{score.rms.low:.3f} to {score.rms.high:.3f}",
-        Column("median / model", ".3f"): lambda score: score.median if np.isfinite(score.median) else None,
-        Column("NLL"): lambda score: f"{score.nll:.2f}" if score.nll < 1e3 else f"{score.nll:.1e}",
-        Column("90 % coverage"): lambda score: f"{100 * score.coverage:.0f} %",
-        Column("µs", ".0f"): lambda score: score.microseconds,
-        Column("kB", ".0f"): lambda score: score.kilobytes,
+        Column("median / model alone", ".3f"): lambda score: (
+            score.median if np.isfinite(score.median) else None
+        ),
+        Column("NLL [nats]"): lambda score: f"{score.nll:.2f}" if score.nll < 1e3 else f"{score.nll:.1e}",
+        Column("90 % coverage [%]", ".0f"): lambda score: 100 * score.coverage,
+        Column("time [µs]", ".0f"): lambda score: score.microseconds,
+        Column("memory [kB]", ".0f"): lambda score: score.kilobytes,
     }
     best = comparison.best(stream)
     items = {score.learner + (" *" if score is best else ""): score for score in comparison.row(stream)}
     one = comparison.stream(stream)
     n, parts = len(one) - one.warm_up, len(one.segments)
-    note = f"{n} samples scored{f' in {parts} parts' if parts else ''}, "
-    note += f"{one.x.shape[1]} inputs, {one.y.shape[1]} outputs."
+    note = f"On {one.used}, of which {n} are scored{f' in {parts} parts' if parts else ''}; "
+    note += f"{one.x.shape[1]} inputs, {one.y.shape[1]} outputs. * best; below 1 a learner helps. "
+    note += "Median: of the absolute errors, blind to outliers. NLL: per sample and output. "
+    note += "Time: one prediction and one update."
     return Table.of(f"scores_{stream}", f"{stream}: {one.about}", "learner", items, columns, note)
 
 
@@ -103,7 +126,9 @@ def constructor_table(comparison: Comparison) -> Table:
 
 
 def curve_learners(comparison: Comparison, stream: str, most: int = 6) -> Sequence[str]:
-    """The model alone and the best few: more curves in one picture cannot be followed."""
+    """The model alone, the default learner and the best few: more curves cannot be followed."""
     order = sorted(comparison.row(stream), key=lambda score: score.rms.mean)
-    chosen = {score.learner for score in order[: most - 1]} | {"model alone"}
+    always = {"model alone", "default"} & {*comparison.learners}
+    rest = [score.learner for score in order if score.learner not in always]
+    chosen = always | {*rest[: most - len(always)]}
     return [name for name in comparison.learners if name in chosen]

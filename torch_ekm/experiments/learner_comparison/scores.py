@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from ..._extras import require
 from ...typing import Array
 from ..learners import OURS
 from ..reporting.statistics import Estimate
@@ -70,8 +70,9 @@ class Comparison:
 
     def ranks(self) -> Array:
         """``(n_streams, n_learners)``, 1 is best; ties share their mean rank."""
-        table = [[score.rms.mean for score in self.row(stream.name)] for stream in self.streams]
-        return require("scipy.stats").rankdata(table, axis=1)
+        table = np.array([[score.rms.mean for score in self.row(stream.name)] for stream in self.streams])
+        mine, others = table[:, :, None], table[:, None, :]
+        return (others < mine).sum(-1) + 0.5 * ((others == mine).sum(-1) + 1)
 
     def critical_difference(self, alpha: float = 0.05) -> float:
         """Mean ranks that differ by less are not distinguishable (Nemenyi; Demsar, JMLR 7, 2006)::
@@ -83,24 +84,45 @@ class Comparison:
         k, n = len(self.learners), len(self.streams)
         if n < 2 or k < 2:
             return float("inf")
-        q = require("scipy.stats").studentized_range.ppf(1 - alpha, k, 1e6) / np.sqrt(2)
-        return float(q * np.sqrt(k * (k + 1) / (6 * n)))
+        return studentized_range(k, alpha) / np.sqrt(2) * np.sqrt(k * (k + 1) / (6 * n))
 
     def verdicts(self) -> list[str]:
-        """One sentence for each stream: who wins, by how much, and whether ours loses."""
+        """For each stream: the default learner first, who wins, by how much, whether ours loses, and how many
+        of how many rows this was on."""
         others = [name for name in self.learners if name not in (*OURS, "model alone")]
         ours = [name for name in self.learners if name in OURS]
         sentences = []
         for stream in self.streams:
             best = self.best(stream.name)
-            text = f"{stream.name}: {best.learner} is best, {best.rms} of the model alone."
+            text = f"{stream.name}: "
+            if "default" in self.learners and best.learner != "default":
+                text += f"the default learner's rms error is {self.scores[stream.name, 'default'].rms} "
+                text += "of that of the model alone; "
+            text += f"{best.learner} is best, {best.rms} of the model alone."
             if ours and others:
                 mine, rival = (self.best(stream.name, names) for names in (ours, others))
                 ratio = self.ratio(stream.name, mine.learner, rival.learner)
                 verb = "wins against" if ratio.high < 1 else "loses to" if ratio.low > 1 else "ties with"
                 text += f" Our {mine.learner} {verb} {rival.learner}: ratio {ratio}."
-            sentences.append(text)
+            sentences.append(f"{text} On {stream.used}.")
         return sentences
+
+
+def studentized_range(k: int, alpha: float = 0.05) -> float:
+    """The q that the range of k independent standard normals exceeds with probability alpha::
+
+        P(range < q) = k int phi(z) (Phi(z) - Phi(z - q))^(k - 1) dz
+
+    (scipy.stats.studentized_range for infinite degrees of freedom, without scipy).
+    """
+    z = torch.linspace(-8.0, 8.0, 4001, dtype=torch.float64)
+    density, below = torch.exp(-0.5 * z**2) / np.sqrt(2 * np.pi), torch.special.ndtr(z)
+    low, high = 0.0, 20.0
+    for _ in range(50):
+        q = 0.5 * (low + high)
+        inside = k * torch.trapezoid(density * (below - torch.special.ndtr(z - q)) ** (k - 1), z)
+        low, high = (q, high) if inside < 1 - alpha else (low, q)
+    return 0.5 * (low + high)
 
 
 def blocks_of(stream: Stream) -> NDArray[np.int64]:

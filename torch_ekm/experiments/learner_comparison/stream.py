@@ -28,6 +28,7 @@ class Stream:
         warm_up: first samples that are learned but not scored: they gave the units.
         segments: lengths of parts that stand for themselves (objects, grasps), for the statistics.
         about: what it is, and what "the model alone" predicts.
+        available: samples of the file or recording, of which these are the first; 0: nobody counted.
 
     Raises:
         ShapeError: lengths do not fit.
@@ -39,6 +40,7 @@ class Stream:
     warm_up: int = 0
     segments: tuple[int, ...] = ()
     about: str = ""
+    available: int = 0
 
     def __post_init__(self) -> None:
         n = len(self.y)
@@ -49,6 +51,12 @@ class Stream:
 
     def __len__(self) -> int:
         return len(self.y)
+
+    @property
+    def used(self) -> str:
+        """How many samples of how many, in words."""
+        n, rows = len(self), max(self.available, len(self))
+        return f"all {n} rows" if rows == n else f"the first {n} of {rows} rows"
 
     def save(self, path: Path) -> Path:
         """Write the samples as CSV: columns ``x1..xd, y1..ym``."""
@@ -85,16 +93,19 @@ def load_table(path: str | Path, targets: Sequence[str] = (), limit: int | None 
     inputs = [i for i in range(len(names)) if i not in columns]
     if not inputs:
         raise DescriptionError(path, "all columns are targets; at least one must be an input")
-    values = values[:limit]
     about = f"{', '.join(names[i] for i in columns)} from {len(inputs)} columns of {Path(path).name}"
-    return in_own_units(Path(path).stem, values[:, inputs], values[:, columns], about)
+    return in_own_units(Path(path).stem, values[:, inputs], values[:, columns], about, limit)
 
 
-def in_own_units(name: str, x: Array, y: Array, about: str = "") -> Stream:
+def in_own_units(name: str, x: Array, y: Array, about: str = "", limit: int | None = None) -> Stream:
     """Standardize by the first tenth of the stream (20 to 200 samples), which is then not scored.
 
     Nothing of what is scored is seen beforehand. A constant input stays 0.
+
+    Args:
+        limit: only the first so many samples.
     """
+    available, x, y = len(x), x[:limit], y[:limit]
     warm_up = min(max(len(x) // 10, 20), 200)
 
     def units(values: Array) -> Tensor:
@@ -103,4 +114,4 @@ def in_own_units(name: str, x: Array, y: Array, about: str = "") -> Stream:
         deviation = np.where(deviation > 1e-9 * np.abs(values).max(0), deviation, values.std(0))
         return torch.from_numpy((values - start.mean(0)) / np.where(deviation > 0, deviation, 1.0))
 
-    return Stream(name, units(x), units(y), warm_up, about=about)
+    return Stream(name, units(x), units(y), warm_up, about=about, available=available)

@@ -1,0 +1,34 @@
+"""The command line: ``torch-ekm``."""
+
+from __future__ import annotations
+
+import sys
+
+from .._terminal import say_error  # first: needs the extra
+from ..exceptions import EKMError
+from . import describe, experiments, logs
+from ._app import app, parse_seeds
+
+import typer  # isort: skip
+
+__all__ = ["app", "describe", "experiments", "logs", "main", "parse_seeds"]
+
+_ClickException: type[Exception] = typer.BadParameter.__mro__[2]  # newer versions of typer hold their own
+
+
+def main() -> None:
+    """Entry point: what torch_ekm refuses on purpose, and what the system refuses (a full disk, say), is told
+    in one line, without a traceback. The process ends with 1 then, with 2 if it was an option."""
+    try:
+        code = app(standalone_mode=False)
+    except _ClickException as error:
+        context = getattr(error, "ctx", None)
+        hint = f"; see '{context.command_path} --help'" if context is not None else ""
+        say_error(f"{error.format_message().rstrip('.')}{hint}")  # pyright: ignore[reportAttributeAccessIssue]
+        sys.exit(2)
+    except typer.Abort:
+        sys.exit(1)
+    except (EKMError, OSError) as error:
+        say_error(error)
+        sys.exit(1)
+    sys.exit(code if isinstance(code, int) else 0)

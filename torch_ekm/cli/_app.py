@@ -1,0 +1,120 @@
+"""The application that the groups of commands add theirs to, and what their options share."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, ParamSpec, TypeVar
+
+from .._terminal import say  # first: needs the extra
+from .._versions import versions_of
+from ..exceptions import MissingExtraError, ParameterError
+
+import typer  # isort: skip
+from typer import Option  # isort: skip
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+app = typer.Typer(
+    help="Kinematic models of underactuated hands, corrected by online learners.",
+    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    rich_markup_mode=None,  # rich would take "[deg]" for a style and drop it
+)
+
+Hand = Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")]
+Preset = Annotated[str, Option(help="Faults of the simulated hand: none, nominal, worn or hostile.")]
+Sensing = Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")]
+Jobs = Annotated[int, Option(min=1, help="Processes at once.")]
+Html = Annotated[Path | None, Option(help="Write a stand-alone page instead of serving.")]
+Port = Annotated[int, Option(min=1, max=65535, help="To serve at; the next free one if it is taken.")]
+AN_OBJECT = "An object (see 'torch-ekm objects') or a path to a URDF."
+
+#: Extras, each part of the next: a command names the one that brings all that it needs.
+_NESTED = ("plots", "robot", "sim", "experiments")
+_MOST_SEEDS = 10_000
+_LARGEST_SEED = 2**31
+
+
+@app.callback(invoke_without_command=True)
+def root(
+    context: typer.Context,
+    version: Annotated[bool, Option("--version", help="Print the version.")] = False,
+) -> None:
+    """Kinematic models of underactuated hands, corrected by online learners."""
+    if version:
+        say(f"torch-ekm {versions_of(['torch_ekm'])['torch_ekm']}")
+    elif context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+def needs(extra: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """A command that needs an extra: what is missing is named with this one, not with a part of it."""
+
+    def decorate(command: Callable[P, R]) -> Callable[P, R]:
+        @functools.wraps(command)
+        def run(*arguments: P.args, **options: P.kwargs) -> R:
+            try:
+                return command(*arguments, **options)
+            except MissingExtraError as error:
+                if error.extra not in _NESTED[: _NESTED.index(extra) + 1]:
+                    raise
+                raise MissingExtraError(error.module, extra) from None
+
+        return run
+
+    return decorate
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """``"1000:1006"`` as 1000..1005; a single number as itself.
+
+    Raises:
+        ParameterError: it is neither, a seed is negative or above 2^31, or there are more than 10,000.
+    """
+    try:
+        numbers = [int(part) for part in text.split(":")]
+    except ValueError:
+        numbers = []
+    if len(numbers) == 1:
+        numbers.append(numbers[0] + 1)
+    if len(numbers) == 2 and 0 <= numbers[0] < numbers[1] <= _LARGEST_SEED:
+        if numbers[1] - numbers[0] <= _MOST_SEEDS:
+            return tuple(range(*numbers))
+        raise ParameterError("seeds", text, f"at most {_MOST_SEEDS} seeds")
+    raise ParameterError("seeds", text, "FIRST:END with 0 <= FIRST < END, e.g. 1000:1006, or one number")
+
+
+def parse_angles(text: str) -> tuple[float, ...]:
+    """``"10,20"`` as (10.0, 20.0) [deg].
+
+    Raises:
+        ParameterError: no number, or one that is no rotation.
+    """
+    valid = "numbers separated by commas, of more than 0 and less than 180 deg, e.g. 10,20"
+    try:
+        angles = tuple(map(float, names(text)))
+    except ValueError:
+        raise ParameterError("angles", text, valid) from None
+    if not angles or not all(0 < abs(angle) < 180 for angle in angles):
+        raise ParameterError("angles", text, valid)
+    return angles
+
+
+def parse_step(degrees: float) -> float:
+    """Degrees as radians.
+
+    Raises:
+        ParameterError: a motion cannot turn an object by so much.
+    """
+    if not 0 < degrees <= 45:
+        raise ParameterError("step", degrees, "more than 0 and at most 45 deg")
+    return math.radians(degrees)
+
+
+def names(text: str) -> tuple[str, ...]:
+    """``"a, b"`` as ("a", "b")."""
+    return tuple(filter(None, map(str.strip, text.split(","))))

@@ -1,0 +1,78 @@
+"""Commands about what the package holds: hands, objects, notebooks, versions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from .._terminal import print_table, say
+from ._app import AN_OBJECT, app, needs
+
+import typer  # isort: skip
+from typer import Argument, Option  # isort: skip
+
+
+@app.command()
+@needs("robot")
+def hands() -> None:
+    """List the hands that come with the package."""
+    from ..description import list_hands, load_hand
+
+    found = [load_hand(name) for name in list_hands()]
+    rows = [(hand.name, hand.n_q, hand.n_a, len(hand.pads), hand.urdf_path.name) for hand in found]
+    print_table(("hand", "joints", "actuators", "contact pads", "URDF"), rows)
+
+
+@app.command()
+@needs("robot")
+def objects() -> None:
+    """List the objects that come with the package."""
+    from ..description import list_cylinders, list_objects, load_object
+
+    rows = []
+    for name in (*list_objects(), *list_cylinders()):
+        obj = load_object(name)
+        figures = f"{1e3 * obj.mass:.0f}", f"{obj.friction:g}", f"{1e3 * obj.grasp_width:.0f}"
+        rows.append((name, *figures, ", ".join(shape.kind for shape in obj.shapes)))
+    print_table(("object", "mass [g]", "friction [1]", "grasp width [mm]", "shapes"), rows)
+
+
+@app.command()
+@needs("experiments")
+def check(
+    hand: Annotated[str, Argument(help="A hand (see 'torch-ekm hands') or a path to a URDF.")],
+    object: Annotated[str, Argument(help=AN_OBJECT)] = "box",
+    picture: Annotated[Path, Option(help="Picture of pads and contact frames.")] = Path("check.png"),
+) -> None:
+    """Check a hand: files, pads, axes, limits, tendons, and a pinch of the object in simulation and model.
+
+    Each row says what was found and what to mend. Ends with 1 if there is an error, with 0 if not.
+    """
+    from ..experiments.check import Check, check_hand
+
+    rows = check_hand(hand, object, picture)
+    print_table(Check._fields, rows, hand)
+    if any(row.state == "error" for row in rows):
+        raise typer.Exit(1)
+
+
+@app.command()
+def notebooks(
+    copy: Annotated[Path | None, Option(help="Copy them into this folder.")] = None,
+    overwrite: Annotated[bool, Option(help="Also over files that are there.")] = False,
+) -> None:
+    """List the notebooks that come with the package, or copy them to where you can run them."""
+    from ..experiments.reporting.notebook import copy_notebooks, notebook_folder
+
+    found = sorted(notebook_folder().glob("[0-9]*.ipynb"))
+    for path in found if copy is None else copy_notebooks(copy, overwrite=overwrite):
+        say(str(path))
+
+
+@app.command()
+def version() -> None:
+    """Print the version, and those of the packages that decide the numbers."""
+    from ..experiments.reporting.report import versions
+
+    for package, number in versions().items():
+        say(f"{package} {number}")

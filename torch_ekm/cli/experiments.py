@@ -1,0 +1,183 @@
+"""Commands that run experiments and comparisons, and leave a report."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from .._terminal import print_report, progress, say
+from ._app import (
+    AN_OBJECT,
+    Hand,
+    Jobs,
+    Preset,
+    Sensing,
+    app,
+    names,
+    needs,
+    parse_angles,
+    parse_seeds,
+)
+
+from typer import Argument, Option  # isort: skip
+
+if TYPE_CHECKING:
+    from ..experiments.reporting.report import Report
+    from ..experiments.reproduce import Experiment
+
+
+@app.command()
+@needs("experiments")
+def demo(
+    object: Annotated[str, Argument(help=AN_OBJECT)] = "box",
+    out: Annotated[Path, Option(help="Folder for the report.")] = Path("demo_output"),
+    hand: Hand = "icub_right",
+    seeds: Annotated[str, Option(help="FIRST:END, e.g. 1000:1008; each seed is one grasp.")] = "1000:1008",
+    jobs: Jobs = 2,
+    quick: Annotated[bool, Option(help="Two grasps, two angles: to see that it works.")] = False,
+) -> None:
+    """Turn a grasped object in the simulated hand, with the KM and with the E-KM, and report.
+
+    Takes about two minutes on two cores. Interrupted, it goes on where it stopped.
+    """
+    from ..experiments.config import Setting
+    from ..experiments.protocols.demo import Demo
+    from ..experiments.reproduce import Experiment
+
+    protocol, chosen = Demo(Setting(hand=hand), (object,)), parse_seeds(seeds)
+    planned = Experiment(protocol.quick(), chosen[:2]) if quick else Experiment(protocol, chosen)
+    for figure in _run("manipulating", planned, out, jobs).figures:
+        say(f"           {(out / figure.path).resolve()}")
+
+
+@app.command()
+@needs("experiments")
+def reproduce(
+    experiment: Annotated[
+        str, Argument(help="online, generalize, ablation, adapt or foresight.")
+    ] = "generalize",
+    seeds: Annotated[str, Option(help="FIRST:END; each seed is an independent run.")] = "1000:1020",
+    jobs: Jobs = 2,
+    out: Annotated[Path | None, Option(help="Folder for the report [reproduce_<experiment>].")] = None,
+    quick: Annotated[bool, Option(help="Two seeds, small turns: to see that it works.")] = False,
+    objects: Annotated[
+        str,
+        Option(
+            help="Names separated by commas, or a folder with URDF files of your own (generalize, adapt)."
+        ),
+    ] = "",
+    hand: Hand = "icub_right",
+    preset: Preset = "nominal",
+    learner: Annotated[str, Option(help="action-linear, rbf, linear RLS, SOGP deep, ...")] = "action-linear",
+    sensing: Sensing = True,
+    angles: Annotated[
+        str, Option(help="Turns [deg], e.g. 5,10,15; Table I if left out (generalize, ablation).")
+    ] = "",
+    step: Annotated[
+        float | None,
+        Option(help="Largest turn of one motion [deg]; 2.5 if left out (less where a contact goes 1.2 mm)."),
+    ] = None,
+    address: Annotated[
+        str | None, Option(help="A Dask cluster instead of processes here: dask://HOST:PORT.")
+    ] = None,
+) -> None:
+    """Repeat the paper's experiments, and more, with every controller on the same seeds and grasps.
+
+    Interrupted, it goes on where it stopped, and ends with the same report.
+    """
+    from ..experiments.config import Setting
+    from ..experiments.reproduce import plan
+
+    control = {} if step is None else {"LimitingFunction.step": math.radians(step)}
+    setting = Setting(hand=hand, preset=preset, learner=learner, sensing=sensing, control=control)
+    turns = parse_angles(angles) if angles else None
+    planned = plan(
+        experiment,
+        parse_seeds(seeds),
+        setting=setting,
+        objects=objects or None,
+        angles_deg=turns,
+        quick=quick,
+    )
+    _run(experiment, planned, out or Path(f"reproduce_{experiment}"), jobs, address)
+
+
+@app.command()
+@needs("plots")
+def compare(
+    data: Annotated[
+        list[str], Option(help="A .csv or .parquet file, or the name of a recording; repeatable.")
+    ],
+    learners: Annotated[str, Option(help="Names, separated by commas; all without peers by default.")] = "",
+    targets: Annotated[str, Option(help="Columns to predict; y, y1, y2, ... or the last by default.")] = "",
+    out: Annotated[Path, Option(help="Folder for tables and figures.")] = Path("compare_output"),
+    limit: Annotated[
+        int, Option(min=0, help="Rows of a file or recording that are used, its first; 0: all.")
+    ] = 1500,
+    jobs: Jobs = 2,
+) -> None:
+    """Compare residual learners on streams: predict, score, update, in the order of time.
+
+    A file needs the extra 'plots' only. One learner takes seconds to a minute for 1500 rows, all of them
+    two to five minutes on two cores. Interrupted, it goes on where it stopped.
+
+    Recordings: simulated_hand (extra 'sim'); in the folder that TORCH_EKM_DATA names: t42 (Sintov et al.,
+    GitHub avishais/t42_autonomous_system), icub_grasp (Soh et al., clear-nus/icub_grasp_dataset), sarcos
+    (Kaixhin/SARCOS), kin40k and powerplant (treforevans/uci_datasets), mimo, lorenz, mackey_glass and
+    santafe (steven2358/kafbox).
+    """
+    from ..experiments import compare as run
+    from ..experiments.learners import COMPARED
+
+    chosen = names(learners) or COMPARED
+    if jobs > 1 and find_spec("joblib") is None:
+        say("One process at a time: joblib, of the extra 'experiments', is not installed.")
+        jobs = 1
+    with progress("comparing", len(data) * len(chosen)) as advance:
+        compared = run(
+            data,
+            chosen,
+            targets=names(targets),
+            limit=limit or None,
+            folder=out / "runs",
+            processes=jobs,
+            on_done=advance,
+        )
+    print_report(compared.write(out), out, notes=True)
+
+
+@app.command()
+@needs("experiments")
+def recorded_hand(
+    data: Annotated[
+        Path | None, Option(help="t42_testpaths.npz or its folder; a small synthetic one if left out.")
+    ] = None,
+    learners: Annotated[str, Option(help="Names, separated by commas.")] = "SOGP mixture",
+    out: Annotated[Path, Option(help="Folder for the report.")] = Path("recorded_hand_output"),
+    jobs: Jobs = 2,
+    quick: Annotated[bool, Option(help="Two paths of four objects: to see that it works.")] = False,
+) -> None:
+    """Predict the recorded motions of a Yale T42 with its kinematic model, with and without learners.
+
+    The recordings (Sintov et al., GitHub avishais/t42_autonomous_system) are read in place; the documentation
+    tells how to save them as npz. Interrupted, it goes on where it stopped.
+    """
+    from ..experiments.recorded_hand.benchmark import count_jobs, predict_recorded_hand
+    from ..experiments.recorded_hand.report import write_report
+
+    chosen = names(learners)
+    with progress("predicting", count_jobs(data, len(chosen), quick=quick)) as advance:
+        result = predict_recorded_hand(
+            data, learners=chosen, folder=out / "runs", processes=jobs, quick=quick, on_done=advance
+        )
+    print_report(write_report(result, out), out, notes=True)
+
+
+def _run(what: str, planned: Experiment, folder: Path, jobs: int, address: str | None = None) -> Report:
+    from ..experiments.reproduce import reproduce as run
+
+    with progress(what, len(planned.jobs)) as advance:
+        report = run(planned, folder, jobs, advance, address)
+    print_report(report, folder)
+    return report
