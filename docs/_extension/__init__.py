@@ -7,8 +7,9 @@ from typing import Any
 
 def setup(app: Any) -> dict[str, bool]:
     """Connect the parts."""
-    from . import docstrings, names
+    from . import docstrings, generated, names
 
     docstrings.setup(app)
     names.setup(app)
+    generated.setup(app)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

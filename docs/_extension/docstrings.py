@@ -12,17 +12,24 @@ import inspect
 import textwrap
 from typing import Any
 
-from sphinx.util.inspect import signature, stringify_signature
+from sphinx import addnodes
+from sphinx.util.inspect import TypeAliasForwardRef, signature, stringify_signature
 
 from .packages import data_comment, public_bases
 
 
 def setup(app: Any) -> None:
     """Connect."""
-    app.connect("autodoc-process-docstring", _prepare, priority=100)  # before napoleon
+    app.connect("autodoc-process-docstring", _prepare, priority=100)  # napoleon has 500
+    app.connect("autodoc-process-docstring", _restore, priority=900)
+    app.connect("object-description-transform", _without_value)
     app.connect("autodoc-process-signature", _signature)
     app.connect("autodoc-process-bases", _bases)
     app.connect("autodoc-skip-member", _skip)
+    TypeAliasForwardRef.__repr__ = lambda self: self.name  # in unions it would show its own kind
+
+
+_prepared: dict[tuple[str, str], list[str]] = {}
 
 
 def _prepare(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
@@ -35,10 +42,26 @@ def _prepare(app: Any, what: str, name: str, obj: Any, options: Any, lines: list
             inside = not inside
             result += ["", line.replace(line.strip(), ".. code-block:: text"), ""] if inside else [""]
         else:
-            result.append(f"   {line}" if inside else line)
-    if what in ("attribute", "data", "property"):
-        result.insert(0, "")  # napoleon takes what stands before a colon in the first line for a type
+            result.append(f"   {line.replace('``', '')}" if inside else line)
     lines[:] = result
+    _prepared[what, name] = result
+
+
+def _restore(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Napoleon takes what stands before a colon in a field's first line for its type."""
+    before = _prepared.pop((what, name))
+    if what in ("attribute", "data", "property") and "Raises:" not in before:
+        lines[:] = before
+
+
+def _without_value(app: Any, domain: str, kind: str, content: addnodes.desc_content) -> None:
+    """Fields show their type; their default stands in the signature, as written."""
+    if kind != "attribute" or content.parent is None:
+        return
+    for line in content.parent.findall(addnodes.desc_signature):
+        notes = [node for node in line if isinstance(node, addnodes.desc_annotation)]
+        if len(notes) > 1 and notes[-1].astext().startswith(" = "):
+            line.remove(notes[-1])
 
 
 class _Source:
@@ -59,12 +82,15 @@ def _signature(
         return None
     if issubclass(obj, enum.Enum) or getattr(obj, "_is_protocol", False):
         return "", None
-    if not dataclasses.is_dataclass(obj) or "__init__" in _own(obj):
-        return None
     written: dict[str, str] = {}
-    for one in reversed(obj.__mro__):
-        if dataclasses.is_dataclass(one):
-            written |= _defaults(one)
+    if dataclasses.is_dataclass(obj) and "__init__" not in _own(obj):
+        for one in reversed(obj.__mro__):
+            if dataclasses.is_dataclass(one):
+                written |= _defaults(one)
+    elif hasattr(obj, "__signature__"):
+        written = _defaults_of_method(obj.__init__)
+    else:
+        return None
     found = signature(obj, type_aliases=app.config.autodoc_type_aliases)
     parameters = [
         one.replace(default=_Source(written[one.name]))
@@ -88,6 +114,18 @@ def _defaults(kind: type) -> dict[str, str]:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value is not None:
             found[node.target.id] = _value(node.value)
     return found
+
+
+def _defaults_of_method(method: Any) -> dict[str, str]:
+    """Argument -> the default's source."""
+    if not inspect.isfunction(method):
+        return {}
+    (parsed,) = ast.parse(textwrap.dedent(inspect.getsource(method))).body
+    assert isinstance(parsed, ast.FunctionDef)
+    given = parsed.args
+    plain = zip(given.args[len(given.args) - len(given.defaults) :], given.defaults, strict=True)
+    named = ((one, value) for one, value in zip(given.kwonlyargs, given.kw_defaults, strict=True) if value)
+    return {one.arg: ast.unparse(value) for one, value in (*plain, *named)}
 
 
 def _value(node: ast.expr) -> str:

@@ -33,6 +33,9 @@ def _full_name(target: str) -> str | None:
     """Where a dotted name is documented: ``torch_ekm.residual.base.ResidualLearner.update`` ->
     ``torch_ekm.residual.ResidualLearner.update``."""
     known = places()
+    if "." not in target:  # of an annotation that is not evaluated
+        named = [full for full in known.values() if full.rpartition(".")[2] == target]
+        return named[0] if len(named) == 1 else None
     parts = target.split(".")
     for cut in range(len(parts) - 1, 0, -1):
         try:

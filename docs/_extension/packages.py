@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import functools
 import importlib
 import inspect
 import pkgutil
@@ -13,7 +14,11 @@ from typing import Any
 
 import torch_ekm
 
-_ALSO = ["torch_ekm.testing", "torch_ekm.exceptions", "torch_ekm.typing"]  # public modules that are no packages
+_ALSO = [
+    "torch_ekm.testing",
+    "torch_ekm.exceptions",
+    "torch_ekm.typing",
+]  # public modules that are no packages
 # their names are listed where they come from, not where they are offered again
 _LAST = ["torch_ekm.control.guards", "torch_ekm"]
 
@@ -38,10 +43,13 @@ class Page:
     """(name, package that documents it)"""
 
 
+@functools.cache
 def packages() -> list[str]:
     """All packages whose ``__all__`` has a name, and the public modules."""
     found = ["torch_ekm"]
     for info in pkgutil.walk_packages(torch_ekm.__path__, "torch_ekm."):
+        if info.name.startswith("torch_ekm.cli"):
+            continue  # its reference is that of the commands
         if info.ispkg and getattr(importlib.import_module(info.name), "__all__", ()):
             found.append(info.name)
     return found + _ALSO
@@ -65,11 +73,13 @@ def pages() -> dict[str, Page]:
     return found
 
 
+@functools.cache
 def places() -> dict[int, str]:
     """id of each public object -> its full name, where it is documented."""
     return {key: name for key, name in _places().items() if name.partition(".")[0] == "torch_ekm"}
 
 
+@functools.cache
 def _places() -> dict[int, str]:
     found: dict[int, str] = {}
     for package in sorted(packages(), key=lambda one: _LAST.index(one) + 1 if one in _LAST else 0):
@@ -86,7 +96,9 @@ def public_bases(value: Any) -> list[type]:
     public = _places()
     for base in value.__mro__[1:]:
         ours = base.__module__.partition(".")[0] == "torch_ekm"
-        if id(base) in public or not (ours or hasattr(builtins, base.__name__) or base.__module__ == "typing"):
+        if id(base) in public or not (
+            ours or hasattr(builtins, base.__name__) or base.__module__ == "typing"
+        ):
             return [base]
     return [object]
 
@@ -114,12 +126,14 @@ def _directive(value: Any) -> str:
 def _summary(value: Any, name: str) -> str:
     """The first sentence of a docstring, equations left whole."""
     if _directive(value) == "py:data":
-        return f"of :mod:`{value.__module__.partition('.')[0]}`"
+        return f"``{value.__module__}.{getattr(value, '__name__', name)}``."
     text = (value.__doc__ or "") if callable(value) else "\n".join(data_comment(name, value))
     paragraph = " ".join(text.strip().split("\n\n")[0].split())
     parts = re.split(r"(``.*?``)", paragraph)  # a full stop within an equation ends no sentence
     for k in range(0, len(parts), 2):
-        end = re.search(r"(?<!eq)(?<!e\.g)(?<!i\.e)\. (?=[A-Z:`])", parts[k] + (" A" if k == len(parts) - 1 else ""))
+        end = re.search(
+            r"(?<!eq)(?<!e\.g)(?<!i\.e)\. (?=[A-Z:`])", parts[k] + (" A" if k == len(parts) - 1 else "")
+        )
         if end:
             return "".join(parts[:k]) + parts[k][: end.start()] + "."
     return paragraph.removesuffix("::") + ("" if paragraph.endswith((".", "::")) else ".")

@@ -1,4 +1,4 @@
-"""HOW the hand touches the object: contacts, grasp matrices, contact forces."""
+"""How the hand touches the object: contacts, grasp matrices, contact forces."""
 
 from __future__ import annotations
 

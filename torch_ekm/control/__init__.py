@@ -1,4 +1,4 @@
-"""WHICH motor increment to command."""
+"""The controller: which motor increment to command, and the loop that commands it."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from .situation import LinearizedModel, Situation
 
 
 class Limit(Protocol):
-    """A limit. One of your own needs no more than this method."""
+    """What a step must not do. One of your own needs no more than this method."""
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Inequality | Bounds | None:
         """Rows in ``u = da`` [rad]; None: nothing is near this limit."""

@@ -182,7 +182,15 @@ def sum_rows(n_u: int, rows: Iterable[Rows | None]) -> RowSum:
 
 
 def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
-    """The program of one step; arguments and errors are those of :func:`sum_rows`."""
+    """The program of one step: the sum of what tasks and limits ask for.
+
+    Args:
+        n_u: number of actuators.
+        rows: of each task and limit; None asks for nothing.
+
+    Raises:
+        ParameterError: bounds that cross, or a figure that is not finite.
+    """
     qpsolvers, s = require("qpsolvers"), sum_rows(n_u, rows)
     n_e, n_t = len(s.d), len(s.h)
     n = n_u + 2 * n_e + n_t

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 
 
 class Task(Protocol):
-    """A wish. One of your own needs no more than this method.
+    """What a step should do. One of your own needs no more than this method.
 
-    A wish about a motion itself, and not about where it leads, has ``per_motion = True``: a plan of several
+    A task about a motion itself, and not about where it leads, has ``per_motion = True``: a plan of several
     motions (:mod:`torch_ekm.foresight`) counts it motion by motion.
     """
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Squares | Quadratic | Equality | None:
-        """Rows in ``u = da`` [rad]; None: nothing is wished here."""
+        """Rows in ``u = da`` [rad]; None: nothing is asked for here."""
         ...
 
 

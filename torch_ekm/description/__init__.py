@@ -1,4 +1,4 @@
-"""WHAT the robot is: hands and objects as data, read from URDF and transmission files."""
+"""What the robot is: hands and objects as data, read from URDF and transmission files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Claims: protocols, metrics, figures, reports."""
+"""Experiments: comparisons of learners, the paper's protocols, metrics, figures, reports."""
 
 from .learner_comparison.compare import compare
 

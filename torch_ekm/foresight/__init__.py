@@ -1,4 +1,4 @@
-"""The whole turn planned on f + g: what a sequence of motions does, and which sequence to begin with."""
+"""Planning of a whole turn on f + g: what a sequence of motions does, and which sequence to begin with."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Learners in other libraries' words: river, scikit-learn, CapyMOA, CasADi, acados, MCAP recordings.
+"""Learners in other libraries' interfaces: river, scikit-learn, CapyMOA, CasADi, acados, MCAP recordings.
 
 Each function imports its library when it is called, and names the extra ``interop`` if that is missing.
 """

@@ -1,4 +1,4 @@
-"""WHERE its points are: forward kinematics, Jacobians, the actuation map."""
+"""Where the hand's points are: forward kinematics, Jacobians, the actuation map."""
 
 from __future__ import annotations
 

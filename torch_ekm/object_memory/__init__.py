@@ -1,4 +1,4 @@
-"""WHICH object is it: models of familiar objects, recognised by what a grasp feels like."""
+"""Which object is held: models of familiar objects, recognised by the forces and angles of a grasp."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of a hand and its object: still ones, and pages to turn and zoom."""
+"""Pictures of a hand and its object: still images, and pages on which it can be turned and zoomed."""
 
 from __future__ import annotations
 

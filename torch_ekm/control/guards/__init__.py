@@ -1,4 +1,4 @@
-"""WHAT a closed loop believes of its sensors, and where it ends rather than go on."""
+"""Guards of a closed loop: which readings it believes, and where it ends rather than go on."""
 
 from __future__ import annotations
 
