@@ -55,6 +55,7 @@ from .residual import (
 )
 
 try:
+    #: Version of the package.
     __version__ = version("torch_ekm")
 except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"

@@ -1,4 +1,4 @@
-"""Parts of pages that are made from the code: ``<!-- generated: NAME -->`` in a page stands for one of them."""
+"""Parts of pages that are made from the code; ``<!-- generated: NAME -->`` in a page stands for one."""
 
 from __future__ import annotations
 

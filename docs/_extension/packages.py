@@ -108,7 +108,7 @@ def data_comment(name: str, value: Any) -> list[str]:
     from sphinx.pycode import ModuleAnalyzer
 
     for module in list(sys.modules):
-        if module.startswith("torch_ekm.") and getattr(sys.modules[module], name, None) is value:
+        if module.partition(".")[0] == "torch_ekm" and getattr(sys.modules[module], name, None) is value:
             found = ModuleAnalyzer.for_module(module).find_attr_docs().get(("", name))
             if found:
                 return found

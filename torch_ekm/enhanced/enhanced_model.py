@@ -292,7 +292,8 @@ class EnhancedModel(Recorded, nn.Module):
     def variance(self, state: Any, action: Float[Tensor, " n_a"], weight: Float[Tensor, " n_s"]) -> Quadratic:
         """``sum_j weight_j Var[ds_j]`` about one action, as a convex quadratic in the action.
 
-        Exact with an action-linear kernel, else a convex model of second order. Outputs that are not learned are certain.
+        Exact with an action-linear kernel, else a convex model of second order. Outputs that are not learned
+        are certain.
 
         Args:
             weight: of each entry of the increment, not negative, per squared unit of the entry.

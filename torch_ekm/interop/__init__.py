@@ -83,8 +83,8 @@ def to_casadi(learner: ResidualLearner, *, variance: bool = True) -> CasadiResid
 def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTable:
     """A recording of ROS (MCAP, sqlite3 or .bag) as a table: a row for each message of ``clock``.
 
-    Other topics stand as they were last heard: nothing of the future enters a row. Rows before every topic was
-    heard once are left out, and so are texts, headers and fields of more than 64 numbers.
+    Other topics keep their last message: nothing of the future enters a row. Rows before every topic had its
+    first message are left out, and so are texts, headers and fields of more than 64 numbers.
 
     Args:
         path: a folder of rosbag2, a single ``.mcap`` or ``.db3`` file, or a ``.bag`` of ROS 1.
@@ -92,7 +92,7 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
         topics: those that are read; all of them by default.
 
     Returns:
-        ``names`` (``/topic.field.joint`` or ``/topic.field[0]``), ``time`` [s] ``(n,)`` from the first row on,
+        ``names`` (``/topic.field.joint`` or ``/topic.field[0]``), ``time`` ``(n,)`` [s] from the first row,
         ``values`` ``(n, columns)`` in the messages' own units.
 
     Raises:

@@ -33,8 +33,8 @@ def calibrate(
 ) -> Calibration:
     """``min_x |W r(x)|^2 + |x|^2``: figures of the hand from measured motions, and how sure they are.
 
-    ``r``: motions against ``J_m``, joint torques that no force explains, fingertip forces. ``x``: distance of each parameter from its
-    description, in units of its prior. ``W``: one standard deviation for each kind of residual, estimated
+    ``r``: motions against ``J_m``, joint torques that no force explains, fingertip forces. ``x``: distance of
+    each parameter from its description, in units of its prior. ``W``: one standard deviation for each kind of residual, estimated
     from the residuals in turn with x. Bounds: five priors, and no negative play. The derivative is that of
     :meth:`KinematicModel.linearize`; solved by scipy's trust-region reflective least squares.
 
@@ -48,8 +48,8 @@ def calibrate(
         parameters: kinds ("springs", "rest", "moment_arms", "stiffness", "offset", "backlash",
             "object_position", "object_rotation"), or one of a kind: "springs:thumb_2",
             "moment_arms:thumb_distal".
-        priors: standard deviations by kind, in place of 0.5 (springs), 0.3 (moment arms), 0.7 (stiffness), all
-            three of the logarithm, 10 deg (rest), 5 deg (offset), 1 deg (backlash), 2 mm and 2 deg (object).
+        priors: standard deviations by kind, in place of 0.5 (springs), 0.3 (moment arms), 0.7 (stiffness),
+            these of the logarithm, 10 deg (rest), 5 deg (offset), 1 deg (backlash), 2 mm and 2 deg (object).
         loss: of scipy's ``least_squares``: "soft_l1" bears motions in which a contact slipped, "linear" is a
             little better where there are none.
 

@@ -1,0 +1,175 @@
+"""The built site: no warning, no broken link, nothing from elsewhere, every public name."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.util
+import inspect
+import os
+import pkgutil
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+import torch_ekm
+
+ROOT = Path(__file__).parents[2]
+_NEEDED = ("sphinx", "furo", "myst_nb", "sphinx_copybutton", "sphinx-mathjax-offline")
+_LOADED = {"img": "src", "script": "src", "link": "href", "source": "src", "iframe": "src", "object": "data"}
+_NO_ASSET = {"canonical", "next", "prev", "author", "search", "index"}  # rel of links that load nothing
+
+
+class Site(NamedTuple):
+    """What the build left."""
+
+    html: Path
+    code: int
+    """Exit status of ``sphinx-build -W -n``: 0 if there is no warning."""
+    warnings: str
+
+
+class Page(HTMLParser):
+    """Anchors, links and assets of a page."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+        self.ids: set[str] = set()
+        self.links: set[str] = set()
+        self.assets: set[str] = set()
+        self.styles = ""
+        self._in_style = False
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = {name: value or "" for name, value in attrs}
+        self.ids.add(given.get("id", ""))
+        self.styles += given.get("style", "")
+        self._in_style = tag == "style"
+        if tag == "a" and "href" in given:
+            self.links.add(given["href"])
+        if given.get(_LOADED.get(tag, "")) and not _NO_ASSET & {*given.get("rel", "").split()}:
+            self.assets.add(given[_LOADED[tag]])
+
+    def handle_data(self, data: str) -> None:
+        self.styles += data if self._in_style else ""
+        self._in_style = False
+
+
+@pytest.fixture(scope="session")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
+    """Built once for all tests, from a copy: nothing is written into the checkout."""
+    if not (ROOT / "docs" / "conf.py").is_file():
+        pytest.skip("the documentation is not part of this installation")
+    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        pytest.skip(f"{', '.join(missing)} not installed: pip install -e '.[docs]'")
+    place = tmp_path_factory.mktemp("site")
+    shutil.copytree(ROOT / "docs", place / "docs", ignore=shutil.ignore_patterns("_build", "generated"))
+    shutil.copytree(ROOT / "notebooks", place / "notebooks")
+    for page in ROOT.glob("*.md"):
+        shutil.copy2(page, place)
+    command = [sys.executable, "-m", "sphinx", "-W", "-n", "--keep-going", "-q"]
+    done = subprocess.run(
+        [*command, str(place / "docs"), str(place / "html")],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return Site(place / "html", done.returncode, done.stderr)
+
+
+@functools.cache
+def page_at(path: Path) -> Page:
+    return Page(path)
+
+
+def pages(site: Site) -> list[Page]:
+    found = [page_at(path) for path in sorted(site.html.rglob("*.html")) if "_static" not in path.parts]
+    assert len(found) > 20
+    return found
+
+
+def outside(style: str) -> list[str]:
+    """What a style sheet loads from a network."""
+    loaded = re.findall(r"url\(\s*['\"]?([^'\")]+)", style) + re.findall(r"@import\s+['\"]([^'\"]+)", style)
+    return [one for one in loaded if urlsplit(one).netloc]
+
+
+def public_modules() -> Iterator[str]:
+    """Found here once more, so that the site's own list is checked."""
+    yield "torch_ekm"
+    for info in pkgutil.walk_packages(torch_ekm.__path__, "torch_ekm."):
+        private = any(part.startswith("_") for part in info.name.split("."))
+        command_line = info.name.startswith("torch_ekm.cli")
+        if private or command_line or not (info.ispkg or info.name.count(".") == 1):
+            continue
+        if getattr(importlib.import_module(info.name), "__all__", ()):
+            yield info.name
+
+
+def test_the_build_has_no_warning(site: Site) -> None:
+    assert site.code == 0, site.warnings
+
+
+def test_every_link_leads_somewhere(site: Site) -> None:
+    broken = []
+    for page in pages(site):
+        for link in sorted(page.links):
+            target = urlsplit(link)
+            if target.scheme or target.netloc:
+                continue
+            there = (page.path.parent / unquote(target.path)).resolve() if target.path else page.path
+            if not there.is_file():
+                broken.append(f"{page.path.relative_to(site.html)}: {link}")
+            elif there.suffix == ".html" and unquote(target.fragment) not in {"", *page_at(there).ids}:
+                broken.append(f"{page.path.relative_to(site.html)}: no anchor {link}")
+    assert not broken, "\n".join(broken)
+
+
+def test_nothing_is_loaded_from_elsewhere(site: Site) -> None:
+    foreign = []
+    for page in pages(site):
+        for asset in sorted(page.assets):
+            target = urlsplit(asset)
+            there = page.path.parent / unquote(target.path)
+            if target.netloc or target.scheme not in ("", "data") or not (target.scheme or there.is_file()):
+                foreign.append(f"{page.path.relative_to(site.html)}: {asset}")
+        foreign += [f"{page.path.name}: {one}" for one in outside(page.styles)]
+    for sheet in site.html.rglob("*.css"):
+        foreign += [f"{sheet.name}: {one}" for one in outside(sheet.read_text(encoding="utf-8"))]
+    assert not foreign, "\n".join(foreign)
+
+
+def test_every_public_name_is_documented(site: Site) -> None:
+    modules = list(public_modules())
+    assert {"torch_ekm.control", "torch_ekm.testing", "torch_ekm.exceptions"} <= {*modules}
+    missing = []
+    for module in modules:
+        path = site.html / "reference" / "api" / "generated" / f"{module}.html"
+        if not path.is_file():
+            missing.append(f"{module}: no page")
+            continue
+        page = page_at(path)
+        elsewhere = {link.rpartition("#")[2].removeprefix("module-") for link in page.links}
+        for name in importlib.import_module(module).__all__:
+            value = getattr(importlib.import_module(module), name)
+            if f"{module}.{name}" not in page.ids | elsewhere and not any(
+                one.endswith(f".{name}")
+                and one in page_at(path.with_name(f"{one[: -len(name) - 1]}.html")).ids
+                for one in elsewhere - page.ids
+            ):
+                missing.append(f"{module}.{name}: no entry")
+            if (inspect.isclass(value) or inspect.isroutine(value)) and not (value.__doc__ or "").strip():
+                missing.append(f"{module}.{name}: no docstring")
+    assert not missing, "\n".join(missing)
