@@ -147,9 +147,10 @@ def sparse_gp() -> Figure:
     x = 6 * torch.rand(60, 1, generator=generator, dtype=torch.float64) - 3
     y = torch.sin(2 * x) + 0.4 * x + 0.15 * torch.randn(60, 1, generator=generator, dtype=torch.float64)
     options = {"noise_variance": 0.15**2, "standardize": False, "dtype": torch.float64}
-    kernel = {"lengthscale": 0.8}
-    sparse = SparseOnlineGP(1, 1, capacity=8, kernel=SquaredExponential(1, **kernel), parts=[], **options)
-    exact = WindowGP(1, 1, window=60, kernel=SquaredExponential(1, **kernel), **options)
+    sparse = SparseOnlineGP(
+        1, 1, capacity=8, kernel=SquaredExponential(1, lengthscale=0.8), parts=[], **options
+    )
+    exact = WindowGP(1, 1, window=60, kernel=SquaredExponential(1, lengthscale=0.8), **options)
     for learner in (sparse, exact):
         learner.update(x, y)
     at = torch.linspace(-3.3, 3.3, 200, dtype=torch.float64)[:, None]
