@@ -24,7 +24,7 @@ from torch_ekm.residual import SparseOnlineGP, SquaredExponential, WindowGP
 IMAGES = Path(__file__).parent / "images"
 INK, BLUE, ORANGE, GREEN = "#7a7a7a", "#3b82c4", "#d9822b", "#3f9e5a"
 STYLE = {
-    "svg.fonttype": "none", "svg.hashsalt": "torch_ekm", "font.family": "DejaVu Sans", "font.size": 10,
+    "svg.fonttype": "path", "svg.hashsalt": "torch_ekm", "font.family": "DejaVu Sans", "font.size": 10,
     "text.color": INK, "axes.edgecolor": INK, "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK,
     "axes.spines.top": False, "axes.spines.right": False, "lines.linewidth": 1.6, "legend.frameon": False,
     "mathtext.fontset": "dejavusans",
