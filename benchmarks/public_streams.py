@@ -1,6 +1,6 @@
 """Public records of streaming regression: ours beside what was published, and the peers run again.
 
-    python benchmarks/public_streams.py --data ../shared/data --page docs/benchmarks/public_streams.md
+    TORCH_EKM_DATA=../shared/data python benchmarks/public_streams.py
 
 Protocols are those of the libraries. river's regression track: river's own ``progressive_val_score``; a
 prediction of None, before the first sample, is not scored (river's forest does the same). CapyMOA's
@@ -12,12 +12,10 @@ needs Java and pandas 2, so it has its own environment.
 from __future__ import annotations
 
 import argparse
-import datetime
 import importlib.util
 import math
 import os
-import platform
-import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -29,7 +27,6 @@ import numpy as np
 import torch
 
 from torch_ekm import LearnHyperparameters, RobustWeight, SparseOnlineGP, Standardize
-from torch_ekm._versions import versions_of
 from torch_ekm.interop import as_capymoa, as_river
 from torch_ekm.interop._default import default_learner
 from torch_ekm.typing import Array
@@ -38,7 +35,7 @@ SEED = 1000
 
 
 def plain(d: int, m: int) -> SparseOnlineGP:
-    """The first row of "Start here" in docs/choosing_a_learner.md."""
+    """The first row of "Start here" of docs/how_to/choose_a_learner.md."""
     return SparseOnlineGP(d, m, parts=[RobustWeight(3.0), Standardize(), LearnHyperparameters()])
 
 
@@ -73,8 +70,6 @@ PUBLISHED = (
     Published("Fried", "MVE", None, _INTERVALS, 0.974, 0.296),
 )
 STREAMS = ("TrumpApproval", "ChickWeights", "Fried, first 1000", "Fried")
-#: of the default: rmse, and on the whole of Fried share and width of the intervals
-BARS = {"TrumpApproval": 0.33, "ChickWeights": 35.0, "Fried, first 1000": 1.85, "Fried": 1.20}
 
 
 @dataclass(frozen=True)
@@ -175,35 +170,18 @@ def measure(data: Path | None, limit: int | None) -> Iterator[Row]:
         yield from capymoa_peers(x, y)
 
 
-def commit() -> str:
-    """What is measured; asked before, since a long run outlives it."""
-
-    def git(*words: str) -> str:
-        return subprocess.run(["git", *words], capture_output=True, text=True, check=False).stdout.strip()
-
-    changed = " with changes" if git("status", "--porcelain", "--untracked-files=no") else ""
-    return git("rev-parse", "--short", "HEAD") + changed
-
-
-def page(rows: list[Row], of: str) -> str:
-    """The results as Markdown, with everything that is needed to get them again."""
-    versions = versions_of(["torch", "numpy", "river", "capymoa"])
+def tables(rows: list[Row]) -> str:
+    """A table for each stream, ours beside what was published, as Markdown."""
     lines = [
-        "# Public records of streaming regression", "",
-        "Written by `python benchmarks/public_streams.py --data ../shared/data --page "
-        "docs/benchmarks/public_streams.md`; protocols are told at the top of that file.", "",
-        f"Commit {of}, {datetime.date.today()}, "
-        f"{platform.machine()} {platform.system()}, {os.cpu_count()} cores, one thread; seed {SEED}; "
-        f"{', '.join(f'{name} {version}' for name, version in versions.items())}.", "",
-        "Errors are those of each sample before it is learned. \"95 %\": share of samples in the interval, "
-        "and its mean width over the range of y. \"again\": the peer, run on the same machine. Times are "
-        "those of a machine that does other things, too.", "",
+        "Errors are those of each sample before it is learned; seed "
+        f"{SEED}. \"95 %\": share of samples in the interval, and its mean width over the range of y. "
+        '"again": the peer, run on the same machine. "ms": time of a sample, one thread.', "",
     ]  # fmt: skip
     for stream in STREAMS:
         mine = [row for row in rows if row.stream == stream]
         if not mine:
             continue
-        lines += [f"## {stream} ({mine[0].samples} samples)", ""]
+        lines += [f"### {stream} ({mine[0].samples} samples)", ""]
         lines += ["| | MAE | RMSE | 95 %: share | width | ms | source |", "|---|---|---|---|---|---|---|"]
         for row in mine:
             name = f"**{row.method}**" if row.method in OURS else row.method
@@ -213,23 +191,8 @@ def page(rows: list[Row], of: str) -> str:
             if one.stream == stream:
                 cells = ["", _cell(one.rmse), _percent(one.coverage), _percent(one.width), ""]
                 lines.append(f"| {one.method}, published | {' | '.join(cells)} | {one.source} |")
-        lines += ["", *_verdict(stream, mine), ""]
+        lines.append("")
     return "\n".join(lines)
-
-
-def _verdict(stream: str, rows: list[Row]) -> list[str]:
-    """The bars that were set for the default."""
-    row = next(row for row in rows if row.method == "default")
-    said = [f"RMSE {_cell(row.rmse)}, bar {BARS[stream]:g}: {_met(row.rmse <= BARS[stream])}"]
-    if stream == "Fried" and row.coverage is not None and row.width is not None:
-        good = 0.94 <= row.coverage <= 0.96
-        said.append(f"share {_percent(row.coverage)}, bar 94 to 96 %: {_met(good)}")
-        said.append(f"width {_percent(row.width)}, bar 16 %: {_met(row.width <= 0.16)}")
-    return [f"The default: {'; '.join(said)}."]
-
-
-def _met(good: bool) -> str:
-    return "met" if good else "**missed**"
 
 
 def _cell(value: float | None) -> str:
@@ -244,23 +207,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--data", type=Path, help="folder that holds capymoa/fried.csv.gz; without: river's only"
-    )
-    parser.add_argument("--page", type=Path, help="where to write the page; without: on the screen")
     parser.add_argument("--quick", action="store_true", help="the first 150 samples of each stream")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    rows, of = [], commit()
-    for row in measure(options.data, 150 if options.quick else None):
-        print(row, flush=True)
+    data = os.environ.get("TORCH_EKM_DATA")
+    rows = []
+    for row in measure(Path(data) if data else None, 150 if options.quick else None):
+        print(row, file=sys.stderr, flush=True)
         rows.append(row)
-    text = page(rows, of)
-    if options.page is None:
-        print(text)
-    else:
-        options.page.parent.mkdir(parents=True, exist_ok=True)
-        options.page.write_text(text, encoding="utf-8")
+    print(tables(rows))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How well does the tracker see? ``benchmarks/tracking_accuracy.py --frames 1000 --seed 1000``
 
-Two marker boards are drawn in random poses and found again; prints the figures of docs/sensing.md.
+Two marker boards are drawn in random poses and found again; prints the figures of docs/benchmarks/sensing.md.
 """
 
 from __future__ import annotations

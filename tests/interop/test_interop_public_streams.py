@@ -28,18 +28,13 @@ def test_progressive_error_from_nothing_and_intervals_over_the_range() -> None:
     assert whole.width == pytest.approx(2 * half * 1199 / 1200 / np.ptp(y), rel=1e-6)
 
 
-def test_the_page_says_what_was_met() -> None:
+def test_tables_hold_ours_beside_what_was_published() -> None:
     rows = [
         public_streams.Row("Fried", "default", 9, 1.0, 1.1, 2.0, 0.95, 0.17),
         public_streams.Row("TrumpApproval", "default", 9, 0.2, 0.34, 2.0),
     ]
-    text = public_streams.page(rows, "abc1234")
-    assert "Commit abc1234" in text
-    assert (
-        "RMSE 1.100, bar 1.2: met; share 95.0 %, bar 94 to 96 %: met; width 17.0 %, bar 16 %: **missed**"
-        in text
-    )
-    assert "RMSE 0.340, bar 0.33: **missed**" in text
+    text = public_streams.tables(rows)
+    assert "| **default** | 1.000 | 1.100 | 95.0 % | 17.0 % | 2.00 | here |" in text
     assert "| kNN (best), published |  | 2.720 |" in text
     assert "ChickWeights" not in text
 

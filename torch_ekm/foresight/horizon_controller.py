@@ -88,7 +88,7 @@ class HorizonController(LookAndMoveController):
         *,
         horizon: int = 12,
         along: Sequence[Limit] = (SlipLimit(),),
-        sqp_iterations: int = 3,
+        sqp_iterations: int = 2,
         receding_iterations: int = 1,
         sqp_damping: float = 0.6,
         sqp_tolerance: float = 0.1 * DEGREE,

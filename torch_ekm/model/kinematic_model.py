@@ -41,7 +41,7 @@ class KinematicModel(nn.Module):
     ``P = [A; B]^+ [0; I]``: only the stiffness with the actuators locked is inverted. Rigid couplings are
     reduced out, joints at a stop are held, contacts come from the detector, forces from
     :func:`~torch_ekm.contact.contact_forces`. Derived from the Lagrange multipliers of the
-    quasi-static equilibrium; ``docs/kinematic_model.md`` has the whole of it.
+    quasi-static equilibrium; ``docs/explanation/quasi_static_model.md`` has the derivation.
 
     Args:
         hand: the hand; its gravity is the model's unless the options say otherwise.

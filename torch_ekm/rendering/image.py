@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._extras import require
+from ..typing import Array
 from .scene import Scene, shape_mesh
 
 _DRAW = """
@@ -54,13 +55,19 @@ class Picture:
             if smooth:
                 self._plotter.enable_anti_aliasing("ssaa")
 
-    def draw(self, scene: Scene, path: Path | None = None) -> NDArray[np.uint8]:
-        """A scene of the same shapes, ``(height, width, 3)``; also written to ``path``."""
+    def draw(
+        self, scene: Scene, path: Path | None = None, camera: tuple[Array, Array, Array] | None = None
+    ) -> NDArray[np.uint8]:
+        """A scene of the same shapes, ``(height, width, 3)``; also written to ``path``.
+
+        Args:
+            camera: position, focus and up; that of the scene if None.
+        """
         for k, actors in enumerate(self._actors):
             self._plotter.subplot(0, k)
             for actor, transform in zip(actors, scene.transforms[k], strict=True):
                 actor.user_matrix = transform
-            self._plotter.camera_position = [tuple(part) for part in scene.camera]
+            self._plotter.camera_position = [tuple(part) for part in camera or scene.camera]
         self._plotter.render()
         return np.asarray(self._plotter.screenshot(path, return_img=True), dtype=np.uint8)[..., :3]
 

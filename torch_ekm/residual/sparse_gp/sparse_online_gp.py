@@ -63,7 +63,7 @@ class SparseOnlineGP(DoubleStateLearner):
 
     Args:
         capacity: largest number of basis points b.
-        kernel: covariance function in the learner's (standardised) units; default squared exponential
+        kernel: covariance function in the learner's (standardised) units; default Matern 3/2
             with lengthscale sqrt(in_features) and unit variance.
         noise_variance: s2 in the (standardised) output's squared units, one number or one per output.
         novelty_threshold: smallest ``gamma / k**`` of a new basis point.

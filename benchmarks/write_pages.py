@@ -1,0 +1,149 @@
+"""Measure, and write the pages of docs/benchmarks.
+
+    python benchmarks/write_pages.py generalize speed     # these pages; without names: all
+    python benchmarks/write_pages.py --list               # every page with its commands
+    python benchmarks/write_pages.py speed --quick        # to see that it works; writes to --out only
+
+pages.toml names the commands of each page. A page is made of what they print, or of the reports that they
+leave; both are kept in ``--out``. Stopped and started again, it goes on with what is missing. What another
+commit has measured is measured again, unless ``--keep`` says that nothing has changed that matters to it.
+Recordings are read from ``TORCH_EKM_DATA``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+from page import ROOT, commit, provenance
+
+HERE = Path(__file__).parent
+PAGES = ROOT / "docs" / "benchmarks"
+PLAN = tomllib.loads((HERE / "pages.toml").read_text(encoding="utf-8"))
+
+
+@dataclass(frozen=True)
+class Part:
+    """A command, and what a reader should see in what it prints."""
+
+    title: str
+    command: str
+    """Words after ``python benchmarks/``, or ``torch-ekm ...``; ``{out}`` is a folder of its own."""
+    see: str
+    quick: str = "--quick"
+    """What makes it short."""
+    text: bool = False
+    """It prints text, not Markdown."""
+    pictures: tuple[str, ...] = ()
+    """Figures of its report that the page shows."""
+
+    @property
+    def reports(self) -> bool:
+        """It leaves a report in ``{out}``."""
+        return "{out}" in self.command
+
+    def words(self, out: Path, quick: bool) -> list[str]:
+        """The command as it is run."""
+        words = f"{self.command} {self.quick if quick else ''}".format(out=out).split()
+        if words[0] == "torch-ekm":
+            return [sys.executable, "-c", "from torch_ekm.cli import main; main()", *words[1:]]
+        if words[0] == "pytest":
+            return [sys.executable, "-m", *words]
+        return [sys.executable, str(HERE / words[0]), *words[1:]]
+
+    def spoken(self) -> str:
+        """The command as a reader would type it."""
+        words = self.command.format(out="FOLDER")
+        return words if words.startswith(("torch-ekm", "pytest")) else f"python benchmarks/{words}"
+
+
+def parts_of(name: str) -> list[Part]:
+    """The commands of a page."""
+    return [Part(**{**part, "pictures": tuple(part.get("pictures", ()))}) for part in PLAN[name]["parts"]]
+
+
+def measure(part: Part, folder: Path, quick: bool, keep: bool) -> dict[str, str]:
+    """What a command printed or reported, from ``folder`` if it is there."""
+    kept, now, words = folder / "measured.json", commit(), part.words(folder / "report", quick)
+    if kept.exists():
+        found = json.loads(kept.read_text(encoding="utf-8"))
+        if found["command"] == shlex.join(words[1:]) and (keep or found["commit"] == now):
+            return found
+    folder.mkdir(parents=True, exist_ok=True)
+    print(f"{part.spoken()} ...", flush=True)
+    begin = time.time()
+    environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **os.environ}
+    done = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT, env=environment)
+    found = {
+        "command": shlex.join(words[1:]),
+        "commit": now,
+        "date": str(datetime.date.today()),
+        "minutes": f"{(time.time() - begin) / 60:.0f}",
+        "body": _demoted(folder / "report" / "report.md") if part.reports else done.stdout,
+    }
+    kept.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    return found
+
+
+def _demoted(report: Path) -> str:
+    """A report without its title, its headings one level deeper."""
+    lines = report.read_text(encoding="utf-8").splitlines()
+    return "\n".join(
+        f"#{line}" if line.startswith("#") else line for line in lines if not line.startswith("# ")
+    )
+
+
+def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:
+    """A page, and the pictures that it shows beside it."""
+    lines = []
+    for k, part in enumerate(parts_of(name)):
+        folder = out / name / str(k)
+        found = measure(part, folder, quick, keep)
+        body = f"```text\n{found['body'].strip()}\n```" if part.text else found["body"].strip()
+        how = f"`{part.spoken()}`: commit {found['commit']}, {found['date']}, {found['minutes']} min."
+        lines += [f"## {part.title}", "", part.see, "", how, "", body, ""]
+        for picture in part.pictures:
+            source = folder / "report" / f"{picture}.svg"
+            if source.exists():
+                (page.parent / name).mkdir(exist_ok=True)
+                shutil.copy(source, page.parent / name / source.name)
+                lines += [f"![{picture.replace('_', ' ')}]({name}/{source.name})", ""]
+    head = provenance(f"python benchmarks/write_pages.py {name}")
+    page.parent.mkdir(parents=True, exist_ok=True)
+    page.write_text("\n".join([f"# {PLAN[name]['title']}", "", *head, *lines]), encoding="utf-8")
+    print(f"{page}", flush=True)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("pages", nargs="*", metavar="page", help=", ".join(PLAN))
+    parser.add_argument("--out", type=Path, default=ROOT / "benchmark_output", help="where results are kept")
+    parser.add_argument("--quick", action="store_true", help="to see that it works; pages go to --out")
+    parser.add_argument("--keep", action="store_true", help="use what other commits have measured")
+    parser.add_argument("--list", action="store_true", help="print the commands and end")
+    options = parser.parse_args(arguments)
+    unknown = [name for name in options.pages if name not in PLAN]
+    if unknown:
+        parser.error(f"no page {', '.join(unknown)}; there are {', '.join(PLAN)}")
+    for name in options.pages or PLAN:
+        if options.list:
+            print(name, *(f"    {part.spoken()}" for part in parts_of(name)), sep="\n")
+        else:
+            folder = options.out if options.quick else PAGES
+            write(name, options.out, folder / f"{name}.md", options.quick, options.keep)
+
+
+if __name__ == "__main__":
+    main()
