@@ -23,8 +23,8 @@ class ModelOptions:
     link_weights: bool = False
     """Count the weight of the hand's own links (masses of its URDF)."""
     length: float = CHARACTERISTIC_LENGTH
-    """L, characteristic length [m], of the order of the object's size: translations and moments are divided by
-    it before they are compared with rotations and forces, in the rank decisions and in the force problem."""
+    """L, characteristic length [m], of the order of the object's size. Translations and moments are divided
+    by it where they are compared with rotations and forces: in rank decisions and in the force problem."""
     hand_stiffness: bool = True
     """Keep S, the change of moment arms with posture. False only for ablation."""
     object_stiffness: bool = True

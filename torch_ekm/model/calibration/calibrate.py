@@ -34,9 +34,10 @@ def calibrate(
     """``min_x |W r(x)|^2 + |x|^2``: figures of the hand from measured motions, and how sure they are.
 
     ``r``: motions against ``J_m``, joint torques that no force explains, fingertip forces. ``x``: distance of
-    each parameter from its description, in units of its prior. ``W``: one standard deviation for each kind of residual, estimated
-    from the residuals in turn with x. Bounds: five priors, and no negative play. The derivative is that of
-    :meth:`KinematicModel.linearize`; solved by scipy's trust-region reflective least squares.
+    each parameter from its description, in units of its prior. ``W``: one standard deviation for each kind of
+    residual, estimated from the residuals in turn with x. Bounds: five priors, and no negative play. The
+    derivative is that of :meth:`KinematicModel.linearize`; solved by scipy's trust-region reflective least
+    squares.
 
     The scale of all springs and stiffnesses together is told by fingertip forces alone (and a little by
     the object's weight): without them expect ratios.
