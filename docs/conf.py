@@ -31,7 +31,7 @@ extensions = [
 exclude_patterns = ["_build", "_extension", "_templates"]
 templates_path = ["_templates"]
 nitpicky = True
-suppress_warnings = ["toc.empty_glob"]  # pages that are not written yet
+suppress_warnings = ["toc.empty_glob"]  # a benchmark that has not been measured
 
 html_theme = "furo"
 html_title = f"torch_ekm {version}"
