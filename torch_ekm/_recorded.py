@@ -1,4 +1,4 @@
-"""What an object was made with, as plain values: to compare it with a state, and to make it anew."""
+"""What an object was made with, as plain values: to compare it with a state, and to make it again."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def plain(value: Any) -> Any:
 
 
 def make(described: Any, known: Mapping[str, Any]) -> Any:
-    """What :func:`describe` told of, made anew of the classes ``known`` by their names.
+    """What :func:`describe` told of, made again of the classes ``known`` by their names.
 
     Raises:
         ParameterError: a name is not known, or something had no plain terms.

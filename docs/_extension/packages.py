@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import enum
 import functools
 import importlib
 import inspect
@@ -31,6 +32,8 @@ class Entry:
     directive: str
     bases: bool
     """Whether it tells what it is derived from."""
+    choices: bool
+    """Whether it is an enumeration, which shows all members."""
     summary: str
 
 
@@ -67,7 +70,7 @@ def pages() -> dict[str, Page]:
                 page.elsewhere.append((name, value.__name__))
             elif places[id(value)] == f"{package}.{name}":
                 shown = any(base is not object for base in public_bases(value))
-                page.own.append(Entry(name, _directive(value), shown, _summary(value, name)))
+                page.own.append(Entry(name, _directive(value), shown, _is_enum(value), _summary(value, name)))
             else:
                 page.elsewhere.append((name, places[id(value)].rpartition(".")[0]))
     return found
@@ -113,6 +116,10 @@ def data_comment(name: str, value: Any) -> list[str]:
             if found:
                 return found
     return []
+
+
+def _is_enum(value: Any) -> bool:
+    return inspect.isclass(value) and issubclass(value, enum.Enum)
 
 
 def _directive(value: Any) -> str:

@@ -29,11 +29,11 @@ class GraspAnalysis:
     undetermined_forces: int
     """n_h + n_a - rank [A; B]: combinations of contact and actuator forces that equilibrium leaves open."""
     indeterminate: bool
-    """null G^T: some object motion is not felt by the contacts."""
+    """null G^T: some object motion does not show at the contacts."""
     graspable: bool
     """null G: there are internal forces."""
     redundant: bool
-    """null J_h: joint motions that the contacts do not feel."""
+    """null J_h: joint motions that do not show at the contacts."""
     defective: bool
     """null J_h^T: contact forces that the structure bears without joint torque."""
     smallest_singular_value: float

@@ -140,7 +140,7 @@ class ClosedLoop:
         self._stop.set()
 
     def hold(self) -> None:
-        """Tell the hand to stay where it is; a plant that fails at this, too, is not heard."""
+        """Tell the hand to stay where it is; what the plant raises here is ignored."""
         still = torch.zeros(self.controller.kinematic.hand.n_a, dtype=torch.float64)
         with contextlib.suppress(Exception):
             self.plant.command(still)
@@ -149,7 +149,7 @@ class ClosedLoop:
         """Drive the object to ``target``.
 
         Args:
-            on_step: hears of each motion when it is over, for progress.
+            on_step: called with each motion when it is over.
 
         Raises:
             EKMError: see :meth:`LookAndMoveController.decide`, and what the plant raises.

@@ -44,7 +44,7 @@ def load(
     model: Callable[[Any, Any], Any] | None = None,
     classes: Iterable[type] = (),
 ) -> Any:
-    """What :func:`save` wrote, made anew and in the state it had. Nothing in the file is ever run.
+    """What :func:`save` wrote, made again and in the state it had. Nothing in the file is ever run.
 
     Args:
         model: f, if an enhanced model was saved.

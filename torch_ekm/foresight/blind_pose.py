@@ -76,7 +76,7 @@ class BlindPose(PlantWrapper):
         return math.sqrt(max(float(self.axis @ self.filter.pose_covariance[3:, 3:] @ self.axis), 0.0))
 
     def reset(self, seed: int) -> Observation:
-        """Grasp anew, camera on."""
+        """Grasp again, camera on."""
         self.dark, self.looks, self._before = False, 0, None
         return super().reset(seed)
 

@@ -1,4 +1,4 @@
-"""Look-and-move with foresight: the whole turn is planned, its first motion made, the rest planned anew."""
+"""Look-and-move with foresight: the whole turn is planned, its first motion made, the rest planned again."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ class HorizonController(LookAndMoveController):
         return self.bound.share(lin, step[0], step[1], seen, self._wanted_grip(lin, seen))
 
     def _waits(self, seen: Situation, step: _Step, K: int, left: Tensor) -> bool:
-        """The plan puts off its motions: something is in the way, and will be, too, when it plans anew."""
+        """The plan puts off its motions: something is in the way, and will be, too, when it plans again."""
         focused = self.focus.matrix @ seen.error
         way = float(focused @ (self.focus.matrix @ step[1][-6:]) / torch.linalg.vector_norm(focused))
         return way < _WAITS * float(torch.linalg.vector_norm(focused - left)) / K

@@ -26,7 +26,7 @@ _PACE = 1e4
 """Penalty of a motion that is longer than the pace allows, per degree: above that of the goal."""
 _EVEN, _WAIT = 0.95, 10.0
 """Least share of the mean motion, and the penalty of less, per degree: a plan that puts off its motions, made
-anew before each of them, would not come to an end."""
+again before each of them, would not come to an end."""
 
 
 def error_of(state: GraspState, seen: Situation) -> Float[Tensor, "*batch 6"]:

@@ -184,7 +184,7 @@ class BeyondReach:
             return ""
         if self.reach.end is ReachEnd.NOTHING or abs(asked) <= abs(self.reach.angle) + self.beyond:
             return ""
-        return f"{asked / _DEG:.1f} deg are out of reach: this grasp turns {self.reach}; grasp it anew"
+        return f"{asked / _DEG:.1f} deg are out of reach: this grasp turns {self.reach}; grasp it again"
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ class SklearnRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """``y = c + g(X)``, c the first target, g a learner: a regressor of scikit-learn.
 
     The rows of X ``(n, in)`` and y ``(n,)`` or ``(n, out)`` are learned one after the other, in their order:
-    :meth:`partial_fit` goes on, :meth:`fit` begins anew.
+    :meth:`partial_fit` goes on, :meth:`fit` begins again.
 
     Args:
         learner: ``factory(in_features, out_features)``, an untrained learner of the right sizes, which is

@@ -34,7 +34,7 @@ class ModelBank(SingleLearner):
         log p(m | z, y_1..t) = log p(m | z) + tau sum_i log p(y_i | x_i, y_1..i-1, m) + const
         p(new) = nu / (nu + n_episodes),    p(m) = (1 - p(new)) / n_models         without a signature z
 
-    An *episode* is one grasp: the hand knows that it grasps anew (:meth:`begin`), not what. Each
+    An *episode* is one grasp: the hand knows that it grasps again (:meth:`begin`), not what. Each
     hypothesis learns along during the first ``window`` samples, so its sum is the exact evidence of
     its model for the episode; the best one leads. Then the leader goes on alone, and when the
     episode ends it replaces the model it began as, or becomes a new one.
@@ -49,9 +49,9 @@ class ModelBank(SingleLearner):
     as good as a model of each.
 
     Different objects may answer alike, and then residuals cannot tell them apart. With a *signature* z,
-    what the grasp feels like before the first motion (:class:`GraspSignature`), recognition begins with
+    the readings of the grasp before the first motion (:class:`GraspSignature`), recognition begins with
     ``p(m | z)`` of a mixture (:class:`SignatureModel`). The first grasps say little of how far apart objects
-    are; so the grasps of the past are remembered, and whenever an episode ends they are sorted anew in the
+    are; so the grasps of the past are remembered, and whenever an episode ends they are sorted again in the
     light of all of them. Models whose grasps changed are learned again from their samples.
 
     "New" starts from what is common: a learner of all objects whose information is multiplied by a
@@ -140,10 +140,10 @@ class ModelBank(SingleLearner):
 
     @torch.no_grad()
     def begin(self, signature: Float[Tensor, " d"] | None = None) -> int | None:
-        """A new grasp: keep what the last episode learned, and ask anew which object this is.
+        """A new grasp: keep what the last episode learned, and ask again which object this is.
 
         Args:
-            signature: what the grasp feels like, for a bank with ``signature_features``.
+            signature: the readings of the grasp, for a bank with ``signature_features``.
 
         Returns:
             The model to which the last episode went; None if it was too short to tell.

@@ -13,7 +13,7 @@ class Plant(Protocol):
     """A hand holding an object: simulated, recorded, or real."""
 
     def reset(self, seed: int) -> Observation:
-        """Grasp the object anew; the same seed gives the same grasp and the same noise."""
+        """Grasp the object; the same seed gives the same grasp and the same noise."""
         ...
 
     def observe(self) -> Observation:

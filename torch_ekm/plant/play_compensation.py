@@ -29,7 +29,7 @@ class PlayCompensation(PlantWrapper):
         self._motor: Tensor | None = None
 
     def reset(self, seed: int) -> Observation:
-        """Grasp the object anew; the play is unknown again."""
+        """Grasp the object again; the play is unknown again."""
         self._motor = None
         return super().reset(seed)
 

@@ -30,7 +30,7 @@ class RecordingPlant(PlantWrapper):
         self.trajectory = Trajectory()
 
     def reset(self, seed: int) -> Observation:
-        """Grasp anew, and start a new trajectory, which stays empty if there is no grasp."""
+        """Grasp again, and start a new trajectory, which stays empty if there is no grasp."""
         self.trajectory = Trajectory(seed)
         observation = self.plant.reset(seed)
         self.trajectory.observations.append(observation)

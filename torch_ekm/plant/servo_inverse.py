@@ -58,7 +58,7 @@ class ServoInverse(PlantWrapper):
         return after
 
     def correct(self, after: Observation | None) -> None:
-        """What was learned of the last motion is taken back; it is learned anew from ``after``, if any.
+        """What was learned of the last motion is taken back; it is learned again from ``after``, if any.
 
         Of a motion without any encoder reading that can be believed nothing is learned.
         """

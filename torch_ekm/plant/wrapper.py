@@ -13,7 +13,7 @@ class PlantWrapper:
     """Passes everything on to ``plant``; implements :class:`Plant`.
 
     A subclass overrides :meth:`observation` to change what is seen, :meth:`command` to change what is
-    commanded, :meth:`reset` to begin anew. What a plant offers beyond the contract (``hand``, ``object``,
+    commanded, :meth:`reset` to begin again. What a plant offers beyond the contract (``hand``, ``object``,
     ``rotation_axis`` of a simulated hand) is found on the wrapper, too.
     """
 
@@ -26,7 +26,7 @@ class PlantWrapper:
         return getattr(self.plant, name)
 
     def reset(self, seed: int) -> Observation:
-        """Grasp the object anew."""
+        """Grasp the object again."""
         return self.observation(self.plant.reset(seed))
 
     def observe(self) -> Observation:

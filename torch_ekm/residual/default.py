@@ -24,7 +24,7 @@ def default_learner(
     output_offset: Literal["zero", "learned"] = "zero",
     **options: Any,
 ) -> MixtureResidual:
-    """What we recommend to somebody who tells us nothing: a mixture of four, in constant memory.
+    """The recommended learner where nothing is known of the data: a mixture of four, in constant memory.
 
     Two learners keep the past and learn features, of which one distrusts large samples and one does not (rare
     ones may be outliers, or what is worth learning); one lets g wander; one forgets and is told the last

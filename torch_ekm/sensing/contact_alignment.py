@@ -55,7 +55,7 @@ class ContactAligned(PlantWrapper):
         self._delta = torch.zeros(hand.n_q, dtype=torch.float64)
 
     def reset(self, seed: int) -> Observation:
-        """Grasp anew."""
+        """Grasp again."""
         self._delta.zero_()
         return super().reset(seed)
 

@@ -114,7 +114,7 @@ class InHandRotation(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Grasp the object anew and draw a target.
+        """Grasp the object again and draw a target.
 
         Raises:
             ParameterError: ``options["angle"]`` is not a finite number.

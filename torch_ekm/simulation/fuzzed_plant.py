@@ -50,7 +50,7 @@ class FuzzedPlant(PlantWrapper):
         self._left, self._kind, self._sensor = 0, "", ""
 
     def repair(self) -> None:
-        """End the fault under way, as somebody does who is called."""
+        """End the fault under way."""
         self._left = 0
 
     def observation(self, seen: Observation) -> Observation:

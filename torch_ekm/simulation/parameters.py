@@ -50,7 +50,7 @@ class PlantParameters:
     actuator_bias: float = 0.0
     """Bound of a constant error of each actuator [rad]; drawn once, from ``hardware_seed``."""
     actuator_error: float = 0.0
-    """Bound of an error drawn anew at every command [rad], uniform."""
+    """Bound of an error drawn again at every command [rad], uniform."""
     dead_zone: float = 0.0
     """Coulomb dead band: an actuator stops short of its set-point by this [rad]."""
     threshold: float = 0.0
@@ -66,7 +66,7 @@ class PlantParameters:
     rotation_noise: float = 0.0
     """Standard deviation of the object's orientation, per axis [rad]."""
     force_sensors: bool = True
-    """The fingertips feel; without, ``Observation.fingertip_force`` is None."""
+    """The fingertips measure forces; without, ``Observation.fingertip_force`` is None."""
     force_noise: float = 0.0
     """Standard deviation of the force of a fingertip that touches [N]."""
     force_offset: float = 0.0

@@ -99,7 +99,7 @@ class SensedPlant(PlantWrapper):
         self._last: tuple[Tensor, Tensor, float] | None = None
 
     def reset(self, seed: int) -> Observation:
-        """Grasp anew, and set up the camera so that it sees both boards alike.
+        """Grasp again, and set up the camera so that it sees both boards alike.
 
         Raises:
             ObjectLostError: none of the looks showed both boards.

@@ -86,7 +86,7 @@ class SimulatedHand:
     # -- the plant contract -------------------------------------------------------------------------
 
     def reset(self, seed: int) -> Observation:
-        """Grasp the object anew: plan a pinch, close on the held object, release it, let it settle.
+        """Grasp the object again: plan a pinch, close on the held object, release it, let it settle.
 
         Raises:
             EquilibriumError: no pinch could be planned.
@@ -133,7 +133,7 @@ class SimulatedHand:
         return self.observe()
 
     def observe(self) -> Observation:
-        """Read the sensors; their noise is drawn anew."""
+        """Read the sensors; their noise is drawn again."""
         rig, draw = self._grasped(), self._generator
         q, (position, rotation) = rig.scene.q, rig.scene.object_pose
         status = self.status

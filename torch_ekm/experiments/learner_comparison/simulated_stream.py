@@ -20,7 +20,7 @@ def record_simulated_hand(n: int = 400, seed: int = 1000) -> Stream:
     """``y = ds - J_m da`` [mm, deg] of ``n`` motions with the nominal mismatch of the plant.
 
     The kinematic model turns the object towards targets drawn from 5 to 20 deg, at most ten motions each,
-    then grasps anew. Before motion ``n // 2`` all tendons are replaced, with pulleys of 0.85 instead of 1.3
+    then grasps again. Before motion ``n // 2`` all tendons are replaced, with pulleys of 0.85 instead of 1.3
     times their nominal radius.
 
     Args:

@@ -60,7 +60,7 @@ def record(
     """Turn the object by each angle, for each seed, and log it; what is there already is not run again.
 
     Trial ``seed * len(angles_deg) + k`` is the turn by angle k. A learner goes on from turn to turn of
-    one seed and starts empty with each seed; a seed of which turns are missing is learned anew.
+    one seed and starts empty with each seed; a seed of which turns are missing is learned again.
 
     Args:
         on_trial: called with the number of each trial that is there, earlier ones too.

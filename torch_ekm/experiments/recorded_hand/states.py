@@ -30,7 +30,7 @@ OPTIONS = ModelOptions(slack_tension=None, on_unstable="flag", max_overlap=0.02)
 """Servos keep both tendons taut all the time; markers are too coarse to tell a grasp's stability."""
 _WINDOW = 5  # frames up to now whose median is the measurement: single frames jump by up to 15 mm
 _MOVED = 2e-3  # [m] by which a proximal marker has moved before a frame is worth another look
-_GROWTH = 1.3  # of the frames worth a look, until camera and diameter are fitted anew
+_GROWTH = 1.3  # of the frames worth a look, until camera and diameter are fitted again
 _LOOKS = 60  # frames a fit takes
 _POSITION_STD, _ROTATION_STD = 1e-3, 0.02  # [m], [rad] of the object, for the projection
 _LIKELY = 30.0  # chi^2 of two gaps; beyond, a marker was misread or a pad does not touch

@@ -89,7 +89,7 @@ class GraspShow:
         return make_scene(self.plant.hand, self.plant.object, q, position, rotation, gravity)
 
     def add_controls(self, gui: Any) -> None:
-        """A slider for each actuator, increments since the grasp [deg], and a button to grasp anew."""
+        """A slider for each actuator, increments since the grasp [deg], and a button to grasp again."""
         self._sliders = [
             gui.add_slider(f"{name} [deg]", min=-30.0, max=30.0, step=0.5, initial_value=0.0)
             for name in self.plant.hand.actuator_names

@@ -30,7 +30,7 @@ GROUPS = {
 """Standard deviations at the start: of a measured motion [rad], [m], [rad], of an encoder against joints and
 tension [rad]; of joint torques and fingertip forces in units of those by which the force problem weighs them
 (it trades one for the other, so that neither can be estimated by itself). They are estimated
-anew from the residuals."""
+again from the residuals."""
 
 
 _SLACK = 1e-3  # [N m] a tendon with less has no length to compare

@@ -21,7 +21,7 @@ from ..report import UpdateReport
 class GPyTorchLearner(SingleLearner):
     """A model of GPyTorch and the last samples.
 
-    GPyTorch's state lies partly outside of state dicts, so the model is no submodule: a copy is made anew
+    GPyTorch's state lies partly outside of state dicts, so the model is no submodule: a copy is made again
     and loads its state. A subclass names its own arguments in ``_options`` and calls :meth:`_start` last.
     """
 

@@ -207,7 +207,7 @@ class RandomFeatureRLS(LinearInFeatures):
     settled = 1.0  # frequencies are of one unit: only a much better one is worth starting again
 
     def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
-        """Features of other units are others: the block is learned anew, but for the sample that comes."""
+        """Features of other units are others: the block is learned again, but for the sample that comes."""
         self._learn_block(BLOCK - 1)
 
     def _slopes(self, z: Tensor) -> tuple[Tensor, Tensor]:

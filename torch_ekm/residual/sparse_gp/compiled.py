@@ -56,7 +56,7 @@ class Learner(Host, Protocol):
 class CompiledLoops:
     """A learner's buffers as arrays that share their memory, and the compiled calls on them.
 
-    The arrays are made at the first call, and anew whenever a buffer is another one: the learner was moved,
+    The arrays are made at the first call, and again whenever a buffer is another one: the learner was moved,
     or loaded with other tensors. A call returns None where torch must do the work: without numba, on another
     device, in float32, where a gradient is to be carried, inside of a transformation or of torch.compile, and
     with parts that weigh samples in ways that are not known here.
@@ -147,7 +147,7 @@ class CompiledLoops:
         return not (torch.is_grad_enabled() and any(p.requires_grad for p in self._parameters))
 
     def _is_bound(self, gp: Learner) -> bool:
-        """Whether the arrays, made anew if need be, are of use."""
+        """Whether the arrays, made again if need be, are of use."""
         if vars(gp)["_modules"]["kernel"] is not self._kernel or not self._is_current():
             self._bind(gp)
         return self._usable

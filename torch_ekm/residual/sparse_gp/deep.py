@@ -30,7 +30,7 @@ def DeepKernelSOGP(  # noqa: N802  a kind of learner, called like the others
 ) -> SparseOnlineGP:
     """A SparseOnlineGP on ``[x / L, net(x)]``, network and kernel learned online in constant memory.
 
-    The basis is kept as inputs and embedded anew whenever the network moves; the natural form does not
+    The basis is kept as inputs and embedded again whenever the network moves; the natural form does not
     contain the kernel, so nothing else has to follow. See DeepKernel and LearnHyperparameters.
 
     Thousands of weights want more than the last 32 samples, which on a trajectory are one place: 2000

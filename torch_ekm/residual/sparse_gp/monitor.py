@@ -92,7 +92,7 @@ class CalibrateNoise(Part):
 
 
 class DetectChanges(Part):
-    """Start anew when most of the last samples did not fit: not outliers, another system::
+    """Start again when most of the last samples did not fit: not outliers, another system::
 
         a += ([z2 > 5] - a)/8,   alarm: a > 0.6
 
@@ -112,7 +112,7 @@ class DetectChanges(Part):
         self.levels = nn.Buffer(zeros(_MEMORY, *fleet))
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
-        """Take a sample in; models that face another system start anew."""
+        """Take a sample in; models that face another system start again."""
         nis, mask = sample.report.nis, sample.mask
         step = RATE * ((nis > _LARGE).to(nis.dtype) - self.level)
         self.level += step if mask is None else step * mask

@@ -116,7 +116,7 @@ class Part(Recorded, nn.Module):
     1. :meth:`before_update` with each sample before it is learned;
     2. :meth:`weigh` within an update, on the gain;
     3. :meth:`after_update` after each sample;
-    4. :meth:`on_rebuild` every ``refresh_every`` samples, before the caches are made anew from the natural
+    4. :meth:`on_rebuild` every ``refresh_every`` samples, before the caches are made again from the natural
        form, and :meth:`after_rebuild` thereafter.
 
     A subclass implements what it needs; none of it may look at data on a GPU, or updates wait for it.
@@ -138,7 +138,7 @@ class Part(Recorded, nn.Module):
         return torch.ones_like(nis)
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
-        """Take note of a sample; True if the caches must be made anew at once."""
+        """Take note of a sample; True if the caches must be made again at once."""
         return False
 
     def on_rebuild(self, learner: Host) -> None:

@@ -19,7 +19,7 @@ class SparsePosterior(nn.Module):
     Master copy is (basis, Omega, h): Omega is a sum of squares, so it stays positive, and it holds
     neither kernel nor noise. alpha, C, Q are caches with ``mean = alpha'k``, ``var = k** + k'Ck``,
     ``Q = K^-1``: :func:`~torch_ekm.residual.sparse_gp.recursion.absorb` carries them along by rank-one steps,
-    :meth:`rebuild` makes them anew.
+    :meth:`rebuild` makes them again.
     Always float64, see :class:`~torch_ekm.residual.SparseOnlineGP`. Arguments as there.
     """
 

@@ -86,7 +86,7 @@ class PrequentialLoss(nn.Module):
 
         Args:
             moved: whether kernel or noise changed since the old state's caches were made: they are
-                made anew then.
+                made again then.
         """
         with _differentiable(kernel):
             K, k, prior = outcome = self._covariances(kernel, queries.x)

@@ -250,7 +250,7 @@ class SparseOnlineGP(DoubleStateLearner):
 
     @torch.no_grad()
     def set_basis(self, x: Float[Tensor, "n *batch in"]) -> None:
-        """Start anew from the prior on given basis points (at most ``capacity``).
+        """Start again from the prior on given basis points (at most ``capacity``).
 
         With ``pruning="freeze"`` and a full basis the posterior is then the DTC approximation
         (FITC with ``projection="fitc"``) on these inducing points.
@@ -321,7 +321,7 @@ class SparseOnlineGP(DoubleStateLearner):
         return step(self.posterior, z, t, self.kernel, self.shared_noise(), on, self.weighing)
 
     def _is_stale(self, n: int) -> bool:
-        """Whether the caches must be made anew after n samples although no part changed the state."""
+        """Whether the caches must be made again after n samples although no part changed the state."""
         if n % (_LATEST * self.refresh_every) == 0:
             return True
         drift = None if self._loops is None else self._loops.drift(self)

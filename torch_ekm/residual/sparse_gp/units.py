@@ -23,7 +23,7 @@ class Standardize(Part, Units):
 
     New units are adopted when the caches are rebuilt, and after 1, 2, 4, 8, ... samples, since units are
     rough at first: the sample that comes counts in its own units. The basis follows exactly, and so does
-    ``h <- (h + Omega 1 o) r`` for ``new t = (t + o) r``. Up to 32 samples all are learned anew, so that one
+    ``h <- (h + Omega 1 o) r`` for ``new t = (t + o) r``. Up to 32 samples all are learned again, so that one
     of the first that lies far out is judged by those that follow.
 
     Args:

@@ -16,7 +16,7 @@ class StaticPose:
     Means and differences are taken on the twist ``(z_t - x_t; Log(R_z R_x^T))``. ``frames`` bounds the
     weight of the past, since the errors of successive looks share a part that no average removes.
     Three looks in a row beyond ``chi^2 = 22.46`` (one in a thousand for six degrees of freedom) say
-    that the thing has moved: start anew. A single one is ignored.
+    that the thing has moved: start again. A single one is ignored.
 
     Args:
         frames: looks that are averaged; 1 gives each look back unchanged, and None for a missing one.
