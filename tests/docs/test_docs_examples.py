@@ -6,9 +6,10 @@ import ast
 import doctest
 import importlib.util
 import re
+import sys
 import textwrap
+import types
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -50,10 +51,11 @@ def test_the_examples_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pyt
     skip_without_its_packages(code)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")
-    names: dict[str, Any] = {"__name__": "__main__"}
+    module = types.ModuleType("documentation_page")  # classes of a page can be pickled
+    monkeypatch.setitem(sys.modules, module.__name__, module)
     with torch.random.fork_rng(devices=[]):
         for block in code:
-            exec(compile(block, str(page), "exec"), names)
+            exec(compile(block, str(page), "exec"), vars(module))
 
 
 @pytest.mark.parametrize("page", [one for one in sources() if ">>> " in one.read_text("utf-8")], ids=name_of)
