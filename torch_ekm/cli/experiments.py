@@ -18,6 +18,7 @@ from ._app import (
     needs,
     parse_angles,
     parse_seeds,
+    parse_step,
 )
 
 from typer import Argument, Option  # isort: skip
@@ -89,7 +90,7 @@ def reproduce(
     from ..experiments.config import Setting
     from ..experiments.reproduce import plan
 
-    control = {} if step is None else {"LimitingFunction.step": math.radians(step)}
+    control = {} if step is None else {"LimitingFunction.step": parse_step(step)}
     setting = Setting(hand=hand, preset=preset, learner=learner, sensing=sensing, control=control)
     turns = parse_angles(angles) if angles else None
     planned = plan(
