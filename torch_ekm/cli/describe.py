@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from .._terminal import print_table, say
-from ._app import AN_OBJECT, app, needs
+from ._app import AN_OBJECT, app, check_file, needs
 
 import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
@@ -65,6 +65,7 @@ def check(
     """
     from ..experiments.check import Check, check_hand
 
+    check_file(picture, (".png", ".jpg", ".jpeg"))
     rows = check_hand(hand, object, picture)
     print_table(Check._fields, rows, hand)
     if any(row.state == "error" for row in rows):

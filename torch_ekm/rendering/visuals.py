@@ -99,7 +99,7 @@ def _part(path: Path, element: ET.Element) -> Shape | Mesh:
     if shape.tag == "mesh":
         mesh = _load(path, shape.get("filename", ""))
         scale = np.array(_numbers(shape.get("scale", "1 1 1"), 3))
-        return Mesh(np.asarray(mesh.vertices, dtype=np.float64) , np.asarray(mesh.faces), pose)
+        return Mesh(np.asarray(mesh.vertices, dtype=np.float64) * scale, np.asarray(mesh.faces), pose)
     if shape.tag not in _SIZES:
         raise ValueError(f"<{shape.tag}> is not drawn")
     words = " ".join(shape.get(key, "") for key in _SIZES[shape.tag].split())
