@@ -43,6 +43,7 @@ toc_object_entries_show_parents = "hide"
 
 myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath", "fieldlist"]
 myst_heading_anchors = 4
+mathjax3_config = {"options": {"enableMenu": False}}  # whose speech would come from a network
 
 # notebooks are pages, with the outputs that are stored in them; they lie outside of this folder
 nb_execution_mode = "off"

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
-from torch_ekm.description import load_hand, load_object
+from torch_ekm.description import list_hands, load_hand, load_object
+from torch_ekm.kinematics.se3 import exp
 from torch_ekm.rendering import make_scene
 
 PALM_DOWN = np.array([0.0, 0.0, 9.81])
@@ -36,6 +38,26 @@ def test_a_ghost_stands_where_it_was_planned_and_can_be_seen_through():
     moved = scene.transforms[0, -n:, :3, 3] - scene.transforms[0, -2 * n : -n, :3, 3]
     np.testing.assert_allclose(moved, [[0.01, 0, 0]] * n, atol=1e-12)
     assert scene_of("icub_right", PALM_DOWN).ghosts == 0
+
+
+@pytest.mark.parametrize("name", list_hands())
+@pytest.mark.parametrize("given", [True, False])
+def test_a_turn_is_seen_along_its_axis(name, given):
+    """The one that is named, or that of the turn; square to a planar hand."""
+    hand, axis = load_hand(name), np.array([0.1, -0.9, 0.3]) / np.linalg.norm([0.1, -0.9, 0.3])
+    turn = exp(torch.from_numpy(np.outer([0.0, 0.2, 0.4], axis))).numpy()
+    if given:
+        turn = turn[:1]
+    n = len(turn)
+    scene = make_scene(
+        hand, load_object("box"), np.tile(hand.spring_rest, (n, 1)), np.zeros((n, 3)), turn, PALM_DOWN,
+        axis=-axis if given else None,
+    )  # fmt: skip
+    position, focus, up = scene.camera
+    sight = (position - focus) / np.linalg.norm(position - focus)
+    expected = axis if hand.planar_normal is None else np.array(hand.planar_normal)
+    assert abs(sight @ expected) == pytest.approx(1.0, abs=1e-6)
+    assert np.linalg.norm(np.cross(up, sight)) > 0.1
 
 
 def test_hands_are_seen_from_the_side_of_the_index_finger():

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from .._terminal import print_table, say
-from ._app import AN_OBJECT, app, needs
+from ._app import AN_OBJECT, app, check_file, needs
 
 import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
@@ -14,10 +14,25 @@ from typer import Argument, Option  # isort: skip
 
 @app.command()
 @needs("robot")
-def hands() -> None:
-    """List the hands that come with the package."""
-    from ..description import list_hands, load_hand
+def hands(
+    new: Annotated[
+        Path | None,
+        Option(metavar="URDF", help="Write NAME.transmission.toml beside this NAME.urdf, to be filled in."),
+    ] = None,
+) -> None:
+    """List the hands of the package, or begin your own.
 
+    With --new: all joints of the URDF with their limits, a coupling for each <mimic>, and examples of
+    actuators and pads. Fill in what is marked with TODO; 'torch-ekm check NAME.urdf' tells what lacks. A file
+    that is there is not overwritten.
+    """
+    from ..description import list_hands, load_hand, write_template
+
+    if new is not None:
+        written = write_template(new)
+        say(f"Written:   {written.resolve()}")
+        say(f"Next:      put a figure wherever TODO stands, then: torch-ekm check {new}")
+        return
     found = [load_hand(name) for name in list_hands()]
     rows = [(hand.name, hand.n_q, hand.n_a, len(hand.pads), hand.urdf_path.name) for hand in found]
     print_table(("hand", "joints", "actuators", "contact pads", "URDF"), rows)
@@ -50,6 +65,7 @@ def check(
     """
     from ..experiments.check import Check, check_hand
 
+    check_file(picture, (".png", ".jpg", ".jpeg"))
     rows = check_hand(hand, object, picture)
     print_table(Check._fields, rows, hand)
     if any(row.state == "error" for row in rows):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from .._terminal import print_report, progress, say
+from ..exceptions import ParameterError
 from ._app import (
     AN_OBJECT,
     Hand,
@@ -18,6 +19,7 @@ from ._app import (
     needs,
     parse_angles,
     parse_seeds,
+    parse_step,
 )
 
 from typer import Argument, Option  # isort: skip
@@ -63,9 +65,7 @@ def reproduce(
     quick: Annotated[bool, Option(help="Two seeds, small turns: to see that it works.")] = False,
     objects: Annotated[
         str,
-        Option(
-            help="Names separated by commas, or a folder with URDF files of your own (generalize, adapt)."
-        ),
+        Option(help="Names separated by commas, or a folder with URDF files (generalize, adapt, foresight)."),
     ] = "",
     hand: Hand = "icub_right",
     preset: Preset = "nominal",
@@ -89,7 +89,9 @@ def reproduce(
     from ..experiments.config import Setting
     from ..experiments.reproduce import plan
 
-    control = {} if step is None else {"LimitingFunction.step": math.radians(step)}
+    if address is not None and not address.startswith("dask://"):
+        raise ParameterError("address", address, "dask://HOST:PORT")
+    control = {} if step is None else {"LimitingFunction.step": parse_step(step)}
     setting = Setting(hand=hand, preset=preset, learner=learner, sensing=sensing, control=control)
     turns = parse_angles(angles) if angles else None
     planned = plan(
@@ -130,7 +132,9 @@ def compare(
     from ..experiments import compare as run
     from ..experiments.learners import COMPARED
 
-    chosen = names(learners) or COMPARED
+    chosen = names(learners) if learners else COMPARED
+    if not chosen:
+        raise ParameterError("learners", learners, "names of learners, separated by commas")
     if jobs > 1 and find_spec("joblib") is None:
         say("One process at a time: joblib, of the extra 'experiments', is not installed.")
         jobs = 1

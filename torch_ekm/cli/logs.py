@@ -64,6 +64,8 @@ def show(
     shown = choose_show(what, object, seed, reach)
     if isinstance(shown, ReachShow):
         print_table(("direction", "angle [deg]", "ends by"), shown.rows(), shown.title)
+    for note in getattr(shown, "notes", ()):
+        say(f"Not drawn: {note}")
     _look(shown, html, port)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from .digests import file_digests
 from .hand import Actuator, ContactPad, HallSensor, HandDescription
+from .mimic import Mimic
 from .objects import ObjectDescription
 from .registry import (
     hand_paths,
@@ -16,6 +17,7 @@ from .registry import (
     urdf_folder,
 )
 from .shape import Shape
+from .template import write_template
 from .transmission_file import write_transmission
 from .urdf import UrdfJoint, UrdfLink, UrdfModel, read_urdf
 
@@ -24,6 +26,7 @@ __all__ = [
     "ContactPad",
     "HallSensor",
     "HandDescription",
+    "Mimic",
     "ObjectDescription",
     "Shape",
     "UrdfJoint",
@@ -38,6 +41,7 @@ __all__ = [
     "load_object",
     "object_paths",
     "read_urdf",
+    "write_template",
     "write_transmission",
     "file_digests",
 ]

@@ -6,7 +6,7 @@ contact pads, Hall sensors. The format is documented in ``docs/reference/file_fo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -15,8 +15,11 @@ import numpy as np
 from ..exceptions import DescriptionError, JointMismatchError
 from ._toml import TomlTable, read_toml
 from .hand import Actuator, ContactPad, HallSensor, HandDescription
+from .mimic import check_mimics
 from .urdf import UrdfModel
 
+#: Stands for a figure that is still to be filled in.
+TODO = "TODO"
 TABLES = ("hand", "joints", "actuators", "couplings", "pads", "hall_sensors", "notes")
 HAND = ("name", "base_link", "planar_normal", "gravity")
 JOINT = ("spring", "rest", "rest_deg", "friction")
@@ -48,7 +51,12 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
             coupling holds.
         JointMismatchError: the file names joints that the URDF lacks, or leaves some out.
     """
-    top = TomlTable(path, "top level", read_toml(path, "transmission file"), TABLES)
+    if not path.is_file():
+        problem = f"no such transmission file; 'torch-ekm hands --new {urdf.path}' begins one"
+        raise DescriptionError(path, problem)
+    data = read_toml(path, "transmission file")
+    _check_filled_in(path, data)
+    top = TomlTable(path, "top level", data, TABLES)
     joints = urdf.moving_joints
     names = tuple(joint.name for joint in joints)
     if not names:
@@ -63,6 +71,7 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
     J_a = _rows(path, names, [(f"actuator '{a.name}'", arms) for a, arms in actuators])
     C = _rows(path, names, [(table.place, table.weights("joints")) for table in couplings])
     K_s = springs[:, 0]
+    check_mimics(path, urdf.path, urdf.mimics, names, C, springs[:, 1])
     _check_mechanism(path, names, J_a, C, K_s)
     pads = _each(top, "pads", lambda place, data: _pad(path, place, data, urdf))
     hall = _each(top, "hall_sensors", lambda place, data: _hall(path, place, data, names))
@@ -92,6 +101,30 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
         gravity=(gravity[0], gravity[1], gravity[2]),
         notes=top.notes(),
     )
+
+
+def _check_filled_in(path: Path, data: dict[str, Any]) -> None:
+    """Figures of a template that nobody has filled in yet, all of them in one message."""
+
+    def places(value: Any, name: str) -> Iterator[str]:
+        parts = (
+            list(value.values() if isinstance(value, dict) else value)
+            if isinstance(value, dict | list)
+            else []
+        )
+        if value == TODO or (parts and all(part == TODO for part in parts)):
+            yield name
+        elif isinstance(value, dict):
+            for key, part in value.items():
+                yield from places(part, f"{name}.{key}")
+        elif isinstance(value, list):
+            for k, part in enumerate(value):
+                label = part.get("name", k + 1) if isinstance(part, dict) else k + 1
+                yield from places(part, f"{name}[{label}]")
+
+    left = [place for key, value in data.items() for place in places(value, key)]
+    if left:
+        raise DescriptionError(path, f"still to be filled in ({len(left)} figures): {', '.join(left)}")
 
 
 def _each(top: TomlTable, key: str, read: Callable[[str, Any], T], minimum: int = 0) -> list[T]:

@@ -62,18 +62,19 @@ def _document(data: dict[str, Any]) -> str:
     for name, value in data.items():
         for table in value if isinstance(value, list) else [value]:
             lines += ["", f"[[{name}]]" if isinstance(value, list) else f"[{name}]"]
-            lines += [f"{_key(key)} = {_value(entry)}" for key, entry in table.items()]
+            lines += [f"{toml_key(key)} = {_value(entry)}" for key, entry in table.items()]
     return "\n".join(lines[1:]) + "\n"
 
 
 def _value(value: Any) -> str:
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_key(key)} = {_value(entry)}" for key, entry in value.items()) + " }"
+        return "{ " + ", ".join(f"{toml_key(key)} = {_value(entry)}" for key, entry in value.items()) + " }"
     if isinstance(value, list):
         return "[" + ", ".join(map(_value, value)) + "]"
     # numbers, booleans and strings are written alike in JSON and in TOML
     return json.dumps(value, ensure_ascii=False)
 
 
-def _key(key: str) -> str:
+def toml_key(key: str) -> str:
+    """A key as it is written in TOML."""
     return key if key.replace("_", "").replace("-", "").isalnum() and key.isascii() else json.dumps(key)

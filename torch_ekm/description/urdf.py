@@ -20,6 +20,7 @@ from .._extras import require
 from ..exceptions import DescriptionError
 from ..typing import Array
 from ._toml import LARGEST_FIGURE, read_bounded
+from .mimic import Mimic, read_mimics
 from .shape import Shape, merge_capsules
 
 # what no hand and no object needs: a file may be a stranger's
@@ -90,6 +91,8 @@ class UrdfModel:
     links: tuple[UrdfLink, ...]
     joints: tuple[UrdfJoint, ...]
     root: str
+    mimics: tuple[Mimic, ...] = ()
+    """Joints that are tied to others; the couplings of a transmission file say the same."""
 
     @property
     def moving_joints(self) -> tuple[UrdfJoint, ...]:
@@ -105,8 +108,8 @@ def read_urdf(path: str | Path) -> UrdfModel:
 
     Raises:
         DescriptionError: no such file, malformed XML, a missing or non-finite figure or one above 1e9, an
-            unknown joint type, ``<mimic>``, reversed limits, links that do not form one tree, or more than
-            4 MiB, 400 links, 400 joints or 2000 collision shapes.
+            unknown joint type, a ``<mimic>`` of no joint, reversed limits, links that do not form one tree,
+            or more than 4 MiB, 400 links, 400 joints or 2000 collision shapes.
         MissingExtraError: yourdfpy is not installed.
     """
     path = Path(path)
@@ -131,7 +134,7 @@ def read_urdf(path: str | Path) -> UrdfModel:
     robot = require("yourdfpy").URDF.load(document, build_scene_graph=False, load_meshes=False).robot
     links = tuple(_link(path, link) for link in robot.links)
     joints = tuple(_joint(path, joint) for joint in robot.joints)
-    return UrdfModel(path, robot.name, links, joints, _root(path, links, joints))
+    return UrdfModel(path, robot.name, links, joints, _root(path, links, joints), read_mimics(path, root))
 
 
 def _place(path: Path, element: ET.Element) -> str:
@@ -146,9 +149,6 @@ def _strict_joint(path: Path, element: ET.Element) -> ET.Element:
     if kind not in (*MOVING, "fixed"):
         valid = "revolute, continuous and fixed"
         raise DescriptionError(path, f"{place}: type '{kind}' is not supported; supported: {valid}")
-    if element.find("mimic") is not None:
-        hint = "write it as a [[couplings]] entry of the transmission file"
-        raise DescriptionError(path, f"{place}: <mimic> is not supported; {hint}")
     if kind == "revolute" and element.find("limit") is None:
         raise DescriptionError(path, f"{place}: <joint> needs a <limit>")
     unread = {"revolute": (), "continuous": ("limit",), "fixed": ("axis", "limit")}

@@ -95,7 +95,7 @@ class Setting:
 
     def __post_init__(self) -> None:
         if self.hand not in list_hands() and not Path(self.hand).exists():
-            raise UnknownNameError("hand", self.hand, list_hands())
+            raise UnknownNameError("hand", self.hand, (*list_hands(), "a path to a .urdf file"))
         if self.learner not in LEARNERS:
             raise UnknownNameError("learner", self.learner, LEARNERS)
         for name in ("capacity", "frames", "horizon", "tolerance_deg", "max_steps"):

@@ -82,7 +82,7 @@ def plan(
     for key in changes:
         takers = [name for name, kind in PROTOCOLS.items() if hasattr(kind(), key)]
         if name not in takers:
-            raise ParameterError(key, changes[key], f"left out: only {' and '.join(takers)} take them")
+            raise ParameterError(key, changes[key], f"left out: only {', '.join(takers)} take them")
     return Experiment(dataclasses.replace(protocol, **changes), seeds)  # pyright: ignore[reportArgumentType]
 
 
@@ -125,7 +125,7 @@ def objects_of(names: str | Path) -> tuple[str, ...]:
     """
     folder = Path(names)
     if not folder.is_dir() and not isinstance(names, Path):
-        chosen = tuple(part.strip() for part in names.split(",") if part.strip())
+        chosen = tuple(dict.fromkeys(part.strip() for part in names.split(",") if part.strip()))
         for name in chosen:
             load_object(name)
         return chosen

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from .image import Picture, save_picture
 from .scene import Scene, make_scene
+from .visuals import Mesh, Visuals, visuals
 from .web import draw, place, save_animation, start_server
 
 __all__ = [
+    "Mesh",
     "Picture",
     "Scene",
+    "Visuals",
     "draw",
     "make_scene",
     "place",
     "save_animation",
     "save_picture",
     "start_server",
+    "visuals",
 ]

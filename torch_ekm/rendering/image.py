@@ -100,10 +100,13 @@ def _draw_matplotlib(scene: Scene, path: Path, size: int) -> None:
     n = len(scene.transforms)
     figure = require("matplotlib.figure").Figure(figsize=(size / 100 * n, size / 100))
     meshes = [(shape_mesh(shape), colour, scene.opacity(i)) for i, (shape, colour) in enumerate(scene.shapes)]
-    _, focus, up = scene.camera  # matplotlib's z is up in the picture: turn everything there
+    position, focus, up = scene.camera  # matplotlib's z is up in the picture: turn everything there
     forward = np.array([1.0, 0.0, 0.0]) - up[0] * up
     forward /= np.linalg.norm(forward)
     turn = np.stack([forward, np.cross(up, forward), up])
+    sight = turn @ (position - focus)
+    azimuth = np.degrees(np.arctan2(sight[1], sight[0]))
+    elevation = np.degrees(np.arcsin(sight[2] / np.linalg.norm(sight)))
     for k, transforms in enumerate(scene.transforms):
         axis = figure.add_subplot(1, n, k + 1, projection="3d")
         for (mesh, colour, opacity), T in zip(meshes, transforms, strict=True):
@@ -114,5 +117,5 @@ def _draw_matplotlib(scene: Scene, path: Path, size: int) -> None:
             getattr(axis, f"set_{name}lim")(middle - 0.06, middle + 0.06)
         axis.set_axis_off()
         axis.set_box_aspect((1, 1, 1), zoom=1.4)
-        axis.view_init(elev=15, azim=70)
+        axis.view_init(elev=elevation, azim=azimuth)
     figure.savefig(path, dpi=100)

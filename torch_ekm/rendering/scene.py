@@ -1,4 +1,4 @@
-"""What is drawn: the collision shapes of the descriptions, so that what one sees is what touches."""
+"""What is drawn of a hand and its object, and from where: along the axis about which the object turns."""
 
 from __future__ import annotations
 
@@ -10,21 +10,25 @@ import torch
 
 from .._extras import require
 from ..description import HandDescription, ObjectDescription, Shape
+from ..exceptions import DescriptionError
 from ..kinematics import HandKinematics
+from ..kinematics.se3 import log
 from ..typing import Array
+from .visuals import Mesh, visuals
 
 Colour = tuple[float, float, float]
 
 _PALM, _PHALANX, _TIP, _OBJECT = (0.45, 0.47, 0.50), (0.72, 0.74, 0.77), (0.00, 0.45, 0.70), (0.90, 0.62, 0.0)
 _GHOST = (0.0, 0.62, 0.45)
 _DISTANCE = 0.34  # [m] of the camera
+_TURNED = 0.05  # [rad]: a smaller rotation does not tell its axis
 
 
 @dataclass(frozen=True)
 class Scene:
     """Poses of everything that is drawn, in the hand frame; ``frames`` along the first axis."""
 
-    shapes: list[tuple[Shape, Colour]]
+    shapes: list[tuple[Shape | Mesh, Colour]]
     transforms: Array
     """``(n_frames, n_shapes, 4, 4)``"""
     down: Array
@@ -41,9 +45,8 @@ class Scene:
     @property
     def camera(self) -> tuple[Array, Array, Array]:
         """Position and focus of the camera [m], and up."""
-        focus, up = self.transforms[:, :, :3, 3].reshape(-1, 3).mean(axis=0), -self.down
-        side = self.side - 0.5 * (self.side @ up) * up
-        return focus + _DISTANCE * side / np.linalg.norm(side), focus, up
+        focus = self.transforms[:, :, :3, 3].reshape(-1, 3).mean(axis=0)
+        return focus + _DISTANCE * self.side / np.linalg.norm(self.side), focus, -self.down
 
 
 def make_scene(
@@ -54,8 +57,12 @@ def make_scene(
     rotation: Array | None,
     gravity: Array,
     ghost: tuple[Array, Array] | None = None,
+    axis: Array | None = None,
 ) -> Scene:
-    """Place the shapes of the hand, and of the object if there is one, for each frame.
+    """Place what is seen of the hand (``<visual>``, else ``<collision>``) and of the object for each frame.
+
+    It is looked at along the axis about which the object turns: ``axis``, else that of the largest rotation
+    from the first frame.
 
     Args:
         q: ``(n_frames, n_q)`` [rad].
@@ -63,15 +70,17 @@ def make_scene(
         rotation: ``(n_frames, 3, 3)``.
         gravity: ``(3,)`` [m/s^2], hand frame.
         ghost: position and rotation of the object once more, where it was planned to be, say.
+        axis: unit vector, hand frame; needed where nothing has turned yet.
     """
     links = HandKinematics(hand)(torch.as_tensor(q, dtype=torch.float64))
     pads = {pad.link for pad in hand.pads}
-    shapes: list[tuple[Shape, Colour]] = []
+    shapes: list[tuple[Shape | Mesh, Colour]] = []
     transforms: list[Array] = []
+    drawn = visuals(hand.urdf).of_link
     for link in hand.urdf.links:
         colour = _TIP if link.name in pads else _PALM if link.name == hand.base_link else _PHALANX
         pose = links.of(link.name).numpy()
-        for shape in link.collisions:
+        for shape in drawn[link.name]:
             shapes.append((shape, colour))
             transforms.append(pose @ shape.transform)
     pose = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
@@ -86,26 +95,46 @@ def make_scene(
         planned[:, :3, 3], planned[:, :3, :3] = ghost
         shapes += [(shape, _GHOST) for shape in ghosts]
         transforms += [planned @ shape.transform for shape in ghosts]
-    return Scene(shapes, np.stack(transforms, axis=1), *_view(hand, gravity), ghosts=len(ghosts))
+    if not transforms:
+        problem = "no link has a <visual> or <collision> that can be drawn"
+        raise DescriptionError(hand.urdf_path, problem)
+    if axis is None and rotation is not None:
+        axis = _axis(np.asarray(rotation))
+    return Scene(shapes, np.stack(transforms, axis=1), *_view(hand, gravity, axis), ghosts=len(ghosts))
 
 
-def _view(hand: HandDescription, gravity: Array) -> tuple[Array, Array]:
+def _axis(rotation: Array) -> Array | None:
+    """Of the largest rotation from the first frame; None: nothing has turned. ``rotation``: ``(n, 3, 3)``."""
+    turned = log(torch.as_tensor(rotation @ rotation[0].T, dtype=torch.float64)).numpy()
+    angles = np.linalg.norm(turned, axis=-1)
+    return turned[angles.argmax()] / angles.max() if angles.max() > _TURNED else None
+
+
+def _view(hand: HandDescription, gravity: Array, axis: Array | None) -> tuple[Array, Array]:
     """Down in the picture, and the side from which it is looked at.
 
-    Square to a planar hand; else from the index finger's side, a little from the front and the palm: along
-    the axis about which a pinch turns the object.
+    Along the axis of rotation, or square to a planar hand, from the side of the index finger; where neither
+    is known, from there and a little from the front and the palm.
     """
-    side = np.array([0.35, 1.0 if "left" in hand.name else -1.0, 0.45])
+    up = -gravity / max(float(np.linalg.norm(gravity)), 1e-9)
+    usual = np.array([0.35, 1.0 if "left" in hand.name else -1.0, 0.45])
+    usual -= 0.5 * (usual @ up) * up
     if hand.planar_normal is not None:
         side = np.array(hand.planar_normal)
-    if np.linalg.norm(np.cross(gravity, side)) < 1e-6:  # no gravity, or along the line of sight
+    elif axis is not None:
+        side = np.array(axis) * (1.0 if axis @ usual >= 0 else -1.0)
+    else:
+        side = usual
+    if np.linalg.norm(np.cross(up, side)) < 1e-6:  # no gravity, or along the line of sight
         return -np.eye(3)[np.argmin(np.abs(side))], side
-    return gravity / np.linalg.norm(gravity), side
+    return -up, side
 
 
-def shape_mesh(shape: Shape) -> Any:
+def shape_mesh(shape: Shape | Mesh) -> Any:
     """The shape as a ``trimesh.Trimesh`` in its own frame."""
     trimesh = require("trimesh")
+    if isinstance(shape, Mesh):
+        return trimesh.Trimesh(shape.vertices, shape.faces, process=False)
     if shape.kind == "box":
         return trimesh.creation.box(shape.size)
     if shape.kind == "sphere":

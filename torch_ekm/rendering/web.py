@@ -13,6 +13,7 @@ from .._extras import require
 from .._files import write_whole
 from ..typing import Array
 from .scene import Scene, shape_mesh
+from .visuals import Mesh
 from .web_guard import HOST, WebGuard
 
 
@@ -62,7 +63,7 @@ def draw(server: Any, scene: Scene) -> list[Any]:
                 np.asarray(mesh.vertices, dtype=np.float32),
                 np.asarray(mesh.faces, dtype=np.uint32),
                 color=tuple(int(255 * c) for c in colour),
-                flat_shading=shape.kind == "box",
+                flat_shading=isinstance(shape, Mesh) or shape.kind == "box",
                 opacity=scene.opacity(i),
             )
         )

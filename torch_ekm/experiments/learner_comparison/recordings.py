@@ -6,12 +6,13 @@ import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
 
 from ..._extras import require
-from ...exceptions import DescriptionError, UnknownNameError
+from ...exceptions import DescriptionError, EKMError, UnknownNameError
 from ...typing import Array
 from .stream import Stream, in_own_units, load_table
 
@@ -41,7 +42,13 @@ def load_recording(name: str | Path, limit: int | None = LIMIT, targets: Sequenc
 
         return record_simulated_hand(min(limit or 400, 400))
     if name in _READERS:
-        return _READERS[str(name)](limit)
+        try:
+            return _READERS[str(name)](limit)
+        except EKMError:
+            raise
+        except (ValueError, LookupError, EOFError, BadZipFile) as error:  # of whatever reads the file
+            problem = f"the recording '{name}' there is damaged: {error}"
+            raise DescriptionError(os.environ["TORCH_EKM_DATA"], problem) from None
     if Path(name).suffix:
         return load_table(name, targets, limit)
     known = ("simulated_hand", *_READERS, "a path to a .csv or .parquet file")

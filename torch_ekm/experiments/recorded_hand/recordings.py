@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -57,7 +59,7 @@ def read_recordings(data: str | Path) -> dict[str, list[RecordedPath]]:
         DescriptionError: there is no such file, or its arrays are not of these shapes.
     """
     path = find_file(data)
-    with np.load(path) as file:
+    with _open(path) as file:
         keys = sorted(key[:-2] for key in file.files if key.endswith("/S"))
         if not keys:
             raise DescriptionError(path, "there is no array 'object/path/S' in it")
@@ -87,8 +89,18 @@ def find_file(data: str | Path) -> Path:
         if path.is_file():
             return path
     raise DescriptionError(
-        data / Path(FILE).name, "there is no such file; docs/how_to/compare_on_your_data.md tells its source"
+        data / Path(FILE).name, "there is no such file; 'torch-ekm recorded-hand --help' tells its source"
     )
+
+
+def _open(path: Path) -> Any:
+    try:
+        file = np.load(path)
+    except (ValueError, EOFError, BadZipFile):
+        file = None
+    if not isinstance(file, np.lib.npyio.NpzFile):
+        raise DescriptionError(path, "this is no .npz file, as numpy.savez writes it")
+    return file
 
 
 def _path(states: Array, actions: Array, *, exchanged: bool) -> RecordedPath:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..._files import make_folder
 from ...exceptions import DescriptionError, MissingExtraError
 from ...rendering import Scene, save_animation, save_picture
 
@@ -84,5 +85,5 @@ def copy_notebooks(folder: Path, *, overwrite: bool = False) -> list[Path]:
         raise DescriptionError(folder, f"{', '.join(present)} {problem}")
     if folder.exists() and not folder.is_dir():
         raise DescriptionError(folder, "this is a file; name a folder")
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     return [Path(shutil.copyfile(*pair)) for pair in zip(sources, copies, strict=True)]

@@ -11,7 +11,7 @@ import torch
 from ...description import HandDescription, load_hand
 from ...kinematics import ActuationMap
 from ...plant import PlantStatus
-from ...rendering.scene import Scene, make_scene
+from ...rendering import Scene, make_scene, visuals
 from ...simulation import PlantConfig, SimulatedHand
 from ...typing import Array
 from .words import as_html
@@ -31,6 +31,8 @@ class HandShow:
         self._lower, self._upper = np.array([(part.lower, part.upper) for part in hand.actuators]).T
         self._a = np.clip(np.zeros(hand.n_a), self._lower, self._upper)
         self.title = hand.name
+        self.notes = visuals(hand.urdf).problems
+        """What could not be drawn."""
 
     def scene(self) -> Scene:
         """Every actuator through its range."""
@@ -86,7 +88,8 @@ class GraspShow:
         """The grasp as it is now."""
         q, position, rotation = (part[None] for part in self.plant.hand_state())
         gravity = np.array(self.plant.gravity)
-        return make_scene(self.plant.hand, self.plant.object, q, position, rotation, gravity)
+        axis = self.plant.rotation_axis.numpy()
+        return make_scene(self.plant.hand, self.plant.object, q, position, rotation, gravity, axis=axis)
 
     def add_controls(self, gui: Any) -> None:
         """A slider for each actuator, increments since the grasp [deg], and a button to grasp again."""

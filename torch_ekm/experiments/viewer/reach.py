@@ -70,4 +70,5 @@ class ReachShow:
             np.stack([getattr(state, name).numpy() for state in states])
             for name in ("q", "position", "rotation")
         )
-        return make_scene(plant.hand, plant.object, q, position, rotation, np.array(plant.gravity))
+        gravity, axis = np.array(plant.gravity), plant.rotation_axis.numpy()
+        return make_scene(plant.hand, plant.object, q, position, rotation, gravity, axis=axis)

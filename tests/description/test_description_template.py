@@ -1,0 +1,87 @@
+"""A transmission file begun from a URDF: it names what lacks, and loads when that is filled in."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from torch_ekm.description import hand_paths, list_hands, load_hand, read_urdf, write_template
+from torch_ekm.exceptions import DescriptionError, UnknownNameError
+from torch_ekm.kinematics import ActuationMap
+
+MIMIC = """<robot name="my finger">
+  <link name="base"/>
+  <joint name="knuckle" type="revolute"><parent link="base"/><child link="proximal"/>
+    <axis xyz="0 0 1"/><limit lower="0.1" upper="1.5" effort="1" velocity="1"/></joint>
+  <link name="proximal"/>
+  <joint name="middle" type="revolute"><parent link="proximal"/><child link="distal"/>
+    <axis xyz="0 0 1"/><limit lower="0" upper="1.5" effort="1" velocity="1"/>
+    <mimic joint="knuckle" multiplier="0.5" offset="0.2"/></joint>
+  <link name="distal"><collision><geometry><mesh filename="tip.stl"/></geometry></collision></link>
+</robot>"""
+
+
+def filled_in(path: Path) -> str:
+    """The file with figures where it asks for them."""
+    text = path.read_text()
+    text = text.replace('["TODO", "TODO", "TODO"]', "[0.0, 1.0, 0.0]").replace(
+        '["TODO", "TODO"]', "[0.0, 180.0]"
+    )
+    return text.replace('"TODO"', "0.5")
+
+
+@pytest.mark.parametrize("name", list_hands())
+def test_a_template_names_what_lacks_and_loads_when_it_is_filled_in(name: str, tmp_path: Path) -> None:
+    urdf = Path(shutil.copy(hand_paths(name)[0], tmp_path / "mine.urdf"))
+    with pytest.raises(DescriptionError, match=r"torch-ekm hands --new"):
+        load_hand(urdf)
+    written = write_template(urdf)
+    joints = [joint.name for joint in read_urdf(urdf).moving_joints]
+    free = joints[-1]
+    with pytest.raises(DescriptionError, match=rf"still to be filled in.*joints\.{free}\.spring"):
+        load_hand(urdf)
+    written.write_text(filled_in(written))
+    hand, true = load_hand(urdf), load_hand(name)
+    assert hand.joint_names == true.joint_names
+    assert hand.base_link == true.base_link
+    assert hand.planar_normal == true.planar_normal
+    assert {pad.link for pad in true.pads} <= {pad.link for pad in hand.pads}
+    with pytest.raises(DescriptionError, match="not overwritten"):
+        write_template(urdf)
+    assert "TODO" not in written.read_text().split("[hand]")[1]
+
+
+def test_a_mimic_becomes_a_coupling(tmp_path: Path) -> None:
+    urdf = tmp_path / "mine.urdf"
+    urdf.write_text(MIMIC)
+    written = write_template(urdf)
+    good = filled_in(written)
+    written.write_text(good)
+    hand = load_hand(urdf)
+    knuckle, middle = ActuationMap(hand).joints(torch.tensor([[0.1], [0.4]], dtype=torch.float64)).T
+    torch.testing.assert_close(middle, 0.5 * knuckle + 0.2, rtol=0, atol=1e-7)
+    assert float(knuckle[1] - knuckle[0]) > 0.1
+    written.write_text(
+        good.replace("middle = -0.5", "middle = -0.4").replace("knuckle = -0.5", "knuckle = -0.4")
+    )
+    with pytest.raises(DescriptionError, match=r"'middle' is a <mimic> of 'knuckle'.*knuckle = -0\.5"):
+        load_hand(urdf)
+    written.write_text(good.replace("rest_deg = 14.3", "rest_deg = 34.3"))
+    with pytest.raises(DescriptionError, match=r"rests at 0\.25 rad"):
+        load_hand(urdf)
+
+
+def test_what_no_template_is_written_for(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="urdf"):
+        write_template(tmp_path / "hand.xml")
+    with pytest.raises(DescriptionError, match="no such URDF"):
+        write_template(tmp_path / "hand.urdf")
+    (tmp_path / "thing.urdf").write_text('<robot name="thing"><link name="thing"/></robot>')
+    with pytest.raises(DescriptionError, match="no revolute or continuous joint"):
+        write_template(tmp_path / "thing.urdf")
+    (tmp_path / "m.urdf").write_text(MIMIC.replace('joint="knuckle"', 'joint="thumb"'))
+    with pytest.raises(DescriptionError, match="names 'thumb', which must be one of knuckle"):
+        write_template(tmp_path / "m.urdf")

@@ -1,0 +1,203 @@
+"""A transmission file to be filled in: all that a URDF tells of a hand, and marks where it does not."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from .._files import write_whole
+from ..exceptions import DescriptionError, UnknownNameError
+from .shape import Shape
+from .transmission import TODO
+from .transmission_file import toml_key
+from .urdf import UrdfModel, read_urdf
+
+_HEAD = """\
+# What {urdf} cannot say about this hand. Begun by 'torch-ekm hands --new'.
+# Put a figure wherever "TODO" stands; 'torch-ekm check {urdf}' tells what lacks.
+# Angles in rad, or in deg where the key ends in _deg; lengths in m; torques in N m.
+# All keys, and how to calibrate springs and moment arms: docs/tutorials/your_own_hand.md
+
+[hand]
+name = {name}
+base_link = {base}  # the hand frame: poses, contacts and Jacobians are expressed in it
+gravity = [0.0, 0.0, 9.81]  # [m/s^2] in the hand frame; as it stands, the palm faces down
+"""
+_JOINTS = """
+# spring [N m/rad]: stiffness of the return spring, 0.0 where there is none (0.01 to 0.2 in fingers);
+# rest_deg [deg]: angle at which it is slack; friction [N m]: Coulomb friction.
+[joints]
+"""
+_ACTUATORS = """
+# One table for each motor: a = offset + sum of moment arm * joint angle.
+# range_deg [deg]: smallest and largest a. moment_arms [1]: radius of the joint's pulley over the motor's;
+# leave out joints that it does not pull. tendon = true: can only pull; false: looped cable or gear.
+# stiffness [N m/rad]: of tendon and servo in series; leave it out if rigid.
+# This guess has one tendon for each finger: change, add or remove tables.
+"""
+_PADS = """
+# The parts that touch objects, as capsules in the link's frame: all points within radius [m] of the segment
+# from start to end [m]. direction: outward, the middle of the side that touches. Pads that are simulated need
+# the same shape as <collision> in the URDF: a cylinder with a ball on either end, or a sphere.
+"""
+
+
+def write_template(urdf: str | Path) -> Path:
+    """Write ``<stem>.transmission.toml`` beside a URDF: all joints, and couplings for ``<mimic>``.
+
+    Figures that the URDF does not tell are ``"TODO"``; as long as one is left, ``load_hand`` names them all.
+
+    Args:
+        urdf: a path that ends in ".urdf".
+
+    Raises:
+        UnknownNameError: another ending.
+        DescriptionError: the file is missing or wrong, has no joint that moves, or its transmission file is
+            there already.
+        OutputError: the folder cannot be written to.
+    """
+    path = Path(urdf)
+    if path.suffix != ".urdf":
+        raise UnknownNameError("URDF", str(urdf), ("a path to a .urdf file",))
+    model, written = read_urdf(path), path.with_suffix(".transmission.toml")
+    if not model.moving_joints:
+        raise DescriptionError(path, "there is no revolute or continuous joint")
+    if written.exists():
+        raise DescriptionError(written, "is there already and is not overwritten; move it away first")
+    write_whole(written, template(model))
+    return written
+
+
+def template(model: UrdfModel) -> str:
+    """The text of the file."""
+    base = _base(model)
+    normal = _planar_normal(model, base)
+    head = _HEAD.format(urdf=_comment(model.path.name), name=_text(model.name), base=_text(base))
+    lines = [head.rstrip("\n")]
+    if normal is not None:
+        lines.append(f"planar_normal = {_vector(normal)}  # all axes are parallel: a planar hand")
+    lines += [_JOINTS.rstrip("\n"), *_joints(model), *_couplings(model), _ACTUATORS.rstrip("\n")]
+    fingers = _fingers(model, base)
+    for k, finger in enumerate(fingers, start=1):
+        lines += _actuator(model, finger, f"finger_{k}")
+    lines.append(_PADS.rstrip("\n"))
+    for k, finger in enumerate(fingers, start=1):
+        lines += _pad(model, finger[-1], f"tip_{k}")
+    return "\n".join(lines) + "\n"
+
+
+def _joints(model: UrdfModel) -> Iterator[str]:
+    tied = {mimic.joint: mimic for mimic in model.mimics}
+    rest = {joint.name: min(max(0.0, joint.lower), joint.upper) for joint in model.moving_joints}
+    for _ in tied:  # as many sweeps as ties reach the end of a chain of them
+        rest |= {name: tie.multiplier * rest[tie.other] + tie.offset for name, tie in tied.items()}
+    for joint in model.moving_joints:
+        limits = f"{math.degrees(joint.lower):.6g} to {math.degrees(joint.upper):.6g} deg"
+        limits = limits if math.isfinite(joint.lower + joint.upper) else "no limits"
+        about = f"{joint.kind}, {limits}, from {_comment(joint.parent)} to {_comment(joint.child)}"
+        spring = "0.0" if joint.name in tied or joint.lower == joint.upper else _text(TODO)
+        about += f", tied to {_comment(tied[joint.name].other)}" if joint.name in tied else ""
+        figures = f"spring = {spring}, rest_deg = {math.degrees(rest[joint.name]):.9g}, friction = 0.0"
+        yield f"{toml_key(joint.name)} = {{ {figures} }}  # {about}"
+
+
+def _couplings(model: UrdfModel) -> Iterator[str]:
+    """Sum of weight * joint angle stays what it is at rest."""
+    rows = [(f"{tie.joint} mimics {tie.other}", tie.coupling()) for tie in model.mimics]
+    tied = {tie.joint for tie in model.mimics}
+    for joint in model.moving_joints:
+        if joint.lower == joint.upper and joint.name not in tied:
+            rows.append((f"{joint.name} is locked", {joint.name: 1.0}))
+    if rows:
+        yield "\n# Rigid couplings, from <mimic> and from joints whose limits are equal:"
+        yield "# the sum of weight * angle stays what it is at rest."
+    for name, weights in rows:
+        shown = ", ".join(f"{toml_key(joint)} = {weight:.9g}" for joint, weight in weights.items())
+        yield f"\n[[couplings]]\nname = {_text(name)}\njoints = {{ {shown} }}"
+
+
+def _actuator(model: UrdfModel, links: list[str], name: str) -> Iterator[str]:
+    tied = {tie.joint for tie in model.mimics}
+    free = [j for j in model.moving_joints if j.child in links and j.name not in tied and j.lower < j.upper]
+    if not free:
+        return
+    arms = ", ".join(f"{toml_key(joint.name)} = {_text(TODO)}" for joint in free)
+    yield f"\n[[actuators]]  # the finger that ends in {_comment(links[-1])}\nname = {_text(name)}"
+    yield f"range_deg = [{_text(TODO)}, {_text(TODO)}]\nmoment_arms = {{ {arms} }}\ntendon = true"
+    yield "# stiffness = 4.0"
+
+
+def _pad(model: UrdfModel, link: str, name: str) -> Iterator[str]:
+    yield f"\n[[pads]]\nname = {_text(name)}\nlink = {_text(link)}"
+    round_shapes = [s for s in model.link(link).collisions if s.kind in ("capsule", "sphere")]
+    if round_shapes:
+        shape = round_shapes[-1]
+        start, end = _ends(shape)
+        yield f"start = {_vector(start)}\nend = {_vector(end)}"
+        yield f"radius = {shape.size[0]:.9g}  # as <collision>"
+    else:
+        todo = f"[{', '.join([_text(TODO)] * 3)}]"
+        yield f"start = {todo}\nend = {todo}\nradius = {_text(TODO)}"
+    yield f"direction = [{', '.join([_text(TODO)] * 3)}]  # outward, e.g. [0.0, 1.0, 0.0]"
+
+
+def _ends(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+    half = 0.5 * shape.size[1] * shape.transform[:3, 2] if shape.kind == "capsule" else np.zeros(3)
+    return shape.transform[:3, 3] - half, shape.transform[:3, 3] + half
+
+
+def _base(model: UrdfModel) -> str:
+    """The last link that every joint that moves is beyond, from the root on."""
+    base = model.root
+    while True:
+        joints = [joint for joint in model.joints if joint.parent == base]
+        if len(joints) != 1 or joints[0].kind != "fixed":
+            return base
+        base = joints[0].child
+
+
+def _fingers(model: UrdfModel, base: str) -> list[list[str]]:
+    """Links of each chain from the base to a link that moves and carries no other that does."""
+    parent = {joint.child: joint for joint in model.joints}
+    moving = {joint.child for joint in model.moving_joints}
+
+    def chain(link: str) -> list[str]:
+        links = []
+        while link in parent:
+            links.append(link)
+            link = parent[link].parent
+        return [one for one in reversed(links) if one in moving]
+
+    chains = [chain(link) for link in moving]
+    inner = {link for links in chains for link in links[:-1]}
+    ends = [joint.child for joint in model.moving_joints if joint.child not in inner]
+    return [chain(link) for link in ends]
+
+
+def _planar_normal(model: UrdfModel, base: str) -> np.ndarray | None:
+    """The common direction of all axes, in the base's frame at zero angles; None: there is none."""
+    rotations = {model.root: np.eye(3)}
+    for _ in model.joints:
+        for joint in model.joints:
+            if joint.parent in rotations:
+                rotations[joint.child] = rotations[joint.parent] @ joint.transform[:3, :3]
+    axes = [rotations[base].T @ rotations[joint.child] @ joint.axis for joint in model.moving_joints]
+    normal = axes[0] * np.sign(axes[0][np.abs(axes[0]).argmax()])
+    return normal if all(np.linalg.norm(np.cross(normal, axis)) < 1e-6 for axis in axes) else None
+
+
+def _vector(values: np.ndarray) -> str:
+    return "[" + ", ".join(f"{float(x):.9g}" for x in values.round(12) + 0.0) + "]"
+
+
+def _text(text: str) -> str:
+    return json.dumps(text, ensure_ascii=True)
+
+
+def _comment(text: str) -> str:
+    """A name of a file, on one line whatever it holds."""
+    return json.dumps(text, ensure_ascii=True)[1:-1]

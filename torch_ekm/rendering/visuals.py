@@ -1,0 +1,154 @@
+"""What a URDF says a link looks like: its <visual>, meshes included, for pictures alone."""
+
+from __future__ import annotations
+
+import math
+import os
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from .._extras import require
+from ..description import Shape, UrdfModel
+from ..description.shape import Kind, merge_capsules
+from ..typing import Array
+
+_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".dae", ".glb")
+_LARGEST_FILE = 64 << 20  # bytes
+_MOST = 2000  # visuals of a hand
+_SIZES = {"box": "size", "sphere": "radius", "cylinder": "radius length", "capsule": "radius length"}
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A surface in the frame of its link; lengths [m]."""
+
+    vertices: Array
+    """``(n, 3)``"""
+    faces: Array
+    """``(m, 3)``, indices of vertices."""
+    transform: Array
+    """Pose in the frame of the link, ``(4, 4)``."""
+
+
+@dataclass(frozen=True)
+class Visuals:
+    """What is drawn for each link, and what could not be read."""
+
+    of_link: dict[str, tuple[Shape | Mesh, ...]]
+    problems: tuple[str, ...] = ()
+
+
+def visuals(urdf: UrdfModel) -> Visuals:
+    """``<visual>`` of each link, where there is one and all of it can be read; else its ``<collision>``.
+
+    A mesh-only ``<collision>`` without ``<visual>`` is drawn, too. A mesh is looked for beside the URDF, and
+    for ``package://name/rest`` in the folders above it as ``name/rest`` and ``rest``. Pictures do without
+    what is missing: a problem is told, not raised.
+    """
+    try:
+        changed = os.stat(urdf.path).st_mtime_ns
+    except OSError:  # a description that outlived its file
+        return Visuals({link.name: tuple(link.collisions) for link in urdf.links})
+    drawn, problems = _read(urdf.path.resolve(), changed)
+    meshes = {name: parts for (name, tag), parts in drawn.items() if tag == "collision"}
+    found: dict[str, tuple[Shape | Mesh, ...]] = {}
+    for link in urdf.links:
+        parts = drawn.get((link.name, "visual"))
+        found[link.name] = parts or tuple(link.collisions) or meshes.get(link.name, ())
+    return Visuals(found, problems)
+
+
+@lru_cache(maxsize=8)
+def _read(
+    path: Path, changed: int
+) -> tuple[dict[tuple[str, str], tuple[Shape | Mesh, ...]], tuple[str, ...]]:
+    """(link, tag) -> its parts, none where one of them cannot be read; and why not."""
+    root = ET.fromstring(path.read_bytes())
+    drawn, problems, left = {}, [], _MOST
+    for link in root.findall("link"):
+        name = link.get("name", "")
+        for tag in ("visual", "collision"):
+            elements = link.findall(tag)
+            left -= len(elements)
+            if not elements or left < 0:
+                continue
+            try:
+                parts = [_part(path, element) for element in elements]
+            except (ValueError, OSError) as error:
+                problems.append(f"link '{name}', {tag}: {error}")
+                continue
+            shapes = merge_capsules(tuple(part for part in parts if isinstance(part, Shape)))
+            drawn[name, tag] = (*shapes, *(part for part in parts if isinstance(part, Mesh)))
+    return drawn, tuple(problems)
+
+
+def _part(path: Path, element: ET.Element) -> Shape | Mesh:
+    origin, geometry = element.find("origin"), element.find("geometry")
+    if geometry is None or not len(geometry):
+        raise ValueError("<geometry> is missing")
+    pose = np.eye(4)
+    if origin is not None:
+        pose[:3, :3] = _rotation(_numbers(origin.get("rpy", "0 0 0"), 3))
+        pose[:3, 3] = _numbers(origin.get("xyz", "0 0 0"), 3)
+    shape = geometry[0]
+    if shape.tag == "mesh":
+        mesh = _load(path, shape.get("filename", ""))
+        scale = np.array(_numbers(shape.get("scale", "1 1 1"), 3))
+        return Mesh(np.asarray(mesh.vertices, dtype=np.float64) * scale, np.asarray(mesh.faces), pose)
+    if shape.tag not in _SIZES:
+        raise ValueError(f"<{shape.tag}> is not drawn")
+    words = " ".join(shape.get(key, "") for key in _SIZES[shape.tag].split())
+    size = _numbers(words, 3 if shape.tag == "box" else len(_SIZES[shape.tag].split()))
+    if min(size) <= 0:
+        raise ValueError(f"the size of a {shape.tag} must be positive, got '{words}'")
+    return Shape(cast(Kind, shape.tag), tuple(size), pose)
+
+
+def _load(urdf: Path, name: str) -> Any:
+    file = _find(urdf, name)
+    if file is None:
+        raise ValueError(f"the mesh '{name}' is not there")
+    if file.suffix.lower() not in _SUFFIXES:
+        raise ValueError(f"a mesh of kind '{file.suffix}' is not drawn; {', '.join(_SUFFIXES)} are")
+    if file.stat().st_size > _LARGEST_FILE:
+        raise ValueError(f"the mesh '{name}' has more than {_LARGEST_FILE >> 20} MiB")
+    trimesh = require("trimesh")
+    try:
+        mesh = trimesh.load(str(file), force="mesh", process=False, skip_materials=True)
+    except Exception as error:  # whatever a stranger's file makes trimesh raise
+        raise ValueError(f"the mesh '{name}' cannot be read: {error or type(error).__name__}") from None
+    if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
+        raise ValueError(f"the mesh '{name}' has no faces, or figures that are none")
+    return mesh
+
+
+def _find(urdf: Path, name: str) -> Path | None:
+    rest = name.removeprefix("file://")
+    places = [urdf.parent / rest]
+    if name.startswith("package://"):
+        package, _, inside = name.removeprefix("package://").partition("/")
+        places = [
+            above / part for above in urdf.parents for part in (f"{package}/{inside}", inside) if inside
+        ]
+    return next((place for place in places if place.is_file()), None)
+
+
+def _numbers(text: str, n: int) -> list[float]:
+    values = [float(word) for word in text.split()]
+    if len(values) != n or not all(map(math.isfinite, values)):
+        raise ValueError(f"needs {n} finite numbers, got '{text}'")
+    return values
+
+
+def _rotation(rpy: list[float]) -> Array:
+    """``Rz(y) Ry(p) Rx(r)``, as the URDF standard has it."""
+    (sr, sp, sy), (cr, cp, cy) = np.sin(rpy), np.cos(rpy)
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return about_z @ about_y @ about_x
