@@ -20,7 +20,7 @@ _HEAD = """\
 # What {urdf} cannot say about this hand. Begun by 'torch-ekm hands --new'.
 # Put a figure wherever "TODO" stands; 'torch-ekm check {urdf}' tells what lacks.
 # Angles in rad, or in deg where the key ends in _deg; lengths in m; torques in N m.
-# All keys, and how to calibrate springs and moment arms: docs/tutorials/your_own_hand.md
+# All keys, and how to calibrate springs and moment arms: docs/reference/file_formats.md
 
 [hand]
 name = {name}

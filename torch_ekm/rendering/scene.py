@@ -68,7 +68,7 @@ def make_scene(
         q: ``(n_frames, n_q)`` [rad].
         position: ``(n_frames, 3)`` [m].
         rotation: ``(n_frames, 3, 3)``.
-        gravity: ``(3,)`` [m/s^2], hand frame.
+        gravity: ``(3,)`` [m/s^2], hand frame, such as ``hand.gravity``.
         ghost: position and rotation of the object once more, where it was planned to be, say.
         axis: unit vector, hand frame; needed where nothing has turned yet.
     """
@@ -116,7 +116,7 @@ def _view(hand: HandDescription, gravity: Array, axis: Array | None) -> tuple[Ar
     Along the axis of rotation, or square to a planar hand, from the side of the index finger; where neither
     is known, from there and a little from the front and the palm.
     """
-    up = -gravity / max(float(np.linalg.norm(gravity)), 1e-9)
+    up = -np.asarray(gravity, dtype=np.float64) / max(float(np.linalg.norm(gravity)), 1e-9)
     usual = np.array([0.35, 1.0 if "left" in hand.name else -1.0, 0.45])
     usual -= 0.5 * (usual @ up) * up
     if hand.planar_normal is not None:
