@@ -42,8 +42,8 @@ class Page:
     """What a package's page shows: its own names, and links to those that it takes from another package."""
 
     own: list[Entry] = field(default_factory=list)
-    elsewhere: list[tuple[str, str]] = field(default_factory=list)
-    """(name, package that documents it)"""
+    elsewhere: list[tuple[str, str, str]] = field(default_factory=list)
+    """(name, where it is documented, summary)"""
 
 
 @functools.cache
@@ -67,12 +67,12 @@ def pages() -> dict[str, Page]:
         for name in sorted(module.__all__, key=str.lower):
             value = getattr(module, name)
             if inspect.ismodule(value):
-                page.elsewhere.append((name, value.__name__))
+                page.elsewhere.append((name, value.__name__, _summary(value, name)))
             elif places[id(value)] == f"{package}.{name}":
                 shown = any(base is not object for base in public_bases(value))
                 page.own.append(Entry(name, _directive(value), shown, _is_enum(value), _summary(value, name)))
             else:
-                page.elsewhere.append((name, places[id(value)].rpartition(".")[0]))
+                page.elsewhere.append((name, places[id(value)], _summary(value, name)))
     return found
 
 
@@ -134,7 +134,11 @@ def _summary(value: Any, name: str) -> str:
     """The first sentence of a docstring, equations left whole."""
     if _directive(value) == "py:data":
         return f"``{value.__module__}.{getattr(value, '__name__', name)}``."
-    text = (value.__doc__ or "") if callable(value) else "\n".join(data_comment(name, value))
+    text = (
+        (value.__doc__ or "")
+        if callable(value) or inspect.ismodule(value)
+        else "\n".join(data_comment(name, value))
+    )
     paragraph = " ".join(text.strip().split("\n\n")[0].split())
     parts = re.split(r"(``.*?``)", paragraph)  # a full stop within an equation ends no sentence
     for k in range(0, len(parts), 2):
