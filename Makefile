@@ -6,7 +6,7 @@ JOBS ?= 2
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test notebooks notebooks-smoke lint types imports check install clean
+.PHONY: demo test test-fast notebooks notebooks-smoke lint types imports check install clean
 
 install: $(VENV)/installed
 
@@ -22,6 +22,13 @@ demo: install
 
 test: install
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+
+# what most changes break first: description, kinematics, learners, f + g, QP, drivers and logs
+FAST := description kinematics enhanced plant residual/test_residual_sogp_identities.py \
+	residual/test_residual_parts.py control/test_control_qp.py control/test_control_controller.py
+test-fast: install
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(addprefix tests/,$(FAST)) \
+		--ignore=tests/description/test_description_hostile.py --ignore=tests/description/test_description_docs.py
 
 # 01 to 03 are run, 04 to 06 keep their outputs: they are the evidence
 notebooks: install

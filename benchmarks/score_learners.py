@@ -1,4 +1,4 @@
-"""Errors of the learners on a real hand and on public streams, as in docs/choosing_a_learner.md.
+"""Errors of the learners on a real hand and on public streams, as in docs/benchmarks/learners.md.
 
 ``benchmarks/score_learners.py hand --half reported`` and ``... streams --seed 1000 --stream kin40k``.
 Needs the recordings (``TORCH_EKM_DATA``). Settings were chosen on the development half and on seeds below

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+import torch_ekm
 from torch_ekm.residual import (
     ActionLinearKernel,
     CalibrateNoise,
@@ -149,14 +150,34 @@ def test_contract_of_gpytorch_window():
     check_residual_learner(lambda **o: GPyTorchWindow(3, 2, **options, **o), vmap=False)
 
 
-def test_the_learner_of_the_docs_uses_public_names_only(monkeypatch):
-    text = (Path(__file__).parents[2] / "docs" / "choosing_a_learner.md").read_text(encoding="utf-8")
-    (block,) = [one for one in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "class Offset" in one]
+def test_the_learner_of_the_docs_uses_public_names_only(monkeypatch, tmp_path):
+    text = _page("write_a_learner")
+    blocks = re.findall(r"^```\{code-block\} python\n:class: skip\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    (block,) = [one for one in blocks if "class Offset" in one]
     assert not re.search(r"\b_[a-z]", block)
     assert len(block.split("class Offset")[1].split("\n\n\n")[0].splitlines()) <= 22
     module = types.ModuleType("of_the_docs")
     monkeypatch.setitem(sys.modules, module.__name__, module)  # a class is pickled by its module's name
-    exec(compile(block, "choosing_a_learner.md", "exec"), vars(module))
+    monkeypatch.chdir(tmp_path)
+    for block in blocks:
+        exec(compile(block, "write_a_learner.md", "exec"), vars(module))
+    assert type(vars(module)["learner"]).__name__ == "Offset"
+
+
+def test_the_decision_table_names_learners_that_can_be_made():
+    calls = re.findall(r"^\| [^|]* \| `([A-Za-z_]\w*\(d, m.*?\))`", _page("choose_a_learner"), re.MULTILINE)
+    assert len(calls) >= 8
+    for call in calls:
+        names = {**vars(torch_ekm), "d": 4, "m": 2, "n_actions": 2, "n": 3}
+        made = eval(call, names)
+        assert (made.in_features, made.out_features) == (4, 2), call
+
+
+def _page(name):
+    page = Path(__file__).parents[2] / "docs" / "how_to" / f"{name}.md"
+    if not page.is_file():
+        pytest.skip("the documentation is not part of this installation")
+    return page.read_text(encoding="utf-8")
 
 
 class _WrongPrior(RecursiveLeastSquares):

@@ -1,4 +1,4 @@
-"""docs/your_own_hand.md: its example works as printed, and it documents every key."""
+"""The hand that docs/tutorials/your_own_hand.md describes, and the calibration of docs/how_to."""
 
 from __future__ import annotations
 
@@ -9,50 +9,41 @@ from pathlib import Path
 import pytest
 import torch
 
-from torch_ekm.description import load_hand, transmission
+from torch_ekm.description import load_hand
 from torch_ekm.kinematics import ActuationMap, HandKinematics
 
-PAGE = Path(__file__).parents[2] / "docs" / "your_own_hand.md"
+DOCS = Path(__file__).parents[2] / "docs"
 
 
-@pytest.fixture
-def page() -> str:
-    if not PAGE.is_file():
+def block(page: str, containing: str) -> str:
+    """The one block of Python with this text, whether the test of all pages runs it or not."""
+    path = DOCS / page
+    if not path.is_file():
         pytest.skip("the documentation is not part of this installation")
-    return PAGE.read_text(encoding="utf-8")
+    code = r"^```(?:python|\{code-block\} python\n:class: skip)\n(.*?)^```"
+    blocks = re.findall(code, path.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    (found,) = [one for one in blocks if containing in one]
+    return found
 
 
-def block(page: str, language: str, containing: str = "") -> str:
-    blocks = re.finditer(rf"```{language}\n(.*?)```", page, re.DOTALL)
-    found = next((match for match in blocks if containing in match.group(1)), None)
-    assert found is not None
-    return found.group(1)
-
-
-def test_the_printed_example_loads_and_moves(page: str, tmp_path: Path) -> None:
-    (tmp_path / "finger.urdf").write_text(block(page, "xml"))
-    (tmp_path / "finger.transmission.toml").write_text(block(page, "toml"))
-    hand = load_hand(tmp_path / "finger.urdf")
-    assert hand.base_link == "base"
-    assert [shape.kind for shape in hand.urdf.link("distal").collisions] == ["capsule"]
-    q = ActuationMap(hand).joints(torch.tensor([1.14], dtype=torch.float64))
-    torch.testing.assert_close(q, torch.tensor([0.5, 0.8], dtype=torch.float64))
-    tip = HandKinematics(hand)(q).of("distal")[:3, 3]
-    expected = 0.04 * torch.tensor([torch.cos(q[0]), torch.sin(q[0]), 0.0], dtype=torch.float64)
-    torch.testing.assert_close(tip, expected)
-
-
-def test_every_key_is_documented(page: str) -> None:
-    keys = {*transmission.HAND, *transmission.JOINT, *transmission.ACTUATOR, *transmission.COUPLING}
-    keys |= {*transmission.PAD, *transmission.HALL}
-    missing = [key for key in sorted(keys) if f"`{key}`" not in page]
-    assert not missing
-    for table in transmission.TABLES:
-        assert re.search(rf"`\[+{table}\]+`", page), table
+def test_the_hand_of_the_tutorial_loads_and_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for part in ("LINK = ", "[[actuators]]"):
+        exec(block("tutorials/your_own_hand.md", part), {"Path": Path})
+    hand = load_hand("gripper.urdf")
+    assert hand.base_link == "hand"
+    assert [shape.kind for shape in hand.urdf.link("left_far").collisions] == ["cylinder", "sphere"]
+    q = ActuationMap(hand).joints(torch.tensor([1.14, 0.57], dtype=torch.float64))
+    left = torch.tensor([0.5, 0.8], dtype=torch.float64)  # 0.2 q_0 = t, 0.1 q_1 = 0.8 t, q_0 + 0.8 q_1 = a
+    torch.testing.assert_close(q, torch.cat([left, 0.5 * left]))
+    base = torch.tensor([-0.03, 0.0, 0.0], dtype=torch.float64)
+    along = torch.tensor([torch.sin(q[0]), torch.cos(q[0]), 0.0], dtype=torch.float64)  # closes towards +x
+    tip = HandKinematics(hand)(q).of("left_far")[:3, 3]
+    torch.testing.assert_close(tip, base + 0.04 * along, atol=1e-6, rtol=0)  # 1.5708 is half of pi
 
 
 def test_the_printed_calibration_runs(
-    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     pytest.importorskip("sapien")
     from torch_ekm.description import write_transmission
@@ -73,7 +64,7 @@ def test_the_printed_calibration_runs(
         log.write(trial, plant.trajectory)
     plant.close()
     names: dict = {}
-    exec(block(page, "python", "calibrate"), names)
+    exec(block("how_to/drive_a_real_hand.md", "calibrate("), names)
     assert "spring of left_0" in capsys.readouterr().out
     found = names["hand"].spring_stiffness
     assert (abs(found / described.spring_stiffness - 1) < 0.1).all()

@@ -1,7 +1,7 @@
 """Read a transmission file: what a URDF cannot say about a hand.
 
 Actuators and their moment arms (J_a), rigid couplings (C dq = 0), joint springs and friction,
-contact pads, Hall sensors. The format is documented in ``docs/your_own_hand.md``.
+contact pads, Hall sensors. The format is documented in ``docs/reference/file_formats.md``.
 """
 
 from __future__ import annotations

@@ -58,13 +58,13 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
     try:
         description = load_hand(hand)
     except (EKMError, OSError) as error:
-        return [Check("hand's files", "error", str(error), "see docs/your_own_hand.md")]
+        return [Check("hand's files", "error", str(error), "see docs/reference/file_formats.md")]
     rows = [Check("hand's files", "ok", f"{description.n_q} joints, {description.n_a} actuators")]
     rows += [*_pads(description), *_tensions(description)]
     try:
         obj = load_object(object)
     except (EKMError, OSError) as error:
-        return [*rows, Check("object's files", "error", str(error), "see docs/your_own_hand.md")]
+        return [*rows, Check("object's files", "error", str(error), "see docs/reference/file_formats.md")]
     rows += [*_rigid(description), *_reach(description, obj), *_pinch(description, obj, picture)]
     return rows
 

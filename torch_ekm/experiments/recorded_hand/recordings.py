@@ -87,7 +87,7 @@ def find_file(data: str | Path) -> Path:
         if path.is_file():
             return path
     raise DescriptionError(
-        data / Path(FILE).name, "there is no such file; docs/recorded_hand.md tells its source"
+        data / Path(FILE).name, "there is no such file; docs/how_to/compare_on_your_data.md tells its source"
     )
 
 

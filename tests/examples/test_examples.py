@@ -1,0 +1,39 @@
+"""Every script in examples/ runs from any folder, and prints what it is there to show."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+#: Script: what it needs beyond the core, its arguments, and what its output must show.
+SCRIPTS = {
+    "gymnasium_environment": (("sapien", "gymnasium"), [], r"success True"),
+    "own_hand": (("sapien",), [], r"KM: stalled .*\nE-KM: reached"),
+    "own_learner_in_compare": (("matplotlib",), [], r"kernel average +0\.[1-6]"),
+    "real_hand_driver": (("sapien",), [], r"^reached"),
+    "record_and_replay": (("sapien", "h5py"), [], r"(trial_00000\d\.h5 ok.*\n){2}[\s\S]*trial 1: error"),
+    "residual_mpc": (("casadi",), ["--quick"], r"with the learner"),
+}
+
+
+def test_every_script_is_run() -> None:
+    assert sorted(SCRIPTS) == sorted(path.stem for path in EXAMPLES.glob("*.py"))
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_the_script_runs(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    needs, arguments, shows = SCRIPTS[name]
+    for module in needs:
+        pytest.importorskip(module)
+    script = EXAMPLES / f"{name}.py"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(script), *arguments])
+    runpy.run_path(str(script), run_name="__main__")
+    assert re.search(shows, capsys.readouterr().out)
