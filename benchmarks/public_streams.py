@@ -35,7 +35,7 @@ SEED = 1000
 
 
 def plain(d: int, m: int) -> SparseOnlineGP:
-    """A sparse online GP with the parts of docs/how_to/choose_a_learner.md."""
+    """A sparse online GP with parts of docs/how_to/choose_a_learner.md."""
     return SparseOnlineGP(d, m, parts=[RobustWeight(3.0), Standardize(), LearnHyperparameters()])
 
 
