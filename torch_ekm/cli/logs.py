@@ -85,7 +85,8 @@ def replay(
 
     shown = LogShow(log, trial, estimates)
     if shown.log is not None:
-        print_table(TrialEntry._fields, shown.log.index, str(log))
+        header = ["time [s]" if name == "time" else name for name in TrialEntry._fields]
+        print_table(header, shown.log.index, str(log))
         for number, problem in shown.log.damaged.items():
             say(f"trial {number}: {problem}")
     _look(shown, html, port)

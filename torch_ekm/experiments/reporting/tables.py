@@ -151,13 +151,13 @@ def reason_table(records: Sequence[Record]) -> Table:
 def comparison_table(records: Sequence[Record], limit: int) -> Table:
     """E-KM against KM and KM+I in everything that is measured."""
     values: dict[str, tuple[str, Value]] = {
-        "steady-state error [deg]": ("turn", steady_state_error),
+        "steady-state error": ("turn", steady_state_error),
         "motions to settle": ("turn", stats.settle_steps(limit)),
-        "error of the first motion [deg]": ("turn", lambda r: r.first_step_deg),
-        "error of a motion [deg]": ("turn", lambda r: r.step_error_deg),
-        "rotation off the axis [deg]": ("turn", survivors_off_axis),
-        "error of one long step [deg]": ("long step", steady_state_error),
-        "steady-state error, camera off [deg]": ("camera off", steady_state_error),
+        "error of the first motion": ("turn", lambda r: r.first_step_deg),
+        "error of a motion": ("turn", lambda r: r.step_error_deg),
+        "rotation off the axis": ("turn", survivors_off_axis),
+        "error of one long step": ("long step", steady_state_error),
+        "steady-state error, camera off": ("camera off", steady_state_error),
     }
     rows: list[list[Cell]] = []
     there, n_seeds = {r.controller for r in records}, len({r.seed for r in records})
@@ -169,7 +169,7 @@ def comparison_table(records: Sequence[Record], limit: int) -> Table:
         for ours, theirs in pairs:
             row += ratio_and_p(*paired(records, ours, theirs, value, kind), n_seeds)
         rows.append(row)
-    columns: list[Column | str] = ["mean of"]
+    columns: list[Column | str] = ["ratio of"]
     for pair in map(" : ".join, pairs):
         columns += [Column(f"{pair} [%]", ".0f", percent=True), Column(f"p, {pair}", ".1g")]
     note = (
