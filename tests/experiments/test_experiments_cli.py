@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from torch_ekm._terminal import as_printed, print_report, print_table, unbroken
 from torch_ekm.cli import app, main
-from torch_ekm.experiments.reporting.report import Report, Table
+from torch_ekm.experiments.reporting.report import FigureFile, Report, Table
 from torch_ekm.experiments.reporting.report import unbroken as unbroken_html
 from torch_ekm.experiments.reproduce import PROTOCOLS, plan
 from torch_ekm.plant import Trajectory, TrialLog
@@ -125,3 +125,23 @@ def test_verify(tmp_path: Path) -> None:
     wrong = CliRunner().invoke(app, ["verify", str(tmp_path)])
     assert wrong.exit_code == 1
     assert re.search(r"index\.csv.*wrong", wrong.output)
+
+
+def test_a_page_begins_with_the_answer_and_folds_the_rest(tmp_path: Path) -> None:
+    tables = [
+        Table(name, f"Caption {name}", ["case", "error [deg]"], [["a", "-"]]) for name in ("one", "two")
+    ]
+    figure, legend = FigureFile("a.svg", "What to see"), {"E-KM": "with a learner"}
+    report = Report("Title", "Ends 0.1 [0.0, 0.2] deg off.", tables, [figure], leading=1, legend=legend)
+    page = report.write(tmp_path).read_text()
+    order = (
+        "Ends ",
+        "with a learner",
+        "Caption one</caption>",
+        "a.svg",
+        "<details>",
+        "Caption two</caption>",
+    )
+    places = [page.index(part) for part in order]
+    assert places == sorted(places)
+    assert '<span class="figure">0.1 [0.0, 0.2] deg</span>' in page

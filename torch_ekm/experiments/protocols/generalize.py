@@ -172,7 +172,7 @@ class Generalize(Protocol):
                 caption = (
                     f"Steady-state error with the {name.replace('_', ' ')} for each target: every turn, and "
                 )
-                caption += f"the mean (the paper's Fig. 6).{crosses_caption(errors)}"
+                caption += f"the mean (as in the paper's Fig. 6).{crosses_caption(errors)}"
                 plot = plot_steady_state_error(errors, name.replace("_", " "))
                 figures.append(save_figure(plot, folder, f"steady_state_error_{name}", caption))
         shown = [
@@ -220,9 +220,7 @@ def paper_table(records: Sequence[Record]) -> Table:
         "E-KM, here [deg]", Column("E-KM:KM, paper [%]", ".0f", percent=True),
         Column("E-KM:KM, here [%]", ".0f", percent=True),
     ]  # fmt: skip
-    note = (
-        "Mean steady-state errors; the paper: one real iCub hand, here: a simulated hand, one of each seed. "
-    )
+    note = "Mean steady-state errors; the paper: one iCub hand, here: a simulated hand for each seed. "
     note += f"p over all objects: paper 3.8e-4, here {'-' if p is None else f'{p:.1g}'} (paired)."
     return Table("paper", "The paper's Table II, and the same here", columns, rows, note)
 
