@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +20,14 @@ except MissingExtraError as error:
     raise SystemExit(f"torch-ekm: {error}") from None
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table as RichTable
 from rich.text import Text
 
@@ -26,6 +35,8 @@ if TYPE_CHECKING:
     from .experiments.reporting.report import Report
 
 console = Console(markup=False)  # the units of a table are no styles, nor is "[red]" in a file
+_SHORT = 34  # characters: what is longer is prose, which may be wrapped
+_FIGURE = re.compile(r"[-+]?\d[\d.e+-]*(?: \[[^\]]*\])?(?: (?:%|deg\b|mm\b))?")
 # control characters, formats such as a change of the direction of writing, halves of characters
 _UNPRINTED = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
@@ -53,17 +64,24 @@ def say_error(text: object) -> None:
 
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[object], None]]:
-    """What, a bar, how many of how many, and for how long; gives what is to be called after each."""
+    """What, a bar, how many of how many, for how long, how long still; gives what is called after each."""
     name = TextColumn("{task.description}", markup=False)
-    columns = (name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    left = TextColumn("left:"), TimeRemainingColumn()
+    columns = (name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), *left)
     with Progress(*columns, console=console) as bars:
         task = bars.add_task(as_printed(what), total=total)
         yield lambda _: bars.advance(task)
 
 
+def unbroken(text: str, width: int) -> str:
+    """Lines of at most this width, with figures, their intervals and units on one."""
+    kept = _FIGURE.sub(lambda found: found[0].replace(" ", "\u00a0"), text)
+    return textwrap.fill(kept, width, break_long_words=False, break_on_hyphens=False).replace("\u00a0", " ")
+
+
 def print_report(report: Report, folder: Path, notes: bool = False) -> None:
     """What came of it, the tables, and where the page is."""
-    console.print(as_printed(report.summary))
+    say(unbroken(as_printed(report.summary), console.width))
     for table in report.tables:
         print_table(table.header, table.text(), table.caption, table.note if notes else None)
     say(f"Report:    {(folder / 'index.html').resolve()}")
@@ -72,12 +90,38 @@ def print_report(report: Report, folder: Path, notes: bool = False) -> None:
 def print_table(
     header: Iterable[str], rows: Iterable[Iterable[object]], title: str | None = None, note: str | None = None
 ) -> None:
-    """Cells are text as it stands, and never cut short."""
-    table = RichTable(*map(as_printed, header))
-    table.title, table.caption = (text and as_printed(text) for text in (title, note))
-    for row in rows:
-        table.add_row(*map(as_printed, row))
-    for column in table.columns:
-        column.overflow = "fold"  # figures are never cut short
+    """Cells are text as it stands, never cut short; figures with their intervals are not broken over lines.
+
+    A table that is too wide for the terminal is printed in parts, each with the first column.
+    """
+    head, cells = [*map(as_printed, header)], [[*map(as_printed, row)] for row in rows]
     # a file or a pipe has no width of its own
-    (console if console.is_terminal else Console(width=1000, markup=False)).print(table)
+    screen = console if console.is_terminal else Console(width=1000, markup=False)
+    parts = _parts([_width(column) for column in zip(head, *cells, strict=True)], screen.width)
+    for number, columns in enumerate(parts):
+        last = number == len(parts) - 1
+        table = RichTable(title=as_printed(title) if title and not number else None)
+        table.caption = as_printed(note) if note and last else None
+        for column in columns:
+            figures = all(len(row[column]) <= _SHORT for row in cells)
+            table.add_column(head[column], overflow="fold", no_wrap=figures and len(head[column]) <= _SHORT)
+        for row in cells:
+            table.add_row(*(row[column] for column in columns))
+        screen.print(table)
+
+
+def _width(column: Sequence[str]) -> int:
+    """Of a column with its borders, where prose may be wrapped."""
+    return min(max(map(len, column)), _SHORT) + 3
+
+
+def _parts(widths: Sequence[int], screen: int) -> list[list[int]]:
+    """Columns of each part of a table: the first, and as many others as there is room for, one at least."""
+    parts, room = [[0]], screen - widths[0] - 1
+    for column, width in enumerate(widths[1:], start=1):
+        if width > room and len(parts[-1]) > 1:
+            parts.append([0])
+            room = screen - widths[0] - 1
+        parts[-1].append(column)
+        room -= width
+    return parts

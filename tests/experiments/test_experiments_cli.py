@@ -7,11 +7,14 @@ from pathlib import Path
 
 import pytest
 import typer
+from rich.console import Console
 from typer.testing import CliRunner
 
-from torch_ekm._terminal import as_printed, print_report
+from torch_ekm._terminal import as_printed, print_report, print_table, unbroken
 from torch_ekm.cli import app, main
-from torch_ekm.experiments.reporting.report import Report, Table
+from torch_ekm.experiments.reporting.report import FigureFile, Report, Table
+from torch_ekm.experiments.reporting.report import unbroken as unbroken_html
+from torch_ekm.experiments.reproduce import PROTOCOLS, plan
 from torch_ekm.plant import Trajectory, TrialLog
 
 COMMANDS = typer.main.get_command(app).commands
@@ -19,7 +22,7 @@ COMMANDS = typer.main.get_command(app).commands
 
 def said(text: str) -> str:
     """Without line breaks and hyphenation, which depend on the width of a terminal."""
-    return re.sub(r"\s+", "", text)
+    return re.sub(r"[\s\b]+", "", text)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -29,6 +32,40 @@ def test_help_tells_all_of_every_option(name: str) -> None:
     for parameter in COMMANDS[name].params:
         assert said(parameter.help or "") in said(shown.output), parameter.name
     assert said(COMMANDS[name].help) in said(shown.output)
+
+
+def test_the_help_tells_how_much_there_is_to_run() -> None:
+    text = COMMANDS["reproduce"].help
+    for name in PROTOCOLS:
+        assert re.search(rf"{name} +{len(plan(name).jobs)} ", text), name
+
+
+def test_figures_with_their_intervals_are_not_broken_over_lines() -> None:
+    text = "The E-KM ends 0.10 [0.07, 0.12] deg from the target, KM+S 101 [99, 107] % of that."
+    for width in range(20, 90):
+        lines = unbroken(text, width).split("\n")
+        assert " ".join(lines) == text
+        for figure in ("0.10 [0.07, 0.12] deg", "101 [99, 107] %"):
+            assert sum(figure in line for line in lines) == 1
+    assert ">0.10 [0.07, 0.12] deg</span>" in unbroken_html(text)
+    assert "&lt;b&gt;" in unbroken_html("<b>")
+
+
+@pytest.mark.parametrize("width", [60, 100])
+def test_a_table_that_is_too_wide_is_printed_in_parts(
+    width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import torch_ekm._terminal as terminal
+
+    monkeypatch.setattr(terminal, "console", Console(markup=False, force_terminal=True, width=width))
+    cells = [["box", *(f"0.{k}1 [0.01, 0.99]" for k in range(9))], ["can", *["-"] * 9]]
+    print_table(["object", *(f"error {k} [deg]" for k in range(9))], cells, "Title", "Note")
+    printed = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    assert printed.count("box") == printed.count("can") > 1
+    assert printed.count("Title") == printed.count("Note") == 1
+    for k in range(9):
+        assert printed.count(f"0.{k}1 [0.01, 0.99]") == printed.count(f"error {k} [deg]") == 1
+    assert max(map(len, printed.splitlines())) <= width
 
 
 def test_some_help_has_units_in_brackets() -> None:
@@ -44,7 +81,7 @@ def test_units_of_a_table_are_printed(capsys: pytest.CaptureFixture[str]) -> Non
         "errors", "Errors [deg]", ["case", "KM [deg]"], [["box", "0.5 [0.4, 0.6]"]], "per turn [deg]"
     )
     print_report(Report("", "", [table]), Path(), notes=True)
-    printed = capsys.readouterr().out
+    printed = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
     for text in ("Errors [deg]", "KM [deg]", "0.5 [0.4, 0.6]", "per turn [deg]"):
         assert text in printed
 
@@ -88,3 +125,23 @@ def test_verify(tmp_path: Path) -> None:
     wrong = CliRunner().invoke(app, ["verify", str(tmp_path)])
     assert wrong.exit_code == 1
     assert re.search(r"index\.csv.*wrong", wrong.output)
+
+
+def test_a_page_begins_with_the_answer_and_folds_the_rest(tmp_path: Path) -> None:
+    tables = [
+        Table(name, f"Caption {name}", ["case", "error [deg]"], [["a", "-"]]) for name in ("one", "two")
+    ]
+    figure, legend = FigureFile("a.svg", "What to see"), {"E-KM": "with a learner"}
+    report = Report("Title", "Ends 0.1 [0.0, 0.2] deg off.", tables, [figure], leading=1, legend=legend)
+    page = report.write(tmp_path).read_text()
+    order = (
+        "Ends ",
+        "with a learner",
+        "Caption one</caption>",
+        "a.svg",
+        "<details>",
+        "Caption two</caption>",
+    )
+    places = [page.index(part) for part in order]
+    assert places == sorted(places)
+    assert '<span class="figure">0.1 [0.0, 0.2] deg</span>' in page

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import html
 import json
 from pathlib import Path
 
@@ -101,7 +102,7 @@ def test_report_is_complete(name: str, tmp_path: Path) -> None:
         assert rows[0] == list(table.header)
         assert len(rows) == len(table.rows) + 1 > 1, table.name
         assert all(len(row) == len(rows[0]) for row in rows), table.name
-        assert table.caption in page
+        assert table.caption in html.unescape(page)
         assert rows[1:] == table.text()
     cells = [cell for table in report.tables for row in table.rows for cell in row]
     assert not any(isinstance(cell, float) and np.isnan(cell) for cell in cells)

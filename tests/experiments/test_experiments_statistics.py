@@ -6,11 +6,12 @@ import json
 
 import numpy as np
 import pytest
+import scipy.stats
 import torch
 from experiments_records import memory_turn, not_grasped, turn
 
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
-from torch_ekm.experiments.protocols.generalize import Generalize, object_table
+from torch_ekm.experiments.protocols.generalize import Generalize, ends_table, object_table
 from torch_ekm.experiments.protocols.object_memory import MemoryTurn, ObjectMemory, judge_assignment
 from torch_ekm.experiments.protocols.online import Online, prediction_curves, recovery_trials
 from torch_ekm.experiments.records import NotGrasped, TrialRecord, prediction_error
@@ -38,6 +39,7 @@ from torch_ekm.experiments.reporting.tables import (
     prediction_table,
     reason_table,
     targets_table,
+    verdict,
 )
 
 # -- records -----------------------------------------------------------------------------------------
@@ -102,8 +104,8 @@ def test_units_are_objects_and_seeds_and_pairs_need_both() -> None:
 def test_what_was_not_grasped_is_not_measured_but_counted() -> None:
     records = [not_grasped(seed=3), turn(), turn(error=2.0, reason="stalled"), turn(reason="object lost")]
     assert select(records, controller="KM", reason="reached") == [turn()]
-    assert [row[1:] for row in reason_table(records).rows] == [
-        ["reached", 1, 1.0], ["stalled", 1, 2.0], ["object lost", 1, None], [NotGrasped.reason, 1, None],
+    assert [row[:2] for row in reason_table(records).rows] == [
+        ["reached", "1 (1.00)"], ["stalled", "1 (2.00)"], ["object lost", "1"], [NotGrasped.reason, "1"],
     ]  # fmt: skip
 
 
@@ -199,6 +201,26 @@ def test_p_values_are_uniform_under_the_null() -> None:
     assert 0.02 < np.mean([test is not None and test.welch_p < 0.05 for test in tests]) < 0.08
 
 
+@pytest.mark.filterwarnings("error")
+def test_tests_are_scipys_and_warn_of_nothing() -> None:
+    """Welch's test, the paired one and the interval; constants, for which scipy warns, are told."""
+    rng = np.random.default_rng(3)
+    ours, theirs = rng.normal(1.0, 0.5, 12), rng.normal(1.3, 0.2, 12)
+    found, curve = paired_test(ours, theirs), learning_curve(ours, theirs)
+    one = scipy.stats.ttest_ind(ours, theirs, equal_var=False, alternative="less")
+    assert found.welch_p == pytest.approx(scipy.stats.ttest_ind(ours, theirs, equal_var=False).pvalue)
+    assert found.paired_p == pytest.approx(scipy.stats.ttest_rel(ours, theirs).pvalue)
+    assert curve.p[-1] == pytest.approx(one.pvalue)
+    assert curve.upper[-1] == pytest.approx(one.confidence_interval(0.95).high)
+    lost = np.full(12, 20.0)
+    assert paired_test(ours, lost).welch_p < 1e-12
+    assert paired_test(lost, lost + 1e-14).paired_p == 0.0
+    assert paired_test(lost, lost).paired_p == 1.0
+    constant = learning_curve(lost - 1.0, lost)
+    assert constant.p[1:].tolist() == [0.0] * 11
+    assert constant.last_upper == -1.0
+
+
 def test_learning_curve_marks_the_last_negative_result() -> None:
     rng = np.random.default_rng(2)
     theirs = 2 + 0.3 * rng.normal(size=45)
@@ -251,20 +273,51 @@ def test_object_table_shows_means_ratios_and_losses() -> None:
     assert row["KM [deg]"].mean == pytest.approx(8.0)  # (20 + 3 + 4 + 5) / 4
     assert row["E-KM [deg]"].mean == pytest.approx(0.875)
     assert row["E-KM:KM [%]"].mean == pytest.approx(0.875 / 8)
-    assert (row["KM lost, given up"], row["E-KM lost, given up"]) == ("1, 0", "0, 0")
+    ends = dict(zip(ends_table(records).header, ends_table(records).rows[0], strict=True))
+    assert (ends["KM lost, given up"], ends["E-KM lost, given up"]) == ("1, 0", "0, 0")
     assert table.text()[0][5] == "11 [" + table.text()[0][5].split("[")[1]  # in percent
     assert table.rows[-1][0] == "all"
-    controllers = controller_table(records, limit=40)
+    controllers = controller_table(records)
     shown = dict(zip(controllers.header, controllers.rows[0], strict=True))
     assert shown["controller"] == "KM"
-    assert shown["survivors"].mean == pytest.approx(4.0)
+    assert shown["survivors [deg]"].mean == pytest.approx(4.0)
     compared = comparison_table([*records, not_grasped("KM+I")], limit=40)
     assert compared.rows[0][1].mean == pytest.approx(0.875 / 8)
     assert compared.rows[0][3] is None  # no KM+I was ever measured
     assert len(comparison_table(records, limit=40).columns) == 3  # and here it took no part
     predicted = dict(zip(*(prediction_table(records).header, prediction_table(records).rows[0]), strict=True))
     assert predicted["E-KM:KM, measured [%]"].mean == pytest.approx(0.4)
-    assert predicted["E-KM, true"].mean == pytest.approx(0.1)
+    assert predicted["E-KM, true [deg]"].mean == pytest.approx(0.1)
+
+
+def test_the_answer_comes_in_a_sentence_with_losses_and_no_verdict_from_few_seeds() -> None:
+    def records(n: int) -> list[TrialRecord]:
+        found = []
+        for seed in range(1000, 1000 + n):
+            found += [turn("KM+S", seed, 0.3), turn("KM", seed, 2.0 + 0.01 * seed)]
+            found.append(turn("E-KM", seed, 0.2, reason="object lost" if seed == 1000 else "reached"))
+        return found
+
+    few, many = verdict(records(4), range(1000, 1004)), verdict(records(12), range(1000, 1012))
+    assert few.startswith("The E-KM ends 5.15 [0.20, ")
+    assert "from the target, KM+S 0.30 [0.30, 0.30] deg, KM " in few
+    assert "on 4 seeds. Objects lost and turns given up: E-KM 1 and 0 of 4, KM+S 0 and " in few
+    assert "Fewer than 10 seeds: no verdict." in few
+    assert "paired" not in few
+    assert "Error of the E-KM over that of KM+S " in many
+    assert "no verdict" not in many
+
+
+def test_why_turns_ended_is_told_of_each_controller() -> None:
+    records = [turn("KM", seed, 1.0, reason="stalled") for seed in range(3)] + [turn("E-KM", 0, 0.25)]
+    records.append(turn("E-KM", 1, 0.3, reason="object lost"))
+    table = reason_table([*records, not_grasped("E-KM")])
+    cells = {row[0]: row[1:] for row in table.text()}
+    assert cells["stalled"][:2] == ["3 (1.00)", "-"]
+    assert cells["reached"][:2] == ["-", "1 (0.25)"]
+    assert cells["object lost"][1] == "1"
+    assert cells["not grasped"][1] == "1"
+    assert all(row[2] for row in cells.values())
 
 
 def test_learning_table_finds_the_last_negative_result() -> None:

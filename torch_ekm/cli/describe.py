@@ -41,7 +41,7 @@ def hands(
 @app.command()
 @needs("robot")
 def objects() -> None:
-    """List the objects that come with the package."""
+    """List the objects of the package."""
     from ..description import list_cylinders, list_objects, load_object
 
     rows = []
@@ -59,9 +59,10 @@ def check(
     object: Annotated[str, Argument(help=AN_OBJECT)] = "box",
     picture: Annotated[Path, Option(help="Picture of pads and contact frames.")] = Path("check.png"),
 ) -> None:
-    """Check a hand: files, pads, axes, limits, tendons, and a pinch of the object in simulation and model.
+    """Check a hand, from its files to a pinch of an object.
 
-    Each row says what was found and what to mend. Ends with 1 if there is an error, with 0 if not.
+    Files, pads, axes, limits, tendons, and a pinch of the object in simulation and model. Each row says what
+    was found and what to mend. Ends with 1 if there is an error, with 0 if not.
     """
     from ..experiments.check import Check, check_hand
 
@@ -77,7 +78,7 @@ def notebooks(
     copy: Annotated[Path | None, Option(help="Copy them into this folder.")] = None,
     overwrite: Annotated[bool, Option(help="Also over files that are there.")] = False,
 ) -> None:
-    """List the notebooks that come with the package, or copy them to where you can run them."""
+    """List the notebooks of the package, or copy them."""
     from ..experiments.reporting.notebook import copy_notebooks, notebook_folder
 
     found = sorted(notebook_folder().glob("[0-9]*.ipynb"))
@@ -87,7 +88,7 @@ def notebooks(
 
 @app.command()
 def version() -> None:
-    """Print the version, and those of the packages that decide the numbers."""
+    """Print the versions that decide the numbers."""
     from ..experiments.reporting.report import versions
 
     for package, number in versions().items():

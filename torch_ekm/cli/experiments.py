@@ -39,9 +39,10 @@ def demo(
     jobs: Jobs = 2,
     quick: Annotated[bool, Option(help="Two grasps, two angles: to see that it works.")] = False,
 ) -> None:
-    """Turn a grasped object in the simulated hand, with the KM and with the E-KM, and report.
+    """Turn an object with the KM and with the E-KM, and report.
 
-    Takes about two minutes on two cores. Interrupted, it goes on where it stopped.
+    Eight instances of the simulated hand, five turns from new grasps with each controller: two to three
+    minutes on two cores; half a minute with --quick. Interrupted, it goes on where it stopped.
     """
     from ..experiments.config import Setting
     from ..experiments.protocols.demo import Demo
@@ -57,7 +58,7 @@ def demo(
 @needs("experiments")
 def reproduce(
     experiment: Annotated[
-        str, Argument(help="online, generalize, ablation, adapt or foresight.")
+        str, Argument(help="generalize, online, ablation, adapt or foresight.")
     ] = "generalize",
     seeds: Annotated[str, Option(help="FIRST:END; each seed is an independent run.")] = "1000:1020",
     jobs: Jobs = 2,
@@ -82,9 +83,20 @@ def reproduce(
         str | None, Option(help="A Dask cluster instead of processes here: dask://HOST:PORT.")
     ] = None,
 ) -> None:
-    """Repeat the paper's experiments, and more, with every controller on the same seeds and grasps.
+    """Repeat the paper's experiments, and more.
 
-    Interrupted, it goes on where it stopped, and ends with the same report.
+    Every controller has the same seeds and grasps. Interrupted, it goes on where it stopped, and ends with
+    the same report. With 20 seeds, on two cores:
+
+    \b
+    experiment  sessions  of                                       time
+    generalize       400  8 to 11 turns: 5 objects, 4 controllers  1 h
+    online            80  45 turns: 4 controllers                  1 h
+    ablation        3040  3 to 6 turns: one change at a time       5 h
+    adapt             20  48 turns of 6 objects in random order    0.5 h
+    foresight        560  6 to 10 turns: 7 objects, 4 contenders   5 h
+
+    Time grows with the number of seeds and objects. With --quick: one or two minutes.
     """
     from ..experiments.config import Setting
     from ..experiments.reproduce import plan
@@ -119,10 +131,11 @@ def compare(
     ] = 1500,
     jobs: Jobs = 2,
 ) -> None:
-    """Compare residual learners on streams: predict, score, update, in the order of time.
+    """Compare learners on streams of samples.
 
-    A file needs the extra 'plots' only. One learner takes seconds to a minute for 1500 rows, all of them
-    two to five minutes on two cores. Interrupted, it goes on where it stopped.
+    Each learner predicts every sample, is scored, and then learns it, in the order of time. A file needs the
+    extra 'plots' only. One learner takes seconds to a minute for 1500 rows, all of them a few minutes on two
+    cores. Interrupted, it goes on where it stopped.
 
     Recordings: simulated_hand (extra 'sim'); in the folder that TORCH_EKM_DATA names: t42 (Sintov et al.,
     GitHub avishais/t42_autonomous_system), icub_grasp (Soh et al., clear-nus/icub_grasp_dataset), sarcos
@@ -162,10 +175,11 @@ def recorded_hand(
     jobs: Jobs = 2,
     quick: Annotated[bool, Option(help="Two paths of four objects: to see that it works.")] = False,
 ) -> None:
-    """Predict the recorded motions of a Yale T42 with its kinematic model, with and without learners.
+    """Predict the recorded motions of a Yale T42 hand.
 
-    The recordings (Sintov et al., GitHub avishais/t42_autonomous_system) are read in place; the documentation
-    tells how to save them as npz. Interrupted, it goes on where it stopped.
+    With its kinematic model, with and without learners. The recordings (Sintov et al., GitHub
+    avishais/t42_autonomous_system) are read in place; the documentation tells how to save them as npz.
+    Interrupted, it goes on where it stopped.
     """
     from ..experiments.recorded_hand.benchmark import count_jobs, predict_recorded_hand
     from ..experiments.recorded_hand.report import write_report

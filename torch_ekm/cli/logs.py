@@ -28,9 +28,10 @@ def record(
     sensing: Sensing = True,
     images: Annotated[bool, Option(help="Keep the camera's images too.")] = False,
 ) -> None:
-    """Turn an object in the simulated hand and log all of it, one HDF5 file for each turn.
+    """Turn an object in the simulated hand, and log all of it.
 
-    Interrupted or killed, it goes on where it stopped, and ends with the same files.
+    One HDF5 file for each turn. Interrupted or killed, it goes on where it stopped, and ends with the same
+    files.
     """
     from ..experiments.config import Setting
     from ..experiments.protocols.record import RecordConfig
@@ -54,7 +55,7 @@ def show(
     html: Html = None,
     port: Port = 8080,
 ) -> None:
-    """Turn and zoom a hand, a grasp or a log in the browser.
+    """Look at a hand, a grasp or a log in the browser.
 
     A hand has a slider for each actuator, a grasp is simulated while its actuators are moved, a log is
     played.
@@ -84,7 +85,8 @@ def replay(
 
     shown = LogShow(log, trial, estimates)
     if shown.log is not None:
-        print_table(TrialEntry._fields, shown.log.index, str(log))
+        header = ["time [s]" if name == "time" else name for name in TrialEntry._fields]
+        print_table(header, shown.log.index, str(log))
         for number, problem in shown.log.damaged.items():
             say(f"trial {number}: {problem}")
     _look(shown, html, port)
@@ -93,9 +95,10 @@ def replay(
 @app.command()
 @needs("sim")
 def verify(log: Annotated[Path, Argument(help="Folder of the log.")]) -> None:
-    """Check every byte of a log, its index, and the files of hand and object that it was made from.
+    """Check every byte of a log.
 
-    Ends with 1 if a file is wrong, with 0 if not. "torch-ekm record" makes damaged trials again.
+    Its trials, its index, and the files of hand and object that it was made from. Ends with 1 if a file is
+    wrong, with 0 if not. "torch-ekm record" makes damaged trials again.
     """
     from ..plant import Finding, verify_log
 

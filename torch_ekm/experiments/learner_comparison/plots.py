@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _BLUE, _GREY = "#0072B2", "#7f7f7f"
-_CYCLE = ("#7f7f7f", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#0072B2", "#56B4E9", "#000000")
+_ALWAYS = {"model alone": _GREY, "default": _BLUE}
+_CYCLE = ("#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
 
 
 def colour_of(learner: str) -> str:
@@ -29,7 +30,7 @@ def plot_scores(comparison: Comparison) -> Figure:
     n = len(comparison.streams)
     columns = min(n, 3)
     rows = -(-n // columns)
-    width, height = 3.2 * columns + 1.2, (0.22 * len(comparison.learners) + 0.8) * rows
+    width, height = 3.2 * columns + 1.2, (0.22 * len(comparison.learners) + 1.0) * rows
     figure, axes = new_figure(width, height, columns, rows, sharey=True)
     y = np.arange(len(comparison.learners))
     for axis, stream in zip(axes, comparison.streams, strict=False):
@@ -46,7 +47,7 @@ def plot_scores(comparison: Comparison) -> Figure:
         axis.grid(axis="x", color="0.9", linewidth=0.8)
     for axis in axes[::columns]:
         axis.set_yticks(y, comparison.learners, fontsize=8)
-    axes[0].invert_yaxis()  # shared by all panels
+    axes[0].set_ylim(len(comparison.learners) - 0.4, -0.6)  # shared by all panels
     for axis in axes[n:]:
         axis.set_visible(False)
     figure.supxlabel("rms error / that of the model alone (95 % interval); filled: best", fontsize=9)
@@ -66,7 +67,9 @@ def plot_learning_curves(
     n = len(one) - one.warm_up
     edges = np.linspace(0, n, min(windows, n // 5) + 1).astype(int)
     middle = one.warm_up + 0.5 * (edges[1:] + edges[:-1])
-    for name, colour in zip(learners or comparison.learners, _CYCLE * 3, strict=False):
+    others = iter(_CYCLE * 3)
+    for name in learners or comparison.learners:
+        colour = _ALWAYS[name] if name in _ALWAYS else next(others)
         total = np.concatenate([[0.0], np.cumsum(comparison.errors[stream, name])])
         rms = np.sqrt(np.diff(total[edges]) / np.diff(edges))
         axis.plot(middle, rms, color=colour, linewidth=1.4, label=name)
@@ -83,7 +86,7 @@ def plot_ranks(comparison: Comparison) -> Figure:
     """Mean rank on the streams, +- half the critical difference: what overlaps cannot be told apart."""
     ranks, difference = comparison.ranks().mean(0), comparison.critical_difference()
     order = np.argsort(ranks)
-    figure, (axis,) = new_figure(6.5, 0.26 * len(ranks) + 0.9)
+    figure, (axis,) = new_figure(6.5, 0.26 * len(ranks) + 1.0)
     for place, i in enumerate(order):
         colour = colour_of(comparison.learners[i])
         if np.isfinite(difference):
@@ -91,7 +94,7 @@ def plot_ranks(comparison: Comparison) -> Figure:
             axis.plot(ends, [place, place], color=colour, linewidth=5, alpha=0.3)
         axis.plot(ranks[i], place, "o", color=colour)
     axis.set_yticks(range(len(ranks)), [comparison.learners[i] for i in order], fontsize=8)
-    axis.invert_yaxis()
+    axis.set_ylim(len(ranks) - 0.4, -0.6)
     axis.grid(axis="y", visible=False)
     axis.set_xlabel(f"mean rank on {len(comparison.streams)} streams (1 is best)")
     return figure

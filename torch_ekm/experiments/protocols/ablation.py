@@ -15,7 +15,7 @@ from ..learners import HAND_LEARNERS
 from ..records import Record
 from ..reporting.report import Cell, Column, Report, Table
 from ..reporting.statistics import estimate, rate, steady_state_error
-from ..reporting.tables import by_controller, prediction_cells, which_seeds
+from ..reporting.tables import LEGEND, by_controller, prediction_cells, which_seeds
 from .generalize import Generalize
 from .protocol import Protocol, Results
 
@@ -149,35 +149,70 @@ class Ablation(Protocol):
         return variant.session(self.object, controller, seed)
 
     def report(self, seeds: Sequence[int], results: Results[Record], folder: Path) -> Report:
-        """One table for each group."""
-        tables = [self.table(group, seeds, results) for group in self.groups]
-        summary = f"One change at a time, {object_name(self.object)}. {which_seeds(seeds)}"
-        return Report("Ablations: what each part is worth", summary, tables)
+        """Two tables for each group: where the turns end, and one motion ahead."""
+        shown = [
+            make(group, seeds, results) for group in self.groups for make in (self.table, self.predictions)
+        ]
+        turned = ", ".join(f"{angle:g}" for angle in self.angles_deg)
+        summary = (
+            f"{self._answer(seeds, results)} One change at a time; {object_name(self.object)}, turns of "
+        )
+        summary += f"{turned} deg. {which_seeds(seeds)}"
+        title, names = (
+            "Ablations: what each part is worth",
+            {c for v in self._variants() for c in v.controllers},
+        )
+        explained = {name: line for name, line in LEGEND.items() if name in names}
+        return Report(title, summary, shown, leading=2, legend=explained)
+
+    def _variants(self) -> list[Variant]:
+        return [variant for group in self.groups for variant in self.variants(group)]
+
+    def _answer(self, seeds: Sequence[int], results: Results[Record]) -> str:
+        """How the E-KM does as it is; what changes it, from enough seeds alone."""
+        base = next((v for v in self._variants() if v.name == _BASE), None)
+        if base is None:
+            return ""
+        mine = by_controller(self._records(base, seeds, results)).get("E-KM", [])
+        if not mine:
+            return "Nothing was grasped."
+        lost, given_up = sum(r.lost for r in mine), sum(r.given_up for r in mine)
+        text = f"The E-KM as it is ends {estimate(mine, steady_state_error):.2f} deg from the target; of "
+        return f"{text}{len(mine)} turns {lost} objects were lost and {given_up} turns given up."
+
+    def _records(self, variant: Variant, seeds: Sequence[int], results: Results[Record]) -> list[Record]:
+        return [r for name in self._jobs_of(variant, seeds) for r in results[name]]
 
     def table(self, group: str, seeds: Sequence[int], results: Results[Record]) -> Table:
-        """The variants of one group."""
+        """Where the turns of the variants of one group end."""
         rows: list[list[Cell]] = []
         for variant in self.variants(group):
-            records = [r for name in self._jobs_of(variant, seeds) for r in results[name]]
-            turns = by_controller(records)
+            turns = by_controller(self._records(variant, seeds, results))
             row: list[Cell] = [variant.name]
             row += [estimate(turns.get(name, []), steady_state_error) for name in _ALL]
-            row += [*prediction_cells(records), prediction_cells(records, "true_")[-1]]
             lost = [turns.get(name, []) for name in ("KM+I", "E-KM")]
             row += [rate(r.lost for r in mine) if mine else None for mine in lost]
             rows.append([*row, rate(r.given_up for r in lost[-1]) if lost[-1] else None])
-        columns = [
-            group, "steady-state error KM", "KM+I", "KM+S", "E-KM", "prediction KM", "prediction E-KM",
-            Column("E-KM:KM [%]", ".0f", percent=True), Column("E-KM:KM, true [%]", ".0f", percent=True),
-            "lost: KM+I", "lost: E-KM", "given up: E-KM",
-        ]  # fmt: skip
+        columns = [group, *(f"{name} [deg]" for name in _ALL), "KM+I lost", "E-KM lost", "E-KM given up"]
         note = (
-            f"{object_name(self.object)}, {', '.join(f'{a:g}' for a in self.angles_deg)} deg, "
-            f"{len(seeds)} seeds. Steady-state error by the truth, lost objects with the whole angle; "
-            "one-step prediction error on the E-KM's own motions; both in degrees with 95 % bootstrap "
-            "intervals over seeds."
+            f"{len(seeds)} seeds. Steady-state error by the truth, lost objects with the whole angle; 95 % "
+            "bootstrap intervals over seeds."
         )
         return Table(f"ablation_{group.replace(' ', '_')}", f"Ablation: {group}", columns, rows, note)
+
+    def predictions(self, group: str, seeds: Sequence[int], results: Results[Record]) -> Table:
+        """One-step prediction errors of the variants of one group."""
+        rows: list[list[Cell]] = []
+        for variant in self.variants(group):
+            records = self._records(variant, seeds, results)
+            rows.append([variant.name, *prediction_cells(records), prediction_cells(records, "true_")[-1]])
+        columns = [
+            group, "KM [deg]", "E-KM [deg]", Column("E-KM:KM [%]", ".0f", percent=True),
+            Column("E-KM:KM, true [%]", ".0f", percent=True),
+        ]  # fmt: skip
+        name = f"ablation_{group.replace(' ', '_')}_prediction"
+        note = "One-step prediction error on the E-KM's own motions, as measured, and its ratio by the truth."
+        return Table(name, f"Ablation: {group}, prediction", columns, rows, note)
 
     def _jobs_of(self, variant: Variant, seeds: Sequence[int]) -> dict[str, tuple[Generalize, str, int]]:
         one = Generalize(

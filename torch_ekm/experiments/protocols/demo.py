@@ -56,16 +56,17 @@ class Demo(Generalize):
         report, records = super().report(seeds, results, folder), select(records_of(results))
         what, hand = _spoken(self.object), _spoken(self.setting.hand)
         report.title = f"Turning the {what} with the hand {hand}: KM and E-KM"
-        shown = ("controllers", "comparison", "prediction", "stop_reasons", "timing")
+        shown = ("stop_reasons", "controllers", "motions", "comparison", "prediction", "timing")
         report.tables = [self.angle_table(records)] + [t for t in report.tables if t.name in shown]
+        report.leading = 1
         report.figures = [*self._pictures(records, folder), *self._motions(records, folder), *report.figures]
         return report
 
     def angle_table(self, records: Sequence[TrialRecord]) -> Table:
         """Each target on its own."""
-        columns: list[Column | str] = [Column("target", "g")]
+        columns: list[Column | str] = [Column("target [deg]", "g")]
         for name in self.controllers:
-            columns += [f"{name}: error", Column(f"{name}: motions", ".1f"), f"{name}: lost"]
+            columns += [f"{name}: error [deg]", Column(f"{name}: motions", ".1f"), f"{name}: lost"]
         rows: list[list[Cell]] = []
         for angle in self.angles_of(self.object):
             row: list[Cell] = [float(angle)]
@@ -74,7 +75,7 @@ class Demo(Generalize):
                 figures = np.array([(steady_state_error(r), r.steps, r.lost) for r in mine])
                 row += [*map(float, figures.mean(0)[:2]), int(figures[:, 2].sum())] if mine else [None] * 3
             rows.append(row)
-        caption = "Steady-state error, motions and lost objects for each target [deg]"
+        caption = "Mean steady-state error, motions and lost objects for each target"
         return Table("by_angle", caption, columns, rows)
 
     def _motions(self, records: Sequence[TrialRecord], folder: Path) -> list[FigureFile]:
@@ -87,9 +88,10 @@ class Demo(Generalize):
         )
         shortest, figures = min(map(len, ekm), default=0), []
         if shortest >= 5:
+            over = f"median and quartiles over {len(runs)} seeds" if len(runs) > 1 else "one seed"
             caption = (
-                "One-step prediction error of KM and E-KM on the same motions, running mean over 5 motions; "
-                "the learner starts empty at motion 1 (the paper's Fig. 5a)."
+                f"One-step prediction error of KM and E-KM on the E-KM's first {shortest} motions, running "
+                f"mean over 5 motions, {over}; the learner starts empty at motion 1 (the paper's Fig. 5a)."
             )
             curves = (np.stack([curve[:shortest] for curve in found]) for found in (ekm, km))
             figure = plot_prediction_error(*curves, xlabel="motion")
@@ -100,7 +102,7 @@ class Demo(Generalize):
             for name in self.controllers
         }
         figure = plot_convergence(histories, f"{last:g} deg")
-        caption = f"Error on the way to {last:g} deg, as measured."
+        caption = f"Measured error on the way to {last:g} deg: a line for each grasp."
         return [*figures, save_figure(figure, folder, "convergence", caption)]
 
     def _pictures(self, records: Sequence[TrialRecord], folder: Path) -> list[FigureFile]:
@@ -116,7 +118,10 @@ class Demo(Generalize):
         save_animation(scene, folder / "animation.html")
         what = f"a turn of {turn.angle_deg:g} deg (seed {turn.seed})"
         return [
-            FigureFile("hand.png", f"The {_spoken(self.object)} before and after {what}."),
+            FigureFile(
+                "hand.png",
+                f"The {_spoken(self.object)} before and after {what} by the E-KM, seen along the axis.",
+            ),
             FigureFile("animation.html", "The same turn, motion by motion: drag to look around."),
         ]
 

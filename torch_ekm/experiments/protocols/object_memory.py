@@ -33,6 +33,20 @@ from .protocol import Protocol, Results
 
 #: How the knowledge of several objects may be kept.
 MEMORIES = ("bank", "labelled", "one model", "fresh")
+_WORDS = {
+    "bank": "the bank",
+    "labelled": "labelled models",
+    "one model": "one model",
+    "fresh": "fresh models",
+}
+_WORDS["none"] = "the KM"
+_LEGEND = {
+    "bank": "several models; evidence decides which one a grasp belongs to",
+    "labelled": "one model for each object, with the object's label told",
+    "one model": "one for all objects",
+    "fresh": "an empty one for each grasp",
+    "none": "the kinematic model alone",
+}
 #: The residuals of one grasp are far from independent, and they speak for whichever model has seen most:
 #: beside a signature they count for little.
 _TEMPERATURE = 0.1
@@ -162,20 +176,26 @@ class ObjectMemory(Protocol):
         figures = []
         if sessions and sessions[0]:
             shown = zip(*((r.object, r.model, r.posterior) for r in sessions[0]), strict=True)
-            caption = f"Where the bank put each turn, seed {seeds[0]}."
+            caption = f"Which model of the bank took each turn of seed {seeds[0]}; pale: it was unsure."
             figures.append(save_figure(plot_bank(*shown), folder, "bank", caption))
         tables = [
-            targets_table(self.targets(results)),
             _memory_table(sessions),
             comparison_table(sessions),
             _assignment_table(seeds, sessions),
+            targets_table(self.targets(results)),
         ]
-        lost = rate(r.lost for s in sessions for r in s)
-        summary = (
-            f"{len(self.objects)} objects in random order, {self.turns_each} turns each, without labels; "
-            f"objects lost: {lost}. {which_seeds(seeds)}"
+        lost, given_up = (
+            rate(getattr(r, what) for s in sessions for r in s) for what in ("lost", "given_up")
         )
-        return Report("Object memory: familiar objects and new ones", summary, tables, figures)
+        errors = [f"{_WORDS[name]} {bootstrap_mean(_means(sessions, name)):.3f} deg" for name in _WORDS]
+        summary = (
+            f"Turns that went to the right model without labels: {recognition(sessions)}. One-step "
+            f"prediction error: {', '.join(errors)}. Objects lost: {lost}; turns given up: {given_up}. "
+            f"{len(self.objects)} objects in random order, {self.turns_each} turns each. {which_seeds(seeds)}"
+        )
+        return Report(
+            "Object memory: familiar objects and new ones", summary, tables, figures, legend=_LEGEND
+        )
 
     def make_signature(self, bench: Bench) -> GraspSignature:
         """What tells grasps apart, without the object's label."""
@@ -269,11 +289,11 @@ def _feel(bench: Bench, signature: GraspSignature, readings: int) -> Tensor:
 def _memory_table(sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
     turns = [r for s in sessions for r in s]
     columns: dict[Column, Callable[[str], Cell]] = {
-        Column("all", ".3f"): lambda name: bootstrap_mean(_means(sessions, name)),
-        Column("first motions", ".3f"): lambda name: float(np.mean(_errors(turns, name, _FIRST))),
+        Column("all motions [deg]", ".3f"): lambda name: bootstrap_mean(_means(sessions, name)),
+        Column("first motions [deg]", ".3f"): lambda name: float(np.mean(_errors(turns, name, _FIRST))),
     }
     note = (
-        "Mean over all motions [deg], 95 % bootstrap interval over sequences; and over the first five "
+        "Mean over all motions, 95 % bootstrap interval over sequences; and over the first five "
         "motions of each turn. All memories see the same motions, those that the bank's E-KM chose; "
         "'none' is the KM."
     )
@@ -293,7 +313,7 @@ def comparison_table(sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
         rows.append(row)
     columns: list[Column | str] = ["memories"]
     for what in ("all motions", f"first {_FIRST} of a turn"):
-        columns += [Column(f"{what} [%]", ".0f", percent=True), Column(f"paired p, {what}", ".1g")]
+        columns += [Column(f"{what} [%]", ".0f", percent=True), Column(f"p paired, {what}", ".1g")]
     note = (
         "Ratio of mean one-step prediction errors with 95 % bootstrap interval over sequences "
         f"({len(sessions)}); p of the paired t-test. Right model: {recognition(sessions)}."
@@ -314,7 +334,9 @@ def recognition(sessions: Sequence[Sequence[MemoryTurn]]) -> str:
 def _assignment_table(seeds: Sequence[int], sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
     rows = [[str(seed), *judge_assignment(mine)] for seed, mine in zip(seeds, sessions, strict=True)]
     note = "Turns after the first three of their object; a model belongs to the object of most of its turns."
-    return Table("assignments", "Recognised objects", ["seed", "right", "of", "models"], rows, note)
+    return Table(
+        "assignments", "Recognised objects", ["seed", "right [turns]", "of [turns]", "models"], rows, note
+    )
 
 
 def _errors(turns: Sequence[MemoryTurn], memory: str, first: int | None = None) -> list[float]:

@@ -17,7 +17,7 @@ from ..records import Record
 from ..reporting import tables
 from ..reporting.plots import plot_learning_test, plot_prediction_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from ..reporting.statistics import Array, learning_curve, select
+from ..reporting.statistics import Array, bootstrap_mean, learning_curve, select
 from ..reporting.tables import Target
 from ..runner import Bench
 from .protocol import Protocol, Results, records_of
@@ -43,7 +43,7 @@ class Online(Protocol):
     angle_range_deg: tuple[float, float] = (6.0, 24.0)
     """Rotations are drawn from this interval."""
     dislocations: tuple[int, ...] = (20, 44)
-    """In these trials somebody knocks at the object after its third motion."""
+    """In these trials the object is knocked after its third motion."""
     knock: tuple[float, float, float] = (0.0, 0.10, 0.0)
     """Torque of the knock [N m], hand frame, for 50 ms: it turns the tube by 5 to 10 deg."""
     tendons_replaced: int = 31
@@ -122,8 +122,11 @@ class Online(Protocol):
         ekm, km = (np.stack([curve[i] for curve in curves]) for i in (0, 1))
         some = np.isfinite(ekm).any(axis=0)
         if some.sum() > 1:
-            events = ", ".join(map(str, self.events)) or "none"
-            caption = f"One-step prediction error in each trial (Fig. 5a). Events in trials {events}."
+            events = f"trials {', '.join(map(str, self.events))}" if self.events else "none"
+            over = f", median and quartiles over {len(curves)} seeds" if len(curves) > 1 else ""
+            caption = (
+                f"One-step prediction error in each trial{over} (the paper's Fig. 5a). Events: {events}."
+            )
             happened = {trial: "dislocated" for trial in self.dislocations if trial <= self.trials}
             happened |= {self.tendons_replaced: "new tendons"} if self.tendons_replaced in self.events else {}
             trials = np.arange(1.0, self.trials + 1)[some]
@@ -131,22 +134,29 @@ class Online(Protocol):
             figures.append(save_figure(figure, folder, "prediction_error", caption))
         some = np.isfinite(ekm[0])
         if some.sum() > 1:
-            caption = f"p(k) and b(k) of the first k trials, seed {min(seeds)} (Fig. 5b)."
+            caption = (
+                f"The first k trials of seed {min(seeds)} (the paper's Fig. 5b). Left: p of the test whether "
+                "the E-KM's error is smaller than the KM's; right: upper end of their difference's interval."
+            )
             figure = plot_learning_test(ekm[0][some], km[0][some])
             figures.append(save_figure(figure, folder, "learning_test", caption))
         shown = [
             self.paper_table(records),
-            tables.targets_table(self.targets(results)),
+            tables.reason_table(records),
             self.learning_table(records),
             self.learning_table(records, against_truth=True),
             tables.prediction_table(records),
-            tables.controller_table(records, limit),
+            tables.controller_table(records),
+            tables.motion_table(records, limit),
             tables.comparison_table(records, limit),
-            tables.reason_table(records),
+            tables.targets_table(self.targets(results)),
             tables.timing_table(records),
         ]
-        summary = f"{self.trials} turns of the {object_name(self.object)}. {tables.verdict(records, seeds)}"
-        return Report("Online manipulation: learning while turning", summary, shown, figures)
+        what = f"{self.trials} turns of the {object_name(self.object)} for each seed and controller."
+        negative = shown[0].text()[0][2]
+        what += f" The E-KM predicts better for good after {negative} trials (the paper: 16)."
+        summary, legend = f"{tables.verdict(records, seeds)} {what}", tables.legend(records)
+        return Report("Online manipulation: learning while turning", summary, shown, figures, legend=legend)
 
     def paper_table(self, records: Sequence[Record]) -> Table:
         """The figures that the paper prints, beside those found here."""
@@ -157,15 +167,21 @@ class Online(Protocol):
         )
         rows: list[list[Cell]] = [
             [
-                "last index of negative result",
+                "last index of negative result [trials]",
                 "16",
-                float(np.mean(negative)) if negative else None,
+                bootstrap_mean(np.array(negative)) if negative else None,
                 len(negative),
             ],
-            ["last upper boundary [deg]", "-0.57", float(np.mean(upper)) if upper else None, len(upper)],
+            [
+                "last upper boundary [deg]",
+                "-0.57",
+                bootstrap_mean(np.array(upper)) if upper else None,
+                len(upper),
+            ],
         ]
-        columns = ["", "paper", Column("here, mean of seeds", ".3g"), "seeds"]
-        return Table("paper", "Figures of the paper and those found here", columns, rows)
+        columns = ["figure", "paper", Column("here, mean over seeds", ".2f"), "seeds"]
+        note = "After how many trials the E-KM predicts better for good, and by how much at least at the end."
+        return Table("paper", "Figures of the paper and those found here", columns, rows, note)
 
     def learning_table(self, records: Sequence[Record], against_truth: bool = False) -> Table:
         """How fast the E-KM learns (the paper's Fig. 5b), for each seed and for the mean over seeds."""
@@ -180,9 +196,9 @@ class Online(Protocol):
             back = ["never" if n is None else n or None for n in one.recovery]
             rows.append([name, one.last_negative, one.last_upper, one.late, *back])
         columns = [
-            "seed", "last negative result", "last upper boundary [deg]",
+            "seed", "last negative result [trial]", "last upper boundary [deg]",
             Column("E-KM:KM after 16 trials [%]", ".0f", percent=True),
-            *(f"recovered after trial {event}" for event in self.events),
+            *(f"recovered after trial {event} [trials]" for event in self.events),
         ]  # fmt: skip
         note = (
             "Per-trial means of the one-step prediction error. Last negative result: last k with p(k) > 0.05 "

@@ -26,6 +26,12 @@ BEYOND_DEG = 2.0
 _NINETY = 1.645  # standard deviations on either side that hold 90 % of a Gaussian
 ONE_STEP = "one-step E-KM"
 _FREE = "nothing"
+_LEGEND = {
+    ONE_STEP: "each motion is chosen for itself",
+    "horizon E-KM": "twelve motions are planned ahead with the E-KM, one is made",
+    "horizon KM": "the same with the kinematic model on the servo inverse",
+    "oracle": "each motion is chosen for itself, by the true model, pose and forces",
+}
 
 
 def turns_of(results: Results, **wanted: object) -> list[ForesightTurn]:
@@ -102,16 +108,27 @@ def foresight_report(setting: Setting, seeds: Sequence[int], results: Results, f
     """The answer, the tables, two figures and an animation."""
     found = foresight_targets(results)
     tables = [
-        targets_table(found) if found else None,
         far_table(results),
         reach_table(results),
         beyond_table(results),
         blind_table(results),
+        targets_table(found) if found else None,
     ]
     figures = [*_plots(results, folder), *_animation(setting, results, folder)]
     shown = [table for table in tables if table is not None and table.rows]
     title = "Foresight: how far, and what ends it; a turn in the dark"
-    return Report(title, f"{_answer(results)} {which_seeds(seeds)}", shown, figures)
+    ends = [f"{name} {_ends(turns_of(results, contender=name))}" for name in contenders_of(results)]
+    summary = f"{_answer(results)} Objects lost: {', '.join(ends)}. {which_seeds(seeds)}"
+    legend = {name: line for name, line in _LEGEND.items() if name in contenders_of(results)}
+    return Report(title, summary, shown, figures, legend=legend)
+
+
+def _ends(turns: Turns) -> str:
+    beyond = [r for r in turns if r.kind == "turn"]
+    given_up = (
+        f" ({sum(r.given_up for r in beyond)} of {len(beyond)} beyond Table I given up)" if beyond else ""
+    )
+    return f"{sum(r.lost for r in turns)} of {len(turns)} turns{given_up}"
 
 
 def _answer(results: Results) -> str:
@@ -145,7 +162,7 @@ def far_table(results: Results) -> Table:
         Column("largest angle [deg]", ".1f"): lambda mine: stats.bootstrap_mean(
             np.array([r.largest_deg for r in mine])
         ),
-        Column("median", ".1f"): lambda mine: float(np.median([r.largest_deg for r in mine])),
+        Column("median [deg]", ".1f"): lambda mine: float(np.median([r.largest_deg for r in mine])),
         Column(f"paired, {ONE_STEP} = 1"): lambda mine: paired_ratio(results, mine[0].contender),
         Column("given up"): lambda mine: stats.rate(r.given_up for r in mine),
         Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
@@ -171,15 +188,15 @@ def reach_table(results: Results) -> Table:
         items[f"{name}, all"] = mine
     columns: dict[Column, Callable[[Turns], Cell]] = {
         Column("grasps"): lambda mine: len(reach_errors(mine)),
-        Column("median |error|", ".1f"): lambda mine: float(np.median(np.abs(reach_errors(mine)))),
-        Column("mean error", "+.1f"): lambda mine: float(reach_errors(mine).mean()),
+        Column("median |error| [deg]", ".1f"): lambda mine: float(np.median(np.abs(reach_errors(mine)))),
+        Column("mean error [deg]", "+.1f"): lambda mine: float(reach_errors(mine).mean()),
         Column("within 2 deg"): lambda mine: stats.rate((np.abs(reach_errors(mine)) <= 2).tolist()),
         Column("within 5 deg"): lambda mine: stats.rate((np.abs(reach_errors(mine)) <= 5).tolist()),
         Column("ends by (foretold)"): lambda mine: _most(r.reach_end for r in mine),
     }
     items = {name: mine for name, mine in items.items() if len(reach_errors(mine))}
-    note = "Foretold less real largest angle [deg]; how a turn really ended is in the rows below the objects."
-    return Table.of("reach", "Foretold ends of turns", "", items, columns, note)
+    note = "Foretold less real largest angle; how a turn really ended is in the rows below the objects."
+    return Table.of("reach", "Foretold ends of turns", "turns", items, columns, note)
 
 
 def beyond_table(results: Results) -> Table:
@@ -218,10 +235,10 @@ def blind_table(results: Results) -> Table:
     columns: dict[Column, Callable[[Turns], Cell]] = {
         Column("turns"): len,
         Column("median error [deg]"): lambda mine: float(np.median([r.true_error_deg for r in mine])),
-        Column("mean"): lambda mine: float(np.mean([r.true_error_deg for r in mine])),
-        Column("largest"): lambda mine: float(max(r.true_error_deg for r in mine)),
-        Column("of the estimate, rms"): lambda mine: _rms([r.estimate_error_deg for r in mine]),
-        Column("stated sd"): lambda mine: _rms([r.axis_std_deg for r in mine]),
+        Column("mean error [deg]"): lambda mine: float(np.mean([r.true_error_deg for r in mine])),
+        Column("largest error [deg]"): lambda mine: float(max(r.true_error_deg for r in mine)),
+        Column("error of the estimate, rms [deg]"): lambda mine: _rms([r.estimate_error_deg for r in mine]),
+        Column("stated sd [deg]"): lambda mine: _rms([r.axis_std_deg for r in mine]),
         Column("90 % interval holds"): lambda mine: stats.rate(covered(mine)) if covered(mine) else None,
         Column("looks", ".1f"): lambda mine: float(np.mean([r.looks for r in mine])),
         Column("lost"): lambda mine: sum(r.lost for r in mine),
@@ -231,7 +248,7 @@ def blind_table(results: Results) -> Table:
         "The camera is off from the first reading on. True error about the axis at the end; error of the "
         "estimate and its stated standard deviation likewise. 'No touch': the prediction alone."
     )
-    return Table.of("blind", "Whole turns in the dark", "", items, columns, note)
+    return Table.of("blind", "Whole turns in the dark", "kind", items, columns, note)
 
 
 def _most(names) -> str:
@@ -258,7 +275,7 @@ def _plots(results: Results, folder: Path) -> list[FigureFile]:
             axis.plot(x, y, "osD^v*PX"[k % 8], label=name.replace("_", " "), markersize=5)
         axis.set(xlabel="real end [deg]", ylabel="foretold end [deg]", xlim=(0, top), ylim=(0, top))
         axis.legend(frameon=False, fontsize=8)
-        caption = "Where turns ended, and where the model said so before anything moved."
+        caption = "Where the one-step E-KM's turns ended, and where the model said before anything moved."
         figures.append(save_figure(figure, folder, "reach", caption))
     kinds = {
         kind: turns_of(results, kind=kind) for kind in ("blind", "blind, looks again", "blind, no touch")
@@ -274,7 +291,12 @@ def _plots(results: Results, folder: Path) -> list[FigureFile]:
         axis.set_xticks(range(len(kinds)), list(kinds))
         axis.set(ylabel="true error [deg]", ylim=(0, None))
         figures.append(
-            save_figure(figure, folder, "blind", "Whole turns in the dark: each turn, and the median.")
+            save_figure(
+                figure,
+                folder,
+                "blind",
+                "Whole turns in the dark, without lost ones: each turn, and the median.",
+            )
         )
     return figures
 

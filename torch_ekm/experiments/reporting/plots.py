@@ -97,12 +97,12 @@ def plot_learning_test(ekm_deg: Array, km_deg: Array) -> Figure:
     left.plot(k, curve.p, color=COLOURS["E-KM"])
     left.axhline(ALPHA, color=COLOURS["limit"], linewidth=1, linestyle="--", label=f"{ALPHA:g}")
     left.set_yscale("log")
-    left.set(xlabel="k", ylabel="p(k)")
+    left.set(xlabel="trials k", ylabel="p(k)")
     left.set_title(f"last negative result: {curve.last_negative}", loc="left", fontsize=10)
     left.legend(frameon=False)
     right.plot(k, curve.upper, color=COLOURS["E-KM"])
     right.axhline(0, color=COLOURS["limit"], linewidth=1, linestyle="--")
-    right.set(xlabel="k", ylabel="b(k) [deg]")
+    right.set(xlabel="trials k", ylabel="b(k) [deg]")
     finite = curve.upper[np.isfinite(curve.upper)]
     if finite.size > 3:  # the first intervals are enormous and hide the rest
         right.set_ylim(1.2 * finite.min(), max(np.percentile(finite, 90), 0.1))
@@ -113,16 +113,14 @@ def plot_learning_test(ekm_deg: Array, km_deg: Array) -> Figure:
 def plot_steady_state_error(errors_deg: dict[str, dict[str, Array]], what: str = "") -> Figure:
     """Steady-state error of each controller for each target (the paper's Fig. 6): every run and the mean.
 
-    A few lost objects, at many times the error of all others, are crosses at the upper edge; a mean
-    that they carry beyond it is written there.
+    A few turns at many times the error of all others are crosses at the upper edge; a mean that they carry
+    beyond it is written there.
 
     Args:
         errors_deg: controller -> target -> ``(n_runs,)`` absolute errors [deg].
         what: named in the title.
     """
-    everything = np.concatenate([np.ravel(v) for t in errors_deg.values() for v in t.values()])
-    top = 1.3 * float(np.percentile(everything, 95)) if everything.size else 1.0
-    top = top if everything.size and everything.max() > 2 * top else np.inf
+    top = _top(errors_deg)
     targets = list(next(iter(errors_deg.values())))
     figure, (axis,) = new_figure(max(4.0, 1.3 * len(targets)), 3.4)
     width = 0.8 / len(errors_deg)
@@ -150,6 +148,22 @@ def plot_steady_state_error(errors_deg: dict[str, dict[str, Array]], what: str =
     return figure
 
 
+def _top(errors_deg: dict[str, dict[str, Array]]) -> float:
+    """Upper edge of the errors [deg]; infinite: all of them are shown."""
+    everything = np.concatenate([np.ravel(v) for t in errors_deg.values() for v in t.values()])
+    top = 1.3 * float(np.percentile(everything, 95)) if everything.size else 1.0
+    return top if everything.size and everything.max() > 2 * top else np.inf
+
+
+def crosses_caption(errors_deg: dict[str, dict[str, Array]]) -> str:
+    """What the crosses in :func:`plot_steady_state_error` are; "": there are none."""
+    top = _top(errors_deg)
+    if not np.isfinite(top):
+        return ""
+    beyond = sum(int((np.asarray(v) > top).sum()) for t in errors_deg.values() for v in t.values())
+    return f" Crosses at the upper edge: {beyond} turn{'' if beyond == 1 else 's'} above {top:.1f} deg."
+
+
 def plot_convergence(histories_deg: dict[str, list[Array]], target: str = "") -> Figure:
     """|e| over the steps of each manipulation: controller -> list of ``(n_steps,)`` errors [deg]."""
     figure, (axis,) = new_figure(6.0, 3.4)
@@ -157,7 +171,7 @@ def plot_convergence(histories_deg: dict[str, list[Array]], target: str = "") ->
         colour = COLOURS.get(name, f"C{j}")
         for i, run in enumerate(runs):
             axis.plot(run, color=colour, alpha=0.6, linewidth=1.1, label=name if i == 0 else None)
-    axis.set(xlabel="step", ylabel="|e| [deg]", ylim=(0, None))
+    axis.set(xlabel="motion", ylabel="measured error [deg]", ylim=(0, None))
     axis.set_title(f"Error on the way{' to ' + target if target else ''}", loc="left")
     axis.legend(frameon=False)
     return figure

@@ -6,6 +6,7 @@ import csv
 import html
 import json
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,8 @@ from .statistics import Estimate, Rate
 _PACKAGES = (
     "torch_ekm", "torch", "numpy", "scipy", "sapien", "coal", "qpsolvers", "piqp", "pytorch-kinematics",
 )  # fmt: skip
+#: A number with its interval or its unit, or both.
+_FIGURE = re.compile(r"[-+]?\d[\d.e+-]*(?: \[[^\]]*\]| (?=%|deg\b|mm\b))(?: ?(?:%|deg\b|mm\b))?")
 T = TypeVar("T")
 #: None: there is nothing to say.
 Cell = str | bool | int | float | Estimate | Rate | None
@@ -119,14 +122,20 @@ class Report:
     """What a run has to show.
 
     ``write`` leaves ``index.html``, one CSV for each table, and ``configuration.json`` with the exact
-    configuration, versions and seeds.
+    configuration, versions and seeds. On the page the answer comes first, then the leading tables, the
+    figures, and the other tables, folded.
     """
 
     title: str
     summary: str
+    """The answer, with its intervals."""
     tables: list[Table] = field(default_factory=list)
     figures: list[FigureFile] = field(default_factory=list)
     configuration: dict[str, Any] = field(default_factory=dict)
+    leading: int = 1
+    """So many of the first tables are not folded."""
+    legend: Mapping[str, str] = field(default_factory=dict)
+    """What is compared: name -> one line."""
 
     def write(self, folder: Path) -> Path:
         """Write everything into ``folder`` and return the page's path; equal reports give equal files.
@@ -144,13 +153,20 @@ class Report:
         for table in self.tables:
             with (folder / f"{table.name}.csv").open("w", newline="", encoding="utf-8") as stream:
                 csv.writer(stream).writerows([table.header, *table.text()])
-        jinja2 = require("jinja2")
-        template = jinja2.Environment(autoescape=True).from_string(
+        environment = require("jinja2").Environment(autoescape=True)
+        environment.filters["unbroken"] = unbroken
+        template = environment.from_string(
             (Path(__file__).parent / "templates" / "report.html").read_text(encoding="utf-8")
         )
         page = folder / "index.html"
         page.write_text(template.render(vars(self) | {"configuration": configuration}), encoding="utf-8")
         return page
+
+
+def unbroken(text: str) -> Any:
+    """HTML of a text whose figures keep their interval and unit on one line."""
+    kept = _FIGURE.sub(r'<span class="figure">\g<0></span>', html.escape(str(text)))
+    return require("jinja2.utils").markupsafe.Markup(kept)
 
 
 def versions() -> dict[str, str]:

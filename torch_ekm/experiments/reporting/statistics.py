@@ -100,7 +100,7 @@ class Estimate:
 
     def __format__(self, spec: str) -> str:
         mean, low, high = (format(x, spec or ".3g") for x in (self.mean, self.low, self.high))
-        return f"{mean} [{low}, {high}]"
+        return mean if self.n < 2 else f"{mean} [{low}, {high}]"  # one unit has no interval
 
     def __str__(self) -> str:
         return format(self)
@@ -197,16 +197,35 @@ def paired_test(ours: Array, theirs: Array) -> PairedTest | None:
     """
     if len(ours) < 2:
         return None
-    stats = require("scipy.stats")
+    t = require("scipy.stats").t
     ours, theirs = _clean((ours, theirs))
     difference = ours - theirs
-    spread = difference.std(ddof=1)
+    spread = _spread(difference)
     if spread == 0:  # a t-test of a constant is undefined; say what it means
         p = float(difference[0] == 0)
         return PairedTest(p, p, 0.0)
-    paired = stats.ttest_rel(ours, theirs).pvalue
-    welch = stats.ttest_ind(ours, theirs, equal_var=False).pvalue
-    return PairedTest(float(welch), float(paired), float(difference.mean() / spread))
+    n, mean = len(difference), float(difference.mean())
+    paired = 2 * t.sf(abs(mean) / (spread / np.sqrt(n)), n - 1)
+    error, freedom = _welch(ours, theirs)
+    welch = 2 * t.sf(abs(mean) / error, freedom) if error > 0 else float(mean == 0)
+    return PairedTest(float(welch), float(paired), mean / spread)
+
+
+def _spread(values: Array) -> float:
+    """Standard deviation; 0 where the values differ by rounding alone."""
+    spread = float(values.std(ddof=1))
+    return spread if spread > 1e-12 * np.abs(values).max() else 0.0
+
+
+def _welch(ours: Array, theirs: Array) -> tuple[float, float]:
+    """Standard error of the difference of means, and Welch's degrees of freedom::
+
+    s^2 = v_1 / n_1 + v_2 / n_2,  nu = s^4 / (v_1^2 / (n_1^2 (n_1 - 1)) + v_2^2 / (n_2^2 (n_2 - 1)))
+    """
+    a, b = (_spread(values) ** 2 / len(values) for values in (ours, theirs))
+    if a + b == 0:
+        return 0.0, float("nan")
+    return float(np.sqrt(a + b)), (a + b) ** 2 / (a**2 / (len(ours) - 1) + b**2 / (len(theirs) - 1))
 
 
 @dataclass(frozen=True)
@@ -228,17 +247,17 @@ class LearningCurve:
 
 def learning_curve(ours: Array, theirs: Array) -> LearningCurve:
     """Test the first k trials for every k: from where on is ours significantly better for good?"""
-    stats = require("scipy.stats")
+    t = require("scipy.stats").t
     ours, theirs = _clean((ours, theirs))
     p, upper = np.full(len(ours), np.nan), np.full(len(ours), np.nan)
     for k in range(2, len(ours) + 1):
-        if np.ptp(ours[:k]) + np.ptp(theirs[:k]) == 0:
-            p[k - 1] = float(ours[0] >= theirs[0])
-            upper[k - 1] = ours[0] - theirs[0]
+        difference = float(ours[:k].mean() - theirs[:k].mean())
+        error, freedom = _welch(ours[:k], theirs[:k])
+        if error == 0:  # both are constant
+            p[k - 1], upper[k - 1] = float(difference >= 0), difference
             continue
-        test = stats.ttest_ind(ours[:k], theirs[:k], equal_var=False, alternative="less")
-        p[k - 1] = test.pvalue
-        upper[k - 1] = test.confidence_interval(1 - ALPHA).high
+        p[k - 1] = t.cdf(difference / error, freedom)
+        upper[k - 1] = difference + t.ppf(1 - ALPHA, freedom) * error
     negative = np.flatnonzero(~(p <= ALPHA))  # k = 1 cannot be tested and counts as negative
     return LearningCurve(p, upper, int(negative[-1]) + 1 if negative.size else 0)
 

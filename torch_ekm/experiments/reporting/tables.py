@@ -18,6 +18,24 @@ from .statistics import BAND_DEG, LEAST_SEEDS, Array, Estimate, Value, bootstrap
 Trials = Sequence[TrialRecord]
 
 _PAIRS = (("E-KM", "KM"), ("E-KM", "KM+I"), ("E-KM", "KM+S"))
+#: What each controller is, in a line.
+LEGEND = {
+    "KM": "the kinematic model alone; increments are added to what the encoders read",
+    "KM+I": "the same model with integral action: increments add up on the set-point; it learns nothing",
+    "KM+S": "the same model on the servo inverse, which finds the dead zones of the motors on the encoders",
+    "E-KM": "the kinematic model and what was learned of its errors, on the same servo inverse",
+}
+_MEANINGS = {
+    StopReason.REACHED: "the measured error stays within the tolerance",
+    StopReason.STALLED: "the error falls no further",
+    StopReason.STEP_LIMIT: "all motions are used up",
+    StopReason.ACTUATOR_LIMITS: "the motors that are needed are at the ends of their ranges",
+    StopReason.UNSTABLE_GRASP: "the model says that the grasp is about to buckle",
+    StopReason.GIVEN_UP: "the grasp came too near to a loss, and the way back did not help",
+    StopReason.OUT_OF_REACH: "declined before anything moved",
+    StopReason.OBJECT_LOST: "the object was dropped, or turned off the axis beyond help",
+    StopReason.FORCE_CEILING: "a fingertip pressed harder than the guard allows",
+}
 
 
 @dataclass(frozen=True)
@@ -57,32 +75,51 @@ def by_controller(records: Sequence[Record], kind: str = "turn") -> dict[str, li
     return {name: mine for name, mine in found.items() if mine}
 
 
-def controller_table(records: Sequence[Record], limit: int) -> Table:
-    """Every controller on the same seeds and grasps."""
-    step = LimitingFunction().step / DEGREE
-    beyond = stats.beyond_least(limit, step)
+def legend(records: Sequence[Record]) -> dict[str, str]:
+    """What the controllers are that took part."""
+    there = {r.controller for r in records}
+    return {name: line for name, line in LEGEND.items() if name in there}
+
+
+def controller_table(records: Sequence[Record]) -> Table:
+    """How the turns of every controller ended, on the same seeds and grasps."""
     columns: dict[Column, Callable[[Trials], Cell]] = {
-        Column("steady-state error"): lambda mine: stats.estimate(mine, steady_state_error),
-        Column("survivors"): lambda mine: stats.estimate(mine, stats.survivor_error),
-        Column("median"): lambda mine: float(np.median([steady_state_error(r) for r in mine])),
-        Column("motions", ".1f"): lambda mine: stats.estimate(mine, lambda r: r.steps),
-        Column("beyond the least", ".1f"): lambda mine: stats.estimate(mine, beyond),
-        Column("first motion"): lambda mine: stats.estimate(mine, lambda r: r.first_step_deg),
-        Column("of all motions"): lambda mine: stats.estimate(mine, lambda r: r.step_error_deg),
-        Column("off-axis rotation", ".1f"): lambda mine: stats.estimate(mine, survivors_off_axis),
+        Column("steady-state error [deg]"): lambda mine: stats.estimate(mine, steady_state_error),
+        Column("survivors [deg]"): lambda mine: stats.estimate(mine, stats.survivor_error),
+        Column("median [deg]"): lambda mine: float(np.median([steady_state_error(r) for r in mine])),
         Column("reached"): lambda mine: stats.rate(r.reason == StopReason.REACHED.value for r in mine),
         Column("given up"): lambda mine: stats.rate(r.given_up for r in mine),
         Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
     }
     note = (
-        "Mean and 95 % bootstrap interval over seeds; angles in degrees, steady-state errors by the "
-        "simulation's truth. A lost object counts with the whole angle that was asked for; 'survivors' "
-        f"leaves it out. Beyond the least: motions until the measured error stays within {BAND_DEG:g} deg, "
-        f"less the angle over {step:g} deg, rounded up; a turn that never settles counts with the limit. "
-        "Given up: the object is in the hand, but not where it was to be. Intervals of rates are Wilson's."
+        "Mean and 95 % bootstrap interval over seeds; steady-state errors by the simulation's truth. A lost "
+        "object counts with the whole angle that was asked for; 'survivors' leaves it out. Given up: the "
+        "object is in the hand, but not where it was to be. Intervals of rates are Wilson's."
     )
     items = by_controller(records)
     return Table.of("controllers", "All turns of each controller", "controller", items, columns, note)
+
+
+def motion_table(records: Sequence[Record], limit: int) -> Table:
+    """What the motions of every controller were worth."""
+    step = LimitingFunction().step / DEGREE
+    beyond = stats.beyond_least(limit, step)
+    columns: dict[Column, Callable[[Trials], Cell]] = {
+        Column("motions", ".1f"): lambda mine: stats.estimate(mine, lambda r: r.steps),
+        Column("beyond the least", ".1f"): lambda mine: stats.estimate(mine, beyond),
+        Column("first motion [deg]"): lambda mine: stats.estimate(mine, lambda r: r.first_step_deg),
+        Column("all motions [deg]"): lambda mine: stats.estimate(mine, lambda r: r.step_error_deg),
+        Column("off the axis [deg]", ".1f"): lambda mine: stats.estimate(mine, survivors_off_axis),
+    }
+    note = (
+        "Mean and 95 % bootstrap interval over seeds. Beyond the least: motions until the measured error "
+        f"stays within {BAND_DEG:g} deg, less the angle over {step:g} deg, rounded up; a turn that never "
+        "settles counts with the limit. First motion, all motions: by how much more or less a motion changed "
+        "the error than it was to. Off the axis: rotation at the end, of objects that were not lost."
+    )
+    return Table.of(
+        "motions", "The motions of each controller", "controller", by_controller(records), columns, note
+    )
 
 
 def survivors_off_axis(record: TrialRecord) -> float | None:
@@ -91,16 +128,24 @@ def survivors_off_axis(record: TrialRecord) -> float | None:
 
 
 def reason_table(records: Sequence[Record]) -> Table:
-    """Why the controllers stopped, with the true error of each kind."""
+    """Why the turns of each controller ended, and how far from the target."""
+    found = [name for name in CONTROLLERS if any((r.controller, r.kind) == (name, "turn") for r in records)]
     rows: list[list[Cell]] = []
-    for name in CONTROLLERS:
-        for reason in [*(reason.value for reason in StopReason), NotGrasped.reason]:
+    for reason in [*(reason.value for reason in StopReason), NotGrasped.reason]:
+        cells: list[Cell] = []
+        for name in found:
             those = [r for r in records if (r.controller, r.kind, r.reason) == (name, "turn", reason)]
             errors = [r.true_error_deg for r in stats.select(those) if not r.lost]
-            if those:
-                rows.append([name, reason, len(those), float(np.mean(errors)) if errors else None])
-    columns = ["controller", "reason", "turns", "mean true error [deg]"]
-    return Table("stop_reasons", "Why the controllers stopped", columns, rows)
+            off = f" ({np.mean(errors):.2f})" if errors else ""
+            cells.append(f"{len(those)}{off}" if those else "-")
+        if any(cell != "-" for cell in cells):
+            meaning = "no pinch held the object"
+            if reason != NotGrasped.reason:
+                meaning = _MEANINGS.get(StopReason(reason), "a guard stopped it")
+            rows.append([reason, *cells, meaning])
+    columns = ["reason", *(f"{name}: turns (error [deg])" for name in found), "what it means"]
+    note = "Turns, and in brackets the mean true error at their end; none of lost objects."
+    return Table("stop_reasons", "Why the turns ended", columns, rows, note)
 
 
 def comparison_table(records: Sequence[Record], limit: int) -> Table:
@@ -109,8 +154,8 @@ def comparison_table(records: Sequence[Record], limit: int) -> Table:
         "steady-state error": ("turn", steady_state_error),
         "motions to settle": ("turn", stats.settle_steps(limit)),
         "error of the first motion": ("turn", lambda r: r.first_step_deg),
-        "error of all motions": ("turn", lambda r: r.step_error_deg),
-        "off-axis rotation": ("turn", survivors_off_axis),
+        "error of a motion": ("turn", lambda r: r.step_error_deg),
+        "rotation off the axis": ("turn", survivors_off_axis),
         "error of one long step": ("long step", steady_state_error),
         "steady-state error, camera off": ("camera off", steady_state_error),
     }
@@ -124,7 +169,7 @@ def comparison_table(records: Sequence[Record], limit: int) -> Table:
         for ours, theirs in pairs:
             row += ratio_and_p(*paired(records, ours, theirs, value, kind), n_seeds)
         rows.append(row)
-    columns: list[Column | str] = [""]
+    columns: list[Column | str] = ["ratio of"]
     for pair in map(" : ".join, pairs):
         columns += [Column(f"{pair} [%]", ".0f", percent=True), Column(f"p, {pair}", ".1g")]
     note = (
@@ -179,7 +224,7 @@ def prediction_table(records: Sequence[Record]) -> Table:
     columns: list[Column | str] = ["object"]
     for what in ("measured", "true"):
         ratio = Column(f"E-KM:KM, {what} [%]", ".0f", percent=True)
-        columns += [f"KM, {what}", f"E-KM, {what}", ratio]
+        columns += [f"KM, {what} [deg]", f"E-KM, {what} [deg]", ratio]
     note = (
         "Mean |M_c (ds - prediction)| [deg], the prediction made before the learner trains on the motion. "
         "'Measured' includes the camera's noise, which no model can predict; 'true' does not."
@@ -206,22 +251,38 @@ def timing_table(records: Sequence[Record]) -> Table:
 
 
 def verdict(records: Sequence[Record], seeds: Sequence[int]) -> str:
-    """What the E-KM is worth beside the others, in one sentence; none from too few seeds."""
-    never = [f"{name} was never grasped ({why})" for name, why in _never_grasped(records).items()]
-    if len(seeds) < LEAST_SEEDS:
-        return ". ".join([*never, which_seeds(seeds)])
-    ours, theirs = paired(records, "E-KM", "KM", steady_state_error)
-    parts = []
-    if len(ours) and theirs.mean() > 0:
-        parts.append(f"Steady-state error E-KM : KM {100 * bootstrap_ratio(ours, theirs):.0f} %")
-        for name, mine in by_controller(records).items():
-            if name != "KM":
-                lost, given_up = sum(r.lost for r in mine), sum(r.given_up for r in mine)
-                parts.append(f"{name}: {lost} lost, {given_up} given up of {len(mine)}")
+    """How far from the target each controller ends, what was lost and given up, and from enough seeds the
+    ratios of the E-KM to the others."""
+    turns, parts = by_controller(records), []
+    order = [name for name in ("E-KM", "KM+S", "KM+I", "KM") if name in turns]
+    ends = [f"{name} {stats.estimate(turns[name], steady_state_error):.2f} deg" for name in order]
+    if ends:
+        first = ends[0].replace(" ", " ends ", 1) + " from the target"
+        failed = [
+            f"{name} {sum(r.lost for r in turns[name])} and {sum(r.given_up for r in turns[name])} "
+            f"of {len(turns[name])}"
+            for name in order
+        ]
+        parts.append(f"The {', '.join([first, *ends[1:]])}, on {_counted(len(seeds), 'seed')}.")
+        parts.append(f"Objects lost and turns given up: {', '.join(failed)}.")
     ours, theirs = prediction_means(records)
     if len(ours):
-        parts.append(f"prediction error on the same motions {100 * bootstrap_ratio(ours, theirs):.0f} %")
-    return "; ".join([*parts, *never] or ["Nothing to compare"]) + f". {which_seeds(seeds)}"
+        wrong = f"{stats.bootstrap_mean(ours):.2f} deg, the KM by {stats.bootstrap_mean(theirs):.2f} deg"
+        parts.append(f"One motion ahead the E-KM is wrong by {wrong} on the same motions.")
+    if len(seeds) >= LEAST_SEEDS:
+        ratios = []
+        for name in order[1:]:
+            ours, theirs = paired(records, "E-KM", name, steady_state_error)
+            if order[0] == "E-KM" and len(ours) and theirs.mean() > 0:
+                ratios.append(f"{name} {100 * bootstrap_ratio(ours, theirs):.0f} %")
+        if ratios:
+            parts.append(f"Error of the E-KM over that of {', '.join(ratios)} (paired).")
+    parts += [f"{name} was never grasped ({why})." for name, why in _never_grasped(records).items()]
+    return f"{' '.join(parts) or 'Nothing to compare.'} {which_seeds(seeds)}"
+
+
+def _counted(n: int, what: str) -> str:
+    return f"{n} {what}{'' if n == 1 else 's'}"
 
 
 def _never_grasped(records: Sequence[Record]) -> Mapping[str, str]:
@@ -236,4 +297,5 @@ def which_seeds(seeds: Sequence[int]) -> str:
     few = f" Fewer than {LEAST_SEEDS} seeds: no verdict." if len(seeds) < LEAST_SEEDS else ""
     development = min(seeds) < FIRST_REPORTED
     tuned = " Development seeds: figures may have been tuned on them." if development else ""
-    return f"{len(seeds)} seeds, {seeds[0]} to {seeds[-1]}.{few}{tuned}"
+    which = f"Seed {seeds[0]}." if len(seeds) == 1 else f"Seeds {seeds[0]} to {seeds[-1]}."
+    return f"{which}{few}{tuned}"
