@@ -8,8 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
-import matplotlib.style
+import matplotlib.pyplot as plt
 import pytest
 from typer.testing import CliRunner
 
@@ -86,13 +85,13 @@ def test_figures_have_the_style_of_the_package(name: str) -> None:
 
 
 def test_the_package_draws_in_its_style_and_leaves_the_others_alone() -> None:
-    before = dict(mpl.rcParams)
+    before = dict(plt.rcParams)
     figure, axes = new_figure(4.0, 3.0, columns=2)
     assert not any(axis.spines["top"].get_visible() for axis in axes)
     assert figure.get_layout_engine() is not None
-    assert dict(mpl.rcParams) == before
-    with mpl.style.context("torch_ekm.style"):  # by its name, as notebooks use it
-        assert mpl.rcParams["svg.hashsalt"] == "torch_ekm"
+    assert dict(plt.rcParams) == before
+    with plt.style.context("torch_ekm.style"):  # by its name, as notebooks use it
+        assert plt.rcParams["svg.hashsalt"] == "torch_ekm"
 
 
 def test_copies(tmp_path: Path) -> None:
