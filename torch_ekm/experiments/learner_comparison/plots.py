@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _BLUE, _GREY = "#0072B2", "#7f7f7f"
+_CYCLE = ("#7f7f7f", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#0072B2", "#56B4E9", "#000000")
 
 
 def colour_of(learner: str) -> str:
@@ -65,8 +66,7 @@ def plot_learning_curves(
     n = len(one) - one.warm_up
     edges = np.linspace(0, n, min(windows, n // 5) + 1).astype(int)
     middle = one.warm_up + 0.5 * (edges[1:] + edges[:-1])
-    for name in learners or comparison.learners:
-        colour = _GREY if name == "model alone" else None  # None: the next of the style
+    for name, colour in zip(learners or comparison.learners, _CYCLE * 3, strict=False):
         total = np.concatenate([[0.0], np.cumsum(comparison.errors[stream, name])])
         rms = np.sqrt(np.diff(total[edges]) / np.diff(edges))
         axis.plot(middle, rms, color=colour, linewidth=1.4, label=name)
