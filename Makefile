@@ -23,7 +23,7 @@ demo: install
 test: install
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
-# executed in place, with their outputs; 04 wants TORCH_EKM_DATA, 05 TORCH_EKM_REPORTS (docs: the notebooks)
+# executed in place, outputs stored; 04 reads recordings in TORCH_EKM_DATA, 05 finished runs in TORCH_EKM_REPORTS
 NBCONVERT := $(BIN)/jupyter nbconvert --to notebook --inplace
 notebooks: install
 	$(NBCONVERT) --execute --ExecutePreprocessor.record_timing=False --ExecutePreprocessor.timeout=1800 \
