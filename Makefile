@@ -34,11 +34,12 @@ test-fast: install
 docs: install
 	$(BIN)/python -m sphinx -E -W -n --keep-going docs docs/_build/html
 
-# 01 to 03 are run, 04 to 06 keep their outputs: they are the evidence
+# executed in place, outputs stored; 04 reads recordings in TORCH_EKM_DATA, 05 finished runs in TORCH_EKM_REPORTS
+NBCONVERT := $(BIN)/jupyter nbconvert --to notebook --inplace
 notebooks: install
-	$(BIN)/python -m pytest -o addopts="" -o timeout=1800 --nbmake --nbmake-timeout=1800 $(wildcard notebooks/0[123]*.ipynb)
-	$(BIN)/jupyter nbconvert --to notebook --execute --inplace --ExecutePreprocessor.record_timing=False \
-		--ExecutePreprocessor.timeout=1800 $(wildcard notebooks/0[456]*.ipynb)
+	$(NBCONVERT) --execute --ExecutePreprocessor.record_timing=False --ExecutePreprocessor.timeout=1800 \
+		$(wildcard notebooks/*.ipynb)
+	$(NBCONVERT) --coalesce-streams $(wildcard notebooks/*.ipynb)
 
 notebooks-smoke: install
 	TORCH_EKM_SMOKE=1 $(BIN)/python -m pytest -o addopts="" -o timeout=600 --nbmake --nbmake-timeout=600 notebooks

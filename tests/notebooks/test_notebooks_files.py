@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
+import matplotlib.pyplot as plt
 import pytest
 from typer.testing import CliRunner
 
@@ -15,31 +19,79 @@ from torch_ekm.experiments.reporting.notebook import (
     notebook_folder,
     smoke_mode,
 )
+from torch_ekm.experiments.reporting.plots import new_figure
 from torch_ekm.experiments.reporting.report import Table
 
 NAMES = sorted(path.name for path in notebook_folder().glob("*.ipynb"))
-EVIDENCE = ("04_", "05_", "06_")  # their outputs are kept
+LARGEST = 600_000  # bytes of a stored notebook: it is read where it lies, and is a page of the site
+
+
+def cells_of(name: str) -> list[dict[str, Any]]:
+    """Cells of a notebook."""
+    return json.loads((notebook_folder() / name).read_text(encoding="utf-8"))["cells"]
+
+
+def outputs_of(cell: dict[str, Any]) -> list[dict[str, Any]]:
+    """Outputs of a cell; those of text have none."""
+    return cell.get("outputs", [])
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_outputs_are_kept_only_where_they_are_the_evidence(name: str) -> None:
-    notebook = json.loads((notebook_folder() / name).read_text(encoding="utf-8"))
-    code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
-    if name.startswith(EVIDENCE):
-        kinds = {output["output_type"] for cell in code for output in cell["outputs"]}
-        assert "display_data" in kinds or "execute_result" in kinds
-        assert "error" not in kinds
-    else:
-        assert not any(cell["outputs"] for cell in code)
+def test_outputs_are_stored(name: str) -> None:
+    assert (notebook_folder() / name).stat().st_size < LARGEST
+    code = [cell for cell in cells_of(name) if cell["cell_type"] == "code"]
+    numbers = [cell["execution_count"] for cell in code]
+    assert numbers == list(range(1, len(code) + 1))  # in one go, from top to bottom
+    for output in (output for cell in code for output in outputs_of(cell)):
+        assert output["output_type"] != "error"
+        assert output.get("name") != "stderr", output["text"]
+        assert not any("widget" in kind for kind in output.get("data", {}))
+        text = json.dumps(output)
+        assert "/tmp/" not in text
+        assert "/home/" not in text
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_picture_comes_early(name: str) -> None:
-    cells = json.loads((notebook_folder() / name).read_text(encoding="utf-8"))["cells"]
-    assert cells[0]["cell_type"] == "markdown"
-    assert "".join(cells[0]["source"]).startswith(f"# {int(name[:2])}. ")
-    early = "".join("".join(cell["source"]) for cell in cells[:7])
-    assert "plot" in early or "view(" in early
+def test_it_opens_with_a_picture(name: str) -> None:
+    title, first, said = cells_of(name)[:3]
+    assert "".join(title["source"]).startswith(f"# {int(name[:2])}. ")
+    kinds = {kind for output in outputs_of(first) for kind in output.get("data", {})}
+    assert "image/png" in kinds
+    assert "\nYou learn " in "".join(said["source"])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_title_and_no_level_is_skipped(name: str) -> None:
+    levels, lines = [], []
+    for cell in cells_of(name):
+        if cell["cell_type"] == "markdown":
+            text = re.sub(r"```.*?```", "", "".join(cell["source"]), flags=re.DOTALL)
+            levels += [len(mark) for mark in re.findall(r"^(#+) ", text, flags=re.MULTILINE)]
+            lines += text.splitlines()
+    assert levels[0] == 1
+    assert 1 not in levels[1:]
+    assert all(after <= before + 1 for before, after in pairwise(levels))
+    assert not any(
+        re.search(r"\]\((?!https://)", line) for line in lines
+    )  # a page of the site lies elsewhere
+    assert all(line.count("|") <= 9 for line in lines if line.startswith("|"))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_figures_have_the_style_of_the_package(name: str) -> None:
+    code = "".join("".join(cell["source"]) for cell in cells_of(name) if cell["cell_type"] == "code")
+    assert "rcParams" not in code
+    assert ('plt.style.use("torch_ekm.style")' in code) == ("import matplotlib.pyplot" in code)
+
+
+def test_the_package_draws_in_its_style_and_leaves_the_others_alone() -> None:
+    before = dict(plt.rcParams)
+    figure, axes = new_figure(4.0, 3.0, columns=2)
+    assert not any(axis.spines["top"].get_visible() for axis in axes)
+    assert figure.get_layout_engine() is not None
+    assert dict(plt.rcParams) == before
+    with plt.style.context("torch_ekm.style"):  # by its name, as notebooks use it
+        assert plt.rcParams["svg.hashsalt"] == "torch_ekm"
 
 
 def test_copies(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ def plot_scores(comparison: Comparison) -> Figure:
         axis.set_title(stream.name, loc="left", fontsize=10)
         axis.set_xlim(0, min(max(1.15, 1.1 * max(score.rms.mean for score in scores)), 2.0))
         axis.grid(axis="y", visible=False)
-        axis.grid(axis="x", color="0.9", linewidth=0.8)
+        axis.grid(axis="x")
     for axis in axes[::columns]:
         axis.set_yticks(y, comparison.learners, fontsize=8)
     axes[0].set_ylim(len(comparison.learners) - 0.4, -0.6)  # shared by all panels

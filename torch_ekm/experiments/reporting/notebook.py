@@ -25,14 +25,15 @@ def smoke_mode() -> bool:
 
 @dataclass
 class HandView:
-    """A scene as the last line of a notebook cell: to turn and zoom where that works, a picture elsewhere."""
+    """A scene as the last line of a notebook cell: a picture, or a page to turn and zoom."""
 
     scene: Scene
     """See :func:`~torch_ekm.rendering.make_scene`."""
     frames: tuple[int, ...] = (0,)
     """Of the picture, side by side."""
-    interactive: bool = True
-    """Also offer the page with all frames (viser). Without viser: the picture only."""
+    interactive: bool = False
+    """Also offer the page with all frames (viser): megabytes in a notebook that is stored. Without viser:
+    the picture only."""
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
         bundle = {"text/plain": "HandView"}

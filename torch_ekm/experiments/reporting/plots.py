@@ -21,20 +21,19 @@ if TYPE_CHECKING:
     from ...model import Calibration
 
 
+#: Of every figure, as in ``plt.style.use("torch_ekm.style")``: the file ``style.mplstyle`` of the package.
+STYLE = "torch_ekm.style"
 #: Okabe and Ito's palette, safe for colour-blind readers; grey for what is compared against.
 COLOURS = {"KM": "#7f7f7f", "KM+I": "#E69F00", "KM+S": "#009E73", "E-KM": "#0072B2", "limit": "#D55E00"}
 _MARKERS = {"KM": "s", "KM+I": "D", "KM+S": "^", "E-KM": "o"}
 
 
 def new_figure(width: float, height: float, columns: int = 1, rows: int = 1, sharey: bool = False):
-    """A figure of this size [inch], and its axes row by row."""
-    # a Figure of its own: pyplot would keep it alive and touch the caller's backend
-    figure = require("matplotlib.figure").Figure(figsize=(width, height), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, sharey=sharey)
-    for axis in axes.flat:
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.grid(axis="y", color="0.9", linewidth=0.8)
-        axis.set_axisbelow(True)
+    """A figure of this size [inch] in :data:`STYLE`, and its axes row by row."""
+    with require("matplotlib.style").context(STYLE):
+        # a Figure of its own: pyplot would keep it alive and touch the caller's backend
+        figure = require("matplotlib.figure").Figure(figsize=(width, height))
+        axes = figure.subplots(rows, columns, squeeze=False, sharey=sharey)
     return figure, axes.ravel().tolist()
 
 
@@ -42,8 +41,8 @@ def save_figure(figure: Figure, folder: Path, name: str, caption: str = "") -> F
     """Write ``name.svg`` and ``name.png`` into ``folder``, which is made if it is not there."""
     make_folder(folder)
     # the same figure gives the same files: identifiers of an SVG would be drawn at random, and dated
-    steady = require("matplotlib").rc_context({"svg.hashsalt": "torch_ekm"})
-    with told_as_output_error(folder / f"{name}.svg"), steady:
+    style = require("matplotlib.style").context(STYLE)
+    with told_as_output_error(folder / f"{name}.svg"), style:
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
         figure.savefig(folder / f"{name}.png", dpi=150)
     return FigureFile(f"{name}.svg", caption)
