@@ -16,6 +16,7 @@ import argparse
 import datetime
 import json
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -96,11 +97,9 @@ def measure(part: Part, folder: Path, quick: bool, keep: bool) -> dict[str, str]
 
 
 def _demoted(report: Path) -> str:
-    """A report without its title, its headings one level deeper."""
-    lines = report.read_text(encoding="utf-8").splitlines()
-    return "\n".join(
-        f"#{line}" if line.startswith("#") else line for line in lines if not line.startswith("# ")
-    )
+    """A report without its title and figures, its headings one level deeper."""
+    text = re.sub(r"^# .*\n+|^!\[.*\n+\*.*\*\n+", "", report.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return re.sub(r"^#", "##", text, flags=re.MULTILINE)
 
 
 def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:

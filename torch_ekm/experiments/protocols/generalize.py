@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import zip_longest
 from pathlib import Path
 from typing import Self
 
@@ -198,9 +197,9 @@ class Generalize(Protocol):
 
     def angles_table(self) -> Table:
         """The rotations that were asked for (Table I)."""
-        angles = {object_name(item): map(float, self.angles_of(item)) for item in self.objects}
-        rows = [[k + 1, *row] for k, row in enumerate(zip_longest(*angles.values()))]
-        columns = ["trial", *(Column(f"{name} [deg]", "g") for name in angles)]
+        angles = {object_name(item): list(map(float, self.angles_of(item))) for item in self.objects}
+        rows = [[name, ", ".join(f"{angle:g}" for angle in turned)] for name, turned in angles.items()]
+        columns = ["object", "rotations [deg]"]
         return Table("angles", "Rotations that were asked for (Table I)", columns, rows)
 
 

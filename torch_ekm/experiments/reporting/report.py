@@ -121,9 +121,9 @@ class FigureFile:
 class Report:
     """What a run has to show.
 
-    ``write`` leaves ``index.html``, one CSV for each table, and ``configuration.json`` with the exact
-    configuration, versions and seeds. On the page the answer comes first, then the leading tables, the
-    figures, and the other tables, folded.
+    ``write`` leaves ``index.html``, the same as ``report.md``, one CSV for each table, and
+    ``configuration.json`` with the exact configuration, versions and seeds. On the page the answer comes
+    first, then the leading tables, the figures, and the other tables, folded.
     """
 
     title: str
@@ -153,14 +153,14 @@ class Report:
         for table in self.tables:
             with (folder / f"{table.name}.csv").open("w", newline="", encoding="utf-8") as stream:
                 csv.writer(stream).writerows([table.header, *table.text()])
-        environment = require("jinja2").Environment(autoescape=True)
-        environment.filters["unbroken"] = unbroken
-        template = environment.from_string(
-            (Path(__file__).parent / "templates" / "report.html").read_text(encoding="utf-8")
-        )
-        page = folder / "index.html"
-        page.write_text(template.render(vars(self) | {"configuration": configuration}), encoding="utf-8")
-        return page
+        jinja2, given = require("jinja2"), vars(self) | {"configuration": configuration}
+        for page, kind in (("report.md", "report.md"), ("index.html", "report.html")):
+            environment = jinja2.Environment(autoescape=kind.endswith("html"), keep_trailing_newline=True)
+            environment.filters["unbroken"] = unbroken
+            template = (Path(__file__).parent / "templates" / kind).read_text(encoding="utf-8")
+            text = environment.from_string(template).render(given)
+            (folder / page).write_text(text, encoding="utf-8")
+        return folder / "index.html"
 
 
 def unbroken(text: str) -> Any:
