@@ -8,7 +8,7 @@ from torch_ekm.control import ClosedLoop, Guards, LookAndMoveController, PoseTar
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.model import KinematicModel
-from torch_ekm.plant import Observation, PlantStatus
+from torch_ekm.plant import Observation, PlantStatus, Stamps
 from torch_ekm.simulation import SimulatedHand
 
 TICK = 2 * math.pi / 4096  # of an encoder [rad]
@@ -28,23 +28,25 @@ class FakeBus(SimulatedHand):
 
 class RealHand:  # the Plant protocol: reset, observe, command, close
     def __init__(self, bus: FakeBus) -> None:
-        self.bus = bus
+        self.bus, self.pose, self.dated = bus, None, 0.0
 
-    def reset(self, seed: int) -> Observation:  # a person puts the object between the fingers
+    def reset(self, seed: int) -> Observation:  # a person puts the object between the fingers, in view
         return self.observe()
 
     def observe(self) -> Observation:  # SI units, hand frame, dated by one clock
         seen = self.bus.read()
-        self.pose = seen["pose"] or self.pose  # an old one if the camera sees nothing
-        status = PlantStatus.HELD if seen["pose"] else PlantStatus.NOT_SEEN
-        return Observation(seen["q"], seen["ticks"] * TICK, *self.pose, time=seen["t"], status=status)
+        now, status = seen["t"], PlantStatus.HELD if seen["pose"] else PlantStatus.NOT_SEEN
+        if seen["pose"]:  # else the old one with its old stamp
+            self.pose, self.dated = seen["pose"], now
+        q, a, stamps = seen["q"], seen["ticks"] * TICK, Stamps(now, now, self.dated, now)
+        return Observation(q, a, *self.pose, time=now, status=status, stamps=stamps)
 
     def command(self, delta_a: torch.Tensor) -> Observation:  # [rad], relative to the encoders
         self.bus.move(self.bus.read()["ticks"] + torch.as_tensor(delta_a) / TICK)
         return self.observe()
 
     def close(self) -> None:
-        self.command(torch.zeros(2))  # hold
+        self.bus.move(self.bus.read()["ticks"])  # hold
 
 
 if __name__ == "__main__":
@@ -54,7 +56,6 @@ if __name__ == "__main__":
     seen = plant.reset(seed=0)
     model = KinematicModel(load_hand("planar_two_finger"), load_object("can"))
     controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), focus=axis)
-    result = ClosedLoop(plant, controller, guards=Guards()).run(
-        PoseTarget.turned(seen.state, axis, degrees=8)
-    )
+    target = PoseTarget.turned(seen.state, axis, degrees=8)
+    result = ClosedLoop(plant, controller, guards=Guards()).run(target)
     print(f"{result.reason.value}, {math.degrees(result.errors[-1]):.2f} deg off", result.stop.message)

@@ -107,3 +107,24 @@ def test_learner_as_sure_of_one_action_as_of_another_is_refused(learner: type) -
     x, weight = torch.ones(N_S + N_A, dtype=torch.float64), torch.ones(N_OUT, dtype=torch.float64)
     with pytest.raises(ParameterError, match=learner.__name__):
         action_variance(learner(N_S + N_A, N_OUT), x, N_A, weight)
+
+
+def test_the_law_of_a_measurement_has_the_noise_too():
+    torch.manual_seed(0)
+    learner = SparseOnlineGP(2, 1, noise_variance=0.04, standardize=False, parts=[])
+    ekm = EnhancedModel(lambda s, a: 2 * a, learner)
+    state, action = torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+    ekm.update(state, action, torch.tensor([2.3], dtype=torch.float64))
+    model, measured = ekm.predict(state, action), ekm.predict(state, action, observation=True)
+    assert torch.allclose(measured.mean, model.mean)
+    assert torch.allclose(measured.variance - model.variance, torch.tensor([0.04], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("action", "increment", "name"), [([1.0], None, "action"), (None, [1.0], "increment")]
+)
+def test_what_is_no_tensor_is_named(action, increment, name):
+    ekm = EnhancedModel(lambda s, a: 2 * a, SparseOnlineGP(2, 1))
+    one = torch.ones(1)
+    with pytest.raises(ParameterError, match=name):
+        ekm.update(one, action or one, increment or one)

@@ -274,7 +274,7 @@ def test_object_table_shows_means_ratios_and_losses() -> None:
     assert row["E-KM [deg]"].mean == pytest.approx(0.875)
     assert row["E-KM:KM [%]"].mean == pytest.approx(0.875 / 8)
     ends = dict(zip(ends_table(records).header, ends_table(records).rows[0], strict=True))
-    assert (ends["KM lost, given up"], ends["E-KM lost, given up"]) == ("1, 0", "0, 0")
+    assert (ends["KM lost, not reached"], ends["E-KM lost, not reached"]) == ("1, 0", "0, 0")
     assert table.text()[0][5] == "11 [" + table.text()[0][5].split("[")[1]  # in percent
     assert table.rows[-1][0] == "all"
     controllers = controller_table(records)
@@ -301,7 +301,10 @@ def test_the_answer_comes_in_a_sentence_with_losses_and_no_verdict_from_few_seed
     few, many = verdict(records(4), range(1000, 1004)), verdict(records(12), range(1000, 1012))
     assert few.startswith("The E-KM ends 5.15 [0.20, ")
     assert "from the target, KM+S 0.30 [0.30, 0.30] deg, KM " in few
-    assert "on 4 seeds. Objects lost and turns given up: E-KM 1 and 0 of 4, KM+S 0 and " in few
+    assert (
+        "on 4 seeds. Objects lost, and turns that did not reach the target: E-KM 1 and 0 of 4, KM+S 0 and "
+        in few
+    )
     assert "Fewer than 10 seeds: no verdict." in few
     assert "paired" not in few
     assert "Error of the E-KM over that of KM+S " in many

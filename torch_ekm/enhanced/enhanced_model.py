@@ -150,7 +150,13 @@ class EnhancedModel(Recorded, nn.Module):
         return nominal + self._scatter(mean, nominal)
 
     def nominal(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_s"]:
-        """``f(s, da)``, as a tensor of the action's dtype."""
+        """``f(s, da)``, as a tensor of the action's dtype.
+
+        Raises:
+            ParameterError: the action is no tensor.
+        """
+        if not isinstance(action, Tensor):
+            raise ParameterError("action", type(action).__name__, "a tensor: torch.as_tensor(action)")
         return torch.as_tensor(self.model(state, action)).to(action)
 
     @torch.no_grad()
@@ -175,7 +181,12 @@ class EnhancedModel(Recorded, nn.Module):
         Raises:
             NonFiniteError: an entry is NaN or infinite; nothing was changed.
             ShapeError: the increment has not the shape of the model's prediction.
+            ParameterError: action or increment is no tensor.
         """
+        if not isinstance(increment, Tensor):
+            raise ParameterError(
+                "increment", type(increment).__name__, "a tensor: torch.as_tensor(increment)"
+            )
         predicted = self.nominal(state, action) if nominal is None else nominal
         if increment.shape != predicted.shape:
             raise ShapeError(
@@ -270,10 +281,16 @@ class EnhancedModel(Recorded, nn.Module):
         mean, variance = g.mean / self.output_scale, g.variance / self.output_scale**2
         return self._scatter(mean, still), self._scatter(variance, still)
 
-    def predict(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> torch.distributions.Normal:
-        """Distribution of the learned outputs' increment, in the increment's unit."""
+    def predict(
+        self, state: Any, action: Float[Tensor, "*batch n_a"], *, observation: bool = False
+    ) -> torch.distributions.Normal:
+        """Distribution of the learned outputs' increment, in the increment's unit.
+
+        Args:
+            observation: of what will be measured, noise included; else of ``f + g`` alone.
+        """
         nominal = self._gather(self.nominal(state, action))
-        g = self.learner.predict(self.features(state, action))
+        g = self.learner.predict(self.features(state, action), observation=observation)
         mean, deviation = (value / self.output_scale for value in (g.mean, g.stddev))
         return torch.distributions.Normal(nominal + mean.to(nominal), deviation.abs().to(nominal))
 

@@ -27,6 +27,7 @@ from ..simulation.physics.bodies import x_axis_to
 _SURFACE = 2e-4  # [m] between a pad and its link's collision shape
 _LOW_MARGIN = 0.1  # of the friction cone
 _CONTRADICT = 1e4  # [N/rad]: 100 N for 0.6 deg; soft actuators have some hundreds
+_GENTLER = (3.0, 2.0, 1.0)  # [N] pinch forces that are tried where the usual one is too high
 _STABLE = 1e-6  # [N m/rad]; less is none
 _FRACTIONS = np.linspace(0.0, 1.0, 21)  # of an actuator's range
 
@@ -65,8 +66,10 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
         obj = load_object(object)
     except (EKMError, OSError) as error:
         return [*rows, Check("object's files", "error", str(error), "see docs/reference/file_formats.md")]
-    rows += [*_rigid(description), *_reach(description, obj), *_pinch(description, obj, picture)]
-    return rows
+    rows += [*_rigid(description), *_reach(description, obj)]
+    pinch = list(_pinch(description, obj, picture))
+    faulty = any(row.state == "error" for row in pinch)
+    return [*rows, *pinch, *(_gentler(description, obj) if faulty else ())]
 
 
 def _pads(hand: HandDescription) -> Iterator[Check]:
@@ -139,10 +142,21 @@ def _reach(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
         yield Check("limits", "ok", f"pads {names} come face to face, {1e3 * obj.grasp_width:.0f} mm apart")
 
 
-def _pinch(hand: HandDescription, obj: ObjectDescription, picture: Path | None) -> Iterator[Check]:
-    plant = lin = None
+def _gentler(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
+    """Springs that are too soft for the usual force may bear a smaller one."""
+    for force in _GENTLER:
+        if not any(row.state == "error" for row in _pinch(hand, obj, None, force)):
+            mend = f"PlantConfig(pinch_force={force:g}), or stiffer springs"
+            yield Check("pinch force", "warning", f"too high: the pinch is sound at {force:g} N", mend)
+            return
+
+
+def _pinch(
+    hand: HandDescription, obj: ObjectDescription, picture: Path | None, force: float | None = None
+) -> Iterator[Check]:
+    lin = seen = None
     try:
-        plant = SimulatedHand(hand, obj)
+        plant = SimulatedHand(hand, obj, PlantConfig() if force is None else PlantConfig(pinch_force=force))
         seen = plant.reset(0)  # as it is: the sensors have no noise
         assert seen.fingertip_force is not None  # of a simulated hand as described
         felt = zip(hand.pads, seen.fingertip_force.tolist(), strict=True)
@@ -156,7 +170,7 @@ def _pinch(hand: HandDescription, obj: ObjectDescription, picture: Path | None) 
     except MissingExtraError as error:
         yield Check("pinch", "warning", f"not tried: {error}")
     except EKMError as error:
-        what = "pinch" if plant is None or lin is None else "model"
+        what = "pinch" if seen is None else "model"
         yield Check(what, "error", str(error), "mend the rows above first, or give another object")
     if picture is not None:
         try:

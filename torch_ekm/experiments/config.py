@@ -106,6 +106,10 @@ class Setting:
         self.model_options()
         self.controller_parts()
 
+    def __str__(self) -> str:
+        seen = "camera images and Hall counts" if self.sensing else "true poses plus noise"
+        return f"simulated hand {Path(self.hand).stem}, preset {self.preset}, {seen}"
+
     def parameters(self) -> PlantParameters:
         """The plant's."""
         return preset(self.preset).replace(**self.plant)

@@ -95,7 +95,7 @@ class TrialRecord(Trial):
         return self.reason == StopReason.OBJECT_LOST.value
 
     @property
-    def given_up(self) -> bool:
+    def not_reached(self) -> bool:
         """The object is in the hand, but not where it was to be."""
         return not self.lost and self.reason != StopReason.REACHED.value
 

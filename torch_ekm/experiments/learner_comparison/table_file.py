@@ -26,7 +26,9 @@ def read_table(path: Path) -> tuple[tuple[str, ...], Array]:
     if not path.is_file():
         raise DescriptionError(path, "there is no such file")
     if path.suffix.lower() not in readers:
-        raise DescriptionError(path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet")
+        raise DescriptionError(
+            path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet (a ROS bag: load_own)"
+        )
     names, values = readers[path.suffix.lower()](path)
     for i, name in enumerate(names):
         if not name:

@@ -176,9 +176,11 @@ class Ablation(Protocol):
         mine = by_controller(self._records(base, seeds, results)).get("E-KM", [])
         if not mine:
             return "Nothing was grasped."
-        lost, given_up = sum(r.lost for r in mine), sum(r.given_up for r in mine)
+        lost, missed = sum(r.lost for r in mine), sum(r.not_reached for r in mine)
         text = f"The E-KM as it is ends {estimate(mine, steady_state_error):.2f} deg from the target; of "
-        return f"{text}{len(mine)} turns {lost} objects were lost and {given_up} turns given up."
+        return (
+            f"{text}{len(mine)} turns {lost} objects were lost and {missed} turns did not reach the target."
+        )
 
     def _records(self, variant: Variant, seeds: Sequence[int], results: Results[Record]) -> list[Record]:
         return [r for name in self._jobs_of(variant, seeds) for r in results[name]]
@@ -192,8 +194,8 @@ class Ablation(Protocol):
             row += [estimate(turns.get(name, []), steady_state_error) for name in _ALL]
             lost = [turns.get(name, []) for name in ("KM+I", "E-KM")]
             row += [rate(r.lost for r in mine) if mine else None for mine in lost]
-            rows.append([*row, rate(r.given_up for r in lost[-1]) if lost[-1] else None])
-        columns = [group, *(f"{name} [deg]" for name in _ALL), "KM+I lost", "E-KM lost", "E-KM given up"]
+            rows.append([*row, rate(r.not_reached for r in lost[-1]) if lost[-1] else None])
+        columns = [group, *(f"{name} [deg]" for name in _ALL), "KM+I lost", "E-KM lost", "E-KM not reached"]
         note = (
             f"{len(seeds)} seeds. Steady-state error by the truth, lost objects with the whole angle; 95 % "
             "bootstrap intervals over seeds."

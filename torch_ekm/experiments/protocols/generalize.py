@@ -249,14 +249,16 @@ def object_table(records: Sequence[Record]) -> Table:
 
 
 def ends_table(records: Sequence[Record]) -> Table:
-    """Lost objects and turns that were given up, for each object and controller."""
+    """Lost objects and turns that did not reach the target, for each object and controller."""
     rows: list[list[Cell]] = []
     names = list(tables.by_controller(records))
     for item, chosen in tables.by_object(records).items():
         by = [stats.select(chosen, controller=name, kind="turn") for name in names]
-        rows.append([item, *(f"{sum(r.lost for r in mine)}, {sum(r.given_up for r in mine)}" for mine in by)])
-    columns = ["object", *(f"{name} lost, given up" for name in names)]
-    return Table("ends", "Objects lost and turns given up", columns, rows)
+        rows.append(
+            [item, *(f"{sum(r.lost for r in mine)}, {sum(r.not_reached for r in mine)}" for mine in by)]
+        )
+    columns = ["object", *(f"{name} lost, not reached" for name in names)]
+    return Table("ends", "Objects lost, and turns that did not reach the target", columns, rows)
 
 
 def probe_table(records: Sequence[Record]) -> Table:

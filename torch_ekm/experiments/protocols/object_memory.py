@@ -184,14 +184,15 @@ class ObjectMemory(Protocol):
             _assignment_table(seeds, sessions),
             targets_table(self.targets(results)),
         ]
-        lost, given_up = (
-            rate(getattr(r, what) for s in sessions for r in s) for what in ("lost", "given_up")
+        lost, missed = (
+            rate(getattr(r, what) for s in sessions for r in s) for what in ("lost", "not_reached")
         )
         errors = [f"{_WORDS[name]} {bootstrap_mean(_means(sessions, name)):.3f} deg" for name in _WORDS]
         summary = (
             f"Turns that went to the right model without labels: {recognition(sessions)}. One-step "
-            f"prediction error: {', '.join(errors)}. Objects lost: {lost}; turns given up: {given_up}. "
-            f"{len(self.objects)} objects in random order, {self.turns_each} turns each. {which_seeds(seeds)}"
+            f"prediction error: {', '.join(errors)}. Objects lost: {lost}; turns that did not "
+            f"reach the target: {missed}. {len(self.objects)} objects in random order, {self.turns_each} "
+            f"turns each. {which_seeds(seeds)}"
         )
         return Report(
             "Object memory: familiar objects and new ones", summary, tables, figures, legend=_LEGEND

@@ -17,7 +17,7 @@ from ..records import Record
 from ..reporting import tables
 from ..reporting.plots import plot_learning_test, plot_prediction_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from ..reporting.statistics import Array, bootstrap_mean, learning_curve, select
+from ..reporting.statistics import LEAST_SEEDS, Array, bootstrap_mean, learning_curve, select
 from ..reporting.tables import Target
 from ..runner import Bench
 from .protocol import Protocol, Results, records_of
@@ -153,8 +153,9 @@ class Online(Protocol):
             tables.timing_table(records),
         ]
         what = f"{self.trials} turns of the {object_name(self.object)} for each seed and controller."
-        negative = shown[0].text()[0][2]
-        what += f" The E-KM predicts better for good after {negative} trials (the paper: 16)."
+        if len(seeds) >= LEAST_SEEDS:
+            negative = shown[0].text()[0][2]
+            what += f" The E-KM predicts better for good after {negative} trials (the paper: 16)."
         summary, legend = f"{tables.verdict(records, seeds)} {what}", tables.legend(records)
         return Report("Online manipulation: learning while turning", summary, shown, figures, legend=legend)
 
@@ -180,7 +181,10 @@ class Online(Protocol):
             ],
         ]
         columns = ["figure", "paper", Column("here, mean over seeds", ".2f"), "seeds"]
-        note = "After how many trials the E-KM predicts better for good, and by how much at least at the end."
+        note = (
+            "After how many trials the E-KM predicts better for good, and by how much at least at the end. "
+            "1: it predicts better from the first test on, which needs two trials."
+        )
         return Table("paper", "Figures of the paper and those found here", columns, rows, note)
 
     def learning_table(self, records: Sequence[Record], against_truth: bool = False) -> Table:
@@ -189,7 +193,7 @@ class Online(Protocol):
         items = dict(zip(map(str, sorted({r.seed for r in records})), curves, strict=True))
         if len(curves) > 1:
             ekm, km = (np.nanmean([curve[i] for curve in curves], axis=0) for i in (0, 1))
-            items["mean of seeds"] = ekm, km
+            items["of the seeds' mean errors"] = ekm, km
         rows: list[list[Cell]] = []
         for name, (ekm, km) in items.items():
             one = Learning.of(ekm, km, self.events)

@@ -125,10 +125,12 @@ def foresight_report(setting: Setting, seeds: Sequence[int], results: Results, f
 
 def _ends(turns: Turns) -> str:
     beyond = [r for r in turns if r.kind == "turn"]
-    given_up = (
-        f" ({sum(r.given_up for r in beyond)} of {len(beyond)} beyond Table I given up)" if beyond else ""
+    missed = (
+        f" ({sum(r.not_reached for r in beyond)} of {len(beyond)} beyond Table I not reached)"
+        if beyond
+        else ""
     )
-    return f"{sum(r.lost for r in turns)} of {len(turns)} turns{given_up}"
+    return f"{sum(r.lost for r in turns)} of {len(turns)} turns{missed}"
 
 
 def _answer(results: Results) -> str:
@@ -164,7 +166,7 @@ def far_table(results: Results) -> Table:
         ),
         Column("median [deg]", ".1f"): lambda mine: float(np.median([r.largest_deg for r in mine])),
         Column(f"paired, {ONE_STEP} = 1"): lambda mine: paired_ratio(results, mine[0].contender),
-        Column("given up"): lambda mine: stats.rate(r.given_up for r in mine),
+        Column("not reached"): lambda mine: stats.rate(r.not_reached for r in mine),
         Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
     }
     note = "The target is farther than any grasp goes; the largest true angle before the turn ended."
@@ -205,11 +207,11 @@ def beyond_table(results: Results) -> Table:
     columns: dict[Column, Callable[[Turns], Cell]] = {
         Column("turns"): len,
         Column("reached"): lambda mine: stats.rate(r.reason == StopReason.REACHED.value for r in mine),
-        Column("given up"): lambda mine: stats.rate(r.given_up for r in mine),
+        Column("not reached"): lambda mine: stats.rate(r.not_reached for r in mine),
         Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
         Column("declined"): lambda mine: sum(declined(r) for r in mine),
-        Column("of these lost or given up"): lambda mine: sum(
-            r.lost or r.given_up for r in mine if declined(r)
+        Column("of these lost or not reached"): lambda mine: sum(
+            r.lost or r.not_reached for r in mine if declined(r)
         ),
         Column("lost, not declined"): lambda mine: sum(r.lost for r in mine if not declined(r)),
     }

@@ -88,12 +88,12 @@ def controller_table(records: Sequence[Record]) -> Table:
         Column("survivors [deg]"): lambda mine: stats.estimate(mine, stats.survivor_error),
         Column("median [deg]"): lambda mine: float(np.median([steady_state_error(r) for r in mine])),
         Column("reached"): lambda mine: stats.rate(r.reason == StopReason.REACHED.value for r in mine),
-        Column("given up"): lambda mine: stats.rate(r.given_up for r in mine),
+        Column("not reached"): lambda mine: stats.rate(r.not_reached for r in mine),
         Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
     }
     note = (
         "Mean and 95 % bootstrap interval over seeds; steady-state errors by the simulation's truth. A lost "
-        "object counts with the whole angle that was asked for; 'survivors' leaves it out. Given up: the "
+        "object counts with the whole angle that was asked for; 'survivors' leaves it out. Not reached: the "
         "object is in the hand, but not where it was to be. Intervals of rates are Wilson's."
     )
     items = by_controller(records)
@@ -251,7 +251,7 @@ def timing_table(records: Sequence[Record]) -> Table:
 
 
 def verdict(records: Sequence[Record], seeds: Sequence[int]) -> str:
-    """How far from the target each controller ends, what was lost and given up, and from enough seeds the
+    """How far from the target each controller ends, what was lost and not reached, and from enough seeds the
     ratios of the E-KM to the others."""
     turns, parts = by_controller(records), []
     order = [name for name in ("E-KM", "KM+S", "KM+I", "KM") if name in turns]
@@ -259,12 +259,12 @@ def verdict(records: Sequence[Record], seeds: Sequence[int]) -> str:
     if ends:
         first = ends[0].replace(" ", " ends ", 1) + " from the target"
         failed = [
-            f"{name} {sum(r.lost for r in turns[name])} and {sum(r.given_up for r in turns[name])} "
+            f"{name} {sum(r.lost for r in turns[name])} and {sum(r.not_reached for r in turns[name])} "
             f"of {len(turns[name])}"
             for name in order
         ]
         parts.append(f"The {', '.join([first, *ends[1:]])}, on {_counted(len(seeds), 'seed')}.")
-        parts.append(f"Objects lost and turns given up: {', '.join(failed)}.")
+        parts.append(f"Objects lost, and turns that did not reach the target: {', '.join(failed)}.")
     ours, theirs = prediction_means(records)
     if len(ours):
         wrong = f"{stats.bootstrap_mean(ours):.2f} deg, the KM by {stats.bootstrap_mean(theirs):.2f} deg"
