@@ -122,8 +122,8 @@ def constructor_table(comparison: Comparison) -> Table:
         [name, call] for name in comparison.learners if (call := comparison.calls.get(name, ""))
     ]
     note = (
-        "d inputs, m outputs. The streams above are in units of their own first samples; in the units of your "
-        "own data leave standardize=False out."
+        "d inputs, m outputs. The streams above are in units of their own first samples; in the units of "
+        "your own data leave standardize=False out."
     )
     return Table("learners", "How they are made", ["learner", "call"], rows, note)
 
