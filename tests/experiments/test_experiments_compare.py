@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,8 @@ def test_a_linear_stream_is_won_by_the_linear_learner_and_we_say_so(compared: Co
     assert compared.best("linear").learner == "linear RLS"
     sentence = compared.verdicts()[0]
     assert "linear RLS is best" in sentence
-    assert "Our SOGP plain loses to linear RLS" in sentence
+    assert re.search(r"SOGP plain has [\d.]+ \[[\d.]+, [\d.]+\] times its error", sentence)
+    assert "read the median" not in sentence
     assert compared.ratio("linear", "SOGP plain", "linear RLS").low > 1
 
 
@@ -66,7 +68,8 @@ def test_tables_hold_the_scores(compared: Comparison) -> None:
     table = score_table(compared, "linear")
     row = next(row for row in table.rows if row[0].startswith("linear RLS"))
     assert row[0].endswith("*")
-    assert float(row[1]) == pytest.approx(compared.scores["linear", "linear RLS"].rms.mean, abs=5e-4)
+    assert row[1] == compared.scores["linear", "linear RLS"].rms
+    assert row[2] is None  # it is the best itself
     assert [row[0] for row in overview_table(compared).rows] == ["linear RLS", "SOGP plain", "model alone"]
 
 
@@ -264,7 +267,7 @@ def test_how_many_of_how_many_rows_were_used_is_told(tmp_path: Path) -> None:
     assert stream.used == "the first 50 of 60 rows"
     report = compare(stream, ("default", "linear RLS"))
     assert report.verdicts()[0].endswith("On the first 50 of 60 rows.")
-    assert "the default learner" in report.verdicts()[0] or "default is best" in report.verdicts()[0]
+    assert "default" in report.verdicts()[0]
     assert report.tables()[0].rows[0][0] in ("default", "default *")
 
 
@@ -323,7 +326,7 @@ def test_command_prints_and_writes_what_the_function_returns(tmp_path: Path) -> 
     direct = compare(path, ("linear RLS", "SOGP plain"))
     written = (out / "scores_mine.csv").read_text().splitlines()[1:]
     for line, score in zip(written, direct.row("mine"), strict=True):
-        assert line.split(",")[1] == f"{score.rms.mean:.3f}"
+        assert line.split(",")[1].strip('"').startswith(f"{score.rms.mean:.3f} [")
 
 
 def test_command_refuses_clearly(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -38,21 +37,6 @@ def damped_class(share: float) -> type[ResidualLearner]:
             return Normal(share * law.mean, law.stddev)
 
     return Damped
-
-
-def test_the_third_example_of_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-    (example,) = [block for block in blocks if "import compare" in block]
-    assert len(example.splitlines()) <= 12
-    monkeypatch.chdir(tmp_path)
-    x = np.random.default_rng(0).normal(size=(60, 3))
-    np.savetxt("stream.csv", np.c_[x, x[:, :1]], delimiter=",", header="a,b,c,y", comments="")
-    exec(compile(example, "README.md", "exec"), {})
-    printed = capsys.readouterr().out
-    assert "rms / model" in printed
-    assert "mine" in printed
-    assert "is best" in printed
-    assert (tmp_path / "comparison" / "index.html").stat().st_size > 1000
 
 
 def test_own_learners_give_the_same_in_processes(tmp_path: Path) -> None:

@@ -75,9 +75,12 @@ class ComparisonReport(Comparison):
 
 def score_table(comparison: Comparison, stream: str) -> Table:
     """Every learner on one stream."""
+    best = comparison.best(stream)
     columns: dict[Column, Callable[[Score], Cell]] = {
-        Column("rms / model alone", ".3f"): lambda score: score.rms.mean,
-        Column("95 % interval"): lambda score: f"{score.rms.low:.3f} to {score.rms.high:.3f}",
+        Column("rms / model alone", ".3f"): lambda score: score.rms,
+        Column("rms / best", ".3f"): lambda score: (
+            None if score is best else comparison.ratio(stream, score.learner, best.learner)
+        ),
         Column("median / model alone", ".3f"): lambda score: (
             score.median if np.isfinite(score.median) else None
         ),
@@ -86,12 +89,12 @@ def score_table(comparison: Comparison, stream: str) -> Table:
         Column("time [µs]", ".0f"): lambda score: score.microseconds,
         Column("memory [kB]", ".0f"): lambda score: score.kilobytes,
     }
-    best = comparison.best(stream)
     items = {score.learner + (" *" if score is best else ""): score for score in comparison.row(stream)}
     one = comparison.stream(stream)
     n, parts = len(one) - one.warm_up, len(one.segments)
     note = f"On {one.used}, of which {n} are scored{f' in {parts} parts' if parts else ''}; "
     note += f"{one.x.shape[1]} inputs, {one.y.shape[1]} outputs. * best; below 1 a learner helps. "
+    note += "95 % intervals; rms / best is paired: above 1 where its interval is. "
     note += "Median: of the absolute errors, blind to outliers. NLL: per sample and output. "
     note += "Time: one prediction and one update."
     return Table.of(f"scores_{stream}", f"{stream}: {one.about}", "learner", items, columns, note)

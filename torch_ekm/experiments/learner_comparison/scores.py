@@ -10,11 +10,12 @@ import torch
 from numpy.typing import NDArray
 
 from ...typing import Array
-from ..learners import OURS
 from ..reporting.statistics import Estimate
 from .stream import Stream
 
 _BLOCKS = 20
+_DECIDED = 0.5
+"""Share of the squared error, made by a hundredth of the samples, above which the rms says little."""
 
 
 @dataclass(frozen=True)
@@ -87,25 +88,38 @@ class Comparison:
         return studentized_range(k, alpha) / np.sqrt(2) * np.sqrt(k * (k + 1) / (6 * n))
 
     def verdicts(self) -> list[str]:
-        """For each stream: the default learner first, who wins, by how much, whether ours loses, and how many
-        of how many rows this was on."""
-        others = [name for name in self.learners if name not in (*OURS, "model alone")]
-        ours = [name for name in self.learners if name in OURS]
+        """For each stream: which learner is best, which cannot be told from it, how far off the default is,
+        on how many of how many rows, and whether a few of them decide."""
         sentences = []
         for stream in self.streams:
-            best = self.best(stream.name)
-            text = f"{stream.name}: "
-            if "default" in self.learners and best.learner != "default":
-                text += f"the default learner's rms error is {self.scores[stream.name, 'default'].rms} "
-                text += "of that of the model alone; "
-            text += f"{best.learner} is best, {best.rms} of the model alone."
-            if ours and others:
-                mine, rival = (self.best(stream.name, names) for names in (ours, others))
-                ratio = self.ratio(stream.name, mine.learner, rival.learner)
-                verb = "wins against" if ratio.high < 1 else "loses to" if ratio.low > 1 else "ties with"
-                text += f" Our {mine.learner} {verb} {rival.learner}: ratio {ratio}."
-            sentences.append(f"{text} On {stream.used}.")
+            best = self.best(stream.name).learner
+            ratios = {
+                name: self.ratio(stream.name, name, best)
+                for name in self.learners
+                if name not in (best, "model alone")
+            }
+            level = [name for name, ratio in ratios.items() if ratio.low <= 1]
+            found = f"{self.scores[stream.name, best].rms:.3f}"
+            text = f"{stream.name}: {best} is best, {found} of the model alone"
+            if level:
+                text += f"; this recording does not tell it from {', '.join(level)}"
+            behind = [name for name in ratios if name not in level]
+            told = [] if level else [min(behind, key=lambda name: ratios[name].mean)] if behind else []
+            told += [name for name in behind if name == "default" and name not in told]
+            text += "".join(f"; {name} has {ratios[name]:.3f} times its error" for name in told)
+            text += f". On {stream.used}."
+            share = self._rare(stream.name, best)
+            if share > _DECIDED:
+                text += (
+                    f" One row in a hundred makes {100 * share:.0f} % of the squared error: read the median."
+                )
+            sentences.append(text)
         return sentences
+
+    def _rare(self, stream: str, learner: str) -> float:
+        """Share of the squared error that the worst hundredth of the samples makes."""
+        errors = np.sort(self.errors[stream, learner])[::-1]
+        return float(errors[: max(1, len(errors) // 100)].sum() / max(errors.sum(), np.finfo(float).tiny))
 
 
 def studentized_range(k: int, alpha: float = 0.05) -> float:
