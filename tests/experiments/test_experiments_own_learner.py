@@ -18,8 +18,6 @@ from torch_ekm.experiments.learner_comparison.fingerprint import fingerprint
 from torch_ekm.experiments.learner_comparison.stream import Stream
 from torch_ekm.residual import RecursiveLeastSquares, ResidualLearner, SparseOnlineGP
 
-README = Path(__file__).parents[2] / "README.md"
-
 
 def stream(n: int = 60, name: str = "linear") -> Stream:
     generator = torch.Generator().manual_seed(0)
