@@ -98,8 +98,17 @@ def test_a_pad_that_holds_with_its_back_is_told(monkeypatch):
     hand = dataclasses.replace(HAND, joint_lower=lower, joint_upper=upper)
     monkeypatch.setattr("torch_ekm.experiments.check.load_hand", lambda _: hand)
     rows = {row.name: row for row in check_hand("mine")}
-    assert rows["contact sides"].state == rows["pinch"].state == "error"
+    assert rows["contact sides"].state == rows["model"].state == "error"
     assert "'right'" in rows["contact sides"].found
+
+
+def test_springs_too_soft_for_the_usual_force_are_told_which_one_they_bear(monkeypatch):
+    hand = dataclasses.replace(HAND, spring_stiffness=HAND.spring_stiffness / 4)
+    monkeypatch.setattr("torch_ekm.experiments.check.load_hand", lambda _: hand)
+    rows = {row.name: row for row in check_hand("mine", "can")}
+    assert rows["pinch"].state == "error"
+    assert "sound at 2 N" in rows["pinch force"].found
+    assert "PlantConfig(pinch_force=2)" in rows["pinch force"].mend
 
 
 def test_rigid_actuators_that_contradict_each_other_are_told(monkeypatch):

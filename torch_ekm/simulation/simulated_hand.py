@@ -118,7 +118,7 @@ class SimulatedHand:
                 return self.observe()
         raise GraspError(
             f"none of {_ATTEMPTS} planned pinches of '{self.object.name}' held it (seed {seed}); "
-            + (pinch_hint(self._problem) or "a higher pinch_force, friction or another gravity may help")
+            + (pinch_hint(self._problem) or "another pinch_force, more friction or another gravity may help")
         )
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
