@@ -23,7 +23,7 @@ from test_model_sapien import true_state, turning_step
 
 from torch_ekm.exceptions import GraspError
 from torch_ekm.model import KinematicModel, ModelOptions
-from torch_ekm.plant.plant import PlantStatus
+from torch_ekm.plant import PlantStatus
 from torch_ekm.simulation import SimulatedHand
 
 DEG = np.pi / 180

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from pathlib import Path
 
@@ -67,3 +68,9 @@ def test_a_report_comes_with_its_headings_below_the_pages(
     assert "# Title" not in text
     assert "An answer.\n\n### A table" in text
     assert sys.executable not in text
+
+
+@pytest.mark.parametrize("script", sorted(write_pages.HERE.glob("*.py")), ids=lambda path: path.stem)
+def test_every_script_can_be_imported(script: Path) -> None:
+    """What nobody runs in a test still follows the package's names."""
+    importlib.import_module(script.stem)
