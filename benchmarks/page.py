@@ -5,14 +5,16 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
-from collections.abc import Iterable
 from pathlib import Path
 
 from torch_ekm._versions import versions_of
 
 ROOT = Path(__file__).resolve().parents[1]
-#: What decides most figures.
-PACKAGES = ("torch_ekm", "torch", "numpy", "scipy", "sapien", "coal", "qpsolvers", "piqp", "numba")
+#: What decides the figures, and the peers that are measured beside.
+PACKAGES = (
+    "torch_ekm", "torch", "numpy", "scipy", "sapien", "coal", "qpsolvers", "piqp", "numba",
+    "gpytorch", "scikit-learn", "river", "capymoa",
+)  # fmt: skip
 
 
 def commit() -> str:
@@ -27,14 +29,14 @@ def commit() -> str:
     return (git("rev-parse", "--short", "HEAD") or "unknown") + changed
 
 
-def provenance(command: str, packages: Iterable[str] = PACKAGES) -> list[str]:
+def provenance(command: str) -> list[str]:
     """Command, kind of machine and versions, as lines of Markdown.
 
     Args:
         command: that writes the page, in a checkout.
     """
     versions = (
-        f"{name} {found}" for name, found in versions_of(packages).items() if found != "not installed"
+        f"{name} {found}" for name, found in versions_of(PACKAGES).items() if found != "not installed"
     )
     machine = f"{platform.machine()} {platform.system()}, {os.cpu_count()} cores, {_processor()}"
     return [f"Written by `{command}` on {machine}; {', '.join(versions)}.", ""]

@@ -8,6 +8,7 @@ Runs the first hand of the demo; needs a graphics library (OpenGL).
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -72,7 +73,7 @@ def main(path: Path) -> None:
     films = []
     for turn in turns():
         scene, titles = in_between(turn)
-        one = [Scene(**{**vars(scene), "transforms": frame[None]}) for frame in scene.transforms]
+        one = [replace(scene, transforms=frame[None]) for frame in scene.transforms]
         camera = Picture(one[0], SIZE, smooth=True)
         drawn = [camera.draw(frame, camera=scene.camera) for frame in one]
         camera.close()

@@ -71,7 +71,7 @@ class WriterLock:
     """The right to write in a folder; the system takes it back when its process ends, however it ends.
 
     Raises:
-        FolderInUseError: somebody else has it; the message names the process.
+        FolderInUseError: another process has it; the message names the process.
         OutputError: the folder cannot be written to.
         MissingExtraError: filelock is not installed.
     """

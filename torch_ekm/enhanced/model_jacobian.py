@@ -1,4 +1,4 @@
-"""How somebody else's model changes with the action: differentiated, by finite differences, or as it says."""
+"""How a user's model changes with the action: differentiated, by finite differences, or as it says."""
 
 from __future__ import annotations
 

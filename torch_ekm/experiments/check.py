@@ -67,7 +67,7 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
     except (EKMError, OSError) as error:
         return [*rows, Check("object's files", "error", str(error), "see docs/reference/file_formats.md")]
     rows += [*_rigid(description), *_reach(description, obj)]
-    pinch = list(_pinch(description, obj, picture))
+    pinch = list(_pinch(description, obj, picture, PlantConfig()))
     faulty = any(row.state == "error" for row in pinch)
     return [*rows, *pinch, *(_gentler(description, obj) if faulty else ())]
 
@@ -145,18 +145,18 @@ def _reach(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
 def _gentler(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     """Springs that are too soft for the usual force may bear a smaller one."""
     for force in _GENTLER:
-        if not any(row.state == "error" for row in _pinch(hand, obj, None, force)):
+        if not any(row.state == "error" for row in _pinch(hand, obj, None, PlantConfig(pinch_force=force))):
             mend = f"PlantConfig(pinch_force={force:g}), or stiffer springs"
             yield Check("pinch force", "warning", f"too high: the pinch is sound at {force:g} N", mend)
             return
 
 
 def _pinch(
-    hand: HandDescription, obj: ObjectDescription, picture: Path | None, force: float | None = None
+    hand: HandDescription, obj: ObjectDescription, picture: Path | None, config: PlantConfig
 ) -> Iterator[Check]:
     lin = seen = None
     try:
-        plant = SimulatedHand(hand, obj, PlantConfig() if force is None else PlantConfig(pinch_force=force))
+        plant = SimulatedHand(hand, obj, config)
         seen = plant.reset(0)  # as it is: the sensors have no noise
         assert seen.fingertip_force is not None  # of a simulated hand as described
         felt = zip(hand.pads, seen.fingertip_force.tolist(), strict=True)

@@ -108,7 +108,7 @@ class Setting:
 
     def __str__(self) -> str:
         seen = "camera images and Hall counts" if self.sensing else "true poses plus noise"
-        return f"simulated hand {Path(self.hand).stem}, preset {self.preset}, {seen}"
+        return f"Simulated hand {Path(self.hand).stem}, preset {self.preset}, {seen}"
 
     def parameters(self) -> PlantParameters:
         """The plant's."""

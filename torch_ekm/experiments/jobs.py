@@ -62,7 +62,7 @@ def run_jobs(
     Raises:
         ParameterError: ``address`` is no such address, or nobody answers there.
         WorkerDiedError: a job's process was killed each time it was tried; the message names the job.
-        FolderInUseError: somebody else runs jobs into this folder; the message names the process.
+        FolderInUseError: another process runs jobs into this folder; the message names the process.
         OutputError: a result cannot be written.
         MissingExtraError: joblib, or distributed, is not installed.
     """

@@ -106,8 +106,7 @@ def reproduce(
     read = protocol.record.from_json
     results = {name: [read(figures) for figures in session] for name, session in kept.items()}
     report = protocol.report(seeds, results, folder)
-    told = str(protocol.setting)
-    report.summary += f" {told[:1].upper()}{told[1:]}."
+    report.summary += f" {protocol.setting}."
     report.configuration = {
         "experiment": dataclasses.asdict(protocol),  # pyright: ignore[reportArgumentType]
         "seeds": list(seeds),

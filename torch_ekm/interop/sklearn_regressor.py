@@ -36,11 +36,11 @@ class SklearnRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def fit(self, X: Any, y: Any) -> Self:
         """Forget everything, and learn the rows in their order."""
-        return self._learn(X, y, anew=True)
+        return self._learn(X, y, reset=True)
 
     def partial_fit(self, X: Any, y: Any) -> Self:
         """Learn further rows in their order."""
-        return self._learn(X, y, anew=not hasattr(self, "regressor_"))
+        return self._learn(X, y, reset=not hasattr(self, "regressor_"))
 
     def predict(self, X: Any, return_std: bool = False) -> Array | tuple[Array, Array]:
         """Mean of y, ``(n,)`` or ``(n, out)``; with ``return_std`` also the standard deviation of y."""
@@ -51,10 +51,10 @@ class SklearnRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             mean, deviation = mean[:, 0], deviation[:, 0]
         return (mean, deviation) if return_std else mean
 
-    def _learn(self, X: Any, y: Any, anew: bool) -> Self:
-        X, y = validate_data(self, X, y, reset=anew, multi_output=True, y_numeric=True, dtype=np.float64)
+    def _learn(self, X: Any, y: Any, reset: bool) -> Self:
+        X, y = validate_data(self, X, y, reset=reset, multi_output=True, y_numeric=True, dtype=np.float64)
         rows = np.asarray(y, dtype=np.float64).reshape(len(X), -1)
-        if anew:
+        if reset:
             self.flat_ = np.ndim(y) == 1
             self.regressor_ = OnlineRegressor(make_learner(self.learner, X.shape[1], rows.shape[1]))
         for x, target in zip(X, rows, strict=True):

@@ -103,9 +103,8 @@ class Comparison:
             text = f"{stream.name}: {best} is best, {found} of the model alone"
             if level:
                 text += f"; this recording does not tell it from {', '.join(level)}"
-            behind = [name for name in ratios if name not in level]
-            told = [] if level else [min(behind, key=lambda name: ratios[name].mean)] if behind else []
-            told += [name for name in behind if name == "default" and name not in told]
+            behind = sorted((n for n in ratios if n not in level), key=lambda n: ratios[n].mean)
+            told = [name for k, name in enumerate(behind) if name == "default" or (k == 0 and not level)]
             text += "".join(f"; {name} has {ratios[name]:.3f} times its error" for name in told)
             text += f". On {stream.used}."
             share = self._rare(stream.name, best)

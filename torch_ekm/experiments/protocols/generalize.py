@@ -213,7 +213,7 @@ def paper_table(records: Sequence[Record]) -> Table:
         if all(by):
             ratio = stats.bootstrap_ratio(*stats.paired_means(by[1], by[0], steady_state_error))
             here = [stats.estimate(mine, steady_state_error) for mine in by]
-            rows.append([item, km, *here[:1], ekm, *here[1:], ekm / km, ratio])
+            rows.append([item, km, here[0], ekm, here[1], ekm / km, ratio])
     columns: list[Column | str] = [
         "object", Column("KM, paper [deg]", ".1f"), "KM, here [deg]", Column("E-KM, paper [deg]", ".1f"),
         "E-KM, here [deg]", Column("E-KM:KM, paper [%]", ".0f", percent=True),

@@ -38,8 +38,8 @@ _WORDS = {
     "labelled": "labelled models",
     "one model": "one model",
     "fresh": "fresh models",
+    "none": "the KM",
 }
-_WORDS["none"] = "the KM"
 _LEGEND = {
     "bank": "several models; evidence decides which one a grasp belongs to",
     "labelled": "one model for each object, with the object's label told",

@@ -67,7 +67,7 @@ def record(
 
     Raises:
         ParameterError, DescriptionError: ``folder`` has a log of another configuration, or is a file.
-        FolderInUseError: somebody else records there; the message names the process.
+        FolderInUseError: another process records there; the message names the process.
         OutputError: the log cannot be written.
     """
     with TrialLog(folder, config.configuration) as log:
