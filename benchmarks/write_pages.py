@@ -90,15 +90,21 @@ def measure(part: Part, folder: Path, quick: bool, keep: bool) -> dict[str, str]
         "commit": now,
         "date": str(datetime.date.today()),
         "minutes": f"{(time.time() - begin) / 60:.0f}",
-        "body": _demoted(folder / "report" / "report.md") if part.reports else done.stdout,
+        "body": done.stdout,
     }
     kept.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return found
 
 
-def _demoted(report: Path) -> str:
-    """A report without its title and figures, its headings one level deeper."""
-    text = re.sub(r"^# .*\n+|^!\[.*\n+\*.*\*\n+", "", report.read_text(encoding="utf-8"), flags=re.MULTILINE)
+def _demoted(report: Path, folder: str, shown: tuple[str, ...]) -> str:
+    """A report without its title, headings one level deeper, with those of its figures that are ``shown``."""
+
+    def figure(found: re.Match[str]) -> str:
+        caption, file = found["caption"], found["file"]
+        return f"![{caption}]({folder}/{file})\n\n*{caption}*\n\n" if Path(file).stem in shown else ""
+
+    text = re.sub(r"^# .*\n+", "", report.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    text = re.sub(r"^!\[(?P<caption>.*)\]\((?P<file>.*)\)\n+\*.*\*\n+", figure, text, flags=re.MULTILINE)
     return re.sub(r"^#", "##", text, flags=re.MULTILINE)
 
 
@@ -108,15 +114,16 @@ def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:
     for k, part in enumerate(parts_of(name)):
         folder = out / name / str(k)
         found = measure(part, folder, quick, keep)
-        body = f"```text\n{found['body'].strip()}\n```" if part.text else found["body"].strip()
+        body = found["body"].strip()
+        if part.text:
+            body = f"```text\n{body}\n```"
+        elif part.reports:
+            body = _demoted(folder / "report" / "report.md", name, part.pictures).strip()
         how = f"`{part.spoken()}`: commit {found['commit']}, {found['date']}, {found['minutes']} min."
         lines += [f"## {part.title}", "", part.see, "", how, "", body, ""]
         for picture in part.pictures:
-            source = folder / "report" / f"{picture}.svg"
-            if source.exists():
-                (page.parent / name).mkdir(exist_ok=True)
-                shutil.copy(source, page.parent / name / source.name)
-                lines += [f"![{picture.replace('_', ' ')}]({name}/{source.name})", ""]
+            (page.parent / name).mkdir(exist_ok=True)
+            shutil.copy(folder / "report" / f"{picture}.svg", page.parent / name)
     head = provenance(f"python benchmarks/write_pages.py {name}")
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text("\n".join([f"# {PLAN[name]['title']}", "", *head, *lines]), encoding="utf-8")

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from .experiments.reporting.report import Report
 
 console = Console(markup=False)  # the units of a table are no styles, nor is "[red]" in a file
+_PIPED = 120  # characters of a line in a file or a pipe, which has no width of its own
 _SHORT = 34  # characters: what is longer is prose, which may be wrapped
 _FIGURE = re.compile(r"[-+]?\d[\d.e+-]*(?: \[[^\]]*\])?(?: (?:%|deg\b|mm\b))?")
 # control characters, formats such as a change of the direction of writing, halves of characters
@@ -95,8 +96,7 @@ def print_table(
     A table that is too wide for the terminal is printed in parts, each with the first column.
     """
     head, cells = [*map(as_printed, header)], [[*map(as_printed, row)] for row in rows]
-    # a file or a pipe has no width of its own
-    screen = console if console.is_terminal else Console(width=1000, markup=False)
+    screen = console if console.is_terminal else Console(width=_PIPED, markup=False)
     parts = _parts([_width(column) for column in zip(head, *cells, strict=True)], screen.width)
     for number, columns in enumerate(parts):
         last = number == len(parts) - 1

@@ -192,9 +192,9 @@ class _WrongSlope(RecursiveLeastSquares):
 
 
 class _StateOutside(RecursiveLeastSquares):
-    def _absorb(self, x, y, mask):
+    def absorb(self, x, y, mask):
         self.extra = getattr(self, "extra", 0.0) + float(y.sum())
-        return super()._absorb(x, y, mask)
+        return super().absorb(x, y, mask)
 
     def _mean(self, z):
         return super()._mean(z) + getattr(self, "extra", 0.0)
@@ -215,13 +215,13 @@ class _Leaky(RecursiveLeastSquares):
 
 
 class _LearnsWithoutSample(RecursiveLeastSquares):
-    def _absorb(self, x, y, mask):
-        return super()._absorb(x, y, None if mask is not None and bool(mask.any()) else mask)
+    def absorb(self, x, y, mask):
+        return super().absorb(x, y, None if mask is not None and bool(mask.any()) else mask)
 
 
 class _LeaksBetweenModels(RecursiveLeastSquares):
-    def _absorb(self, x, y, mask):
-        report = super()._absorb(x, y, mask)
+    def absorb(self, x, y, mask):
+        report = super().absorb(x, y, mask)
         self.weights.copy_(0.999 * self.weights + 0.001 * self.weights.roll(1, 0))
         return report
 
@@ -232,8 +232,8 @@ class _IgnoresObservation(RecursiveLeastSquares):
 
 
 class _ReportsNaN(RecursiveLeastSquares):
-    def _absorb(self, x, y, mask):
-        report = super()._absorb(x, y, mask)
+    def absorb(self, x, y, mask):
+        report = super().absorb(x, y, mask)
         return dataclasses.replace(report, novelty=report.novelty * torch.nan)
 
 
@@ -246,8 +246,8 @@ class _LearnsWhatItSkips(RecursiveLeastSquares):
 
 
 class _OverwritesInputs(RecursiveLeastSquares):
-    def _absorb(self, x, y, mask):
-        report = super()._absorb(x, y, mask)
+    def absorb(self, x, y, mask):
+        report = super().absorb(x, y, mask)
         y.mul_(0.5)
         return report
 

@@ -278,7 +278,7 @@ class ModelBank(SingleLearner):
             self.memory.reset()
         self._open(None)
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         leader, choosing = int(self.leader), int(self.seen) < self.window
         reports: dict[int, UpdateReport] = {}
         density = torch.zeros_like(self.log_evidence)

@@ -91,21 +91,18 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         for buffer in self.buffers(recurse=False):
             buffer.zero_()
 
+    @abstractmethod
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         """Take in one checked sample per model; models outside ``mask`` must not change.
 
         :meth:`update` calls it, under the lock and without autograd. Report with :meth:`UpdateReport.of`.
         """
-        raise NotImplementedError(f"{type(self).__name__} has no absorb(x, y, mask)")
-
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        return self.absorb(x, y, mask)
 
     def linearize(
         self, x: Float[Tensor, "*any in_features"]
     ) -> tuple[Float[Tensor, "*any out_features"], Float[Tensor, "*any out_features in_features"]]:
         """``(g(x), dg/dx)``. Learners with a closed form override this autograd version."""
-        x = self._check_query(x).detach().requires_grad_(True)
+        x = self.check_query(x).detach().requires_grad_(True)
         with torch.enable_grad():
             mean = self(x)
             # one backward pass per output; queries do not interact, so their sum separates them
@@ -182,12 +179,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
     def _step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         if mask is not None and not mask.is_cuda and not bool(mask.any()):
             return UpdateReport.of_nothing(mask, self.dtype)
-        return self._absorb(x, y, mask)
-
-    def _report(
-        self, nis: Tensor, mask: Tensor | None, novelty: Tensor | None = None, weight: Tensor | None = None
-    ) -> UpdateReport:
-        return UpdateReport.of(nis, mask, novelty, weight)
+        return self.absorb(x, y, mask)
 
     # -- state ----------------------------------------------------------------------------------
 
@@ -227,9 +219,6 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         Raises:
             ShapeError: another width, or axes that are not the fleet's.
         """
-        return self._check_query(x)
-
-    def _check_query(self, x: Tensor) -> Tensor:
         x = self._cast(x)
         n = len(self.batch_shape) + 1
         if x.shape[-1:] != (self.in_features,) or (n > 1 and not self._fits(x.shape[-n:-1])):
@@ -300,7 +289,7 @@ class DoubleStateLearner(ResidualLearner):
 class SingleLearner(ResidualLearner):
     """A learner that is one model: ``batch_shape`` must be ``()``; ``LearnerFleet`` holds several.
 
-    Its ``_absorb`` gets samples only, never a mask.
+    Its ``absorb`` gets samples only, never a mask.
     """
 
     def __init__(self, in_features: int, out_features: int, **options) -> None:
@@ -312,4 +301,4 @@ class SingleLearner(ResidualLearner):
     def _step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         if mask is not None and not bool(mask):
             return UpdateReport.of_nothing(mask, self.dtype)
-        return self._absorb(x, y, None)
+        return self.absorb(x, y, None)

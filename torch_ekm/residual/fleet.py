@@ -70,22 +70,22 @@ class LearnerFleet(ResidualLearner):
         return self._all()[int(places[place])]
 
     def forward(self, x: Tensor) -> Tensor:
-        return self._stack([g(z) for g, z in self._each(self._check_query(x))], 1)
+        return self._stack([g(z) for g, z in self._each(self.check_query(x))], 1)
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
-        each = self._each(self._check_query(x))
+        each = self._each(self.check_query(x))
         return self._normal([g.predict(z, observation=observation) for g, z in each])
 
     def predictive(self, x: Float[Tensor, "*any in_features"]) -> Distribution:
         """Each learner's law of y: a Normal, or where one is heavy-tailed a law with mean and log_prob."""
-        laws = [g.predictive(z) for g, z in self._each(self._check_query(x))]
+        laws = [g.predictive(z) for g, z in self._each(self.check_query(x))]
         if all(isinstance(law, Normal) for law in laws):
             return self._normal(laws)
         return _SideBySide(laws, self.batch_shape)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Each learner's mean and Jacobian, closed where it has a closed form."""
-        parts = [g.linearize(z) for g, z in self._each(self._check_query(x))]
+        parts = [g.linearize(z) for g, z in self._each(self.check_query(x))]
         return self._stack([p[0] for p in parts], 1), self._stack([p[1] for p in parts], 2)
 
     def reset(self) -> None:
@@ -93,7 +93,7 @@ class LearnerFleet(ResidualLearner):
         for g in self._all():
             g.reset()
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         n = len(self.learners)
         x, y = x.reshape(n, -1), y.reshape(n, -1)
         who = [None] * n if mask is None else list(mask.reshape(n))

@@ -39,15 +39,15 @@ class LastResidual(ResidualLearner):
 
     def forward(self, x: Tensor) -> Tensor:
         """``f([x, y_last])``."""
-        return self.learner(self._with_last(self._check_query(x)))
+        return self.learner(self._with_last(self.check_query(x)))
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """f's law."""
-        return self.learner.predict(self._with_last(self._check_query(x)), observation=observation)
+        return self.learner.predict(self._with_last(self.check_query(x)), observation=observation)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """f's slope by x."""
-        mean, slope = self.learner.linearize(self._with_last(self._check_query(x)))
+        mean, slope = self.learner.linearize(self._with_last(self.check_query(x)))
         return mean, slope[..., : self.in_features]
 
     def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> Prediction:
@@ -60,7 +60,7 @@ class LastResidual(ResidualLearner):
             valid = "one with predict_with_jacobians, such as SparseOnlineGP"
             raise ParameterError("learner", type(self.learner).__name__, valid)
         n, f = self.in_features, cast("Any", self.learner)
-        p: Prediction = f.predict_with_jacobians(self._with_last(self._check_query(x)))
+        p: Prediction = f.predict_with_jacobians(self._with_last(self.check_query(x)))
         return Prediction(p.mean, p.variance, p.mean_jacobian[..., :n], p.variance_jacobian[..., :n])
 
     def reset(self) -> None:
@@ -74,7 +74,7 @@ class LastResidual(ResidualLearner):
         """The next sample does not follow on the last one."""
         self.last.zero_()
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         report = self.learner.update(self._with_last(x), y, mask)
         self.last.copy_(y if mask is None else y.where(mask.unsqueeze(-1), self.last))
         return report

@@ -120,13 +120,13 @@ class MixtureResidual(ResidualLearner):
 
     def forward(self, x: Tensor) -> Tensor:
         """``sum_b gain_b m_b(x) + offset``."""
-        x = self._check_query(x)
+        x = self.check_query(x)
         means = torch.stack([learner(x).to(x.dtype) for learner in self.members], dim=-1)
         return (self.gain * means).sum(-1) + self.offset
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """Moments of the mixture, or mean and running variance of y with ``observation=True``."""
-        x = self._check_query(x)
+        x = self.check_query(x)
         mean, deviation, means = self._standard(x)
         deviation = deviation * self.inflation.sqrt()
         if observation:
@@ -141,11 +141,11 @@ class MixtureResidual(ResidualLearner):
 
     def predictive(self, x: Tensor) -> Distribution:
         """Mixture of Student t laws about the mean: what log densities should be taken of."""
-        return self.tails.law(*self._standard(self._check_query(x))[:2])
+        return self.tails.law(*self._standard(self.check_query(x))[:2])
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The learners' slopes, weighted; what is carried over does not depend on x."""
-        x = self._check_query(x)
+        x = self.check_query(x)
         pairs = [learner.linearize(x) for learner in self.members]
         means = torch.stack([mean for mean, _ in pairs], dim=-1).to(x.dtype)
         slopes = torch.stack([slope for _, slope in pairs], dim=-1).to(x.dtype)
@@ -159,7 +159,7 @@ class MixtureResidual(ResidualLearner):
         Raises:
             ParameterError: a learner does not give its own in closed form.
         """
-        x = self._check_query(x)
+        x = self.check_query(x)
         for learner in self.members:
             if not hasattr(learner, "predict_with_jacobians"):
                 valid = "learners with predict_with_jacobians, such as SparseOnlineGP"
@@ -241,7 +241,7 @@ class MixtureResidual(ResidualLearner):
                 learner.new_sequence()
         self._settle()
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         mean, deviation, means = self._standard(x)
         # what is carried over is cut by a scale in which outliers have little say; what experts are judged by
         # heeds the few large samples of a stream that mostly rests, too

@@ -244,7 +244,7 @@ class Memories(ModelBank):
         self.errors = {name: [] for name in (*MEMORIES, "none")}
         return self.begin(signature)
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         """One motion: note every memory's one-step error about the axis [deg], then train all."""
         others = {"labelled": self.labelled[self.label], "one model": self.one, "fresh": self.fresh}
         self.errors["none"].append(abs(float(self.axis @ y[3:6])))
@@ -252,7 +252,7 @@ class Memories(ModelBank):
             self.errors[name].append(abs(float(self.axis @ (y - learner(x))[3:6])))
         for learner in others.values():
             learner.update(x, y, mask)
-        return super()._absorb(x, y, mask)
+        return super().absorb(x, y, mask)
 
 
 class Assignment(NamedTuple):

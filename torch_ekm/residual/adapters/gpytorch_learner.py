@@ -62,7 +62,7 @@ class GPyTorchLearner(SingleLearner):
         self._settle()
 
     def _law(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        x = self._check_query(x)
+        x = self.check_query(x)
         mean, variance = self._moments(x.reshape(-1, self.in_features))
         shape = (*x.shape[:-1], self.out_features)
         return mean.reshape(shape), variance.clamp_min(1e-12).reshape(shape)
@@ -78,14 +78,14 @@ class GPyTorchLearner(SingleLearner):
             variance = variance + self._noise() if observation else variance
         return Normal(mean, variance.sqrt(), validate_args=False)
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         law = self.predict(x, observation=True)
         nis = ((y - law.mean) / law.stddev).square().mean(-1)
         place = self._count % len(self.inputs)
         self.inputs[place], self.targets[place] = x, y
         self._count += 1
         self._learn(place)
-        return self._report(nis, mask)
+        return UpdateReport.of(nis, mask)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Sample count, and the state dicts of what GPyTorch made."""

@@ -58,7 +58,7 @@ class RiverResidual(SingleLearner):
 
     def forward(self, x: Tensor) -> Tensor:
         """Predictions of the regressors; no gradient reaches x."""
-        x = self._check_query(x)
+        x = self.check_query(x)
         rows = x.detach().reshape(-1, self.in_features).tolist()
         values = [[self._value(model, row) for model in self._models] for row in rows]
         mean = torch.tensor(values, dtype=self.dtype, device=self.device).reshape(*x.shape[:-1], -1)
@@ -71,7 +71,7 @@ class RiverResidual(SingleLearner):
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Central differences with ``step``."""
-        x = self._check_query(x)
+        x = self.check_query(x)
         eye = self.step * torch.eye(self.in_features, dtype=x.dtype, device=x.device)
         up, down = self(x.unsqueeze(-2) + eye), self(x.unsqueeze(-2) - eye)
         return self(x), ((up - down) / (2 * self.step)).mT
@@ -79,14 +79,14 @@ class RiverResidual(SingleLearner):
     def _value(self, model: Any, row: list[float]) -> float:
         return float(model.predict_one(dict(enumerate(row))) or 0.0) if self._count else 0.0
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         error = (y - self(x)).square()
         row = dict(enumerate(x.tolist()))
         for model, target in zip(self._models, y.tolist(), strict=True):
             model.learn_one(row, target)
         self.noise.lerp_(error, max(0.02, 1.0 / (self._count + 2)))
         self._count += 1
-        return self._report((error / self.noise).mean(-1), mask)
+        return UpdateReport.of((error / self.noise).mean(-1), mask)
 
     def get_extra_state(self) -> dict[str, Any]:
         """None: reading river's objects from a file would mean to run what the file says.

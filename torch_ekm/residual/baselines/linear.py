@@ -107,7 +107,7 @@ class LinearInFeatures(ScaledLearner):
         self.pending += 1.0 if mask is None else mask
         if self.n_samples % self.refresh_every == 0:
             self._rebuild()
-        return self._report(nis, mask, weight=weight)
+        return UpdateReport.of(nis, mask, weight=weight)
 
     def _rebuild(self) -> None:
         """Forget what is due; (P, w) from (A, b) by Cholesky in double precision."""

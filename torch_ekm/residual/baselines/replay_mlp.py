@@ -150,4 +150,4 @@ class ReplayMLP(ScaledLearner, SingleLearner):
             rate = self.rate * self.adam.correction(n * self.steps + step + 1)
             for i, (p, gradient) in enumerate(zip(self.theta, gradients, strict=True)):
                 self.adam.move(i, p, gradient, rate)
-        return self._report(nis, mask)
+        return UpdateReport.of(nis, mask)

@@ -89,11 +89,11 @@ class ScaledLearner(ResidualLearner):
 
     def forward(self, x: Tensor) -> Tensor:
         """Mean of g."""
-        return self._value(self._mean(self._inputs(self._check_query(x))))
+        return self._value(self._mean(self._inputs(self.check_query(x))))
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """Mean and deviation of g, or of y."""
-        mean, variance = self._law(self._inputs(self._check_query(x)), observation)
+        mean, variance = self._law(self._inputs(self.check_query(x)), observation)
         deviation = variance.sqrt().expand_as(mean)
         if self.standardize:
             deviation = deviation * self.output.scale
@@ -103,7 +103,7 @@ class ScaledLearner(ResidualLearner):
         """Mean of g and its derivative."""
         if type(self)._slopes is ScaledLearner._slopes:
             return super().linearize(x)
-        mean, slope = self._slopes(self._inputs(self._check_query(x)))
+        mean, slope = self._slopes(self._inputs(self.check_query(x)))
         if self.standardize:
             slope = slope * self.output.scale.unsqueeze(-1) / self.input.scale.unsqueeze(-2)
         return self._value(mean), slope.to(self.dtype)
@@ -117,7 +117,7 @@ class ScaledLearner(ResidualLearner):
             self.input.reset()
             self.output.reset()
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         if self.standardize:
             self._observe(x, y, mask)
         self.n_samples += 1

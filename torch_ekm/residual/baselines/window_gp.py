@@ -101,4 +101,4 @@ class WindowGP(ScaledLearner):
         self.solution.copy_(inverse.mT @ (inverse @ self.targets.double()))
         self.inverse.copy_(inverse)
         novelty = (variance[..., 0] - self.noise_variance) / self.kernel.diagonal(x)
-        return self._report(nis, mask, novelty=novelty, weight=weight)
+        return UpdateReport.of(nis, mask, novelty=novelty, weight=weight)

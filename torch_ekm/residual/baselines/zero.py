@@ -27,7 +27,7 @@ class ZeroResidual(ResidualLearner):
 
     def forward(self, x: Tensor) -> Tensor:
         """Zeros that depend on x, so that gradients exist and are 0."""
-        x = self._check_query(x)
+        x = self.check_query(x)
         return (0.0 * x[..., :1]).expand(*x.shape[:-1], self.out_features)
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
@@ -37,5 +37,5 @@ class ZeroResidual(ResidualLearner):
         deviation = self.noise_variance**0.5 if observation else floor
         return Normal(mean, torch.full_like(mean, deviation), validate_args=False)
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        return self._report(y.square().mean(-1) / self.noise_variance, mask)
+    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        return UpdateReport.of(y.square().mean(-1) / self.noise_variance, mask)

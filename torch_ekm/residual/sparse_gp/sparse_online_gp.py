@@ -153,20 +153,20 @@ class SparseOnlineGP(DoubleStateLearner):
         """``alpha' k(X, x)``, differentiable in x."""
         if self._loops is not None and (found := self._loops.query(self, x)) is not None:
             return found[0]
-        return self._mean(self._cross(self.units.inputs(self._check_query(x))))
+        return self._mean(self._cross(self.units.inputs(self.check_query(x))))
 
     def variance(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any out"]:
         """Latent variance ``k** + k'Ck`` of each output, differentiable in x."""
         if self._loops is not None and (found := self._loops.query(self, x, variance=True)) is not None:
             return found[1]
-        z = self.units.inputs(self._check_query(x))
+        z = self.units.inputs(self.check_query(x))
         return self._latent(z, self._cross(z))
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """N(mean, var), with the observation noise added on request."""
         found = None if self._loops is None else self._loops.query(self, x, variance=True)
         if found is None:
-            z = self.units.inputs(self._check_query(x))
+            z = self.units.inputs(self.check_query(x))
             k = self._cross(z)
             mean, variance = self._mean(k), self._latent(z, k)
         else:
@@ -180,7 +180,7 @@ class SparseOnlineGP(DoubleStateLearner):
         if self._loops is not None and (found := self._loops.query(self, x, slopes=True)) is not None:
             return found[0], found[2]
         # free slots need no mask here: their rows in alpha and C are 0
-        k, dk = self.kernel.with_gradient(self.units.inputs(self._check_query(x)), self.posterior.basis)
+        k, dk = self.kernel.with_gradient(self.units.inputs(self.check_query(x)), self.posterior.basis)
         coefficients = self.posterior.alpha.mT
         mean, jacobian = (coefficients @ k.unsqueeze(-1)).squeeze(-1), coefficients @ dk
         return self._out(mean, 1), self._out_slope(jacobian, 1)
@@ -196,7 +196,7 @@ class SparseOnlineGP(DoubleStateLearner):
             found = self._loops.query(self, x, variance=True, slopes=True)
             if found is not None:
                 return Prediction(*found)
-        z = self.units.inputs(self._check_query(x))
+        z = self.units.inputs(self.check_query(x))
         k, dk = self.kernel.with_gradient(z, self.posterior.basis)
         column = k.unsqueeze(-1)
         Ck = self.posterior.covariance @ column
@@ -285,10 +285,10 @@ class SparseOnlineGP(DoubleStateLearner):
         if mask is None and self._loops is not None:
             with self.lock:
                 if self._loops.accept(self, x, y):
-                    return self._absorb(x, y, None)
+                    return self.absorb(x, y, None)
         return super().update(x, y, mask)
 
-    def _absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         on = None if mask is None else mask.to(x.dtype)
         if self._preparing:
             with torch.no_grad():
