@@ -70,7 +70,9 @@ def reproduce(
     ] = "",
     hand: Hand = "icub_right",
     preset: Preset = "nominal",
-    learner: Annotated[str, Option(help="action-linear, rbf, SOGP deep, ...; an unknown name lists all.")] = "action-linear",
+    learner: Annotated[
+        str, Option(help="action-linear, rbf, SOGP deep, ...; an unknown name lists all.")
+    ] = "action-linear",
     sensing: Sensing = True,
     angles: Annotated[
         str, Option(help="Turns [deg], e.g. 5,10,15; Table I if left out (generalize, ablation).")
