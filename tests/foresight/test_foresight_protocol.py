@@ -90,6 +90,12 @@ def test_what_is_made_of_the_figures() -> None:
     further = [turn(contender="horizon E-KM", largest_deg=1.5 * t.largest_deg, seed=t.seed) for t in turns]
     results = {"a": [*turns, *further]}
     assert report.paired_ratio(results, "horizon E-KM") == pytest.approx(1.5)
+    nearer = [
+        turn(contender="oracle", largest_deg=t.largest_deg + d, seed=t.seed)
+        for t, d in zip(turns, (-1.9, 3.0, 0.5), strict=True)
+    ]
+    rows = {row[0]: row for row in report.far_table({"a": [*turns, *nearer]}).rows}
+    assert (rows["oracle"][4].count, rows["oracle"][4].n, rows[report.ONE_STEP][4]) == (2, 3, None)
     met = {target.what: target for target in report.foresight_targets(results)}
     assert met["reach foretold within 2 deg [% of grasps]"].measured == 50
     assert met["largest angle, horizon E-KM : one-step E-KM, median"].missed_by == 0

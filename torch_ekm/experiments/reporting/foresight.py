@@ -68,14 +68,27 @@ def contenders_of(results: Results) -> list[str]:
     return sorted(names, key=lambda name: name != ONE_STEP)
 
 
-def paired_ratio(results: Results, contender: str) -> float | None:
-    """Median of the largest angle over that of the one-step controller, on the same grasps."""
+def _same_grasps(results: Results, contender: str) -> np.ndarray:
+    """Largest angles [deg] of a contender and of the one-step controller on each grasp, ``(n, 2)``."""
     ours, theirs = (
         {(r.object, r.seed): r.largest_deg for r in turns_of(results, kind="far", contender=name)}
         for name in (contender, ONE_STEP)
     )
-    ratios = [ours[unit] / theirs[unit] for unit in ours if theirs.get(unit, 0.0) > 1.0]
-    return float(np.median(ratios)) if ratios else None
+    return np.array([(ours[unit], theirs[unit]) for unit in ours if unit in theirs]).reshape(-1, 2)
+
+
+def paired_ratio(results: Results, contender: str) -> float | None:
+    """Median of the largest angle over that of the one-step controller, on the same grasps."""
+    ours, theirs = _same_grasps(results, contender).T
+    turned = theirs > 1.0
+    return float(np.median(ours[turned] / theirs[turned])) if turned.any() else None
+
+
+def _agreement(results: Results, contender: str) -> Cell:
+    """How often a contender's turn ends within 2 deg of the one-step controller's."""
+    if contender == ONE_STEP:
+        return None
+    return stats.rate((np.abs(np.diff(_same_grasps(results, contender))) <= 2).ravel().tolist())
 
 
 def foresight_targets(results: Results) -> list[Target]:
@@ -166,10 +179,14 @@ def far_table(results: Results) -> Table:
         ),
         Column("median [deg]", ".1f"): lambda mine: float(np.median([r.largest_deg for r in mine])),
         Column(f"paired, {ONE_STEP} = 1"): lambda mine: paired_ratio(results, mine[0].contender),
+        Column(f"within 2 deg of {ONE_STEP}"): lambda mine: _agreement(results, mine[0].contender),
         Column("not reached"): lambda mine: stats.rate(r.not_reached for r in mine),
         Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
     }
-    note = "The target is farther than any grasp goes; the largest true angle before the turn ended."
+    note = (
+        "The target is farther than any grasp goes; the largest true angle before the turn ended. How "
+        "often two controllers end within 2 deg of each other on the same grasp bounds what can be foretold."
+    )
     items = {name: mine for name, mine in items.items() if mine}
     return Table.of("far", "As far as it goes", "contender", items, columns, note)
 
