@@ -25,9 +25,11 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx-mathjax-offline",
     "sphinx_copybutton",
+    "sphinxcontrib.bibtex",
     "myst_nb",
     "_extension",
 ]
+bibtex_bibfiles = ["references.bib"]
 exclude_patterns = ["_build", "_extension", "_templates"]
 templates_path = ["_templates"]
 nitpicky = True
