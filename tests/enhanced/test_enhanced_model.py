@@ -124,6 +124,23 @@ def test_bad_samples_leave_the_learner_untouched(generator: torch.Generator) -> 
         assert torch.equal(value, before[name]), name
 
 
+@pytest.mark.parametrize("spoilt", ["state", "action", "increment"])
+def test_a_learner_that_skips_leaves_bad_samples_out_here_too(
+    generator: torch.Generator, spoilt: str
+) -> None:
+    ekm = train(enhanced(), generator, 20)
+    ekm.learner.on_invalid = "skip"
+    before = {name: value.clone() for name, value in ekm.learner.named_buffers()}
+    state, action = sample(generator)
+    sent = {"state": state[0], "action": action[0], "increment": world(state[0], action[0])}
+    sent[spoilt] = sent[spoilt] * torch.nan
+    assert not ekm.update(**sent).accepted
+    assert int(ekm.learner.n_refused) == 1
+    for name, value in ekm.learner.named_buffers():
+        assert name == "n_refused" or torch.equal(value, before[name]), name
+    assert ekm.predict(sent["state"], sent["action"]).mean.isfinite().all() == (spoilt == "increment")
+
+
 def test_grasp_encoding_is_zero_at_the_reference_and_scaled(generator: torch.Generator) -> None:
     draw = lambda n: torch.randn(n, generator=generator, dtype=torch.float64)  # noqa: E731
     reference = GraspState(draw(4), draw(3), exp(draw(3)))

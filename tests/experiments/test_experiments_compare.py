@@ -178,7 +178,7 @@ def table(n: int = 60) -> np.ndarray:
     return np.random.default_rng(0).normal(size=(n, 4))
 
 
-def write(path: Path, values: np.ndarray, names: str = "a,b,c,load") -> Path:
+def write(path: Path, values: np.ndarray, names: str = "a,b,c,y") -> Path:
     np.savetxt(path, values, delimiter=",", header=names, comments="")
     return path
 
@@ -219,7 +219,7 @@ def test_other_files(tmp_path: Path) -> None:
         load_table(tmp_path / "latin.csv")
     with pytest.raises(UnknownNameError, match="t42"):
         load_recording("t43")
-    with pytest.raises(UnknownNameError, match="load"):
+    with pytest.raises(UnknownNameError, match="a, b, c, y"):
         load_table(write(tmp_path / "good.csv", table()), ["torque"])
 
 
@@ -256,8 +256,9 @@ def test_parquet_is_csv(tmp_path: Path) -> None:
 
 def test_targets_are_named_or_found(tmp_path: Path) -> None:
     values = table()
-    path = write(tmp_path / "a.csv", values)
-    assert load_table(path).y.shape == (60, 1)  # the last column
+    path = write(tmp_path / "a.csv", values, "a,b,c,load")
+    with pytest.raises(DescriptionError, match=r"no column is called 'y'.*--targets.* are a, b, c, load"):
+        load_table(path)
     assert load_table(path, ["a", "c"]).y.shape == (60, 2)
     assert load_table(write(tmp_path / "b.csv", values, "y1,a,y2,b")).y.shape == (60, 2)
 

@@ -150,3 +150,13 @@ def test_what_cannot_be_asked_is_refused(grasp) -> None:
     whole.focus = FocusedPose(torch.eye(6, dtype=torch.float64))
     with pytest.raises(ParameterError, match="one axis"):
         reachable(whole, seen)
+
+
+def test_a_planar_hand_reaches_as_far_as_its_plane_lets_it() -> None:
+    """Two pads hold no moment about the line through them, nor has a plane of motion any."""
+    plant = SimulatedHand("planar_two_finger", "can", preset="none")
+    seen = plant.reset(0)
+    controller = LookAndMoveController(KinematicModel(plant.hand, plant.object), plant.rotation_axis)
+    lin = controller.kinematic.linearize(seen.state, fingertip_force=seen.fingertip_force)
+    assert friction_share(controller.kinematic, lin) < 0.6
+    assert reachable(controller, seen, limit=12 * DEG).angle > 5 * DEG

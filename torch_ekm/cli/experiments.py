@@ -125,8 +125,14 @@ def compare(
     data: Annotated[
         list[str], Option(help="A .csv or .parquet file, or the name of a recording; repeatable.")
     ],
-    learners: Annotated[str, Option(help="Names, separated by commas; all without peers by default.")] = "",
-    targets: Annotated[str, Option(help="Columns to predict; y, y1, y2, ... or the last by default.")] = "",
+    learners: Annotated[
+        str,
+        Option(
+            help="Names, separated by commas: default, SOGP, linear RLS, window GP, model alone, ...; an "
+            "unknown name lists all. If left out: all but those of other libraries."
+        ),
+    ] = "",
+    targets: Annotated[str, Option(help="Columns to predict; y, y1, y2, ... if left out.")] = "",
     out: Annotated[Path, Option(help="Folder for tables and figures.")] = Path("compare_output"),
     limit: Annotated[
         int, Option(min=0, help="Rows of a file or recording that are used, its first; 0: all.")

@@ -179,7 +179,8 @@ class EnhancedModel(Recorded, nn.Module):
             The learner's report.
 
         Raises:
-            NonFiniteError: an entry is NaN or infinite; nothing was changed.
+            NonFiniteError: an entry is NaN or infinite; nothing was changed. With ``on_invalid="skip"`` the
+                learner leaves the sample out instead and counts it in ``learner.n_refused``.
             ShapeError: the increment has not the shape of the model's prediction.
             ParameterError: action or increment is no tensor.
         """
@@ -192,8 +193,11 @@ class EnhancedModel(Recorded, nn.Module):
             raise ShapeError(
                 "increment", f"{tuple(predicted.shape)}, that of the prediction", increment.shape
             )
-        for name, value in (("action", action), ("increment", increment), ("prediction", predicted)):
-            check_finite(name, value)
+        if self.learner.on_invalid == "raise":  # else the learner leaves such a sample out, and counts it
+            for name, value in (
+                ("action", action), ("increment", increment), ("f(state, action)", predicted)
+            ):  # fmt: skip
+                check_finite(name, value)
         residual = self._gather(increment - predicted) * self.output_scale
         return self.learner.update(self.features(state, action), residual)
 
@@ -292,7 +296,8 @@ class EnhancedModel(Recorded, nn.Module):
         nominal = self._gather(self.nominal(state, action))
         g = self.learner.predict(self.features(state, action), observation=observation)
         mean, deviation = (value / self.output_scale for value in (g.mean, g.stddev))
-        return torch.distributions.Normal(nominal + mean.to(nominal), deviation.abs().to(nominal))
+        law = nominal + mean.to(nominal), deviation.abs().to(nominal)
+        return torch.distributions.Normal(*law, validate_args=False)  # of NaN comes NaN, as from f + g
 
     @torch.no_grad()
     def deviation(

@@ -18,7 +18,7 @@ def friction_share(model: KinematicModel, lin: Linearization) -> float:
     """``min_f max_i |f_t,i| / (mu_i f_n,i)`` over all contact forces f that balance the object's weight.
 
     The normal forces are those of ``lin``, give or take 0.3 N; how the fingers push each other along the
-    object is free. Above 1 no force within the cones holds it, whatever the fingers do; infinite: none at
+    object is free. In a plane of motion only what lies in it is balanced. Above 1 no force within the cones holds it, whatever the fingers do; infinite: none at
     all. A linear program, with a pyramid of 12 sides inside each cone; moments of soft fingers are left out.
 
     A contact that creeps at its friction limit has a margin of 0 for as long as it creeps. This figure tells
@@ -35,6 +35,8 @@ def friction_share(model: KinematicModel, lin: Linearization) -> float:
     G, load = grasp_matrix(kin).numpy().copy(), model.potential(lin.state)[0][-6:].numpy().copy()
     G[3:] /= L
     load[3:] /= L
+    free = model.reduction.pose_basis.numpy()  # of the object: what the plane of motion holds is left out
+    G, load = free.T @ G, free.T @ load
     normal = lin.forces.normal.clamp_min(0.0).tolist()
     cost, bounds, inside = np.zeros(len(parts) + 1), [], []
     cost[-1] = 1.0
@@ -52,7 +54,7 @@ def friction_share(model: KinematicModel, lin: Linearization) -> float:
         cost,
         np.array(inside),
         np.zeros(len(inside)),
-        np.column_stack([G, np.zeros(6)]),
+        np.column_stack([G, np.zeros(len(G))]),
         load,
         bounds=[*bounds, (0, None)],
     )

@@ -45,7 +45,7 @@ def compare(
             different names.
         learners: name -> ``factory(in_features, out_features)``, lambdas and classes of a notebook included;
             or names of the package's own. By default all of these but those of other libraries.
-        targets: columns of the files to predict. By default ``y``, ``y1``, ``y2``, ..., else the last one.
+        targets: columns of the files to predict; ``y``, ``y1``, ``y2``, ... if none is named.
         limit: only the first so many samples of a file or recording; None: all.
         folder: keeps what is finished, so that an interrupted comparison goes on where it stopped. A result
             is read again if the samples and the learner are the same: all that the learner holds when it is

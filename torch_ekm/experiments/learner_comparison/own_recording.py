@@ -113,7 +113,8 @@ def load_own(
     moved = values[starts + every][:, seen] - values[starts][:, seen]
     nominal = np.zeros_like(moved) if model is None else np.asarray(model(s, u), dtype=np.float64)
     if nominal.shape != moved.shape:
-        raise ShapeError("increments of the model", str(moved.shape), nominal.shape)
+        hint = f"f gets all rows: state {s.shape}, command {u.shape}"
+        raise ShapeError("increments of the model", str(moved.shape), nominal.shape, hint)
     alone = "nothing moves" if model is None else getattr(model, "__name__", type(model).__name__)
     inputs, outputs = ([names[i] for i in which] for which in ([*state, *command], seen))
     about = f"increments of {len(outputs)} columns of {path.name}; alone: {alone}"

@@ -73,11 +73,12 @@ def load_table(path: str | Path, targets: Sequence[str] = (), limit: int | None 
 
     Args:
         path: the file; rows in the order of time.
-        targets: columns to predict. By default those called ``y``, ``y1``, ``y2``, ..., else the last one.
+        targets: columns to predict; those called ``y``, ``y1``, ``y2``, ... if none is named.
         limit: only the first so many rows.
 
     Raises:
-        DescriptionError: the file cannot be used; the message names line and column.
+        DescriptionError: the file cannot be used; the message names line and column. No target is named,
+            and no column is called ``y``.
         UnknownNameError: there is no such target column; the message lists the columns.
     """
     names, values = read_table(Path(path))
@@ -89,7 +90,10 @@ def load_table(path: str | Path, targets: Sequence[str] = (), limit: int | None 
     chosen = list(targets) or [
         name for name in names if name == "y" or (name[:1] == "y" and name[1:].isdigit())
     ]
-    columns = [names.index(name) for name in chosen or names[-1:]]
+    if not chosen:
+        problem = "no column is called 'y' (or y1, y2, ...); name the targets: targets=, or --targets"
+        raise DescriptionError(path, f"{problem}. The columns are {', '.join(names)}")
+    columns = [names.index(name) for name in chosen]
     inputs = [i for i in range(len(names)) if i not in columns]
     if not inputs:
         raise DescriptionError(path, "all columns are targets; at least one must be an input")
