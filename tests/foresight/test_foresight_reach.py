@@ -5,9 +5,14 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+import sys
+from pathlib import Path
 
 import pytest
 import torch
+
+sys.path.append(str(Path(__file__).parents[1] / "model"))
+import model_toys
 
 from torch_ekm.control import Caution, ClosedLoop, FocusedPose, LookAndMoveController, PoseTarget
 from torch_ekm.control.termination import StopReason
@@ -101,6 +106,16 @@ def test_the_share_of_friction_is_what_statics_say(grasp) -> None:
     reach = reachable(controller, seen, friction=1.01 * share)
     assert reach.end is ReachEnd.FRICTION
     assert abs(reach.angle) < reachable(controller, seen).angle
+
+
+def test_the_spin_moments_of_soft_fingers_hold_what_two_points_cannot() -> None:
+    """Two pads, the weight 20 mm beside the line through both: m g (1/mu + d/gamma) over normal forces."""
+    toy = model_toys.soft_two_finger(com=(0.0, 0.02, 0.0))
+    lin = toy.model.linearize(toy.state, toy.contacts, forces=toy.forces())
+    by_hand = 0.05 * 9.81 * (1 / 3.0 + 0.02 / 0.03) / float(lin.forces.normal.sum())
+    assert friction_share(toy.model, lin) == pytest.approx(by_hand, rel=0.2)
+    slippery = lin.contacts.replace(torsional_friction=lin.contacts.torsional_friction / 100)
+    assert friction_share(toy.model, dataclasses.replace(lin, contacts=slippery)) > 1
 
 
 def test_what_lies_within_reach_ends_by_nothing(grasp) -> None:

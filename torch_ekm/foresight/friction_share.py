@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -15,11 +16,12 @@ _NORMAL = 0.3  # [N] by which a normal force may be off
 
 
 def friction_share(model: KinematicModel, lin: Linearization) -> float:
-    """``min_f max_i |f_t,i| / (mu_i f_n,i)`` over all contact forces f that balance the object's weight.
+    """``min_f max_i (|f_t,i|/mu_i + |m_i|/gamma_i) / f_n,i`` over all contact forces that balance the weight.
 
     The normal forces are those of ``lin``, give or take 0.3 N; how the fingers push each other along the
-    object is free. In a plane of motion only what lies in it is balanced. Above 1 no force within the cones holds it, whatever the fingers do; infinite: none at
-    all. A linear program, with a pyramid of 12 sides inside each cone; moments of soft fingers are left out.
+    object is free, and m are spin moments of soft fingers. In a plane of motion only what lies in it is
+    balanced. Above 1 no force within the cones holds the object, whatever the fingers do; infinite: none at
+    all. A linear program, with a pyramid of 12 sides (soft fingers: 24) inside each cone.
 
     A contact that creeps at its friction limit has a margin of 0 for as long as it creeps. This figure tells
     whether the others still hold what it lets go of.
@@ -42,13 +44,18 @@ def friction_share(model: KinematicModel, lin: Linearization) -> float:
     cost[-1] = 1.0
     for contact, part in parts:
         low, high = max(normal[contact] - _NORMAL, 0.0), normal[contact] + _NORMAL
-        bounds.append((low, high) if part == 0 else (None, None) if part < 3 else (0.0, 0.0))
+        bounds.append((low, high) if part == 0 else (None, None))
     for i in range(n):
         tangents = [column for column, at in enumerate(parts) if at in ((i, 1), (i, 2))]
-        for angle in np.arange(_SIDES) * (2 * math.pi / _SIDES):
+        spin = [column for column, at in enumerate(parts) if at == (i, 3)]
+        friction, torsional = float(contacts.friction[i]), float(contacts.torsional_friction[i])
+        for angle, sign in itertools.product(
+            np.arange(_SIDES) * (2 * math.pi / _SIDES), (1, -1)[: 1 + len(spin)]
+        ):
             side = np.zeros(len(parts) + 1)
             side[tangents] = [math.cos(angle), math.sin(angle)][: len(tangents)]
-            side[-1] = -float(contacts.friction[i]) * normal[i] * math.cos(math.pi / _SIDES)
+            side[spin] = sign * friction / torsional if spin else 0.0
+            side[-1] = -friction * normal[i] * math.cos(math.pi / _SIDES)
             inside.append(side)
     found = optimize.linprog(
         cost,
