@@ -84,8 +84,11 @@ def compare(
         stream, name = keys[job]
         squared, alone = np.array(result.pop("squared")), _squared(stream.y[stream.warm_up :])
         errors[stream.name, name] = squared
-        rms = block_bootstrap(squared, alone, blocks_of(stream))
-        scores[stream.name, name] = Score(stream.name, name, rms, **result)
+        rms, median = (
+            block_bootstrap(squared, alone, blocks_of(stream), measure=measure)
+            for measure in ("rms", "median")
+        )
+        scores[stream.name, name] = Score(stream.name, name, rms, median, **result)
     calls = {name: constructor_call(factory) for name, factory in factories.items()}
     return ComparisonReport(tuple(streams), tuple(factories), scores, errors, calls)
 
@@ -105,7 +108,6 @@ def run_one(stream: Stream, factory: Factory) -> dict[str, Any]:
     error, deviation = run.error[start:], run.deviation[start:]
     return {
         "squared": [float(f"{value:.6g}") for value in _squared(error)],
-        "median": run.median_ratio(start),
         "nll": run.nll(start),
         "coverage": float((error.abs() <= Z90 * deviation).double().mean()),
         "microseconds": 1e6 * run.seconds / len(stream),

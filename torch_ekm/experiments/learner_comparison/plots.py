@@ -26,7 +26,7 @@ def colour_of(learner: str) -> str:
 
 
 def plot_scores(comparison: Comparison) -> Figure:
-    """rms error over that of the model alone, with 95 % intervals: a panel for each stream."""
+    """Error over that of the model alone, with 95 % intervals: a panel for each stream."""
     n = len(comparison.streams)
     columns = min(n, 3)
     rows = -(-n // columns)
@@ -35,14 +35,16 @@ def plot_scores(comparison: Comparison) -> Figure:
     y = np.arange(len(comparison.learners))
     for axis, stream in zip(axes, comparison.streams, strict=False):
         scores, best = comparison.row(stream.name), comparison.best(stream.name)
-        for i, score in enumerate(scores):
+        measure = comparison.measure(stream.name)
+        errors = [score.error(measure) for score in scores]
+        for i, (score, error) in enumerate(zip(scores, errors, strict=True)):
             colour = colour_of(score.learner)
-            axis.plot([score.rms.low, score.rms.high], [i, i], color=colour, linewidth=1.6)
+            axis.plot([error.low, error.high], [i, i], color=colour, linewidth=1.6)
             filled = colour if score is best else "white"
-            axis.plot(score.rms.mean, i, "o", color=colour, markerfacecolor=filled, markersize=5.5)
+            axis.plot(error.mean, i, "o", color=colour, markerfacecolor=filled, markersize=5.5)
         axis.axvline(1, color="black", linewidth=0.8, linestyle="--")
-        axis.set_title(stream.name, loc="left", fontsize=10)
-        axis.set_xlim(0, min(max(1.15, 1.1 * max(score.rms.mean for score in scores)), 2.0))
+        axis.set_title(stream.name + (", medians" if measure == "median" else ""), loc="left", fontsize=10)
+        axis.set_xlim(0, min(max(1.15, 1.1 * max(error.mean for error in errors)), 2.0))
         axis.grid(axis="y", visible=False)
         axis.grid(axis="x")
     for axis in axes[::columns]:
@@ -50,7 +52,7 @@ def plot_scores(comparison: Comparison) -> Figure:
     axes[0].set_ylim(len(comparison.learners) - 0.4, -0.6)  # shared by all panels
     for axis in axes[n:]:
         axis.set_visible(False)
-    figure.supxlabel("rms error / that of the model alone (95 % interval); filled: best", fontsize=9)
+    figure.supxlabel("error / that of the model alone (95 % interval); filled: best", fontsize=9)
     return figure
 
 
@@ -61,22 +63,23 @@ def plot_learning_curves(
     mark: dict[int, str] | None = None,
     windows: int = 25,
 ) -> Figure:
-    """rms error over the time of one stream, in windows; ``mark``: sample -> what happened there."""
+    """Error over the time of one stream, in windows; ``mark``: sample -> what happened there."""
     figure, (axis,) = new_figure(7.5, 3.4)
     one = comparison.stream(stream)
     n = len(one) - one.warm_up
     edges = np.linspace(0, n, min(windows, n // 5) + 1).astype(int)
     middle = one.warm_up + 0.5 * (edges[1:] + edges[:-1])
-    others = iter(_CYCLE * 3)
+    others, measure = iter(_CYCLE * 3), comparison.measure(stream)
+    reduce = np.mean if measure == "rms" else np.median
     for name in learners or comparison.learners:
         colour = _ALWAYS[name] if name in _ALWAYS else next(others)
-        total = np.concatenate([[0.0], np.cumsum(comparison.errors[stream, name])])
-        rms = np.sqrt(np.diff(total[edges]) / np.diff(edges))
-        axis.plot(middle, rms, color=colour, linewidth=1.4, label=name)
+        windowed = np.split(comparison.errors[stream, name], edges[1:-1])
+        error = np.sqrt([reduce(squared) for squared in windowed])
+        axis.plot(middle, error, color=colour, linewidth=1.4, label=name)
     for sample, text in (mark or {}).items():
         axis.axvline(sample, color="black", linewidth=0.8, linestyle="--")
         axis.annotate(text, (sample, 0.97), xycoords=("data", "axes fraction"), fontsize=8, va="top")
-    axis.set(xlabel="sample", ylabel="rms error, before learning", ylim=(0, None))
+    axis.set(xlabel="sample", ylabel=f"{measure} error [sd of y]", ylim=(0, None))
     axis.set_title(f"{stream}: {one.about}", loc="left", fontsize=9)
     axis.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
@@ -103,11 +106,12 @@ def plot_ranks(comparison: Comparison) -> Figure:
 def plot_cost(comparison: Comparison) -> Figure:
     """Time for one sample against the geometric mean of the error ratios; the model alone is 1."""
     figure, (axis,) = new_figure(7.5, 3.8)
-    points = []
+    points, measures = [], {stream.name: comparison.measure(stream.name) for stream in comparison.streams}
     for name in comparison.learners:
         scores = [comparison.scores[stream.name, name] for stream in comparison.streams]
+        errors = [comparison.scores[stream, name].error(measures[stream]).mean for stream in measures]
         time = float(np.median([score.microseconds for score in scores]))
-        ratio = float(np.exp(np.mean([np.log(max(score.rms.mean, 1e-6)) for score in scores])))
+        ratio = float(np.exp(np.mean(np.log(np.maximum(errors, 1e-6)))))
         if name != "model alone":
             points.append((ratio, time, name))
     beside = {"textcoords": "axes fraction", "fontsize": 8, "va": "center"}
@@ -122,5 +126,5 @@ def plot_cost(comparison: Comparison) -> Figure:
     axis.xaxis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
     axis.xaxis.set_minor_formatter(ticker.NullFormatter())
     axis.margins(x=0.1, y=0.08)
-    axis.set(xlabel="one prediction and one update [µs]", ylabel="rms error / model alone (geometric mean)")
+    axis.set(xlabel="one prediction and one update [µs]", ylabel="error / model alone (geometric mean)")
     return figure

@@ -30,7 +30,7 @@ class ComparisonReport(Comparison):
         """Tables as CSV, figures as SVG and PNG, and ``index.html`` with all of them, into ``folder``."""
         save = partial(save_figure, folder=Path(folder))
         caption = (
-            "rms error over that of the model alone with 95 % intervals, left of 1 a learner helps. Blue: "
+            "Error over that of the model alone with 95 % intervals, left of 1 a learner helps. Blue: "
             "the default learner and sparse online GPs; filled: the best of each stream."
         )
         figures = [save(plot_scores(self), name="scores", caption=caption)]
@@ -43,7 +43,8 @@ class ComparisonReport(Comparison):
         figures.append(save(plot_cost(self), name="cost", caption=caption))
         for stream in (s.name for s in self.streams):
             shown = curve_learners(self, stream)
-            caption = f"rms error on {stream} over time, each sample predicted before it is learned"
+            measure = self.measure(stream)
+            caption = f"{measure} error on {stream} over time, each sample predicted before it is learned"
             caption += (
                 f": {len(shown)} of {len(self.learners)} learners."
                 if len(shown) < len(self.learners)
@@ -75,14 +76,12 @@ class ComparisonReport(Comparison):
 
 def score_table(comparison: Comparison, stream: str) -> Table:
     """Every learner on one stream."""
-    best = comparison.best(stream)
+    best, measure = comparison.best(stream), comparison.measure(stream)
     columns: dict[Column, Callable[[Score], Cell]] = {
         Column("rms / model alone", ".3f"): lambda score: score.rms,
-        Column("rms / best", ".3f"): lambda score: (
+        Column("median / model alone", ".3f"): lambda score: score.median,
+        Column(f"{measure} / best", ".3f"): lambda score: (
             None if score is best else comparison.ratio(stream, score.learner, best.learner)
-        ),
-        Column("median / model alone", ".3f"): lambda score: (
-            score.median if np.isfinite(score.median) else None
         ),
         Column("NLL [nats]"): lambda score: f"{score.nll:.2f}" if score.nll < 1e3 else f"{score.nll:.1e}",
         Column("90 % coverage [%]", ".0f"): lambda score: 100 * score.coverage,
@@ -94,20 +93,25 @@ def score_table(comparison: Comparison, stream: str) -> Table:
     n, parts = len(one) - one.warm_up, len(one.segments)
     note = f"On {one.used}, of which {n} are scored{f' in {parts} parts' if parts else ''}; "
     note += f"{one.x.shape[1]} inputs, {one.y.shape[1]} outputs. * best; below 1 a learner helps. "
-    note += "95 % intervals; rms / best is paired: above 1 where its interval is. "
-    note += "Median: of the absolute errors, blind to outliers. NLL: per sample and output. "
+    note += f"95 % intervals; {measure} / best is paired: above 1 where its interval is. "
+    note += "Median: of the absolute errors, blind to outliers; it decides where a hundredth of the "
+    note += "rows makes more than half of the squared error. NLL: per sample and output. "
     note += "Time: one prediction and one update."
     return Table.of(f"scores_{stream}", f"{stream}: {one.about}", "learner", items, columns, note)
 
 
 def overview_table(comparison: Comparison) -> Table:
-    """rms error over that of the model alone: learners by streams, and the mean rank."""
+    """Error over that of the model alone: learners by streams, and the mean rank."""
     names = [stream.name for stream in comparison.streams]
     ranks = comparison.ranks().mean(0)
     best = {name: comparison.best(name).learner for name in names}
+    measures = {name: comparison.measure(name) for name in names}
     rows: list[list[Cell]] = []
     for learner, rank in sorted(zip(comparison.learners, ranks, strict=True), key=lambda pair: pair[1]):
-        figures = ((comparison.scores[name, learner].rms.mean, best[name] == learner) for name in names)
+        figures = (
+            (comparison.scores[name, learner].error(measures[name]).mean, best[name] == learner)
+            for name in names
+        )
         rows.append(
             [learner, *(f"{mean:.3f}{' *' if first else ''}" for mean, first in figures), float(rank)]
         )
@@ -115,7 +119,8 @@ def overview_table(comparison: Comparison) -> Table:
     note = "* best of its column."
     if np.isfinite(difference):
         note += f" Mean ranks closer than {difference:.1f} cannot be told apart (Nemenyi, 5 %)."
-    columns = ["learner", *names, Column("mean rank", ".1f")]
+    heads = [f"{name}, {measures[name]}" if measures[name] == "median" else name for name in names]
+    columns = ["learner", *heads, Column("mean rank", ".1f")]
     return Table("overview", "rms error / that of the model alone", columns, rows, note)
 
 
@@ -126,14 +131,15 @@ def constructor_table(comparison: Comparison) -> Table:
     ]
     note = (
         "d inputs, m outputs. The streams above are in units of their own first samples; in the units of "
-        "your own data leave standardize=False out."
+        "your own data omit standardize=False."
     )
     return Table("learners", "How they are made", ["learner", "call"], rows, note)
 
 
 def curve_learners(comparison: Comparison, stream: str, most: int = 6) -> Sequence[str]:
     """The model alone, the default learner and the best few: more curves cannot be followed."""
-    order = sorted(comparison.row(stream), key=lambda score: score.rms.mean)
+    measure = comparison.measure(stream)
+    order = sorted(comparison.row(stream), key=lambda score: score.error(measure).mean)
     always = {"model alone", "default"} & {*comparison.learners}
     rest = [score.learner for score in order if score.learner not in always]
     chosen = always | {*rest[: most - len(always)]}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from ...typing import Array
 from ..reporting.statistics import Estimate
 from .stream import Stream
 
+Measure = Literal["rms", "median"]
 _BLOCKS = 20
 _DECIDED = 0.5
 """Share of the squared error, made by a hundredth of the samples, above which the rms says little."""
@@ -26,7 +28,7 @@ class Score:
     learner: str
     rms: Estimate
     """rms error over that of the model alone: below 1 the learner helps; 95 % block bootstrap."""
-    median: float
+    median: Estimate
     """The same of the median absolute errors: blind to outliers."""
     nll: float
     """Negative log density per sample and output [nats]."""
@@ -36,6 +38,10 @@ class Score:
     """One prediction with deviation and one update."""
     kilobytes: float
     """Of the state dict."""
+
+    def error(self, measure: Measure) -> Estimate:
+        """That one of ``rms`` and ``median``."""
+        return self.rms if measure == "rms" else self.median
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,16 @@ class Comparison:
     calls: dict[str, str] = field(default_factory=dict)
     """learner -> how a user makes it, of d inputs and m outputs, where that is known."""
 
+    def measure(self, stream: str) -> Measure:
+        """What the learners are ranked by: rms errors, or medians where few samples make the rms.
+
+        That is where a hundredth of the samples makes more than half of the squared error of the learner
+        with the smallest.
+        """
+        errors = [self.errors[stream, name] for name in self.learners if (stream, name) in self.errors]
+        least = min(errors, key=np.sum, default=np.zeros(1))
+        return "median" if rare_share(least) > _DECIDED else "rms"
+
     def stream(self, name: str) -> Stream:
         """The stream of that name."""
         return next(stream for stream in self.streams if stream.name == name)
@@ -60,18 +76,31 @@ class Comparison:
         return [self.scores[stream, name] for name in self.learners]
 
     def best(self, stream: str, among: Sequence[str] | None = None) -> Score:
-        """The smallest rms error on a stream."""
+        """The smallest error on a stream, by its :meth:`measure`."""
         chosen = [score for score in self.row(stream) if among is None or score.learner in among]
-        return min(chosen, key=lambda score: score.rms.mean)
+        measure = self.measure(stream)
+        return min(chosen, key=lambda score: score.error(measure).mean)
 
-    def ratio(self, stream: str, ours: str, theirs: str, seed: int = 0) -> Estimate:
-        """rms error of ``ours`` over that of ``theirs`` on the same samples, 95 % paired block bootstrap."""
-        blocks = blocks_of(self.stream(stream))
-        return block_bootstrap(self.errors[stream, ours], self.errors[stream, theirs], blocks, seed)
+    def ratio(
+        self, stream: str, ours: str, theirs: str, seed: int = 0, measure: Measure | None = None
+    ) -> Estimate:
+        """Error of ``ours`` over that of ``theirs`` on the same samples, 95 % paired block bootstrap.
+
+        Args:
+            measure: ``"rms"`` or ``"median"``; None: that of the stream.
+        """
+        blocks, measure = blocks_of(self.stream(stream)), measure or self.measure(stream)
+        errors = self.errors[stream, ours], self.errors[stream, theirs]
+        return block_bootstrap(*errors, blocks, seed, measure=measure)
 
     def ranks(self) -> Array:
         """``(n_streams, n_learners)``, 1 is best; ties share their mean rank."""
-        table = np.array([[score.rms.mean for score in self.row(stream.name)] for stream in self.streams])
+        table = np.array(
+            [
+                [score.error(measure).mean for score in self.row(stream)]
+                for stream, measure in ((s.name, self.measure(s.name)) for s in self.streams)
+            ]
+        )
         mine, others = table[:, :, None], table[:, None, :]
         return (others < mine).sum(-1) + 0.5 * ((others == mine).sum(-1) + 1)
 
@@ -99,7 +128,8 @@ class Comparison:
                 if name not in (best, "model alone")
             }
             level = [name for name, ratio in ratios.items() if ratio.low <= 1]
-            found = f"{self.scores[stream.name, best].rms:.3f}"
+            measure = self.measure(stream.name)
+            found = f"{self.scores[stream.name, best].error(measure):.3f}"
             text = f"{stream.name}: {best} is best, {found} of the model alone"
             if level:
                 text += f"; this recording does not tell it from {', '.join(level)}"
@@ -107,18 +137,27 @@ class Comparison:
             told = [name for k, name in enumerate(behind) if name == "default" or (k == 0 and not level)]
             text += "".join(f"; {name} has {ratios[name]:.3f} times its error" for name in told)
             text += f". On {stream.used}."
-            share = self._rare(stream.name, best)
-            if share > _DECIDED:
-                text += (
-                    f" One row in a hundred makes {100 * share:.0f} % of the squared error: read the median."
-                )
+            if measure == "median":
+                share = 100 * rare_share(self.errors[stream.name, best])
+                text += f" Medians: one row in a hundred makes {share:.0f} % of the squared error."
+            if gives_away(stream):
+                text += " The inputs give y exactly: is what was measured among them?"
             sentences.append(text)
         return sentences
 
-    def _rare(self, stream: str, learner: str) -> float:
-        """Share of the squared error that the worst hundredth of the samples makes."""
-        errors = np.sort(self.errors[stream, learner])[::-1]
-        return float(errors[: max(1, len(errors) // 100)].sum() / max(errors.sum(), np.finfo(float).tiny))
+
+def rare_share(squared: Array) -> float:
+    """Share of the squared errors that the worst hundredth of the samples makes."""
+    errors = np.sort(squared)[::-1]
+    return float(errors[: max(1, len(errors) // 100)].sum() / max(errors.sum(), np.finfo(float).tiny))
+
+
+def gives_away(stream: Stream) -> bool:
+    """y is a linear function of x, without noise: more than any model leaves over."""
+    x = torch.cat([torch.ones_like(stream.x[:, :1]), stream.x], dim=1).double().numpy()
+    y = stream.y.double().numpy()
+    left = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
+    return bool((left.std(0) < 1e-6 * y.std(0)).any())
 
 
 def studentized_range(k: int, alpha: float = 0.05) -> float:
@@ -147,19 +186,30 @@ def blocks_of(stream: Stream) -> NDArray[np.int64]:
 
 
 def block_bootstrap(
-    ours: Array, theirs: Array, blocks: NDArray[np.int64], seed: int = 0, resamples: int = 2000
+    ours: Array,
+    theirs: Array,
+    blocks: NDArray[np.int64],
+    seed: int = 0,
+    resamples: int = 2000,
+    measure: Measure = "rms",
 ) -> Estimate:
-    """``sqrt(sum ours / sum theirs)`` with its 95 % percentile interval over resampled blocks.
+    """``sqrt(sum ours / sum theirs)``, or of medians, with its 95 % percentile interval over blocks.
 
     Args:
         ours, theirs: squared errors of the same samples.
         blocks: the block of each sample; samples of a block stay together.
+        measure: a mean or a median of the squared errors before the root.
     """
     _, index = np.unique(blocks, return_inverse=True)
-    sums = np.stack([np.bincount(index, weights=values) for values in (ours, theirs)])
-    draw = np.random.default_rng(seed).integers(sums.shape[1], size=(resamples, sums.shape[1]))
-    tiny = np.finfo(float).tiny
-    ratios = np.sqrt(sums[0][draw].sum(1) / np.maximum(sums[1][draw].sum(1), tiny))
-    low, high = np.percentile(ratios, [2.5, 97.5])
-    middle = np.sqrt(ours.sum() / max(theirs.sum(), tiny))
-    return Estimate(float(middle), float(low), float(high), sums.shape[1])
+    n, tiny = int(index.max()) + 1, np.finfo(float).tiny
+    draw = np.random.default_rng(seed).integers(n, size=(resamples, n))
+    errors = np.stack([ours, theirs])
+    if measure == "rms":
+        sums = np.stack([np.bincount(index, weights=values) for values in errors])
+        drawn, whole = sums[:, draw].sum(-1), errors.sum(-1)
+    else:
+        parts = [errors[:, index == k] for k in range(n)]
+        drawn = np.stack([np.median(np.hstack([parts[k] for k in one]), axis=-1) for one in draw], axis=-1)
+        whole = np.median(errors, axis=-1)
+    low, high = np.percentile(np.sqrt(drawn[0] / np.maximum(drawn[1], tiny)), [2.5, 97.5])
+    return Estimate(float(np.sqrt(whole[0] / max(whole[1], tiny))), float(low), float(high), n)
