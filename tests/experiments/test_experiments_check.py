@@ -39,11 +39,17 @@ def test_the_hands_of_the_package_pass(name, tmp_path):
     assert {"tendon", "limits", "pinch", "stability"} <= {row.name.split()[0] for row in rows}
 
 
+_CAPSULE = (
+    '<collision><origin xyz="0.015 0 0" rpy="0 1.57079632679 0"/><geometry><cylinder radius="0.006" '
+    'length="0.03"/></geometry></collision>'
+)
+_BOX = '<collision><origin xyz="0.015 0 0"/><geometry><box size="0.042 0.012 0.016"/></geometry></collision>'
 SPRING = "spring = 0.2, rest_deg = "
 FAULTS = {  # what is changed (0: URDF, 1: transmission file); name, state and text of a row
     "pad away": (1, "[0.0, -1.0, 0.0]", "[0.0, 1.0, 0.0]", "pad 'left'", "error", "away.*'left_1' closes"),
     "pad sideways": (1, "[0.0, -1.0, 0.0]", "[0.0, 0.0, 1.0]", "pad 'left'", "error", "no joint moves it"),
     "pad off its link": (1, "radius = 0.006", "radius = 0.009", "pad 'left'", "warning", "not the <"),
+    "pad in a box": (0, _CAPSULE, _BOX, "pad 'left'", "warning", "a <collision> box, whose edges touch"),
     "limits": (0, 'upper="1.5"', 'upper="0.02"', "limits", "error", "joint '.*_[01]': no posture within"),
     "no limits": (0, 'left_0" type="revolute"', 'left_0" type="continuous"', "limits", "error", "left_0"),
     "wide limits": (0, '"-0.5" upper="1.5"', '"-3" upper="3"', "limits", "warning", "left_0.*344 deg"),
@@ -109,6 +115,18 @@ def test_springs_too_soft_for_the_usual_force_are_told_which_one_they_bear(monke
     assert rows["pinch"].state == "error"
     assert "sound at 2 N" in rows["pinch force"].found
     assert "PlantConfig(pinch_force=2)" in rows["pinch force"].mend
+
+
+def test_a_pinch_that_the_usual_faults_break_is_told(monkeypatch):
+    def hand(*args, preset="none", **options):
+        if preset == "nominal":
+            raise GraspError("it slips")
+        return SimulatedHand(*args, preset=preset, **options)
+
+    monkeypatch.setattr("torch_ekm.experiments.check.SimulatedHand", hand)
+    rows = {row.name: row for row in check_hand("planar_two_finger", "can")}
+    assert (rows["pinch"].state, rows["pinch, preset nominal"].state) == ("ok", "warning")
+    assert "it slips" in rows["pinch, preset nominal"].found
 
 
 def test_rigid_actuators_that_contradict_each_other_are_told(monkeypatch):

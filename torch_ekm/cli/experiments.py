@@ -79,7 +79,7 @@ def reproduce(
     ] = "",
     step: Annotated[
         float | None,
-        Option(help="Largest turn of one motion [deg]; 2.5 if left out (less where a contact goes 1.2 mm)."),
+        Option(help="Turn of one motion at pace 1 [deg]; 2.5 if left out (less where a contact moves far)."),
     ] = None,
     address: Annotated[
         str | None, Option(help="A Dask cluster instead of processes here: dask://HOST:PORT.")

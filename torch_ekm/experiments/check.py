@@ -69,7 +69,7 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
     rows += [*_rigid(description), *_reach(description, obj)]
     pinch = list(_pinch(description, obj, picture, PlantConfig()))
     faulty = any(row.state == "error" for row in pinch)
-    return [*rows, *pinch, *(_gentler(description, obj) if faulty else ())]
+    return [*rows, *pinch, *(_gentler if faulty else _disturbed)(description, obj)]
 
 
 def _pads(hand: HandDescription) -> Iterator[Check]:
@@ -78,12 +78,16 @@ def _pads(hand: HandDescription) -> Iterator[Check]:
         place = f"on {pad.link}, end {_vector(np.array(pad.end) * 1e3)} mm, "
         found = place + f"direction {_vector(pad.direction)}, radius {1e3 * pad.radius:g} mm"
         shapes, lack = hand.urdf.link(pad.link).collisions, direction_unmet(hand, pad)
-        depth = -signed_distance(shapes, np.array([pad.start, pad.end]))[0] if shapes else np.zeros(2)
+        ends = np.array([pad.start, pad.end])
+        depth = -signed_distance(shapes, ends)[0] if shapes else np.zeros(2)
         name = f"pad '{pad.name}'"
         if lack is not None:
             yield Check(name, "error", f"{found}; {lack.problem}", lack.remedy)
         elif not shapes:
             yield Check(name, "error", f"{found}; its link has no primitive <collision>", "write its capsule")
+        elif any(shape.kind == "box" and (signed_distance([shape], ends)[0] < 0).all() for shape in shapes):
+            mend = "write it as a capsule: a cylinder and two spheres"
+            yield Check(name, "warning", f"{found}; in a <collision> box, whose edges touch first", mend)
         elif np.abs(depth - pad.radius).max() > _SURFACE:
             yield Check(name, "warning", f"{found}; not the <collision> of its link", "make both the same")
         else:
@@ -149,6 +153,19 @@ def _gentler(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
             mend = f"PlantConfig(pinch_force={force:g}), or stiffer springs"
             yield Check("pinch force", "warning", f"too high: the pinch is sound at {force:g} N", mend)
             return
+
+
+def _disturbed(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
+    """Experiments and examples have faults in the hand."""
+    try:
+        SimulatedHand(hand, obj, preset="nominal").reset(0)
+    except MissingExtraError:
+        return
+    except EKMError as error:
+        mend = "stiffer springs, a lower PlantConfig(pinch_force=...), more friction"
+        yield Check("pinch, preset nominal", "warning", str(error), mend)
+    else:
+        yield Check("pinch, preset nominal", "ok", "held with the usual faults, too")
 
 
 def _pinch(

@@ -106,16 +106,17 @@ def motion_table(records: Sequence[Record], limit: int) -> Table:
     beyond = stats.beyond_least(limit, step)
     columns: dict[Column, Callable[[Trials], Cell]] = {
         Column("motions", ".1f"): lambda mine: stats.estimate(mine, lambda r: r.steps),
-        Column("beyond the least", ".1f"): lambda mine: stats.estimate(mine, beyond),
+        Column("beyond angle / step", ".1f"): lambda mine: stats.estimate(mine, beyond),
         Column("first motion [deg]"): lambda mine: stats.estimate(mine, lambda r: r.first_step_deg),
         Column("all motions [deg]"): lambda mine: stats.estimate(mine, lambda r: r.step_error_deg),
         Column("off the axis [deg]", ".1f"): lambda mine: stats.estimate(mine, survivors_off_axis),
     }
     note = (
-        "Mean and 95 % bootstrap interval over seeds. Beyond the least: motions until the measured error "
-        f"stays within {BAND_DEG:g} deg, less the angle over {step:g} deg, rounded up; a turn that never "
-        "settles counts with the limit. First motion, all motions: by how much more or less a motion changed "
-        "the error than it was to. Off the axis: rotation at the end, of objects that were not lost."
+        "Mean and 95 % bootstrap interval over seeds. Beyond angle / step: motions until the measured error "
+        f"stays within {BAND_DEG:g} deg, less the angle over {step:g} deg, rounded up; below 0 where the "
+        "pace is above 1. A turn that never settles counts with the limit. First motion, all motions: by how "
+        "much more or less a motion changed the error than it was to. Off the axis: rotation at the end, of "
+        "objects that were not lost."
     )
     return Table.of(
         "motions", "The motions of each controller", "controller", by_controller(records), columns, note
