@@ -39,6 +39,7 @@ from torch_ekm.residual import (
     SparseOnlineGP,
     SquaredExponential,
     Standardize,
+    default_learner,
 )
 
 D = 20
@@ -367,6 +368,14 @@ def table(compiled: bool) -> list[tuple[str, float, float]]:
         found = alternately(calls, rounds=3)
         for backend, us in found.items():
             rows.append((f"update b=100 m=6, {learned}, mean: {backend}", us / 64, math.nan))
+    for name, make in (("SparseOnlineGP(d, m)", SparseOnlineGP), ("default_learner(d, m)", default_learner)):
+        learner, times = make(D, 6), []
+        for x, y in zip(*stream(1500, 6, seed=1), strict=True):
+            begin = time.perf_counter()
+            learner.update(x, y)
+            times.append(1e6 * (time.perf_counter() - begin))
+        for which, us in (("median", np.median(times[500:])), ("slowest of 1000", max(times[500:]))):
+            rows.append((f"update of {name}, m=6, {which}", float(us), math.nan))
     deep = SparseOnlineGP(D, 6, kernel=DeepKernel(SquaredExponential(D))), DeepKernelSOGP(D, 6)
     for gp in deep:
         gp.update(*stream(2110, 6, seed=1))  # a memory is full then

@@ -118,6 +118,7 @@ LEARNERS: dict[str, Factory] = {
     "KRLS-T": _kind(residual.KRLSTracker, "capacity", "kernel", forgetting_factor=0.99, **_AS_GIVEN),
     "MLP": _kind(residual.ReplayMLP, standardize=False),
     "MLP ensemble": _kind(residual.ReplayMLP, members=3, standardize=False),
+    "SOGP default": _kind(residual.SparseOnlineGP, "capacity"),
     "SOGP plain": _sogp(),  # as in the paper: nothing forgotten, every sample trusted
     "SOGP": _sogp(forgetting_factor=0.99, robust=3.0),
     "SOGP adaptive": _sogp(forgetting_factor=0.99, robust=3.0, parts=[residual.CalibrateNoise(), *_LEARNING]),

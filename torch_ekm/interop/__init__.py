@@ -135,6 +135,15 @@ def log_from_mcap(folder: str | Path, target: str | Path) -> TrialLog:
 
 
 __all__ = [
-    "AcadosResidual", "CapyMOARegressor", "LearnerLike", "OnlineRegressor", "as_capymoa", "as_river",
-    "as_sklearn", "log_from_mcap", "log_to_mcap", "read_bag", "to_casadi",
-]  # fmt: skip
+    "AcadosResidual",
+    "CapyMOARegressor",
+    "LearnerLike",
+    "OnlineRegressor",
+    "as_capymoa",
+    "as_river",
+    "as_sklearn",
+    "log_from_mcap",
+    "log_to_mcap",
+    "read_bag",
+    "to_casadi",
+]
