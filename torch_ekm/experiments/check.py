@@ -85,7 +85,7 @@ def _pads(hand: HandDescription) -> Iterator[Check]:
             yield Check(name, "error", f"{found}; {lack.problem}", lack.remedy)
         elif not shapes:
             yield Check(name, "error", f"{found}; its link has no primitive <collision>", "write its capsule")
-        elif any(shape.kind == "box" and (signed_distance([shape], ends)[0] < 0).all() for shape in shapes):
+        elif any(shape.kind == "box" and (signed_distance((shape,), ends)[0] < 0).all() for shape in shapes):
             mend = "write it as a capsule: a cylinder and two spheres"
             yield Check(name, "warning", f"{found}; in a <collision> box, whose edges touch first", mend)
         elif np.abs(depth - pad.radius).max() > _SURFACE:

@@ -84,10 +84,9 @@ def compare(
         stream, name = keys[job]
         squared, alone = np.array(result.pop("squared")), _squared(stream.y[stream.warm_up :])
         errors[stream.name, name] = squared
-        rms, median = (
-            block_bootstrap(squared, alone, blocks_of(stream), measure=measure)
-            for measure in ("rms", "median")
-        )
+        blocks = blocks_of(stream)
+        rms = block_bootstrap(squared, alone, blocks)
+        median = block_bootstrap(squared, alone, blocks, measure="median")
         scores[stream.name, name] = Score(stream.name, name, rms, median, **result)
     calls = {name: constructor_call(factory) for name, factory in factories.items()}
     return ComparisonReport(tuple(streams), tuple(factories), scores, errors, calls)

@@ -35,15 +35,15 @@ def plot_scores(comparison: Comparison) -> Figure:
     y = np.arange(len(comparison.learners))
     for axis, stream in zip(axes, comparison.streams, strict=False):
         scores, best = comparison.row(stream.name), comparison.best(stream.name)
-        measure = comparison.measure(stream.name)
-        errors = [score.error(measure) for score in scores]
+        errors = [comparison.error(stream.name, score.learner) for score in scores]
         for i, (score, error) in enumerate(zip(scores, errors, strict=True)):
             colour = colour_of(score.learner)
             axis.plot([error.low, error.high], [i, i], color=colour, linewidth=1.6)
             filled = colour if score is best else "white"
             axis.plot(error.mean, i, "o", color=colour, markerfacecolor=filled, markersize=5.5)
         axis.axvline(1, color="black", linewidth=0.8, linestyle="--")
-        axis.set_title(stream.name + (", medians" if measure == "median" else ""), loc="left", fontsize=10)
+        medians = ", medians" if comparison.measure(stream.name) == "median" else ""
+        axis.set_title(stream.name + medians, loc="left", fontsize=10)
         axis.set_xlim(0, min(max(1.15, 1.1 * max(error.mean for error in errors)), 2.0))
         axis.grid(axis="y", visible=False)
         axis.grid(axis="x")
@@ -106,10 +106,10 @@ def plot_ranks(comparison: Comparison) -> Figure:
 def plot_cost(comparison: Comparison) -> Figure:
     """Time for one sample against the geometric mean of the error ratios; the model alone is 1."""
     figure, (axis,) = new_figure(7.5, 3.8)
-    points, measures = [], {stream.name: comparison.measure(stream.name) for stream in comparison.streams}
+    points = []
     for name in comparison.learners:
         scores = [comparison.scores[stream.name, name] for stream in comparison.streams]
-        errors = [comparison.scores[stream, name].error(measures[stream]).mean for stream in measures]
+        errors = [comparison.error(stream.name, name).mean for stream in comparison.streams]
         time = float(np.median([score.microseconds for score in scores]))
         ratio = float(np.exp(np.mean(np.log(np.maximum(errors, 1e-6)))))
         if name != "model alone":

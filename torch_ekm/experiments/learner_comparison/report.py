@@ -105,13 +105,9 @@ def overview_table(comparison: Comparison) -> Table:
     names = [stream.name for stream in comparison.streams]
     ranks = comparison.ranks().mean(0)
     best = {name: comparison.best(name).learner for name in names}
-    measures = {name: comparison.measure(name) for name in names}
     rows: list[list[Cell]] = []
     for learner, rank in sorted(zip(comparison.learners, ranks, strict=True), key=lambda pair: pair[1]):
-        figures = (
-            (comparison.scores[name, learner].error(measures[name]).mean, best[name] == learner)
-            for name in names
-        )
+        figures = ((comparison.error(name, learner).mean, best[name] == learner) for name in names)
         rows.append(
             [learner, *(f"{mean:.3f}{' *' if first else ''}" for mean, first in figures), float(rank)]
         )
@@ -119,7 +115,7 @@ def overview_table(comparison: Comparison) -> Table:
     note = "* best of its column."
     if np.isfinite(difference):
         note += f" Mean ranks closer than {difference:.1f} cannot be told apart (Nemenyi, 5 %)."
-    heads = [f"{name}, {measures[name]}" if measures[name] == "median" else name for name in names]
+    heads = [name + (", median" if comparison.measure(name) == "median" else "") for name in names]
     columns = ["learner", *heads, Column("mean rank", ".1f")]
     return Table("overview", "rms error / that of the model alone", columns, rows, note)
 
@@ -138,8 +134,7 @@ def constructor_table(comparison: Comparison) -> Table:
 
 def curve_learners(comparison: Comparison, stream: str, most: int = 6) -> Sequence[str]:
     """The model alone, the default learner and the best few: more curves cannot be followed."""
-    measure = comparison.measure(stream)
-    order = sorted(comparison.row(stream), key=lambda score: score.error(measure).mean)
+    order = sorted(comparison.row(stream), key=lambda score: comparison.error(stream, score.learner).mean)
     always = {"model alone", "default"} & {*comparison.learners}
     rest = [score.learner for score in order if score.learner not in always]
     chosen = always | {*rest[: most - len(always)]}

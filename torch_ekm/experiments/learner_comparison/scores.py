@@ -39,10 +39,6 @@ class Score:
     kilobytes: float
     """Of the state dict."""
 
-    def error(self, measure: Measure) -> Estimate:
-        """That one of ``rms`` and ``median``."""
-        return self.rms if measure == "rms" else self.median
-
 
 @dataclass(frozen=True)
 class Comparison:
@@ -67,6 +63,11 @@ class Comparison:
         least = min(errors, key=np.sum, default=np.zeros(1))
         return "median" if rare_share(least) > _DECIDED else "rms"
 
+    def error(self, stream: str, learner: str) -> Estimate:
+        """Over that of the model alone, by the stream's :meth:`measure`."""
+        score = self.scores[stream, learner]
+        return score.rms if self.measure(stream) == "rms" else score.median
+
     def stream(self, name: str) -> Stream:
         """The stream of that name."""
         return next(stream for stream in self.streams if stream.name == name)
@@ -78,8 +79,7 @@ class Comparison:
     def best(self, stream: str, among: Sequence[str] | None = None) -> Score:
         """The smallest error on a stream, by its :meth:`measure`."""
         chosen = [score for score in self.row(stream) if among is None or score.learner in among]
-        measure = self.measure(stream)
-        return min(chosen, key=lambda score: score.error(measure).mean)
+        return min(chosen, key=lambda score: self.error(stream, score.learner).mean)
 
     def ratio(
         self, stream: str, ours: str, theirs: str, seed: int = 0, measure: Measure | None = None
@@ -96,10 +96,7 @@ class Comparison:
     def ranks(self) -> Array:
         """``(n_streams, n_learners)``, 1 is best; ties share their mean rank."""
         table = np.array(
-            [
-                [score.error(measure).mean for score in self.row(stream)]
-                for stream, measure in ((s.name, self.measure(s.name)) for s in self.streams)
-            ]
+            [[self.error(stream.name, name).mean for name in self.learners] for stream in self.streams]
         )
         mine, others = table[:, :, None], table[:, None, :]
         return (others < mine).sum(-1) + 0.5 * ((others == mine).sum(-1) + 1)
@@ -128,8 +125,7 @@ class Comparison:
                 if name not in (best, "model alone")
             }
             level = [name for name, ratio in ratios.items() if ratio.low <= 1]
-            measure = self.measure(stream.name)
-            found = f"{self.scores[stream.name, best].error(measure):.3f}"
+            found = f"{self.error(stream.name, best):.3f}"
             text = f"{stream.name}: {best} is best, {found} of the model alone"
             if level:
                 text += f"; this recording does not tell it from {', '.join(level)}"
@@ -137,7 +133,7 @@ class Comparison:
             told = [name for k, name in enumerate(behind) if name == "default" or (k == 0 and not level)]
             text += "".join(f"; {name} has {ratios[name]:.3f} times its error" for name in told)
             text += f". On {stream.used}."
-            if measure == "median":
+            if self.measure(stream.name) == "median":
                 share = 100 * rare_share(self.errors[stream.name, best])
                 text += f" Medians: one row in a hundred makes {share:.0f} % of the squared error."
             if gives_away(stream):
