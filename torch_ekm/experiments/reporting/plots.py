@@ -106,6 +106,8 @@ def plot_learning_test(ekm_deg: Array, km_deg: Array) -> Figure:
     if finite.size > 3:  # the first intervals are enormous and hide the rest
         right.set_ylim(1.2 * finite.min(), max(np.percentile(finite, 90), 0.1))
     right.set_title(f"last upper boundary: {curve.last_upper:.2f} deg", loc="left", fontsize=10)
+    for axis in (left, right):
+        axis.xaxis.get_major_locator().set_params(integer=True)
     return figure
 
 
@@ -142,7 +144,7 @@ def plot_steady_state_error(errors_deg: dict[str, dict[str, Array]], what: str =
     axis.set_xticks(range(len(targets)), targets)
     limits = (0, top if np.isfinite(top) else None)
     axis.set(xlabel="target [deg]", ylabel="steady-state error [deg]", ylim=limits)
-    axis.set_title(f"Steady-state error{', ' + what if what else ''}: each run, and the mean", loc="left")
+    axis.set_title(f"Steady-state error{', ' + what if what else ''}", loc="left")
     axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     return figure
 
