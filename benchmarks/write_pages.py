@@ -39,7 +39,8 @@ class Part:
 
     title: str
     command: str
-    """Words after ``python benchmarks/``, or ``torch-ekm ...``; ``{out}`` is a folder of its own."""
+    """Words after ``python benchmarks/``, or ``torch-ekm ...``; ``{out}`` is a folder of its own, ``{data}``
+    that of the recordings."""
     see: str
     quick: str = "--quick"
     """What makes it short."""
@@ -55,7 +56,8 @@ class Part:
 
     def words(self, out: Path, quick: bool) -> list[str]:
         """The command as it is run."""
-        words = f"{self.command} {self.quick if quick else ''}".format(out=out).split()
+        data = os.environ["TORCH_EKM_DATA"] if "{data}" in self.command else ""
+        words = f"{self.command} {self.quick if quick else ''}".format(out=out, data=data).split()
         if words[0] == "torch-ekm":
             return [sys.executable, "-c", "from torch_ekm.cli import main; main()", *words[1:]]
         if words[0] == "pytest":
@@ -64,7 +66,7 @@ class Part:
 
     def spoken(self) -> str:
         """The command as a reader would type it."""
-        words = self.command.format(out="FOLDER")
+        words = self.command.format(out="FOLDER", data="DATA")
         return words if words.startswith(("torch-ekm", "pytest")) else f"python benchmarks/{words}"
 
 
