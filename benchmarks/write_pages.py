@@ -56,7 +56,7 @@ class Part:
 
     def words(self, out: Path, quick: bool) -> list[str]:
         """The command as it is run."""
-        data = os.environ["TORCH_EKM_DATA"] if "{data}" in self.command else ""
+        data = os.environ.get("TORCH_EKM_DATA", "TORCH_EKM_DATA")
         words = f"{self.command} {self.quick if quick else ''}".format(out=out, data=data).split()
         if words[0] == "torch-ekm":
             return [sys.executable, "-c", "from torch_ekm.cli import main; main()", *words[1:]]
