@@ -207,7 +207,9 @@ def reach_table(results: Results) -> Table:
         items[f"{name}, all"] = mine
     columns: dict[Column, Callable[[Turns], Cell]] = {
         Column("grasps"): lambda mine: len(reach_errors(mine)),
-        Column("median absolute error [deg]", ".1f"): lambda mine: float(np.median(np.abs(reach_errors(mine)))),
+        Column("median absolute error [deg]", ".1f"): lambda mine: float(
+            np.median(np.abs(reach_errors(mine)))
+        ),
         Column("mean error [deg]", "+.1f"): lambda mine: float(reach_errors(mine).mean()),
         Column("within 2 deg"): lambda mine: stats.rate((np.abs(reach_errors(mine)) <= 2).tolist()),
         Column("within 5 deg"): lambda mine: stats.rate((np.abs(reach_errors(mine)) <= 5).tolist()),
