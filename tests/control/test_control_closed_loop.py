@@ -11,13 +11,14 @@ import torch
 
 from torch_ekm.control import (
     ClosedLoop,
+    ControlProblem,
     LookAndMoveController,
     PoseTarget,
     StoppingRule,
 )
 from torch_ekm.control import StopReason as Reason
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.exceptions import NonFiniteError, ParameterError
+from torch_ekm.exceptions import NonFiniteError, ParameterError, SolverError
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, Plant, PlantStatus
@@ -91,6 +92,24 @@ def test_target_that_is_reached_already_needs_no_command(held) -> None:
     done, plant = drive(held, angle=0.1)
     assert done.reason is Reason.REACHED
     assert plant.commands == 1  # seen twice within the tolerance
+
+
+@pytest.mark.parametrize("solved", [0, 1, 4])
+def test_a_program_that_no_solver_solves_gives_up_holding(held, monkeypatch, solved: int) -> None:
+    """Next to buckling a Jacobian is out of all scale: the loop goes back and ends, and raises nothing."""
+    solve, calls = ControlProblem.solve, []
+
+    def no_longer(problem: ControlProblem, solver: str = "piqp"):
+        calls.append(solver)
+        if len(calls) > solved:
+            raise SolverError(solver, "no solution found")
+        return solve(problem, solver)
+
+    monkeypatch.setattr(ControlProblem, "solve", no_longer)
+    done, _ = drive(held)
+    assert done.reason is (Reason.GIVEN_UP if done.steps else Reason.UNSTABLE_GRASP)
+    assert "no solution found" in done.stop.message
+    assert len(done.steps) % 2 == 0  # as many on the way back
 
 
 def test_lost_object_ends_the_manipulation(held) -> None:

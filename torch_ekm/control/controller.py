@@ -12,7 +12,7 @@ import torch
 
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
-from ..exceptions import GraspError, NoContactError, ShapeError
+from ..exceptions import EKMError, GraspError, NoContactError, ShapeError, SolverError
 from ..kinematics import GraspState
 from ..model import ModelStatus
 from ..residual.checks import check_finite
@@ -191,12 +191,12 @@ class LookAndMoveController:
 
         Returns:
             A :class:`Decision`. A grasp that cannot be modelled gives ``delta_a = 0`` and a
-            status that says so, never an exception.
+            status that says so, never an exception; one that is next to buckling has a Jacobian that is
+            out of all scale, and is unstable where the QP solver fails on it.
 
         Raises:
             NonFiniteError: an observation is NaN or infinite.
             ShapeError: an observation has the wrong size.
-            SolverError: the QP solver failed (it cannot be infeasible: all rows have slack).
             EKMError: what the tasks and limits raise.
         """
         hand = self.kinematic.hand
@@ -215,8 +215,7 @@ class LookAndMoveController:
         except GraspError as failure:
             lost = isinstance(failure, NoContactError)
             status = StopReason.OBJECT_LOST if lost else StopReason.UNSTABLE_GRASP
-            zero, still = a.new_zeros(hand.n_a), a.new_zeros(hand.n_q + 6)
-            return Decision(zero, status, self.limiting(focused), still, still, message=str(failure))
+            return self._none(status, failure, focused)
 
         travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
         pace, steps = self.pace, self.limiting.steps(focused, travel)
@@ -226,19 +225,28 @@ class LookAndMoveController:
         seen = Situation(
             hand, self.focus, state, a, fingertip_force, error, desired, alone, self._weight, self.tighter
         )
-        da, predicted, problem, solution = self._solve(lin, seen)
-        phi = self.bound.share(lin, da, predicted, seen, self._wanted_grip(lin, seen))
-        phi = max(phi, min(1.0, self.bound.least / max(share * pace, 1e-9)))
-        if phi < 1:
-            desired, share = phi * desired, phi * share
-            seen = dataclasses.replace(seen, desired=desired)
+        try:
             da, predicted, problem, solution = self._solve(lin, seen)
+            phi = self.bound.share(lin, da, predicted, seen, self._wanted_grip(lin, seen))
+            phi = max(phi, min(1.0, self.bound.least / max(share * pace, 1e-9)))
+            if phi < 1:
+                desired, share = phi * desired, phi * share
+                seen = dataclasses.replace(seen, desired=desired)
+                da, predicted, problem, solution = self._solve(lin, seen)
+        except SolverError as failure:  # it cannot be infeasible, as all rows have slack
+            return self._none(StopReason.UNSTABLE_GRASP, failure, focused)
         nominal = lin.manipulation_jacobian @ da
         slack = float(np.abs(solution.slack).max(initial=0.0))
         limited = slack > 0.05 * float(desired.abs().max()) and self._at_limit(a, da, problem)
         return Decision(
             da, StopReason.RUNNING, desired, predicted, nominal, share, limited, slack, lin, solution
         )
+
+    def _none(self, status: StopReason, failure: EKMError, focused: Tensor) -> Decision:
+        """No motion, and why."""
+        hand = self.kinematic.hand
+        zero, still = focused.new_zeros(hand.n_a), focused.new_zeros(hand.n_q + 6)
+        return Decision(zero, status, self.limiting(focused), still, still, message=str(failure))
 
     def _solve(
         self, lin: Linearization, seen: Situation
