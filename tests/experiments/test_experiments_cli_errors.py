@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from torch_ekm.cli import main
+from torch_ekm.exceptions import ParameterError
 
 MESH_ONLY = """<robot name="finger"><link name="base"/><link name="tip"><collision><geometry>
 <mesh filename="a.stl"/></geometry></collision></link><joint name="knuckle" type="revolute">
@@ -141,3 +142,17 @@ def test_a_wrong_option_is_told_in_one_line(
     assert said.startswith("torch-ekm: ")
     assert said.count("\n") == 1
     assert sorted(place.iterdir()) == before
+
+
+def test_the_job_in_which_it_went_wrong_is_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails(**options: object) -> None:
+        error = ParameterError("dead_zone", -1.0, "positive")
+        error.add_note("in the job 'box_1000'")
+        raise error
+
+    monkeypatch.setattr("torch_ekm.cli.app", fails)
+    with pytest.raises(SystemExit):
+        main()
+    assert capsys.readouterr().err.endswith("; in the job 'box_1000'\n")

@@ -36,9 +36,10 @@ def test_parallel_equals_serial(tmp_path: Path) -> None:
 
 def test_interrupted_run_resumes(tmp_path: Path) -> None:
     done: list[str] = []
-    with pytest.raises(ValueError, match="negative"):
+    with pytest.raises(ValueError, match="negative") as told:
         run_jobs(square, {"a": (1,), "b": (-1,), "c": (2,)}, tmp_path, on_done=done.append)
     assert done == ["a"]
+    assert told.value.__notes__ == ["in the job 'b'"]
     calls: list[int] = []
 
     def counted(x: int) -> dict[str, float]:
@@ -90,8 +91,9 @@ def mark(folder: str, x: int) -> int:
 def test_a_failure_cancels_what_has_not_begun(tmp_path: Path) -> None:
     traces = tmp_path / "traces"
     traces.mkdir()
-    with pytest.raises(ValueError, match="job 0"):
+    with pytest.raises(ValueError, match="job 0") as told:
         run_jobs(mark, {f"job_{x}": (str(traces), x) for x in range(60)}, tmp_path / "runs", processes=2)
+    assert told.value.__notes__ == ["in the job 'job_0'"]
     time.sleep(1.5)
     assert len(list(traces.iterdir())) < 30
 
@@ -221,8 +223,9 @@ def check_cluster(address: str, folder: Path) -> None:
     assert done[0] == "a"
     assert sorted(done) == ["a", "b", "c"]
     assert read_result(folder / "b.json", "b") == 0.25
-    with pytest.raises(ZeroDivisionError):
+    with pytest.raises(ZeroDivisionError) as told:
         run_jobs(truediv, {**DIVISIONS, "d": (1, 0)}, folder, address=address)
+    assert told.value.__notes__ == ["in the job 'd'"]
     assert not (folder / "d.json").exists()
 
 

@@ -29,6 +29,6 @@ def main() -> None:
     except typer.Abort:
         sys.exit(1)
     except (EKMError, OSError) as error:
-        say_error(error)
+        say_error("; ".join([str(error), *getattr(error, "__notes__", ())]))
         sys.exit(1)
     sys.exit(code if isinstance(code, int) else 0)

@@ -15,9 +15,9 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import closing
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -47,8 +47,9 @@ def run_jobs(
 
     A job whose file exists is not run again, so an interrupted run goes on where it stopped. A file appears
     whole or not at all, and is written here, wherever the job ran; it has the job's name and a digest in it,
-    and one that is not what it should be is told in a warning, and the job run again. When a job fails, or
-    the caller stops asking, what has not begun is cancelled. A job whose process is killed is run again,
+    and one that is not what it should be is told in a warning, and the job run again. When a job fails, its
+    exception has the job's name as a note, and what has not begun is cancelled, as it is when the caller
+    stops asking. A job whose process is killed is run again,
     three times at most; processes end with this one, however it ends.
 
     Args:
@@ -99,9 +100,22 @@ def _run_all(
     return {name: results[name] for name in jobs}
 
 
+@contextmanager
+def _named(job: str) -> Iterator[None]:
+    """What is raised here says in which job."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"in the job '{job}'")
+        raise
+
+
 def _in_processes(processes: int, function: Callable[..., Any], jobs: Jobs) -> Outcomes:
     if min(processes, len(jobs)) <= 1:
-        yield from ((name, function(*arguments)) for name, arguments in jobs.items())
+        for name, arguments in jobs.items():
+            with _named(name):
+                result = function(*arguments)
+            yield name, result
         return
     loky = require("joblib.externals.loky")
     died = require("joblib.externals.loky.process_executor").TerminatedWorkerError
@@ -125,7 +139,8 @@ def _in_processes(processes: int, function: Callable[..., Any], jobs: Jobs) -> O
                 place, name, tries = running.pop(future)
                 idle.append(place)
                 try:
-                    result = future.result()
+                    with _named(name):
+                        result = future.result()
                 except died:
                     if tries == _TRIES:
                         raise WorkerDiedError(name, tries) from None
@@ -167,7 +182,8 @@ def _on_dask(address: str, function: Callable[..., Any], jobs: Jobs) -> Outcomes
         futures = {client.submit(_alone, function, job, pure=False): name for name, job in jobs.items()}
         for future in distributed.as_completed(futures, loop=client.loop):
             try:
-                result = future.result()
+                with _named(futures[future]):
+                    result = future.result()
             except distributed.KilledWorker as error:  # after as many tries as the scheduler allows
                 raise WorkerDiedError(futures[future], error.allowed_failures + 1) from None
             yield futures[future], result
