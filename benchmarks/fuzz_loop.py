@@ -16,6 +16,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 import torch
+from joblib import Parallel, delayed
 
 from torch_ekm.control import ClosedLoop, LookAndMoveController, PoseTarget, StopReason
 from torch_ekm.enhanced import EnhancedModel
@@ -118,6 +119,7 @@ def turn(plant, sight, ekm: EnhancedModel, grasp: int, session: Session | None) 
 
 def fuzz(seed: int, observations: int, chance: float = 0.15, clean: tuple[int, ...] = CLEAN) -> Session:
     """One session; without ``clean`` turns nothing is compared."""
+    torch.set_num_threads(1)
     parameters = preset("nominal").replace(hardware_seed=seed)
     plant = Checked(SimulatedHand("icub_right", "box", PlantConfig(time_step=2e-3), parameters))
     sight, session, turns = FuzzedPlant(plant, chance, seed=seed), Session(seed), 0
@@ -147,12 +149,13 @@ def main() -> None:
     arguments.add_argument("--each", type=int, default=250, help="observations of a session")
     arguments.add_argument("--compare", type=int, default=1, help="clean turns after each so many sessions")
     arguments.add_argument("--seed", type=int, default=1000, help="of the first session")
+    arguments.add_argument("--jobs", type=int, default=-1, help="processes; -1: one for each core")
     options = arguments.parse_args()
-    torch.set_num_threads(1)
+    first, n = options.seed, math.ceil(options.observations / options.each)
+    grasps = [() if k % options.compare else CLEAN for k in range(n)]
+    call, run = delayed(fuzz), Parallel(options.jobs, return_as="generator")
     sessions: list[Session] = []
-    while sum(s.observations for s in sessions) < options.observations:
-        clean = () if len(sessions) % options.compare else CLEAN
-        s = fuzz(options.seed + len(sessions), options.each, clean=clean)
+    for s in run(call(first + k, options.each, clean=clean) for k, clean in enumerate(grasps)):
         sessions.append(s)
         print(
             f"seed {s.seed}: {s.observations} observations, {s.commands} commands up to "
