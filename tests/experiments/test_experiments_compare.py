@@ -112,9 +112,11 @@ def test_tables_hold_the_scores(compared: Comparison) -> None:
 
 def test_ranks_share_ties(compared: Comparison) -> None:
     assert compared.ranks().sum(1) == pytest.approx([6.0, 6.0])
-    twice = Comparison(compared.streams[:1], ("a", "b"), {}, {})
-    score = compared.scores["linear", "linear RLS"]
-    twice.scores.update({("linear", "a"): score, ("linear", "b"): score})
+    score, errors = (of["linear", "linear RLS"] for of in (compared.scores, compared.errors))
+    both = [("linear", "a"), ("linear", "b")]
+    twice = Comparison(
+        compared.streams[:1], ("a", "b"), dict.fromkeys(both, score), dict.fromkeys(both, errors)
+    )
     assert twice.ranks().tolist() == [[1.5, 1.5]]
 
 

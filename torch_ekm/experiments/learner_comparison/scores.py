@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -59,9 +60,15 @@ class Comparison:
         That is where a hundredth of the samples makes more than half of the squared error of the learner
         with the smallest.
         """
-        errors = [self.errors[stream, name] for name in self.learners if (stream, name) in self.errors]
-        least = min(errors, key=np.sum, default=np.zeros(1))
-        return "median" if rare_share(least) > _DECIDED else "rms"
+        return self._measures[stream]
+
+    @functools.cached_property
+    def _measures(self) -> dict[str, Measure]:
+        def measure(stream: str) -> Measure:
+            least = min((self.errors[stream, name] for name in self.learners), key=np.sum)
+            return "median" if rare_share(least) > _DECIDED else "rms"
+
+        return {stream.name: measure(stream.name) for stream in self.streams}
 
     def error(self, stream: str, learner: str) -> Estimate:
         """Over that of the model alone, by the stream's :meth:`measure`."""

@@ -140,7 +140,7 @@ class ScaledLearner(ResidualLearner):
                 self._follow(*changes)
 
     def _learn_block(self, n: int) -> None:
-        """Anew, from the first n samples of the present block only."""
+        """Again, from the first n samples of the present block only."""
         self._clear()
         for i in range(n):
             on = self.input.block_on[..., i, 0] > 0 if self.batch_shape else None
