@@ -26,7 +26,7 @@ from torch_ekm.experiments.learner_comparison.scores import (
     studentized_range,
 )
 from torch_ekm.experiments.learner_comparison.stream import Stream, in_own_units, load_table
-from torch_ekm.experiments.learner_comparison.table_file import read_table
+from torch_ekm.experiments.learner_comparison.table_file import open_table
 from torch_ekm.experiments.learners import COMPARED, LEARNERS, PEERS, learner_factory
 from torch_ekm.experiments.reporting.report import Report, Table
 
@@ -269,9 +269,9 @@ def test_csv_is_read_as_it_was_written(delimiter: str, tmp_path: Path) -> None:
     values = table()
     path = tmp_path / "good.csv"
     np.savetxt(path, values, delimiter=delimiter, header=delimiter.join("abcd"), comments="", fmt="%.17g")
-    names, read = read_table(path)
+    names, read = open_table(path)
     assert names == ("a", "b", "c", "d")
-    np.testing.assert_array_equal(read, values)
+    np.testing.assert_array_equal(read("dbca"), values[:, [3, 1, 2, 0]])
 
 
 def test_parquet_is_csv(tmp_path: Path) -> None:
@@ -280,19 +280,19 @@ def test_parquet_is_csv(tmp_path: Path) -> None:
     values = table()
     columns = dict(zip("abcd", values.T, strict=True))
     parquet.write_table(pyarrow.table(columns), tmp_path / "good.parquet")
-    names, read = read_table(tmp_path / "good.parquet")
+    names, read = open_table(tmp_path / "good.parquet")
     assert names == ("a", "b", "c", "d")
-    np.testing.assert_array_equal(read, values)
+    np.testing.assert_array_equal(read("dbca"), values[:, [3, 1, 2, 0]])
     holes = pyarrow.table({"a": [1.0, None], "y": [1.0, 2.0]})
     parquet.write_table(holes, tmp_path / "holes.parquet")
     with pytest.raises(DescriptionError, match="row 2, column 'a'"):
-        read_table(tmp_path / "holes.parquet")
+        load_table(tmp_path / "holes.parquet")
     parquet.write_table(pyarrow.table({"a": ["wood"], "y": [1.0]}), tmp_path / "text.parquet")
     with pytest.raises(DescriptionError, match="column 'a' holds string"):
-        read_table(tmp_path / "text.parquet")
+        load_table(tmp_path / "text.parquet")
     (tmp_path / "fake.parquet").write_text("no")
     with pytest.raises(DescriptionError, match="no Parquet file"):
-        read_table(tmp_path / "fake.parquet")
+        load_table(tmp_path / "fake.parquet")
 
 
 def test_targets_are_named_or_found(tmp_path: Path) -> None:
@@ -302,6 +302,27 @@ def test_targets_are_named_or_found(tmp_path: Path) -> None:
         load_table(path)
     assert load_table(path, ["a", "c"]).y.shape == (60, 2)
     assert load_table(write(tmp_path / "b.csv", values, "y1,a,y2,b")).y.shape == (60, 2)
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_columns_that_are_not_asked_for_may_hold_anything(kind: str, tmp_path: Path) -> None:
+    values, path = table(), tmp_path / f"a.{kind}"
+    if kind == "csv":
+        lines = [",".join(["monday", *map(repr, row), ""]) for row in values.tolist()]
+        path.write_text("\n".join(["day,a,b,c,y,note", *lines]))
+    else:
+        parquet, pyarrow = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("pyarrow")
+        columns = {"day": ["monday"] * 60, **dict(zip("abcy", values.T, strict=True)), "note": [None] * 60}
+        parquet.write_table(pyarrow.table(columns), path)
+    chosen, given = load_table(path, inputs=["c", "a"]), in_own_units("a", values[:, [2, 0]], values[:, 3:])
+    torch.testing.assert_close(chosen.x, given.x)
+    torch.testing.assert_close(chosen.y, given.y)
+    with pytest.raises(DescriptionError, match="column 'day'"):
+        load_table(path)
+    with pytest.raises(DescriptionError, match="column 'y' cannot be both"):
+        load_table(path, inputs=["a", "y"])
+    with pytest.raises(UnknownNameError, match=r"torque.*day, a, b, c, y, note"):
+        load_table(path, inputs=["torque"])
 
 
 def test_how_many_of_how_many_rows_were_used_is_told(tmp_path: Path) -> None:
@@ -326,7 +347,8 @@ def test_units_come_from_the_warm_up_alone() -> None:
 
 def test_a_stream_survives_its_file(tmp_path: Path) -> None:
     stream = linear()
-    names, values = read_table(stream.save(tmp_path / "a.csv"))
+    names, read = open_table(stream.save(tmp_path / "a.csv"))
+    values = read(names)
     assert names == ("x1", "x2", "x3", "y1", "y2")
     np.testing.assert_array_equal(values, torch.cat([stream.x, stream.y], 1).numpy())
 

@@ -133,6 +133,7 @@ def compare(
         ),
     ] = "",
     targets: Annotated[str, Option(help="Columns to predict; y, y1, y2, ... if left out.")] = "",
+    inputs: Annotated[str, Option(help="Columns to predict from; all but the targets if left out.")] = "",
     out: Annotated[Path, Option(help="Folder for tables and figures.")] = Path("compare_output"),
     limit: Annotated[
         int, Option(min=0, help="Rows of a file or recording that are used, its first; 0: all.")
@@ -164,6 +165,7 @@ def compare(
             data,
             chosen,
             targets=names(targets),
+            inputs=names(inputs),
             limit=limit or None,
             folder=out / "runs",
             processes=jobs,

@@ -30,6 +30,7 @@ def compare(
     learners: Mapping[str, Factory] | Sequence[str] | None = None,
     *,
     targets: Sequence[str] = (),
+    inputs: Sequence[str] = (),
     limit: int | None = LIMIT,
     folder: str | Path | None = None,
     processes: int = 1,
@@ -46,6 +47,7 @@ def compare(
         learners: name -> ``factory(in_features, out_features)``, lambdas and classes of a notebook included;
             or names of the package's own. By default all of these but those of other libraries.
         targets: columns of the files to predict; ``y``, ``y1``, ``y2``, ... if none is named.
+        inputs: columns of the files to predict from; all but the targets if none is named.
         limit: only the first so many samples of a file or recording; None: all.
         folder: keeps what is finished, so that an interrupted comparison goes on where it stopped. A result
             is read again if the samples and the learner are the same: all that the learner holds when it is
@@ -64,7 +66,10 @@ def compare(
     """
     factories = _factories(learners)
     data = [data] if isinstance(data, str | Path | Stream) else list(data)
-    streams = [one if isinstance(one, Stream) else load_recording(one, limit, tuple(targets)) for one in data]
+    streams = [
+        one if isinstance(one, Stream) else load_recording(one, limit, tuple(targets), tuple(inputs))
+        for one in data
+    ]
     names = [stream.name for stream in streams]
     if not names or not factories:
         raise ParameterError("data, learners", (names, list(factories)), "at least one of each")

@@ -13,7 +13,7 @@ from ...exceptions import DescriptionError, ParameterError, ShapeError, UnknownN
 from ...interop import read_bag
 from ...typing import Array, Float, Tensor
 from .stream import LEAST, Stream
-from .table_file import read_table
+from .table_file import open_table
 
 #: ``f(state, command) -> increment of the observation`` of all motions at once, ``(n, .)`` each.
 Model = Callable[[Array, Array], Array]
@@ -96,43 +96,43 @@ def load_own(
     if every < 1 or int(every) != every:
         raise ParameterError("every", every, "an integer of at least 1")
     if path.suffix.lower() in (".csv", ".tsv", ".txt", ".parquet", ".pq"):
-        names, values = read_table(path)
+        names, read = open_table(path)
     elif clock is None:
         raise ParameterError("clock", clock, "a topic, such as that of the commands, for a recording of ROS")
     else:
         names, _, values = read_bag(path, clock)
-    state, command, seen = (
+
+        def read(wanted: Sequence[str], /) -> Array:
+            return values[:, [names.index(name) for name in wanted]]
+
+    state, command, outputs = (
         _find(wanted, names) for wanted in (columns.state, columns.command, columns.observation)
     )
-    starts = np.arange(0, len(values) - every, every)
+    known, commanded, seen = read(state), read(command), read(outputs)
+    starts = np.arange(0, len(seen) - every, every)
     if len(starts) < LEAST:
         problem = f"it has {len(starts)} motions of {every} rows; at least {LEAST} are needed"
         raise DescriptionError(path, problem)
-    sums = np.vstack([np.zeros(len(command)), values[:, command].cumsum(0)])
-    s, u = values[starts][:, state], (sums[starts + every] - sums[starts]) / every
-    moved = values[starts + every][:, seen] - values[starts][:, seen]
+    sums = np.vstack([np.zeros(len(command)), commanded.cumsum(0)])
+    s, u = known[starts], (sums[starts + every] - sums[starts]) / every
+    moved = seen[starts + every] - seen[starts]
     nominal = np.zeros_like(moved) if model is None else np.asarray(model(s, u), dtype=np.float64)
     if nominal.shape != moved.shape:
         hint = f"f gets all rows: state {s.shape}, command {u.shape}"
         raise ShapeError("increments of the model", str(moved.shape), nominal.shape, hint)
     alone = "nothing moves" if model is None else getattr(model, "__name__", type(model).__name__)
-    inputs, outputs = ([names[i] for i in which] for which in ([*state, *command], seen))
     about = f"increments of {len(outputs)} columns of {path.name}; alone: {alone}"
     x, y = torch.from_numpy(np.hstack([s, u])), torch.from_numpy(moved - nominal)
-    return OwnRecording(path.stem, x, y, tuple(inputs), tuple(outputs), about)
+    return OwnRecording(path.stem, x, y, (*state, *command), tuple(outputs), about)
 
 
-def _find(wanted: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Places of the columns, in the order in which they are asked for."""
-    found: list[int] = []
+def _find(wanted: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Names of the columns, in the order in which they are asked for."""
+    found: list[str] = []
     for pattern in wanted:
         begin = pattern.removesuffix("*")
-        fits = [
-            i
-            for i, name in enumerate(names)
-            if name == pattern or (begin != pattern and name.startswith(begin))
-        ]
+        fits = [name for name in names if name == pattern or (begin != pattern and name.startswith(begin))]
         if not fits:
             raise UnknownNameError("column", pattern, names)
-        found += [i for i in fits if i not in found]
+        found += [name for name in fits if name not in found]
     return found

@@ -24,14 +24,16 @@ _T42_EXCHANGED = "_red_"  # in the names of recordings whose columns of actions 
 _T42_HORIZON = 10  # [steps] of the log in one sample
 
 
-def load_recording(name: str | Path, limit: int | None = LIMIT, targets: Sequence[str] = ()) -> Stream:
+def load_recording(
+    name: str | Path, limit: int | None = LIMIT, targets: Sequence[str] = (), inputs: Sequence[str] = ()
+) -> Stream:
     """A public recording by name, or a file of one's own by path.
 
     Args:
         name: ``simulated_hand``, a recording in the folder ``TORCH_EKM_DATA`` (the error lists them), or a
             path.
         limit: only the first so many samples (of each object alike, where there are many); None: all.
-        targets: columns to predict, in a file of one's own.
+        targets, inputs: columns to predict, and to predict from, in a file of one's own.
 
     Raises:
         UnknownNameError: neither a known name nor a file.
@@ -50,7 +52,7 @@ def load_recording(name: str | Path, limit: int | None = LIMIT, targets: Sequenc
             problem = f"the recording '{name}' there is damaged: {error}"
             raise DescriptionError(os.environ["TORCH_EKM_DATA"], problem) from None
     if Path(name).suffix:
-        return load_table(name, targets, limit)
+        return load_table(name, targets, limit, inputs)
     known = ("simulated_hand", *_READERS, "a path to a .csv or .parquet file")
     raise UnknownNameError("recording", str(name), known)
 

@@ -12,7 +12,7 @@ import torch
 
 from ...exceptions import DescriptionError, ShapeError, UnknownNameError
 from ...typing import Array, Float, Tensor
-from .table_file import read_table
+from .table_file import open_table
 
 LEAST = 40  #: samples; fewer cannot tell learners apart
 
@@ -68,37 +68,41 @@ class Stream:
         return Path(path)
 
 
-def load_table(path: str | Path, targets: Sequence[str] = (), limit: int | None = None) -> Stream:
-    """A stream from a CSV or Parquet file, see ``table_file.read_table``.
+def load_table(
+    path: str | Path, targets: Sequence[str] = (), limit: int | None = None, inputs: Sequence[str] = ()
+) -> Stream:
+    """A stream from a CSV or Parquet file, see ``table_file.open_table``.
 
     Args:
         path: the file; rows in the order of time.
         targets: columns to predict; those called ``y``, ``y1``, ``y2``, ... if none is named.
         limit: only the first so many rows.
+        inputs: columns to predict from; all but the targets if none is named.
 
     Raises:
         DescriptionError: the file cannot be used; the message names line and column. No target is named,
-            and no column is called ``y``.
-        UnknownNameError: there is no such target column; the message lists the columns.
+            and no column is called ``y``. A column is both input and target.
+        UnknownNameError: there is no such column; the message lists the columns.
     """
-    names, values = read_table(Path(path))
-    if len(values) < LEAST:
-        raise DescriptionError(path, f"it has {len(values)} samples; at least {LEAST} are needed to compare")
-    for name in targets:
+    names, read = open_table(Path(path))
+    for name in (*inputs, *targets):
         if name not in names:
             raise UnknownNameError("column", name, names)
-    chosen = list(targets) or [
-        name for name in names if name == "y" or (name[:1] == "y" and name[1:].isdigit())
-    ]
-    if not chosen:
+    outputs = targets or [name for name in names if name == "y" or (name[:1] == "y" and name[1:].isdigit())]
+    if not outputs:
         problem = "no column is called 'y' (or y1, y2, ...); name the targets: targets=, or --targets"
         raise DescriptionError(path, f"{problem}. The columns are {', '.join(names)}")
-    columns = [names.index(name) for name in chosen]
-    inputs = [i for i in range(len(names)) if i not in columns]
-    if not inputs:
+    chosen = inputs or [name for name in names if name not in outputs]
+    if not chosen:
         raise DescriptionError(path, "all columns are targets; at least one must be an input")
-    about = f"{', '.join(names[i] for i in columns)} from {len(inputs)} columns of {Path(path).name}"
-    return in_own_units(Path(path).stem, values[:, inputs], values[:, columns], about, limit)
+    both = [name for name in chosen if name in outputs]
+    if both:
+        raise DescriptionError(path, f"column '{both[0]}' cannot be both input and target")
+    x, y = read(chosen), read(outputs)
+    if len(x) < LEAST:
+        raise DescriptionError(path, f"it has {len(x)} samples; at least {LEAST} are needed to compare")
+    about = f"{', '.join(outputs)} from {len(chosen)} columns of {Path(path).name}"
+    return in_own_units(Path(path).stem, x, y, about, limit)
 
 
 def in_own_units(name: str, x: Array, y: Array, about: str = "", limit: int | None = None) -> Stream:

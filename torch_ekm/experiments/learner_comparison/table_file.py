@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +13,22 @@ from ..._extras import require
 from ...exceptions import DescriptionError
 from ...typing import Array
 
+Names = tuple[str, ...]
+#: Values ``(n_rows, n)`` of the n columns that it is told.
+Read = Callable[[Sequence[str]], Array]
 
-def read_table(path: Path) -> tuple[tuple[str, ...], Array]:
-    """Column names and values ``(n_rows, n_columns)``, rows in the order of time.
+
+def open_table(path: Path) -> tuple[Names, Read]:
+    """Column names, and a function that reads some of the columns, rows in the order of time.
 
     CSV (``.csv``, ``.tsv``, ``.txt``): UTF-8, separated by comma, semicolon or tab; the first line names the
     columns, every other field is a number with a decimal point. Parquet (``.parquet``): every column is
-    numeric. Nothing may be missing: a learner cannot guess what a hole means.
+    numeric. Nothing may be missing: a learner cannot guess what a hole means. Columns that are not read may
+    hold anything.
 
     Raises:
-        DescriptionError: the file cannot be used; the message names line (row) and column.
+        DescriptionError: the file cannot be used; the message names line (row) and column. The function
+            raises it, too.
     """
     readers = {".csv": _csv, ".tsv": _csv, ".txt": _csv, ".parquet": _parquet, ".pq": _parquet}
     if not path.is_file():
@@ -29,16 +37,16 @@ def read_table(path: Path) -> tuple[tuple[str, ...], Array]:
         raise DescriptionError(
             path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet (a ROS bag: load_own)"
         )
-    names, values = readers[path.suffix.lower()](path)
+    names, read = readers[path.suffix.lower()](path)
     for i, name in enumerate(names):
         if not name:
             raise DescriptionError(path, f"column {i + 1} has no name in the header")
         if name in names[:i]:
             raise DescriptionError(path, f"two columns are called '{name}'")
-    return names, values
+    return names, read
 
 
-def _csv(path: Path) -> tuple[tuple[str, ...], Array]:
+def _csv(path: Path) -> tuple[Names, Read]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -53,12 +61,21 @@ def _csv(path: Path) -> tuple[tuple[str, ...], Array]:
     if all(_number(field) is not None for field in names):
         problem = "holds numbers only; the first line must name the columns"
         raise DescriptionError(path, f"line {number} {problem}")
-    values = np.empty((len(rows) - 1, len(names)))
-    for i, (line, row) in enumerate(rows[1:]):
+    for line, row in rows:
         if len(row) != len(names):
             problem = f"has {len(row)} fields, but the header names {len(names)} columns"
             raise DescriptionError(path, f"line {line} {problem}")
-        for j, field in enumerate(row):
+    return tuple(names), partial(_csv_values, path, names, rows[1:])
+
+
+def _csv_values(
+    path: Path, names: list[str], rows: list[tuple[int, list[str]]], columns: Sequence[str]
+) -> Array:
+    values = np.empty((len(rows), len(columns)))
+    places = [names.index(name) for name in columns]
+    for i, (line, row) in enumerate(rows):
+        for j, place in enumerate(places):
+            field = row[place]
             value = _number(field)
             if value is None or not np.isfinite(value):
                 problem = f": '{field}' is not finite"
@@ -66,9 +83,9 @@ def _csv(path: Path) -> tuple[tuple[str, ...], Array]:
                     problem = f": '{field}' is no number; leave the column out or encode it"
                 if not field:
                     problem = " is empty; fill it in, or leave the whole line out"
-                raise DescriptionError(path, f"line {line}, column '{names[j]}'{problem}")
+                raise DescriptionError(path, f"line {line}, column '{names[place]}'{problem}")
             values[i, j] = value
-    return tuple(names), values
+    return values
 
 
 def _number(field: str) -> float | None:
@@ -78,21 +95,26 @@ def _number(field: str) -> float | None:
         return None
 
 
-def _parquet(path: Path) -> tuple[tuple[str, ...], Array]:
+def _parquet(path: Path) -> tuple[Names, Read]:
     parquet, pyarrow = require("pyarrow.parquet"), require("pyarrow")
     try:
         table = parquet.read_table(path)
     except pyarrow.ArrowInvalid as error:
         raise DescriptionError(path, f"this is no Parquet file ({error})") from None
-    columns = []
-    for name, column in zip(table.column_names, table.columns, strict=True):
+
+    def values(name: str) -> Array:
+        column = table.column(name)
         kind = column.type
         if not (pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind)):
             problem = f"holds {kind}, not numbers; leave it out or encode it"
             raise DescriptionError(path, f"column '{name}' {problem}")
-        values = column.to_numpy().astype(np.float64)
-        if column.null_count or not np.isfinite(values).all():
-            row = int(np.flatnonzero(~np.isfinite(values))[0])
+        found = column.to_numpy().astype(np.float64)
+        if column.null_count or not np.isfinite(found).all():
+            row = int(np.flatnonzero(~np.isfinite(found))[0])
             raise DescriptionError(path, f"row {row + 1}, column '{name}' is empty or not finite")
-        columns.append(values)
-    return tuple(table.column_names), np.column_stack(columns) if columns else np.empty((0, 0))
+        return found
+
+    def read(columns: Sequence[str]) -> Array:
+        return np.column_stack([values(name) for name in columns])
+
+    return tuple(table.column_names), read
