@@ -152,6 +152,10 @@ def test_ablation_covers_every_disturbance_of_the_nominal_plant() -> None:
             ]
             assert set(different) == set(DISTURBANCES[variant.name]), variant.name
     jobs = protocol.jobs((0,))
+    places = {(job.objects, job.angles_deg) for job, _, _ in jobs.values()}
+    assert places == {(("box",), (9.0, 19.0, 29.0)), (("tea_tin",), (10.0, 20.0, 25.0))}
+    oracle = next(job for job, _, _ in jobs.values() if job.setting.oracle)
+    assert oracle.objects == ("tea_tin",)
     # alike variants share their jobs
     assert len(jobs) < sum(len(v.controllers) for v in variants(protocol.setting))
 

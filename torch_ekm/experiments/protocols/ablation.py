@@ -97,7 +97,7 @@ def variants(base: Setting) -> list[Variant]:
         *(Variant(group, _BASE) for group in ("learner", "online learning", "model")),
         *(Variant(group, _BASE, controllers=_ALL) for group in ("controller", "care")),
         Variant("care", "normal forces learned, too", {"force_learner": True}, _LEARNING),
-        Variant("care", "the true model, pose and forces", {"oracle": True}, ("KM+S",)),
+        Variant("care", "oracle: true model, pose and forces", {"oracle": True}, ("KM+S",)),
         Variant("care", "pose and joints from six readings at rest", {"frames": 6}, _ALL),
         Variant("care", "the same, to a tolerance of 0.1 deg", {"frames": 6, "tolerance_deg": 0.1}, _ALL),
         Variant("preset", f"{base.preset}: {_BASE}"),
@@ -121,11 +121,14 @@ def variants(base: Setting) -> list[Variant]:
 
 @dataclass(frozen=True)
 class Ablation(Protocol):
-    """One object, some angles, every variant."""
+    """One object, some angles, every variant; care shows with an object that is hard to hold."""
 
     setting: Setting = field(default_factory=Setting)
     object: str = "box"
     angles_deg: tuple[float, ...] = (9.0, 19.0, 29.0)
+    care_object: str = "tea_tin"
+    """Of the group "care"."""
+    care_angles_deg: tuple[float, ...] = (10.0, 20.0, 25.0)
     warm_up: int = 3
     groups: tuple[str, ...] = (
         "learner", "online learning", "model", "controller", "care", "preset", "disturbance", "dead zone",
@@ -146,24 +149,33 @@ class Ablation(Protocol):
 
     def session(self, variant: Generalize, controller: str, seed: int) -> list[Record]:
         """All turns with one variant, controller and seed."""
-        return variant.session(self.object, controller, seed)
+        return variant.session(variant.objects[0], controller, seed)
 
     def report(self, seeds: Sequence[int], results: Results[Record], folder: Path) -> Report:
         """Two tables for each group: where the turns end, and one motion ahead."""
         shown = [
             make(group, seeds, results) for group in self.groups for make in (self.table, self.predictions)
         ]
-        turned = ", ".join(f"{angle:g}" for angle in self.angles_deg)
-        summary = (
-            f"{self._answer(seeds, results)} One change at a time; {object_name(self.object)}, turns of "
-        )
-        summary += f"{turned} deg. {which_seeds(seeds)}"
+        turned = dict.fromkeys(self._turned(group) for group in self.groups)
+        summary = f"{self._answer(seeds, results)} One change at a time; {'; '.join(turned)}. "
+        summary += which_seeds(seeds)
         title, names = (
             "Ablations: what each part is worth",
             {c for v in self._variants() for c in v.controllers},
         )
         explained = {name: line for name, line in LEGEND.items() if name in names}
         return Report(title, summary, shown, leading=2, legend=explained)
+
+    def _turned(self, group: str) -> str:
+        """What is done in a group."""
+        object, angles = self._place(group)
+        care = " in the group 'care'" if group == "care" else ""
+        return f"{object_name(object)}, turns of {', '.join(f'{angle:g}' for angle in angles)} deg{care}"
+
+    def _place(self, group: str) -> tuple[str, tuple[float, ...]]:
+        """Object and angles of a group."""
+        care = self.care_object, self.care_angles_deg
+        return care if group == "care" else (self.object, self.angles_deg)
 
     def _variants(self) -> list[Variant]:
         return [variant for group in self.groups for variant in self.variants(group)]
@@ -197,8 +209,8 @@ class Ablation(Protocol):
             rows.append([*row, rate(r.not_reached for r in lost[-1]) if lost[-1] else None])
         columns = [group, *(f"{name} [deg]" for name in _ALL), "KM+I lost", "E-KM lost", "E-KM not reached"]
         note = (
-            f"{len(seeds)} seeds. Steady-state error by the truth, lost objects with the whole angle; 95 % "
-            "bootstrap intervals over seeds."
+            f"{object_name(self._place(group)[0])}, {len(seeds)} seeds. Steady-state error by the truth, "
+            "lost objects with the whole angle; 95 % bootstrap intervals over seeds."
         )
         return Table(f"ablation_{group.replace(' ', '_')}", f"Ablation: {group}", columns, rows, note)
 
@@ -217,10 +229,11 @@ class Ablation(Protocol):
         return Table(name, f"Ablation: {group}, prediction", columns, rows, note)
 
     def _jobs_of(self, variant: Variant, seeds: Sequence[int]) -> dict[str, tuple[Generalize, str, int]]:
+        object, angles = self._place(variant.group)
         one = Generalize(
             self.setting.replace(**variant.changes),
-            objects=(self.object,),
-            angles_deg=self.angles_deg,
+            objects=(object,),
+            angles_deg=angles,
             warm_up=self.warm_up,
             long_step_deg=0.0,
             blind_deg=0.0,
