@@ -152,10 +152,8 @@ class Ablation(Protocol):
         return variant.session(variant.objects[0], controller, seed)
 
     def report(self, seeds: Sequence[int], results: Results[Record], folder: Path) -> Report:
-        """Two tables for each group: where the turns end, and one motion ahead."""
-        shown = [
-            make(group, seeds, results) for group in self.groups for make in (self.table, self.predictions)
-        ]
+        """Two tables for each group: where the turns end, and what a motion of the E-KM is worth."""
+        shown = [make(group, seeds, results) for group in self.groups for make in (self.table, self.motions)]
         turned = dict.fromkeys(self._turned(group) for group in self.groups)
         summary = f"{self._answer(seeds, results)} One change at a time; {'; '.join(turned)}. "
         summary += which_seeds(seeds)
@@ -214,19 +212,27 @@ class Ablation(Protocol):
         )
         return Table(f"ablation_{group.replace(' ', '_')}", f"Ablation: {group}", columns, rows, note)
 
-    def predictions(self, group: str, seeds: Sequence[int], results: Results[Record]) -> Table:
-        """One-step prediction errors of the variants of one group."""
+    def motions(self, group: str, seeds: Sequence[int], results: Results[Record]) -> Table:
+        """What the motions of the E-KM are worth with the variants of one group."""
         rows: list[list[Cell]] = []
         for variant in self.variants(group):
             records = self._records(variant, seeds, results)
-            rows.append([variant.name, *prediction_cells(records), prediction_cells(records, "true_")[-1]])
+            mine = by_controller(records).get("E-KM")
+            if mine:
+                count, first = estimate(mine, lambda r: r.steps), estimate(mine, lambda r: r.first_step_deg)
+                *predicted, _ = prediction_cells(records)
+                rows.append([variant.name, count, first, *predicted, prediction_cells(records, "true_")[-1]])
         columns = [
-            group, "KM [deg]", "E-KM [deg]", Column("E-KM:KM [%]", ".0f", percent=True),
-            Column("E-KM:KM, true [%]", ".0f", percent=True),
+            group, Column("motions", ".1f"), "first motion [deg]", "predicted by the KM [deg]",
+            "by the E-KM [deg]", Column("ratio, true [%]", ".0f", percent=True),
         ]  # fmt: skip
-        name = f"ablation_{group.replace(' ', '_')}_prediction"
-        note = "One-step prediction error on the E-KM's own motions, as measured, and its ratio by the truth."
-        return Table(name, f"Ablation: {group}, prediction", columns, rows, note)
+        name = f"ablation_{group.replace(' ', '_')}_motions"
+        note = (
+            "Motions of a turn of the E-KM. First motion: by how much more or less it changed the error than "
+            "it was to. Errors of one-step predictions on its motions, as measured, and E-KM over KM by the "
+            "truth."
+        )
+        return Table(name, f"Ablation: {group}, motions of the E-KM", columns, rows, note)
 
     def _jobs_of(self, variant: Variant, seeds: Sequence[int]) -> dict[str, tuple[Generalize, str, int]]:
         object, angles = self._place(variant.group)
