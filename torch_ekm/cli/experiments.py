@@ -49,7 +49,7 @@ def demo(
     from ..experiments.reproduce import Experiment
 
     protocol, chosen = Demo(Setting(hand=hand), (object,)), parse_seeds(seeds)
-    planned = Experiment(protocol.quick(), chosen[:2]) if quick else Experiment(protocol, chosen)
+    planned = Experiment(protocol.quick(), chosen[:2], quick) if quick else Experiment(protocol, chosen)
     for figure in _run("manipulating", planned, out, jobs).figures:
         say(f"           {(out / figure.path).resolve()}")
 
