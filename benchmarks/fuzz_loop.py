@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections import Counter
 from dataclasses import dataclass, field
 
@@ -22,7 +23,7 @@ from torch_ekm.control import ClosedLoop, LookAndMoveController, PoseTarget, Sto
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import EKMError, GraspError
 from torch_ekm.model import KinematicModel
-from torch_ekm.plant import Observation, PlantWrapper
+from torch_ekm.plant import Observation, PlantStatus, PlantWrapper
 from torch_ekm.simulation import FuzzedPlant, PlantConfig, SimulatedHand, preset
 
 DEG = math.pi / 180
@@ -72,6 +73,10 @@ class Session:
     """Farthest set-point outside the actuators' range [rad]."""
     force: float = 0.0
     """Largest true normal force [N]."""
+    dropped: int = 0
+    """Turns after which the object was truly out of the hand."""
+    dropped_unfaulted: int = 0
+    """The same without faults, on the same grasps."""
     error: float = math.nan
     """Of the clean turns [deg], rms over motions."""
     unfaulted: float = math.nan
@@ -94,12 +99,12 @@ def error_of_clean_turns(plant: SimulatedHand, ekm: EnhancedModel, grasps: tuple
     return math.sqrt(sum(squares) / len(squares)) / DEG
 
 
-def turn(plant, sight, ekm: EnhancedModel, grasp: int, session: Session | None) -> None:
-    """One turn, gone on with after each repair."""
+def turn(plant, sight, ekm: EnhancedModel, grasp: int, session: Session | None) -> bool:
+    """One turn, gone on with after each repair; whether the object was dropped."""
     try:
         seen = plant.reset(grasp)
     except GraspError:
-        return
+        return False
     ekm.model = KinematicModel(plant.hand, plant.object)
     target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=(18, 12)[grasp % 2])
     controller = LookAndMoveController(ekm, plant.rotation_axis)
@@ -115,6 +120,7 @@ def turn(plant, sight, ekm: EnhancedModel, grasp: int, session: Session | None) 
             session.reasons[reason] += 1
         if reason in (StopReason.REACHED.value, StopReason.OBJECT_LOST.value, StopReason.GIVEN_UP.value):
             break
+    return plant.observe().status is PlantStatus.LOST
 
 
 def fuzz(seed: int, observations: int, chance: float = 0.15, clean: tuple[int, ...] = CLEAN) -> Session:
@@ -127,7 +133,7 @@ def fuzz(seed: int, observations: int, chance: float = 0.15, clean: tuple[int, .
     model = KinematicModel(plant.hand, plant.object)
     ekm, untaught = (EnhancedModel.for_grasp(model, first.state) for _ in range(2))
     while sight.observations < observations:
-        turn(plant, sight, ekm, 1000 * seed + turns, session)
+        session.dropped += turn(plant, sight, ekm, 1000 * seed + turns, session)
         turns += 1
         added = (ekm.servo.dead_zone + ekm.servo.bias.abs()).max()
         session.allowed = max(session.allowed, STEP + float(added))
@@ -137,7 +143,7 @@ def fuzz(seed: int, observations: int, chance: float = 0.15, clean: tuple[int, .
     if not clean:
         return session
     for k in range(turns):
-        turn(plant, plant, untaught, 1000 * seed + k, None)
+        session.dropped_unfaulted += turn(plant, plant, untaught, 1000 * seed + k, None)
     session.error = error_of_clean_turns(plant.plant, ekm, clean)
     session.unfaulted = error_of_clean_turns(plant.plant, untaught, clean)
     return session
@@ -161,7 +167,7 @@ def main() -> None:
             f"seed {s.seed}: {s.observations} observations, {s.commands} commands up to "
             f"{s.largest / DEG:.1f} of {s.allowed / DEG:.1f} deg, {s.beyond / DEG:.1f} deg beyond the range, "
             f"{s.force:.1f} N; clean turn {s.error:.3f} deg, unfaulted {s.unfaulted:.3f} deg",
-            flush=True,
+            file=sys.stderr,
         )
     total = Counter[str]()
     for s in sessions:
@@ -172,12 +178,19 @@ def main() -> None:
         math.sqrt(sum(getattr(s, name) ** 2 for s in compared) / len(compared))
         for name in ("error", "unfaulted")
     )
-    print(
-        f"observations {sum(s.observations for s in sessions)}, spoilt {sum(faults.values())}: {dict(faults)}"
-    )
-    print(f"ends: {dict(total.most_common())}")
-    print(f"sessions with a command above what is allowed: {sum(s.largest > s.allowed for s in sessions)}")
-    print(f"clean turn: {error:.3f} deg, unfaulted {unfaulted:.3f} deg, ratio {error / unfaulted:.3f}")
+    spoilt = ", ".join(f"{n} {kind}" for kind, n in faults.most_common())
+    print(f"{sum(s.observations for s in sessions)} observations, {sum(faults.values())} spoilt: {spoilt}")
+    print(f"turns ended {', '.join(f'{n} {reason}' for reason, n in total.most_common())}")
+    dropped, else_dropped = (sum(getattr(s, k) for s in sessions) for k in ("dropped", "dropped_unfaulted"))
+    print(f"objects out of the hand: {dropped}; in the same turns without faults: {else_dropped}")
+    commands, largest = sum(s.commands for s in sessions), max(s.largest for s in sessions) / DEG
+    above, allowed = sum(s.largest > s.allowed for s in sessions), min(s.allowed for s in sessions) / DEG
+    print(f"{commands} commands up to {largest:.1f} deg; sessions with one above what is allowed: {above}")
+    print(f"allowed: {allowed:.1f} deg or more, as the servo inverse adds dead zone and bias")
+    print(f"farthest set-point out of an actuator's range: {max(s.beyond for s in sessions) / DEG:.1f} deg")
+    print(f"largest normal force: {max(s.force for s in sessions):.1f} N")
+    print(f"one-step error of clean turns afterwards: {error:.3f} deg; had there been no faults: ", end="")
+    print(f"{unfaulted:.3f} deg, ratio {error / unfaulted:.3f}")
 
 
 if __name__ == "__main__":

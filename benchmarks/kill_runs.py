@@ -2,7 +2,7 @@
 
 ``torch-ekm record`` (camera, Hall sensors, images) and ``torch-ekm reproduce`` (two processes) run to their
 end once, and then are killed (SIGKILL) at random moments, 30 times each; a run that reached its end starts
-anew. After each kill: every finished file is byte by byte what it was before, a recorded trial is that of
+again. After each kill: every finished file is byte by byte what it was before, a recorded trial is that of
 the unbroken run, a result is its job's, and no process is left after fifteen seconds (one that is still
 importing ends when it has imported). Results of two runs are equal but for the seconds of the wall. In the
 end ``verify_log`` is asked about 400 single bits of the log, flipped one at a time. ``--quick``: three kills
@@ -103,7 +103,7 @@ def kill_often(
             shutil.rmtree(folder)
         else:
             tally.finished += len(there)
-            print(f"  {len(there)} of {len(whole)} are there; {tally}", flush=True)
+            print(f"  {len(there)} of {len(whole)} are there; {tally}", file=sys.stderr)
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     tally.rounds += 1
     there = finished(folder)
