@@ -17,7 +17,6 @@ import datetime
 import json
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import sys
@@ -77,18 +76,19 @@ def parts_of(name: str) -> list[Part]:
 
 def measure(part: Part, folder: Path, quick: bool, keep: bool) -> dict[str, str]:
     """What a command printed or reported, from ``folder`` if it is there."""
-    kept, now, words = folder / "measured.json", commit(), part.words(folder / "report", quick)
+    kept, now, spoken = folder / "measured.json", commit(), f"{part.spoken()} {part.quick if quick else ''}"
     if kept.exists():
         found = json.loads(kept.read_text(encoding="utf-8"))
-        if found["command"] == shlex.join(words[1:]) and (keep or found["commit"] == now):
+        if found["command"] == spoken and (keep or found["commit"] == now):
             return found
+    words = part.words(folder / "report", quick)
     folder.mkdir(parents=True, exist_ok=True)
     print(f"{part.spoken()} ...", flush=True)
     begin = time.time()
     environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **os.environ}
     done = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT, env=environment)
     found = {
-        "command": shlex.join(words[1:]),
+        "command": spoken,
         "commit": now,
         "date": str(datetime.date.today()),
         "minutes": f"{(time.time() - begin) / 60:.0f}",
