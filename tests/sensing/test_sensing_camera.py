@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from torch_ekm.exceptions import CalibrationError, DescriptionError, ParameterError
-from torch_ekm.sensing import CharucoTarget, PinholeCamera, calibrate_camera
+from torch_ekm.sensing import CharucoTarget, MarkerBoard, PinholeCamera, calibrate_camera
 from torch_ekm.simulation import CardScene, PlacedCard, SimulatedCamera
 
 cv2 = pytest.importorskip("cv2")
@@ -88,3 +88,16 @@ def test_calibration_says_what_is_missing(target_views):
         calibrate_camera(target_views[:5])
     with pytest.raises(CalibrationError, match="those before"):
         calibrate_camera([target_views[0], target_views[1][:400]])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("height", [0.0, 0.0005])
+def test_a_card_seen_edge_on_is_drawn_without_complaint(height):
+    """Its plane holds the camera's centre, or runs along some of the rays nearby."""
+    camera = SimulatedCamera(replace(PinholeCamera(), cy=240.125))  # a row of samples has rays with y = 0
+    pose = np.eye(4)
+    pose[:3, :3] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    pose[:3, 3] = [0.0, height, 0.3]
+    scene = CardScene((PlacedCard(MarkerBoard(), pose),))
+    image, empty = (camera.render(s, np.random.default_rng(0)) for s in (scene, CardScene(())))
+    assert (image != empty).any() == (height > 0)

@@ -14,6 +14,7 @@ from ...sensing.vision.camera import PinholeCamera
 from .card_scene import Card, CardScene, ConvexBody, PlacedCard
 
 _SHIFT = 4  # fractional bits of OpenCV's polygon coordinates
+_EDGE_ON = 1e-6  # cosine below which a card shows nothing of its face
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,8 @@ class SimulatedCamera:
     ) -> None:
         cv2, s = require("cv2"), self.supersample
         outline = placed.outline
-        if np.any(outline[:, 2] < 1e-3):
+        cosine = abs(placed.pose[:3, 2] @ placed.pose[:3, 3]) / np.linalg.norm(placed.pose[:3, 3])
+        if np.any(outline[:, 2] < 1e-3) or cosine < _EDGE_ON:
             return
         corners = self.camera.project(outline)
         if not np.all(np.abs(corners) < 1e5):
@@ -119,7 +121,8 @@ class SimulatedCamera:
         # plane of the card: (x, y, 1) ~ [r1 r2 t] (X, Y, 1)
         to_card = np.linalg.inv(placed.pose[:3, [0, 1, 3]]).astype(np.float32)
         X, Y, W = (row[0] * x + row[1] * y + row[2] for row in to_card)
-        X, Y = X / W, Y / W
+        with np.errstate(divide="ignore", invalid="ignore"):  # a ray along the card does not meet it
+            X, Y = X / W, Y / W
         width, height = placed.card.size
         inside = (np.abs(X) <= width / 2) & (np.abs(Y) <= height / 2)
         visible = inside.astype(np.float32)
@@ -130,7 +133,6 @@ class SimulatedCamera:
                     visible, np.rint(fine * 2**_SHIFT).astype(np.int32), 0.0, cv2.LINE_8, _SHIFT
                 )
         quality = self.quality
-        cosine = abs(placed.pose[:3, 2] @ placed.pose[:3, 3]) / np.linalg.norm(placed.pose[:3, 3])
         light = 0.7 + 0.3 * cosine
         if placed.faces_camera:
             texture = self._texture(placed.card)
