@@ -55,9 +55,7 @@ def test_it_holds_still_for_ten_seconds(plant, seed):
     moved, turned = motion(before, plant.observe())
     assert moved.norm() < 1e-4 / 100  # the target is 0.1 mm and 0.1 deg
     assert turned.norm() < 0.1 * DEG / 100
-    assert (
-        10.0 / cost > 3.0
-    )  # times faster than real time; benchmarks/plant_hold.py measures it on a quiet core
+    assert 10.0 / cost > 8.0  # times faster than real time, on one core
 
 
 @pytest.mark.parametrize("time_step", [0.002, 0.004])
