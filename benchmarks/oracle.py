@@ -14,54 +14,51 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torch_ekm.cli import parse_seeds
+from torch_ekm.control import StopReason
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.jobs import run_jobs
+from torch_ekm.experiments.protocols.foresight import CONTENDERS
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.report import Cell, Column, Table
-from torch_ekm.experiments.reporting.statistics import estimate, rate, steady_state_error
+from torch_ekm.experiments.reporting.statistics import estimate, rate, select, steady_state_error
 
-#: Name -> (changes of the setting, controller).
-CONTENDERS = {"E-KM": ({}, "E-KM"), "oracle": ({"oracle": True}, "KM+S")}
+_REACHED = StopReason.REACHED.value
 
-
-def protocol(objects: Sequence[str], contender: str) -> Generalize:
-    """The turns of ``generalize``, without its probes."""
-    setting = Setting(sensing=True, **CONTENDERS[contender][0])
-    controllers = (CONTENDERS[contender][1],)
-    return Generalize(setting, tuple(objects), long_step_deg=0.0, blind_deg=0.0, controllers=controllers)
+#: Name here -> name among the contenders of ``reproduce foresight``.
+NAMES = {"E-KM": "one-step E-KM", "oracle": "oracle"}
 
 
 def run(
     objects: Sequence[str], seeds: Sequence[int], folder: Path, jobs: int
 ) -> dict[str, list[TrialRecord]]:
-    """Contender -> its turns."""
+    """Contender -> its turns of ``generalize``, whose probes are left out."""
     found: dict[str, list[TrialRecord]] = {}
-    for name in CONTENDERS:
-        plan = protocol(objects, name)
+    for name, contender in NAMES.items():
+        changes, controller = CONTENDERS[contender]
+        plan = Generalize(
+            Setting(sensing=True, **changes), tuple(objects), long_step_deg=0.0, blind_deg=0.0,
+            controllers=(controller,),
+        )  # fmt: skip
         kept = run_jobs(plan.run, plan.jobs(seeds), folder, jobs)
         records = [TrialRecord.from_json(figures) for session in kept.values() for figures in session]
-        found[name] = [r for r in records if isinstance(r, TrialRecord) and r.kind == "turn"]
+        found[name] = select(records, kind="turn")
     return found
 
 
 def table(turns: dict[str, list[TrialRecord]]) -> Table:
     """One row for each object, angle and contender."""
     rows: list[list[Cell]] = []
-    places = {(r.object, r.angle_deg): None for mine in turns.values() for r in mine}
-    for place in places:
+    places = dict.fromkeys((r.object, r.angle_deg) for mine in turns.values() for r in mine)
+    for object, angle in places:
         for name, records in turns.items():
-            mine = [r for r in records if (r.object, r.angle_deg) == place]
+            mine = select(records, object=object, angle_deg=angle)
             if not mine:
                 continue
-            reached = [r for r in mine if not r.lost and not r.not_reached]
-            why = Counter(r.reason for r in mine if r not in reached).most_common()
-            rows.append(
-                [
-                    place[0], place[1], name, rate(r in reached for r in mine), rate(r.lost for r in mine),
-                    estimate(mine, steady_state_error), ", ".join(f"{n} {reason}" for reason, n in why),
-                ]
-            )  # fmt: skip
+            ends = Counter(r.reason for r in mine)
+            others = ", ".join(f"{n} {reason}" for reason, n in ends.most_common() if reason != _REACHED)
+            reached, lost = rate(r.reason == _REACHED for r in mine), rate(r.lost for r in mine)
+            rows.append([object, angle, name, reached, lost, estimate(mine, steady_state_error), others])
     columns = [
         "object", Column("angle [deg]", ".0f"), "contender", "reached", "lost",
         Column("error [deg]", ".2f"), "why the others ended",

@@ -58,7 +58,7 @@ class TrialLog:
     Raises:
         ParameterError: the log in ``folder`` is of another configuration; the message says where.
         DescriptionError: ``folder`` is a file.
-        FolderInUseError: somebody else writes this log; the message names the process.
+        FolderInUseError: another process writes this log; the message names the process.
         OutputError: the folder cannot be written to.
     """
 

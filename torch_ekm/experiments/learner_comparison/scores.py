@@ -64,11 +64,11 @@ class Comparison:
 
     @functools.cached_property
     def _measures(self) -> dict[str, Measure]:
-        def measure(stream: str) -> Measure:
-            least = min((self.errors[stream, name] for name in self.learners), key=np.sum)
-            return "median" if rare_share(least) > _DECIDED else "rms"
-
-        return {stream.name: measure(stream.name) for stream in self.streams}
+        found: dict[str, Measure] = {}
+        for stream in self.streams:
+            least = min((self.errors[stream.name, name] for name in self.learners), key=np.sum)
+            found[stream.name] = "median" if rare_share(least) > _DECIDED else "rms"
+        return found
 
     def error(self, stream: str, learner: str) -> Estimate:
         """Over that of the model alone, by the stream's :meth:`measure`."""
