@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from ..exceptions import ParameterError
@@ -21,11 +22,12 @@ _DEG = math.pi / 180
 @dataclass(frozen=True)
 class StepBound:
     """``phi = min(1, off_rotation/|w_off|, off_travel/|v_off|, (m + creep mu f/W)/(m - m_after),
-    (f/f_wanted)^2)``: the share of a step that is made.
+    (f/f_wanted)^2, (n - 1)^2 (f_i/(even f_wanted))^2)``: the share of a step that is made.
 
     w_off and v_off are the foretold rotation and translation off the focus; m_after the foretold friction
     margins. A contact that slides holds no weight W across its way: the heavier the object is for its grip,
-    the less may be missing. A grip f that falls short of the wanted one is tightened first.
+    the less may be missing. A grip f that falls short of the wanted one is tightened first, and so is each of
+    the n - 1 fingers that oppose the strongest (f_i): their sum may be right while one of them lets go.
 
     A step is not cut below ``least`` of the largest one at pace 1: standing still turns nothing.
     """
@@ -36,11 +38,13 @@ class StepBound:
     """[m]"""
     creep: float = 1.0
     """Margin that may be missing where friction and weight are equal [N]."""
+    even: float = 0.75
+    """Of its equal share of the wanted grip, what each finger that opposes the strongest one should have."""
     least: float = 0.35
     """Infinite: steps are never cut."""
 
     def __post_init__(self) -> None:
-        for name in ("off_rotation", "off_travel", "creep", "least"):
+        for name in ("off_rotation", "off_travel", "creep", "even", "least"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "greater than 0")
 
@@ -68,7 +72,9 @@ class StepBound:
             return phi
         force = float(f_n.max())
         if wanted:
-            phi = min(phi, max(force / wanted, 0.0) ** 2)
+            others = np.delete(f_n, f_n.argmax())
+            weakest = float(others.min(initial=math.inf)) * len(others) / self.even
+            phi = min(phi, max(min(force, weakest) / wanted, 0.0) ** 2)
         friction = float(lin.contacts.friction.mean()) * force
         spare = self.creep * friction / max(seen.weight, 1e-3)
         before, after = lin.margins, lin.margins_after(delta_a)
