@@ -49,13 +49,29 @@ def test_it_is_a_plant(plant):
 def test_it_holds_still_for_ten_seconds(plant, seed):
     before = plant.reset(seed)
     assert before.status is PlantStatus.HELD
-    start = time.process_time()
     plant.wait(10.0)
-    cost = time.process_time() - start
     moved, turned = motion(before, plant.observe())
     assert moved.norm() < 1e-4 / 100  # the target is 0.1 mm and 0.1 deg
     assert turned.norm() < 0.1 * DEG / 100
-    assert 10.0 / cost > 8.0  # times faster than real time, on one core
+
+
+def test_servos_and_tendons_take_no_longer_than_physx(plant, grasped):
+    """At 20 000 steps of PhysX a second, that is ten times real time; benchmarks/plant_hold.py measures it.
+
+    The ratio of two parts that take turns holds on a busy machine, too; a time would not.
+    """
+    plant.restore(grasped)
+    physx = plant._rig.scene._system.step
+    whole, bare = [], []
+    for _ in range(40):
+        start = time.process_time()
+        plant.wait(0.1)
+        middle = time.process_time()
+        for _ in range(round(0.1 / plant.config.time_step)):
+            physx()
+        whole.append(middle - start)
+        bare.append(time.process_time() - middle)
+    assert min(whole) < 2.0 * min(bare)
 
 
 @pytest.mark.parametrize("time_step", [0.002, 0.004])
