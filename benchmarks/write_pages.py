@@ -81,8 +81,12 @@ def measure(part: Part, folder: Path, quick: bool, keep: bool) -> dict[str, str]
         found = json.loads(kept.read_text(encoding="utf-8"))
         if found["command"] == spoken and (keep or found["commit"] == now):
             return found
+    started = folder / "started.txt"
+    if folder.exists() and not (keep or (started.exists() and started.read_text(encoding="utf-8") == now)):
+        shutil.rmtree(folder)  # a command would go on with what another commit has left
     words = part.words(folder / "report", quick)
     folder.mkdir(parents=True, exist_ok=True)
+    started.write_text(now, encoding="utf-8")
     print(f"{part.spoken()} ...", flush=True)
     begin = time.time()
     environment = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **os.environ}

@@ -47,6 +47,25 @@ def test_a_page_keeps_what_was_measured_and_says_how(tmp_path: Path, monkeypatch
     assert "| 2 ['--other', '--quick'] |" in (out / "one.md").read_text(encoding="utf-8")
 
 
+def test_half_a_result_of_another_commit_is_not_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = tmp_path / "resume.py"
+    script.write_text(
+        "import pathlib, sys\n"
+        "done = pathlib.Path(sys.argv[1]); done.mkdir(exist_ok=True)\n"
+        "(done / 'report.md').write_text(f'# T\\n\\n{len(list(done.glob(\"run_*\")))} runs were there\\n')\n"
+        "(done / 'run_1').touch()\n"
+    )
+    _plan(tmp_path, monkeypatch, f"{script} {{out}}")
+    out = tmp_path / "out"
+    for commit, there in (("old", 0), ("old", 1), ("new", 0), ("new", 1)):
+        monkeypatch.setattr(write_pages, "commit", lambda commit=commit: commit)
+        write_pages.main(["one", "--quick", "--out", str(out)])
+        assert f"{there} runs were there" in (out / "one.md").read_text(encoding="utf-8")
+        (out / "one" / "0" / "measured.json").unlink()  # as if it had been stopped
+
+
 def test_an_unknown_page_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         write_pages.main(["nothing"])
