@@ -227,8 +227,9 @@ class LookAndMoveController:
         )
         try:
             da, predicted, problem, solution = self._solve(lin, seen)
-            phi = self.bound.share(lin, da, predicted, seen, self._wanted_grip(lin, seen))
-            phi = max(phi, min(1.0, self.bound.least / max(share * pace, 1e-9)))
+            asked = share * pace
+            phi = self.bound.share(lin, da, predicted, seen, self._wanted_grip(lin, seen), asked)
+            phi = max(phi, min(1.0, self.bound.least / max(asked, 1e-9)))
             if phi < 1:
                 desired, share = phi * desired, phi * share
                 seen = dataclasses.replace(seen, desired=desired)

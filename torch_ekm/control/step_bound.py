@@ -22,12 +22,13 @@ _DEG = math.pi / 180
 @dataclass(frozen=True)
 class StepBound:
     """``phi = min(1, off_rotation/|w_off|, off_travel/|v_off|, (m + creep mu f/W)/(m - m_after),
-    (f/f_wanted)^2, (n - 1)^2 (f_i/(even f_wanted))^2)``: the share of a step that is made.
+    (f/f_wanted)^2, max(1/p, ((n - 1) f_i/(even f_wanted))^2))``: the share of a step that is made.
 
     w_off and v_off are the foretold rotation and translation off the focus; m_after the foretold friction
     margins. A contact that slides holds no weight W across its way: the heavier the object is for its grip,
-    the less may be missing. A grip f that falls short of the wanted one is tightened first, and so is each of
-    the n - 1 fingers that oppose the strongest (f_i): their sum may be right while one of them lets go.
+    the less may be missing. A grip f that falls short of the wanted one is tightened first. The sum of the
+    n - 1 fingers that oppose the strongest may be right while one of them lets go: steps p above those of
+    pace 1, which change the forces faster than they are corrected, need a part f_i of each.
 
     A step is not cut below ``least`` of the largest one at pace 1: standing still turns nothing.
     """
@@ -39,7 +40,7 @@ class StepBound:
     creep: float = 1.0
     """Margin that may be missing where friction and weight are equal [N]."""
     even: float = 0.75
-    """Of its equal share of the wanted grip, what each finger that opposes the strongest one should have."""
+    """Of its equal part of the wanted grip, what each finger that opposes the strongest one should bear."""
     least: float = 0.35
     """Infinite: steps are never cut."""
 
@@ -55,12 +56,14 @@ class StepBound:
         predicted: Float[Tensor, " n_s"],
         seen: Situation,
         wanted: float | None,
+        asked: float = 1.0,
     ) -> float:
         """phi of a step.
 
         Args:
             predicted: increment that the corrected model foretells for ``delta_a``.
             wanted: grip force of the finger that opposes the others [N]; None: no such wish.
+            asked: p, size of the step in units of the largest at pace 1.
         """
         focus = seen.focus
         off = focus.off_matrix @ predicted[-6:]
@@ -74,7 +77,8 @@ class StepBound:
         if wanted:
             others = np.delete(f_n, f_n.argmax())
             weakest = float(others.min(initial=math.inf)) * len(others) / self.even
-            phi = min(phi, max(min(force, weakest) / wanted, 0.0) ** 2)
+            phi = min(phi, max(force / wanted, 0.0) ** 2)
+            phi = min(phi, max(1 / max(asked, 1.0), max(weakest / wanted, 0.0) ** 2))
         friction = float(lin.contacts.friction.mean()) * force
         spare = self.creep * friction / max(seen.weight, 1e-3)
         before, after = lin.margins, lin.margins_after(delta_a)

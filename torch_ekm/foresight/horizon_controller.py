@@ -157,7 +157,9 @@ class HorizonController(LookAndMoveController):
 
     def _share(self, lin: Linearization, seen: Situation, step: _Step) -> float:
         """Of a motion that the step bound would make."""
-        return self.bound.share(lin, step[0], step[1], seen, self._wanted_grip(lin, seen))
+        travel = contact_travel(self.focus.matrix.mT @ seen.desired, lin.contacts.point - seen.state.position)
+        asked = self.limiting.steps(seen.desired, travel)
+        return self.bound.share(lin, step[0], step[1], seen, self._wanted_grip(lin, seen), asked)
 
     def _waits(self, seen: Situation, step: _Step, K: int, left: Tensor) -> bool:
         """The plan puts off its motions: something is in the way, and will be, too, when it plans again."""
