@@ -97,6 +97,12 @@ def test_the_way_back_is_gone_as_far_as_it_helps(held) -> None:
     torch.testing.assert_close(sliding.commands[4], -sliding.commands[1])
 
 
+def test_an_object_that_is_lost_on_the_way_back_is_not_called_given_up(held) -> None:
+    done, _, _ = slide(held, [0.0, 0.0, 1.2, 1.8, 31.0, 31.0], CAREFUL)
+    assert done.lost
+    assert "off the focus" in done.stop.message
+
+
 def test_where_going_back_does_not_help_the_turn_is_given_up_at_once(held) -> None:
     done, _, _ = slide(held, [0.0, 0.0, 1.2, 1.8, 1.9, 1.9], CAREFUL)
     assert done.reason is Reason.GIVEN_UP

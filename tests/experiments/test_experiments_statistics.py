@@ -88,6 +88,14 @@ def test_settling_means_staying_inside(errors: tuple[float, ...], expected: int)
     assert settle_steps(40)(turn(errors_deg=errors)) == expected
 
 
+def test_what_stopped_the_loop_does_not_hide_a_loss() -> None:
+    flipped = turn(error=3.0, reason="pose jump", off_rotation_deg=76.0)
+    assert flipped.lost
+    assert not flipped.not_reached
+    assert steady_state_error(flipped) == 20.0
+    assert not turn(error=3.0, reason="pose jump", off_rotation_deg=2.0).lost
+
+
 def test_lost_objects_never_settle() -> None:
     assert settle_steps(25)(turn(errors_deg=(3, 0.1), reason="object lost")) == 25
 

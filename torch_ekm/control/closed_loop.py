@@ -205,7 +205,7 @@ class ClosedLoop:
                 seen, clear = yield from self._go_back(seen, decision, turn)
                 if turn.halt is not None:
                     continue
-                if seen.status is PlantStatus.LOST:
+                if seen.status is PlantStatus.LOST or turn.off_rotation(seen) > self.rule.off_limit:
                     return Stop(StopReason.OBJECT_LOST, seen, sign)
                 if not clear or turn.alarms > self.caution.retreats:
                     return Stop(StopReason.GIVEN_UP, seen, sign)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,13 +12,14 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import torch
 
-from ..control import Manipulation, StopReason
+from ..control import Manipulation, StoppingRule, StopReason
 from ..exceptions import ParameterError
 from ..kinematics import GraspState
 from ..plant import Observation
 from ..typing import Float, Tensor
 
 _DEG = np.pi / 180
+_DISLOCATED = math.degrees(StoppingRule().off_limit)
 _MOVING = 0.5 * _DEG  # commands that ask for less tell nothing about the shortfall of a step
 
 
@@ -91,8 +93,11 @@ class TrialRecord(Trial):
 
     @property
     def lost(self) -> bool:
-        """The object was dropped, or turned off the axis beyond help."""
-        return self.reason == StopReason.OBJECT_LOST.value
+        """The object was dropped, or turned off the axis beyond help.
+
+        Whatever stopped the loop: to the guards, an object that flips between two looks is a jumping pose.
+        """
+        return self.reason == StopReason.OBJECT_LOST.value or self.off_rotation_deg > _DISLOCATED
 
     @property
     def not_reached(self) -> bool:
