@@ -157,9 +157,13 @@ class HorizonController(LookAndMoveController):
 
     def _share(self, lin: Linearization, seen: Situation, step: _Step) -> float:
         """Of a motion that the step bound would make."""
-        travel = contact_travel(self.focus.matrix.mT @ seen.desired, lin.contacts.point - seen.state.position)
-        asked = self.limiting.steps(seen.desired, travel)
+        asked = self._steps(lin, seen, seen.desired)
         return self.bound.share(lin, step[0], step[1], seen, self._wanted_grip(lin, seen), asked)
+
+    def _steps(self, lin: Linearization, seen: Situation, focused: Tensor) -> float:
+        """How many of the largest steps, at pace 1, make up a focused way."""
+        travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - seen.state.position)
+        return self.limiting.steps(focused, travel)
 
     def _waits(self, seen: Situation, step: _Step, K: int, left: Tensor) -> bool:
         """The plan puts off its motions: something is in the way, and will be, too, when it plans again."""
@@ -197,8 +201,7 @@ class HorizonController(LookAndMoveController):
     def _motions_left(self, lin: Linearization, seen: Situation) -> tuple[int, Tensor]:
         """K, and what of the focused error will be left after as many motions."""
         focused = self.focus.matrix @ seen.error
-        travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - seen.state.position)
-        steps = self.limiting.steps(focused, travel) / self.pace
+        steps = self._steps(lin, seen, focused) / self.pace
         if self.limiting.gain * steps <= 1:
             return 1, 0 * focused
         K = min(math.ceil(steps - 1e-9), self.horizon)
