@@ -166,10 +166,13 @@ def test_a_step_is_cut_in_proportion_to_what_is_foretold_to_go_wrong(held) -> No
     # the sum of three fingers is right, but one of the two that share a side bears half of its part
     felt = torch.tensor([6.0, 4.5, 1.5], dtype=torch.float64)
     uneven = dataclasses.replace(at, fingertip_force=torch.cat([felt, torch.full((2,), torch.nan)]))
-    part = (1.5 / (0.75 * 3.0)) ** 2
+    part = (1.5 / (bound.even * 3.0)) ** 2
     shares = [bound.share(lin, still, predicted, uneven, 6.0, asked) for asked in (0.3, 1.0, 2.0, 4.0)]
     assert shares == pytest.approx([1.0, 1.0, 0.5, part])  # steps of pace 1 are not cut
     assert StepBound(even=0.5).share(lin, still, predicted, uneven, 6.0, 4.0) == 1.0
+    felt = torch.tensor([6.0, 4.5, -1.5, torch.nan, torch.nan], dtype=torch.float64)  # of a pad that drifts
+    off = dataclasses.replace(at, fingertip_force=felt)
+    assert bound.share(lin, still, predicted, off, 6.0, 4.0) == pytest.approx(0.25)
     # a motion that takes the margins away: the heavier the object, the less of it is made
     delta = 4 * DEG * torch.from_numpy(np.sign(lin.margin_sensitivity.sum(0).numpy())) * -1.0
     shares = [bound.share(lin, delta, predicted, dataclasses.replace(at, weight=w), None) for w in (0.3, 3.0)]

@@ -22,13 +22,14 @@ _DEG = math.pi / 180
 @dataclass(frozen=True)
 class StepBound:
     """``phi = min(1, off_rotation/|w_off|, off_travel/|v_off|, (m + creep mu f/W)/(m - m_after),
-    (f/f_wanted)^2, max(1/p, ((n - 1) f_i/(even f_wanted))^2))``: the share of a step that is made.
+    (f/f_wanted)^2, max(1/p, (f_i/(even f_mean))^2))``: the share of a step that is made.
 
     w_off and v_off are the foretold rotation and translation off the focus; m_after the foretold friction
     margins. A contact that slides holds no weight W across its way: the heavier the object is for its grip,
-    the less may be missing. A grip f that falls short of the wanted one is tightened first. The sum of the
-    n - 1 fingers that oppose the strongest may be right while one of them lets go: steps p above those of
-    pace 1, which change the forces faster than they are corrected, need a part f_i of each.
+    the less may be missing. A grip f that falls short of the wanted one is tightened first. The fingers that
+    oppose the strongest one may bear enough together while one of them lets go: steps p above those of
+    pace 1, which change the forces faster than they are corrected, ask for a force f_i of each that is near
+    the mean f_mean of them.
 
     A step is not cut below ``least`` of the largest one at pace 1: standing still turns nothing.
     """
@@ -39,8 +40,8 @@ class StepBound:
     """[m]"""
     creep: float = 1.0
     """Margin that may be missing where friction and weight are equal [N]."""
-    even: float = 0.75
-    """Of its equal part of the wanted grip, what each finger that opposes the strongest one should bear."""
+    even: float = 0.85
+    """Of the mean of the fingers that oppose the strongest one, what each of them should bear."""
     least: float = 0.35
     """Infinite: steps are never cut."""
 
@@ -76,9 +77,10 @@ class StepBound:
         force = float(f_n.max())
         if wanted:
             others = np.delete(f_n, f_n.argmax())
-            weakest = float(others.min(initial=math.inf)) * len(others) / self.even
             phi = min(phi, max(force / wanted, 0.0) ** 2)
-            phi = min(phi, max(1 / max(asked, 1.0), max(weakest / wanted, 0.0) ** 2))
+            if len(others) and (mean := float(others.mean())) > 0:
+                even = max(float(others.min()), 0.0) / (self.even * mean)
+                phi = min(phi, max(1 / max(asked, 1.0), even**2))
         friction = float(lin.contacts.friction.mean()) * force
         spare = self.creep * friction / max(seen.weight, 1e-3)
         before, after = lin.margins, lin.margins_after(delta_a)
