@@ -32,3 +32,13 @@ def increment(**moves: float) -> torch.Tensor:
 
 SQUEEZE = increment(thumb_distal=3.0, index_distal=2.0, middle_distal=2.0)
 ROLL = increment(thumb_distal=-3.0, index_distal=2.0, middle_distal=2.0)
+
+
+def turned(plant, delta):
+    """Rotation about the grasp's axis that a command brings [rad]."""
+    before = plant.observe()
+    return float(motion(before, plant.command(delta))[1] @ plant.rotation_axis)
+
+
+def truth(observation, name="q"):
+    return getattr(observation.truth, name)
