@@ -88,7 +88,7 @@ class GripForceTask:
     """[N]"""
     most: float = 8.5
     """[N]; also of a grip that was tightened."""
-    weight: float = 12.0
+    weight: float = 4.0
     """Per N^2."""
     step: float = 0.7
     """At most this much of an error is corrected in one step [N]."""

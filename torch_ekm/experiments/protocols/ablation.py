@@ -80,7 +80,6 @@ _OPTIONS: list[tuple[str, str, str, dict[str, Any], tuple[str, ...]]] = [
     ),
     ("care", "steps never cut", "control", {"StepBound.least": math.inf}, _ALL),
     ("care", "large steps with uneven forces", "control", {"StepBound.even": 1e-3}, _LEARNING),
-    ("care", "grip regulated with weight 4", "control", {"GripForceTask.weight": 4.0}, _ALL),
     ("care", "no second look", "control", {"Caution.looks": 0}, _ALL),
     (
         "care", "no way back", "control",
