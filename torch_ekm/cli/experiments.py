@@ -94,7 +94,7 @@ def reproduce(
     experiment  sessions  of                                       time
     generalize       400  8 to 11 turns: 5 objects, 4 controllers  1 h
     online            80  45 turns: 4 controllers                  1 h
-    ablation        3120  3 to 6 turns: one change at a time       4 h
+    ablation        3140  3 to 6 turns: one change at a time       4 h
     adapt             20  48 turns of 6 objects in random order    0.5 h
     foresight        560  6 to 10 turns: 7 objects, 4 contenders   5 h
 
