@@ -13,26 +13,6 @@ from torch_ekm.simulation import PlantParameters, SimulatedHand
 pytest.importorskip("sapien")
 
 
-@pytest.fixture(scope="module")
-def plant():
-    plant = SimulatedHand("icub_right", "box")
-    plant.reset(0)
-    return plant
-
-
-@pytest.fixture(scope="module")
-def grasped(plant):
-    return plant.snapshot()
-
-
-@pytest.fixture
-def exact(plant, grasped):
-    """The plant without any disturbance, freshly grasped."""
-    plant.restore(grasped)
-    yield plant
-    plant.restore(grasped)
-
-
 SENSOR_DISTURBANCES = {
     "joint_noise": 1.0 * DEG,
     "position_noise": 1e-3,

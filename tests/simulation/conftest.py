@@ -1,0 +1,27 @@
+"""A grasp that tests of disturbances begin with."""
+
+from __future__ import annotations
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def plant():
+    from torch_ekm.simulation import SimulatedHand  # where SAPIEN is missing, these tests are skipped
+
+    plant = SimulatedHand("icub_right", "box")
+    plant.reset(0)
+    return plant
+
+
+@pytest.fixture(scope="module")
+def grasped(plant):
+    return plant.snapshot()
+
+
+@pytest.fixture
+def exact(plant, grasped):
+    """The plant without any disturbance, freshly grasped."""
+    plant.restore(grasped)
+    yield plant
+    plant.restore(grasped)
