@@ -173,6 +173,9 @@ def test_a_step_is_cut_in_proportion_to_what_is_foretold_to_go_wrong(held) -> No
     felt = torch.tensor([6.0, 4.5, -1.5, torch.nan, torch.nan], dtype=torch.float64)  # of a pad that drifts
     off = dataclasses.replace(at, fingertip_force=felt)
     assert bound.share(lin, still, predicted, off, 6.0, 4.0) == pytest.approx(0.25)
+    felt = torch.tensor([6.0, -0.5, -0.5, torch.nan, torch.nan], dtype=torch.float64)  # nobody opposes
+    alone = dataclasses.replace(at, fingertip_force=felt)
+    assert bound.share(lin, still, predicted, alone, 6.0, 4.0) == pytest.approx(0.25)
     # a motion that takes the margins away: the heavier the object, the less of it is made
     delta = 4 * DEG * torch.from_numpy(np.sign(lin.margin_sensitivity.sum(0).numpy())) * -1.0
     shares = [bound.share(lin, delta, predicted, dataclasses.replace(at, weight=w), None) for w in (0.3, 3.0)]

@@ -78,8 +78,8 @@ class StepBound:
         if wanted:
             others = np.delete(f_n, f_n.argmax())
             phi = min(phi, max(force / wanted, 0.0) ** 2)
-            if len(others) and (mean := float(others.mean())) > 0:
-                even = max(float(others.min()), 0.0) / (self.even * mean)
+            if len(others):
+                even = max(float(others.min()), 0.0) / max(self.even * float(others.mean()), 1e-9)
                 phi = min(phi, max(1 / max(asked, 1.0), even**2))
         friction = float(lin.contacts.friction.mean()) * force
         spare = self.creep * friction / max(seen.weight, 1e-3)
