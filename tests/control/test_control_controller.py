@@ -34,21 +34,11 @@ from torch_ekm.exceptions import NonFiniteError, ShapeError, UnknownNameError
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel, ModelStatus
 from torch_ekm.residual import SparseOnlineGP
-from torch_ekm.simulation import SimulatedHand
 
 DEG = math.pi / 180
 STEP = LimitingFunction().step
 #: The model's own doubts about a step are another matter.
 WHOLE = StepBound(least=math.inf)
-
-
-@pytest.fixture(scope="module")
-def grasp():
-    """A held box: plant, kinematic model, first observation and its state."""
-    plant = SimulatedHand("icub_right", "box")
-    seen = plant.reset(seed=3)
-    model = KinematicModel(plant.hand, plant.object)
-    return plant, model, seen, GraspState(seen.q, seen.position, seen.rotation)
 
 
 def controller(grasp, enhanced: bool = False, **parts) -> LookAndMoveController:

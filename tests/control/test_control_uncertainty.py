@@ -21,24 +21,12 @@ from torch_ekm.control import (
 )
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import ParameterError
-from torch_ekm.kinematics import GraspState
-from torch_ekm.model import KinematicModel
 from torch_ekm.residual import ActionLinearKernel, SparseOnlineGP, ZeroResidual
-from torch_ekm.simulation import SimulatedHand
 
 DEG = math.pi / 180
 STEP = LimitingFunction().step
 #: The model's own doubts about a step are another matter.
 WHOLE = StepBound(least=math.inf)
-
-
-@pytest.fixture(scope="module")
-def grasp():
-    """A held box: plant, kinematic model, first observation and its state."""
-    plant = SimulatedHand("icub_right", "box")
-    seen = plant.reset(seed=3)
-    model = KinematicModel(plant.hand, plant.object)
-    return plant, model, seen, GraspState(seen.q, seen.position, seen.rotation)
 
 
 @pytest.fixture(scope="module")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from torch_ekm.simulation import SimulatedHand
+
 
 @pytest.fixture(scope="module")
 def plant():
-    from torch_ekm.simulation import SimulatedHand  # where SAPIEN is missing, these tests are skipped
-
     plant = SimulatedHand("icub_right", "box")
     plant.reset(0)
     return plant
