@@ -84,7 +84,7 @@ class Session:
 
 
 def error_of_clean_turns(plant: SimulatedHand, ekm: EnhancedModel, grasps: tuple[int, ...] = CLEAN) -> float:
-    """Rotation that f + g did not foretell, by the truth, rms over the motions [deg]."""
+    """Rotation that f + g did not predict, by the truth, rms over the motions [deg]."""
     squares = []
     for grasp in grasps:
         seen = plant.reset(grasp)
@@ -94,7 +94,7 @@ def error_of_clean_turns(plant: SimulatedHand, ekm: EnhancedModel, grasps: tuple
         for step in loop.run(PoseTarget.turned(seen.state, plant.rotation_axis, degrees=18)).steps:
             lin, moved = step.decision.linearization, step.after.a - step.before.a
             true = step.after.truth.state.minus(step.before.truth.state)
-            off = controller.foretell(lin, moved)[0] - true
+            off = controller.predict(lin, moved)[0] - true
             squares.append(float(off[-3:].square().sum()))
     return math.sqrt(sum(squares) / len(squares)) / DEG
 

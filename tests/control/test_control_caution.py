@@ -146,7 +146,7 @@ def test_the_grip_follows_from_weight_friction_and_lever(held) -> None:
     assert GripForceTask(force=4.0).wanted(lin, tighter) == 4.5
 
 
-def test_a_step_is_cut_in_proportion_to_what_is_foretold_to_go_wrong(held) -> None:
+def test_a_step_is_cut_in_proportion_to_what_is_predicted_to_go_wrong(held) -> None:
     plant, model, seen = held
     controller = LookAndMoveController(model, plant.rotation_axis)
     lin, focus = model.linearize(seen.state), controller.focus
@@ -198,20 +198,20 @@ def test_the_bound_shortens_the_step_that_is_made(held) -> None:
 
 def test_the_pace_grows_where_the_model_is_right_and_shrinks_where_it_is_not() -> None:
     trust, options = TrustRegion(), TrustOptions()
-    foretold = torch.tensor([0.0, 0.0, 0.0, 2.5 * DEG, 0.0, 0.0], dtype=torch.float64)
-    wrong = foretold + torch.tensor([0.0, 0.0, 0.0, 0.0, 3 * DEG, 0.0], dtype=torch.float64)
-    assert trust.judge(foretold, foretold, 0.015) == 0.0
+    predicted = torch.tensor([0.0, 0.0, 0.0, 2.5 * DEG, 0.0, 0.0], dtype=torch.float64)
+    wrong = predicted + torch.tensor([0.0, 0.0, 0.0, 0.0, 3 * DEG, 0.0], dtype=torch.float64)
+    assert trust.judge(predicted, predicted, 0.015) == 0.0
     assert trust.pace == pytest.approx(options.start * options.grow)
     # one direction of six is wrong by 3 deg: rho^2 = 9 / 6 / (0.3^2 + (0.12 * 2.5)^2)
-    assert trust.judge(foretold, wrong, 0.015) == pytest.approx(math.sqrt(9 / 6 / 0.18), rel=1e-6)
+    assert trust.judge(predicted, wrong, 0.015) == pytest.approx(math.sqrt(9 / 6 / 0.18), rel=1e-6)
     assert trust.pace == pytest.approx(options.start * options.grow * options.shrink)
     before = trust.pace
-    trust.judge(foretold, foretold, 0.015, share=0.5)  # half a step says nothing for a larger one
+    trust.judge(predicted, predicted, 0.015, share=0.5)  # half a step says nothing for a larger one
     assert trust.pace == before
-    trust.judge(foretold, foretold, 0.015, surprise=torch.full((3,), 5.0))  # forces went wrong
+    trust.judge(predicted, predicted, 0.015, surprise=torch.full((3,), 5.0))  # forces went wrong
     assert trust.pace < before
     for _ in range(50):
-        trust.judge(foretold, foretold, 0.015)
+        trust.judge(predicted, predicted, 0.015)
     assert trust.pace == options.largest
     other = TrustRegion()
     other.load_state_dict(trust.state_dict())

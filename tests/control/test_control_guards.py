@@ -110,7 +110,7 @@ def test_a_surprise_that_stands_is_believed_but_does_not_teach(held) -> None:
     axis = held[1]
     run = Run(held, lambda plant, seen: turned(seen, axis, -12 * DEG))
     assert run.taught[1] is False
-    assert "foretold" in run.done.steps[1].note
+    assert "predicted" in run.done.steps[1].note
     assert run.taught[2] is True
     torch.testing.assert_close(
         run.done.steps[1].after.rotation, run.plant.last[4].rotation, atol=0.02, rtol=0
@@ -318,7 +318,7 @@ def test_spoilt_readings_neither_break_the_limits_nor_what_is_learned(held) -> N
         loop = ClosedLoop(plant, controller, RULE, learn=False)
         for step in loop.run(PoseTarget.turned(start.state, axis, degrees=15)).steps:
             lin, da = step.decision.linearization, step.after.a - step.before.a
-            off.append((controller.foretell(lin, da)[0] - plant.gain * lin.step(da))[-3:])
+            off.append((controller.predict(lin, da)[0] - plant.gain * lin.step(da))[-3:])
         return float(torch.stack(off).square().mean().sqrt()) / DEG
 
     plant, fuzzed, turns = session(0.15, observations=300)

@@ -28,7 +28,7 @@ QUICK = dataclasses.replace(
 )
 
 
-def test_a_session_says_what_was_foretold_and_what_came(tmp_path: Path) -> None:
+def test_a_session_says_what_was_predicted_and_what_came(tmp_path: Path) -> None:
     made = reproduce(Experiment(QUICK, (0,)), tmp_path)
     (session,) = (tmp_path / "runs").glob("*.json")
     records = {r.kind: r for r in map(ForesightTurn.from_json, json.loads(session.read_text())["result"])}
@@ -39,7 +39,7 @@ def test_a_session_says_what_was_foretold_and_what_came(tmp_path: Path) -> None:
     assert isinstance(alone, ForesightTurn)
     assert far.reach_end == "nothing"
     assert far.largest_deg == pytest.approx(8.0, abs=1.5)
-    assert len(far.foretold) > 1
+    assert len(far.predicted) > 1
     assert far.axis_std_deg is None
     assert dark.reach_deg is None
     assert dark.axis_std_deg is not None
@@ -49,7 +49,7 @@ def test_a_session_says_what_was_foretold_and_what_came(tmp_path: Path) -> None:
     assert abs(dark.estimate_error_deg) < 3 * dark.axis_std_deg
     assert dark.looks == 0
     names = [table.name for table in made.tables]
-    assert names == ["far", "blind", "targets"]  # nothing ended, so nothing was foretold of an end
+    assert names == ["far", "blind", "targets"]  # nothing ended, so nothing was predicted of an end
     assert (tmp_path / "animation.html").stat().st_size > 100_000
     assert "blind turn of 5 deg" in made.summary
 
@@ -97,7 +97,7 @@ def test_what_is_made_of_the_figures() -> None:
     rows = {row[0]: row for row in report.far_table({"a": [*turns, *nearer]}).rows}
     assert (rows["oracle"][4].count, rows["oracle"][4].n, rows[report.ONE_STEP][4]) == (2, 3, None)
     met = {target.what: target for target in report.foresight_targets(results)}
-    assert met["reach foretold within 2 deg [% of grasps]"].measured == 50
+    assert met["reach predicted within 2 deg [% of grasps]"].measured == 50
     assert met["largest angle, horizon E-KM : one-step E-KM, median"].missed_by == 0
     blind = [turn(estimate_error_deg=e, axis_std_deg=0.3) for e in (0.1, -0.45, 0.6)]
     assert report.covered(blind) == [True, True, False]

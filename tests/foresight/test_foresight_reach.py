@@ -46,13 +46,13 @@ def test_the_model_hand_goes_where_the_simulated_one_goes(grasp) -> None:
     target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=10)
     controller.reset()
     for _ in range(5):
-        foretold = model.observe()
-        da = controller.decide(foretold.state, foretold.a, target, foretold.fingertip_force).delta_a
-        foretold, seen = model.command(da), plant.command(da)
-    error = foretold.state.minus(seen.truth.state)[-6:]
+        predicted = model.observe()
+        da = controller.decide(predicted.state, predicted.a, target, predicted.fingertip_force).delta_a
+        predicted, seen = model.command(da), plant.command(da)
+    error = predicted.state.minus(seen.truth.state)[-6:]
     assert float(error[3:].norm()) < 1.0 * DEG
     assert float(error[:3].norm()) < 1.0e-3
-    assert float((foretold.fingertip_force - seen.truth.fingertip_force).abs().max()) < 0.6
+    assert float((predicted.fingertip_force - seen.truth.fingertip_force).abs().max()) < 0.6
 
 
 def test_joints_keep_their_stops_and_encoders_their_ranges(grasp) -> None:
@@ -68,7 +68,7 @@ def test_joints_keep_their_stops_and_encoders_their_ranges(grasp) -> None:
     assert bool((seen.a >= torch.from_numpy(hand.actuator_lower)).all())
     if model.failure:
         assert seen.status is PlantStatus.LOST
-        assert torch.equal(model.command(-push).q, seen.q)  # nothing is foretold of what was lost
+        assert torch.equal(model.command(-push).q, seen.q)  # nothing is predicted of what was lost
     assert model.reset(0).status is PlantStatus.HELD
 
 

@@ -151,7 +151,7 @@ def test_a_pruned_step_is_the_streaming_variational_step():
         if gp.update(x[n], y[n]).event == UpdateEvent.REPLACED and before.posterior.slot != gp.posterior.slot:
             break
     else:
-        pytest.fail("no sample replaced a basis point")
+        pytest.fail("no sample replaced a basis vector")
     old = before.posterior.active.bool()
     a, b = before.posterior.basis[old].numpy(), gp.posterior.basis[gp.posterior.active.bool()].numpy()
     assert not np.array_equal(a, b)

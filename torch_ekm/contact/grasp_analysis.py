@@ -23,7 +23,7 @@ class GraspAnalysis:
     """
 
     mobility: int
-    """dim null A: freedoms of hand and object that the contacts leave."""
+    """dim null A: degrees of freedom of hand and object that the contacts leave."""
     internal_forces: int
     """dim null G: contact force combinations that cancel on the object."""
     undetermined_forces: int

@@ -292,11 +292,11 @@ class ClosedLoop:
             return None
         servo = isinstance(self.plant, ServoInverse)
         moved = after.a - seen.a if servo else decision.delta_a
-        foretold, nominal = self.controller.foretell(lin, moved)
+        predicted, nominal = self.controller.predict(lin, moved)
         surprise = self._learn_forces(enhanced, lin, seen, moved, after)
         if enhanced.trust is not None:
             lever = contact_lever(lin.contacts.point - seen.position)
-            enhanced.trust.judge(foretold[-6:], increment[-6:], lever, decision.share, surprise)
+            enhanced.trust.judge(predicted[-6:], increment[-6:], lever, decision.share, surprise)
         return enhanced.update(seen.state, moved, increment, nominal)
 
     def _learn_forces(
@@ -307,7 +307,7 @@ class ClosedLoop:
         moved: Tensor,
         after: Observation,
     ) -> Float[Tensor, " n_c"] | None:
-        """How far each contact's normal force is from what was foretold [N]; None: not all pads measure."""
+        """How far each contact's normal force is from what was predicted [N]; None: not all pads measure."""
         if seen.fingertip_force is None or after.fingertip_force is None:
             return None
         pads = self.controller.kinematic.hand.pad_indices(lin.contacts.finger)

@@ -88,7 +88,7 @@ class LookAndMoveController:
         sqp_iterations: at most so many quadratic programs, for a model that is not linear in the action.
         sqp_damping: share of each change that is made.
         sqp_tolerance: a smaller change is the last [rad].
-        bound: how much of a step is made where the model foretells that it goes wrong.
+        bound: how much of a step is made where the model predicts that it goes wrong.
         solver: any that qpsolvers finds installed.
     """
 
@@ -130,7 +130,7 @@ class LookAndMoveController:
         trust = None if self.enhanced is None else self.enhanced.trust
         return 1.0 if trust is None else trust.pace
 
-    def foretell(
+    def predict(
         self, lin: Linearization, moved: Float[Tensor, " n_a"]
     ) -> tuple[Float[Tensor, " n_s"], Float[Tensor, " n_s"]]:
         """``(f + g)(s, w)`` and ``f(s, w)`` of what the encoders did from a linearized state."""
@@ -167,7 +167,7 @@ class LookAndMoveController:
         still = at.predicted.new_zeros(at.predicted.shape)
         predicted, nominal = still, still
         if at.linearization is not None:
-            predicted, nominal = self.foretell(at.linearization, delta_a)
+            predicted, nominal = self.predict(at.linearization, delta_a)
         desired = self.focus.matrix @ predicted[-6:]
         lin = at.linearization
         return Decision(
@@ -252,7 +252,7 @@ class LookAndMoveController:
     def _solve(
         self, lin: Linearization, seen: Situation
     ) -> tuple[Tensor, Tensor, ControlProblem, ControlSolution]:
-        """The best increment, what the model foretells of it, and the last program with its solution."""
+        """The best increment, what the model predicts of it, and the last program with its solution."""
         enhanced, da = self.enhanced, seen.a.new_zeros(len(seen.a))
         encoded = None if enhanced is None else enhanced.encode(seen.state)
         linear = enhanced is None or enhanced.affine

@@ -24,7 +24,7 @@ class StepBound:
     """``phi = min(1, off_rotation/|w_off|, off_travel/|v_off|, (m + creep mu f/W)/(m - m_after),
     (f/f_wanted)^2, max(1/p, (f_i/(even f_mean))^2))``: the share of a step that is made.
 
-    w_off and v_off are the foretold rotation and translation off the focus; m_after the foretold friction
+    w_off and v_off are the predicted rotation and translation off the focus; m_after the predicted friction
     margins. A contact that slides holds no weight W across its way: the heavier the object is for its grip,
     the less may be missing. A grip f that falls short of the wanted one is tightened first. The fingers that
     oppose the strongest one may bear enough together while one of them lets go: steps p above those of
@@ -62,7 +62,7 @@ class StepBound:
         """phi of a step.
 
         Args:
-            predicted: increment that the corrected model foretells for ``delta_a``.
+            predicted: increment that the corrected model predicts for ``delta_a``.
             wanted: grip force of the finger that opposes the others [N]; None: no such wish.
             asked: p, size of the step in units of the largest at pace 1.
         """

@@ -48,7 +48,7 @@ class EnhancedModel(Recorded, nn.Module):
             trains on what the encoders did; without it g has to learn the dead zones, too.
         force_learner: of the fingertips' normal forces, with the inputs of ``learner`` and one output [N] for
             each pad; without it the model's sensitivities of the forces hold.
-        trust: sets the pace of a closed loop by how well f + g foretells; without it the pace is fixed.
+        trust: sets the pace of a closed loop by how well f + g predicts; without it the pace is fixed.
         jacobian: df/dda for :meth:`linearize`: a callable ``(state, action) -> (*batch, n_s, n_a)``, or
             ``"finite-difference"`` (central, 2 n_a calls of f); None: J_m, or automatic differentiation.
 

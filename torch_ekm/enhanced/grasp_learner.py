@@ -19,7 +19,7 @@ def grasp_learner(n_s: int, n_a: int, capacity: int = 60, n_out: int = 6) -> Spa
 
     Args:
         n_s, n_a: features of the state (of the order of 1 cm or 0.3 rad), actuators (units of 2 deg).
-        capacity: largest number of basis points.
+        capacity: largest number of basis vectors.
         n_out: six directions of the object, or fingertips.
     """
     parts = [RobustWeight(3.0), ForgettingFactor(0.995)]

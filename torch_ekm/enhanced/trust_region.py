@@ -1,4 +1,4 @@
-"""How far a motion may go: as far as what was foretold of the last ones came true."""
+"""How far a motion may go: as far as what was predicted of the last ones came true."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class TrustOptions:
 class TrustRegion(Recorded, nn.Module):
     """``pace <- pace * grow`` where ``rho < agree``, ``pace * shrink`` where ``rho > disagree``, with::
 
-        rho^2 = mean_i (dx_i - foretold_i)^2 / (noise_i^2 + (relative_i |foretold|)^2)
+        rho^2 = mean_i (dx_i - predicted_i)^2 / (noise_i^2 + (relative_i |predicted|)^2)
 
     over the object's twist in all six directions and the normal forces: 1 is an error that the sensors' noise
     and ``relative`` of the motion explain. The pace multiplies the largest step of
@@ -82,7 +82,7 @@ class TrustRegion(Recorded, nn.Module):
 
     def judge(
         self,
-        foretold: Float[Tensor, 6],
+        predicted: Float[Tensor, 6],
         came: Float[Tensor, 6],
         lever: float,
         share: float = 1.0,
@@ -91,17 +91,17 @@ class TrustRegion(Recorded, nn.Module):
         """Learn from one motion; rho.
 
         Args:
-            foretold: twist of the object that the model promised for what the encoders did [m, rad].
+            predicted: twist of the object that the model promised for what the encoders did [m, rad].
             came: as measured.
             lever: of the contacts about the object's point [m].
             share: of the largest step that was asked for.
-            surprise: normal forces at the contacts, as measured less foretold [N]; None: unknown.
+            surprise: normal forces at the contacts, as measured less predicted [N]; None: unknown.
         """
-        unit = foretold.new_tensor([lever] * 3 + [1.0] * 3)
+        unit = predicted.new_tensor([lever] * 3 + [1.0] * 3)
         o = self.options
-        size = torch.linalg.vector_norm(foretold / unit)
-        noise = foretold.new_tensor([o.translation_noise] * 3 + [o.rotation_noise] * 3)
-        terms = (came - foretold).square() / (noise.square() + (o.relative * size * unit).square())
+        size = torch.linalg.vector_norm(predicted / unit)
+        noise = predicted.new_tensor([o.translation_noise] * 3 + [o.rotation_noise] * 3)
+        terms = (came - predicted).square() / (noise.square() + (o.relative * size * unit).square())
         if surprise is not None:
             terms = torch.cat([terms, (surprise / o.force_noise).square()])
         rho = float(terms.mean().sqrt())

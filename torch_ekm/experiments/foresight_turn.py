@@ -1,4 +1,4 @@
-"""What came of a turn, and what was foretold of it."""
+"""What came of a turn, and what was predicted of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .records import TrialRecord
 
 @dataclass(frozen=True)
 class ForesightTurn(TrialRecord):
-    """A turn, with what was foretold of it; angles [deg]."""
+    """A turn, with what was predicted of it; angles [deg]."""
 
     contender: str = ""
     largest_deg: float = 0.0
@@ -25,5 +25,5 @@ class ForesightTurn(TrialRecord):
     """Of the estimated rotation about the axis at the end, in the dark, by the truth."""
     looks: int = 0
     """How often the camera was asked in the dark."""
-    foretold: tuple[Any, ...] = ()
-    """Joint angles, position and rotation on the foretold way, for pictures."""
+    predicted: tuple[Any, ...] = ()
+    """Joint angles, position and rotation on the predicted way, for pictures."""

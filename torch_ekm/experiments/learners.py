@@ -175,7 +175,7 @@ def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -
 
     Args:
         n_s, n_a: features of the state, actuators.
-        capacity: basis points, window or random frequencies; networks and RLS have no such figure.
+        capacity: basis vectors, window or random frequencies; networks and RLS have no such figure.
         options: instead of the factory's own choices.
 
     Raises:

@@ -1,4 +1,4 @@
-"""A plant whose camera is off: the pose is foretold, corrected by touch, and looked at when it must be."""
+"""A plant whose camera is off: the pose is predicted, corrected by touch, and looked at when it must be."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class BlindPose(PlantWrapper):
 
     Args:
         plant: sees until then.
-        model: foretells.
+        model: predicts the motions.
         axis: about which the object turns, hand frame.
         look_again: [rad]; infinite: never.
         switch_off: the camera goes off with the first observation for which this is true; None: with the

@@ -179,7 +179,7 @@ class HorizonController(LookAndMoveController):
         """A part of a motion."""
         da, _, problem, solution = step
         da = share * da
-        return da, self.foretell(lin, da)[0], problem, dataclasses.replace(solution, u=as_array(da))
+        return da, self.predict(lin, da)[0], problem, dataclasses.replace(solution, u=as_array(da))
 
     def _planned(self, lin: Linearization, seen: Situation, K: int, left: Tensor) -> _Step:
         """The first motion of the best plan."""
@@ -196,7 +196,7 @@ class HorizonController(LookAndMoveController):
         da, rows = path.actions[0], motions[0].motion
         first = dataclasses.replace(solution, u=as_array(da))
         problem = build_qp(len(da), [Bounds(*(DEGREE * x for x in (rows.lower, rows.upper)))])
-        return da, self.foretell(lin, da)[0], problem, first
+        return da, self.predict(lin, da)[0], problem, first
 
     def _motions_left(self, lin: Linearization, seen: Situation) -> tuple[int, Tensor]:
         """K, and what of the focused error will be left after as many motions."""

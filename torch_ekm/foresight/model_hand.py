@@ -1,4 +1,4 @@
-"""A hand that does what the model foretells: the plant on which a turn is tried before anything moves."""
+"""A hand that does what the model predicts: the plant on which a turn is tried before anything moves."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ModelHand:
     after each motion; fingertips report the normal ones. Encoders go where they are told.
 
     Args:
-        model: foretells.
+        model: predicts the motions.
         state, a, fingertip_force: where it begins, as measured [rad, m, N].
         options: of the filter.
     """

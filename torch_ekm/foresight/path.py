@@ -106,7 +106,7 @@ class PathModel:
         """Amid and after each of ``count`` equal motions, by the rates before them.
 
         Args:
-            action, ds: of all together, and what f + g foretell of it.
+            action, ds: of all together, and what f + g predict of it.
         """
         kin, g = self.kinematic.contact_kinematics(z.state, z.contacts), ds - lin.step(action)
         share = torch.arange(1, 2 * count + 1, dtype=action.dtype)[:, None] / (2 * count)

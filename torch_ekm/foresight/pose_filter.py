@@ -35,7 +35,7 @@ class Measurement(NamedTuple):
 
 @dataclass(frozen=True)
 class BlindOptions:
-    """Standard deviations of what a :class:`PoseFilter` is told and foretells.
+    """Standard deviations of what a :class:`PoseFilter` is told and predicts.
 
     Raises:
         ParameterError: one is not positive.
@@ -50,10 +50,10 @@ class BlindOptions:
     gap: float = 0.05e-3
     """Of the gap of a pad that feels a force [m]."""
     joint_drift: float = 0.5
-    """Of a joint's foretold motion, as a share of the largest motion of an actuator: a kinematic model with
-    tendons of another radius foretells joints badly."""
+    """Of a joint's predicted motion, as a share of the largest motion of an actuator: a kinematic model with
+    tendons of another radius predicts joints badly."""
     pose_drift: float = 0.02
-    """Of the object's foretold motion, as a share of it, on top of what the learner states."""
+    """Of the object's predicted motion, as a share of it, on top of what the learner states."""
     model_drift: float = 0.3
     """The same of a kinematic model alone, which states nothing."""
     slip: float = 0.05
@@ -81,7 +81,7 @@ class PoseFilter:
     too. The update is iterated, since gaps are not linear (Bell and Cathey, IEEE TAC 38(2), 1993).
 
     Args:
-        model: foretells; of an enhanced model the learner tells how unsure it is.
+        model: predicts the motions; of an enhanced model the learner tells how unsure it is.
         options: standard deviations.
         touch: False leaves the pose to the prediction alone, without rolling and gaps.
     """
@@ -136,8 +136,8 @@ class PoseFilter:
         fingertip_force: Float[Tensor, " n_pads"] | None = None,
         lin: Linearization | None = None,
     ) -> None:
-        """Carry the state along with a motion. A state that the model refuses has no foretold motion, but one
-        that may be as large as the actuators', as far as contacts that roll allow.
+        """Carry the state along with a motion. A state that the model refuses has no predicted motion, but
+        one that may be as large as the actuators', as far as contacts that roll allow.
 
         Args:
             moved: w [rad].

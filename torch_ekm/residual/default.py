@@ -32,7 +32,7 @@ def default_learner(
     output. It predicts the *next* sample: see MixtureResidual.
 
     Args:
-        capacity: basis points of each of the four.
+        capacity: basis vectors of each of the four.
         output_offset: ``"learned"`` if y is no residual but has a mean of its own.
         options: see ResidualLearner.
 

@@ -15,8 +15,8 @@ class UpdateEvent(enum.IntEnum):
 
     REFUSED = 0  #: masked out, or not finite under ``on_invalid="skip"``: nothing was learned
     ABSORBED = 1  #: taken in; the learner has no basis, or projected the sample onto it
-    ADDED = 2  #: became a new basis point
-    REPLACED = 3  #: became a basis point, and another was pruned for it
+    ADDED = 2  #: became a new basis vector
+    REPLACED = 3  #: became a basis vector, and another was pruned for it
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from .options import Guards
 
 _DEG = math.pi / 180
 _NAMES = ("the encoders' reading", "the joints' reading", "the object's pose")
-_LEVER = 0.03  # [m] a rotation that is foretold wrong carries the object's point so much
+_LEVER = 0.03  # [m] a rotation that is predicted wrong carries the object's point so much
 
 
 class Doubt(NamedTuple):
@@ -35,7 +35,7 @@ class Doubts:
 
     Args:
         guards: limits.
-        controller: foretells motions.
+        controller: predicts motions.
     """
 
     def __init__(self, guards: Guards, controller: LookAndMoveController) -> None:
@@ -66,11 +66,11 @@ class Doubts:
         lin, moved = decision.linearization, seen.a - before.a
         if lin is None:
             return doubt
-        ds, foretold = seen.state.minus(before.state), self.controller.foretell(lin, moved)[0]
+        ds, predicted = seen.state.minus(before.state), self.controller.predict(lin, moved)[0]
         if doubt is not None:  # blind: the joints are still looked at
-            ds[-6:] = foretold[-6:]
-            return self._jump(ds, foretold, seen) or doubt
-        return self._jump(ds, foretold, seen) or self._gate(before, moved, ds, foretold, seen, blind)
+            ds[-6:] = predicted[-6:]
+            return self._jump(ds, predicted, seen) or doubt
+        return self._jump(ds, predicted, seen) or self._gate(before, moved, ds, predicted, seen, blind)
 
     def _age(self, seen: Observation, before: Observation | None = None) -> Doubt | None:
         """Stale, repeated or missing readings."""
@@ -144,21 +144,21 @@ class Doubts:
             return Doubt(StopReason.SPEED_CEILING, message)
         return None
 
-    def _jump(self, ds: Tensor, foretold: Tensor, seen: Observation) -> Doubt | None:
+    def _jump(self, ds: Tensor, predicted: Tensor, seen: Observation) -> Doubt | None:
         """What no motion does."""
         guards, n_q = self.guards, self.hand.n_q
-        off = ds - foretold
+        off = ds - predicted
         i = int(off[:n_q].abs().argmax())
         if off[i].abs() > guards.joint_jump:
             message = (
-                f"joint '{self.hand.joint_names[i]}' turned {deg(ds[i])} where {deg(foretold[i])} "
-                f"were foretold (Guards.joint_jump is {deg(guards.joint_jump)}): look after its sensor"
+                f"joint '{self.hand.joint_names[i]}' turned {deg(ds[i])} where {deg(predicted[i])} "
+                f"were predicted (Guards.joint_jump is {deg(guards.joint_jump)}): look after its sensor"
             )
             return Doubt(StopReason.JOINT_JUMP, message)
         way, turn = (float(torch.linalg.vector_norm(part)) for part in (off[-6:-3], off[-3:]))
         if (way > guards.translation_jump or turn > guards.rotation_jump) and hold(seen):
             message = (
-                f"the pose is {1e3 * way:.1f} mm and {deg(turn)} away from what was foretold, while "
+                f"the pose is {1e3 * way:.1f} mm and {deg(turn)} away from what was predicted, while "
                 f"the fingertips hold the object (Guards allow jumps of {1e3 * guards.translation_jump:g} mm "
                 f"and {deg(guards.rotation_jump)}): look after camera and markers"
             )
@@ -166,11 +166,11 @@ class Doubts:
         return None
 
     def _gate(
-        self, before: Observation, moved: Tensor, ds: Tensor, foretold: Tensor, seen: Observation, blind: int
+        self, before: Observation, moved: Tensor, ds: Tensor, predicted: Tensor, seen: Observation, blind: int
     ) -> Doubt | None:
         """The innovation against its covariance."""
-        sigma = self.deviation(before, moved, foretold, seen, blind)
-        z = (ds - foretold).abs() / sigma
+        sigma = self.deviation(before, moved, predicted, seen, blind)
+        z = (ds - predicted).abs() / sigma
         i, n_q = int(z.argmax()), self.hand.n_q
         if z[i] <= self.guards.gate:
             return None
@@ -181,29 +181,29 @@ class Doubts:
         else:
             what, unit, name = f"the object turned about {'xyz'[i - n_q - 3]}", _DEG, "deg"
         message = (
-            f"{what} {float(ds[i]) / unit:.2f} {name} where {float(foretold[i]) / unit:.2f} ± "
-            f"{float(sigma[i]) / unit:.2f} {name} were foretold (Guards.gate is {self.guards.gate:g})"
+            f"{what} {float(ds[i]) / unit:.2f} {name} where {float(predicted[i]) / unit:.2f} ± "
+            f"{float(sigma[i]) / unit:.2f} {name} were predicted (Guards.gate is {self.guards.gate:g})"
         )
         return Doubt(StopReason.BLIND, message, gated=True)
 
     def deviation(
-        self, before: Observation, moved: Tensor, foretold: Tensor, seen: Observation, blind: int = 0
+        self, before: Observation, moved: Tensor, predicted: Tensor, seen: Observation, blind: int = 0
     ) -> Float[Tensor, " n_s"]:
         """sigma of each entry of an increment, see :class:`~torch_ekm.control.Guards`."""
         guards, n_q = self.guards, self.hand.n_q
-        variance = foretold.new_zeros(foretold.shape)
+        variance = predicted.new_zeros(predicted.shape)
         variance[:n_q] = 2 * guards.joint_noise**2
         for reading in (before, seen):
             variance[n_q:] += self._stated(reading)
         # blind motions before this one left the pose as unsure as the model is
         share = guards.relative * (1 + blind)
-        parts = foretold[:n_q], foretold[-6:-3], foretold[-3:]
+        parts = predicted[:n_q], predicted[-6:-3], predicted[-3:]
         way, turn = torch.linalg.vector_norm(parts[1]), torch.linalg.vector_norm(parts[2])
         along, about = way + _LEVER * turn, turn + way / _LEVER
         size = torch.cat([parts[0].abs().amax().expand(n_q), along.expand(3), about.expand(3)])
         variance += (share * size).square()
         if self.controller.enhanced is not None:
-            variance += self.controller.enhanced.deviation(before.state, moved, foretold).square()
+            variance += self.controller.enhanced.deviation(before.state, moved, predicted).square()
         return variance.sqrt()
 
     def _stated(self, reading: Observation) -> Float[Tensor, " 6"]:

@@ -28,12 +28,12 @@ class Guards:
 
     A reading that breaks one is looked at again (``observe()``), ``looks`` times. If it stands, the loop ends
     with a reason of its own, and what learns (learner, trust region, servo model) is as it was before the
-    motion. Two things are no end: a motion whose pose is unknown is blind, and the model foretells the
+    motion. Two things are no end: a motion whose pose is unknown is blind, and the model predicts the
     pose; a fingertip at fault is left out, and the model's estimate stands in.
 
-    A change ``z_i`` is gated: ``|z_i - foretold_i| > gate sigma_i`` is no evidence, with::
+    A change ``z_i`` is gated: ``|z_i - predicted_i| > gate sigma_i`` is no evidence, with::
 
-        sigma^2 = Sigma_before + Sigma_after + Var[g] + (relative |foretold|)^2
+        sigma^2 = Sigma_before + Sigma_after + Var[g] + (relative |predicted|)^2
 
     Sigma of a pose is what the plant states (``info["estimate"]["pose_covariance"]``), else
     ``translation_noise`` and ``rotation_noise``. A gated change that further looks confirm is real (it
@@ -64,7 +64,7 @@ class Guards:
     encoder_jump: float = 8 * _DEG
     """An encoder goes so much further than it was told, or so far back [rad]."""
     joint_jump: float = 20 * _DEG
-    """Of a joint, away from what was foretold of one motion [rad]."""
+    """Of a joint, away from what was predicted of one motion [rad]."""
     rotation_jump: float = 60 * _DEG
     """Of the object, likewise [rad]. Objects that slip out of a pinch do turn by 40 deg."""
     translation_jump: float = 0.03

@@ -25,7 +25,7 @@ class Verdict(NamedTuple):
     """What is believed after a motion."""
 
     seen: Observation
-    """The reading to go on with; of a blind motion with the pose that the model foretold."""
+    """The reading to go on with; of a blind motion with the pose that the model predicted."""
     teaches: bool
     """Both ends of the motion were measured, and nothing speaks against them."""
     halt: Halt | None = None
@@ -39,7 +39,7 @@ class Watch:
 
     Args:
         guards: limits.
-        controller: foretells motions.
+        controller: predicts motions.
     """
 
     def __init__(self, guards: Guards, controller: LookAndMoveController) -> None:
@@ -108,7 +108,7 @@ class Watch:
         measured = self.blind == 0
         if doubt is not None and doubt.blind:
             self.blind += 1
-            seen, most = self._foretold(before, decision, seen), self.guards.blind_motions
+            seen, most = self._predicted(before, decision, seen), self.guards.blind_motions
             if self.blind > most:
                 more = f"{doubt.message} ({self.blind} motions running, Guards.blind_motions is {most})"
                 halt = halt or Halt(doubt.reason, more)
@@ -143,11 +143,11 @@ class Watch:
         message = f"actuator {names} does not move however it is commanded: look after motor and tendon"
         return Halt(StopReason.ACTUATOR_STUCK, message)
 
-    def _foretold(self, before: Observation, decision: Decision, seen: Observation) -> Observation:
-        """With the pose that the model foretells for what the encoders did."""
+    def _predicted(self, before: Observation, decision: Decision, seen: Observation) -> Observation:
+        """With the pose that the model predicts for what the encoders did."""
         pose = before.state
         if decision.linearization is not None:
-            pose = pose.plus(self.controller.foretell(decision.linearization, seen.a - before.a)[0])
+            pose = pose.plus(self.controller.predict(decision.linearization, seen.a - before.a)[0])
         return dataclasses.replace(
             seen, position=pose.position, rotation=pose.rotation, status=PlantStatus.NOT_SEEN
         )

@@ -109,7 +109,7 @@ def variants(base: Setting) -> list[Variant]:
             for group, name, field, option, controllers in _OPTIONS
         ),
         *(
-            Variant("online learning", f"{capacity} basis points", {"capacity": capacity}, _LEARNING)
+            Variant("online learning", f"{capacity} basis vectors", {"capacity": capacity}, _LEARNING)
             for capacity in (15, 30, 120)
         ),
         *(Variant("preset", name, {"preset": name}, _ALL) for name in PRESETS if name != base.preset),

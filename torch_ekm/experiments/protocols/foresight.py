@@ -1,4 +1,4 @@
-"""Foresight: how far an object can be turned, whether that was foretold, and a turn that nobody looks at."""
+"""Foresight: how far an object can be turned, whether that was predicted, and a turn that nobody looks at."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ class Foresight(Protocol):
             dark |= {"reach_deg": sign * reach.angle / _DEG, "reach_end": reach.ends_by}
             if done.poses:
                 way = ([s.q.tolist(), s.position.tolist(), s.rotation.tolist()] for s in reach.path)
-                dark["foretold"] = tuple(way)
+                dark["predicted"] = tuple(way)
         return ForesightTurn(**vars(done), contender=contender, largest_deg=max(angles) / _DEG, **dark)
 
     def targets(self, results: Results[ForesightTurn]) -> list[Target]:
@@ -151,5 +151,5 @@ class Foresight(Protocol):
         return foresight_targets(results)
 
     def report(self, seeds: Sequence[int], results: Results[ForesightTurn], folder: Path) -> Report:
-        """Answer, tables, figures, and a turn beside what was foretold of it."""
+        """Answer, tables, figures, and a turn beside what was predicted of it."""
         return foresight_report(self.setting, seeds, results, folder)

@@ -21,7 +21,7 @@ from .tables import Target, targets_table, which_seeds
 Turns = Sequence[ForesightTurn]
 Results = Mapping[str, Sequence[Record]]
 
-#: A target is declined where it lies this far beyond the foretold reach [deg].
+#: A target is declined where it lies this far beyond the predicted reach [deg].
 BEYOND_DEG = 2.0
 _NINETY = 1.645  # standard deviations on either side that hold 90 % of a Gaussian
 ONE_STEP = "one-step E-KM"
@@ -41,7 +41,7 @@ def turns_of(results: Results, **wanted: object) -> list[ForesightTurn]:
 
 
 def reach_errors(turns: Turns) -> np.ndarray:
-    """Foretold end less the real one [deg], of turns that ended and of which an end was foretold."""
+    """Predicted end less the real one [deg], of turns that ended and of which an end was predicted."""
     ended = [r for r in turns if r.reach_deg is not None and r.reason != StopReason.REACHED.value]
     return np.array([abs(r.reach_deg or 0.0) - r.largest_deg for r in ended])
 
@@ -97,7 +97,7 @@ def foresight_targets(results: Results) -> list[Target]:
     errors = reach_errors(turns_of(results, kind="far", contender=ONE_STEP))
     if errors.size:
         within = 100 * float(np.mean(np.abs(errors) <= 2))
-        found.append(Target("reach foretold within 2 deg [% of grasps]", within, least=90))
+        found.append(Target("reach predicted within 2 deg [% of grasps]", within, least=90))
     blind = turns_of(results, kind="blind", contender=ONE_STEP)
     if blind:
         median = float(np.median([r.true_error_deg for r in blind]))
@@ -152,7 +152,7 @@ def _answer(results: Results) -> str:
     if errors.size:
         share = 100 * np.mean(errors <= 2)
         parts.append(
-            f"The end of a turn is foretold to {np.median(errors):.1f} deg (median), within 2 deg in "
+            f"The end of a turn is predicted to {np.median(errors):.1f} deg (median), within 2 deg in "
             f"{share:.0f} % of {errors.size} grasps."
         )
     blind = turns_of(results, kind="blind", contender=ONE_STEP)
@@ -185,14 +185,14 @@ def far_table(results: Results) -> Table:
     }
     note = (
         "The target is farther than any grasp goes; the largest true angle before the turn ended. How "
-        "often two controllers end within 2 deg of each other on the same grasp bounds what can be foretold."
+        "often two controllers end within 2 deg of each other on the same grasp bounds what can be predicted."
     )
     items = {name: mine for name, mine in items.items() if mine}
     return Table.of("far", "As far as it goes", "contender", items, columns, note)
 
 
 def reach_table(results: Results) -> Table:
-    """How well the end was foretold, for each object and how the turn ended."""
+    """How well the end was predicted, for each object and how the turn ended."""
     far = [r for r in turns_of(results, kind="far") if r.reach_deg is not None]
     items: dict[str, Turns] = {}
     for name in contenders_of(results):
@@ -213,11 +213,11 @@ def reach_table(results: Results) -> Table:
         Column("mean error [deg]", "+.1f"): lambda mine: float(reach_errors(mine).mean()),
         Column("within 2 deg"): lambda mine: stats.rate((np.abs(reach_errors(mine)) <= 2).tolist()),
         Column("within 5 deg"): lambda mine: stats.rate((np.abs(reach_errors(mine)) <= 5).tolist()),
-        Column("ends by (foretold)"): lambda mine: _most(r.reach_end for r in mine),
+        Column("ends by (predicted)"): lambda mine: _most(r.reach_end for r in mine),
     }
     items = {name: mine for name, mine in items.items() if len(reach_errors(mine))}
-    note = "Foretold less real largest angle; how a turn really ended is in the rows below the objects."
-    return Table.of("reach", "Foretold ends of turns", "turns", items, columns, note)
+    note = "Predicted less real largest angle; how a turn really ended is in the rows below the objects."
+    return Table.of("reach", "Predicted ends of turns", "turns", items, columns, note)
 
 
 def beyond_table(results: Results) -> Table:
@@ -235,7 +235,7 @@ def beyond_table(results: Results) -> Table:
         Column("lost, not declined"): lambda mine: sum(r.lost for r in mine if not declined(r)),
     }
     note = (
-        f"Declined: more than {BEYOND_DEG:g} deg beyond the foretold reach. These turns were made all the "
+        f"Declined: more than {BEYOND_DEG:g} deg beyond the predicted reach. These turns were made all the "
         "same, to see what declining them would have spared."
     )
     items = {name: mine for name, mine in items.items() if mine}
@@ -283,7 +283,7 @@ def _rms(values: Sequence[float | None]) -> float | None:
 
 
 def _plots(results: Results, folder: Path) -> list[FigureFile]:
-    """Foretold against real ends, and errors of blind turns."""
+    """Predicted against real ends, and errors of blind turns."""
     figures = []
     far = [r for r in turns_of(results, kind="far", contender=ONE_STEP) if r.reach_deg is not None]
     if far:
@@ -294,7 +294,7 @@ def _plots(results: Results, folder: Path) -> list[FigureFile]:
             mine = [r for r in far if r.object == name]
             x, y = [r.largest_deg for r in mine], [abs(r.reach_deg or 0.0) for r in mine]
             axis.plot(x, y, "osD^v*PX"[k % 8], label=name.replace("_", " "), markersize=5)
-        axis.set(xlabel="real end [deg]", ylabel="foretold end [deg]", xlim=(0, top), ylim=(0, top))
+        axis.set(xlabel="real end [deg]", ylabel="predicted end [deg]", xlim=(0, top), ylim=(0, top))
         axis.legend(frameon=False, fontsize=8)
         caption = "Where the one-step E-KM's turns ended, and where the model said before anything moved."
         figures.append(save_figure(figure, folder, "reach", caption))
@@ -323,21 +323,21 @@ def _plots(results: Results, folder: Path) -> list[FigureFile]:
 
 
 def _animation(setting: Setting, results: Results, folder: Path) -> list[FigureFile]:
-    """The farthest turn that was foretold, with the foretold object as a ghost."""
-    turns = [r for r in turns_of(results, kind="far") if r.poses and r.foretold and not r.lost]
+    """The farthest turn that was predicted, with the predicted object as a ghost."""
+    turns = [r for r in turns_of(results, kind="far") if r.poses and r.predicted and not r.lost]
     if not turns:
         return []
     turn = max(turns, key=lambda r: r.largest_deg)
     hand, obj = load_hand(setting.hand), load_object(turn.object)
     n = len(turn.poses)
-    foretold = [turn.foretold[min(k, len(turn.foretold) - 1)] for k in range(n)]
+    predicted = [turn.predicted[min(k, len(turn.predicted) - 1)] for k in range(n)]
     q, position, rotation = (np.array(part) for part in zip(*turn.poses, strict=True))
-    _, ghost_position, ghost_rotation = (np.array(part) for part in zip(*foretold, strict=True))
+    _, ghost_position, ghost_rotation = (np.array(part) for part in zip(*predicted, strict=True))
     scene = make_scene(
         hand, obj, q, position, rotation, np.array(hand.gravity), ghost=(ghost_position, ghost_rotation)
     )
     save_animation(scene, folder / "animation.html")
     what = f"{turn.object.replace('_', ' ')}, {turn.contender}, seed {turn.seed}"
     return [
-        FigureFile("animation.html", f"As far as it goes ({what}); see-through: as the model foretold it.")
+        FigureFile("animation.html", f"As far as it goes ({what}); see-through: as the model predicted it.")
     ]

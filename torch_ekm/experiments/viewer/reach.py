@@ -1,4 +1,4 @@
-"""How far a grasp can be turned: the turn as the model foretells it, with what ends it on either side."""
+"""How far a grasp can be turned: the turn as the model predicts it, with what ends it on either side."""
 
 from __future__ import annotations
 

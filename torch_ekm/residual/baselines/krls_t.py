@@ -26,7 +26,7 @@ class KRLSTracker(ScaledLearner, SingleLearner, DoubleStateLearner):
     & Santamaria, IEEE TNNLS 23, 2012). One model; state in float64.
 
     Args:
-        capacity: largest number of basis points.
+        capacity: largest number of basis vectors.
         kernel: default Matern 3/2 with lengthscale sqrt(in_features).
         noise_variance: s2.
         forgetting_factor: lam in (0, 1].

@@ -32,7 +32,7 @@ class LearnHyperparameters(Part):
     state and k samples. The streaming variational bound needs as much and is a worse objective: it inflates
     the noise.
 
-    With a memory, each step predicts 4 k samples of the past too (as many as basis points, if these are
+    With a memory, each step predicts 4 k samples of the past too (as many as basis vectors, if these are
     more), so that a network with thousands of weights does not run after the last k. The state has seen
     them; each is left out of it in closed form.
 

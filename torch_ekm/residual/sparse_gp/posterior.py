@@ -14,7 +14,7 @@ from ..kernels.kernel import Kernel
 
 
 class SparsePosterior(nn.Module):
-    """``exp(-1/2 f'Omega f/s2 + h'f/s2) N(f; 0, K)`` on at most ``capacity`` basis points.
+    """``exp(-1/2 f'Omega f/s2 + h'f/s2) N(f; 0, K)`` on at most ``capacity`` basis vectors.
 
     Master copy is (basis, Omega, h): Omega is a sum of squares, so it stays positive, and it holds
     neither kernel nor noise. alpha, C, Q are caches with ``mean = alpha'k``, ``var = k** + k'Ck``,
@@ -108,7 +108,7 @@ class SparsePosterior(nn.Module):
         self.slot.fill_(n)
 
     def forget(self, models: Bool[Tensor, "*batch"]) -> None:
-        """These models go back to the prior but keep their basis points."""
+        """These models go back to the prior but keep their basis vectors."""
         keep = (~models)[..., None, None]
         for block in (self.covariance, self.precision, self.alpha, self.information):
             block.mul_(keep)
@@ -130,7 +130,7 @@ class SparsePosterior(nn.Module):
     def drift(self, kernel: Kernel, s2: Float[Tensor, "*batch"]) -> float:
         """How far the caches are from what :meth:`rebuild` would make, in O(b^2) (waits for a GPU).
 
-        Two figures, the larger one counts. By how much the mean at the basis points, summed over the outputs,
+        The larger of two values. By how much the mean at the basis vectors, summed over the outputs,
         is off, relative to its largest value: with ``W = Omega/s2`` exact coefficients have
         ``alpha + W K alpha = h/s2``, and what is missing there, d, moves the mean by ``K (d + C K d)``. And
         the largest entry of ``Q K_i - 1_i``, i the point that the others explain best: there Q_ii is

@@ -36,13 +36,13 @@ class Prediction(NamedTuple):
 
 
 class SparseOnlineGP(DoubleStateLearner):
-    """``g ~ GP(0, k)``, ``y = g(x) + noise``, on at most ``capacity`` basis points::
+    """``g ~ GP(0, k)``, ``y = g(x) + noise``, on at most ``capacity`` basis vectors::
 
         mean(x) = alpha' k(X, x),   var(x) = k(x, x) + k(X, x)' C k(X, x)
 
     One sample costs O(b^2 + b m), a prediction O(b m) for the mean and O(b^2) for the variance
-    (b basis points, m outputs). A sample with novelty ``gamma = k** - k'Qk`` above the threshold becomes
-    a basis point, another is projected onto the basis by KL divergence; beyond the capacity the point
+    (b basis vectors, m outputs). A sample with novelty ``gamma = k** - k'Qk`` above the threshold becomes
+    a basis vector, another is projected onto the basis by KL divergence; beyond the capacity the vector
     with the lowest score is pruned, the same way (Csato & Opper, Neural Computation 14, 2002).
 
     The state is kept in natural form and the caches that predict are rebuilt from it by Cholesky every
@@ -62,12 +62,12 @@ class SparseOnlineGP(DoubleStateLearner):
     after the other at each rebuild.
 
     Args:
-        capacity: largest number of basis points b.
+        capacity: largest number of basis vectors b.
         kernel: covariance function in the learner's (standardised) units; default Matern 3/2
             with lengthscale sqrt(in_features) and unit variance.
         noise_variance: s2 in the (standardised) output's squared units, one number or one per output.
-        novelty_threshold: smallest ``gamma / k**`` of a new basis point.
-        jitter: nugget on k(x, x) at basis points, relative to k**.
+        novelty_threshold: smallest ``gamma / k**`` of a new basis vector.
+        jitter: nugget on k(x, x) at basis vectors, relative to k**.
         projection: ``"kl"``, or ``"fitc"``: novelty of a projected sample counts as noise.
         pruning: the point goes that loses least: ``"kl"`` exact loss, ``"mean"`` its first term;
             ``"freeze"``: a full basis stays.
@@ -250,7 +250,7 @@ class SparseOnlineGP(DoubleStateLearner):
 
     @torch.no_grad()
     def set_basis(self, x: Float[Tensor, "n *batch in"]) -> None:
-        """Start again from the prior on given basis points (at most ``capacity``).
+        """Start again from the prior on given basis vectors (at most ``capacity``).
 
         With ``pruning="freeze"`` and a full basis the posterior is then the DTC approximation
         (FITC with ``projection="fitc"``) on these inducing points.
