@@ -192,19 +192,14 @@ def far_table(results: Results) -> Table:
 
 
 def reach_table(results: Results) -> Table:
-    """How well the end was predicted, for each object and how the turn ended."""
+    """How well the end was predicted; of the one-step controller for each object and how the turn ended."""
     far = [r for r in turns_of(results, kind="far") if r.reach_deg is not None]
     items: dict[str, Turns] = {}
     for name in contenders_of(results):
         mine = [r for r in far if r.contender == name]
-        items |= {
-            f"{name}, {item}": [r for r in mine if r.object == item] for item in {r.object: 0 for r in mine}
-        }
-        items |= {
-            f"{name}, {reason}": [r for r in mine if r.reason == reason]
-            for reason in {r.reason: 0 for r in mine}
-        }
         items[f"{name}, all"] = mine
+        if name == ONE_STEP:
+            items |= _each("object", mine) | _each("reason", mine)
     columns: dict[Column, Callable[[Turns], Cell]] = {
         Column("grasps"): lambda mine: len(reach_errors(mine)),
         Column("median absolute error [deg]", ".1f"): lambda mine: float(
@@ -216,7 +211,10 @@ def reach_table(results: Results) -> Table:
         Column("ends by (predicted)"): lambda mine: _most(r.reach_end for r in mine),
     }
     items = {name: mine for name, mine in items.items() if len(reach_errors(mine))}
-    note = "Predicted less real largest angle; how a turn really ended is in the rows below the objects."
+    note = (
+        f"Predicted less real largest angle. Of the {ONE_STEP} also for each object and, below, by how the "
+        "turn really ended."
+    )
     return Table.of("reach", "Predicted ends of turns", "turns", items, columns, note)
 
 
@@ -248,28 +246,31 @@ def blind_table(results: Results) -> Table:
     for name in contenders_of(results):
         for kind in ("blind", "blind, looks again", "blind, no touch"):
             mine = turns_of(results, kind=kind, contender=name)
-            items |= {
-                f"{name}: {kind}, {item}": [r for r in mine if r.object == item]
-                for item in {r.object: 0 for r in mine}
-            }
-            items[f"{name}: {kind}, all"] = mine
+            items[f"{name}, {kind}, all"] = mine
+            if name == ONE_STEP:
+                items |= _each("object", mine, f"{kind}, ")
     columns: dict[Column, Callable[[Turns], Cell]] = {
-        Column("turns"): len,
         Column("median error [deg]"): lambda mine: float(np.median([r.true_error_deg for r in mine])),
-        Column("mean error [deg]"): lambda mine: float(np.mean([r.true_error_deg for r in mine])),
         Column("largest error [deg]"): lambda mine: float(max(r.true_error_deg for r in mine)),
         Column("error of the estimate, rms [deg]"): lambda mine: _rms([r.estimate_error_deg for r in mine]),
         Column("stated sd [deg]"): lambda mine: _rms([r.axis_std_deg for r in mine]),
         Column("90 % interval holds"): lambda mine: stats.rate(covered(mine)) if covered(mine) else None,
         Column("looks", ".1f"): lambda mine: float(np.mean([r.looks for r in mine])),
-        Column("lost"): lambda mine: sum(r.lost for r in mine),
+        Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
     }
     items = {name: mine for name, mine in items.items() if mine}
     note = (
         "The camera is off from the first reading on. True error about the axis at the end; error of the "
-        "estimate and its stated standard deviation likewise. 'No touch': the prediction alone."
+        "estimate and its stated standard deviation likewise. 'No touch': the prediction alone. "
+        f"Single objects: {ONE_STEP}."
     )
     return Table.of("blind", "Whole turns in the dark", "kind", items, columns, note)
+
+
+def _each(entry: str, turns: Turns, prefix: str = "") -> dict[str, Turns]:
+    """Turns by the value of an entry, under ``{prefix}{value}``."""
+    values = dict.fromkeys(str(getattr(r, entry)) for r in turns)
+    return {f"{prefix}{value}": [r for r in turns if getattr(r, entry) == value] for value in values}
 
 
 def _most(names) -> str:
