@@ -92,11 +92,11 @@ def reproduce(
 
     \b
     experiment  sessions  of                                       time
-    generalize       400  8 to 11 turns: 5 objects, 4 controllers  1 h
-    online            80  45 turns: 4 controllers                  1 h
-    ablation        3140  3 to 6 turns: one change at a time       4 h
-    adapt             20  48 turns of 6 objects in random order    0.5 h
-    foresight        560  6 to 10 turns: 7 objects, 4 contenders   5 h
+    generalize       400  8 to 11 turns: 5 objects, 4 controllers  1.5 h
+    online            80  45 turns: 4 controllers                  1.5 h
+    ablation        3140  3 to 6 turns: one change at a time       5 h
+    adapt             20  48 turns of 6 objects in random order    0.3 h
+    foresight        560  6 to 10 turns: 7 objects, 4 contenders   2 h
 
     Time grows with the number of seeds and objects. With --quick: one or two minutes.
     """
@@ -142,9 +142,9 @@ def compare(
 ) -> None:
     """Compare learners on streams of samples.
 
-    Each learner predicts every sample, is scored, and then learns it, in the order of time. A file needs the
-    extra 'plots' only. One learner takes seconds to a minute for 1500 rows, all of them a few minutes on two
-    cores. Interrupted, it goes on where it stopped.
+    Each learner predicts every sample, is scored, and then learns it, in the order of time. A CSV file needs
+    the extra 'plots' only. One learner takes seconds to a minute for 1500 rows, all of them a few minutes on
+    two cores. Interrupted, it goes on where it stopped.
 
     Recordings: simulated_hand (extra 'sim'); in the folder that TORCH_EKM_DATA names: t42 (Sintov et al.,
     GitHub avishais/t42_autonomous_system), icub_grasp (Soh et al., clear-nus/icub_grasp_dataset), sarcos

@@ -39,7 +39,7 @@ _DEG = math.pi / 180
 
 #: The controllers that are compared on the same seeds, grasps, limits and stopping rule. "+I" is integral
 #: action: the increments accumulate on the set-point instead of the encoder, which learns nothing. "+S" is
-#: the servo inverse, on which the E-KM stands, too: what it gains over KM+S it has learned of the hand.
+#: the servo inverse, on which the E-KM stands, too; the E-KM also learns the hand, and paces itself.
 CONTROLLERS = ("KM", "KM+I", "KM+S", "E-KM")
 #: Seeds from here on are never used for tuning.
 FIRST_REPORTED = 1000

@@ -20,10 +20,10 @@ class ForesightTurn(TrialRecord):
     reach_end: str = ""
     """What it said that ends it; "nothing": it goes on beyond what was asked."""
     axis_std_deg: float | None = None
-    """Standard deviation of the rotation about the axis that was stated at the end, in the dark."""
+    """Standard deviation of the rotation about the axis that was stated at the end, with the camera off."""
     estimate_error_deg: float | None = None
-    """Of the estimated rotation about the axis at the end, in the dark, by the truth."""
+    """Of the estimated rotation about the axis at the end, with the camera off, by the truth."""
     looks: int = 0
-    """How often the camera was asked in the dark."""
+    """How often the camera was asked while it was off."""
     predicted: tuple[Any, ...] = ()
     """Joint angles, position and rotation on the predicted way, for pictures."""

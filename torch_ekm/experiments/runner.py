@@ -131,7 +131,7 @@ class Bench:
             learn: train after every motion (an E-KM only).
             events: what happens on the way; ``at`` counts this trial's commands from 0.
             blind_deg: the camera is off for this last part of the turn [deg]; infinite: for all of it.
-            touch: in the dark joints and fingertips correct the pose; else the prediction is all there is.
+            touch: without camera joints and fingertips correct the pose; else the prediction is all there is.
             look_again_deg: of :class:`~torch_ekm.foresight.BlindPose` [deg].
             poses: keep the true poses, for pictures.
         """

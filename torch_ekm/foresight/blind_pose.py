@@ -21,7 +21,7 @@ class BlindPose(PlantWrapper):
 
     Joint angles, encoders and fingertip forces go on being measured. The camera is asked again where the
     standard deviation of the rotation about the axis exceeds ``look_again``; what it then sees is one more
-    measurement. ``info["estimate"]`` of an observation in the dark has ``pose_covariance`` of the error twist
+    measurement. ``info["estimate"]`` without a picture has ``pose_covariance`` of the error twist
     ``(v; w)`` [m, rad], ``axis_std`` [rad] and ``looked``. Train nothing meanwhile
     (``ClosedLoop(..., learn=False)``): increments are estimates, too. ::
 
@@ -88,7 +88,7 @@ class BlindPose(PlantWrapper):
         return self.observation(after)
 
     def observation(self, seen: Observation) -> Observation:
-        """``seen``, in the dark with the estimated state."""
+        """``seen``, with the estimated state while the camera is off."""
         self._before = seen
         if not self.dark:
             self.dark = self._switch_off is None or self._switch_off(seen)

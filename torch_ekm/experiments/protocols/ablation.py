@@ -15,7 +15,7 @@ from ..learners import HAND_LEARNERS
 from ..records import Record
 from ..reporting.report import Cell, Column, Report, Table
 from ..reporting.statistics import estimate, rate, steady_state_error
-from ..reporting.tables import LEGEND, by_controller, prediction_cells, which_seeds
+from ..reporting.tables import LEGEND, by_controller, prediction_cells, warmed_up, which_seeds
 from .generalize import Generalize
 from .protocol import Protocol, Results
 
@@ -157,7 +157,7 @@ class Ablation(Protocol):
         shown = [make(group, seeds, results) for group in self.groups for make in (self.table, self.motions)]
         turned = dict.fromkeys(self._turned(group) for group in self.groups)
         summary = f"{self._answer(seeds, results)} One change at a time; {'; '.join(turned)}. "
-        summary += which_seeds(seeds)
+        summary += f"{which_seeds(seeds)}{warmed_up(self.warm_up)}"
         title, names = (
             "Ablations: what each part is worth",
             {c for v in self._variants() for c in v.controllers},

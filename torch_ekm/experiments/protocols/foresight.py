@@ -96,7 +96,7 @@ class Foresight(Protocol):
         }
 
     def session(self, object: str, contender: str, seed: int) -> list[Record]:
-        """Warm-up, in the dark (not the oracle, which sees all), as far as it goes, beyond Table I."""
+        """Warm-up, camera off (not the oracle, which sees all), as far as it goes, beyond Table I."""
         changes, controller = CONTENDERS[contender]
         bench = Bench(self.setting.hardware_instance(seed).replace(**changes), object, controller)
         if bench.learns:

@@ -190,7 +190,7 @@ class Generalize(Protocol):
         ]
         shown = [table for table in shown if table.rows]
         names = ", ".join(object_name(item) for item in self.objects)
-        summary = f"{tables.verdict(records, seeds)} Objects: {names}."
+        summary = f"{tables.verdict(records, seeds)} Objects: {names}.{tables.warmed_up(self.warm_up)}"
         leading, legend = int(shown[0].name == "paper"), tables.legend(records)
         title = "Generalisation: other objects, other weights"
         return Report(title, summary, shown, figures, leading=leading, legend=legend)
@@ -244,7 +244,7 @@ def object_table(records: Sequence[Record]) -> Table:
     ]  # fmt: skip
     note = (
         "Steady-state error, lost objects with the whole angle. Ratio of means with the bootstrap over "
-        "paired seeds; the effect size is Cohen's d of the paired differences."
+        "pairs of object and seed; the effect size is Cohen's d of the paired differences."
     )
     return Table("by_object", "Steady-state error of each object", columns, rows, note)
 
@@ -263,7 +263,7 @@ def ends_table(records: Sequence[Record]) -> Table:
 
 
 def probe_table(records: Sequence[Record]) -> Table:
-    """What the model is worth without feedback: one long step, and turns that end in the dark."""
+    """What the model is worth without feedback: one long step, and turns that end with the camera off."""
     steps, dark = (tables.by_controller(records, kind) for kind in ("long step", "camera off"))
     items = {name: name for name in CONTROLLERS if name in steps or name in dark}
     columns: dict[Column, Callable[[str], Cell]] = {

@@ -1,4 +1,4 @@
-"""The report on foresight: reach, turns beyond Table I, turns in the dark."""
+"""The report on foresight: reach, turns beyond Table I, turns with the camera off."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def foresight_report(setting: Setting, seeds: Sequence[int], results: Results, f
     ]
     figures = [*_plots(results, folder), *_animation(setting, results, folder)]
     shown = [table for table in tables if table is not None and table.rows]
-    title = "Foresight: how far, and what ends it; a turn in the dark"
+    title = "Foresight: how far, and what ends it; turns with the camera off"
     ends = [f"{name} {_ends(turns_of(results, contender=name))}" for name in contenders_of(results)]
     summary = f"{_answer(results)} Objects lost: {', '.join(ends)}. {which_seeds(seeds)}"
     legend = {name: line for name, line in _LEGEND.items() if name in contenders_of(results)}
@@ -241,7 +241,7 @@ def beyond_table(results: Results) -> Table:
 
 
 def blind_table(results: Results) -> Table:
-    """Turns in the dark."""
+    """Turns with the camera off."""
     items: dict[str, Turns] = {}
     for name in contenders_of(results):
         for kind in ("blind", "blind, looks again", "blind, no touch"):
@@ -264,7 +264,7 @@ def blind_table(results: Results) -> Table:
         "estimate and its stated standard deviation likewise. 'No touch': the prediction alone. "
         f"Single objects: {ONE_STEP}."
     )
-    return Table.of("blind", "Whole turns in the dark", "kind", items, columns, note)
+    return Table.of("blind", "Whole turns with the camera off", "kind", items, columns, note)
 
 
 def _each(entry: str, turns: Turns, prefix: str = "") -> dict[str, Turns]:
@@ -317,7 +317,7 @@ def _plots(results: Results, folder: Path) -> list[FigureFile]:
                 figure,
                 folder,
                 "blind",
-                "Whole turns in the dark, without lost ones: each turn, and the median.",
+                "Whole turns with the camera off, without lost ones: each turn, and the median.",
             )
         )
     return figures

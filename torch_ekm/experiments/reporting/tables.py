@@ -92,9 +92,10 @@ def controller_table(records: Sequence[Record]) -> Table:
         Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
     }
     note = (
-        "Mean and 95 % bootstrap interval over seeds; steady-state errors by the simulation's truth. A lost "
-        "object counts with the whole angle that was asked for; 'survivors' leaves it out. Not reached: the "
-        "object is in the hand, but not where it was to be. Intervals of rates are Wilson's."
+        "Mean and 95 % bootstrap interval over pairs of object and seed; steady-state errors by the "
+        "simulation's truth. A lost object counts with the whole angle that was asked for; 'survivors' "
+        "leaves it out. Not reached: the object is in the hand, but not where it was to be. Intervals of "
+        "rates are Wilson's."
     )
     items = by_controller(records)
     return Table.of("controllers", "All turns of each controller", "controller", items, columns, note)
@@ -112,11 +113,11 @@ def motion_table(records: Sequence[Record], limit: int) -> Table:
         Column("off the axis [deg]", ".1f"): lambda mine: stats.estimate(mine, survivors_off_axis),
     }
     note = (
-        "Mean and 95 % bootstrap interval over seeds. Beyond angle / step: motions until the measured error "
-        f"stays within {BAND_DEG:g} deg, less the angle over {step:g} deg, rounded up; below 0 where the "
-        "pace is above 1. A turn that never settles counts with the limit. First motion, all motions: by how "
-        "much more or less a motion changed the error than it was to. Off the axis: rotation at the end, of "
-        "objects that were not lost."
+        "Mean and 95 % bootstrap interval over pairs of object and seed. Beyond angle / step: motions until "
+        f"the measured error stays within {BAND_DEG:g} deg, less the angle over {step:g} deg, rounded up; "
+        "below 0 where the pace is above 1. A turn that never settles counts with the limit. First motion, "
+        "all motions: by how much more or less a motion changed the error than it was to. Off the axis: "
+        "rotation at the end, of objects that were not lost."
     )
     return Table.of(
         "motions", "The motions of each controller", "controller", by_controller(records), columns, note
@@ -280,6 +281,11 @@ def verdict(records: Sequence[Record], seeds: Sequence[int]) -> str:
             parts.append(f"Error of the E-KM over that of {', '.join(ratios)} (paired).")
     parts += [f"{name} was never grasped ({why})." for name, why in _never_grasped(records).items()]
     return f"{' '.join(parts) or 'Nothing to compare.'} {which_seeds(seeds)}"
+
+
+def warmed_up(turns: int) -> str:
+    """What the E-KM does before it is measured."""
+    return f" Before, the E-KM makes {_counted(turns, 'turn')} with each object and seed." if turns else ""
 
 
 def _counted(n: int, what: str) -> str:

@@ -34,7 +34,7 @@ class TrackerOptions:
     max_residual: float = 1.0
     """A corner farther than this from the fitted board is left out [px]."""
     edges: bool = True
-    """Refine each board's pose on the edges of its markers: about five times as accurate, 2 ms a board."""
+    """Refine each board's pose on the edges of its markers: more accurate, and slower."""
     max_step: float = 0.020
     """Largest believable displacement between two frames [m]."""
     max_turn: float = float(np.radians(20.0))
