@@ -285,7 +285,8 @@ def verdict(records: Sequence[Record], seeds: Sequence[int]) -> str:
 
 def warmed_up(turns: int) -> str:
     """What the E-KM does before it is measured."""
-    return f" Before, the E-KM makes {_counted(turns, 'turn')} with each object and seed." if turns else ""
+    before = f" The E-KM makes {_counted(turns, 'turn')} with each object and seed before those that count."
+    return before if turns else ""
 
 
 def _counted(n: int, what: str) -> str:
