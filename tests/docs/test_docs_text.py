@@ -44,3 +44,15 @@ def test_every_key_of_a_transmission_file_is_documented() -> None:
     assert not [key for key in sorted(keys) if f"`{key}`" not in page]
     for table in transmission.TABLES:
         assert re.search(rf"`\[+{table}\]+`", page), table
+
+
+def test_tables_fit_on_a_page() -> None:
+    """At most eight columns, of benchmarks too."""
+    rules = re.compile(r"^\|(?:\s*:?-+:?\s*\|)+\s*$", re.MULTILINE)
+    wide = {
+        str(page.relative_to(DOCS)): rule.count("|") - 1
+        for page in DOCS.rglob("*.md")
+        for rule in rules.findall(page.read_text(encoding="utf-8"))
+        if rule.count("|") > 9
+    }
+    assert not wide

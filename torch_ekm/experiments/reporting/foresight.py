@@ -25,6 +25,7 @@ Results = Mapping[str, Sequence[Record]]
 BEYOND_DEG = 2.0
 _NINETY = 1.645  # standard deviations on either side that hold 90 % of a Gaussian
 ONE_STEP = "one-step E-KM"
+_BLIND = "blind", "blind, looks again", "blind, no touch"
 _FREE = "nothing"
 _LEGEND = {
     ONE_STEP: "each motion is chosen for itself",
@@ -127,7 +128,11 @@ def foresight_report(setting: Setting, seeds: Sequence[int], results: Results, f
         blind_table(results),
         targets_table(found) if found else None,
     ]
-    figures = [*_plots(results, folder), *_animation(setting, results, folder)]
+    figures = [
+        *_reach_plot(results, folder),
+        *_blind_plot(results, folder),
+        *_animation(setting, results, folder),
+    ]
     shown = [table for table in tables if table is not None and table.rows]
     title = "Foresight: how far, and what ends it; turns with the camera off"
     ends = [f"{name} {_ends(turns_of(results, contender=name))}" for name in contenders_of(results)]
@@ -244,7 +249,7 @@ def blind_table(results: Results) -> Table:
     """Turns with the camera off."""
     items: dict[str, Turns] = {}
     for name in contenders_of(results):
-        for kind in ("blind", "blind, looks again", "blind, no touch"):
+        for kind in _BLIND:
             mine = turns_of(results, kind=kind, contender=name)
             items[f"{name}, {kind}, all"] = mine
             if name == ONE_STEP:
@@ -283,44 +288,45 @@ def _rms(values: Sequence[float | None]) -> float | None:
     return float(np.sqrt(np.mean(np.square(known)))) if known else None
 
 
-def _plots(results: Results, folder: Path) -> list[FigureFile]:
-    """Predicted against real ends, and errors of blind turns."""
-    figures = []
+def _reach_plot(results: Results, folder: Path) -> list[FigureFile]:
+    """Predicted against real ends."""
     far = [r for r in turns_of(results, kind="far", contender=ONE_STEP) if r.reach_deg is not None]
-    if far:
-        figure, (axis,) = new_figure(4.5, 4.2)
-        top = 5 + max(max(abs(r.reach_deg or 0.0), r.largest_deg) for r in far)
-        axis.plot([0, top], [0, top], color=COLOURS["KM"], linewidth=1)
-        for k, name in enumerate(dict.fromkeys(r.object for r in far)):
-            mine = [r for r in far if r.object == name]
-            x, y = [r.largest_deg for r in mine], [abs(r.reach_deg or 0.0) for r in mine]
-            axis.plot(x, y, "osD^v*PX"[k % 8], label=name.replace("_", " "), markersize=5)
-        axis.set(xlabel="real end [deg]", ylabel="predicted end [deg]", xlim=(0, top), ylim=(0, top))
-        axis.legend(frameon=False, fontsize=8)
-        caption = "Where the one-step E-KM's turns ended, and where the model said before anything moved."
-        figures.append(save_figure(figure, folder, "reach", caption))
-    kinds = {
-        kind: turns_of(results, kind=kind) for kind in ("blind", "blind, looks again", "blind, no touch")
-    }
-    if any(kinds.values()):
-        figure, (axis,) = new_figure(5.0, 3.2)
-        for k, mine in enumerate(kinds.values()):
-            errors = sorted(r.true_error_deg for r in mine if not r.lost)
-            spread = np.linspace(-0.25, 0.25, len(errors)) if len(errors) > 1 else np.zeros(len(errors))
-            axis.plot(k + spread, errors, "o", color=COLOURS["E-KM"], markersize=3.5)
+    if not far:
+        return []
+    figure, (axis,) = new_figure(4.5, 4.2)
+    top = 5 + max(max(abs(r.reach_deg or 0.0), r.largest_deg) for r in far)
+    axis.plot([0, top], [0, top], color=COLOURS["KM"], linewidth=1)
+    for k, name in enumerate(dict.fromkeys(r.object for r in far)):
+        mine = [r for r in far if r.object == name]
+        x, y = [r.largest_deg for r in mine], [abs(r.reach_deg or 0.0) for r in mine]
+        axis.plot(x, y, "osD^v*PX"[k % 8], label=name.replace("_", " "), markersize=5)
+    axis.set(xlabel="real end [deg]", ylabel="predicted end [deg]", xlim=(0, top), ylim=(0, top))
+    axis.legend(frameon=False, fontsize=8)
+    caption = "Where the one-step E-KM's turns ended, and where the model said before anything moved."
+    return [save_figure(figure, folder, "reach", caption)]
+
+
+def _blind_plot(results: Results, folder: Path) -> list[FigureFile]:
+    """Errors of turns with the camera off, by contender."""
+    blind = [r for r in turns_of(results) if r.kind in _BLIND and not r.lost]
+    names = [name for name in contenders_of(results) if any(r.contender == name for r in blind)]
+    if not blind:
+        return []
+    figure, (axis,) = new_figure(5.0, 3.2)
+    width = 0.8 / len(names)
+    for j, name in enumerate(names):
+        for k, kind in enumerate(_BLIND):
+            errors = sorted(r.true_error_deg for r in blind if (r.contender, r.kind) == (name, kind))
+            middle = k + (j - (len(names) - 1) / 2) * width
+            places = middle + width * np.linspace(-0.3, 0.3, len(errors))
+            axis.plot(places, errors, "o", color=f"C{j}", markersize=2.5, label=None if k else name)
             if errors:
-                axis.plot([k - 0.3, k + 0.3], [np.median(errors)] * 2, color=COLOURS["limit"])
-        axis.set_xticks(range(len(kinds)), list(kinds))
-        axis.set(ylabel="true error [deg]", ylim=(0, None))
-        figures.append(
-            save_figure(
-                figure,
-                folder,
-                "blind",
-                "Whole turns with the camera off, without lost ones: each turn, and the median.",
-            )
-        )
-    return figures
+                axis.plot(middle + width * np.array([-0.4, 0.4]), [np.median(errors)] * 2, color="black")
+    axis.set_xticks(range(len(_BLIND)), list(_BLIND))
+    axis.set(ylabel="true error [deg]", ylim=(0, None))
+    axis.legend(frameon=False, fontsize=8, markerscale=2)
+    caption = "Whole turns with the camera off, without lost ones: each turn, in order, and the median."
+    return [save_figure(figure, folder, "blind", caption)]
 
 
 def _animation(setting: Setting, results: Results, folder: Path) -> list[FigureFile]:
