@@ -134,6 +134,25 @@ def test_the_end_of_the_range_teaches_nothing() -> None:
     assert float((plant.servo.estimate - known).abs().max()) < 0.05 * DEG
 
 
+def test_set_points_stay_in_the_range() -> None:
+    class Watched(Servos):
+        def command(self, delta_a: torch.Tensor) -> Observation:
+            goals.append(self.a + delta_a.numpy())
+            return super().command(delta_a)
+
+    goals: list[np.ndarray] = []
+    inner = Watched()
+    plant = ServoInverse(inner, HAND)
+    plant.reset(0)
+    for w in moves(10):
+        plant.command(w)
+    inner.a[:] = REACH * [1, -1, 1] - [0.5 * DEG, -0.5 * DEG, -0.1 * DEG]  # the last one is read beyond it
+    plant.reset(0)
+    goals.clear()
+    plant.command(torch.tensor([1.0, -1.0, 0.0]).double() * DEG)  # dead zones would take it farther
+    assert np.allclose(goals[0], [REACH[0], -REACH[1], REACH[2] + 0.1 * DEG], rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("scale", [0.2, 2.5])
 def test_a_repaired_servo_is_found_again(scale: float) -> None:
     inner = Servos()
@@ -146,6 +165,18 @@ def test_a_repaired_servo_is_found_again(scale: float) -> None:
         plant.command(w)
     assert float((plant.servo.dead_zone - torch.from_numpy(inner.d)).abs().max()) < 0.25 * DEG
     assert plant.stuck == ()
+
+
+def test_readings_that_no_dead_zone_explains_are_undone_by_what_was_learned_of_them() -> None:
+    """Frozen encoders once taught d = -5, b = -6.4 deg: the inverse without d went 5 deg too far."""
+    servo = ServoModel(("thumb", "index"))
+    for size in (8.0, 9.0, 7.0, 8.0, 9.0):  # two degrees farther than told, in one direction
+        v = torch.tensor([size, -size]).double() * DEG
+        servo.update(v, v + torch.tensor([2.0, -2.0]).double() * DEG)
+    assert bool((servo.estimate[:, 0] < -1 * DEG).all())  # more of it than of b, whose prior is narrower
+    assert not bool(servo.dead_zone.any())
+    wanted = torch.tensor([6.0, -6.0]).double() * DEG
+    assert torch.allclose(servo.command(wanted), wanted - wanted.sign() * 2 * DEG, rtol=0, atol=0.1 * DEG)
 
 
 def test_bad_input_changes_nothing_and_a_state_dict_carries_all() -> None:

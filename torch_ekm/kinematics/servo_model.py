@@ -85,8 +85,9 @@ class ServoModel(Recorded, nn.Module):
 
     @property
     def bias(self) -> Float[Tensor, " n_a"]:
-        """b [rad]."""
-        return self.estimate[:, 1]
+        """b [rad]: the most probable one with ``d >= 0``."""
+        negative = self.estimate[:, 0].clamp(max=0.0)  # what d gives up, b takes over as they are correlated
+        return self.estimate[:, 1] - self.covariance[:, 1, 0] / self.covariance[:, 0, 0] * negative
 
     @property
     def noise_std(self) -> Float[Tensor, " n_a"]:

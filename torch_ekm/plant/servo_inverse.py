@@ -47,15 +47,23 @@ class ServoInverse(PlantWrapper):
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Move the encoders by ``delta_a`` [rad], wait, read the sensors, learn of the servos.
 
+        Set-points stay in the actuators' range.
+
         Raises:
             ShapeError, NonFiniteError: the increment is no finite figure for each actuator.
         """
         seen = self.observe() if self._seen is None else self._seen
-        v = self.servo.command(delta_a)
+        v = self._within_range(seen.a, self.servo.command(delta_a))
         after = super().command(v)
         self._motion = seen.a, v, copy.deepcopy(dict(self.servo.named_buffers()))
         self._learn(after)
         return after
+
+    def _within_range(self, a: Tensor, v: Tensor) -> Tensor:
+        """v, cut where ``a + v`` would lie outside; it is never turned round."""
+        lower, upper = self._range
+        up, down = (upper - a).clamp(min=0.0), (lower - a).clamp(max=0.0)
+        return v.clamp(down, up)
 
     def correct(self, after: Observation | None) -> None:
         """What was learned of the last motion is taken back; it is learned again from ``after``, if any.
