@@ -1,5 +1,6 @@
 """Everyday objects: dimensions, masses, friction, all chosen by us. The names of the first six are the
-paper's; the other six reach from 15 to 66 mm and from 0.03 to 0.3 kg, and nothing is tuned on them.
+paper's; the other six reach from 15 to 66 mm and from 0.03 to 0.3 kg. docs/development/decisions.md says
+which of them served a choice.
 
 The cylinders have the diameters of those that a Yale T42 was recorded with, and its pads' friction.
 
