@@ -104,6 +104,14 @@ def test_rolling_mobility_of_ball_on_ball_cylinder_and_pin():
     assert rolling_mobility(contacts.replace(pinned=(True,))).abs().max() == 0
 
 
+def test_a_planar_pinch_is_analysed_in_its_plane():
+    """Two points with friction hold an object in a plane: four forces, one of them the squeeze."""
+    kin = held([[1.0, 0, 0], [-1.0, 0, 0]], plane=[0.0, 0.0, 1.0])
+    found = analyse(kin, torch.eye(2, 6, dtype=F64))
+    assert (found.indeterminate, found.graspable, found.internal_forces) == (False, True, 1)
+    assert found.mobility == 6 + 3 - 4
+
+
 @pytest.mark.parametrize(("gamma", "rank"), [(0.0, 5), (0.004, 6)])
 def test_two_points_cannot_turn_the_object_about_their_line_but_soft_fingers_can(gamma, rank):
     kin = held([[1.0, 0, 0], [-1.0, 0, 0]], gamma=gamma)

@@ -109,6 +109,11 @@ TRANSMISSION_FAULTS = {
     "pad radius": ("radius = 0.006", "radius = 0.0", "'radius' must be positive"),
     "pad twice": ('name = "right"\nlink', 'name = "left"\nlink', "each pad must be unique, repeated: left"),
     "base": ('base_link = "hand"', 'base_link = "left_1"', "moves with joint 'left_1'"),
+    "no pinch": (
+        'base_link = "hand"',
+        'base_link = "hand"\npinch_force = 0',
+        "'pinch_force' must be positive",
+    ),
     "no base": ('base_link = "hand"', 'base_link = "palm"', "unknown base_link 'palm'"),
     "notes": ("[hand]", "notes = 3\n[hand]", "'notes' must be a table"),
     "no joints": ("[joints]", "[notes]", "missing joints: left_0, left_1"),

@@ -114,7 +114,10 @@ def test_springs_too_soft_for_the_usual_force_are_told_which_one_they_bear(monke
     rows = {row.name: row for row in check_hand("mine", "can")}
     assert rows["pinch"].state == "error"
     assert "sound at 2 N" in rows["pinch force"].found
-    assert "PlantConfig(pinch_force=2)" in rows["pinch force"].mend
+    assert "'pinch_force = 2'" in rows["pinch force"].mend
+    gentle = dataclasses.replace(hand, pinch_force=2.0)
+    monkeypatch.setattr("torch_ekm.experiments.check.load_hand", lambda _: gentle)
+    assert {row.name: row for row in check_hand("mine", "can")}["pinch"].state == "ok"
 
 
 def test_a_pinch_that_the_usual_faults_break_is_told(monkeypatch):

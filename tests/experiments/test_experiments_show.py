@@ -251,6 +251,7 @@ def test_command_line(folder, tmp_path):
     done = runner.invoke(app, arguments)
     assert done.exit_code == 0, done.output
     assert TrialLog.open(made).index[0].reason == "reached"
+    assert "1 reached" in done.output.replace("\n", " ")
     failed = runner.invoke(app, [*arguments[:-1], "x,3"])
     assert isinstance(failed.exception, ParameterError)
     assert "x,3" in str(failed.exception)

@@ -91,7 +91,7 @@ def test_the_grasp_is_the_planned_one(plant, grasped):
     assert np.abs(truth.q.numpy() - plan.q).max() < 1.0 * DEG
     wanted = -np.einsum("ci,ci->c", plan.forces, plan.normals)
     np.testing.assert_allclose(truth.fingertip_force[:3], wanted, rtol=0.15)
-    assert wanted[0] == pytest.approx(plant.config.pinch_force, rel=0.01)
+    assert wanted[0] == pytest.approx(plant.hand.pinch_force, rel=0.01)
 
 
 def test_contact_forces_balance_the_weight(plant, grasped):
@@ -104,6 +104,11 @@ def test_pinch_force_is_what_was_asked(grasped):
     for wanted in (3.0, 8.0):
         plant = SimulatedHand("icub_right", "box", PlantConfig(pinch_force=wanted))
         assert plant.reset(0).fingertip_force[0] == pytest.approx(wanted, rel=0.03)
+
+
+def test_a_hand_says_how_hard_it_pinches():
+    hand = dataclasses.replace(load_hand("icub_right"), pinch_force=3.0)
+    assert SimulatedHand(hand, "box").reset(0).fingertip_force[0] == pytest.approx(3.0, rel=0.03)
 
 
 def run(plant, seed):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,7 @@ from typer import Argument, Option  # isort: skip
 
 if TYPE_CHECKING:
     from ..experiments.viewer.serve import Show
+    from ..plant.trial_log import TrialEntry
 
 
 @app.command()
@@ -42,7 +44,14 @@ def record(
     chosen = parse_seeds(seeds)
     with progress("recording", len(chosen) * len(config.angles_deg)) as advance:
         made = run(config, chosen, log, on_trial=advance)
-    say(f"{len(made)} trials in {made.folder.resolve()}")
+    ends = Counter(_end(entry) for entry in made.index)
+    say(f"{made.folder.resolve()}: {', '.join(f'{n} {end}' for end, n in ends.items())}")
+    if set(ends) == {"not grasped"}:
+        raise typer.Exit(1)
+
+
+def _end(entry: TrialEntry) -> str:
+    return entry.status if entry.status == "not grasped" else entry.reason or entry.status
 
 
 @app.command()

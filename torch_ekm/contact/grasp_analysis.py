@@ -47,7 +47,7 @@ def analyse(
     length: float = CHARACTERISTIC_LENGTH,
     tolerance: float = 1e-8,
 ) -> GraspAnalysis:
-    """Ranks and classes of one grasp (no batch).
+    """Ranks and classes of one grasp (no batch); of a planar hand: of forces and motions in the plane.
 
     Args:
         kin: its contacts.
@@ -60,8 +60,13 @@ def analyse(
     scale[n_q : n_q + 3] = length
     row = torch.tensor([1 / length if r % 6 < 3 else 1.0 for r in kin.rows], dtype=A.dtype, device=A.device)
     A_s = row[:, None] * A * scale
+    if _planar(kin):  # the plane's normal is each contact's second tangent
+        n, t, normal = kin.frame[0].unbind(-1)
+        plane = A.new_zeros(6, 3)
+        plane[:3, 0], plane[:3, 1], plane[3:, 2] = n, t, normal
+        A_s = torch.cat([A_s[:, :n_q], A_s[:, n_q:] @ plane], dim=-1)
     arm = torch.linalg.vector_norm(actuation, dim=-1, keepdim=True).clamp_min(1e-12)
-    B_s = torch.cat([actuation / arm, actuation.new_zeros(len(actuation), 6)], dim=-1)
+    B_s = torch.cat([actuation / arm, actuation.new_zeros(len(actuation), A_s.shape[1] - n_q)], dim=-1)
 
     def rank(matrix: Tensor) -> int:
         return int(torch.linalg.matrix_rank(matrix, rtol=tolerance)) if matrix.numel() else 0
@@ -79,6 +84,10 @@ def analyse(
         defective=rank_J < n_h,
         smallest_singular_value=float(torch.linalg.svdvals(G_s)[n_p - 1]) if n_h >= n_p else 0.0,
     )
+
+
+def _planar(kin: ContactKinematics) -> bool:
+    return bool(kin.models) and all(m is ContactModel.PLANAR_POINT_WITH_FRICTION for m in kin.models)
 
 
 def ferrari_canny(kin: ContactKinematics, *, length: float = CHARACTERISTIC_LENGTH, faces: int = 64) -> float:
@@ -105,7 +114,7 @@ def ferrari_canny(kin: ContactKinematics, *, length: float = CHARACTERISTIC_LENG
         tangential = G[:, cone.start + 1 : cone.start + 1 + cone.dim]
         wrenches.append(G[:, cone.start] + cone.mu_s * (u / cone.scale) @ tangential.T)
     points = np.concatenate(wrenches)
-    if kin.models and all(model is ContactModel.PLANAR_POINT_WITH_FRICTION for model in kin.models):
+    if _planar(kin):
         points = points @ np.linalg.svd(points)[2][:3].T
     if len(points) <= points.shape[1] or np.linalg.matrix_rank(points, 1e-9) < points.shape[1]:
         return 0.0

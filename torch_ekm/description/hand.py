@@ -107,6 +107,8 @@ class HandDescription:
     gravity: tuple[float, float, float] = (0.0, 0.0, 9.81)
     """Nominal gravity in the hand frame [m/s^2], that of plant and model unless one is told otherwise. The
     iCub's palm faces down: its fingers hang, and the line of a pinch is level."""
+    pinch_force: float = 5.0
+    """Normal force with which the thumb pinches an object in simulation [N]; soft springs bear less."""
     notes: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

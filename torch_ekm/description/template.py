@@ -20,7 +20,8 @@ _HEAD = """\
 # What {urdf} cannot say about this hand. Begun by 'torch-ekm hands --new'.
 # Put a figure wherever "TODO" stands; 'torch-ekm check {urdf}' tells what lacks.
 # Angles in rad, or in deg where the key ends in _deg; lengths in m; torques in N m.
-# Positive angles close the finger. All keys: docs/reference/file_formats.md;
+# A joint that closes its finger with negative angles has a negative moment arm.
+# All keys: docs/reference/file_formats.md;
 # springs and moment arms from recorded motions: docs/how_to/drive_a_real_hand.md
 
 [hand]

@@ -21,7 +21,7 @@ from .urdf import UrdfModel
 #: Stands for a figure that is still to be filled in.
 TODO = "TODO"
 TABLES = ("hand", "joints", "actuators", "couplings", "pads", "hall_sensors", "notes")
-HAND = ("name", "base_link", "planar_normal", "gravity")
+HAND = ("name", "base_link", "planar_normal", "gravity", "pinch_force")
 JOINT = ("spring", "rest", "rest_deg", "friction")
 ACTUATOR = (
     "name",
@@ -99,6 +99,7 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
         hall_sensors=tuple(hall),
         planar_normal=None if normal is None else (normal[0], normal[1], normal[2]),
         gravity=(gravity[0], gravity[1], gravity[2]),
+        pinch_force=hand.number("pinch_force", HandDescription.pinch_force, positive=True),
         notes=top.notes(),
     )
 

@@ -143,14 +143,14 @@ def _reach(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
         yield Check("limits", state, f"{lack.part}: {lack.problem}", lack.remedy)
     if not lacks:
         names = " and ".join(pad.name for pad in problem.pads)
-        yield Check("limits", "ok", f"pads {names} come face to face, {1e3 * obj.grasp_width:.0f} mm apart")
+        yield Check("limits", "ok", f"pads {names} can hold {1e3 * obj.grasp_width:.0f} mm between them")
 
 
 def _gentler(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     """Springs that are too soft for the usual force may bear a smaller one."""
-    for force in _GENTLER:
+    for force in (force for force in _GENTLER if force < hand.pinch_force):
         if not any(row.state == "error" for row in _pinch(hand, obj, None, PlantConfig(pinch_force=force))):
-            mend = f"PlantConfig(pinch_force={force:g}), or stiffer springs"
+            mend = f"'pinch_force = {force:g}' in [hand], or stiffer springs"
             yield Check("pinch force", "warning", f"too high: the pinch is sound at {force:g} N", mend)
             return
 
@@ -162,7 +162,7 @@ def _disturbed(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]
     except MissingExtraError:
         return
     except EKMError as error:
-        mend = "stiffer springs, a lower PlantConfig(pinch_force=...), more friction"
+        mend = "stiffer springs, a smaller 'pinch_force' in [hand], more friction"
         yield Check("pinch, preset nominal", "warning", str(error), mend)
     else:
         yield Check("pinch, preset nominal", "ok", "held with the usual faults, too")
@@ -188,7 +188,9 @@ def _pinch(
         yield Check("pinch", "warning", f"not tried: {error}")
     except EKMError as error:
         what = "pinch" if seen is None else "model"
-        yield Check(what, "error", str(error), "mend the rows above first, or give another object")
+        yield Check(
+            what, "error", str(error), "first errors above, then 'pinch force' below, then another object"
+        )
     if picture is not None:
         try:
             yield Check("picture", "ok", str(_draw(hand, lin, picture).resolve()))

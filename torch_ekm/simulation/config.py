@@ -31,8 +31,8 @@ class PlantConfig:
     """Least simulated time of one command, ramp and settling [s]."""
     settle_limit: float = 1.0
     """A command ends at the latest after this time, settled or not [s]."""
-    pinch_force: float = 5.0
-    """Normal force of the thumb in the planned grasp [N]."""
+    pinch_force: float | None = None
+    """Normal force of the thumb in the planned grasp [N]; None: the hand's."""
     thumb: str | None = None
     """Pad that opposes the others; None: the one whose name begins with "thumb", else the first."""
     fingers: tuple[str, ...] | None = None
@@ -55,6 +55,8 @@ class PlantConfig:
     def __post_init__(self) -> None:
         for name in ("time_step", "ramp_time", "rate_limit", "command_time", "settle_limit", "pinch_force"):
             value = getattr(self, name)
+            if name == "pinch_force" and value is None:
+                continue
             if not (math.isfinite(value) and value > 0):
                 raise ParameterError(name, value, "finite and greater than 0")
         for name in ("offset_along", "offset_across", "tilt", "gravity_tilt"):

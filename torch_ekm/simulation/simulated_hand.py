@@ -272,7 +272,7 @@ class SimulatedHand:
         along, across, first, second, tilt, turn = self._generator.uniform(-1.0, 1.0, size=6).tolist()
         return PinchRequest(
             gravity=_tilted(self.hand.gravity, tilt * c.gravity_tilt, np.pi * turn),
-            force=c.pinch_force,
+            force=self.hand.pinch_force if c.pinch_force is None else c.pinch_force,
             along=along * c.offset_along,
             across=across * c.offset_across,
             tilt=(first * c.tilt, second * c.tilt),

@@ -78,9 +78,9 @@ def _csv_values(
             field = row[place]
             value = _number(field)
             if value is None or not np.isfinite(value):
-                problem = f": '{field}' is not finite"
+                problem = f": '{field}' is not finite; fill it in, or leave the whole line out"
                 if value is None:
-                    problem = f": '{field}' is no number; leave the column out or encode it"
+                    problem = f": '{field}' is no number; encode it, or leave the column or the line out"
                 if not field:
                     problem = " is empty; fill it in, or leave the whole line out"
                 raise DescriptionError(path, f"line {line}, column '{names[place]}'{problem}")
