@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from .._terminal import print_table, say
+from .._terminal import console, print_table, say
 from ._app import AN_OBJECT, app, check_file, needs
 
 import typer  # isort: skip
@@ -67,7 +67,8 @@ def check(
     from ..experiments.check import Check, check_hand
 
     check_file(picture, (".png", ".jpg", ".jpeg"))
-    rows = check_hand(hand, object, picture)
+    with console.status("Checking: some seconds, a minute where the pinch fails"):
+        rows = check_hand(hand, object, picture)
     print_table(Check._fields, rows, hand)
     if any(row.state == "error" for row in rows):
         raise typer.Exit(1)
