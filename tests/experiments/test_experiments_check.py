@@ -55,7 +55,7 @@ FAULTS = {  # what is changed (0: URDF, 1: transmission file); name, state and t
     "wide limits": (0, '"-0.5" upper="1.5"', '"-3" upper="3"', "limits", "warning", "left_0.*344 deg"),
     "axis": (0, '<axis xyz="0 0 -1"/>', '<axis xyz="0 0.1 -1"/>', "hand's files", "error", "planar_normal"),
     "never taut": (1, SPRING + "0", SPRING + "160", "tendon 'left'", "error", "slack"),
-    "late": (1, SPRING + "0", SPRING + "100", "tendon 'left'", "warning", "from 105 deg"),
+    "late": (1, SPRING + "0", SPRING + "100", "tendon 'left'", "warning", "from 100 deg"),
     "one pad": (1, '[[pads]]\nname = "left"', '[[pads]]\nname = "left"', "limits", "error", "two"),
     "unreadable": (0, "<robot", "<robot <", "hand's files", "error", "not well-formed XML"),
     "rigid": (1, "stiffness = 10.0", "", "actuators", "ok", "left 100"),
@@ -100,12 +100,32 @@ def test_the_joint_in_the_way_is_the_one_that_was_narrowed():
 
 def test_a_pad_that_holds_with_its_back_is_told(monkeypatch):
     lower, upper = HAND.joint_lower.copy(), HAND.joint_upper.copy()
-    lower[0], upper[0], upper[1] = -0.5, 0.0, 0.2
-    hand = dataclasses.replace(HAND, joint_lower=lower, joint_upper=upper)
+    lower[0], upper[0], upper[1] = -0.5, 0.0, 0.4
+    left = dataclasses.replace(HAND.actuators[0], lower=-0.5)
+    hand = dataclasses.replace(
+        HAND, joint_lower=lower, joint_upper=upper, actuators=(left, *HAND.actuators[1:])
+    )
     monkeypatch.setattr("torch_ekm.experiments.check.load_hand", lambda _: hand)
     rows = {row.name: row for row in check_hand("mine")}
     assert rows["contact sides"].state == rows["model"].state == "error"
     assert "'right'" in rows["contact sides"].found
+
+
+def test_limits_that_leave_no_pinch_are_told_with_the_angle_that_it_takes(monkeypatch):
+    """Postures face to face exist, so that the row on limits is ok; none is in balance."""
+    lower, upper = HAND.joint_lower.copy(), HAND.joint_upper.copy()
+    lower[0], upper[0], upper[1] = -0.5, 0.0, 0.2
+    hand = dataclasses.replace(HAND, joint_lower=lower, joint_upper=upper)
+    monkeypatch.setattr("torch_ekm.experiments.check.load_hand", lambda _: hand)
+    monkeypatch.setattr("torch_ekm.experiments.check._GENTLER", (4.0,))
+    left = dataclasses.replace(hand.actuators[0], lower=-0.5)
+    hand = dataclasses.replace(hand, actuators=(left, *hand.actuators[1:]))
+    rows = {row.name: row for row in check_hand("mine")}
+    assert rows["limits"].state == "ok"
+    angle = re.search(r"joint 'left_1' \(0 to 11 deg\) at (\d+) deg", rows["pinch"].found)
+    assert angle is not None
+    assert 12 < int(angle[1]) < 57
+    assert "no sound pinch with 4 N" in rows["pinch force"].found
 
 
 def test_springs_too_soft_for_the_usual_force_are_told_which_one_they_bear(monkeypatch):

@@ -134,6 +134,30 @@ def test_the_end_of_the_range_teaches_nothing() -> None:
     assert float((plant.servo.estimate - known).abs().max()) < 0.05 * DEG
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_dead_zone_is_learned_at_the_end_of_the_range_too(side: int) -> None:
+    """A motor that does not leave it when told to has a dead zone: the end is no obstacle to that motion."""
+    inner = Servos()
+    plant = ServoInverse(inner, HAND)
+    inner.a[:] = side * REACH
+    plant.reset(0)
+    wish = torch.full((3,), -side * 0.5 * DEG, dtype=torch.float64)
+    for _ in range(12):
+        plant.command(wish)
+    assert bool((np.abs(inner.a) < REACH - 0.3 * DEG).all())
+
+
+def test_a_motion_that_begins_outside_the_range_teaches_nothing() -> None:
+    """The controller of the motors brings it back by more than it was told."""
+    inner = Servos()
+    plant = ServoInverse(inner, HAND)
+    inner.a[:] = REACH + 3 * DEG
+    plant.reset(0)
+    before = {k: v.clone() for k, v in plant.servo.state_dict().items()}
+    plant.command(torch.full((3,), -4 * DEG, dtype=torch.float64))
+    assert all(torch.equal(v, before[k]) for k, v in plant.servo.state_dict().items())
+
+
 def test_set_points_stay_in_the_range() -> None:
     class Watched(Servos):
         def command(self, delta_a: torch.Tensor) -> Observation:

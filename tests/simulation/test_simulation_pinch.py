@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -70,6 +72,27 @@ def test_a_plan_keeps_well_inside_cones_and_stops(name):
     assert spare[bent].min() > 3.0 * DEG
     assert (plan.motor >= hand.actuator_lower - 1e-6).all()
     assert (plan.motor <= hand.actuator_upper).all()
+
+
+def with_range(lower, upper):
+    """The planar hand with another range of its left actuator, and the problem of its pinch of a can."""
+    hand, obj = load_hand("planar_two_finger"), load_object("can")
+    left = dataclasses.replace(hand.actuators[0], lower=lower, upper=upper)
+    hand = dataclasses.replace(hand, actuators=(left, *hand.actuators[1:]))
+    return hand, pinch_problem(hand, obj, PlantConfig(), PlantParameters())
+
+
+def test_a_pinch_keeps_the_actuators_in_their_ranges():
+    hand, problem = with_range(0.0, 150 * DEG)
+    usual = plan_pinch(problem, PinchRequest(hand.gravity)).motor[0]
+    for lower, upper in ((0.0, usual - 8 * DEG), (usual + 8 * DEG, 150 * DEG)):
+        hand, problem = with_range(lower, upper)
+        plan = plan_pinch(problem, PinchRequest(hand.gravity))
+        assert lower < plan.motor[0] < upper
+        assert plan.residual < 0.2
+    hand, problem = with_range(149 * DEG, 150 * DEG)
+    with pytest.raises(EquilibriumError, match=r"actuator 'left' \(149 to 150 deg\) at \d+ deg"):
+        plan_pinch(problem, PinchRequest(hand.gravity))
 
 
 def test_requests_are_met():

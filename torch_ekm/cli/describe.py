@@ -67,7 +67,7 @@ def check(
     from ..experiments.check import Check, check_hand
 
     check_file(picture, (".png", ".jpg", ".jpeg"))
-    with console.status("Checking: some seconds, a minute where the pinch fails"):
+    with console.status("Checking: some seconds, a minute or two where the pinch fails"):
         rows = check_hand(hand, object, picture)
     print_table(Check._fields, rows, hand)
     if any(row.state == "error" for row in rows):

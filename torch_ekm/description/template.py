@@ -16,6 +16,8 @@ from .transmission import TODO
 from .transmission_file import toml_key
 from .urdf import UrdfModel, read_urdf
 
+_ROUND = ("capsule", "sphere")
+_ONE_PLANE = 1e-3  # [m]
 _HEAD = """\
 # What {urdf} cannot say about this hand. Begun by 'torch-ekm hands --new'.
 # Put a figure wherever "TODO" stands; 'torch-ekm check {urdf}' tells what lacks.
@@ -45,6 +47,7 @@ _PADS = """
 # The parts that touch objects, as capsules in the link's frame: all points within radius [m] of the segment
 # from start to end [m]. direction: outward, the middle of the side that touches. Pads that are simulated need
 # the same shape as <collision> in the URDF: a cylinder with a ball on either end, or a sphere.
+# A pinch in simulation is of the first pad, or one called thumb, against all others.
 """
 
 
@@ -81,14 +84,14 @@ def template(model: UrdfModel) -> str:
     head = _HEAD.format(urdf=_comment(model.path.name), name=_text(model.name), base=_text(base))
     lines = [head.rstrip("\n")]
     if normal is not None:
-        lines.append(f"planar_normal = {_vector(normal)}  # all axes are parallel: a planar hand")
+        lines.append(f"planar_normal = {_vector(normal)}  # all joints turn in one plane: a planar hand")
     lines += [_JOINTS.rstrip("\n"), *_joints(model), *_couplings(model), _ACTUATORS.rstrip("\n")]
     fingers = _fingers(model, base)
     for k, finger in enumerate(fingers, start=1):
         lines += _actuator(model, finger, f"finger_{k}")
     lines.append(_PADS.rstrip("\n"))
     for k, finger in enumerate(fingers, start=1):
-        lines += _pad(model, finger[-1], f"tip_{k}")
+        lines += _pad(model, _fingertip(model, finger[-1]), f"tip_{k}")
     return "\n".join(lines) + "\n"
 
 
@@ -135,7 +138,7 @@ def _actuator(model: UrdfModel, links: list[str], name: str) -> Iterator[str]:
 
 def _pad(model: UrdfModel, link: str, name: str) -> Iterator[str]:
     yield f"\n[[pads]]\nname = {_text(name)}\nlink = {_text(link)}"
-    round_shapes = [s for s in model.link(link).collisions if s.kind in ("capsule", "sphere")]
+    round_shapes = [s for s in model.link(link).collisions if s.kind in _ROUND]
     if round_shapes:
         shape = round_shapes[-1]
         start, end = _ends(shape)
@@ -180,16 +183,32 @@ def _fingers(model: UrdfModel, base: str) -> list[list[str]]:
     return [chain(link) for link in ends]
 
 
+def _fingertip(model: UrdfModel, link: str) -> str:
+    """The farthest link on fixed joints beyond it that has a capsule or sphere to touch with; else itself."""
+    tips, reached = [link], [link]
+    for carrier in reached:
+        reached += [joint.child for joint in model.joints if joint.parent == carrier]  # nothing moves there
+        if any(shape.kind in _ROUND for shape in model.link(carrier).collisions):
+            tips.append(carrier)
+    return tips[-1]
+
+
 def _planar_normal(model: UrdfModel, base: str) -> np.ndarray | None:
-    """The common direction of all axes, in the base's frame at zero angles; None: there is none."""
-    rotations = {model.root: np.eye(3)}
+    """The common direction of all axes, in the base's frame at zero angles; None: there is none.
+
+    Nor is there one where joints lie in several parallel planes: their fingers hold an object in space.
+    """
+    placed = {model.root: np.eye(4)}
     for _ in model.joints:
         for joint in model.joints:
-            if joint.parent in rotations:
-                rotations[joint.child] = rotations[joint.parent] @ joint.transform[:3, :3]
-    axes = [rotations[base].T @ rotations[joint.child] @ joint.axis for joint in model.moving_joints]
+            if joint.parent in placed:
+                placed[joint.child] = placed[joint.parent] @ joint.transform
+    frames = [np.linalg.inv(placed[base]) @ placed[joint.child] for joint in model.moving_joints]
+    axes = [T[:3, :3] @ joint.axis for T, joint in zip(frames, model.moving_joints, strict=True)]
     normal = axes[0] * np.sign(axes[0][np.abs(axes[0]).argmax()])
-    return normal if all(np.linalg.norm(np.cross(normal, axis)) < 1e-6 for axis in axes) else None
+    heights = [float(normal @ T[:3, 3]) for T in frames]
+    parallel = all(np.linalg.norm(np.cross(normal, axis)) < 1e-6 for axis in axes)
+    return normal if parallel and max(heights) - min(heights) < _ONE_PLANE else None
 
 
 def _vector(values: np.ndarray) -> str:

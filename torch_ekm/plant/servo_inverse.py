@@ -80,11 +80,16 @@ class ServoInverse(PlantWrapper):
     def _learn(self, after: Observation) -> None:
         assert self._motion is not None
         start, v, _ = self._motion
+        self.servo.update(v, after.a - start, self._free(start, v, after.a))
+
+    def _free(self, start: Tensor, v: Tensor, end: Tensor) -> Tensor:
+        """Motions that no end of the range cut short, nor brought back into it: an end is not a dead zone."""
         lower, upper = self._range
-        free = torch.ones_like(v, dtype=torch.bool)
-        for a in (start + v, after.a):  # a stop of the range is not a dead zone
-            free &= (a > lower + self.servo.moved_from) & (a < upper - self.servo.moved_from)
-        self.servo.update(v, after.a - start, free)
+        low, high = lower + self.servo.moved_from, upper - self.servo.moved_from
+        free = (start > lower - self.servo.moved_from) & (start < upper + self.servo.moved_from)
+        for a in (start + v, end):
+            free &= ((a > low) | (v > 0)) & ((a < high) | (v < 0))
+        return free
 
     def observation(self, seen: Observation) -> Observation:
         """Remembered as the start of the next motion."""

@@ -36,7 +36,7 @@ class PlantConfig:
     thumb: str | None = None
     """Pad that opposes the others; None: the one whose name begins with "thumb", else the first."""
     fingers: tuple[str, ...] | None = None
-    """Opposing pads; None: index and middle where there are such, else the second."""
+    """Opposing pads; None: index and middle where there are such, else all others."""
     along: tuple[float, float, float] | None = None
     """Direction in the hand of the object's long axis, about which a pinch can turn it. None: the
     normal of a planar hand, else y, square to the planes in which the iCub's fingers bend."""

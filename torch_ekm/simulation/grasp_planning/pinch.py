@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,9 +21,12 @@ from .pinch_problem import PinchProblem, PinchRequest
 from .requirements import require_two_pads_and_limits, unmet
 
 _FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
-_GUESSES = 4  # first guesses that are tried before giving up
+_POSTURES = 4096
+_GUESSES = 5  # first guesses that are tried before giving up
 _STIFF_STEP = 0.002  # [s]; at 4 ms a hand with rigid actuators moves by 7 to 55 % another way
+_WIDER = np.pi / 4  # [rad] by which limits are moved to see which ones are in the way
 _GOOD_COST = 20.0  # half a sum of squares; the wishes of a good pinch cost about 0.3
+_BAD_COST = 100.0  # pads beside the object, or hand and object in one another
 
 
 @dataclass(frozen=True)
@@ -43,41 +49,40 @@ class PinchPlan:
     """Largest violation: gap / 0.1 mm, force / 10 mN, moment / 0.2 mN m, joint torque / 1 mN m."""
 
 
+class _Solution(NamedTuple):
+    x: Array
+    violation: float
+    """Largest residual of the equations, in units of its tolerance."""
+    outside: float
+    """How far a motor is beyond its range [rad]; negative: inside."""
+    cost: float
+
+    def rank(self) -> tuple[bool, bool, float]:
+        return self.violation > 1, self.outside > 0, self.cost
+
+    @property
+    def good(self) -> bool:
+        return self.violation < 0.2 and self.outside <= 0 and self.cost < _GOOD_COST
+
+
 def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
     """``min_x |residuals(x)|^2`` within the joints' ranges, from seeded first guesses.
 
     Raises:
         EquilibriumError: no posture was found that holds the object as wanted, across its grasp axis.
     """
-    least_squares = require("scipy.optimize").least_squares
-    low, high = problem.bounds()
-    best, violation, cost = np.zeros_like(low), np.inf, np.inf
-    for guess in _guesses(problem, request):
-        found = least_squares(
-            lambda x: problem.residuals(x[None], request)[0],
-            np.clip(guess, low + 1e-9, high - 1e-9),
-            jac=lambda x: problem.jacobian(x, request),
-            bounds=(low, high),
-            x_scale="jac",
-            max_nfev=150,
-            ftol=1e-9,
-            xtol=1e-9,
-            gtol=1e-9,
-        )
-        worst = float(np.abs(problem.equations(found.x[None], request)[0]).max())
-        if (worst > 1, found.cost) < (violation > 1, cost):
-            best, violation, cost = found.x, worst, found.cost
-        if violation < 0.2 and cost < _GOOD_COST:
-            break
-    if violation > 1.0:
+    found = _solve(problem, request)
+    g = problem.geometry(found.x[None])
+    motor = problem.motors(g)[0]
+    if found.violation > 1.0 or found.outside > 0 or found.cost > _BAD_COST:
         raise EquilibriumError(
             "pinch planner",
-            f"the best posture violates equilibrium by {violation:.2g} times its tolerance",
+            f"no posture within the limits holds '{problem.obj.name}' with {request.force:g} N",
             pinch_hint(problem)
-            or f"the object '{problem.obj.name}' may be too wide, or out of reach, for a force of "
-            f"{request.force} N at along = {request.along} m",
+            or limits_hint(problem, request)
+            or _range_hint(problem.hand, motor)
+            or "the object may be too wide, or out of reach",
         )
-    g = problem.geometry(best[None])
     if np.abs(g.facing).min() < _FACING:
         raise EquilibriumError(
             "pinch planner",
@@ -90,13 +95,44 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
         q=g.q[0],
         position=g.position[0],
         rotation=g.rotation[0],
-        motor=problem.motors(g),
+        motor=motor,
         forces=g.force[0],
         points=g.point[0],
         normals=g.normal[0],
         pads=tuple(pad.name for pad in problem.pads),
-        residual=violation,
+        residual=found.violation,
     )
+
+
+def _solve(problem: PinchProblem, request: PinchRequest) -> _Solution:
+    """The first good solution, or the best from all first guesses."""
+    best = _Solution(np.zeros(0), np.inf, np.inf, np.inf)
+    for guess in _guesses(problem, request):
+        found = _descend(problem, request, guess, ranges=False)
+        if found.violation <= 1 and found.outside > 0:
+            found = _descend(problem, request, found.x, ranges=True)
+        best = min(best, found, key=_Solution.rank)
+        if best.good:
+            break
+    return best
+
+
+def _descend(problem: PinchProblem, request: PinchRequest, guess: Array, ranges: bool) -> _Solution:
+    low, high = problem.bounds()
+    found = require("scipy.optimize").least_squares(
+        lambda x: problem.residuals(x[None], request, ranges)[0],
+        np.clip(guess, low + 1e-9, high - 1e-9),
+        jac=lambda x: problem.jacobian(x, request, ranges),
+        bounds=(low, high),
+        x_scale="jac",
+        max_nfev=150,
+        ftol=1e-9,
+        xtol=1e-9,
+        gtol=1e-9,
+    )
+    violation = float(np.abs(problem.equations(found.x[None], request)[0]).max())
+    outside = float(problem.outside(problem.geometry(found.x[None])).max(initial=-np.inf))
+    return _Solution(found.x, violation, outside, found.cost)
 
 
 def pinch_hint(problem: PinchProblem) -> str:
@@ -104,19 +140,61 @@ def pinch_hint(problem: PinchProblem) -> str:
     return "; ".join(map(str, unmet(problem)))
 
 
+def limits_hint(problem: PinchProblem, request: PinchRequest) -> str:
+    """Joints that a pinch would take beyond their limits; empty if wider limits give none either."""
+    hand = problem.hand
+    wider = dataclasses.replace(
+        hand, joint_lower=hand.joint_lower - _WIDER, joint_upper=hand.joint_upper + _WIDER
+    )
+    thumb, *fingers = (pad.name for pad in problem.pads)
+    freed = PinchProblem(wider, problem.obj, problem.transmission, thumb, tuple(fingers), problem.along)
+    found = _solve(freed, request)
+    n = len(problem.moving)
+    low, high = (edge[:n] for edge in problem.bounds())
+    at, least, most = np.degrees([found.x[:n], *problem.joint_range])
+    beyond = [
+        f"'{hand.joint_names[joint]}' ({least[k]:.0f} to {most[k]:.0f} deg) at {round(at[k])} deg"
+        for k, joint in enumerate(problem.moving)
+        if not low[k] <= found.x[k] <= high[k]
+    ]
+    if not (found.good and beyond):
+        return ""
+    return (
+        f"it takes joint {' and '.join(beyond)}: limits some degrees beyond that, a smaller pinch_force, "
+        "stiffer springs or another object"
+    )
+
+
+def _range_hint(hand: HandDescription, motor: Array) -> str:
+    """Actuators that the best posture takes out of their ranges; empty if there is none."""
+    at, low, high = np.degrees([motor, hand.actuator_lower, hand.actuator_upper])
+    beyond = [
+        f"'{name}' ({low[k]:.0f} to {high[k]:.0f} deg) at {round(at[k])} deg"
+        for k, name in enumerate(hand.actuator_names)
+        if not low[k] <= at[k] <= high[k]
+    ]
+    remedy = "another range_deg, a smaller pinch_force, stiffer springs or another object"
+    return f"the best takes actuator {' and '.join(beyond)}: {remedy}" if beyond else ""
+
+
 def _guesses(problem: PinchProblem, request: PinchRequest) -> Iterator[Array]:
-    """The preferred posture, then seeded variations of it; the object between the fingertips."""
-    generator = np.random.default_rng(0)
-    low, high = problem.joint_range
-    for trial in range(_GUESSES):
-        moving = problem.preferred()
-        if trial:
-            moving = moving + generator.uniform(-0.3, 0.3, size=moving.shape) * (high - low)
+    """The object between the fingertips: in the preferred posture, then in those that suit it best."""
+    for moving in itertools.chain([problem.preferred()], _facing_postures(problem)):
         tips = problem.tips(moving)
         force = np.outer(np.ones(len(tips)), problem.towards) * request.force
         force[1:] *= -1.0 / max(1, len(tips) - 1)
         centre = (tips[0] + tips[1:].mean(axis=0)) / 2
         yield np.concatenate([moving, centre, np.zeros(3), force.ravel()])
+
+
+def _facing_postures(problem: PinchProblem) -> Iterator[Array]:
+    """Of random postures those with the pads face to face, a grasp width apart."""
+    low, high = problem.joint_range
+    moving = low + np.random.default_rng(0).uniform(size=(_POSTURES, len(low))) * (high - low)
+    facing, opening = problem.opposition(moving)
+    width = problem.obj.grasp_width
+    misfit = np.maximum(0.0, 0.9 - facing).max(axis=1) + np.abs(opening - width) / width
+    yield from moving[np.argsort(misfit)[: _GUESSES - 1]]
 
 
 def pinch_problem(
@@ -134,7 +212,7 @@ def pinch_problem(
     fingers = config.fingers
     if fingers is None:
         chosen = tuple(name for name in names if name.startswith(("index", "middle")))
-        fingers = chosen or tuple(name for name in names if name != thumb)[:1]
+        fingers = chosen or tuple(name for name in names if name != thumb)
     transmission = make_transmission(hand, parameters)
     if transmission.stiff and config.time_step > _STIFF_STEP:
         valid = f"at most {_STIFF_STEP} s: '{hand.name}' has rigid or very stiff actuators"

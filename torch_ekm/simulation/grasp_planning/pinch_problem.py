@@ -20,6 +20,7 @@ from .graspable import chain, object_axes, obstacles
 # nearly straight, since turning the object towards the fingers' flexion straightens the thumb.
 _THUMB_BENT = (0.65, 0.3, 0.3, 0.5)
 _FINGER_BENT = (0.4, 0.13, 0.12, 0.3)
+_ROOM = 0.02  # [rad] between a motor and the ends of its range
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,8 @@ class PinchProblem:
         -n_thumb . f_thumb = wanted force
 
     with soft wishes: forces well inside the friction cones, pads that meet the object with their
-    rounded ends, joints away from their stops, tendons taut, the object where it is wanted.
+    rounded ends, joints away from their stops, tendons taut, the object where it is wanted, and if asked
+    for motors within their ranges.
 
     Args:
         hand, obj: the bodies as they really are.
@@ -132,6 +134,7 @@ class PinchProblem:
         free = _null_space(C)
         self._to_tension = np.linalg.pinv((J_a @ free).T) @ free.T
         tendon = np.array([actuator.tendon for actuator in hand.actuators], dtype=bool)
+        self._in_use = (J_a @ self.follow).any(axis=1)
         self._pulling = tendon & J_a[:, self.moving].any(axis=1)
 
     def _unpack(self, x: Array) -> tuple[Array, Array, Array, Array]:
@@ -158,6 +161,16 @@ class PinchProblem:
     def directions(self, moving: Array) -> Array:
         """Outward directions of the pads' middles, hand frame ``(*batch, c, 3)``."""
         return np.einsum("...cij,cj->...ci", self._pad_poses(moving)[..., :3, :3], self._palmar)
+
+    def opposition(self, moving: Array) -> tuple[Array, Array]:
+        """How well the pads face each other, cosines ``(b, c)``, and their distance ``(b,)`` [m]."""
+        tips, directions = self.tips(moving), self.directions(moving)
+        across = tips[:, 1:].mean(axis=1) - tips[:, 0]
+        distance = np.linalg.norm(across, axis=1)
+        across /= distance[:, None]
+        facing = np.einsum("bci,bi->bc", directions, across)
+        facing[:, 1:] *= -1.0
+        return facing, distance - self._radius[0] - self._radius[1:].mean()
 
     def _pad_poses(self, moving: Array) -> Array:
         poses = self.kinematics(torch.from_numpy(self.posture(moving))).transforms.numpy()
@@ -230,8 +243,12 @@ class PinchProblem:
             [g.gap / 1e-4, force / 0.01, moment / 2e-4, passive / 1e-3, press[:, None] / 0.1], axis=1
         )
 
-    def residuals(self, x: Array, request: PinchRequest) -> Array:
-        """Equations and wishes ``(b, n_r)``, to be squared and summed."""
+    def residuals(self, x: Array, request: PinchRequest, ranges: bool = False) -> Array:
+        """Equations and wishes ``(b, n_r)``, to be squared and summed.
+
+        Args:
+            ranges: wish that the motors keep to theirs.
+        """
         g = self.geometry(x)
         f_n = -np.einsum("bci,bci->bc", g.force, g.normal)
         f_t = np.linalg.norm(g.force + f_n[..., None] * g.normal, axis=-1)
@@ -255,6 +272,8 @@ class PinchProblem:
         taut = np.maximum(0.0, 0.02 - self.tension(g)[:, self._pulling]) / 0.01
         hard = 3 * self.equations(x, request, g)
         wishes = [cone, share, cap, pad, np.stack(place, axis=1), tilt, opposed, clear, posture, taut]
+        if ranges:
+            wishes.append(np.maximum(0.0, self.outside(g) + _ROOM) / 0.01)
         return np.concatenate([hard, *wishes], axis=1)
 
     def bounds(self) -> tuple[Array, Array]:
@@ -265,11 +284,15 @@ class PinchProblem:
         return np.concatenate([low + margin, -rest]), np.concatenate([high - margin, rest])
 
     def motors(self, g: PinchGeometry) -> Array:
-        """Motor positions that hold the first candidate ``(n_a,)`` [rad]; idle ones rest."""
+        """Motor positions that hold the candidates ``(b, n_a)`` [rad]; idle ones rest."""
         T = self.transmission
-        in_use = (T.J_a @ self.follow).any(axis=1)
-        stretch = np.where(in_use, self.tension(g)[0] / T.stiffness, 0.0)
-        return T.offset + T.J_a @ g.q[0] + stretch
+        stretch = np.where(self._in_use, self.tension(g) / T.stiffness, 0.0)
+        return T.offset + g.q @ T.J_a.T + stretch
+
+    def outside(self, g: PinchGeometry) -> Array:
+        """How far each motor in use is beyond its range ``(b, n)`` [rad]; negative: inside."""
+        motor, use = self.motors(g), self._in_use
+        return np.maximum(self.hand.actuator_lower - motor, motor - self.hand.actuator_upper)[:, use]
 
     def tension(self, g: PinchGeometry) -> Array:
         """Torque of each actuator along ``+a`` that balances the joints, ``(batch, n_a)`` [N m]."""
@@ -281,10 +304,10 @@ class PinchProblem:
         wish = self.along + request.tilt[0] * third + request.tilt[1] * self.towards
         return wish / np.linalg.norm(wish)
 
-    def jacobian(self, x: Array, request: PinchRequest, step: float = 1e-6) -> Array:
-        """Central differences, all columns in one batch."""
+    def jacobian(self, x: Array, request: PinchRequest, ranges: bool = False, step: float = 1e-6) -> Array:
+        """Of :meth:`residuals`, central differences, all columns in one batch."""
         shift = step * np.eye(len(x))
-        values = self.residuals(np.concatenate([x + shift, x - shift]), request)
+        values = self.residuals(np.concatenate([x + shift, x - shift]), request, ranges)
         return ((values[: len(x)] - values[len(x) :]) / (2 * step)).T
 
 

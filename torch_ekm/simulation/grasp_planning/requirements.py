@@ -140,14 +140,7 @@ def _closing(hand: HandDescription, joint: int) -> int:
 def _opposing(problem: PinchProblem, low: Array, high: Array) -> int:
     """How many of the sampled postures have the pads face to face, about a grasp width apart."""
     moving = low + np.random.default_rng(0).uniform(size=(_SAMPLES, len(low))) * (high - low)
-    tips, directions = problem.tips(moving), problem.directions(moving)
-    across = tips[:, 1:].mean(axis=1) - tips[:, 0]
-    distance = np.linalg.norm(across, axis=1)
-    across /= distance[:, None]
-    facing = np.einsum("bci,bi->bc", directions, across)
-    facing[:, 1:] *= -1.0
-    radius = np.array([pad.radius for pad in problem.pads])
-    opening = distance - radius[0] - radius[1:].mean()
+    facing, opening = problem.opposition(moving)
     width = problem.obj.grasp_width
     return int(((facing.min(axis=1) > _FACING) & (np.abs(opening - width) < 0.5 * width)).sum())
 

@@ -25,8 +25,10 @@ class HandBodies(NamedTuple):
     joints: list[Any]
     order: NDArray[np.int64]
     """Place of each joint in SAPIEN's (breadth-first) order."""
+    links: list[Any]
+    """Link components."""
     link_of: dict[Any, str]
-    """Name of each link component."""
+    """Name of the URDF's link to which each collision shape belongs, of links on fixed joints too."""
 
 
 def build_hand(scene: Any, hand: HandDescription, material: Any) -> HandBodies:
@@ -83,8 +85,9 @@ def build_hand(scene: Any, hand: HandDescription, material: Any) -> HandBodies:
     if owner != root:
         raise DescriptionError(hand.urdf_path, f"the base link '{hand.base_link}' must not move with a joint")
     entities[0].pose = pose(np.linalg.inv(base))
+    link_of: dict[Any, str] = {}
     for name, pieces in parts.items():
-        _fill_link(components[name], pieces, material)
+        link_of |= _fill_link(components[name], pieces, material)
     for entity in entities:
         scene.add_entity(entity)
 
@@ -95,7 +98,7 @@ def build_hand(scene: Any, hand: HandDescription, material: Any) -> HandBodies:
     place = {joint.name: k for k, joint in enumerate(articulation.active_joints)}
     order = np.array([place[name] for name in hand.joint_names])
     joints = [articulation.active_joints[k] for k in order]
-    return HandBodies(articulation, joints, order, {part: name for name, part in components.items()})
+    return HandBodies(articulation, joints, order, list(components.values()), link_of)
 
 
 def _parents_first(urdf: UrdfModel) -> list[UrdfJoint]:
@@ -142,11 +145,13 @@ def x_axis_to(axis: Array) -> Array:
     return frame
 
 
-def _fill_link(link: Any, pieces: list[tuple[Array, UrdfLink]], material: Any) -> None:
+def _fill_link(link: Any, pieces: list[tuple[Array, UrdfLink]], material: Any) -> dict[Any, str]:
     mass, first, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
+    link_of = {}
     for placed, piece in pieces:
         for shape in piece.collisions:
-            _attach(link, shape, placed @ shape.transform, material, _HAND_GROUP)
+            built = _attach(link, shape, placed @ shape.transform, material, _HAND_GROUP)
+            link_of[built] = piece.name
         if piece.mass > 0:
             rotation = placed[:3, :3]
             centre = rotation @ piece.com + placed[:3, 3]
@@ -155,9 +160,10 @@ def _fill_link(link: Any, pieces: list[tuple[Array, UrdfLink]], material: Any) -
             inertia += rotation @ piece.inertia @ rotation.T + piece.mass * _steiner(centre)
     if mass > 0:
         set_inertia(link, mass, first / mass, inertia - mass * _steiner(first / mass))
+    return link_of
 
 
-def _attach(body: Any, shape: Shape, placed: Array, material: Any, group: int) -> None:
+def _attach(body: Any, shape: Shape, placed: Array, material: Any, group: int) -> Any:
     physx = sapien().physx
     if shape.kind == "box":
         built = physx.PhysxCollisionShapeBox(np.array(shape.size) / 2, material)
@@ -172,6 +178,7 @@ def _attach(body: Any, shape: Shape, placed: Array, material: Any, group: int) -
     built.local_pose = sapien().Pose(placed)
     built.set_collision_groups([1, 1, group, 0])
     body.attach(built)
+    return built
 
 
 def _steiner(point: Array) -> Array:

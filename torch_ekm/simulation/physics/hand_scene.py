@@ -68,7 +68,7 @@ class HandScene:
 
     def set_link_weight(self, pulls: bool) -> None:
         """Whether gravity pulls at the links too; without, only at the object."""
-        for link in self._hand.link_of:
+        for link in self._hand.links:
             link.disable_gravity = not pulls
 
     def set_drive_stiffness(self, stiffness: Array) -> None:
@@ -142,7 +142,7 @@ class HandScene:
             first, second = contact.bodies
             if self._object not in (first, second):
                 continue
-            link = self._hand.link_of[second if first == self._object else first]
+            link = self._hand.link_of[contact.shapes[1 if first == self._object else 0]]
             for point in contact.points:
                 impulse = np.asarray(point.impulse, dtype=np.float64)
                 if impulse @ impulse > 0:
