@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from pathlib import Path
 
@@ -109,6 +110,18 @@ def test_a_pad_that_holds_with_its_back_is_told(monkeypatch):
     rows = {row.name: row for row in check_hand("mine")}
     assert rows["contact sides"].state == rows["model"].state == "error"
     assert "'right'" in rows["contact sides"].found
+
+
+def test_a_pinch_that_turns_little_is_told(monkeypatch):
+    def turn(least_deg: float) -> tuple[str, list[int]]:
+        monkeypatch.setattr("torch_ekm.experiments.check._LITTLE_TURN", math.radians(least_deg))
+        row = {row.name: row for row in check_hand("planar_two_finger", "can")}["turn"]
+        return row.state, [int(angle) for angle in re.findall(r"([+-]\d+) deg", row.found)]
+
+    state, (back, forth) = turn(3.0)
+    assert (state, back < 0 < forth) == ("ok", True)
+    assert turn(min(-back, forth) + 2.0)[0] == "warning"
+    assert turn(min(-back, forth) - 2.0)[0] == "ok"
 
 
 def test_limits_that_leave_no_pinch_are_told_with_the_angle_that_it_takes(monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from ..contact.contact_kinematics import contact_frames
 from ..contact.signed_distance import signed_distance
 from ..description import HandDescription, ObjectDescription, Shape, load_hand, load_object
 from ..exceptions import EKMError, MissingExtraError
+from ..foresight import reachable
 from ..kinematics import ActuationMap, HandKinematics, LinkPoses
 from ..model import KinematicModel, Linearization, ModelOptions, ModelStatus
 from ..rendering import make_scene, save_picture
@@ -32,6 +34,7 @@ _GENTLER = (3.0, 2.0, 1.0)  # [N] pinch forces that are tried where the usual on
 _STABLE = 1e-6  # [N m/rad]; less is none
 _LEAST_SLACK = 0.005  # of an actuator's range; less is a spring that just rests
 _FRACTIONS = np.linspace(0.0, 1.0, 21)  # of an actuator's range
+_LITTLE_TURN = math.radians(3.0)
 _DISTURBED = 3  # pinches with the faults of the preset nominal
 
 State = Literal["ok", "warning", "error"]
@@ -72,7 +75,9 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
     rows += [*_rigid(description), *_reach(description, obj)]
     pinch = list(_pinch(description, obj, picture, PlantConfig()))
     faulty = any(row.state == "error" for row in pinch)
-    return [*rows, *pinch, *(_gentler if faulty else _disturbed)(description, obj)]
+    if faulty:
+        return [*rows, *pinch, *_gentler(description, obj)]
+    return [*rows, *pinch, *_turn(description, obj), *_disturbed(description, obj)]
 
 
 def _pads(hand: HandDescription) -> Iterator[Check]:
@@ -172,6 +177,24 @@ def _gentler(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
         yield Check("pinch force", "ok", f"not what is wrong: no sound pinch with {tried} N either")
 
 
+def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
+    """How far the model turns the pinched object: a pinch that holds may be at the edge of its friction."""
+    mend = "stiffer springs, another 'pinch_force', more friction, wider limits"
+    try:
+        plant = SimulatedHand(hand, obj)
+        seen = plant.reset(0)
+        model = KinematicModel(plant.hand, obj, ModelOptions(gravity=plant.gravity))
+        ends = [reachable(model, seen, plant.rotation_axis, sign=sign) for sign in (-1, 1)]
+    except MissingExtraError:
+        return
+    except EKMError as error:
+        yield Check("turn", "warning", str(error), mend)
+        return
+    found = ", ".join(f"{math.degrees(end.angle):+.0f} deg ({end.ends_by})" for end in ends)
+    little = min(abs(end.angle) for end in ends) < _LITTLE_TURN
+    yield Check("turn", "warning" if little else "ok", f"predicted: {found}", mend if little else "")
+
+
 def _disturbed(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     """Experiments and examples have faults in the hand."""
     failures = []
@@ -210,7 +233,7 @@ def _pinch(
         yield Check("pinch", "warning", f"not tried: {error}")
     except EKMError as error:
         what = "pinch" if seen is None else "model"
-        yield Check(what, "error", str(error), "errors above first, then as found; see 'pinch force' below")
+        yield Check(what, "error", str(error), "as found; see 'pinch force' below")
     if picture is not None:
         try:
             yield Check("picture", "ok", str(_draw(hand, lin, picture).resolve()))

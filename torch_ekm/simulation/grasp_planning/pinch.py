@@ -160,8 +160,8 @@ def limits_hint(problem: PinchProblem, request: PinchRequest) -> str:
     if not (found.good and beyond):
         return ""
     return (
-        f"it takes joint {' and '.join(beyond)}: limits some degrees beyond that, a smaller pinch_force, "
-        "stiffer springs or another object"
+        f"it takes joint {' and '.join(beyond)}: let the limits run some degrees beyond that; else less "
+        "force, stiffer springs, another object"
     )
 
 
