@@ -185,12 +185,12 @@ def _fingers(model: UrdfModel, base: str) -> list[list[str]]:
 
 def _fingertip(model: UrdfModel, link: str) -> str:
     """The farthest link on fixed joints beyond it that has a capsule or sphere to touch with; else itself."""
-    tips, reached = [link], [link]
+    tip, reached = link, [link]
     for carrier in reached:
         reached += [joint.child for joint in model.joints if joint.parent == carrier]  # nothing moves there
         if any(shape.kind in _ROUND for shape in model.link(carrier).collisions):
-            tips.append(carrier)
-    return tips[-1]
+            tip = carrier
+    return tip
 
 
 def _planar_normal(model: UrdfModel, base: str) -> np.ndarray | None:

@@ -32,6 +32,7 @@ _LOW_MARGIN = 0.1  # of the friction cone
 _CONTRADICT = 1e4  # [N/rad]: 100 N for 0.6 deg; soft actuators have some hundreds
 _GENTLER = (3.0, 2.0, 1.0)  # [N] pinch forces that are tried where the usual one is too high
 _STABLE = 1e-6  # [N m/rad]; less is none
+_TAUT = 1e-6  # [N m]
 _LEAST_SLACK = 0.005  # of an actuator's range; less is a spring that just rests
 _FRACTIONS = np.linspace(0.0, 1.0, 21)  # of an actuator's range
 _LITTLE_TURN = math.radians(3.0)
@@ -112,15 +113,15 @@ def _tensions(hand: HandDescription) -> Iterator[Check]:
     for k, actuator in enumerate(hand.actuators):
         if not actuator.tendon:
             continue
-        taut = tension[:, k] > 1e-6
-        first, most = _first_above(tension[:, k], 1e-6), tension[:, k].max()
         name, mend = (
             f"tendon '{actuator.name}'",
             "check its springs' stiffness and rest angles, and its range",
         )
-        if not taut.any():
+        most = tension[:, k].max()
+        if most <= _TAUT:
             yield Check(name, "error", "slack over its whole range: no spring opposes it", mend)
         else:
+            first = _first_taut(tension[:, k])
             at = f"{np.degrees(lower[k] + first * (upper[k] - lower[k])):.0f} deg"
             rest = "slack at rest, " if first > _LEAST_SLACK else ""
             state: State = "warning" if first > 0.5 else "ok"
@@ -128,14 +129,10 @@ def _tensions(hand: HandDescription) -> Iterator[Check]:
             yield Check(name, state, found, mend if state == "warning" else "")
 
 
-def _first_above(tension: Array, least: float) -> float:
-    """The part of the range from which a tendon is taut; 1: nowhere before the end."""
-    k = int(np.argmax(tension > least))
-    if tension[k] <= least:
-        return 1.0
-    if k == 0:
-        return 0.0
-    return float(np.interp(least, tension[k - 1 : k + 1], _FRACTIONS[k - 1 : k + 1]))
+def _first_taut(tension: Array) -> float:
+    """The part of the range from which a tendon that becomes taut is so."""
+    k = int(np.argmax(tension > _TAUT))
+    return float(np.interp(_TAUT, tension[k - 1 : k + 1], _FRACTIONS[k - 1 : k + 1])) if k else 0.0
 
 
 def _rigid(hand: HandDescription) -> Iterator[Check]:
@@ -233,7 +230,7 @@ def _pinch(
         yield Check("pinch", "warning", f"not tried: {error}")
     except EKMError as error:
         what = "pinch" if seen is None else "model"
-        yield Check(what, "error", str(error), "as found; see 'pinch force' below")
+        yield Check(what, "error", str(error), "as found")
     if picture is not None:
         try:
             yield Check("picture", "ok", str(_draw(hand, lin, picture).resolve()))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..._extras import require
 from ...description import HandDescription, ObjectDescription
@@ -21,7 +21,7 @@ from .pinch_problem import PinchProblem, PinchRequest
 from .requirements import require_two_pads_and_limits, unmet
 
 _FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
-_POSTURES = 4096
+_POSTURES = 4096  # random ones, of which the best are first guesses
 _GUESSES = 5  # first guesses that are tried before giving up
 _STIFF_STEP = 0.002  # [s]; at 4 ms a hand with rigid actuators moves by 7 to 55 % another way
 _WIDER = np.pi / 4  # [rad] by which limits are moved to see which ones are in the way
@@ -79,8 +79,8 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
             "pinch planner",
             f"no posture within the limits holds '{problem.obj.name}' with {request.force:g} N",
             pinch_hint(problem)
-            or limits_hint(problem, request)
-            or _range_hint(problem.hand, motor)
+            or _limits_hint(problem, request)
+            or _range_hint(problem, motor)
             or "the object may be too wide, or out of reach",
         )
     if np.abs(g.facing).min() < _FACING:
@@ -130,8 +130,9 @@ def _descend(problem: PinchProblem, request: PinchRequest, guess: Array, ranges:
         xtol=1e-9,
         gtol=1e-9,
     )
-    violation = float(np.abs(problem.equations(found.x[None], request)[0]).max())
-    outside = float(problem.outside(problem.geometry(found.x[None])).max(initial=-np.inf))
+    g = problem.geometry(found.x[None])
+    violation = float(np.abs(problem.equations(found.x[None], request, g)[0]).max())
+    outside = float(problem.outside(g).max(initial=-np.inf))
     return _Solution(found.x, violation, outside, found.cost)
 
 
@@ -140,41 +141,42 @@ def pinch_hint(problem: PinchProblem) -> str:
     return "; ".join(map(str, unmet(problem)))
 
 
-def limits_hint(problem: PinchProblem, request: PinchRequest) -> str:
+def _limits_hint(problem: PinchProblem, request: PinchRequest) -> str:
     """Joints that a pinch would take beyond their limits; empty if wider limits give none either."""
     hand = problem.hand
-    wider = dataclasses.replace(
-        hand, joint_lower=hand.joint_lower - _WIDER, joint_upper=hand.joint_upper + _WIDER
-    )
+    wider = replace(hand, joint_lower=hand.joint_lower - _WIDER, joint_upper=hand.joint_upper + _WIDER)
     thumb, *fingers = (pad.name for pad in problem.pads)
     freed = PinchProblem(wider, problem.obj, problem.transmission, thumb, tuple(fingers), problem.along)
     found = _solve(freed, request)
-    n = len(problem.moving)
-    low, high = (edge[:n] for edge in problem.bounds())
-    at, least, most = np.degrees([found.x[:n], *problem.joint_range])
-    beyond = [
-        f"'{hand.joint_names[joint]}' ({least[k]:.0f} to {most[k]:.0f} deg) at {round(at[k])} deg"
-        for k, joint in enumerate(problem.moving)
-        if not low[k] <= found.x[k] <= high[k]
-    ]
+    at = found.x[: len(problem.moving)]
+    low, high = (edge[: len(at)] for edge in problem.bounds())
+    names = [hand.joint_names[joint] for joint in problem.moving]
+    beyond = _places(names, at, *problem.joint_range, (at < low) | (at > high))
     if not (found.good and beyond):
         return ""
     return (
-        f"it takes joint {' and '.join(beyond)}: let the limits run some degrees beyond that; else less "
+        f"it takes joint {beyond}: let the limits run some degrees beyond that; else less "
         "force, stiffer springs, another object"
     )
 
 
-def _range_hint(hand: HandDescription, motor: Array) -> str:
+def _range_hint(problem: PinchProblem, motor: Array) -> str:
     """Actuators that the best posture takes out of their ranges; empty if there is none."""
-    at, low, high = np.degrees([motor, hand.actuator_lower, hand.actuator_upper])
-    beyond = [
-        f"'{name}' ({low[k]:.0f} to {high[k]:.0f} deg) at {round(at[k])} deg"
-        for k, name in enumerate(hand.actuator_names)
-        if not low[k] <= at[k] <= high[k]
-    ]
+    hand = problem.hand
+    low, high = hand.actuator_lower, hand.actuator_upper
+    out = problem.in_use & ((motor < low) | (motor > high))  # idle ones rest, give or take a rounding
+    beyond = _places(hand.actuator_names, motor, low, high, out)
     remedy = "another range_deg, a smaller pinch_force, stiffer springs or another object"
-    return f"the best takes actuator {' and '.join(beyond)}: {remedy}" if beyond else ""
+    return f"the best takes actuator {beyond}: {remedy}" if beyond else ""
+
+
+def _places(names: Sequence[str], at: Array, low: Array, high: Array, chosen: NDArray[np.bool_]) -> str:
+    """``'left' (0 to 90 deg) at 97 deg and ...`` of those chosen; all angles [rad]."""
+    at, low, high = np.degrees([at, low, high])
+    return " and ".join(
+        f"'{names[k]}' ({low[k]:.0f} to {high[k]:.0f} deg) at {round(at[k])} deg"
+        for k in np.flatnonzero(chosen).tolist()
+    )
 
 
 def _guesses(problem: PinchProblem, request: PinchRequest) -> Iterator[Array]:

@@ -134,7 +134,7 @@ class PinchProblem:
         free = _null_space(C)
         self._to_tension = np.linalg.pinv((J_a @ free).T) @ free.T
         tendon = np.array([actuator.tendon for actuator in hand.actuators], dtype=bool)
-        self._in_use = (J_a @ self.follow).any(axis=1)
+        self.in_use = (J_a @ self.follow).any(axis=1)
         self._pulling = tendon & J_a[:, self.moving].any(axis=1)
 
     def _unpack(self, x: Array) -> tuple[Array, Array, Array, Array]:
@@ -286,13 +286,13 @@ class PinchProblem:
     def motors(self, g: PinchGeometry) -> Array:
         """Motor positions that hold the candidates ``(b, n_a)`` [rad]; idle ones rest."""
         T = self.transmission
-        stretch = np.where(self._in_use, self.tension(g) / T.stiffness, 0.0)
+        stretch = np.where(self.in_use, self.tension(g) / T.stiffness, 0.0)
         return T.offset + g.q @ T.J_a.T + stretch
 
     def outside(self, g: PinchGeometry) -> Array:
         """How far each motor in use is beyond its range ``(b, n)`` [rad]; negative: inside."""
-        motor, use = self.motors(g), self._in_use
-        return np.maximum(self.hand.actuator_lower - motor, motor - self.hand.actuator_upper)[:, use]
+        motor = self.motors(g)
+        return np.maximum(self.hand.actuator_lower - motor, motor - self.hand.actuator_upper)[:, self.in_use]
 
     def tension(self, g: PinchGeometry) -> Array:
         """Torque of each actuator along ``+a`` that balances the joints, ``(batch, n_a)`` [N m]."""

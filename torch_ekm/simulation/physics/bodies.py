@@ -25,8 +25,6 @@ class HandBodies(NamedTuple):
     joints: list[Any]
     order: NDArray[np.int64]
     """Place of each joint in SAPIEN's (breadth-first) order."""
-    links: list[Any]
-    """Link components."""
     link_of: dict[Any, str]
     """Name of the URDF's link to which each collision shape belongs, of links on fixed joints too."""
 
@@ -98,7 +96,7 @@ def build_hand(scene: Any, hand: HandDescription, material: Any) -> HandBodies:
     place = {joint.name: k for k, joint in enumerate(articulation.active_joints)}
     order = np.array([place[name] for name in hand.joint_names])
     joints = [articulation.active_joints[k] for k in order]
-    return HandBodies(articulation, joints, order, list(components.values()), link_of)
+    return HandBodies(articulation, joints, order, link_of)
 
 
 def _parents_first(urdf: UrdfModel) -> list[UrdfJoint]:

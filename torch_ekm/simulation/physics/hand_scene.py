@@ -68,7 +68,7 @@ class HandScene:
 
     def set_link_weight(self, pulls: bool) -> None:
         """Whether gravity pulls at the links too; without, only at the object."""
-        for link in self._hand.links:
+        for link in self._hand.articulation.links:
             link.disable_gravity = not pulls
 
     def set_drive_stiffness(self, stiffness: Array) -> None:
