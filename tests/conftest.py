@@ -6,9 +6,12 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import annotations as shapes  # beside this file
+import jaxtyping
 import pytest
 import torch
 
+shapes.install()  # before anything imports the package
 torch.set_num_threads(1)  # many small matrices: threads only get into each other's way
 
 
@@ -26,3 +29,11 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 def generator() -> torch.Generator:
     """Seeded source of randomness."""
     return torch.Generator().manual_seed(7)
+
+
+@pytest.fixture
+def unchecked():
+    """Annotations are not checked: the test passes what they forbid, to see the package's own error."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

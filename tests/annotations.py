@@ -1,0 +1,30 @@
+"""Shape annotations are checked in every call that the tests make.
+
+:mod:`jaxtyping` binds the sizes of a call to each other; :mod:`beartype` checks types. ``int`` is taken where
+``float`` is annotated, as type checkers do (PEP 484).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+import jaxtyping
+from beartype import BeartypeConf, beartype
+
+#: Packages whose annotations are checked.
+CHECKED: tuple[str, ...] = ()
+
+
+def check(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The type checker of the import hook."""
+    return beartype(function, conf=BeartypeConf(is_pep484_tower=True))
+
+
+def install() -> None:
+    """Check what is imported from here on; the environment's ``CHECK_SHAPES`` names other packages."""
+    named = os.environ.get("CHECK_SHAPES")
+    packages = CHECKED if named is None else tuple(filter(None, named.split(",")))
+    if packages:
+        jaxtyping.install_import_hook([f"torch_ekm.{name}" for name in packages], "annotations.check")
