@@ -6,7 +6,7 @@ JOBS ?= 2
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-fast docs notebooks notebooks-smoke lint types imports check install clean
+.PHONY: demo test test-fast coverage docs notebooks notebooks-smoke lint types imports check install clean
 
 install: $(VENV)/installed
 
@@ -22,6 +22,10 @@ demo: install
 
 test: install
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+
+# which lines the tests run: a summary here, htmlcov/index.html line by line
+coverage: install
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --cov=torch_ekm --cov-report=term:skip-covered --cov-report=html
 
 # what most changes break first: description, kinematics, learners, f + g, QP, drivers and logs
 FAST := description kinematics enhanced plant residual/test_residual_sogp_identities.py \
@@ -57,4 +61,4 @@ imports: install
 check: lint types imports test
 
 clean:
-	rm -rf $(VENV) demo_output .pytest_cache .ruff_cache .hypothesis docs/_build docs/reference/api/generated docs/tutorials/notebooks
+	rm -rf $(VENV) demo_output htmlcov .coverage .pytest_cache .ruff_cache .hypothesis docs/_build docs/reference/api/generated docs/tutorials/notebooks
