@@ -1,12 +1,11 @@
-"""How exact is a foreseen turn, and how long does a plan take?
+"""How exact is a foreseen turn?
 
     python benchmarks/foresight.py --objects box,can --seeds 1000:1010
 
 A turn of 20 deg is foreseen in 12 motions before anything moves, with the own parameters of the plant, and
 then made in SAPIEN without feedback. Per grasp: rms error about the axis over the whole turn; rms and largest
 error of the normal forces of the pads until the first foreseen slip; at which motion that is; and how far the
-rolled contacts are from those that the detector finds at the end. Times are CPU times of one thread, medians:
-a single decision of the look-and-move controller, a first plan of 12 motions, and one that goes on from it.
+rolled contacts are from those that the detector finds at the end.
 """
 
 from __future__ import annotations
@@ -14,8 +13,6 @@ from __future__ import annotations
 import argparse
 import statistics
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "foresight"))
 
 from turning import turning
 
-from torch_ekm.control import LookAndMoveController, PoseTarget
-from torch_ekm.foresight import HorizonController, Rollout
+from torch_ekm.foresight import Rollout
 from torch_ekm.model import KinematicModel
 from torch_ekm.simulation import SimulatedHand
 
@@ -63,36 +59,6 @@ def turn(name: str, seed: int) -> tuple[float, float, float, int | None, float]:
     return *rms, float(wrong.abs().max()), foreseen.first_slip, 1e3 * float(foreseen.gap().max())
 
 
-def times() -> dict[str, float]:
-    """CPU time of decisions on a box [ms]."""
-    plant = SimulatedHand("icub_right", "box")
-    seen = plant.reset(0)
-    model = KinematicModel(plant.hand, plant.object)
-    target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=30)
-    single, many = (kind(model, plant.rotation_axis) for kind in (LookAndMoveController, HorizonController))
-
-    def decide(controller: LookAndMoveController) -> None:
-        controller.decide(seen.state, seen.a, target, seen.fingertip_force)
-
-    def first() -> None:
-        many.reset()
-        decide(many)
-
-    plant.close()
-    work: dict[str, Callable[[], None]] = {
-        "single": lambda: decide(single),
-        "first plan": first,
-        "next plan": lambda: decide(many),
-    }
-    taken: dict[str, list[float]] = {name: [] for name in work}
-    for _ in range(20):  # in turn, so that a busy machine slows all of them
-        for name, job in work.items():
-            began = time.process_time()
-            job()
-            taken[name].append(1e3 * (time.process_time() - began))
-    return {name: statistics.median(values) for name, values in taken.items()}
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -115,8 +81,6 @@ def main() -> None:
     axis, force = (sorted(row[i] for row in rows) for i in (0, 1))
     print(f"axis: median {statistics.median(axis):.3f}, worst {axis[-1]:.3f} deg")
     print(f"forces: median {statistics.median(force):.3f}, worst {force[-1]:.3f} N")
-    for name, value in times().items():
-        print(f"{name}: {value:.1f} ms")
 
 
 if __name__ == "__main__":

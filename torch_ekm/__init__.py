@@ -1,12 +1,12 @@
 """torch_ekm: kinematic models of underactuated hands, corrected by online learners.
 
 ``import torch_ekm`` and all that it exports need torch and numpy only: the enhanced model f + g around any
-f, the learners g and the exceptions. The packages, in the order in which data flows:
+f, the learners g, the root of the errors, :mod:`~torch_ekm.exceptions`. In the order in which data flows:
 :mod:`~torch_ekm.description`, :mod:`~torch_ekm.kinematics`, :mod:`~torch_ekm.contact`,
 :mod:`~torch_ekm.model`, :mod:`~torch_ekm.residual` (knows nothing of robots), :mod:`~torch_ekm.enhanced`,
 :mod:`~torch_ekm.object_memory`, :mod:`~torch_ekm.plant`, :mod:`~torch_ekm.control`,
 :mod:`~torch_ekm.sensing`, :mod:`~torch_ekm.simulation`, :mod:`~torch_ekm.rendering`,
-:mod:`~torch_ekm.foresight` (whole turns foreseen and planned), :mod:`~torch_ekm.interop` (learners in other
+:mod:`~torch_ekm.foresight` (whole turns foreseen), :mod:`~torch_ekm.interop` (learners in other
 libraries' words), :mod:`~torch_ekm.experiments`.
 """
 
@@ -16,17 +16,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 from . import exceptions
 from .enhanced import EnhancedModel, load, save
-from .exceptions import (
-    EKMError,
-    FileFormatError,
-    MissingExtraError,
-    NonFiniteError,
-    NoStateError,
-    ParameterError,
-    ShapeError,
-    StateMismatchError,
-    UnknownNameError,
-)
+from .exceptions import EKMError
 from .residual import (
     ActionLinearKernel,
     CalibrateNoise,
@@ -67,31 +57,23 @@ __all__ = [
     "DetectChanges",
     "EKMError",
     "EnhancedModel",
-    "FileFormatError",
     "ForgettingFactor",
     "KRLSTracker",
     "LearnHyperparameters",
     "LearnerFleet",
     "LocalGPs",
-    "MissingExtraError",
     "MixtureResidual",
-    "NoStateError",
-    "NonFiniteError",
-    "ParameterError",
     "ProcessNoise",
     "RandomFeatureRLS",
     "RecursiveLeastSquares",
     "ReplayMLP",
     "ResidualLearner",
     "RobustWeight",
-    "ShapeError",
     "SparseOnlineGP",
     "SquaredExponential",
     "Standardize",
-    "UnknownNameError",
     "UpdateEvent",
     "UpdateReport",
-    "StateMismatchError",
     "WindowGP",
     "ZeroResidual",
     "__version__",

@@ -18,7 +18,7 @@ GROUPS = {
     "Enhanced model": ("torch_ekm.enhanced", ["TrustOptions"]),
     "Controller: tasks": (
         "torch_ekm.control",
-        ["FocusTask", "OffAxisTask", "GripForceTask", "EffortTask", "UncertaintyTask"],
+        ["FocusTask", "OffAxisTask", "GripForceTask", "EffortTask"],
     ),
     "Controller: limits": (
         "torch_ekm.control",

@@ -20,7 +20,7 @@ from torch_ekm.control import (
     StoppingRule,
 )
 from torch_ekm.control import StopReason as Reason
-from torch_ekm.enhanced import EnhancedModel, TrustOptions, TrustRegion
+from torch_ekm.enhanced import TrustOptions, TrustRegion
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
@@ -235,28 +235,3 @@ def test_the_pace_grows_where_the_model_is_right_and_shrinks_where_it_is_not() -
 def test_figures_outside_their_range_are_refused(kind, figures) -> None:
     with pytest.raises(ParameterError, match=next(iter(figures))):
         kind(**figures)
-
-
-def test_learned_forces_correct_the_rows_of_the_grip(held) -> None:
-    """Two pads answer to actuator 3 by 2 N/rad more than the model says: so do the rows after a while."""
-    from torch_ekm.control.situation import LinearizedModel
-    from torch_ekm.enhanced import GraspEncoding, grasp_learner
-
-    plant, model, seen = held
-    encode = GraspEncoding.of(model, seen.state)
-    learner = grasp_learner(encode.n_features, plant.hand.n_a, n_out=len(plant.hand.pads))
-    enhanced = EnhancedModel.for_grasp(model, seen.state, encode=encode, force_learner=learner)
-    lin = model.linearize(seen.state)
-    pads = plant.hand.pad_indices(lin.contacts.finger)
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(40):
-        moved = 0.05 * torch.randn(plant.hand.n_a, dtype=torch.float64, generator=generator)
-        change = torch.zeros(len(plant.hand.pads), dtype=torch.float64)
-        change[pads[:2]] = 2.0 * moved[3]
-        enhanced.update_forces(seen.state, moved, change)
-    still = torch.zeros(plant.hand.n_a, dtype=torch.float64)
-    _, S = LinearizedModel.about(still, lin, enhanced).grip
-    more = S - lin.normal_force_sensitivity.numpy()
-    np.testing.assert_allclose(more[:2, 3], 2.0, rtol=0.1)
-    assert np.abs(more[2]).max() < 1e-9
-    assert EnhancedModel.for_grasp(model, seen.state).force_correction(seen.state, still) is None

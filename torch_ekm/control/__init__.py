@@ -12,7 +12,7 @@ from .limits import ActuatorLimit, FrictionMarginLimit, JointLimit, Limit, Norma
 from .qp import Bounds, ControlProblem, ControlSolution, Equality, Inequality, Squares, build_qp
 from .situation import LinearizedModel, Situation
 from .step_bound import StepBound
-from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task, UncertaintyTask
+from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
 from .termination import StoppingRule, StopReason
 
 __all__ = [
@@ -51,6 +51,5 @@ __all__ = [
     "StopReason",
     "StoppingRule",
     "Task",
-    "UncertaintyTask",
     "build_qp",
 ]

@@ -11,7 +11,6 @@ from typing import NamedTuple, Self
 
 import torch
 
-from ..enhanced import EnhancedModel
 from ..model import Linearization
 from ..plant import Observation, Plant, PlantStatus, ServoInverse
 from ..residual import UpdateReport
@@ -293,19 +292,14 @@ class ClosedLoop:
         servo = isinstance(self.plant, ServoInverse)
         moved = after.a - seen.a if servo else decision.delta_a
         predicted, nominal = self.controller.predict(lin, moved)
-        surprise = self._learn_forces(enhanced, lin, seen, moved, after)
+        surprise = self._force_surprise(lin, seen, moved, after)
         if enhanced.trust is not None:
             lever = contact_lever(lin.contacts.point - seen.position)
             enhanced.trust.judge(predicted[-6:], increment[-6:], lever, decision.share, surprise)
         return enhanced.update(seen.state, moved, increment, nominal)
 
-    def _learn_forces(
-        self,
-        enhanced: EnhancedModel,
-        lin: Linearization,
-        seen: Observation,
-        moved: Tensor,
-        after: Observation,
+    def _force_surprise(
+        self, lin: Linearization, seen: Observation, moved: Tensor, after: Observation
     ) -> Float[Tensor, " n_c"] | None:
         """How far each contact's normal force is from what was predicted [N]; None: not all pads measure."""
         if seen.fingertip_force is None or after.fingertip_force is None:
@@ -314,14 +308,7 @@ class ClosedLoop:
         before, now = seen.fingertip_force[pads], after.fingertip_force[pads]
         if bool((torch.minimum(before, now) < self.controller.kinematic.options.forces.normal_std).any()):
             return None  # a pad that reads so little may be dead, or has let go
-        wrong = now - before - lin.normal_force_sensitivity @ moved
-        correction = enhanced.force_correction(seen.state, moved)
-        if correction is None:
-            return wrong
-        y = torch.zeros_like(seen.fingertip_force)
-        y[pads] = wrong
-        enhanced.update_forces(seen.state, moved, y)
-        return wrong - correction[0][pads]
+        return now - before - lin.normal_force_sensitivity @ moved
 
 
 class _Turn:

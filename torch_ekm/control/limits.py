@@ -110,8 +110,8 @@ class NormalForceLimit:
         most = most if seen.joint_force is None else np.maximum(most, as_array(seen.joint_force))
         high = np.maximum(self.maximum - most, -self.step)
         low = np.minimum(np.minimum(self.minimum - f_n, self.step), high)
-        offset, S = model.grip
-        return Inequality(np.concatenate([-S, S]), np.concatenate([offset - low, high - offset]))
+        S = as_array(model.kinematic.normal_force_sensitivity)
+        return Inequality(np.concatenate([-S, S]), np.concatenate([-low, high]))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._extras import require
-from ..enhanced import Quadratic
 from ..exceptions import ParameterError, SolverError
 from ..typing import Array, Tensor
 
@@ -53,7 +52,7 @@ class Bounds(NamedTuple):
     upper: Numbers
 
 
-Rows = Squares | Quadratic | Equality | Inequality | Bounds
+Rows = Squares | Equality | Inequality | Bounds
 
 
 @dataclass(frozen=True)
@@ -156,9 +155,6 @@ def sum_rows(n_u: int, rows: Iterable[Rows | None]) -> RowSum:
             twice = 2 * A.T
             P += twice @ (weight * A)
             q -= twice @ (weight[:, 0] * b)
-        elif isinstance(row, Quadratic):
-            P += as_array(row.curvature) * DEGREE**2
-            q += as_array(row.gradient) * DEGREE
         elif isinstance(row, Equality):
             d = as_array(row.b) / DEGREE
             reached.append((as_array(row.A), d, np.full(len(d), row.penalty)))

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..enhanced import EnhancedModel, Quadratic
+from ..enhanced import EnhancedModel
 from ..kinematics import GraspState
 from ..typing import Float, Tensor
 from .focus import FocusedPose
@@ -64,12 +62,6 @@ class LinearizedModel:
     offset: Float[Tensor, " n_s"]
     jacobian: Float[Tensor, "n_s n_a"]
     """Rows: joints [rad/rad], object point [m/rad], object rotation [rad/rad]."""
-    force_offset: Array | float = 0.0
-    force_jacobian: Array | None = None
-    """``f_n' = f_n + force_offset + force_jacobian u`` of each contact [N], [N/rad]; None: as the model of
-    the grasp has it."""
-    variance: Callable[[Float[Tensor, " n_s"]], Quadratic] | None = None
-    """``sum_j w_j Var[ds_j]`` of weights w, as a quadratic about ``action``; None: nothing is learned."""
 
     @classmethod
     def about(
@@ -88,17 +80,4 @@ class LinearizedModel:
         if enhanced is None:
             return cls(kinematic, action, J.new_zeros(len(J)), J)
         value, J = enhanced.linearize(state, action, J, encoded)
-        offset, S = 0.0, as_array(kinematic.normal_force_sensitivity)
-        forces = enhanced.force_correction(state, action, encoded)
-        if forces is not None:
-            pads = enhanced.model.hand.pad_indices(kinematic.contacts.finger)
-            mean, slope = (as_array(part)[pads] for part in forces)
-            offset, S = mean - slope @ as_array(action), S + slope
-        variance = partial(enhanced.variance, state, action)
-        return cls(kinematic, action, value - J @ action, J, offset, S, variance)
-
-    @property
-    def grip(self) -> tuple[Array | float, Array]:
-        """``(c, S)`` of ``f_n' = f_n + c + S u`` [N], [N/rad]."""
-        S = self.force_jacobian
-        return self.force_offset, as_array(self.kinematic.normal_force_sensitivity) if S is None else S
+        return cls(kinematic, action, value - J @ action, J)

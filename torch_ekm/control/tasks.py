@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
 
-from ..enhanced import Quadratic
 from .limiting import contact_travel
-from .qp import DEGREE, Equality, Squares
+from .qp import DEGREE, Equality, Squares, as_array
 from .situation import LinearizedModel, Situation
 
 if TYPE_CHECKING:
@@ -18,13 +17,9 @@ if TYPE_CHECKING:
 
 
 class Task(Protocol):
-    """What a step should do. One of your own needs no more than this method.
+    """What a step should do. One of your own needs no more than this method."""
 
-    A task about a motion itself, and not about where it leads, has ``per_motion = True``: a plan of several
-    motions (:mod:`torch_ekm.foresight`) counts it motion by motion.
-    """
-
-    def rows(self, model: LinearizedModel, seen: Situation) -> Squares | Quadratic | Equality | None:
+    def rows(self, model: LinearizedModel, seen: Situation) -> Squares | Equality | None:
         """Rows in ``u = da`` [rad]; None: nothing is asked for here."""
         ...
 
@@ -101,8 +96,7 @@ class GripForceTask:
         wanted = np.full(len(f_n), force / max(len(f_n) - 1, 1))
         wanted[f_n.argmax()] = force
         change = np.clip(wanted - f_n, -self.step, self.step)
-        offset, S = model.grip
-        return Squares(S, change - offset, self.weight)
+        return Squares(as_array(model.kinematic.normal_force_sensitivity), change, self.weight)
 
     def wanted(self, kinematic: Linearization, seen: Situation) -> float:
         """f, of the finger that opposes the others [N]."""
@@ -120,40 +114,9 @@ class GripForceTask:
 class EffortTask:
     """``w |u|^2``: of the steps that do as well, the smallest. It makes the best step unique."""
 
-    per_motion: ClassVar[bool] = True
-
     weight: float = 1e-2
     """w, per deg^2 of an actuator."""
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Squares:
         n_a = len(seen.a)
         return Squares(np.eye(n_a), np.zeros(n_a), self.weight, DEGREE)
-
-
-@dataclass(frozen=True)
-class UncertaintyTask:
-    """``w tr(M_c Sigma_g(s, u) M_c^T)``: of steps that turn as far, that whose effect the learner knows best.
-
-    Convex and exact with an action-linear kernel, ``u^T V(s) u`` for each output; for other learners gradient
-    and the positive semidefinite part of the curvature. A kinematic model alone is never unsure.
-    """
-
-    per_motion: ClassVar[bool] = True
-
-    weight: float = 1.0
-    """w, per deg^2 of the focused rotation, per mm^2 of a focused translation."""
-
-    def rows(self, model: LinearizedModel, seen: Situation) -> Quadratic | None:
-        """The cost about the present action.
-
-        Raises:
-            ParameterError: the learner's variance does not depend on the action.
-        """
-        if model.variance is None:
-            return None
-        translation = seen.focus.matrix[:, :3].abs().sum(-1, keepdim=True) > 0
-        rows = seen.focus.matrix / torch.where(translation, 1e-3, DEGREE)
-        weight = torch.cat([rows.new_zeros(model.kinematic.n_q), rows.square().sum(0)])
-        v = model.variance(self.weight * weight)
-        # v(a) + g.(u - a) + 1/2 (u - a)^T H (u - a), in powers of u; the constant decides nothing
-        return v._replace(gradient=v.gradient - v.curvature @ model.action)

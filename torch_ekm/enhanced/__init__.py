@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from .action_variance import Quadratic
 from .encoding import GraspEncoding
 from .enhanced_model import EnhancedModel
 from .grasp_learner import grasp_learner
@@ -12,7 +11,6 @@ from .trust_region import TrustOptions, TrustRegion
 __all__ = [
     "EnhancedModel",
     "GraspEncoding",
-    "Quadratic",
     "TrustOptions",
     "TrustRegion",
     "grasp_learner",

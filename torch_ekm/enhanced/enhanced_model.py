@@ -16,7 +16,6 @@ from ..residual.base import ResidualLearner, UpdateReport
 from ..residual.checks import check_finite
 from ..residual.kernels.action_linear import ActionLinearKernel
 from ..typing import Float, Tensor
-from .action_variance import Quadratic, action_variance
 from .encoding import GraspEncoding
 from .grasp_learner import grasp_learner
 from .model_jacobian import checked_jacobian, differentiated, finite_differences
@@ -46,8 +45,6 @@ class EnhancedModel(Recorded, nn.Module):
         output_scale: factor, or one for each output, from the increment's unit to the learner's.
         servo: of the actuators. A :class:`~torch_ekm.control.ClosedLoop` commands through its inverse and
             trains on what the encoders did; without it g has to learn the dead zones, too.
-        force_learner: of the fingertips' normal forces, with the inputs of ``learner`` and one output [N] for
-            each pad; without it the model's sensitivities of the forces hold.
         trust: sets the pace of a closed loop by how well f + g predicts; without it the pace is fixed.
         jacobian: df/dda for :meth:`linearize`: a callable ``(state, action) -> (*batch, n_s, n_a)``, or
             ``"finite-difference"`` (central, 2 n_a calls of f); None: J_m, or automatic differentiation.
@@ -68,7 +65,6 @@ class EnhancedModel(Recorded, nn.Module):
         action_scale: float = 1.0,
         output_scale: float | Float[Tensor, " n_out"] = 1.0,
         servo: ServoModel | None = None,
-        force_learner: ResidualLearner | None = None,
         trust: TrustRegion | None = None,
         jacobian: Callable[[Any, Tensor], Any] | Literal["finite-difference"] | None = None,
     ) -> None:
@@ -86,7 +82,6 @@ class EnhancedModel(Recorded, nn.Module):
         self.learner: ResidualLearner = learner
         self.encode: Callable[[Any], Tensor] = nn.Identity() if encode is None else encode
         self.outputs, self.servo, self.trust = outputs, servo, trust
-        self.force_learner = force_learner
         self.action_scale = action_scale
         self.output_scale = nn.Buffer(scale)
         self.jacobian: Any = jacobian
@@ -100,7 +95,6 @@ class EnhancedModel(Recorded, nn.Module):
         encode: GraspEncoding | None = None,
         servo: ServoModel | None = None,
         trust: TrustRegion | None = None,
-        force_learner: ResidualLearner | None = None,
     ) -> EnhancedModel:
         """An E-KM of a grasped object, with nothing learned yet.
 
@@ -115,8 +109,6 @@ class EnhancedModel(Recorded, nn.Module):
             encode: what it sees of a state; None: of this grasp.
             servo: what is known of the hand's servos; None: nothing yet.
             trust: how far it may go; None: as far as with a new object.
-            force_learner: of the pads' normal forces, see the class; None: the model's sensitivities hold. In
-                our simulation learned ones make the object turn off its axis.
 
         Raises:
             NoContactError: nothing touches the object.
@@ -131,7 +123,7 @@ class EnhancedModel(Recorded, nn.Module):
         servo = ServoModel(model.hand.actuator_names) if servo is None else servo
         scales = {"action_scale": 1 / step, "output_scale": scale}
         trust = TrustRegion() if trust is None else trust
-        parts = {"servo": servo, "force_learner": force_learner, "trust": trust}
+        parts = {"servo": servo, "trust": trust}
         return cls(model, learner, encode=encode, outputs=rows, **parts, **scales)
 
     @property
@@ -200,32 +192,6 @@ class EnhancedModel(Recorded, nn.Module):
                 check_finite(name, value)
         residual = self._gather(increment - predicted) * self.output_scale
         return self.learner.update(self.features(state, action), residual)
-
-    @torch.no_grad()
-    def update_forces(
-        self, state: Any, action: Float[Tensor, " n_a"], change: Float[Tensor, " n_pads"]
-    ) -> UpdateReport | None:
-        """Train on one motion: ``y = df_n - (df_n/da) da`` of each pad [N]; None without a force learner.
-
-        Raises:
-            NonFiniteError, ShapeError: as :meth:`update`.
-        """
-        if self.force_learner is None:
-            return None
-        return self.force_learner.update(self.features(state, action), change)
-
-    def force_correction(
-        self, state: Any, action: Float[Tensor, " n_a"], encoded: Float[Tensor, " d"] | None = None
-    ) -> tuple[Float[Tensor, " n_pads"], Float[Tensor, "n_pads n_a"]] | None:
-        """What is learned of the change of each pad's normal force [N], and its Jacobian [N/rad].
-
-        None: no forces are learned.
-        """
-        if self.force_learner is None:
-            return None
-        seen = self.encode(state) if encoded is None else encoded
-        mean, slope = self.force_learner.linearize(torch.cat([seen, self.action_scale * action], dim=-1))
-        return mean, slope[..., -action.shape[-1] :] * self.action_scale
 
     def linearize(
         self,
@@ -310,23 +276,6 @@ class EnhancedModel(Recorded, nn.Module):
         """
         spread = self.learner.predict(self.features(state, action)).stddev
         return self._scatter((spread / self.output_scale).abs(), like)
-
-    def variance(self, state: Any, action: Float[Tensor, " n_a"], weight: Float[Tensor, " n_s"]) -> Quadratic:
-        """``sum_j weight_j Var[ds_j]`` about one action, as a convex quadratic in the action.
-
-        Exact with an action-linear kernel, else a convex model of second order. Outputs that are not learned
-        are certain.
-
-        Args:
-            weight: of each entry of the increment, not negative, per squared unit of the entry.
-
-        Raises:
-            ParameterError: the learner's variance does not depend on the action.
-        """
-        scale, n_a = self.action_scale, action.shape[-1]
-        weight = self._gather(weight) / self.output_scale**2
-        v = action_variance(self.learner, self.features(state, action), n_a, weight)
-        return Quadratic(v.value, v.gradient * scale, v.curvature * scale**2)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Encoding, outputs and scales: what the learner's inputs and outputs mean."""

@@ -14,19 +14,18 @@ from ..residual import (
 NOISE_VARIANCE = 0.1
 
 
-def grasp_learner(n_s: int, n_a: int, capacity: int = 60, n_out: int = 6) -> SparseOnlineGP:
-    """``g ~ GP(0, k)``, k of :func:`grasp_kernel`, outputs in mm and deg, or in N; robust, slowly forgetting.
+def grasp_learner(n_s: int, n_a: int, capacity: int = 60) -> SparseOnlineGP:
+    """``g ~ GP(0, k)``, k of :func:`grasp_kernel`, outputs in mm and deg; robust, slowly forgetting.
 
     Args:
         n_s, n_a: features of the state (of the order of 1 cm or 0.3 rad), actuators (units of 2 deg).
         capacity: largest number of basis vectors.
-        n_out: six directions of the object, or fingertips.
     """
     parts = [RobustWeight(3.0), ForgettingFactor(0.995)]
     kernel = grasp_kernel(n_s, n_a)
     options = {"capacity": capacity, "kernel": kernel, "noise_variance": NOISE_VARIANCE}
     # the kernel's figures are in the units of a grasp
-    return SparseOnlineGP(n_s + n_a, n_out, **options, parts=parts, standardize=False)
+    return SparseOnlineGP(n_s + n_a, 6, **options, parts=parts, standardize=False)
 
 
 def grasp_kernel(n_s: int, n_a: int) -> ActionLinearKernel:

@@ -26,7 +26,6 @@ from ..control import (
     OffAxisTask,
     StepBound,
     StoppingRule,
-    UncertaintyTask,
 )
 from ..description import file_digests, list_hands
 from ..enhanced import TrustOptions, TrustRegion
@@ -45,7 +44,7 @@ CONTROLLERS = ("KM", "KM+I", "KM+S", "E-KM")
 FIRST_REPORTED = 1000
 
 #: Parts of a controller in the order in which they are summed.
-_TASKS = (EffortTask, UncertaintyTask, OffAxisTask, GripForceTask, FocusTask)
+_TASKS = (EffortTask, OffAxisTask, GripForceTask, FocusTask)
 _LIMITS = (ActuatorLimit, NormalForceLimit, FrictionMarginLimit, JointLimit)
 #: How far a step goes, and what is done when it goes wrong.
 _PACE = (LimitingFunction, StepBound, Caution, TrustRegion)
@@ -76,11 +75,6 @@ class Setting:
     ``LimitingFunction``, ``StepBound``, ``Caution``, ``TrustRegion``)."""
     servo_inverse: bool = True
     """The E-KM commands through one; without it the dead zone is learned together with the hand."""
-    force_learner: bool = False
-    """The E-KM learns the normal forces, too, and grips by what it learned."""
-    horizon: int = 1
-    """Motions that the controller foresees; more than one: a
-    :class:`~torch_ekm.foresight.HorizonController`."""
     oracle: bool = False
     """The model is the plant's own, and pose, joints and forces are the true ones: what physics allows."""
     learner: str = DEFAULT_LEARNER
@@ -98,7 +92,7 @@ class Setting:
             raise UnknownNameError("hand", self.hand, (*list_hands(), "a path to a .urdf file"))
         if self.learner not in LEARNERS:
             raise UnknownNameError("learner", self.learner, LEARNERS)
-        for name in ("capacity", "frames", "horizon", "tolerance_deg", "max_steps"):
+        for name in ("capacity", "frames", "tolerance_deg", "max_steps"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
         self.parameters()

@@ -12,9 +12,9 @@ import torch
 
 from ..control import ClosedLoop, LookAndMoveController, Manipulation, PoseTarget, StoppingRule
 from ..description import ObjectDescription
-from ..enhanced import EnhancedModel, GraspEncoding, grasp_learner
+from ..enhanced import EnhancedModel, GraspEncoding
 from ..exceptions import EquilibriumError, GraspError
-from ..foresight import BlindPose, HorizonController, Reach, reachable
+from ..foresight import BlindPose, Reach, reachable
 from ..kinematics import GraspState, ServoModel
 from ..model import KinematicModel
 from ..plant import FramesAtRest, Plant, ServoInverse
@@ -203,8 +203,6 @@ class Bench:
     def _controller(self, axis: torch.Tensor, changes: Mapping[str, Any]) -> LookAndMoveController:
         setting = self.setting.replace(control={**self.setting.control, **changes})
         parts = setting.controller_parts()
-        if setting.horizon > 1:
-            return HorizonController(self._predictor, axis, horizon=setting.horizon, **parts)
         return LookAndMoveController(self._predictor, axis, **parts)
 
     def _loop(
@@ -219,10 +217,7 @@ class Bench:
         if self.learner is None:
             sizes = self.encoding.n_features, self.model.hand.n_a, setting.capacity
             self.learner = make_learner(setting.learner, *sizes, **setting.learner_options)
-        known: dict[str, Any] = {"servo": self.servo, "trust": setting.trust_region()}
-        if setting.force_learner:
-            n_s, n_a, pads = self.encoding.n_features, self.model.hand.n_a, len(self.model.hand.pads)
-            known["force_learner"] = grasp_learner(n_s, n_a, setting.capacity, pads)
+        known = {"servo": self.servo, "trust": setting.trust_region()}
         self.enhanced = EnhancedModel.for_grasp(self.model, start, self.learner, self.encoding, **known)
         if not setting.servo_inverse:
             self.enhanced.servo = None

@@ -14,7 +14,7 @@ from ..contact.contact_model import contact_models, selected_rows
 from ..contact.contact_set import VARYING, ContactSet
 from ..contact.forces.balance import ForceStatus
 from ..kinematics.grasp_state import GraspState
-from ..kinematics.se3 import exp, log
+from ..kinematics.se3 import exp
 from ..model.grasp_forces import GraspForces, friction_use
 from ..typing import Float, Tensor
 
@@ -47,10 +47,6 @@ class Configuration:
     def select(self, k: int) -> Configuration:
         """Number k of the last batch dimension."""
         return self._each(lambda x, tail: x.select(x.dim() - tail - 1, k))
-
-    def of_first(self, part: slice) -> Configuration:
-        """A part of the first batch dimension."""
-        return self._each(lambda x, tail: x[part])
 
     def _each(self, change: Callable[[Tensor, int], Tensor]) -> Configuration:
         s = self.state
@@ -140,37 +136,6 @@ def change(
         spin[..., soft] = dmu[..., [kin.normal_rows[i] + 3 for i in soft]]
     lam = _times(rates.actuator_force_sensitivity, action)
     return Change(ds, 0.5 * (v_f + v_o) + run[..., 0], turns[0], turns[1], force, spin, lam)
-
-
-def chained(changes: Change, contacts: ContactSet, forces: GraspForces) -> Change:
-    """Changes one after the other, ``(K, ...)``, as changes from the beginning, ``(K, ...)``.
-
-    Args:
-        contacts, forces: at the beginning; what slides on the way holds no more than its cone.
-    """
-    n_q = changes.ds.shape[-1] - 6
-    turn = exp(changes.ds[..., None, n_q + 3 :])
-    n_c = changes.point.shape[-2]
-    turns = list(torch.cat([turn, changes.object_turn, changes.finger_turn], dim=-3))
-    for k in range(1, len(turns)):
-        turns[k] = turns[k] @ turns[k - 1]
-    turn, object_turn, finger_turn = torch.stack(turns).split([1, n_c, n_c], dim=-3)
-    normals = (object_turn @ contacts.normal[..., None])[..., 0]
-    force, borne = forces.force, []
-    held = held_force(contacts, contacts.normal, force)
-    for df, normal in zip(changes.force, normals, strict=True):
-        borne.append(held + df)
-        held = held_force(contacts, normal, borne[-1])
-    ds = torch.cat([changes.ds[..., : n_q + 3].cumsum(-2), log(turn[..., 0, :, :])], dim=-1)
-    return Change(
-        ds,
-        changes.point.cumsum(-3),
-        object_turn,
-        finger_turn,
-        torch.stack(borne) - force,
-        changes.spin_moment.cumsum(-2),
-        changes.lam.cumsum(-2),
-    )
 
 
 def held_force(

@@ -36,8 +36,8 @@ def own_controller(
     if e is not None:
         parts = {"encode": e.encode, "outputs": e.outputs, "jacobian": e.jacobian}
         scales = {"action_scale": e.action_scale, "output_scale": e.output_scale}
-        learners = {"force_learner": e.force_learner, "trust": copy.deepcopy(e.trust)}
-        controller.enhanced = EnhancedModel(e.model, e.learner, **parts, **scales, **learners)
+        trust = copy.deepcopy(e.trust)
+        controller.enhanced = EnhancedModel(e.model, e.learner, trust=trust, **parts, **scales)
     return controller
 
 

@@ -71,7 +71,6 @@ _OPTIONS: list[tuple[str, str, str, dict[str, Any], tuple[str, ...]]] = [
         "controller", "actuators cut at 6 deg", "control",
         {"ActuatorLimit.step": 6 * _DEG, "JointLimit.horizon": 6 * _DEG}, _ALL,
     ),
-    ("controller", "uncertainty in the cost", "control", {"UncertaintyTask.weight": 1.0}, _LEARNING),
     ("controller", "rows for the friction margin", "control", {"FrictionMarginLimit.minimum": 0.5}, _ALL),
     ("care", "a grip of 5 N for every object", "control", {"GripForceTask.force": 5.0}, _ALL),
     (
@@ -97,7 +96,6 @@ def variants(base: Setting) -> list[Variant]:
     return [
         *(Variant(group, _BASE) for group in ("learner", "online learning", "model")),
         *(Variant(group, _BASE, controllers=_ALL) for group in ("controller", "care")),
-        Variant("care", "normal forces learned, too", {"force_learner": True}, _LEARNING),
         Variant("care", "oracle: true model, pose and forces", {"oracle": True}, ("KM+S",)),
         Variant("care", "pose and joints from six readings at rest", {"frames": 6}, _ALL),
         Variant("care", "the same, to a tolerance of 0.1 deg", {"frames": 6, "tolerance_deg": 0.1}, _ALL),

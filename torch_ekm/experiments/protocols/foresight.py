@@ -27,8 +27,6 @@ WIDE = ("tea_tin", "jar")
 #: Who is compared: name -> changes of the setting, and the controller of a bench.
 CONTENDERS: dict[str, tuple[dict[str, Any], str]] = {
     "one-step E-KM": ({}, "E-KM"),
-    "horizon E-KM": ({"horizon": 12}, "E-KM"),
-    "horizon KM": ({"horizon": 12}, "KM+S"),
     "oracle": ({"oracle": True}, "KM+S"),
 }
 

@@ -29,8 +29,6 @@ _BLIND = "blind", "blind, looks again", "blind, no touch"
 _FREE = "nothing"
 _LEGEND = {
     ONE_STEP: "each motion is chosen for itself",
-    "horizon E-KM": "twelve motions are planned ahead with the E-KM, one is made",
-    "horizon KM": "the same with the kinematic model on the servo inverse",
     "oracle": "each motion is chosen for itself, by the true model, pose and forces",
 }
 
@@ -104,17 +102,6 @@ def foresight_targets(results: Results) -> list[Target]:
         median = float(np.median([r.true_error_deg for r in blind]))
         found.append(Target("blind turn with touch, median error [deg]", median, most=0.5))
         found.append(Target("its 90 % interval holds [%]", 100 * float(np.mean(covered(blind))), least=90))
-    for name in contenders_of(results):
-        ratio = paired_ratio(results, name)
-        if name.startswith("horizon") and ratio is not None:
-            found.append(Target(f"largest angle, {name} : one-step E-KM, median", ratio, least=1.3))
-            lost, before = (
-                sum(r.lost for r in turns_of(results, kind="turn", contender=n)) for n in (name, ONE_STEP)
-            )
-            if before:
-                found.append(
-                    Target(f"objects lost beyond Table I, {name} : one-step", lost / before, most=0.5)
-                )
     return found
 
 
