@@ -12,11 +12,17 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
+
+sys.path.insert(0, str(Path(__file__).parent / "studies"))
+
+from ablation import Ablation
+from foresight_study import Foresight
 
 from torch_ekm.experiments.learners import LEARNERS, PEERS
 from torch_ekm.experiments.protocols.demo import Demo
@@ -48,7 +54,7 @@ def learner_on(name: str, x: torch.Tensor, y: torch.Tensor) -> list[Any]:
     learner = LEARNERS[name](INPUTS, OUTPUTS, n_actions=1, capacity=20)
     seen = []
     for one, target in zip(x, y, strict=True):
-        prediction = learner(one)
+        prediction = learner.predict(one)
         seen.append([prediction.mean.tolist(), prediction.variance.tolist()])
         learner.update(one, target)
     return seen
@@ -66,7 +72,7 @@ def parts() -> Iterator[tuple[str, Callable[[], Any]]]:
     demo = Demo()
     for job in demo.jobs((0, 1)).values():
         yield f"demo {job[1:]}", lambda job=job: demo.run(*job)
-    for name, kind in PROTOCOLS.items():
+    for name, kind in {**PROTOCOLS, "ablation": Ablation, "foresight": Foresight}.items():
         quick = kind().quick()
         for number, job in enumerate(list(quick.jobs((0,)).values())[:4]):
             yield f"{name} {number}", lambda quick=quick, job=job: quick.run(*job)

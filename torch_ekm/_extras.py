@@ -15,7 +15,6 @@ _BRINGS = {
     "notebooks": ("IPython", "pyarrow"),
     "peers": ("gpytorch", "river"),
     "fast": ("numba",),
-    "cluster": ("distributed",),
     "interop": ("sklearn", "onnx", "onnxscript", "casadi", "rosbags"),
 }
 _EXTRA_OF = {module: extra for extra, modules in _BRINGS.items() for module in modules}

@@ -293,7 +293,7 @@ def test_guards_have_limits_of_their_own() -> None:
 
 
 def test_spoilt_readings_neither_break_the_limits_nor_what_is_learned(held) -> None:
-    """300 observations; 10000 with the simulated hand: ``benchmarks/fuzz_loop.py``."""
+    """300 observations; 10000 with the simulated hand: ``benchmarks/simulated_hand/fuzz_loop.py``."""
     seen, axis, model = held
 
     def session(chance: float, observations: int = 0, turns: int = 0) -> tuple[Obedient, EnhancedModel, int]:

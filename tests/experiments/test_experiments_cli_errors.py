@@ -55,18 +55,17 @@ reproduce online --step 0 | more than 0 and at most 45 deg
 reproduce online --step -1 | more than 0 and at most 45 deg
 reproduce online --step nan | more than 0 and at most 45 deg
 reproduce online --step x | --step
-reproduce online --objects box | only generalize, adapt, foresight
-reproduce online --angles 5 | only generalize, ablation
+reproduce online --objects box | only generalize, adapt
+reproduce online --angles 5 | only generalize
 reproduce generalize --objects nothing | unknown object
 reproduce generalize --objects folder | *.urdf files
 reproduce generalize --objects , | at least one object
 reproduce generalize --angles x | numbers separated by commas
 reproduce generalize --angles 0 | more than 0 and less than 180 deg
 reproduce generalize --angles nan | more than 0 and less than 180 deg
-reproduce ablation --angles 400 | more than 0 and less than 180 deg
+reproduce generalize --angles 400 | more than 0 and less than 180 deg
 reproduce generalize --preset bad | unknown preset
 reproduce generalize --learner bad | unknown learner
-reproduce generalize --address bad | dask://HOST:PORT
 compare | Missing option '--data'
 compare --data none.csv | no such file
 compare --data folder | unknown recording
@@ -81,9 +80,6 @@ compare --data s.csv --targets a,y | at least one must be an input
 compare --data s.csv --limit -1 | --limit
 compare --data s.csv --limit 3 | too short
 compare --data s.csv --learners SOGP --out file.txt | cannot be written
-recorded-hand --data none | no such file
-recorded-hand --data file.txt | no .npz file
-recorded-hand --learners bad | unknown learner
 record file.txt | a log is a folder
 record log --object nothing | unknown object
 record log --controller bad | unknown controller

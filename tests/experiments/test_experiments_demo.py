@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from torch_ekm.cli import app, parse_seeds
+from torch_ekm.cli import app
+from torch_ekm.cli._app import parse_seeds
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.jobs import read_result

@@ -1,4 +1,4 @@
-"""Jobs: parallel equals serial, an interrupted run resumes, and a cluster may do the work."""
+"""Jobs: parallel equals serial, an interrupted run resumes."""
 
 from __future__ import annotations
 
@@ -7,14 +7,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from operator import truediv
 from pathlib import Path
 
 import psutil
 import pytest
 
-from torch_ekm.exceptions import MissingExtraError, ParameterError, WorkerDiedError
+from torch_ekm.exceptions import WorkerDiedError
 from torch_ekm.experiments import jobs as module
 from torch_ekm.experiments.jobs import read_result, run_jobs
 
@@ -99,11 +97,11 @@ def test_a_failure_cancels_what_has_not_begun(tmp_path: Path) -> None:
 
 
 def test_workers_are_fresh_and_take_lambdas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_PATIENCE", 7.0)  # a forked worker would see it
+    monkeypatch.setattr(module, "_WATCH", 7.0)  # a forked worker would see it
     factor = 3
     jobs = {f"job_{x}": (x,) for x in range(2)}
-    results = run_jobs(lambda x: [factor * x, module._PATIENCE], jobs, tmp_path, processes=2)
-    assert results == {"job_0": [0, 10.0], "job_1": [3, 10.0]}
+    results = run_jobs(lambda x: [factor * x, module._WATCH], jobs, tmp_path, processes=2)
+    assert results == {"job_0": [0, 0.25], "job_1": [3, 0.25]}
 
 
 def test_a_job_that_kills_its_process_is_named(tmp_path: Path) -> None:
@@ -185,95 +183,3 @@ def children(pid: int) -> list[psutil.Process]:
 def ended(processes: list[psutil.Process]) -> bool:
     """Within three seconds."""
     return not psutil.wait_procs(processes, timeout=3)[1]
-
-
-# -- clusters ----------------------------------------------------------------------------------------
-
-DIVISIONS = {"a": (6, 3), "b": (1, 4), "c": (0, 2)}
-
-
-def running_together(seconds: float) -> dict[str, int]:
-    global running
-    running += 1
-    most = running
-    time.sleep(seconds)
-    running -= 1
-    return {"most": most}
-
-
-running = 0
-
-
-@pytest.fixture(scope="module")
-def dask_address() -> Iterator[str]:
-    """A Dask cluster in this process: one worker of three threads."""
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=3, processes=False, dashboard_address=None, protocol="tcp"
-    ) as cluster:
-        yield cluster.scheduler_address.replace("tcp://", "dask://")
-
-
-def check_cluster(address: str, folder: Path) -> None:
-    """Results come back and are written here; a failure is the job's own and leaves what is done."""
-    done: list[str] = []
-    run_jobs(lambda x, y: -1.0, {"a": DIVISIONS["a"]}, folder)  # an earlier run
-    results = run_jobs(truediv, DIVISIONS, folder, on_done=done.append, address=address)
-    assert results == {"a": -1.0, "b": 0.25, "c": 0.0}
-    assert done[0] == "a"
-    assert sorted(done) == ["a", "b", "c"]
-    assert read_result(folder / "b.json", "b") == 0.25
-    with pytest.raises(ZeroDivisionError) as told:
-        run_jobs(truediv, {**DIVISIONS, "d": (1, 0)}, folder, address=address)
-    assert told.value.__notes__ == ["in the job 'd'"]
-    assert not (folder / "d.json").exists()
-
-
-def test_dask_cluster(dask_address: str, tmp_path: Path) -> None:
-    check_cluster(dask_address, tmp_path)
-
-
-@pytest.mark.slow
-def test_dead_dask_worker_ends_the_run(tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed")
-    import dask
-
-    with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
-        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
-    ):
-        address = cluster.scheduler_address.replace("tcp://", "dask://")
-        with pytest.raises(WorkerDiedError, match="was run 1 times"):
-            run_jobs(die, {f"job_{x}": (x,) for x in range(2)}, tmp_path, address=address)
-
-
-def test_failure_on_dask_cancels_what_has_not_begun(dask_address: str, tmp_path: Path) -> None:
-    traces = tmp_path / "traces"
-    traces.mkdir()
-    jobs = {f"job_{x}": (str(traces), x) for x in range(60)}
-    with pytest.raises(ValueError, match="job 0"):
-        run_jobs(mark, jobs, tmp_path / "runs", address=dask_address)
-    time.sleep(2.0)
-    assert len(list(traces.iterdir())) < 30
-
-
-def test_worker_with_threads_runs_one_job_at_a_time(dask_address: str, tmp_path: Path) -> None:
-    jobs = {f"job_{k}": (0.05 + 1e-3 * k,) for k in range(6)}
-    results = run_jobs(running_together, jobs, tmp_path, address=dask_address)
-    assert {result["most"] for result in results.values()} == {1}
-
-
-@pytest.mark.parametrize("address", ["host:8786", "slurm://host", "dask://", "ray:/host"])
-def test_wrong_addresses_say_what_would_be_right(address: str, tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match="dask://HOST:PORT"):
-        run_jobs(truediv, DIVISIONS, tmp_path, address=address)
-
-
-def test_cluster_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("distributed")
-    monkeypatch.setattr(module, "_PATIENCE", 0.5)
-    with pytest.raises(ParameterError, match="answers"):
-        run_jobs(truediv, DIVISIONS, tmp_path, address="dask://127.0.0.1:1")
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MissingExtraError, match=r"torch_ekm\[cluster\]"):
-        run_jobs(truediv, DIVISIONS, tmp_path, address="dask://127.0.0.1:1")

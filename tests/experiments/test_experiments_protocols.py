@@ -23,13 +23,11 @@ from torch_ekm.description import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
 from torch_ekm.experiments.learners import HAND_LEARNERS, LEARNERS, make_learner
-from torch_ekm.experiments.protocols.ablation import DISTURBANCES, Ablation, variants
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.protocols.object_memory import ObjectMemory
 from torch_ekm.experiments.protocols.online import Online
 from torch_ekm.experiments.records import NotGrasped, TrialRecord
 from torch_ekm.experiments.runner import Bench
-from torch_ekm.simulation import preset
 
 ONLINE = Online(trials=2, angle_range_deg=(4.0, 5.0), dislocations=(2,), tendons_replaced=2)
 
@@ -135,29 +133,6 @@ def test_every_learner_of_the_ablation_starts_at_zero_and_learns() -> None:
         assert better == 1.0 if name == "model alone" else better < 0.7, (name, better)
     with pytest.raises(UnknownNameError, match="deep"):
         make_learner("forest", 5, 4, 30)
-
-
-def test_ablation_covers_every_disturbance_of_the_nominal_plant() -> None:
-    nominal, exact = preset("nominal"), preset("none")
-    disturbed = {
-        f.name for f in dataclasses.fields(nominal) if getattr(nominal, f.name) != getattr(exact, f.name)
-    }
-    assert disturbed == {name for names in DISTURBANCES.values() for name in names}
-    protocol = Ablation()
-    for variant in variants(protocol.setting):
-        changed = protocol.setting.replace(**variant.changes)
-        if variant.group == "disturbance":
-            different = [
-                name for name in disturbed if getattr(changed.parameters(), name) != getattr(exact, name)
-            ]
-            assert set(different) == set(DISTURBANCES[variant.name]), variant.name
-    jobs = protocol.jobs((0,))
-    places = {(job.objects, job.angles_deg) for job, _, _ in jobs.values()}
-    assert places == {(("box",), (9.0, 19.0, 29.0)), (("tea_tin",), (10.0, 20.0, 25.0))}
-    oracle = next(job for job, _, _ in jobs.values() if job.setting.oracle)
-    assert oracle.objects == ("tea_tin",)
-    # alike variants share their jobs
-    assert len(jobs) < sum(len(v.controllers) for v in variants(protocol.setting))
 
 
 def test_impossible_protocols_are_refused() -> None:

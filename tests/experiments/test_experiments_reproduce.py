@@ -3,87 +3,30 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import html
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from experiments_records import turn
+from made_up_sessions import made_up_generalize, made_up_memory, made_up_online
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
 from torch_ekm.description import object_paths
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
-from torch_ekm.experiments.foresight_turn import ForesightTurn
-from torch_ekm.experiments.protocols.foresight import Foresight
 from torch_ekm.experiments.protocols.generalize import Generalize
-from torch_ekm.experiments.protocols.object_memory import MemoryTurn, ObjectMemory
+from torch_ekm.experiments.protocols.object_memory import ObjectMemory
 from torch_ekm.experiments.protocols.online import Online
-from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reproduce import PROTOCOLS, plan, reproduce
-
-
-def made_up_turn(controller: str, seed: int, trial: int, angle: float, item: str) -> TrialRecord:
-    """A made-up turn, decided by its arguments: reports are tested here, not the hand."""
-    draw = np.random.default_rng([seed, trial, len(controller), len(item)])
-    n = int(draw.integers(3, 9))
-    km = tuple(draw.uniform(0.3, 0.7, n).tolist())
-    ekm = tuple(draw.uniform(0.1, 0.3, n).tolist()) if controller.startswith("E-KM") else ()
-    return turn(
-        controller, seed, float(draw.uniform(0, 0.3)), trial=trial, angle_deg=angle, object=item,
-        errors_deg=tuple(np.linspace(angle, 0.1, n + 1).tolist()),
-        first_step_deg=float(draw.uniform(0.1, 1)), prediction_km_deg=km, prediction_ekm_deg=ekm,
-        true_prediction_km_deg=km, true_prediction_ekm_deg=ekm,
-        off_rotation_deg=float(draw.uniform(0, 2)), seconds=(0.01,) * n,
-    )  # fmt: skip
-
-
-def made_up_online(protocol: Online, controller: str, seed: int) -> list[TrialRecord]:
-    trials = range(1, protocol.trials + 1)
-    return [made_up_turn(controller, seed, trial, 8.0, "toothpaste") for trial in trials]
-
-
-def made_up_generalize(protocol: Generalize, item: str, controller: str, seed: int) -> list[TrialRecord]:
-    angles = enumerate(protocol.angles_of(item))
-    records = [made_up_turn(controller, seed, k, angle, item) for k, angle in angles]
-    error = float(np.random.default_rng([seed, len(controller)]).uniform(0.2, 2.0))
-    dark = made_up_turn(controller, seed, 99, 12.0, item)
-    step = turn(controller, seed, error, kind="long step", angle_deg=5.0, object=item)
-    return [*records, step, dataclasses.replace(dark, kind="camera off")]
-
-
-def made_up_memory(protocol: ObjectMemory, seed: int) -> list[MemoryTurn]:
-    names = ("none", "bank", "labelled", "one model", "fresh")
-    records = []
-    for k in range(8):
-        record = made_up_turn("E-KM", seed, k, 10.0, protocol.objects[k % 2])
-        errors = {name: [0.1 * (i + 1)] * record.steps for i, name in enumerate(names)}
-        posterior = (0.9, 0.1, *[0.0] * 7)
-        records.append(MemoryTurn(**vars(record), model=k % 2, posterior=posterior, memory_errors_deg=errors))
-    return records
-
-
-def made_up_foresight(protocol: Foresight, item: str, contender: str, seed: int) -> list[ForesightTurn]:
-    record, known = made_up_turn("E-KM", seed, 0, 70.0, item), {"contender": contender}
-    far = dataclasses.replace(record, kind="far", reason="given up")
-    dark = {"axis_std_deg": 0.4, "estimate_error_deg": 0.1 * seed, **known}
-    reached = {"largest_deg": 30.0 + seed, "reach_deg": 31.0, "reach_end": "link: thumb_2", **known}
-    return [
-        ForesightTurn(**vars(far), **reached),
-        ForesightTurn(**vars(made_up_turn("E-KM", seed, 1, 34.0, item)), **reached),
-        ForesightTurn(**{**vars(record), "kind": "blind", "angle_deg": 15.0}, **dark),
-    ]
 
 
 @pytest.fixture
 def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sessions without a simulation."""
     monkeypatch.setattr(Online, "session", made_up_online)
-    monkeypatch.setattr(Generalize, "session", made_up_generalize)  # and with it the ablation's
+    monkeypatch.setattr(Generalize, "session", made_up_generalize)
     monkeypatch.setattr(ObjectMemory, "session", made_up_memory)
-    monkeypatch.setattr(Foresight, "session", made_up_foresight)
 
 
 def read(folder: Path) -> dict[str, bytes]:

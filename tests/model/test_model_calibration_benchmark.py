@@ -1,4 +1,4 @@
-"""The quick form of benchmarks/calibration.py: a simulated hand whose every figure is off."""
+"""The quick form of benchmarks/kinematic_model/calibration.py: a simulated hand whose every figure is off."""
 
 from __future__ import annotations
 

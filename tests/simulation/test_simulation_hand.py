@@ -56,7 +56,7 @@ def test_it_holds_still_for_ten_seconds(plant, seed):
 
 
 def test_servos_and_tendons_take_no_longer_than_physx(plant, grasped):
-    """At 20 000 steps of PhysX a second, that is ten times real time; benchmarks/plant_hold.py measures it.
+    """At 20 000 steps of PhysX a second, that is ten times real time; plant_hold.py measures it.
 
     The ratio of two parts that take turns holds on a busy machine, too; a time would not.
     """

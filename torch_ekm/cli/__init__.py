@@ -6,12 +6,14 @@ import sys
 
 from .._terminal import say_error  # first: needs the extra
 from ..exceptions import EKMError
-from . import describe, experiments, logs
-from ._app import app, parse_seeds
+from . import describe as describe
+from . import experiments as experiments
+from . import logs as logs
+from ._app import app
 
 import typer  # isort: skip
 
-__all__ = ["app", "describe", "experiments", "logs", "main", "parse_seeds"]
+__all__ = ["app", "main"]
 
 _ClickException: type[Exception] = typer.BadParameter.__mro__[2]  # newer versions of typer hold their own
 

@@ -57,16 +57,14 @@ def demo(
 @app.command()
 @needs("experiments")
 def reproduce(
-    experiment: Annotated[
-        str, Argument(help="generalize, online, ablation, adapt or foresight.")
-    ] = "generalize",
+    experiment: Annotated[str, Argument(help="generalize, online or adapt.")] = "generalize",
     seeds: Annotated[str, Option(help="FIRST:END; each seed is an independent run.")] = "1000:1020",
     jobs: Jobs = 2,
     out: Annotated[Path | None, Option(help="Folder for the report [reproduce_<experiment>].")] = None,
     quick: Annotated[bool, Option(help="Two seeds, small turns: to see that it works.")] = False,
     objects: Annotated[
         str,
-        Option(help="Names separated by commas, or a folder with URDF files (generalize, adapt, foresight)."),
+        Option(help="Names separated by commas, or a folder with URDF files (generalize, adapt)."),
     ] = "",
     hand: Hand = "icub_right",
     preset: Preset = "nominal",
@@ -74,18 +72,13 @@ def reproduce(
         str, Option(help="action-linear, rbf, SOGP deep, ...; an unknown name lists all.")
     ] = "action-linear",
     sensing: Sensing = True,
-    angles: Annotated[
-        str, Option(help="Turns [deg], e.g. 5,10,15; Table I if left out (generalize, ablation).")
-    ] = "",
+    angles: Annotated[str, Option(help="Turns [deg], e.g. 5,10,15; Table I if left out (generalize).")] = "",
     step: Annotated[
         float | None,
         Option(help="Turn of one motion at pace 1 [deg]; 2.5 if left out (less where a contact moves far)."),
     ] = None,
-    address: Annotated[
-        str | None, Option(help="A Dask cluster instead of processes here: dask://HOST:PORT.")
-    ] = None,
 ) -> None:
-    """Repeat the paper's experiments, and more.
+    """Repeat the paper's experiments.
 
     Every controller has the same seeds and grasps. Interrupted, it goes on where it stopped, and ends with
     the same report. With 20 seeds, on two cores:
@@ -94,17 +87,13 @@ def reproduce(
     experiment  sessions  of                                       time
     generalize       400  8 to 11 turns: 5 objects, 4 controllers  1.5 h
     online            80  45 turns: 4 controllers                  1.5 h
-    ablation        3140  3 to 6 turns: one change at a time       5 h
     adapt             20  48 turns of 6 objects in random order    0.3 h
-    foresight        560  6 to 10 turns: 7 objects, 4 contenders   2 h
 
     Time grows with the number of seeds and objects. With --quick: one or two minutes.
     """
     from ..experiments.config import Setting
     from ..experiments.reproduce import plan
 
-    if address is not None and not address.startswith("dask://"):
-        raise ParameterError("address", address, "dask://HOST:PORT")
     control = {} if step is None else {"LimitingFunction.step": parse_step(step)}
     setting = Setting(hand=hand, preset=preset, learner=learner, sensing=sensing, control=control)
     turns = parse_angles(angles) if angles else None
@@ -116,7 +105,7 @@ def reproduce(
         angles_deg=turns,
         quick=quick,
     )
-    _run(experiment, planned, out or Path(f"reproduce_{experiment}"), jobs, address)
+    _run(experiment, planned, out or Path(f"reproduce_{experiment}"), jobs)
 
 
 @app.command()
@@ -174,38 +163,10 @@ def compare(
     print_report(compared.write(out), out, notes=True)
 
 
-@app.command()
-@needs("experiments")
-def recorded_hand(
-    data: Annotated[
-        Path | None, Option(help="t42_testpaths.npz or its folder; a small synthetic one if left out.")
-    ] = None,
-    learners: Annotated[str, Option(help="Names, separated by commas.")] = "SOGP mixture",
-    out: Annotated[Path, Option(help="Folder for the report.")] = Path("recorded_hand_output"),
-    jobs: Jobs = 2,
-    quick: Annotated[bool, Option(help="Two paths of four objects: to see that it works.")] = False,
-) -> None:
-    """Predict the recorded motions of a Yale T42 hand.
-
-    With its kinematic model, with and without learners. The recordings (Sintov et al., GitHub
-    avishais/t42_autonomous_system) are read in place; the documentation tells how to save them as npz.
-    Interrupted, it goes on where it stopped.
-    """
-    from ..experiments.recorded_hand.benchmark import count_jobs, predict_recorded_hand
-    from ..experiments.recorded_hand.report import write_report
-
-    chosen = names(learners)
-    with progress("predicting", count_jobs(data, len(chosen), quick=quick)) as advance:
-        result = predict_recorded_hand(
-            data, learners=chosen, folder=out / "runs", processes=jobs, quick=quick, on_done=advance
-        )
-    print_report(write_report(result, out), out, notes=True)
-
-
-def _run(what: str, planned: Experiment, folder: Path, jobs: int, address: str | None = None) -> Report:
+def _run(what: str, planned: Experiment, folder: Path, jobs: int) -> Report:
     from ..experiments.reproduce import reproduce as run
 
     with progress(what, len(planned.jobs)) as advance:
-        report = run(planned, folder, jobs, advance, address)
+        report = run(planned, folder, jobs, advance)
     print_report(report, folder)
     return report

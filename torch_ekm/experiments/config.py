@@ -75,8 +75,6 @@ class Setting:
     ``LimitingFunction``, ``StepBound``, ``Caution``, ``TrustRegion``)."""
     servo_inverse: bool = True
     """The E-KM commands through one; without it the dead zone is learned together with the hand."""
-    oracle: bool = False
-    """The model is the plant's own, and pose, joints and forces are the true ones: what physics allows."""
     learner: str = DEFAULT_LEARNER
     learner_options: Mapping[str, Any] = field(default_factory=dict)
     capacity: int = 60

@@ -1,9 +1,8 @@
-"""Run independent jobs in processes or on a cluster, with progress, and resume what was interrupted.
+"""Run independent jobs in processes, with progress, and resume what was interrupted.
 
 Processes are joblib's (loky): fresh ones, since a forked copy of PhysX or of a thread pool is not safe to
 use, and they take lambdas and classes of a notebook. Each has a pool of its own, so that it is known which
-job a process died of. A cluster is asked directly, because joblib's Dask backend waits for ever when a worker
-dies.
+job a process died of.
 """
 
 from __future__ import annotations
@@ -18,21 +17,18 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import closing, contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from .._extras import require
 from .._files import WriterLock, make_folder, write_whole
-from ..exceptions import ParameterError, WorkerDiedError
+from ..exceptions import WorkerDiedError
 
 Jobs = Mapping[str, tuple[Any, ...]]
 Outcomes = Generator[tuple[str, Any], None, None]
 
-_PATIENCE = 10.0  # [s] for a scheduler to answer
 _TRIES = 3  # of a job whose process dies
 _WATCH = 0.25  # [s] between a process's looks at whether its parent lives
-_one_at_a_time = threading.Lock()
 
 
 def run_jobs(
@@ -41,7 +37,6 @@ def run_jobs(
     folder: Path,
     processes: int = 1,
     on_done: Callable[[str], None] | None = None,
-    address: str | None = None,
 ) -> dict[str, Any]:
     """``{name: function(*arguments)}`` for all jobs, each result kept in ``folder/name.json``.
 
@@ -53,23 +48,19 @@ def run_jobs(
     one, however it ends.
 
     Args:
-        function: with results that JSON can hold; on a cluster, importable there.
+        function: with results that JSON can hold.
         processes: 1 runs in this process. PhysX steps hold the interpreter's lock: threads do not help.
         on_done: called with the name of each job that is done, those of an earlier run first.
-        address: ``dask://HOST:PORT`` of a scheduler whose cluster does the work instead of processes here.
-            torch_ekm must be installed on its workers, with the same versions, and files that the arguments
-            name must be found there under the same paths.
 
     Raises:
-        ParameterError: ``address`` is no such address, or nobody answers there.
         WorkerDiedError: a job's process was killed each time it was tried; the message names the job.
         FolderInUseError: another process runs jobs into this folder; the message names the process.
         OutputError: a result cannot be written.
-        MissingExtraError: joblib, or distributed, is not installed.
+        MissingExtraError: joblib is not installed.
     """
     make_folder(folder)
     with WriterLock(folder):
-        return _run_all(function, jobs, folder, processes, on_done or (lambda name: None), address)
+        return _run_all(function, jobs, folder, processes, on_done or (lambda name: None))
 
 
 def _run_all(
@@ -78,7 +69,6 @@ def _run_all(
     folder: Path,
     processes: int,
     tell: Callable[[str], None],
-    address: str | None,
 ) -> dict[str, Any]:
     results = {}
     for name in jobs:
@@ -91,9 +81,7 @@ def _run_all(
     for name in results:
         tell(name)
     waiting = {name: arguments for name, arguments in jobs.items() if name not in results}
-    # either gives (name, result) in the order in which the jobs end
-    run = partial(_in_processes, processes) if address is None else partial(_on_dask, address)
-    with closing(run(function, waiting)) as outcomes:
+    with closing(_in_processes(processes, function, waiting)) as outcomes:
         for name, result in outcomes:
             results[name] = _write(folder / f"{name}.json", name, result)
             tell(name)
@@ -166,34 +154,6 @@ def _end_with(parent: int) -> None:
 
     if os.name != "nt":  # there a process keeps the number of a parent that is gone
         threading.Thread(target=watch, daemon=True).start()
-
-
-def _on_dask(address: str, function: Callable[..., Any], jobs: Jobs) -> Outcomes:
-    scheme, _, place = address.partition("://")
-    if scheme != "dask" or not place:
-        raise ParameterError("address", address, "dask://HOST:PORT")
-    distributed = require("distributed")
-    try:
-        client = distributed.Client(f"tcp://{place}", timeout=_PATIENCE, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise ParameterError("address", address, f"a scheduler that answers ({error})") from error
-    with client:  # its end cancels what has not begun
-        # pure=False: a name is what a job is known by, not a hash of its arguments
-        futures = {client.submit(_alone, function, job, pure=False): name for name, job in jobs.items()}
-        for future in distributed.as_completed(futures, loop=client.loop):
-            try:
-                with _named(futures[future]):
-                    result = future.result()
-            except distributed.KilledWorker as error:  # after as many tries as the scheduler allows
-                raise WorkerDiedError(futures[future], error.allowed_failures + 1) from None
-            yield futures[future], result
-
-
-def _alone(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-    """One at a time in this process: a cluster's worker may have several threads, and two simulations or two
-    settings of torch's threads in one process get into each other's way."""
-    with _one_at_a_time:
-        return function(*arguments)
 
 
 def read_result(path: Path, name: str) -> Any:

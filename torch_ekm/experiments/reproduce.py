@@ -12,8 +12,6 @@ from ..description import load_object
 from ..exceptions import ParameterError, UnknownNameError
 from .config import FIRST_REPORTED, Setting
 from .jobs import run_jobs
-from .protocols.ablation import Ablation
-from .protocols.foresight import Foresight
 from .protocols.generalize import Generalize
 from .protocols.object_memory import ObjectMemory
 from .protocols.online import Online
@@ -23,9 +21,7 @@ from .reporting.report import Report
 PROTOCOLS: dict[str, type[Protocol]] = {
     "online": Online,
     "generalize": Generalize,
-    "ablation": Ablation,
     "adapt": ObjectMemory,
-    "foresight": Foresight,
 }
 #: Seeds that nobody tuned on, at least twenty for each case.
 REPORTED_SEEDS = tuple(range(FIRST_REPORTED, FIRST_REPORTED + 20))
@@ -93,7 +89,6 @@ def reproduce(
     folder: Path,
     processes: int = 1,
     on_done: Callable[[str], None] | None = None,
-    address: str | None = None,
 ) -> Report:
     """Run what has not been run yet, and write the report into ``folder``.
 
@@ -101,10 +96,10 @@ def reproduce(
     unbroken run: a job's result depends on nothing but its configuration and its seed.
 
     Args:
-        processes, on_done, address: of :func:`~torch_ekm.experiments.jobs.run_jobs`.
+        processes, on_done: of :func:`~torch_ekm.experiments.jobs.run_jobs`.
     """
     protocol, seeds = experiment.protocol, experiment.seeds
-    kept = run_jobs(protocol.run, experiment.jobs, folder / "runs", processes, on_done, address)
+    kept = run_jobs(protocol.run, experiment.jobs, folder / "runs", processes, on_done)
     read = protocol.record.from_json
     results = {name: [read(figures) for figures in session] for name, session in kept.items()}
     report = protocol.report(seeds, results, folder)

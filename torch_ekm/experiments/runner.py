@@ -22,7 +22,6 @@ from ..residual import ResidualLearner
 from ..simulation import Change, DisturbedPlant, SimulatedHand, Tug
 from .config import Setting, object_name
 from .learners import make_learner
-from .oracle import Omniscient, true_model
 from .records import NotGrasped, Record, Trial, TrialRecord, true_state
 
 _DEG = math.pi / 180
@@ -63,8 +62,6 @@ class Bench:
         if controller == "KM+S":
             self.plant = ServoInverse(self.plant, self.hand.hand, self.servo)
         self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model_options())
-        if setting.oracle:
-            self.plant, self.model = Omniscient(self.plant), true_model(self.hand, setting.model_options())
         self.learner: ResidualLearner | None = None
         self.encoding: GraspEncoding | None = None
         self.enhanced: EnhancedModel | None = None

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -71,6 +71,8 @@ class Generalize(Protocol):
     poses: bool = False
     """Keep the true poses of every motion, for pictures."""
 
+    bench: ClassVar[type[Bench]] = Bench
+
     def __post_init__(self) -> None:
         if not self.objects:
             raise ParameterError("objects", self.objects, "at least one object")
@@ -104,7 +106,7 @@ class Generalize(Protocol):
 
     def session(self, object: str, controller: str, seed: int) -> list[Record]:
         """Warm-up (E-KM only), all angles, then the probes, with one object and one seed."""
-        bench = Bench(self.setting.hardware_instance(seed), object, controller)
+        bench = self.bench(self.setting.hardware_instance(seed), object, controller)
         turn = partial(bench.trial, seed)
         angles = self.angles_of(object)
         middle = float(np.median(angles))

@@ -1,0 +1,222 @@
+"""Public records of streaming regression: ours beside what was published, and the peers run again.
+
+    TORCH_EKM_DATA=../shared/data python benchmarks/learners/public_streams.py
+
+Protocols are those of the libraries. river's regression track: river's own ``progressive_val_score``; a
+prediction of None, before the first sample, is not scored (river's forest does the same). CapyMOA's
+prequential evaluation on Fried: predict, score, learn; the first prediction is 0 and is scored, as that of
+MOA's learners. ``--quick`` runs the first samples only. Peers are run where they can be imported; CapyMOA
+needs Java and pandas 2, so it has its own environment.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+
+from torch_ekm import LearnHyperparameters, RobustWeight, SparseOnlineGP, Standardize
+from torch_ekm.interop import as_capymoa, as_river
+from torch_ekm.interop._default import default_learner
+from torch_ekm.typing import Array
+
+SEED = 1000
+
+
+def plain(d: int, m: int) -> SparseOnlineGP:
+    """A sparse online GP with parts of docs/how_to/choose_a_learner.md."""
+    return SparseOnlineGP(d, m, parts=[RobustWeight(3.0), Standardize(), LearnHyperparameters()])
+
+
+OURS = {"default": default_learner, "SOGP, adaptation": plain}
+
+
+@dataclass(frozen=True)
+class Published:
+    """A figure of others, and where it stands."""
+
+    stream: str
+    method: str
+    rmse: float | None
+    source: str
+    coverage: float | None = None
+    width: float | None = None
+
+
+_TRACK = "river, docs/benchmarks/Regression/index.md"
+_REGRESSION, _INTERVALS = "CapyMOA, tutorial on regression", "CapyMOA, tutorial on prediction intervals"
+PUBLISHED = (
+    Published("TrumpApproval", "Aggregated Mondrian forest (best)", 0.349421, _TRACK),
+    Published("TrumpApproval", "k nearest neighbours", 1.59417, _TRACK),
+    Published("ChickWeights", "Bagging of adaptive Hoeffding trees (best)", 36.6311, _TRACK),
+    Published("ChickWeights", "Aggregated Mondrian forest", 41.7123, _TRACK),
+    Published("Fried, first 1000", "kNN (best)", 3.03, _REGRESSION),
+    Published("Fried, first 1000", "SGBR", 3.09, _REGRESSION),
+    Published("Fried, first 1000", "SOKNL", 3.35, _REGRESSION),
+    Published("Fried", "kNN (best)", 2.72, _REGRESSION),
+    Published("Fried", "ARF", 3.31, _REGRESSION),
+    Published("Fried", "AdaPI", None, _INTERVALS, 0.963, 0.274),
+    Published("Fried", "MVE", None, _INTERVALS, 0.974, 0.296),
+)
+STREAMS = ("TrumpApproval", "ChickWeights", "Fried, first 1000", "Fried")
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was measured here; ``width`` is the mean width of 95 % intervals over the range of y."""
+
+    stream: str
+    method: str
+    samples: int
+    mae: float
+    rmse: float
+    milliseconds: float
+    coverage: float | None = None
+    width: float | None = None
+
+
+def track(name: str, method: str, model: Any, limit: int | None) -> Row:
+    """A river model on a data set of river's regression track, by river's own evaluation."""
+    from river import datasets, evaluate, metrics
+
+    data = getattr(datasets, name)()
+    data = list(data)[:limit]
+    begin = time.perf_counter()
+    scores: Any = evaluate.progressive_val_score(data, model, metrics.MAE() + metrics.RMSE())
+    milliseconds = 1e3 * (time.perf_counter() - begin) / len(data)
+    mae, rmse = (score.get() for score in scores)
+    return Row(name, method, len(data), mae, rmse, milliseconds)
+
+
+def river_peers() -> dict[str, Callable[[], Any]]:
+    """Those of the published table that lead on one of the two sets."""
+    from river import ensemble, forest, preprocessing, tree
+
+    def bagging() -> Any:
+        model = tree.HoeffdingAdaptiveTreeRegressor(bootstrap_sampling=False)
+        return preprocessing.StandardScaler() | ensemble.BaggingRegressor(model=model, seed=42)
+
+    return {
+        "Aggregated Mondrian forest, again": lambda: forest.AMFRegressor(seed=42),
+        "Bagging, again": bagging,
+    }
+
+
+def fried(method: str, factory: Callable, x: Array, y: Array) -> Iterator[Row]:
+    """The first 1000 samples and all of them, in one pass."""
+    model, spread = as_capymoa(learner=factory), float(np.ptp(y))
+    ends, begin = np.empty((len(y), 3)), time.perf_counter()
+    for t, (row, target) in enumerate(zip(x, y, strict=True)):
+        instance = SimpleNamespace(x=row, y_value=target)
+        ends[t] = model.predict_interval(instance)
+        model.train(instance)
+        if t + 1 in (1000, len(y)):
+            low, mean, high = ends[: t + 1].T
+            error, milliseconds = y[: t + 1] - mean, 1e3 * (time.perf_counter() - begin) / (t + 1)
+            held, width = (low <= y[: t + 1]) & (y[: t + 1] <= high), (high - low).mean() / spread
+            name = "Fried, first 1000" if t + 1 == 1000 else "Fried"
+            rms = math.sqrt(np.square(error).mean())
+            yield Row(name, method, t + 1, np.abs(error).mean(), rms, milliseconds, held.mean(), width)
+
+
+def capymoa_peers(x: Array, y: Array) -> Iterator[Row]:
+    """Its regressors and interval learners, by its own evaluation."""
+    from capymoa.evaluation import prequential_evaluation
+    from capymoa.regressor import SOKNL, AdaptiveRandomForestRegressor, KNNRegressor
+    from capymoa.stream import NumpyStream
+    from capymoa.uncertainty import MVE, AdaPI
+
+    stream = NumpyStream(x, y, dataset_name="Fried", target_type="numeric")
+    for name, n in (("Fried, first 1000", 1000), ("Fried", len(y))):
+        for kind in (KNNRegressor, SOKNL, AdaptiveRandomForestRegressor, AdaPI, MVE):
+            begin = time.perf_counter()
+            result = prequential_evaluation(stream, kind(stream.get_schema()), max_instances=n).cumulative
+            milliseconds = 1e3 * (time.perf_counter() - begin) / n
+            method, interval = f"CapyMOA {kind.__name__}, again", kind in (AdaPI, MVE)
+            if interval:
+                share, width = result.coverage() / 100, result.nmpiw() / 100
+                yield Row(name, method, n, math.nan, math.nan, milliseconds, share, width)
+            else:
+                yield Row(name, method, n, result.mae(), result.rmse(), milliseconds)
+
+
+def measure(data: Path | None, limit: int | None) -> Iterator[Row]:
+    """All rows, as they are ready."""
+    for name in ("TrumpApproval", "ChickWeights"):
+        for method, factory in OURS.items():
+            torch.manual_seed(SEED)
+            yield track(name, method, as_river(factory), limit)
+        for method, peer in river_peers().items():
+            yield track(name, method, peer(), limit)
+    if data is None:
+        return
+    values = np.loadtxt(data / "capymoa" / "fried.csv.gz", delimiter=",", skiprows=1, max_rows=limit)
+    x, y = values[:, :-1], values[:, -1]
+    for method, factory in OURS.items():
+        torch.manual_seed(SEED)
+        yield from fried(method, factory, x, y)
+    if importlib.util.find_spec("capymoa"):
+        yield from capymoa_peers(x, y)
+
+
+def tables(rows: list[Row]) -> str:
+    """A table for each stream, ours beside what was published, as Markdown."""
+    lines = [
+        "Errors are those of each sample before it is learned; seed "
+        f"{SEED}. \"95 %\": share of samples in the interval, and its mean width over the range of y. "
+        '"again": the peer, run on the same machine. "ms": time of a sample, one thread.', "",
+    ]  # fmt: skip
+    for stream in STREAMS:
+        mine = [row for row in rows if row.stream == stream]
+        if not mine:
+            continue
+        lines += [f"### {stream} ({mine[0].samples} samples)", ""]
+        lines += ["| | MAE | RMSE | 95 %: share | width | ms | source |", "|---|---|---|---|---|---|---|"]
+        for row in mine:
+            name = f"**{row.method}**" if row.method in OURS else row.method
+            cells = [_cell(row.mae), _cell(row.rmse), _percent(row.coverage), _percent(row.width)]
+            lines.append(f"| {name} | {' | '.join(cells)} | {row.milliseconds:.2f} | here |")
+        for one in PUBLISHED:
+            if one.stream == stream:
+                cells = ["", _cell(one.rmse), _percent(one.coverage), _percent(one.width), ""]
+                lines.append(f"| {one.method}, published | {' | '.join(cells)} | {one.source} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _cell(value: float | None) -> str:
+    return "" if value is None or math.isnan(value) else f"{value:.3f}" if value < 10 else f"{value:.2f}"
+
+
+def _percent(value: float | None) -> str:
+    return "" if value is None else f"{100 * value:.1f} %"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="the first 150 samples of each stream")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    data = os.environ.get("TORCH_EKM_DATA")
+    rows = []
+    for row in measure(Path(data) if data else None, 150 if options.quick else None):
+        print(row, file=sys.stderr, flush=True)
+        rows.append(row)
+    print(tables(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,219 @@
+"""Nominal models of the recorded motions, and what they predict: no motion, a constant Jacobian, the KM."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torch_ekm.description import HandDescription
+from torch_ekm.kinematics import GraspState
+from torch_ekm.kinematics.play import Play
+from torch_ekm.model import KinematicModel
+from torch_ekm.model.calibration import Calibration, calibrate
+from torch_ekm.typing import Array
+
+from .recordings import RecordedPath
+from .states import OPTIONS, STRIDE, States, cylinder
+
+CALIBRATED = ("springs", "moment_arms", "stiffness")
+"""Kinds of figures that are calibrated: chosen by halves of the recording set apart."""
+EVERY = 5
+"""States between two that the calibration takes for rests: 5 s."""
+_LARGEST = 0.2  # [m/rad]: a Jacobian five times that of the hand's middle is not believed
+_SMOOTH = 2  # frames on either side whose median is a less noisy pose
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """A nominal model by name."""
+
+    name: str
+    kind: str
+    """"none", "constant", "constant per object", "published" or "calibrated"."""
+    play: bool = False
+    """Whether the motors' motion goes through the play of the drive first."""
+
+
+NOMINALS = (
+    Nominal("no model", "none"),
+    Nominal("constant Jacobian", "constant"),
+    Nominal("constant Jacobian, play", "constant", play=True),
+    Nominal("constant Jacobian per object", "constant per object", play=True),
+    Nominal("KM, published figures", "published"),
+    Nominal("KM, published figures, play", "published", play=True),
+    Nominal("KM, calibrated, play", "calibrated", play=True),
+)
+"""The one fitted to each object sees what it is tested on: an upper reference for what is constant."""
+
+
+class Samples(NamedTuple):
+    """Of one object at one horizon; ``n`` samples that do not overlap, in the order of time."""
+
+    row: NDArray[np.int64]
+    """Which state each begins at ``(n,)``."""
+    path: NDArray[np.int64]
+    motion: Array
+    """x, y [m] and angle [rad], camera axes ``(n, 3)``."""
+    smooth: Array
+    """The same between medians of five frames."""
+    delta_a: Array
+    """Of the motors, left and right ``(n, 2)`` [rad]."""
+    transmitted: Array
+    """What of it leaves the play ``(n, 2)`` [rad]."""
+    changed: NDArray[np.bool_]
+    """A command changed in the second before or on the way ``(n,)``."""
+    loads: Array
+    """At the beginning ``(n, 2)``."""
+
+
+def through_play(paths: Sequence[RecordedPath], hand: HandDescription) -> list[Array]:
+    """Motion of the tendons in each step ``(n, 2)`` [rad]; at the beginning they hang at the closing end."""
+    play, most = Play.of(hand), max(map(len, paths))
+    commanded = torch.zeros(most, len(paths), 2, dtype=torch.float64)
+    for k, path in enumerate(paths):
+        commanded[: len(path), k] = torch.from_numpy(path.delta_a)
+    state, out = play.at(-0.5 * play.width.expand(len(paths), 2)), torch.zeros_like(commanded)
+    for t in range(most):
+        out[t], state = play.advance(state, commanded[t])
+    return [out[: len(path), k].numpy() for k, path in enumerate(paths)]
+
+
+def take_samples(
+    paths: Sequence[RecordedPath], states: States, moved: Sequence[Array], horizon: int
+) -> Samples:
+    """Samples of ``horizon`` steps, one after the other in each path.
+
+    Args:
+        states: of the same object.
+        moved: from :func:`through_play`.
+        horizon: a multiple of :data:`~torch_ekm.experiments.recorded_hand.states.STRIDE`.
+    """
+    rows = []
+    for k in np.flatnonzero(states.step % horizon == 0):
+        path, number, t = paths[states.path[k]], states.path[k], int(states.step[k])
+        end = t + horizon
+        if end >= len(path):
+            continue
+        recent = path.delta_a[max(0, t - STRIDE) : end]
+        smooth = [np.median(path.pose[max(0, i - _SMOOTH) : i + _SMOOTH + 1], axis=0) for i in (t, end)]
+        rows.append(
+            (
+                k,
+                number,
+                path.pose[end] - path.pose[t],
+                smooth[1] - smooth[0],
+                path.delta_a[t:end].sum(0),
+                moved[number][t:end].sum(0),
+                bool((np.diff(recent, axis=0) != 0).any()),
+                path.loads[t],
+            )
+        )
+    return Samples(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def jacobians(hand: HandDescription, states: States, *, rigid: bool) -> Array:
+    """``d(x, y, angle)/da`` at each state, camera axes ``(n, 3, 2)``.
+
+    Args:
+        hand: its springs, moment arms and stiffnesses.
+        rigid: without the stiffness of tendon and servo, which is not published.
+    """
+    obj = cylinder(0.045)  # its mass alone counts, and that not in the plane
+    model = KinematicModel(hand, obj, dataclasses.replace(OPTIONS, actuator_compliance=not rigid))
+    linear = model.linearize(states.grasps(), states.contact_set(obj.friction))
+    J = linear.object_jacobian[:, [0, 1, 5]].numpy()
+    believed = np.abs(J[:, :2]).max((1, 2)) < _LARGEST
+    usual = np.median(J[believed], axis=0) if believed.any() else np.zeros((3, 2))
+    J = np.where(believed[:, None, None], J, usual)
+    c, s = np.cos(states.camera[:, 0]), np.sin(states.camera[:, 0])
+    turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+    return np.concatenate([turn @ J[:, :2], J[:, 2:]], axis=1)
+
+
+def constant_jacobian(action: Array, motion: Array) -> Array:
+    """Least squares ``motion = J action``, ``(3, 2)``."""
+    return np.asarray(np.linalg.lstsq(action, motion, rcond=None)[0].T, dtype=np.float64)
+
+
+def predictions(
+    nominal: Nominal,
+    samples: Mapping[str, Samples],
+    by_state: Mapping[str, Mapping[str, Array]],
+    apart: str,
+) -> dict[str, Array]:
+    """Of each object, ``(n, 3)`` [m, m, rad].
+
+    Args:
+        by_state: Jacobians of each kind of KM, of each object.
+        apart: object that a constant Jacobian is fitted to.
+    """
+    found = {}
+    for name, taken in samples.items():
+        action = action_of(nominal, taken)
+        if nominal.kind == "none":
+            found[name] = np.zeros_like(taken.motion)
+            continue
+        if nominal.kind in by_state:
+            J = by_state[nominal.kind][name][taken.row]
+        else:
+            fitted = samples[apart if nominal.kind == "constant" else name]
+            J = constant_jacobian(action_of(nominal, fitted), fitted.motion)
+        found[name] = np.einsum("...ij,nj->ni" if J.ndim == 2 else "nij,nj->ni", J, action)
+    return found
+
+
+def action_of(nominal: Nominal, samples: Samples) -> Array:
+    """What the model takes for the motion of the tendons."""
+    return samples.transmitted if nominal.play else samples.delta_a
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """What :class:`~torch_ekm.model.calibration.Recording` asks of an observation."""
+
+    q: torch.Tensor
+    position: torch.Tensor
+    rotation: torch.Tensor
+    a: torch.Tensor
+    status: str
+    fingertip_force: None = None
+
+    @property
+    def state(self) -> GraspState:
+        return GraspState(self.q, self.position, self.rotation)
+
+
+@dataclass(frozen=True)
+class _Recorded:
+    observations: list[_Rest]
+
+
+def calibrate_hand(
+    hand: HandDescription, paths: Sequence[RecordedPath], states: States, diameter: float
+) -> Calibration:
+    """Springs, moment arms and stiffnesses from the recording set apart, a cylinder of known diameter."""
+    recordings, grasps = [], states.grasps()
+    for number, path in enumerate(paths):
+        a = np.concatenate([np.zeros((1, 2)), np.cumsum(path.delta_a, axis=0)])
+        own = np.flatnonzero((states.path == number) & (states.step % (EVERY * STRIDE) == 0))
+        recordings.append(
+            _Recorded(
+                [
+                    _Rest(
+                        grasps.q[k],
+                        grasps.position[k],
+                        grasps.rotation[k],
+                        torch.from_numpy(a[states.step[k]]),
+                        "held" if states.found[k] else "not_seen",
+                    )
+                    for k in own
+                ]
+            )
+        )
+    return calibrate(KinematicModel(hand, cylinder(diameter), OPTIONS), recordings, CALIBRATED)

@@ -1,1 +1,0 @@
-"""Predicting the recorded motions of a real hand: the Yale T42."""
