@@ -249,7 +249,7 @@ def test_expected_forces_and_measurements_give_the_gaussian_posterior(gamma, mea
     n_h = len(solution.mu)
     assert solution.solves == 0  # no inequality acts
     assert np.abs(solution.mu - mean[:n_h]).max() < 1e-4
-    assert np.abs(solution.covariance - covariance[:n_h, :n_h]).max() < 2e-4 * covariance.max()
+    assert np.abs(solution.covariance - covariance[:n_h, :n_h]).max() < 5e-4 * covariance.max()
     assert solution.violation < 1e-9
 
 

@@ -9,9 +9,8 @@ from pathlib import Path
 import torch
 
 sys.path.append(str(Path(__file__).parents[1] / "model"))
+from equilibrium import EquilibriumSolver
 from test_model_planar_hand import pinch
-
-from torch_ekm.model.equilibrium import EquilibriumSolver
 
 F64 = torch.float64
 

@@ -7,13 +7,13 @@ from functools import lru_cache
 
 import numpy as np
 import torch
+from equilibrium import EquilibriumSolver
 from model_toys import isotropic
 
 from torch_ekm.contact.contact_set import ContactSet
 from torch_ekm.description import load_hand
 from torch_ekm.kinematics import GraspState, HandKinematics
 from torch_ekm.model import KinematicModel, ModelOptions
-from torch_ekm.model.equilibrium import EquilibriumSolver
 
 F64 = torch.float64
 DEG = np.pi / 180

@@ -160,7 +160,7 @@ class Toy:
     a: torch.Tensor
 
     def solver(self, **options):
-        from torch_ekm.model.equilibrium import EquilibriumSolver
+        from equilibrium import EquilibriumSolver
 
         return EquilibriumSolver(self.model, self.state, self.contacts, **options)
 
@@ -170,7 +170,7 @@ class Toy:
         return known_forces(self.model.contact_kinematics(self.state, self.contacts), self.mu, self.lam)
 
     def equilibrium(self):
-        from torch_ekm.model.equilibrium import Equilibrium
+        from equilibrium import Equilibrium
 
         return Equilibrium(
             self.state, self.a, self.mu, self.lam, torch.zeros(0, dtype=F64), self.contacts, 0.0

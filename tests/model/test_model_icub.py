@@ -159,7 +159,7 @@ def test_a_joint_at_its_stop_is_held_and_a_pull_away_from_it_is_not():
 
 
 def test_how_much_a_stop_bears_is_told_by_the_fingertips():
-    from torch_ekm.model.equilibrium import EquilibriumSolver
+    from equilibrium import EquilibriumSolver
 
     model, _, at = gripped("box", friction=6.0)  # pulling hard leaves the usual cones
     names = model.hand.joint_names
@@ -202,7 +202,7 @@ def test_how_much_a_stop_bears_is_told_by_the_fingertips():
 
 @pytest.mark.parametrize("joints", [("thumb_2",), ("index_2", "middle_2")])
 def test_a_locked_joint_equals_the_exact_equilibria_with_it_held(joints):
-    from torch_ekm.model.equilibrium import EquilibriumSolver
+    from equilibrium import EquilibriumSolver
 
     model, _, at = gripped("box")
     held = tuple(model.hand.joint_names.index(name) for name in joints)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from equilibrium import EquilibriumSolver
 from model_icub import Held
 from model_toys import F64, contact_set, finite_difference_jacobian, relative_error
 
 from torch_ekm.description import load_hand
 from torch_ekm.kinematics import GraspState, HandKinematics
 from torch_ekm.model import KinematicModel, ModelOptions
-from torch_ekm.model.equilibrium import EquilibriumSolver
 
 
 def pinch():

@@ -17,7 +17,6 @@ from .forces.options import ForceOptions
 from .forces.solve import contact_forces
 from .grasp_analysis import GraspAnalysis, analyse, ferrari_canny
 from .signed_distance import signed_distance
-from .surface import TrackedContacts
 
 __all__ = [
     "ContactDetector",
@@ -28,7 +27,6 @@ __all__ = [
     "ForceStatus",
     "GraspAnalysis",
     "NearMiss",
-    "TrackedContacts",
     "analyse",
     "constraint_matrix",
     "contact_forces",

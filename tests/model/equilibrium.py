@@ -6,17 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from surface import TrackedContacts
 
-from ..contact.contact_kinematics import ContactKinematics, constraint_matrix
-from ..contact.contact_set import ContactSet
-from ..contact.surface import TrackedContacts
-from ..exceptions import EquilibriumError
-from ..kinematics.grasp_state import GraspState
-from ..typing import Float, Tensor
-from .force_balance import known_forces
-from .grasp_forces import GraspForces
-from .kinematic_model import KinematicModel
-from .stiffness.geometric import geometric_stiffness
+from torch_ekm.contact.contact_kinematics import ContactKinematics, constraint_matrix
+from torch_ekm.contact.contact_set import ContactSet
+from torch_ekm.exceptions import EquilibriumError
+from torch_ekm.kinematics.grasp_state import GraspState
+from torch_ekm.model.force_balance import known_forces
+from torch_ekm.model.grasp_forces import GraspForces
+from torch_ekm.model.kinematic_model import KinematicModel
+from torch_ekm.model.stiffness.geometric import geometric_stiffness
+from torch_ekm.typing import Float, Tensor
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import torch
 
-from ..exceptions import ParameterError
-from ..typing import Float, Tensor
-from .contact_kinematics import FLAT, contact_frames
-from .contact_set import ContactSet
+from torch_ekm.contact.contact_kinematics import FLAT, contact_frames
+from torch_ekm.contact.contact_set import ContactSet
+from torch_ekm.exceptions import ParameterError
+from torch_ekm.typing import Float, Tensor
 
 
 @dataclass(frozen=True)
