@@ -77,8 +77,6 @@ def options_of_all_kinds() -> dict[str, dict[str, Any]]:
     kernel = SquaredExponential(4, lengthscale=1.0)
     return {
         "bare": {"kernel": kernel},
-        "FITC": {"kernel": kernel, "projection": "fitc"},
-        "pruned by the mean": {"kernel": kernel, "pruning": "mean"},
         "frozen basis": {"kernel": kernel, "pruning": "freeze"},
         "Matern 3/2": {"kernel": Matern32(4, lengthscale=1.0)},
         "Matern 5/2": {"kernel": Matern52(4, lengthscale=1.0)},

@@ -65,7 +65,6 @@ LEARNERS = {
     "rls_as_given": lambda **o: RecursiveLeastSquares(3, 2, standardize=False, **o),
     "sogp_all": lambda **o: sogp(
         refresh_every=4,
-        projection="fitc",
         parts=[
             RobustWeight(3.0),
             CalibrateNoise(),

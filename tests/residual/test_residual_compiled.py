@@ -52,7 +52,7 @@ def all_parts() -> list:
 OPTIONS = {
     "plain": lambda shape: {},
     "matern32": lambda shape: {"kernel": Matern32(D, lengthscale=[1.0, 2.0, 3.0, 4.0], batch_shape=shape)},
-    "matern52": lambda shape: {"kernel": Matern52(D, variance=2.0), "projection": "fitc"},
+    "matern52": lambda shape: {"kernel": Matern52(D, variance=2.0)},
     "action": lambda shape: {
         "kernel": ActionLinearKernel(D, 2, state_kernel=Matern32(2, batch_shape=shape), batch_shape=shape),
         "parts": [Standardize(), RobustWeight(3.0)],
@@ -61,11 +61,11 @@ OPTIONS = {
         "kernel": DeepKernel(SquaredExponential(D), hidden=(8,)),
         "parts": [Standardize()],
     },
-    "mean": lambda shape: {"pruning": "mean", "novelty_threshold": 0.0, "jitter": 1e-4},
+    "nugget": lambda shape: {"jitter": 1e-4},
     "freeze": lambda shape: {"pruning": "freeze", "noise_variance": torch.tensor([0.1, 0.3]).double()},
     "wanders": lambda shape: {"parts": [ProcessNoise(0.01), RobustWeight(2.0)], "refresh_every": 8},
     "offset": lambda shape: {"parts": [Standardize(output_offset="learned"), RobustWeight(3.0)]},
-    "all": lambda shape: {"parts": all_parts(), "projection": "fitc"},
+    "all": lambda shape: {"parts": all_parts()},
 }
 
 

@@ -23,8 +23,6 @@ from .monitor import RobustWeight
 from .part import Host, Part
 from .recursion import Absorbed
 
-_PRUNING = {"kl": 0, "mean": 1, "freeze": 2}
-
 
 @cache
 def load_kernels() -> tuple[ModuleType, ModuleType] | None:
@@ -86,7 +84,7 @@ class CompiledLoops:
         if not self._takes(gp, x) or not _is_plain(y, (*self._batch, self._m)):
             return None
         posterior, flags, n_models, m = self._posterior, self._flags, self._n_models, self._m
-        flags[2], flags[3] = posterior.projection == "fitc", _PRUNING[posterior.pruning]
+        flags[2] = posterior.pruning == "freeze"
         k, prior, mask = self._none2, self._none1, self._all
         if self._given:
             x, y = gp.units.inputs(x), gp.units.targets(y)
@@ -181,7 +179,7 @@ class CompiledLoops:
         kernels, checks = modules
         self._given = own is None or units is None
         kind, n_actions = (kernels.GIVEN, 0) if self._given or own is None else own[0]
-        self._flags = np.array([kind, n_actions, 0, 0])
+        self._flags = np.array([kind, n_actions, 0])
         self._robust = np.array([part.threshold**2 for part in robust])
         self._levels = levels[0].numpy().reshape(n) if levels else np.empty(0)
         self._none1, self._none2, self._all = np.empty(0), np.empty((0, 0)), np.ones(n, np.bool_)

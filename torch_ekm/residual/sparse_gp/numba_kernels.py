@@ -23,8 +23,7 @@ from .recursion import TIE, TIE_KL
 #: what a kernel's ``kind`` means; GIVEN: its values come with the call
 SQUARED_EXPONENTIAL, MATERN32, MATERN52, GIVEN = 0, 1, 2, 3
 #: entries of ``flags``
-KIND, ACTIONS, FITC, PRUNING = 0, 1, 2, 3
-PRUNE_KL, PRUNE_MEAN, FREEZE = 0, 1, 2
+KIND, ACTIONS, FREEZE = 0, 1, 2
 
 _EPS, _TINY = np.finfo(np.float64).eps, np.finfo(np.float64).tiny
 # NaN and infinity keep their meaning: samples are tested for them in here.
@@ -106,8 +105,8 @@ def _remaining(c, q):
     return max(c + q, 100.0 * _EPS * q)
 
 
-@njit(types.int64(_I1, _F, _A1, _A1, _A1, _A3, _A3), **_COMMON)
-def _least_loss(flags, s2, active, c_diag, q_diag, moments, vectors):
+@njit(types.int64(_F, _A1, _A1, _A1, _A3, _A3), **_COMMON)
+def _least_loss(s2, active, c_diag, q_diag, moments, vectors):
     """The point that loses least when it is pruned, see ``pruning_loss``."""
     best, m, losses = np.inf, vectors.shape[2], np.empty(active.shape[0])
     for i in range(active.shape[0]):
@@ -119,12 +118,10 @@ def _least_loss(flags, s2, active, c_diag, q_diag, moments, vectors):
         loss = 0.0
         for o in range(m):
             loss += vectors[0, i, o] * vectors[0, i, o]
-        loss /= rest
-        if flags[PRUNING] == PRUNE_KL:
-            loss += m * (moments[2, i, i] / s2 / q + math.log(rest / q))
+        loss = loss / rest + m * (moments[2, i, i] / s2 / q + math.log(rest / q))
         losses[i] = loss
         best = min(best, loss)
-    best += TIE * abs(best) + (TIE_KL * m if flags[PRUNING] == PRUNE_KL else 0.0)
+    best += TIE * abs(best) + TIE_KL * m
     for i in range(active.shape[0]):
         if losses[i] <= best:
             return i
@@ -210,10 +207,8 @@ def _absorb(
         level[0] += RATE * (distrusted - level[0])
         noise = (s2 + v) / weight - v
     full = count[0] == capacity
-    novel = gamma > threshold * prior and not (flags[PRUNING] == FREEZE and full)
+    novel = gamma > threshold * prior and not (flags[FREEZE] and full)
     dropped = 0.0 if novel else gamma
-    if flags[FITC]:
-        noise += dropped
     gain, precision = 1.0 / (noise + v - dropped), s2 / noise
     basis[slot] = z
     told[0], told[1], told[2], told[3] = gamma / max(prior, _TINY), nis, weight, v
@@ -260,7 +255,7 @@ def _absorb(
     for j in range(M):
         c[j] = C[j, j] - gain * s[j] * s[j]
         q[j] = Q[j, j] + grow * e[j] * e[j]
-    i = _least_loss(flags, s2, active, c, q, moments, vectors)
+    i = _least_loss(s2, active, c, q, moments, vectors)
     for j in range(M):
         c[j] = C[i, j] - gain * s[i] * s[j]
         q[j] = Q[i, j] + grow * e[i] * e[j]
@@ -298,7 +293,7 @@ def absorb_fleet(
     """One sample per model where ``on``.
 
     Args:
-        flags: kind of kernel, width of the action, FITC, pruning.
+        flags: kind of kernel, width of the action, whether a full basis stays.
         x, y, errors: one model's after the other's.
         given_k, given_prior: k and k** of a kernel that is not known here, in the learner's units.
         robust, levels: square of a robust weight's threshold, share of samples distrusted; or empty.

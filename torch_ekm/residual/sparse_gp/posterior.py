@@ -31,7 +31,6 @@ class SparsePosterior(nn.Module):
         *,
         novelty_threshold: float,
         jitter: float,
-        projection: str,
         pruning: str,
         batch_shape: tuple[int, ...] = (),
         device: torch.device | str | None = None,
@@ -40,13 +39,11 @@ class SparsePosterior(nn.Module):
         for name, value in (("novelty_threshold", novelty_threshold), ("jitter", jitter)):
             if not 0 <= value < 1:
                 raise ParameterError(name, value, "in [0, 1)")
-        if projection not in ("kl", "fitc"):
-            raise ParameterError("projection", projection, "'kl' or 'fitc'")
-        if pruning not in ("kl", "mean", "freeze"):
-            raise ParameterError("pruning", pruning, "'kl', 'mean' or 'freeze'")
+        if pruning not in ("kl", "freeze"):
+            raise ParameterError("pruning", pruning, "'kl' or 'freeze'")
         self.capacity, self.batch_shape, self.out_features = capacity, batch_shape, out_features
         self.novelty_threshold, self.jitter = novelty_threshold, jitter
-        self.projection, self.pruning = projection, pruning
+        self.pruning = pruning
         factory = {"dtype": torch.float64, "device": device}
         # One slot more than the capacity: a new point moves in before another is pruned. What a
         # free slot holds in `basis` is meaningless; its rows and columns elsewhere are 0.

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import cache
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 
@@ -45,8 +44,7 @@ def absorb(
         novel:       Q += p p'/gamma,  p = e - 1_slot
 
     Csato & Opper 2002, eqs. 2.12-2.14 and the appendix; the projection's D is their
-    ``-1/(eta r)``. A robust weight w and FITC replace s2 by ``(s2 + v)/w - v``
-    ``(+ gamma if projected)``.
+    ``-1/(eta r)``. A robust weight w replaces s2 by ``(s2 + v)/w - v``.
 
     Args:
         s2: noise variance of the gain.
@@ -77,9 +75,7 @@ def absorb(
     novel = gamma > posterior.novelty_threshold * prior
     if posterior.pruning == "freeze":
         novel = novel & ~full
-    dropped = gamma * ~novel  # novelty that a projection ignores (KL) or counts as noise (FITC)
-    if posterior.projection == "fitc":
-        noise = noise + dropped
+    dropped = gamma * ~novel  # novelty that a projection ignores
     gain, precision = 1.0 / (noise + v - dropped), s2 / noise
     if mask is not None:
         novel, gain, precision = novel & (mask > 0), gain * mask, precision * mask
@@ -175,17 +171,16 @@ def pruning_loss(
     """``2 KL = |a|^2/(c+q) + m (w/q + ln(1 + c/q))``: exact loss of pruning each point (Csato's thesis).
 
     a, c, q, w are a point's entries in alpha and on the diagonals of C, Q and W. The first term is the
-    loss in the mean (Csato & Opper 2002), which is all that counts with ``pruning="mean"``.
+    loss in the mean (Csato & Opper 2002).
     """
     rest = _remaining(c, q)
     loss = posterior.alpha.square().sum(-1) / rest
-    return loss if posterior.pruning == "mean" else loss + posterior.out_features * (w / q + (rest / q).log())
+    return loss + posterior.out_features * (w / q + (rest / q).log())
 
 
 def _with_ties(least: Tensor, posterior: SparsePosterior) -> Tensor:
     """Losses up to this differ from the least one by rounding at most: the first of them goes."""
-    rounding = 0.0 if posterior.pruning == "mean" else TIE_KL * posterior.out_features
-    return least + TIE * least.abs() + rounding
+    return least + TIE * least.abs() + TIE_KL * posterior.out_features
 
 
 def _remaining(c: Tensor, q: Tensor) -> Tensor:
@@ -209,17 +204,5 @@ def _weight(weighing: Sequence[Part], nis: Tensor, mask: Tensor | None) -> Tenso
 
 
 def _any(flag: Tensor) -> bool:
-    """Skip work that no model needs where looking is free: on the CPU, outside a compiled graph."""
-    return flag.is_cuda or torch.compiler.is_compiling() or bool(flag.any())
-
-
-@cache
-def compiled_absorb(device: str) -> Callable:
-    """One compiled step for all learners; kept here, since a compiled function cannot be copied.
-
-    Args:
-        device: type of device. On the CPU the calls between the kernels cost a tenth of the step when
-            Python makes them: C++ does.
-    """
-    options: dict[str, Any] | None = {"cpp_wrapper": True} if device == "cpu" else None
-    return torch.compile(absorb, dynamic=False, options=options)
+    """Skip work that no model needs where looking is free: on the CPU."""
+    return flag.is_cuda or bool(flag.any())

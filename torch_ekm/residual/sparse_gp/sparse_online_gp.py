@@ -20,7 +20,7 @@ from .compiled import CompiledLoops
 from .defaults import chosen_parts
 from .part import P, Part, Sample, Units
 from .posterior import SparsePosterior
-from .recursion import Absorbed, absorb, compiled_absorb
+from .recursion import Absorbed, absorb
 
 _LATEST = 8  # rounds of ``refresh_every`` after which the caches are rebuilt in any case
 _DRIFT = 1e-8  # beyond which they are rebuilt at once, see SparsePosterior.drift
@@ -68,16 +68,14 @@ class SparseOnlineGP(DoubleStateLearner):
         noise_variance: s2 in the (standardised) output's squared units, one number or one per output.
         novelty_threshold: smallest ``gamma / k**`` of a new basis vector.
         jitter: nugget on k(x, x) at basis vectors, relative to k**.
-        projection: ``"kl"``, or ``"fitc"``: novelty of a projected sample counts as noise.
-        pruning: the point goes that loses least: ``"kl"`` exact loss, ``"mean"`` its first term;
-            ``"freeze"``: a full basis stays.
+        pruning: ``"kl"``: the point goes that loses least; ``"freeze"``: a full basis stays.
         parts: what it does beside; copied.
         refresh_every: samples after which parts may change the state, and the caches are rebuilt. Without a
             part that does, and on the CPU, one looks whether they have drifted (four times as often where
             they do); they are rebuilt when they have, and at the latest after eight times as many.
         backend: ``"auto"``: where numba is installed (extra ``fast``) compiled loops do updates and queries
             of one sample per model, on the CPU in float64; they agree with torch to rounding. ``"torch"``:
-            never. ``"inductor"``: updates through torch.compile, which needs a C++ compiler and a minute.
+            never.
         options: see ResidualLearner.
 
     Raises:
@@ -97,18 +95,17 @@ class SparseOnlineGP(DoubleStateLearner):
         noise_variance: float | Tensor = 0.1,
         novelty_threshold: float = 1e-4,
         jitter: float = 1e-6,
-        projection: Literal["kl", "fitc"] = "kl",
-        pruning: Literal["kl", "mean", "freeze"] = "kl",
+        pruning: Literal["kl", "freeze"] = "kl",
         parts: Iterable[nn.Module] | None = None,
         standardize: bool = True,
         output_offset: Literal["zero", "learned"] = "zero",
         refresh_every: int = 32,
-        backend: Literal["auto", "torch", "inductor"] = "auto",
+        backend: Literal["auto", "torch"] = "auto",
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        if backend not in ("auto", "torch", "inductor"):
-            raise ParameterError("backend", backend, "'auto', 'torch' or 'inductor'")
+        if backend not in ("auto", "torch"):
+            raise ParameterError("backend", backend, "'auto' or 'torch'")
         self.backend = backend
         self.capacity = check_count("capacity", capacity)
         self.refresh_every = check_count("refresh_every", refresh_every)
@@ -124,7 +121,6 @@ class SparseOnlineGP(DoubleStateLearner):
             self.capacity,
             novelty_threshold=novelty_threshold,
             jitter=jitter,
-            projection=projection,
             pruning=pruning,
             batch_shape=shape,
             device=self.device,
@@ -252,8 +248,8 @@ class SparseOnlineGP(DoubleStateLearner):
     def set_basis(self, x: Float[Tensor, "n *batch in"]) -> None:
         """Start again from the prior on given basis vectors (at most ``capacity``).
 
-        With ``pruning="freeze"`` and a full basis the posterior is then the DTC approximation
-        (FITC with ``projection="fitc"``) on these inducing points.
+        With ``pruning="freeze"`` and a full basis the posterior is then the DTC approximation on these
+        inducing points.
 
         Raises:
             ShapeError: the shape does not fit, or there are more points than the capacity.
@@ -316,9 +312,8 @@ class SparseOnlineGP(DoubleStateLearner):
     def _learn(self, x: Tensor, y: Tensor, on: Tensor | None) -> Absorbed:
         if self._loops is not None and (done := self._loops.absorb(self, x, y, on)) is not None:
             return done
-        step = compiled_absorb(x.device.type) if self.backend == "inductor" else absorb
         z, t = self.units.inputs(x), self.units.targets(y)
-        return step(self.posterior, z, t, self.kernel, self.shared_noise(), on, self.weighing)
+        return absorb(self.posterior, z, t, self.kernel, self.shared_noise(), on, self.weighing)
 
     def _is_stale(self, n: int) -> bool:
         """Whether the caches must be made again after n samples although no part changed the state."""
