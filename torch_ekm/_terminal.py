@@ -58,7 +58,7 @@ def say(text: object) -> None:
 
 
 def say_error(text: object) -> None:
-    """A line on the error stream."""
+    """Print a line on the error stream, headed by the program's name."""
     line = Text.assemble(("torch-ekm:", "bold red"), " ", as_printed(text))
     Console(stderr=True).print(line, soft_wrap=True)
 

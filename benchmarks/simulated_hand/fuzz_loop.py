@@ -24,7 +24,8 @@ from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import EKMError, GraspError
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantStatus, PlantWrapper
-from torch_ekm.simulation import FuzzedPlant, PlantConfig, SimulatedHand, preset
+from torch_ekm.simulation import PlantConfig, SimulatedHand, preset
+from torch_ekm.testing import FuzzedPlant
 
 DEG = math.pi / 180
 STEP = 16 * DEG  # of ActuatorLimit

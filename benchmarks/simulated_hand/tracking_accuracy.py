@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from torch_ekm._extras import require
 from torch_ekm.kinematics.se3 import exp, log
-from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera, TrackerOptions
+from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera
 from torch_ekm.simulation import CardScene, ImageQuality, PlacedCard, SimulatedCamera
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ def measure_tracking(
     seed: int = 0,
     camera: SimulatedCamera | None = None,
     known_camera: PinholeCamera | None = None,
-    options: TrackerOptions | None = None,
+    edges: bool = True,
     max_tilt_deg: float = 50.0,
 ) -> TrackingAccuracy:
     """Track two boards at 0.35 to 0.45 m, each tilted up to ``max_tilt_deg``, in any direction and spin.
@@ -75,12 +75,12 @@ def measure_tracking(
         seed: of the first one.
         camera: takes the pictures.
         known_camera: what the tracker takes the lens for; by default the truth.
-        options: of the tracker.
+        edges: refine the poses on the edges of the markers.
         max_tilt_deg: largest angle between a card's normal and the line of sight [deg].
     """
     camera = camera or SimulatedCamera()
     boards = MarkerBoard(0), MarkerBoard(4)
-    tracker = MarkerTracker(known_camera or camera.camera, *boards, options)
+    tracker = MarkerTracker(known_camera or camera.camera, *boards, edges=edges)
     # columns: twist in the camera frame (6), about the normal, along and across the line of sight
     board_errors, twists, chi2, clock = [], [], [], np.zeros(2)
     for k in range(n_frames):
@@ -168,8 +168,7 @@ def main() -> None:
     require("cv2").setNumThreads(1)
     torch.set_num_threads(1)
     camera = SimulatedCamera(quality=ImageQuality(blur=given.blur, noise=given.noise))
-    options = TrackerOptions(edges=not given.corners_only)
-    print(measure_tracking(given.frames, given.seed, camera, options=options))
+    print(measure_tracking(given.frames, given.seed, camera, edges=not given.corners_only))
 
 
 if __name__ == "__main__":

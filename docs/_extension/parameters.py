@@ -27,7 +27,6 @@ GROUPS = {
     "Controller: size of a step": ("torch_ekm.control", ["LimitingFunction", "StepBound"]),
     "Closed loop": ("torch_ekm.control", ["StoppingRule", "Caution", "Guards"]),
     "Foresight": ("torch_ekm.foresight", ["BlindOptions", "SlipLimit"]),
-    "Sensing": ("torch_ekm.sensing", ["TrackerOptions", "StreamOptions"]),
     "Simulation": ("torch_ekm.simulation", ["PlantConfig", "ImageQuality", "HallQuality"]),
 }
 

@@ -15,7 +15,8 @@ from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantStatus, ServoInverse, Stamps
-from torch_ekm.simulation import FuzzedPlant, SimulatedHand
+from torch_ekm.simulation import SimulatedHand
+from torch_ekm.testing import FuzzedPlant
 
 DEG = math.pi / 180
 RULE = StoppingRule(max_steps=25)

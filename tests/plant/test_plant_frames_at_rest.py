@@ -7,6 +7,7 @@ import math
 
 import pytest
 import torch
+from fakes import FakePlant
 
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.kinematics.se3 import exp, log
@@ -17,7 +18,7 @@ NOISE = torch.tensor([2e-4] * 3 + [0.15 * DEG] * 3, dtype=torch.float64)
 POSE = exp(torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64))
 
 
-class Noisy:
+class Noisy(FakePlant):
     """A hand at rest; ``change(k, observation)`` spoils the k-th reading."""
 
     def __init__(self, noise=NOISE, change=lambda _, seen: seen, covariance=False) -> None:
@@ -33,13 +34,8 @@ class Noisy:
         self.count += 1
         return self.change(self.count - 1, seen)
 
-    def reset(self, seed: int) -> Observation:
-        return self.observe()
-
     def command(self, delta_a: torch.Tensor) -> Observation:
         return dataclasses.replace(self.observe(), info={"events": ("tug",)})
-
-    def close(self) -> None: ...
 
 
 def errors(plant: Noisy, frames: int, n: int = 300) -> torch.Tensor:

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from fakes import FakePlant
 
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
 from torch_ekm.kinematics import ServoModel
@@ -21,7 +22,7 @@ HAND = SimpleNamespace(
 )
 
 
-class Servos:
+class Servos(FakePlant):
     """Three motors, ``w = D(v + b + fresh; d)``, clipped to their range."""
 
     def __init__(self, seed: int = 0) -> None:
@@ -30,23 +31,16 @@ class Servos:
         self.fresh, self.blocked = 0.1 * DEG, np.zeros(3, bool)
         self.a = np.zeros(3)
 
-    def reset(self, seed: int) -> Observation:
-        return self.observe()
-
     def observe(self) -> Observation:
         a = torch.from_numpy(self.a.copy())
         return Observation(a, a, ORIGIN, EYE, a)
 
-    def command(self, delta_a: torch.Tensor) -> Observation:
+    def move(self, delta_a: torch.Tensor) -> None:
         reach = REACH
         x = np.clip(self.a + delta_a.numpy(), -reach, reach) - self.a + self.b
         x = x + self.fresh * self.rng.uniform(-1, 1, 3)
         w = np.where(self.blocked, 0.0, x - np.clip(x, -self.d, self.d))
         self.a = np.clip(self.a + w, -reach, reach)
-        return self.observe()
-
-    def close(self) -> None:
-        pass
 
 
 def moves(n: int, seed: int = 1, size: float = 2.0) -> list[torch.Tensor]:

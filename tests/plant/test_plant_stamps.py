@@ -6,6 +6,7 @@ import dataclasses
 
 import pytest
 import torch
+from fakes import ScriptedPlant
 
 from torch_ekm.plant import FramesAtRest, Observation, Stamps, Trajectory
 
@@ -27,17 +28,8 @@ def test_all_readings_are_of_the_observations_time_unless_told() -> None:
 
 
 def test_the_mean_of_frames_is_no_newer_than_any_of_them() -> None:
-    class Camera:
-        def __init__(self) -> None:
-            self.stamps = iter([4.9, 4.8, 5.0])
-
-        def observe(self) -> Observation:
-            return reading(5.0, next(self.stamps))
-
-        def __getattr__(self, name: str):
-            raise AttributeError(name)
-
-    seen = FramesAtRest(Camera(), 3).observe()
+    camera = ScriptedPlant(reading(5.0, pose) for pose in (4.9, 4.8, 5.0))
+    seen = FramesAtRest(camera, 3).observe()
     assert seen.taken == Stamps(5.0, 5.0, 4.8, 5.0)
 
 

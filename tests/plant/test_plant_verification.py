@@ -170,7 +170,7 @@ except OutputError as error:
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of a process")
 def test_a_full_disk_is_told_and_leaves_the_log_as_it_was(tmp_path: Path) -> None:
     command = [sys.executable, "-c", FULL, str(Path(__file__).parent), str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr  # HDF5 would crash the process
     assert "trial_000001.h5 cannot be written: File too large" in done.stdout
     assert wrong(tmp_path) == []

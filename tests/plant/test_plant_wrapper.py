@@ -6,6 +6,7 @@ import dataclasses
 
 import pytest
 import torch
+from fakes import FakePlant
 
 from torch_ekm.exceptions import NonFiniteError
 from torch_ekm.plant import Observation, Plant, PlantWrapper, Truth
@@ -13,13 +14,14 @@ from torch_ekm.plant import Observation, Plant, PlantWrapper, Truth
 EYE, ORIGIN = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
 
 
-class Counter:
+class Counter(FakePlant):
     """Reports how often it was commanded."""
 
     rotation_axis = "beyond the contract"
 
     def __init__(self) -> None:
-        self.count, self.closed = 0, False
+        super().__init__()
+        self.count = 0
 
     def reset(self, seed: int) -> Observation:
         self.count = seed
@@ -29,12 +31,8 @@ class Counter:
         q = torch.full((2,), float(self.count), dtype=torch.float64)
         return Observation(q, q[:1], ORIGIN, EYE, q[:1], truth=Truth(q, ORIGIN, EYE))
 
-    def command(self, delta_a: torch.Tensor) -> Observation:
+    def move(self, delta_a: torch.Tensor) -> None:
         self.count += int(delta_a)
-        return self.observe()
-
-    def close(self) -> None:
-        self.closed = True
 
 
 class Shifted(PlantWrapper):

@@ -7,14 +7,17 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from fakes import FakePlant
 
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import ObjectLostError, ParameterError, ShapeError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.plant import Observation, Plant, PlantStatus, Truth
-from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera, StreamOptions, TrackStatus
-from torch_ekm.simulation import ICUB_PALM_MOUNT, GraspView, HallSensors, SensedPlant
+from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera, TrackStatus
+from torch_ekm.simulation import HallSensors, SensedPlant
+from torch_ekm.simulation.imaging.grasp_view import GraspView
+from torch_ekm.simulation.sensed_plant import ICUB_PALM_MOUNT
 
 DEG = np.pi / 180
 
@@ -42,7 +45,7 @@ def grasp(hand, turn_deg=0.0):
     return q, torch.tensor([0.035, -0.012, 0.045], dtype=torch.float64), turned
 
 
-class Puppet:
+class Puppet(FakePlant):
     """A plant that turns its object by ``delta_a[0]`` and moves nothing else."""
 
     def __init__(self, hand):
@@ -61,12 +64,8 @@ class Puppet:
         wrong = torch.zeros_like(position)  # nobody may read the pose but from the images
         return Observation(q, a, wrong, torch.eye(3).double(), torch.ones(3), truth=truth)
 
-    def command(self, delta_a):
+    def move(self, delta_a):
         self.turn += float(delta_a[0])
-        return self.observe()
-
-    def close(self):
-        self.turn = None
 
 
 def test_scene_is_the_grasp_seen_from_the_camera(hand, obj):
@@ -144,20 +143,15 @@ def test_same_seed_same_observations(hand, obj):
 
 
 def test_object_not_seen_is_said(hand, obj):
-    plant = SensedPlant(Puppet(hand), hand, obj, looks=1)
+    class Hidden(Puppet):
+        def observe(self):
+            return dataclasses.replace(super().observe(), status=PlantStatus.NOT_SEEN)
+
+    plant = SensedPlant(Hidden(hand), hand, obj)
     with pytest.raises(ParameterError, match="reset"):
         plant.observe()
-    first = plant.reset(seed=0)
-    plant._video.options = StreamOptions(hidden=0.999)
-    unseen = plant.observe()
-    assert unseen.status is PlantStatus.NOT_SEEN
-    assert unseen.info["track"].status in (TrackStatus.PALM_HIDDEN, TrackStatus.OBJECT_HIDDEN)
-    assert torch.equal(unseen.position, first.position)  # the last pose that was seen
-    blind = SensedPlant(Puppet(hand), hand, obj, stream=StreamOptions(hidden=0.999), looks=2)
-    with pytest.raises(ObjectLostError, match="2 frames"):
-        blind.reset(seed=0)
-    with pytest.raises(ParameterError, match="looks"):
-        SensedPlant(Puppet(hand), hand, obj, looks=0)
+    with pytest.raises(ObjectLostError, match="5 frames"):
+        plant.reset(seed=0)
 
 
 def test_what_the_inner_plant_does_not_see_is_hidden_in_the_pictures(hand, obj):
@@ -172,6 +166,7 @@ def test_what_the_inner_plant_does_not_see_is_hidden_in_the_pictures(hand, obj):
     assert unseen.info["track"].status is TrackStatus.OBJECT_HIDDEN
     assert torch.equal(unseen.position, first.position)
     assert unseen.info["estimate"]["pose_covariance"].isnan().all()
+    assert unseen.info["raw"]["corners"].isnan().any()
 
 
 def test_the_camera_shows_the_picture_that_has_arrived(hand, obj):
@@ -199,16 +194,7 @@ def test_raw_readings_of_an_observation(hand, obj):
     again = MarkerTracker(plant.camera.camera, *plant.boards).track(image)
     assert torch.equal(again.position, seen.position)
     np.testing.assert_array_equal(corners[5], again.markers[5])
-    plant._video.options = StreamOptions(hidden=0.999)
-    plant.looks = 1
-    assert plant.observe().info["raw"]["corners"].isnan().any()
-
-
-def test_several_looks_get_over_dropped_frames(hand, obj):
-    plant = SensedPlant(Puppet(hand), hand, obj, stream=StreamOptions(dropped=0.5, seed=3), looks=8)
-    plant.reset(seed=0)
-    assert all(plant.observe().status is PlantStatus.HELD for _ in range(10))
-    assert plant._frames > 13
+    assert np.isfinite(corners).all()
 
 
 def test_a_wrong_lens_or_mount_shows(hand, obj):

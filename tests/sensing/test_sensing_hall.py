@@ -281,8 +281,8 @@ def test_bad_samples_are_refused(hand, generator):
         sensors.read(torch.zeros(3), generator)
     with pytest.raises(ParameterError, match="hall_sensors"):
         HallSensors(dataclasses.replace(hand, hall_sensors=()))
-    with pytest.raises(ParameterError, match="half_turn"):
-        HallQuality(half_turn_deg=(80.0, 89.0))
+    with pytest.raises(ParameterError, match="open_overdrive"):
+        HallQuality(open_overdrive=(0.1, 0.0))
 
 
 # -- all joints together --------------------------------------------------------------------------

@@ -8,7 +8,8 @@ import pytest
 from torch_ekm.description import Shape
 from torch_ekm.exceptions import ParameterError, ShapeError, UnknownNameError
 from torch_ekm.sensing import MarkerBoard, PinholeCamera
-from torch_ekm.simulation import CardScene, ConvexBody, ImageQuality, PlacedCard, SimulatedCamera
+from torch_ekm.simulation import CardScene, ImageQuality, PlacedCard, SimulatedCamera
+from torch_ekm.simulation.imaging.card_scene import ConvexBody
 
 cv2 = pytest.importorskip("cv2")
 

@@ -11,16 +11,10 @@ from tracking_accuracy import measure_tracking
 
 from torch_ekm.exceptions import ObjectLostError, ParameterError, ShapeError
 from torch_ekm.kinematics.se3 import exp, log
-from torch_ekm.sensing import (
-    BoardPose,
-    MarkerBoard,
-    MarkerTracker,
-    PinholeCamera,
-    Track,
-    TrackerOptions,
-    TrackStatus,
-)
-from torch_ekm.simulation import CardScene, ConvexBody, PlacedCard, SimulatedCamera
+from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera, Track, TrackStatus
+from torch_ekm.sensing.vision.board_pose import BoardPose
+from torch_ekm.simulation import CardScene, PlacedCard, SimulatedCamera
+from torch_ekm.simulation.imaging.card_scene import ConvexBody
 
 cv2 = pytest.importorskip("cv2")
 
@@ -108,7 +102,7 @@ def test_accuracy_at_nominal_noise():
     assert result.out_of_plane_deg < 0.4
     assert result.lateral_mm < 0.3
     assert abs(result.depth_bias_mm) < 0.2
-    corners = measure_tracking(24, seed=0, options=TrackerOptions(edges=False))
+    corners = measure_tracking(24, seed=0, edges=False)
     assert result.out_of_plane_deg < 0.6 * corners.out_of_plane_deg
     assert result.in_plane_deg < 0.5 * corners.in_plane_deg
 
@@ -179,24 +173,6 @@ def test_small_motion_is_followed(pose_of, simulated, rng):
         assert track.ok, step
 
 
-def test_still_palm_is_averaged_and_bridged(pose_of, simulated, rng):
-    scene = scene_of(pose_of)
-    hidden = dataclasses.replace(scene, bodies=(ball_before(scene.cards[0]),))
-    steady = MarkerTracker(simulated.camera, PALM, OBJECT, TrackerOptions(palm_frames=20))
-    plain = MarkerTracker(simulated.camera, PALM, OBJECT)
-    for _ in range(10):
-        image = simulated.render(scene, rng)
-        track, single = steady.track(image), plain.track(image)
-    # the object's share is the same in both, the palm's a tenth
-    assert track.covariance.diagonal()[3:].sum() < 0.8 * single.covariance.diagonal()[3:].sum()
-    image = simulated.render(hidden, rng)
-    assert plain.track(image).status is TrackStatus.PALM_HIDDEN
-    bridged = steady.track(image)
-    assert bridged.ok
-    assert bridged.palm is None
-    assert (bridged.position - track.position).abs().max() < 5e-4
-
-
 @pytest.mark.parametrize(("wanted", "enough"), [(1, True), (2, False)])
 def test_one_marker_alone_is_not_enough(pose_of, simulated, rng, wanted, enough):
     boards = MarkerBoard(0), MarkerBoard(4, columns=2, rows=1)
@@ -205,8 +181,7 @@ def test_one_marker_alone_is_not_enough(pose_of, simulated, rng, wanted, enough)
     corner = card.pose[:3, :3] @ [0.018, 0.0, 0.0] + card.pose[:3, 3]
     scene = dataclasses.replace(scene, bodies=(ConvexBody(0.8 * corner[None], np.array([0.007])),))
     image = simulated.render(scene, rng)
-    options = TrackerOptions(min_markers=wanted)
-    track = MarkerTracker(simulated.camera, *boards, options).track(image)
+    track = MarkerTracker(simulated.camera, *boards, min_markers=wanted).track(image)
     assert track.n_markers == 5
     assert (track.object is not None) == enough
     assert (track.status is TrackStatus.OBJECT_HIDDEN) != enough
@@ -218,8 +193,8 @@ def test_more_markers_may_be_asked_for(pose_of, simulated, rng):
     finger = ConvexBody.capsule(tip, tip - np.array([0.0, 0.06, 0.0]), 0.006)
     image = simulated.render(dataclasses.replace(scene, bodies=(finger,)), rng)
     for wanted, status in ((3, TrackStatus.OK), (4, TrackStatus.OBJECT_HIDDEN)):
-        options = TrackerOptions(min_markers=wanted)
-        assert MarkerTracker(simulated.camera, PALM, OBJECT, options).track(image).status is status
+        tracker = MarkerTracker(simulated.camera, PALM, OBJECT, min_markers=wanted)
+        assert tracker.track(image).status is status
 
 
 def test_boards_must_be_told_apart():
@@ -227,6 +202,5 @@ def test_boards_must_be_told_apart():
         MarkerTracker(PinholeCamera(), PALM, MarkerBoard(3))
     with pytest.raises(ParameterError, match="dictionary"):
         MarkerTracker(PinholeCamera(), PALM, MarkerBoard(4, dictionary="DICT_5X5_50"))
-    for bad in ({"min_markers": 0}, {"max_step": 0.0}, {"corner_std": -1.0}, {"palm_frames": 0}):
-        with pytest.raises(ParameterError, match=next(iter(bad))):
-            TrackerOptions(**bad)
+    with pytest.raises(ParameterError, match="min_markers"):
+        MarkerTracker(PinholeCamera(), PALM, OBJECT, min_markers=0)

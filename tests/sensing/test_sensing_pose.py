@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from torch_ekm.kinematics.se3 import exp, log
-from torch_ekm.sensing import BoardPose, MarkerBoard, PinholeCamera, estimate_board_pose, refine_on_edges
-from torch_ekm.sensing.vision.board_pose import projection_jacobian
-from torch_ekm.sensing.vision.static_pose import StaticPose
-from torch_ekm.simulation import CardScene, ConvexBody, ImageQuality, PlacedCard, SimulatedCamera
+from torch_ekm.sensing import MarkerBoard, PinholeCamera
+from torch_ekm.sensing.vision.board_pose import BoardPose, estimate_board_pose, projection_jacobian
+from torch_ekm.sensing.vision.edge_refinement import refine_on_edges
+from torch_ekm.simulation import CardScene, ImageQuality, PlacedCard, SimulatedCamera
+from torch_ekm.simulation.imaging.card_scene import ConvexBody
 
 LENSES = [PinholeCamera(), PinholeCamera(fx=580, cx=300, distortion=(-0.15, 0.1, 1e-3, -5e-4, 0.0))]
 
@@ -132,32 +133,3 @@ def test_no_edges_leave_the_pose_alone(pose_of):
     blank = np.full((480, 640), 128, dtype=np.uint8)
     start = BoardPose(pose_of()[:3, :3], pose_of()[:3, 3], np.eye(6), 0.0, 0, False)
     assert refine_on_edges(blank, PinholeCamera(), MarkerBoard(), start) is start
-
-
-def _look(pose, rng, std):
-    step = std * rng.standard_normal(6)
-    turned = exp(torch.from_numpy(step[3:])).numpy() @ pose[:3, :3]
-    return BoardPose(turned, pose[:3, 3] + step[:3], std**2 * np.eye(6), 0.0, 0, False)
-
-
-def test_average_of_a_still_board_is_better_by_the_root(pose_of, rng):
-    pose, std, errors, single = pose_of(), 1e-3, [], []
-    for _ in range(100):
-        average = StaticPose(frames=16)
-        for _ in range(16):
-            look = _look(pose, rng, std)
-            mean = average.update(look)
-        errors.append(twist(mean, pose))
-        single.append(twist(look, pose))
-    assert np.std(errors) == pytest.approx(np.std(single) / 4, rel=0.25)
-    assert np.sqrt(mean.covariance[0, 0]) == pytest.approx(std / 4, rel=0.01)
-
-
-def test_average_starts_anew_when_the_board_moves(pose_of, rng):
-    average, first, second = StaticPose(frames=16), pose_of(), pose_of(x=0.03)
-    for _ in range(10):
-        average.update(_look(first, rng, 1e-4))
-    for expected in (first, first, second, second):
-        mean = average.update(_look(second, rng, 1e-4))
-        assert np.abs(twist(mean, expected)).max() < 1e-3
-    assert average.update(None) is mean  # bridges a missing look

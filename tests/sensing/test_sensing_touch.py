@@ -8,33 +8,23 @@ import math
 import pytest
 import torch
 
-from torch_ekm.plant import Observation
+from torch_ekm.plant import Observation, PlantWrapper
 from torch_ekm.sensing import ContactAligned
 from torch_ekm.simulation import SimulatedHand
 
 
-class Blurred:
+class Blurred(PlantWrapper):
     """A simulated hand whose encoder-known joint is read wrong."""
 
     def __init__(self, plant: SimulatedHand, joint: int, error: float, numb: bool = False) -> None:
-        self.plant, self.joint, self.error, self.numb = plant, joint, error, numb
+        super().__init__(plant)
+        self.joint, self.error, self.numb = joint, error, numb
 
-    def reset(self, seed: int) -> Observation:
-        self.plant.reset(seed)
-        return self.observe()
-
-    def observe(self) -> Observation:
-        seen = self.plant.observe()
+    def observation(self, seen: Observation) -> Observation:
         q = seen.q.clone()
         q[self.joint] += self.error
         force = None if self.numb else seen.fingertip_force
         return dataclasses.replace(seen, q=q, fingertip_force=force)
-
-    def command(self, delta_a: torch.Tensor) -> Observation:
-        self.plant.command(delta_a)
-        return self.observe()
-
-    def close(self) -> None: ...
 
 
 @pytest.fixture(scope="module")

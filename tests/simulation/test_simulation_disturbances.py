@@ -11,8 +11,8 @@ from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.plant import Plant, PlantStatus
 from torch_ekm.simulation import (
     PRESETS,
-    Change,
     DisturbedPlant,
+    PlantChange,
     PlantConfig,
     PlantParameters,
     SimulatedHand,
@@ -251,7 +251,7 @@ def test_presets_grow():
 
 def test_events_happen_when_they_should(exact):
     tug = Tug(at=1, force=(0.0, 0.0, 5.0))
-    tendons = Change.new_tendons(at=2, moment_arm=1.2)
+    tendons = PlantChange.new_tendons(at=2, moment_arm=1.2)
     disturbed = DisturbedPlant(exact, (tendons, tug))
     assert isinstance(disturbed, Plant)
     still = torch.zeros(9)

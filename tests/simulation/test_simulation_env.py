@@ -140,7 +140,7 @@ assert np.array_equal(again[0], again[1]) and np.array_equal(again[1], first[1])
 envs.step(np.zeros((2, 2), dtype=np.float32))
 envs.close()
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
 
 
@@ -157,7 +157,7 @@ orange = (picture[..., 0] > picture[..., 2] + 60).mean()  # the object
 assert 0.002 < blue < 0.2 and 0.01 < orange < 0.4, (blue, orange)
 env.close()
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     if done.returncode < 0:
         pytest.skip("OpenGL does not work here: it ended the process")
     assert done.returncode == 0, done.stderr

@@ -6,6 +6,7 @@ import dataclasses
 
 import pytest
 import torch
+from fakes import FakePlant
 
 from torch_ekm.exceptions import DescriptionError, ParameterError
 from torch_ekm.plant import Observation, Plant, PlantStatus, RecordingPlant, ReplayedPlant, Trajectory, Truth
@@ -15,7 +16,7 @@ from torch_ekm.simulation import Tug
 h5py = pytest.importorskip("h5py")
 
 
-class FakePlant:
+class Counter(FakePlant):
     """Any plant will do: one whose readings count the commands."""
 
     def __init__(self):
@@ -48,16 +49,12 @@ class FakePlant:
             truth=Truth(self.state + 0.5, self.state, eye),
         )
 
-    def command(self, delta_a):
+    def move(self, delta_a):
         self.state = self.state + delta_a
-        return self.observe()
-
-    def close(self):
-        pass
 
 
 def record():
-    plant = RecordingPlant(FakePlant())
+    plant = RecordingPlant(Counter())
     plant.reset(1)
     plant.command(torch.ones(3))  # belongs to an earlier grasp
     plant.reset(5)
@@ -101,7 +98,7 @@ def test_a_hand_without_fingertip_sensors(tmp_path):
 
 
 def test_a_recording_without_commands(tmp_path):
-    plant = RecordingPlant(FakePlant())
+    plant = RecordingPlant(Counter())
     plant.reset(9)
     loaded = Trajectory.load(plant.trajectory.save(tmp_path / "run.h5"))
     assert loaded.commands == []
@@ -150,7 +147,7 @@ def test_any_flipped_byte_is_noticed(tmp_path):
 
 def test_the_last_reading_before_a_command_is_the_one_that_counts():
     """What a controller acted on; what had happened stays noted."""
-    plant = RecordingPlant(FakePlant())
+    plant = RecordingPlant(Counter())
     plant.observe()  # nothing is recorded before a reset
     plant.reset(6)
     plant.command(torch.ones(3))

@@ -90,7 +90,7 @@ def replay(
 ) -> None:
     """List the trials of a log, and play one in the browser."""
     from ..experiments.viewer.trial import LogShow
-    from ..plant import TrialEntry
+    from ..plant.trial_log import TrialEntry
 
     shown = LogShow(log, trial, estimates)
     if shown.log is not None:
@@ -109,7 +109,8 @@ def verify(log: Annotated[Path, Argument(help="Folder of the log.")]) -> None:
     Its trials, its index, and the files of hand and object that it was made from. Ends with 1 if a file is
     wrong, with 0 if not. "torch-ekm record" makes damaged trials again.
     """
-    from ..plant import Finding, verify_log
+    from ..plant import verify_log
+    from ..plant.verification import Finding
 
     found = verify_log(log)
     print_table(Finding._fields, found, str(log))

@@ -19,7 +19,7 @@ from ..kinematics import GraspState, ServoModel
 from ..model import KinematicModel
 from ..plant import FramesAtRest, Plant, ServoInverse
 from ..residual import ResidualLearner
-from ..simulation import Change, DisturbedPlant, SimulatedHand, Tug
+from ..simulation import DisturbedPlant, PlantChange, SimulatedHand, Tug
 from .config import Setting, object_name
 from .learners import make_learner
 from .records import NotGrasped, Record, Trial, TrialRecord, true_state
@@ -115,7 +115,7 @@ class Bench:
         start: GraspState,
         *,
         learn: bool = True,
-        events: Sequence[Tug | Change] = (),
+        events: Sequence[Tug | PlantChange] = (),
         blind_deg: float = 0.0,
         touch: bool = False,
         look_again_deg: float = math.inf,

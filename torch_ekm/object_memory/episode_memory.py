@@ -1,4 +1,4 @@
-"""Past grasps: what each felt like, what was learned from, and to which model it went."""
+"""Past grasps: what was measured in each, what was learned from, and to which model it went."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class EpisodeMemory(nn.Module):
         return rows[self.age[rows].argsort()]
 
     def open(self, signature: Float[Tensor, " d"]) -> None:
-        """A new grasp."""
+        """Begin a new grasp, to which the samples that follow belong."""
         self.signature[-1] = signature
         self.length[-1] = 0
 
@@ -77,7 +77,7 @@ class EpisodeMemory(nn.Module):
                 learner.update(self.x[row, :n], self.y[row, :n])
 
     def reset(self) -> None:
-        """Forget all grasps."""
+        """Forget all grasps and what was learned from them."""
         for buffer in self.buffers():
             buffer.zero_()
         self.label.fill_(_FREE)

@@ -1,4 +1,4 @@
-"""What a hand feels of the thing that it holds, before it moves it."""
+"""What a hand measures of the object that it holds, before it moves it."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class GraspSignature:
             fingertip_force: normal force of each of the hand's pads [N].
 
         Raises:
-            ParameterError: no forces: what a grasp feels like is told by them.
+            ParameterError: no forces: the signature is made of them.
             ShapeError, NonFiniteError: readings that cannot be right.
         """
         hand = self.hand

@@ -129,7 +129,7 @@ class ModelBank(SingleLearner):
 
     @property
     def n_models(self) -> int:
-        """Objects known so far."""
+        """How many models of objects there are."""
         return int((self.episodes > 0).sum())
 
     @property
@@ -245,7 +245,7 @@ class ModelBank(SingleLearner):
 
     @property
     def working(self) -> ResidualLearner:
-        """The hypothesis that leads."""
+        """The model, known or new, with the largest evidence so far."""
         return self.trial[int(self.leader)]
 
     def forward(self, x: Tensor) -> Tensor:
@@ -269,7 +269,7 @@ class ModelBank(SingleLearner):
 
     @torch.no_grad()
     def reset(self) -> None:
-        """Forget all objects."""
+        """Forget the models of all objects and the signatures of all grasps."""
         for learner in (self.common, *self.kept, *self.trial):
             learner.reset()
         super().reset()

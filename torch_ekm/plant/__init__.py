@@ -10,12 +10,11 @@ from .recording_plant import RecordingPlant
 from .replayed_plant import ReplayedPlant
 from .servo_inverse import ServoInverse
 from .trajectory import Trajectory
-from .trial_log import TrialEntry, TrialLog
-from .verification import Finding, verify_log
+from .trial_log import TrialLog
+from .verification import verify_log
 from .wrapper import PlantWrapper
 
 __all__ = [
-    "Finding",
     "FramesAtRest",
     "Observation",
     "Plant",
@@ -27,7 +26,6 @@ __all__ = [
     "ServoInverse",
     "Stamps",
     "Trajectory",
-    "TrialEntry",
     "TrialLog",
     "Truth",
     "verify_log",

@@ -46,7 +46,7 @@ class FramesAtRest(PlantWrapper):
         self.frames = frames
 
     def observation(self, seen: Observation) -> Observation:
-        """The mean of ``seen`` and of the readings that follow; an object that is lost is told at once."""
+        """The mean of ``seen`` and of the readings that follow; the loss of an object ends them."""
         readings = [seen]
         while len(readings) < self.frames and readings[-1].status is not PlantStatus.LOST:
             readings.append(self.plant.observe())
@@ -77,7 +77,7 @@ class FramesAtRest(PlantWrapper):
 
 def _mean_pose(
     frames: Sequence[Observation],
-) -> tuple[Float[Tensor, 3], Float[Tensor, "3 3"], Float[Tensor, "6 6"]]:
+) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"], Float[Tensor, "6 6"]]:
     """Robust mean of the poses, and its covariance."""
     o, R = torch.stack([f.position for f in frames]), torch.stack([f.rotation for f in frames])
     centre = R[0]

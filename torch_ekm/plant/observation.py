@@ -42,7 +42,7 @@ class Truth:
 
     @property
     def state(self) -> GraspState:
-        """Joint angles and object pose."""
+        """True joint angles [rad] and object pose in the hand frame [m]."""
         return GraspState(self.q, self.position, self.rotation)
 
     def arrays(self) -> dict[str, Tensor]:
@@ -64,7 +64,7 @@ class Stamps(NamedTuple):
 class Observation:
     """What the sensors say, in SI units and the hand frame.
 
-    A driver that tells neither ``time`` nor ``stamps`` is undated: nobody can see that it repeats itself
+    A driver that gives neither ``time`` nor ``stamps`` is undated: nobody can see that it repeats itself
     but by equal readings.
 
     Raises:
@@ -104,7 +104,7 @@ class Observation:
 
     @property
     def dated(self) -> bool:
-        """The driver told a time."""
+        """Whether the driver gave ``time`` or ``stamps``."""
         return self.time != 0.0 or self.stamps is not None
 
     @property

@@ -17,7 +17,7 @@ class Plant(Protocol):
         ...
 
     def observe(self) -> Observation:
-        """Read the sensors."""
+        """Read the sensors: SI units, hand frame; nothing moves."""
         ...
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
@@ -25,5 +25,5 @@ class Plant(Protocol):
         ...
 
     def close(self) -> None:
-        """Give back what the plant holds."""
+        """Release devices, windows and files; the plant is not used afterwards."""
         ...

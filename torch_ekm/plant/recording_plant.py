@@ -48,7 +48,7 @@ class RecordingPlant(PlantWrapper):
         return observation
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
-        """Pass the command on."""
+        """Pass the increment [rad] on; it and the observation after it are recorded."""
         observation = self.plant.command(delta_a)
         self.trajectory.commands.append(torch.as_tensor(delta_a).detach().cpu().double().clone())
         self.trajectory.observations.append(observation)

@@ -32,7 +32,7 @@ class ReplayedPlant:
         return self.observe()
 
     def observe(self) -> Observation:
-        """The observation of this moment."""
+        """The recorded observation after the last replayed command."""
         return self.trajectory.observations[self._place]
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
@@ -51,4 +51,4 @@ class ReplayedPlant:
         return dataclasses.replace(observation, info={**observation.info, "recorded_command": command})
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Does nothing: a recording holds no device."""

@@ -25,7 +25,7 @@ _GROUPS = ("raw", "estimate")  # what is kept of Observation.info, and "events"
 class Trajectory:
     """Commands and observations of one grasp: ``n`` commands, ``n + 1`` observations.
 
-    Beside readings and truth it keeps of ``Observation.info`` the named arrays in "raw" (Hall counts, marker
+    Besides readings and truth it keeps of ``Observation.info`` the named arrays in "raw" (Hall counts, marker
     corners, perhaps images) and "estimate" (what else was estimated, such as covariances), and what
     is in "events", as text.
     """
@@ -88,11 +88,11 @@ class Trajectory:
             info: dict[str, Any] = {group: _row(values, k) for group, values in groups.items()}
             if happened := json.loads(events[k]):
                 info["events"] = tuple(happened)
-            told = None if truth is None else Truth(**_row(truth, k))
+            known = None if truth is None else Truth(**_row(truth, k))
             status = PlantStatus(words[k].decode())
             taken = None if stamps is None else Stamps(*stamps[k].tolist())
             seen = Observation(
-                **_row(sensors, k), time=time, status=status, info=info, truth=told, stamps=taken
+                **_row(sensors, k), time=time, status=status, info=info, truth=known, stamps=taken
             )
             observations.append(seen)
         return cls(seed, commands, observations, about)

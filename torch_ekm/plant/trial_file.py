@@ -60,10 +60,10 @@ def read_trial(
     head = _LINE.match(content)
     if head is None or head[1] != FORMAT.rpartition(" ")[2].encode():
         raise DescriptionError(path, f"damaged, or not a recording of this version of torch_ekm: {_UNREAD}")
-    told = head[2].decode()
-    whole = content[:_HEAD] == _head(told)
+    written_digest = head[2].decode()
+    whole = content[:_HEAD] == _head(written_digest)
     content[:_HEAD] = _head("0" * 64)
-    if not whole or hashlib.sha256(content).hexdigest() != told:
+    if not whole or hashlib.sha256(content).hexdigest() != written_digest:
         raise DescriptionError(path, "damaged: its bytes are not those that were written (SHA-256)")
     h5py = require("h5py")
     try:

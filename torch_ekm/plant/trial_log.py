@@ -25,7 +25,7 @@ _TOLD = ("commands", "time", "status")  # arrays that an entry is made of
 
 
 class TrialEntry(NamedTuple):
-    """One line of the index."""
+    """One trial, as a line of the index: its number, seed, length and end."""
 
     trial: int
     seed: int
@@ -45,7 +45,7 @@ class TrialLog:
     A trial's file appears whole or not at all, so a run that is killed loses the current trial and
     nothing else; started again it asks for :meth:`missing` trials and ends with the same bytes as a run
     that was never stopped, if a trial depends on its configuration and seeds alone. Each file has a digest
-    of all its bytes; one that is damaged is told in a warning, renamed to ``trial_000012.h5.damaged``, and
+    of all its bytes; one that is damaged gives a warning, is renamed to ``trial_000012.h5.damaged``, and
     missing. The index is made from the files, whatever it says.
 
     One writer at a time: a log is locked until :meth:`close`, the end of a ``with``, or of its process.
@@ -181,8 +181,8 @@ class TrialLog:
         for trial, problem in self.damaged.items():
             aside = self.path(trial).with_name(self.path(trial).name + DAMAGED)
             os.replace(self.path(trial), aside)
-            told = f"{problem}; kept as {aside.name}, and missing from the log"
-            warnings.warn(f"{aside.with_suffix('')}: {told}", stacklevel=4)
+            what = f"{problem}; kept as {aside.name}, and missing from the log"
+            warnings.warn(f"{aside.with_suffix('')}: {what}", stacklevel=4)
         for path in self.folder.glob("*.part"):
             if path.stem == INDEX or _NAME.fullmatch(path.stem):
                 path.unlink()
@@ -194,7 +194,7 @@ class TrialLog:
 
 
 def trial_path(folder: Path, trial: int) -> Path:
-    """Of a trial's file."""
+    """Path of the HDF5 file of trial number ``trial`` in a log."""
     return folder / f"trial_{trial:06d}.h5"
 
 
@@ -222,14 +222,14 @@ def read_entry(folder: Path, trial: int) -> tuple[TrialEntry, dict[str, Any]]:
 
 
 def index_lines(entries: Mapping[int, TrialEntry]) -> bytes:
-    """The index as it is written."""
+    """Bytes of ``index.csv``: a header and a line for each trial, in order."""
     text = io.StringIO()
     rows = (TrialEntry._fields, *(entries[trial] for trial in sorted(entries)))
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue().encode(errors="backslashreplace")  # JSON holds texts that UTF-8 does not
 
 
-def compare(there: Mapping[str, Any], wanted: Mapping[str, Any], place: object) -> None:
+def check_configuration(there: Mapping[str, Any], wanted: Mapping[str, Any], place: object) -> None:
     """That a trial's configuration is the wanted one.
 
     Raises:
@@ -259,5 +259,5 @@ def _entries(folder: Path, wanted: Mapping[str, Any] | None) -> tuple[dict[int, 
             damaged[trial] = error.problem
             continue
         if wanted is not None:
-            compare(configuration, wanted, folder)
+            check_configuration(configuration, wanted, folder)
     return entries, damaged

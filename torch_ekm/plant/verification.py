@@ -9,11 +9,20 @@ from typing import Any, Literal, NamedTuple
 from ..description import file_digests
 from ..exceptions import EKMError, ParameterError
 from .trajectory import Trajectory
-from .trial_log import DAMAGED, INDEX, TrialEntry, compare, index_lines, read_entry, trial_path, trials_in
+from .trial_log import (
+    DAMAGED,
+    INDEX,
+    TrialEntry,
+    check_configuration,
+    index_lines,
+    read_entry,
+    trial_path,
+    trials_in,
+)
 
 
 class Finding(NamedTuple):
-    """What was found of one file."""
+    """Whether one file of a log is what was written, and why not."""
 
     file: str
     state: Literal["ok", "wrong", "left over"]
@@ -46,7 +55,7 @@ def verify_log(folder: str | Path) -> list[Finding]:
             entry, configuration = read_entry(folder, trial)
             recording = Trajectory.load(path)
             shared = configuration if shared is None else shared
-            compare(shared, configuration, folder)
+            check_configuration(shared, configuration, folder)
             if len(recording.observations) not in (len(recording.commands) + 1, 0):
                 sizes = f"{len(recording.commands)} commands and {len(recording.observations)} observations"
                 raise ParameterError("recording", sizes, "one observation more than commands")
@@ -83,9 +92,9 @@ def _index(folder: Path, entries: Mapping[int, TrialEntry], n_trials: int) -> Fi
 
 
 def _sources(configuration: Mapping[str, Any]) -> list[Finding]:
-    """Files of hand and object: those here beside those that the log was made from."""
-    told = configuration.get("files")
-    if not isinstance(told, dict):
+    """Files of hand and object: those here compared with those that the log was made from."""
+    recorded = configuration.get("files")
+    if not isinstance(recorded, dict):
         what = "the configuration has no digests of the hand's and the object's files"
         return [Finding("(sources)", "ok", f"{what}; nothing to compare")]
     try:
@@ -93,8 +102,8 @@ def _sources(configuration: Mapping[str, Any]) -> list[Finding]:
     except EKMError as error:
         return [Finding("(sources)", "wrong", f"not here: {error}")]
     found = []
-    for name in sorted({*told, *here}):
-        if told.get(name) == here.get(name):
+    for name in sorted({*recorded, *here}):
+        if recorded.get(name) == here.get(name):
             found.append(Finding(name, "ok", "the file here is the one that the log was made from"))
         else:
             found.append(Finding(name, "wrong", "the file here is not the one that the log was made from"))

@@ -26,11 +26,11 @@ class PlantWrapper:
         return getattr(self.plant, name)
 
     def reset(self, seed: int) -> Observation:
-        """Grasp the object again."""
+        """Grasp the object again; the observation after it, as :meth:`observation` changes it."""
         return self.observation(self.plant.reset(seed))
 
     def observe(self) -> Observation:
-        """Read the sensors."""
+        """Read the sensors, as :meth:`observation` changes the reading."""
         return self.observation(self.plant.observe())
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
@@ -42,5 +42,5 @@ class PlantWrapper:
         return seen
 
     def close(self) -> None:
-        """Give back what the plant holds."""
+        """Close the wrapped plant: its devices, windows and files."""
         self.plant.close()

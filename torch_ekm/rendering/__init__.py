@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from .image import Picture, save_picture
 from .scene import Scene, make_scene
-from .visuals import Mesh, Visuals, visuals
+from .visuals import visuals
 from .web import draw, place, save_animation, start_server
 
 __all__ = [
-    "Mesh",
     "Picture",
     "Scene",
-    "Visuals",
     "draw",
     "make_scene",
     "place",

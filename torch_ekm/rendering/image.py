@@ -72,7 +72,7 @@ class Picture:
         return np.asarray(self._plotter.screenshot(path, return_img=True), dtype=np.uint8)[..., :3]
 
     def close(self) -> None:
-        """Give back the window."""
+        """Close the off-screen window and release its memory."""
         self._plotter.close()
 
 
@@ -101,7 +101,8 @@ def _draw_matplotlib(scene: Scene, path: Path, size: int) -> None:
     figure = require("matplotlib.figure").Figure(figsize=(size / 100 * n, size / 100))
     meshes = [(shape_mesh(shape), colour, scene.opacity(i)) for i, (shape, colour) in enumerate(scene.shapes)]
     position, focus, up = scene.camera  # matplotlib's z is up in the picture: turn everything there
-    forward = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    forward = np.eye(3)[int(abs(up[0]) > 0.99)]  # any direction that is not up
+    forward = forward - (forward @ up) * up
     forward /= np.linalg.norm(forward)
     turn = np.stack([forward, np.cross(up, forward), up])
     sight = turn @ (position - focus)

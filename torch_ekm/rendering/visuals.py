@@ -48,7 +48,7 @@ def visuals(urdf: UrdfModel) -> Visuals:
 
     A mesh-only ``<collision>`` without ``<visual>`` is drawn, too. A mesh is looked for beside the URDF, and
     for ``package://name/rest`` in the folders above it as ``name/rest`` and ``rest``. Pictures do without
-    what is missing: a problem is told, not raised.
+    what is missing: a problem is listed, not raised.
     """
     try:
         changed = os.stat(urdf.path).st_mtime_ns

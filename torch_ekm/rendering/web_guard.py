@@ -35,8 +35,8 @@ class WebGuard:
     def start(self, make: Callable[[], Any]) -> Any:
         """The viser server that ``make`` starts, with this guard in front of it.
 
-        viser has no option for it, so what it starts is handed a guard on the way: ``serve`` of websockets
-        is replaced while the server starts. Then the server must refuse a request without the secret.
+        There is no plain way, since viser has no option for it: ``serve`` of websockets is replaced while the
+        server starts. Then the server must refuse a request without the secret.
 
         Raises:
             ParameterError: it does not, since this version of viser is built otherwise.

@@ -1,4 +1,4 @@
-"""A finger that feels the object touches it: what that says about joints without a sensor."""
+"""A pad that measures a force touches the object: what that says about joints without a sensor."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ _LIMIT = math.radians(25.0)
 _LEAST_SLOPE = 5e-3  # [m/rad]: joints that hardly change the gap are not to blame for it
 _ITERATIONS = 4
 _CLOSED = 5e-5  # [m]
+_LEAST_FORCE = 0.5  # [N]: a pad that measures less says nothing
 
 
 class ContactAligned(PlantWrapper):
-    """``gap_i(q + delta_u e_u) = 0`` for each pad i that feels a force, u its joint without a Hall sensor.
+    """``gap_i(q + delta_u e_u) = 0`` for each pad i that measures 0.5 N, u its joint without a Hall sensor.
 
     The angle of such a joint is known from the motor's encoder alone, through a tendon with another
     pulley radius than the model's that stretches under load: on the iCub the thumb's opposition is
@@ -31,14 +32,11 @@ class ContactAligned(PlantWrapper):
     Args:
         plant: gives estimates of joints, pose and fingertip forces.
         hand, obj: what it consists of.
-        least_force: a pad that feels less than this [N] says nothing; without fingertip sensors no pad does.
     """
 
-    def __init__(
-        self, plant: Plant, hand: HandDescription, obj: ObjectDescription, least_force: float = 0.5
-    ) -> None:
+    def __init__(self, plant: Plant, hand: HandDescription, obj: ObjectDescription) -> None:
         super().__init__(plant)
-        self.hand, self.least_force = hand, least_force
+        self.hand = hand
         self._detector = ContactDetector(hand, obj, margin=math.inf)
         kinematics = HandKinematics(hand)
         sensed = {sensor.joint for sensor in hand.hall_sensors}
@@ -55,17 +53,19 @@ class ContactAligned(PlantWrapper):
         self._delta = torch.zeros(hand.n_q, dtype=torch.float64)
 
     def reset(self, seed: int) -> Observation:
-        """Grasp again."""
+        """Grasp again, with no correction of any joint known."""
         self._delta.zero_()
         return super().reset(seed)
 
     def observation(self, seen: Observation) -> Observation:
         """``seen`` with joints that agree with the contacts."""
-        felt = [0.0] * len(self.hand.pads) if seen.fingertip_force is None else seen.fingertip_force.tolist()
-        for i, pad in enumerate(self.hand.pads):
-            if felt[i] >= self.least_force:
+        forces = (
+            [0.0] * len(self.hand.pads) if seen.fingertip_force is None else seen.fingertip_force.tolist()
+        )
+        for i, force in enumerate(forces):
+            if force >= _LEAST_FORCE:
                 for j in self._joints[i]:
-                    self._close_gap(seen, pad.name, j)
+                    self._close_gap(seen, self.hand.pads[i].name, j)
         return dataclasses.replace(seen, q=seen.q + self._delta)
 
     def _close_gap(self, seen: Observation, pad: str, joint: int) -> None:

@@ -17,9 +17,8 @@ from ..kinematics.null_space import null_space
 from ..kinematics.se3 import exp
 from ..kinematics.tensors import as_tensors
 from ..typing import Array, Float, Tensor
-from .joint_estimator import JointEstimate
+from .joint_estimator import COUPLING_STD, JointEstimate
 
-_COUPLING_STD = 5e-4  # [rad], as JointEstimator
 _LOOSE_ANGLE, _LOOSE_OFFSET = 10.0, 0.1  # [rad], [m]: they keep the normal matrix regular and weigh nothing
 _UNKNOWN = 0.01  # [m]: a marker whose place is no better known is not calibrated
 
@@ -41,9 +40,9 @@ class FingerMarkers:
     """Standard error, the largest over directions [m]."""
     rotation: Float[Tensor, "3 3"]
     """R, hand axes to the camera's."""
-    translation: Float[Tensor, 3]
+    translation: Float[Tensor, " 3"]
     """t [m]."""
-    registration_std: Float[Tensor, 2]
+    registration_std: Float[Tensor, " 2"]
     """Standard errors of R [rad] and t [m], the largest over directions."""
     noise: float
     """Standard deviation of a marker's coordinate that the fit shows [m]; far above ``marker_std``: links,
@@ -70,7 +69,7 @@ class FingerMarkers:
         visible = torch.isfinite(flat)
         weight = visible.to(flat.dtype) / self.marker_std**2
         middle, spread, rest, C = _joint_prior(self.hand)
-        fixed = torch.diag(spread**-2) + C.mT @ C / _COUPLING_STD**2
+        fixed = torch.diag(spread**-2) + C.mT @ C / COUPLING_STD**2
         q = middle.expand(len(flat), -1)
         for _ in range(iterations):
             x, J_q, _ = view.points(q, self.offset)
@@ -78,7 +77,7 @@ class FingerMarkers:
             miss = (flat - (x @ self.rotation.mT + self.translation)[..., : view.d]).nan_to_num().flatten(1)
             J_w = (weight.flatten(1)[..., None] * J).mT
             information = J_w @ J + fixed
-            coupled = (rest - q) @ C.mT @ C / _COUPLING_STD**2
+            coupled = (rest - q) @ C.mT @ C / COUPLING_STD**2
             right = (J_w @ miss[..., None])[..., 0] + (middle - q) / spread**2 + coupled
             q = q + torch.linalg.solve(information, right).clamp(-0.5, 0.5)
         covariance = torch.linalg.inv(information)
@@ -198,8 +197,8 @@ def calibrate_markers(
     prior = np.zeros((ends[1] + n_f * len(C), ends[3]))
     sharp = 1 / spread.reshape(-1, 1).expand(n_m, d)
     np.fill_diagonal(prior, torch.cat([1 / q_scale.flatten(), sharp.flatten()]).numpy())
-    prior[ends[1] :, : ends[0]] = np.kron(np.eye(n_f), C.numpy()) / _COUPLING_STD
-    wish = torch.cat([(q0 / q_scale).flatten(), torch.zeros(d * n_m), (C @ rest / _COUPLING_STD).repeat(n_f)])
+    prior[ends[1] :, : ends[0]] = np.kron(np.eye(n_f), C.numpy()) / COUPLING_STD
+    wish = torch.cat([(q0 / q_scale).flatten(), torch.zeros(d * n_m), (C @ rest / COUPLING_STD).repeat(n_f)])
     wish = wish.numpy()
 
     def unpack(v: Array) -> tuple[Tensor, Tensor, Tensor, Tensor]:

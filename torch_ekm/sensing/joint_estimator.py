@@ -12,9 +12,11 @@ from ..kinematics.tensors import check_finite
 from ..typing import Float, Tensor
 from .hall.calibration import HallCalibration
 
+COUPLING_STD = 5e-4  # s_c, play of a rigid coupling [rad]
+
 
 class JointEstimate(NamedTuple):
-    """Joint angles of a hand."""
+    """Joint angles of a hand with their covariance."""
 
     q: Float[Tensor, "*batch n_q"]
     """[rad]"""
@@ -23,7 +25,7 @@ class JointEstimate(NamedTuple):
 
     @property
     def std(self) -> Float[Tensor, "*batch n_q"]:
-        """Standard deviations [rad]."""
+        """Standard deviation of each joint angle [rad]."""
         return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
 
 
@@ -40,11 +42,10 @@ class JointEstimator:
         encoder_std: s_a, by how much an encoder and ``J_a q + a_0`` differ [rad]. The default is for
             encoders at the motors of a loaded hand, behind cables that stretch by degrees in a pinch of
             5 N; encoders at the joints are good to half a degree.
-        coupling_std: s_c, play of a rigid coupling [rad].
 
     Raises:
         JointMismatchError: the calibration names joints that the hand does not have.
-        ParameterError: a standard deviation is not positive.
+        ParameterError: ``encoder_std`` is not positive.
     """
 
     def __init__(
@@ -52,11 +53,9 @@ class JointEstimator:
         hand: HandDescription,
         calibration: HallCalibration,
         encoder_std: float = 0.0436,  # 2.5 deg
-        coupling_std: float = 0.0005,
     ) -> None:
-        for name, value in (("encoder_std", encoder_std), ("coupling_std", coupling_std)):
-            if not value > 0:
-                raise ParameterError(name, value, "positive [rad]")
+        if not encoder_std > 0:
+            raise ParameterError("encoder_std", encoder_std, "positive [rad]")
         unknown = [joint for joint in calibration.joints if joint not in hand.joint_names]
         if unknown:
             raise JointMismatchError(hand.name, (), unknown, hand.joint_names)
@@ -73,7 +72,7 @@ class JointEstimator:
         prior = 12 / (upper - lower).clamp(min=1e-3) ** 2
         self._middle = prior * (lower + upper) / 2
         self._fixed = (
-            torch.diag(prior) + self._J_a.mT @ self._J_a / encoder_std**2 + C.mT @ C / coupling_std**2
+            torch.diag(prior) + self._J_a.mT @ self._J_a / encoder_std**2 + C.mT @ C / COUPLING_STD**2
         )
 
     def __call__(

@@ -23,14 +23,6 @@ class PlantConfig:
     assumes (section II.A), and the plant's ``hand`` carries it to the model."""
     time_step: float = 1e-3
     """[s]; 2 ms is fine for long runs and the most with rigid actuators, 4 ms the most with soft ones."""
-    ramp_time: float = 0.2
-    """Time in which a command is carried out [s]."""
-    rate_limit: float = 100 * _DEG
-    """Fastest motion of a motor [rad/s]; a large command takes longer than ``ramp_time``."""
-    command_time: float = 0.5
-    """Least simulated time of one command, ramp and settling [s]."""
-    settle_limit: float = 1.0
-    """A command ends at the latest after this time, settled or not [s]."""
     pinch_force: float | None = None
     """Normal force of the thumb in the planned grasp [N]; None: the hand's."""
     thumb: str | None = None
@@ -40,26 +32,22 @@ class PlantConfig:
     along: tuple[float, float, float] | None = None
     """Direction in the hand of the object's long axis, about which a pinch can turn it. None: the
     normal of a planar hand, else y, square to the planes in which the iCub's fingers bend."""
-    offset_along: float = 0.010
-    """Grasp points are drawn within +-this along the object's long axis [m]."""
-    offset_across: float = 0.002
-    """... and within +-this across it [m]."""
     tilt: float = 5 * _DEG
     """The object's long axis is drawn within +-this of ``along`` [rad]."""
     gravity_tilt: float = 0.0
     """At each reset gravity is turned by up to this out of its direction [rad]: another orientation of
-    the hand, which the model must be told (``SimulatedHand.gravity``)."""
+    the hand, which the model must be given (``SimulatedHand.gravity``)."""
     relative_to: str = "encoder"
     """Commands are increments of the "encoder" or of the "setpoint"."""
 
     def __post_init__(self) -> None:
-        for name in ("time_step", "ramp_time", "rate_limit", "command_time", "settle_limit", "pinch_force"):
+        for name in ("time_step", "pinch_force"):
             value = getattr(self, name)
             if name == "pinch_force" and value is None:
                 continue
             if not (math.isfinite(value) and value > 0):
                 raise ParameterError(name, value, "finite and greater than 0")
-        for name in ("offset_along", "offset_across", "tilt", "gravity_tilt"):
+        for name in ("tilt", "gravity_tilt"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise ParameterError(name, value, "finite and not negative")

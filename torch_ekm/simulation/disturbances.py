@@ -15,7 +15,7 @@ from .simulated_hand import SimulatedHand
 
 
 @dataclass(frozen=True)
-class Change:
+class PlantChange:
     """Before command number ``at`` (from 0): plant parameters take new values, and keep them."""
 
     at: int
@@ -25,7 +25,7 @@ class Change:
         plant.change(**self.changes)
 
     @classmethod
-    def new_tendons(cls, at: int, moment_arm: float | tuple[float, ...]) -> Change:
+    def new_tendons(cls, at: int, moment_arm: float | tuple[float, ...]) -> PlantChange:
         """All tendons replaced: other moment arms, and no elongation yet."""
         return cls(at, {"moment_arm": moment_arm, "tendon_elongation": 0.0})
 
@@ -60,7 +60,7 @@ class DisturbedPlant(PlantWrapper):
 
     plant: SimulatedHand
 
-    def __init__(self, plant: SimulatedHand, events: Iterable[Change | Tug] = ()) -> None:
+    def __init__(self, plant: SimulatedHand, events: Iterable[PlantChange | Tug] = ()) -> None:
         super().__init__(plant)
         self.events = tuple(sorted(events, key=lambda event: event.at))
         self.count = 0

@@ -12,6 +12,9 @@ from ..description import HandDescription
 from ..exceptions import ParameterError, ShapeError
 from ..typing import Float, Tensor
 
+_HALF_TURN_DEG = (50.0, 62.0)  # a magnet turns by plus and minus that much before its sensor
+_ASYMMETRY_DEG = 6.0  # largest misalignment of a magnet
+
 
 class Stuck(Enum):
     """How a channel fails. The last is the commonest on real hands at either end of the range."""
@@ -38,10 +41,6 @@ class HallQuality:
     proximal channels, and 491 to 505 of 510 (medians) for the sums of two."""
     closed_overdrive: tuple[float, float] = (-0.16, 0.03)
     """The same for the closed end: medians 0 to 22 of 255, and 127 of 765 for the little finger."""
-    half_turn_deg: tuple[float, float] = (50.0, 62.0)
-    """The magnet turns by plus and minus that much before its sensor."""
-    asymmetry_deg: float = 6.0
-    """Largest misalignment of a magnet."""
     reversed_share: float = 0.0
     """Probability that a channel is mounted the other way round."""
 
@@ -52,10 +51,6 @@ class HallQuality:
             low, high = getattr(self, name)
             if not -0.5 < low <= high < 0.4:
                 raise ParameterError(f"HallQuality.{name}", (low, high), "increasing, within (-0.5, 0.4)")
-        low, high = self.half_turn_deg
-        if not 0 < low <= high or high + self.asymmetry_deg >= 90:
-            valid = "increasing, and below 90 deg with asymmetry_deg: the curve must not turn back"
-            raise ParameterError("HallQuality.half_turn_deg", self.half_turn_deg, valid)
 
 
 class HallSensors:
@@ -90,8 +85,8 @@ class HallSensors:
         rng, n, q = np.random.default_rng(seed), len(sensors), self.quality
         self._lower = torch.from_numpy(hand.joint_lower.copy())[self._index]
         self._upper = torch.from_numpy(hand.joint_upper.copy())[self._index]
-        self._alpha = torch.from_numpy(np.radians(rng.uniform(*q.half_turn_deg, n)))
-        self._beta = torch.from_numpy(np.radians(rng.uniform(-q.asymmetry_deg, q.asymmetry_deg, n)))
+        self._alpha = torch.from_numpy(np.radians(rng.uniform(*_HALF_TURN_DEG, n)))
+        self._beta = torch.from_numpy(np.radians(rng.uniform(-_ASYMMETRY_DEG, _ASYMMETRY_DEG, n)))
         self._over = torch.from_numpy(
             np.stack([rng.uniform(*q.open_overdrive, n), rng.uniform(*q.closed_overdrive, n)])
         )

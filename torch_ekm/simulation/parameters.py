@@ -56,7 +56,7 @@ class PlantParameters:
     threshold: float = 0.0
     """Commands smaller than this do nothing [rad]."""
     backlash: float = 0.0
-    """Full width of the play between motor and tendon [rad], beside that of the description."""
+    """Full width of the play between motor and tendon [rad], added to that of the description."""
 
     # -- the sensors
     joint_noise: float = 0.0
@@ -101,7 +101,7 @@ class PlantParameters:
             raise ParameterError("frame_loss", self.frame_loss, "a chance between 0 and 1")
 
     def replace(self, **changes: object) -> PlantParameters:
-        """A copy with some figures changed."""
+        """A copy in which some figures, given by name in their SI units, are changed."""
         known = {field.name for field in dataclasses.fields(self)}
         for name in changes:
             if name not in known:

@@ -14,7 +14,7 @@ from .parameters import PlantParameters
 
 
 class TimedState(NamedTuple):
-    """The true state at one moment."""
+    """The true state at one moment, hand frame, SI units."""
 
     time: float
     """[s]"""
@@ -70,7 +70,7 @@ class Sensors:
         return self._frames[0] if self._p.latency > 0 and self._frames else now
 
     def joints(self, q: Array, generator: np.random.Generator) -> Array:
-        """Estimated joint angles ``(n_q,)`` [rad]."""
+        """Joint angles ``(n_q,)`` [rad] with noise; those of stuck channels do not change."""
         reading = q + self._p.joint_noise * generator.standard_normal(self.n_q)
         if self._stuck_at is None:
             self._stuck_at = reading.copy()

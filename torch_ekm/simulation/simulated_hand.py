@@ -19,12 +19,13 @@ from .grasp_planning.pinch import PinchPlan, pinch_hint, pinch_problem, plan_pin
 from .grasp_planning.pinch_problem import PinchRequest
 from .mechanism.assembly import true_hand, true_object
 from .parameters import PlantParameters
-from .physics.rig import Gravity, Rig, RigState
+from .physics.rig import COMMAND_TIME, Gravity, Rig, RigState
 from .presets import preset as parameters_of
 from .sensors import Sensors, TimedState
 
 _ATTEMPTS = 5
 _FAR = 0.05  # [m] from where it was grasped: out of the hand
+_OFFSET_ALONG, _OFFSET_ACROSS = 0.010, 0.002  # [m]: grasp points are drawn within +- these, object's axes
 
 
 class PlantSnapshot(NamedTuple):
@@ -145,9 +146,9 @@ class SimulatedHand:
             status = PlantStatus.NOT_SEEN
         torque = rig.transmission.actuator_torque(q, rig.servo.output)
         pictured = GraspState(*_tensors(picture.q, picture.position, picture.rotation))
-        q_seen, a, o, R, felt = _tensors(joints, rig.servo.encoder, seen_position, seen_rotation, force)
+        q_seen, a, o, R, measured = _tensors(joints, rig.servo.encoder, seen_position, seen_rotation, force)
         return Observation(
-            *(q_seen, a, o, R, felt if self.parameters.force_sensors else None),
+            *(q_seen, a, o, R, measured if self.parameters.force_sensors else None),
             time=rig.time,
             status=status,
             truth=Truth(*_tensors(q, position, rotation, rig.normal, torque), pictured=pictured),
@@ -206,7 +207,7 @@ class SimulatedHand:
         return scene.q, *scene.object_pose
 
     def snapshot(self) -> PlantSnapshot:
-        """This moment, to come back to."""
+        """Physics, sensors and noise of this moment, for :meth:`restore`."""
         generator = dict(self._generator.bit_generator.state)
         return PlantSnapshot(self._grasped().snapshot(), copy.deepcopy(self._sensors), generator, self.plan)
 
@@ -249,7 +250,7 @@ class SimulatedHand:
         """Pull at the object [N, at its centre of mass] and twist it [N m], hand frame, then settle."""
         rig = self._grasped()
         rig.wait(duration, (np.asarray(force, dtype=np.float64), np.asarray(torque, dtype=np.float64)))
-        rig.settle(self.config.command_time)
+        rig.settle(COMMAND_TIME)
         return self.observe()
 
     # -- inside -------------------------------------------------------------------------------------
@@ -273,8 +274,8 @@ class SimulatedHand:
         return PinchRequest(
             gravity=_tilted(self.hand.gravity, tilt * c.gravity_tilt, np.pi * turn),
             force=self.hand.pinch_force if c.pinch_force is None else c.pinch_force,
-            along=along * c.offset_along,
-            across=across * c.offset_across,
+            along=along * _OFFSET_ALONG,
+            across=across * _OFFSET_ACROSS,
             tilt=(first * c.tilt, second * c.tilt),
         )
 

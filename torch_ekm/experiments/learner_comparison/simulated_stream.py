@@ -10,7 +10,7 @@ import torch
 from ...control import ClosedLoop, LookAndMoveController, PoseTarget, StoppingRule
 from ...enhanced import EnhancedModel
 from ...model import KinematicModel
-from ...simulation import Change, DisturbedPlant, SimulatedHand
+from ...simulation import DisturbedPlant, PlantChange, SimulatedHand
 from .stream import Stream
 
 _DEG = math.pi / 180
@@ -31,7 +31,7 @@ def record_simulated_hand(n: int = 400, seed: int = 1000) -> Stream:
     """
     draw = np.random.default_rng(seed)
     plant = SimulatedHand("icub_right", "box", preset="nominal")
-    disturbed = DisturbedPlant(plant, [Change.new_tendons(n // 2, 0.85)])
+    disturbed = DisturbedPlant(plant, [PlantChange.new_tendons(n // 2, 0.85)])
     model = KinematicModel(plant.hand, plant.object)
     rule = StoppingRule(max_steps=10)
     enhanced, x, y, segments = None, [], [], []

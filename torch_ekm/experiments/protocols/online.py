@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from ...exceptions import ParameterError
-from ...simulation import Change, Tug
+from ...simulation import PlantChange, Tug
 from ..config import CONTROLLERS, Setting, digest, object_name
 from ..records import Record
 from ..reporting import tables
@@ -83,7 +83,7 @@ class Online(Protocol):
         records = []
         for trial, angle in enumerate(angles.tolist(), start=1):
             if trial == self.tendons_replaced:
-                Change(0, self.new_tendons).happen(bench.hand)
+                PlantChange(0, self.new_tendons).happen(bench.hand)
             events = (Tug(at=3, torque=self.knock),) if trial in self.dislocations else ()
             records.append(bench.trial(seed, trial, angle, events=events))
         bench.close()

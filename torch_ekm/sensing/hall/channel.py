@@ -55,7 +55,7 @@ class HallChannel:
         )
 
     def angle(self, reading: float) -> float:
-        """The cubic [rad], whatever the reading."""
+        """Value of the cubic [rad] at a reading [counts], also outside ``[low, high]``."""
         r, c = reading / FULL_SCALE, self.coefficients
         return c[0] + r * (c[1] + r * (c[2] + r * c[3]))
 

@@ -140,12 +140,12 @@ def projection_jacobian(camera: PinholeCamera, X: Array, rotation: Array, positi
 
 
 def skew(v: Array) -> Array:
-    """``[v]x`` of each vector ``(*batch, 3)``."""
+    """Cross-product matrix ``[v]x``, ``(*batch, 3, 3)``, of each vector ``(*batch, 3)``."""
     x, y, z = np.moveaxis(v, -1, 0)
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape, 3)
 
 
 def angle_between(a: Array, b: Array) -> float:
-    """Angle of ``a b^T`` [rad]."""
+    """Angle of the rotation ``a b^T`` between two orientations [rad]."""
     return float(np.arccos(np.clip((np.trace(a @ b.T) - 1) / 2, -1, 1)))

@@ -13,6 +13,10 @@ from ...exceptions import CalibrationError
 from .camera import PinholeCamera
 from .charuco import CharucoTarget
 
+_MIN_VIEWS = 8  # fewer usable pictures are refused
+_MIN_CORNERS = 12  # a picture with fewer is not used
+_MAX_VIEW_RMS = 1.0  # a picture with more is not used [px]
+
 
 @dataclass(frozen=True)
 class CameraCalibration:
@@ -32,25 +36,17 @@ class CameraCalibration:
 def calibrate_camera(
     images: Iterable[NDArray[np.uint8] | None],
     target: CharucoTarget | None = None,
-    distortion: bool = True,
-    min_views: int = 8,
-    min_corners: int = 12,
-    max_view_rms: float = 1.0,
 ) -> CameraCalibration:
-    """``min sum |u_ij - pi(K, k, R_i X_j + t_i)|^2`` over intrinsics and the pose of each view.
+    """``min sum |u_ij - pi(K, k, R_i X_j + t_i)|^2`` over intrinsics (k3 = 0) and the pose of each view.
 
     Corners of a ChArUco target (OpenCV's detector), then Zhang's method (``cv2.calibrateCamera``).
-    Views whose own error exceeds ``max_view_rms`` are left out and the rest solved again, once.
+    Views whose own error exceeds 1 px are left out and the rest solved again, once.
     The target should fill different parts of the image, at tilts up to about 45 deg: frontal views
     alone do not tell focal length from distance.
 
     Args:
         images: grey or BGR pictures of one size; None (dropped frames) are skipped.
         target: what is seen.
-        distortion: estimate k1, k2, p1, p2 (k3 stays 0); False: an ideal lens.
-        min_views: fewer usable pictures are refused.
-        min_corners: a picture with fewer is not used.
-        max_view_rms: a picture with more is not used [px].
 
     Raises:
         CalibrationError: too few usable views, or pictures of different sizes.
@@ -68,27 +64,23 @@ def calibrate_camera(
             raise CalibrationError("camera", f"picture {k} is {image.shape[:2]}, those before are {shape}")
         shape = image.shape[:2]
         corners, ids, _, _ = detector.detectBoard(image)
-        if ids is not None and len(ids) >= min_corners:
+        if ids is not None and len(ids) >= _MIN_CORNERS:
             views.append((k, points[ids.ravel()].reshape(-1, 3), corners.reshape(-1, 2)))
-    if shape is None or len(views) < min_views:
+    if shape is None or len(views) < _MIN_VIEWS:
         raise CalibrationError(
             "camera",
-            f"only {len(views)} pictures show {min_corners} or more corners of the target, at least "
-            f"{min_views} are needed; move the target about, closer, in good light",
+            f"only {len(views)} pictures show {_MIN_CORNERS} or more corners of the target, at least "
+            f"{_MIN_VIEWS} are needed; move the target about, closer, in good light",
         )
-    flags = cv2.CALIB_FIX_K3
-    if not distortion:
-        flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_ZERO_TANGENT_DIST
 
     def solve(chosen: list[tuple[int, NDArray, NDArray]]):
-        start = (shape[1], shape[0])
-        return cv2.calibrateCameraExtended(
-            [view[1] for view in chosen], [view[2] for view in chosen], start, None, None, flags=flags
-        )
+        size = (shape[1], shape[0])
+        points, corners = [view[1] for view in chosen], [view[2] for view in chosen]
+        return cv2.calibrateCameraExtended(points, corners, size, None, None, flags=cv2.CALIB_FIX_K3)
 
     rms, K, k, _, _, std, _, errors = solve(views)
-    good = [view for view, error in zip(views, errors.ravel(), strict=True) if error <= max_view_rms]
-    if min_views <= len(good) < len(views):
+    good = [view for view, error in zip(views, errors.ravel(), strict=True) if error <= _MAX_VIEW_RMS]
+    if _MIN_VIEWS <= len(good) < len(views):
         views = good
         rms, K, k, _, _, std, _, errors = solve(views)
     fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))

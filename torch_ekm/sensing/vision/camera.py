@@ -79,7 +79,7 @@ class PinholeCamera:
         return undistorted.reshape(pixels.shape)
 
     def save(self, path: str | Path) -> None:
-        """Write the parameters as JSON."""
+        """Write size, focal lengths, centre [px] and distortion as JSON."""
         write_whole(Path(path), json.dumps(asdict(self), indent=2) + "\n")
 
     @classmethod

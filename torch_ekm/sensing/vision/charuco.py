@@ -37,7 +37,7 @@ class CharucoTarget:
 
     @cached_property
     def board(self):
-        """The same as ``cv2.aruco.CharucoBoard``."""
+        """The same target as OpenCV's ``cv2.aruco.CharucoBoard``, lengths in [m]."""
         cv2 = require("cv2")
         size = (self.columns, self.rows)
         return cv2.aruco.CharucoBoard(

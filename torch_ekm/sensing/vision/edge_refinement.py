@@ -15,6 +15,7 @@ from .board_pose import BoardPose, angle_between, projection_jacobian
 from .camera import PinholeCamera
 
 _ITERATIONS = 3
+_EDGE_STD = 0.03  # of the place of an edge [px]
 _REACH = 2.0  # a point of the board that moves farther went to the edge of something else [px]
 _PER_SIDE = 12  # places looked at along each side of a marker
 _CORRELATED = 3.0  # samples along a side share their errors: three count as one
@@ -34,7 +35,6 @@ def refine_on_edges(
     camera: PinholeCamera,
     board: MarkerBoard,
     pose: BoardPose,
-    edge_std: float = 0.03,
     prior: Array | None = None,
 ) -> BoardPose:
     r"""``min_{R, t} sum_i (n_i . (e_i - pi(R X_i + t)))^2``: sides of markers against edges in the image.
@@ -55,7 +55,6 @@ def refine_on_edges(
         camera: the lens.
         board: the board whose pose is given.
         pose: a pose from corners, right to about a pixel.
-        edge_std: standard deviation of the place of an edge [px].
         prior: rotation ``(3, 3)`` of the board that is to be expected.
 
     Returns:
@@ -63,14 +62,14 @@ def refine_on_edges(
         edges can be seen.
     """
     starts = [(pose.rotation, pose.position)] + ([pose.mirror] if pose.mirror is not None else [])
-    fits = [_fit(image, camera, board, start, edge_std) for start in starts]
+    fits = [_fit(image, camera, board, start) for start in starts]
     found = [fit for fit in fits if fit is not None]
     if not found:
         return pose
     ambiguous = False
     if len(found) == 2:
         seen = [fit.residual[np.isfinite(fit.residual)] for fit in found]
-        variance = max(edge_std**2, min(float(np.median(r**2)) * 2.2 for r in seen)) * _CORRELATED
+        variance = max(_EDGE_STD**2, min(float(np.median(r**2)) * 2.2 for r in seen)) * _CORRELATED
         costs = [float(np.minimum(fit.residual**2 / variance, 9.0).sum()) for fit in found]
         found = [found[k] for k in np.argsort(costs)]
         apart = angle_between(found[0].rotation, found[1].rotation) > np.radians(10)
@@ -90,7 +89,7 @@ def refine_on_edges(
 
 
 def _fit(
-    image: NDArray, camera: PinholeCamera, board: MarkerBoard, start: tuple[Array, Array], edge_std: float
+    image: NDArray, camera: PinholeCamera, board: MarkerBoard, start: tuple[Array, Array]
 ) -> _Fit | None:
     """Gauss-Newton from one start; None where there are too few edges, or those of something else."""
     X, along = _side_points(board)
@@ -108,21 +107,21 @@ def _fit(
         offset, valid = _edge_offsets(image, pixel, normal, half_width)
         if valid.sum() < 4 * _PER_SIDE or np.ptp(pixel[valid], axis=0).min() < 8:
             return None
-        limit = 3 * max(edge_std, 1.4826 * float(np.median(np.abs(offset[valid]))))
+        limit = 3 * max(_EDGE_STD, 1.4826 * float(np.median(np.abs(offset[valid]))))
         used = valid & (np.abs(offset) <= limit)
         rows = np.einsum("ni,nij->nj", normal[used], J[used])
         step, *_ = np.linalg.lstsq(rows, offset[used], rcond=None)
         rotation = require("cv2").Rodrigues(step[3:])[0] @ rotation
         position = position + step[:3]
         remaining = offset[used] - rows @ step
-        variance = _variance(remaining, np.flatnonzero(used) // _PER_SIDE, edge_std)
+        variance = _variance(remaining, np.flatnonzero(used) // _PER_SIDE)
         covariance = np.asarray(variance * np.linalg.inv(rows.T @ rows))
         fit = _Fit(rotation, position, covariance, np.where(valid, offset, np.inf))
     moved = camera.project(X @ rotation.T + position) - first
     return fit if float(np.abs(moved).max()) < _REACH else None
 
 
-def _variance(residual: Array, side: NDArray[np.int_], edge_std: float) -> float:
+def _variance(residual: Array, side: NDArray[np.int_]) -> float:
     """Of one sample as if all were independent [px^2].
 
     They are not: light, blur and the raster shift all edges of a side together. What counts is how the
@@ -134,7 +133,7 @@ def _variance(residual: Array, side: NDArray[np.int_], edge_std: float) -> float
     freedom = len(mean) - 6
     between = float(count[count > 0] @ mean**2) / freedom if freedom > 1 else 0.0
     single = float(residual @ residual) / max(len(residual) - 6, 1)
-    return max(_CORRELATED * max(edge_std**2, single), between)
+    return max(_CORRELATED * max(_EDGE_STD**2, single), between)
 
 
 def _side_points(board: MarkerBoard) -> tuple[Array, Array]:

@@ -33,7 +33,7 @@ class Track:
     """
 
     status: TrackStatus
-    position: Float[Tensor, 3] | None = None
+    position: Float[Tensor, " 3"] | None = None
     """Origin of the object's frame [m], float64."""
     rotation: Float[Tensor, "3 3"] | None = None
     covariance: Float[Tensor, "6 6"] | None = None
@@ -54,7 +54,7 @@ class Track:
     def ok(self) -> bool:
         return self.status is TrackStatus.OK
 
-    def pose(self) -> tuple[Float[Tensor, 3], Float[Tensor, "3 3"]]:
+    def pose(self) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"]]:
         """``(position, rotation)``.
 
         Raises:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -15,44 +13,12 @@ from .board import MarkerBoard, get_dictionary
 from .board_pose import BoardPose, angle_between, estimate_board_pose, skew
 from .camera import PinholeCamera
 from .edge_refinement import refine_on_edges
-from .static_pose import StaticPose
 from .track import Track, TrackStatus
 
-
-@dataclass(frozen=True)
-class TrackerOptions:
-    """When a pose is believed.
-
-    Raises:
-        ParameterError: a value is out of range.
-    """
-
-    min_markers: int = 2
-    """Markers of a board that must be seen. One alone is prone to flips."""
-    corner_std: float = 0.20
-    """Standard deviation of one coordinate of a detected corner [px]."""
-    max_residual: float = 1.0
-    """A corner farther than this from the fitted board is left out [px]."""
-    edges: bool = True
-    """Refine each board's pose on the edges of its markers: more accurate, and slower."""
-    max_step: float = 0.020
-    """Largest believable displacement between two frames [m]."""
-    max_turn: float = float(np.radians(20.0))
-    """Largest believable rotation between two frames [rad]."""
-    jump_frames: int = 3
-    """A jump is believed when that many frames in a row agree on it."""
-    palm_frames: int = 1
-    """Average the palm's board over that many frames. More than 1 takes hand and camera to stand still
-    with respect to each other, and bridges frames in which the palm is hidden; a board that moves
-    restarts the average."""
-
-    def __post_init__(self) -> None:
-        for name in ("min_markers", "jump_frames", "palm_frames"):
-            if getattr(self, name) < 1:
-                raise ParameterError(f"TrackerOptions.{name}", getattr(self, name), "1 or more")
-        for name in ("corner_std", "max_residual", "max_step", "max_turn"):
-            if not getattr(self, name) > 0:
-                raise ParameterError(f"TrackerOptions.{name}", getattr(self, name), "positive")
+_CORNER_STD = 0.20  # of one coordinate of a detected corner [px]
+_MAX_RESIDUAL = 1.0  # a corner farther than this from the fitted board is left out [px]
+_MAX_STEP, _MAX_TURN = 0.020, float(np.radians(20.0))  # believable between two frames [m], [rad]
+_JUMP_FRAMES = 3  # a jump is believed when that many frames in a row agree on it
 
 
 class MarkerTracker:
@@ -70,10 +36,12 @@ class MarkerTracker:
         palm_board: its ``mount`` is its pose in the hand frame.
         object_board: its ``mount`` is its pose in the object's frame
             (``ObjectDescription.marker_transform``).
-        options: thresholds.
+        min_markers: markers of a board that must be seen; one alone is prone to flips.
+        edges: refine each board's pose on the edges of its markers: more accurate, and slower.
 
     Raises:
-        ParameterError: the two boards share markers, or are of different dictionaries.
+        ParameterError: the two boards share markers, or are of different dictionaries; ``min_markers`` is
+            less than 1.
     """
 
     def __init__(
@@ -81,8 +49,11 @@ class MarkerTracker:
         camera: PinholeCamera,
         palm_board: MarkerBoard,
         object_board: MarkerBoard,
-        options: TrackerOptions | None = None,
+        min_markers: int = 2,
+        edges: bool = True,
     ) -> None:
+        if min_markers < 1:
+            raise ParameterError("min_markers", min_markers, "1 or more")
         if set(palm_board.ids) & set(object_board.ids):
             raise ParameterError(
                 "object_board.first_id", object_board.first_id, f"beyond the palm's {palm_board.ids}"
@@ -90,7 +61,7 @@ class MarkerTracker:
         if palm_board.dictionary != object_board.dictionary:
             raise ParameterError("object_board.dictionary", object_board.dictionary, palm_board.dictionary)
         self.camera, self.palm_board, self.object_board = camera, palm_board, object_board
-        self.options = options or TrackerOptions()
+        self.min_markers, self.edges = min_markers, edges
         self._detector = _make_detector(palm_board.dictionary)
         self.reset()
 
@@ -99,7 +70,6 @@ class MarkerTracker:
         self._prior: dict[int, Array] = {}
         self._last: tuple[Array, Array] | None = None
         self._jumps: list[tuple[Array, Array]] = []
-        self._palm = StaticPose(self.options.palm_frames)
 
     def track(self, image: NDArray[np.uint8] | None) -> Track:
         """Look for both boards in a grey ``(h, w)`` or BGR ``(h, w, 3)`` image; None is a dropped frame.
@@ -118,17 +88,18 @@ class MarkerTracker:
         def failed(status: TrackStatus) -> Track:
             return Track(status, palm=palm, object=obj, markers=markers)
 
-        seen_palm = self._palm.update(palm) if palm is None or self._certain(self.palm_board, palm) else None
-        if seen_palm is None:
-            return failed(TrackStatus.PALM_HIDDEN if palm is None else TrackStatus.AMBIGUOUS)
+        if palm is None:
+            return failed(TrackStatus.PALM_HIDDEN)
+        if not self._certain(self.palm_board, palm):
+            return failed(TrackStatus.AMBIGUOUS)
         if obj is None:
             return failed(TrackStatus.OBJECT_HIDDEN)
         if not self._certain(self.object_board, obj):
             return failed(TrackStatus.AMBIGUOUS)
-        position, rotation, covariance = self._object_in_hand(seen_palm, obj)
+        position, rotation, covariance = self._object_in_hand(palm, obj)
         if not self._believable(position, rotation):
             return failed(TrackStatus.JUMP)
-        self._prior = {id(self.object_board): obj.rotation, id(self.palm_board): seen_palm.rotation}
+        self._prior = {id(self.object_board): obj.rotation, id(self.palm_board): palm.rotation}
         tensors = (torch.from_numpy(array) for array in (position, rotation, covariance))
         return Track(TrackStatus.OK, *tensors, palm=palm, object=obj, markers=markers)
 
@@ -151,18 +122,18 @@ class MarkerTracker:
 
     def _board_pose(self, board: MarkerBoard, markers: dict[int, Array], grey: NDArray) -> BoardPose | None:
         seen = [k for k in board.ids if k in markers]
-        if len(seen) < min(self.options.min_markers, board.n_markers):
+        if len(seen) < min(self.min_markers, board.n_markers):
             return None
         pose = estimate_board_pose(
             self.camera,
             np.concatenate([board.corners[k - board.first_id] for k in seen]),
             np.concatenate([markers[k] for k in seen]),
-            self.options.corner_std,
-            self.options.max_residual,
+            _CORNER_STD,
+            _MAX_RESIDUAL,
             self._prior.get(id(board)),
-            min_corners=min(6, 4 * self.options.min_markers),
+            min_corners=min(6, 4 * self.min_markers),
         )
-        if pose is None or not self.options.edges:
+        if pose is None or not self.edges:
             return pose
         return refine_on_edges(grey, self.camera, board, pose, prior=self._prior.get(id(board)))
 
@@ -192,7 +163,7 @@ class MarkerTracker:
             if self._jumps and not self._near(self._jumps[-1], position, rotation):
                 self._jumps.clear()
             self._jumps.append((position, rotation))
-            if len(self._jumps) < self.options.jump_frames:
+            if len(self._jumps) < _JUMP_FRAMES:
                 return False
             self._jumps.clear()
         self._last = (position, rotation)
@@ -200,7 +171,7 @@ class MarkerTracker:
 
     def _near(self, other: tuple[Array, Array], position: Array, rotation: Array) -> bool:
         turn, step = angle_between(rotation, other[1]), np.linalg.norm(position - other[0])
-        return bool(step <= self.options.max_step and turn <= self.options.max_turn)
+        return bool(step <= _MAX_STEP and turn <= _MAX_TURN)
 
 
 def _make_detector(dictionary: str):

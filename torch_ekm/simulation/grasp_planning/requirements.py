@@ -1,4 +1,4 @@
-"""What the pinch planner needs of a hand, told by the pad or joint that lacks it."""
+"""What the pinch planner needs of a hand; the message names the pad or joint that lacks it."""
 
 from __future__ import annotations
 

@@ -23,11 +23,11 @@ class Card(Protocol):
 
     @property
     def size(self) -> tuple[float, float]:
-        """Width and height [m]."""
+        """Width and height of the printed card, rim included [m]."""
         ...
 
     def texture(self, texel: float = ...) -> NDArray[np.uint8]:
-        """What is printed, upper left first."""
+        """Grey levels of the print, 0 black to 255 white, upper left first."""
         ...
 
 

@@ -51,7 +51,7 @@ class GraspView:
         self._object = [ConvexBody.of_shape(shape, shade=150) for shape in obj.shapes]
 
     def scene(
-        self, q: Float[Tensor, " n_q"], position: Float[Tensor, 3], rotation: Float[Tensor, "3 3"]
+        self, q: Float[Tensor, " n_q"], position: Float[Tensor, " 3"], rotation: Float[Tensor, "3 3"]
     ) -> CardScene:
         """The scene in the camera frame, at joint angles ``q`` [rad] and an object pose in the hand frame."""
         to_camera = np.linalg.inv(self.camera_pose)

@@ -13,6 +13,7 @@ from ...exceptions import ParameterError
 from ...sensing.vision.camera import PinholeCamera
 from .card_scene import Card, CardScene, ConvexBody, PlacedCard
 
+_SAMPLES = 4  # of a card, per pixel and direction
 _SHIFT = 4  # fractional bits of OpenCV's polygon coordinates
 _EDGE_ON = 1e-6  # cosine below which a card shows nothing of its face
 
@@ -56,26 +57,21 @@ class ImageQuality:
 class SimulatedCamera:
     """Draws cards by their homography ``x ~ K [r1 r2 t] X``, then bodies, blur and noise.
 
-    Cards are sampled ``supersample^2`` times in each pixel and hidden by the bodies before them and
+    Cards are sampled 16 times in each pixel and hidden by the bodies before them and
     by nearer cards; the scene knows the true poses, the picture is all that a tracker gets.
 
     Args:
         camera: the lens.
         quality: blur, noise, light.
-        supersample: samples per pixel and direction.
     """
 
     def __init__(
         self,
         camera: PinholeCamera | None = None,
         quality: ImageQuality | None = None,
-        supersample: int = 4,
     ) -> None:
-        if supersample < 1:
-            raise ParameterError("supersample", supersample, "a positive integer")
         self.camera = camera or PinholeCamera()
         self.quality = quality or ImageQuality()
-        self.supersample = supersample
         self._textures: dict[Card, NDArray[np.uint8]] = {}
         v, u = np.mgrid[: self.camera.height, : self.camera.width].astype(np.float32)
         self._rays = None
@@ -104,7 +100,7 @@ class SimulatedCamera:
     def _draw_card(
         self, image: NDArray, placed: PlacedCard, bodies: list[tuple[ConvexBody, NDArray | None]]
     ) -> None:
-        cv2, s = require("cv2"), self.supersample
+        cv2, s = require("cv2"), _SAMPLES
         outline = placed.outline
         cosine = abs(placed.pose[:3, 2] @ placed.pose[:3, 3]) / np.linalg.norm(placed.pose[:3, 3])
         if np.any(outline[:, 2] < 1e-3) or cosine < _EDGE_ON:
@@ -152,7 +148,7 @@ class SimulatedCamera:
 
     def _sample_rays(self, u0: int, v0: int, u1: int, v1: int) -> tuple[NDArray, NDArray]:
         """``x/z, y/z`` of the samples of a window, float32."""
-        cv2, s, camera = require("cv2"), self.supersample, self.camera
+        cv2, s, camera = require("cv2"), _SAMPLES, self.camera
         n_u, n_v = (u1 - u0) * s, (v1 - v0) * s
         if self._rays is None:
             u = u0 - 0.5 + (np.arange(n_u, dtype=np.float32) + 0.5) / s

@@ -44,7 +44,7 @@ def true_hand(hand: HandDescription, parameters: PlantParameters) -> HandDescrip
 
 
 def true_object(obj: ObjectDescription, parameters: PlantParameters) -> ObjectDescription:
-    """What the object really is."""
+    """The object with true mass, centre, friction and size, where its description is off."""
     return dataclasses.replace(
         obj,
         mass=parameters.mass * obj.mass,

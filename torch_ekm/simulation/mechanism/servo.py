@@ -59,7 +59,7 @@ class Servo:
         self.setpoint = self.encoder
 
     def plan(self, delta: Array, generator: np.random.Generator) -> Array:
-        """Where the motors will stop if told to move by ``delta`` ``(n_a,)`` [rad].
+        """Where the motors will stop if commanded to move by ``delta`` ``(n_a,)`` [rad].
 
         Raises:
             ShapeError, NonFiniteError: ``delta`` is not ``n_a`` finite numbers; nothing is changed.

@@ -78,7 +78,7 @@ class Transmission:
 
     @property
     def stiffness(self) -> Array:
-        """k_a of each actuator [N m/rad]."""
+        """Series stiffness k_a of each actuator, ``(n_a,)`` [N m/rad]."""
         return self._k[: self.n_a]
 
     def relax(self, q: Array) -> None:

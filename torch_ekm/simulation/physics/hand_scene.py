@@ -107,7 +107,7 @@ class HandScene:
 
     @property
     def object_speed(self) -> tuple[float, float]:
-        """Of the object: [m/s] and [rad/s]."""
+        """Linear [m/s] and angular speed [rad/s] of the object, norms."""
         linear, angular = self._object.linear_velocity, self._object.angular_velocity
         return float(np.linalg.norm(linear)), float(np.linalg.norm(angular))
 

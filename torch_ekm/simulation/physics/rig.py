@@ -24,11 +24,15 @@ Gravity = tuple[float, float, float]
 
 _FORCE_WINDOW = 10  # steps over which a fingertip force is averaged
 _STILL = 2e-3  # [rad/s] and [m/s x 10]: slower than this is settled
+_RAMP_TIME = 0.2  # in which a command is carried out [s]
+_RATE_LIMIT = 100 * np.pi / 180  # fastest motion of a motor [rad/s]; a large command takes longer
+COMMAND_TIME = 0.5  # least time of one command, ramp and settling [s]
+_SETTLE_LIMIT = 1.0  # a command ends at the latest after this time, settled or not [s]
 _CLOSING, _HOLDING, _SETTLING = 0.2, 0.3, 1.0  # [s] of a grasp, object held fixed in the first two
 
 
 class RigState(NamedTuple):
-    """A moment of a :class:`Rig`."""
+    """All that changes in a :class:`Rig`, for :meth:`Rig.restore`; SI units, hand frame."""
 
     physics: bytes
     transmission: Transmission
@@ -41,7 +45,7 @@ class RigState(NamedTuple):
 
 
 class Rig:
-    """Steps the scene with the transmission's torques while the servos move, and feels the contacts.
+    """Steps the scene with the transmission's torques while the servos move, and measures the contact forces.
 
     Args:
         hand, obj: the bodies.
@@ -111,15 +115,15 @@ class Rig:
     def move(self, goal: Array) -> None:
         """Ramp the motors to ``goal`` ``(n_a,)`` [rad] and let the hand settle."""
         c, start = self.config, self.servo.encoder
-        ramp = max(c.ramp_time, float(np.abs(goal - start).max()) / c.rate_limit)
+        ramp = max(_RAMP_TIME, float(np.abs(goal - start).max()) / _RATE_LIMIT)
         self.run(max(1, round(ramp / c.time_step)), lambda part: start + part * (goal - start))
-        self.settle(c.command_time - c.ramp_time)
+        self.settle(COMMAND_TIME - _RAMP_TIME)
 
     def settle(self, least: float) -> None:
-        """Wait at least that long [s], and until the object is still or ``settle_limit`` is used up."""
+        """Wait at least that long [s], and until the object is still or 1 s is used up."""
         c = self.config
         self.wait(max(least, c.time_step))
-        for _ in range(round((c.settle_limit - c.command_time) / 0.05)):
+        for _ in range(round((_SETTLE_LIMIT - COMMAND_TIME) / 0.05)):
             linear, angular = self.scene.object_speed
             if max(10 * linear, angular) < _STILL:
                 break
@@ -161,7 +165,7 @@ class Rig:
     def change(self, new: PlantParameters) -> None:
         """Take on other parameters in mid-run, the motors staying where they are.
 
-        What does not differ is left alone: PhysX would not go on bit by bit from being told again.
+        What does not differ is left alone: PhysX would not go on bit by bit from being set again.
         """
         old, self.parameters = self.parameters, new
         self.servo.set_parameters(new)

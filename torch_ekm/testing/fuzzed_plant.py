@@ -50,7 +50,7 @@ class FuzzedPlant(PlantWrapper):
         self._left, self._kind, self._sensor = 0, "", ""
 
     def repair(self) -> None:
-        """End the fault under way."""
+        """End the fault under way; the next reading is passed on unchanged, unless a new one begins."""
         self._left = 0
 
     def observation(self, seen: Observation) -> Observation:

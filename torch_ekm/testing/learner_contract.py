@@ -15,10 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Normal
 
-from .exceptions import EKMError, NonFiniteError, NoStateError, ShapeError, StateMismatchError
-from .residual.base import ResidualLearner, UpdateReport
-
-__all__ = ["check_residual_learner"]
+from ..exceptions import EKMError, NonFiniteError, NoStateError, ShapeError, StateMismatchError
+from ..residual.base import ResidualLearner, UpdateReport
 
 QUERY_SHAPES = ((), (1,), (5,), (2, 3))
 
@@ -91,7 +89,7 @@ def _stream(learner: ResidualLearner, n: int) -> tuple[Tensor, Tensor]:
 def _check_module(learner: ResidualLearner) -> None:
     assert isinstance(learner, nn.Module), "not an nn.Module"
     assert isinstance(learner, ResidualLearner), "not a ResidualLearner"
-    assert str(learner.in_features) in repr(learner), "repr does not tell in_features"
+    assert str(learner.in_features) in repr(learner), "repr does not show in_features"
     assert not any(p.requires_grad for p in learner.parameters()), "a parameter requires grad"
 
 
