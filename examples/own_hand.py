@@ -11,7 +11,7 @@ import numpy as np
 from torch_ekm.control import ClosedLoop, LookAndMoveController, PoseTarget
 from torch_ekm.description import load_hand
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.experiments.check import check_hand
+from torch_ekm.inspection.check import check_hand
 from torch_ekm.model import KinematicModel
 from torch_ekm.simulation import SimulatedHand
 

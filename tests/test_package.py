@@ -102,7 +102,7 @@ def test_rooms_ask_for_their_extras_when_they_need_them(room: str) -> None:
 def test_adapters_name_the_extra_when_they_are_made() -> None:
     made = """
 from torch_ekm.exceptions import MissingExtraError
-from torch_ekm.residual import GPyTorchSVGP, GPyTorchWindow, RiverResidual
+from torch_ekm.interop import GPyTorchSVGP, GPyTorchWindow, RiverResidual
 
 for kind in (GPyTorchSVGP, GPyTorchWindow, RiverResidual):
     try:

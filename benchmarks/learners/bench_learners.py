@@ -189,7 +189,7 @@ def gpytorch_fantasy(capacity: int, m: int) -> Callable:
 def gpytorch_svgp(capacity: int, m: int) -> Callable:
     """One variational step on one sample."""
     pytest.importorskip("gpytorch")
-    from torch_ekm.residual import GPyTorchSVGP
+    from torch_ekm.interop import GPyTorchSVGP
 
     return Timed(GPyTorchSVGP(D, m, inducing=capacity).update, *stream(64, m))
 
@@ -206,7 +206,7 @@ def sklearn_refit(capacity: int, m: int) -> Callable:
 def river_forest(capacity: int, m: int) -> Callable:
     """river's adaptive random forest, one per output."""
     pytest.importorskip("river")
-    from torch_ekm.residual import RiverResidual
+    from torch_ekm.interop import RiverResidual
 
     learner = RiverResidual(D, m)
     learner.update(*stream(capacity, m))

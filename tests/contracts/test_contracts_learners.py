@@ -132,7 +132,7 @@ def test_contract_of_fleets_of_single_learners(name, shape):
 
 def test_contract_of_river():
     pytest.importorskip("river")
-    from torch_ekm.residual import RiverResidual
+    from torch_ekm.interop import RiverResidual
 
     options = {"differentiable": False, "separates_noise": False, "has_state": False}
     check_residual_learner(lambda **o: RiverResidual(3, 2, **o), **options)
@@ -143,7 +143,7 @@ def test_contract_of_river():
 
 def test_contract_of_gpytorch():
     pytest.importorskip("gpytorch")
-    from torch_ekm.residual import GPyTorchSVGP
+    from torch_ekm.interop import GPyTorchSVGP
 
     check_residual_learner(lambda **o: GPyTorchSVGP(3, 2, inducing=6, **o), vmap=False)
     check_residual_learner(
@@ -153,7 +153,7 @@ def test_contract_of_gpytorch():
 
 def test_contract_of_gpytorch_window():
     pytest.importorskip("gpytorch")
-    from torch_ekm.residual import GPyTorchWindow
+    from torch_ekm.interop import GPyTorchWindow
 
     options = {"window": 10, "refit_every": 8, "steps": 2, "noise_variance": 0.05}
     check_residual_learner(lambda **o: GPyTorchWindow(3, 2, **options, **o), vmap=False)

@@ -172,7 +172,7 @@ def test_a_state_is_loaded_whole_or_not_at_all(name: str) -> None:
     """Each of its entries in turn is a hostile one."""
     if name == "svgp":
         pytest.importorskip("gpytorch")
-    from torch_ekm.residual import GPyTorchSVGP
+    from torch_ekm.interop import GPyTorchSVGP
 
     make = {**LEARNERS, "svgp": lambda: GPyTorchSVGP(3, 2, inducing=4)}[name]
     x, y = stream()
@@ -310,7 +310,7 @@ def test_hostile_and_damaged_files(tmp_path: Path) -> None:
 
 def test_another_librarys_objects_are_not_saved(tmp_path: Path) -> None:
     pytest.importorskip("river")
-    from torch_ekm.residual import RiverResidual
+    from torch_ekm.interop import RiverResidual
 
     learner = RiverResidual(3, 2)
     with pytest.raises(exceptions.NoStateError, match="river"):
@@ -322,7 +322,7 @@ def test_another_librarys_objects_are_not_saved(tmp_path: Path) -> None:
 
 def test_gpytorch_holds_plain_figures(tmp_path: Path) -> None:
     pytest.importorskip("gpytorch")
-    from torch_ekm.residual import GPyTorchSVGP
+    from torch_ekm.interop import GPyTorchSVGP
 
     x, y = stream(12)
     learner = GPyTorchSVGP(3, 2, inducing=6)

@@ -27,7 +27,7 @@ from torch_ekm.experiments.learner_comparison.scores import (
 )
 from torch_ekm.experiments.learner_comparison.stream import Stream, in_own_units, load_table
 from torch_ekm.experiments.learner_comparison.table_file import open_table
-from torch_ekm.experiments.learners import COMPARED, LEARNERS, PEERS, learner_factory
+from torch_ekm.experiments.learners import COMPARED, LEARNERS, learner_factory
 from torch_ekm.experiments.reporting.report import Report, Table
 
 WEIGHTS = torch.tensor([[1.0, -0.5], [0.3, 0.8], [0.0, 0.4]], dtype=torch.float64)
@@ -203,12 +203,10 @@ def test_every_kind_of_learner_in_the_package_contends() -> None:
     import torch_ekm.residual as residual
 
     kinds = tuple(type(make(2, 1)) for name, make in LEARNERS.items() if name in COMPARED)
-    peers = {"GPyTorchSVGP", "GPyTorchWindow", "RiverResidual"}  # need other libraries to be made
-    assert len(PEERS) == len(peers)
-    peers |= {"LearnerFleet", "LastResidual"}  # hold others
+    holders = {"LearnerFleet", "LastResidual"}  # of other learners
     for name in dir(residual):
         cls = getattr(residual, name)
-        if isinstance(cls, type) and issubclass(cls, residual.ResidualLearner) and name not in peers:
+        if isinstance(cls, type) and issubclass(cls, residual.ResidualLearner) and name not in holders:
             assert cls is residual.ResidualLearner or issubclass(cls, kinds), f"{name} is not compared"
 
 

@@ -64,7 +64,7 @@ def check(
     Files, pads, axes, limits, tendons, and a pinch of the object in simulation and model. Each row says what
     was found and what to mend. Ends with 1 if there is an error, with 0 if not.
     """
-    from ..experiments.check import Check, check_hand
+    from ..inspection.check import Check, check_hand
 
     check_file(picture, (".png", ".jpg", ".jpeg"))
     with console.status("Checking: some seconds, a minute or two where the pinch fails"):

@@ -13,7 +13,7 @@ import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
 
 if TYPE_CHECKING:
-    from ..experiments.viewer.serve import Show
+    from ..inspection.viewer.serve import Show
     from ..plant.trial_log import TrialEntry
 
 
@@ -69,7 +69,7 @@ def show(
     A hand has a slider for each actuator, a grasp is simulated while its actuators are moved, a log is
     played.
     """
-    from ..experiments.viewer.serve import ReachShow, choose_show
+    from ..inspection.viewer.serve import ReachShow, choose_show
 
     shown = choose_show(what, object, seed, reach)
     if isinstance(shown, ReachShow):
@@ -89,7 +89,7 @@ def replay(
     port: Port = 8080,
 ) -> None:
     """List the trials of a log, and play one in the browser."""
-    from ..experiments.viewer.trial import LogShow
+    from ..inspection.viewer.trial import LogShow
     from ..plant.trial_log import TrialEntry
 
     shown = LogShow(log, trial, estimates)
@@ -120,7 +120,7 @@ def verify(log: Annotated[Path, Argument(help="Folder of the log.")]) -> None:
 
 def _look(show: Show, html: Path | None, port: int) -> None:
     """Write a page, or serve until Ctrl-C."""
-    from ..experiments.viewer.serve import save_page, serve
+    from ..inspection.viewer.serve import save_page, serve
 
     if html is not None:
         say(f"Page:      {save_page(show, html).resolve()}")

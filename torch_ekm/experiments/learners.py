@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from .. import residual
+from .. import interop, residual
 from .._recorded import describe
 from ..enhanced.grasp_learner import NOISE_VARIANCE, grasp_kernel
 from ..exceptions import UnknownNameError
@@ -133,9 +133,9 @@ LEARNERS: dict[str, Factory] = {
         parts=[residual.CalibrateNoise(), residual.DetectChanges()],
     ),
     "SOGP mixture": _mixture,
-    "river forest": _kind(residual.RiverResidual),
-    "GPyTorch window": _kind(residual.GPyTorchWindow, "window", noise_variance=NOISE_VARIANCE),
-    "GPyTorch SVGP": _kind(residual.GPyTorchSVGP, "inducing", memory=500, minibatch=20),
+    "river forest": _kind(interop.RiverResidual),
+    "GPyTorch window": _kind(interop.GPyTorchWindow, "window", noise_variance=NOISE_VARIANCE),
+    "GPyTorch SVGP": _kind(interop.GPyTorchSVGP, "inducing", memory=500, minibatch=20),
 }
 #: Learners of other libraries: ten to a hundred times as slow, and in an extra of their own.
 PEERS = ("river forest", "GPyTorch window", "GPyTorch SVGP")

@@ -1,6 +1,7 @@
-"""Learners in other libraries' interfaces: river, scikit-learn, CapyMOA, CasADi, acados, MCAP recordings.
+"""Both ways between learners and other libraries: river, scikit-learn, CapyMOA, CasADi, acados, GPyTorch.
 
-Each function imports its library when it is called, and names the extra ``interop`` if that is missing.
+Learners of this package in their interfaces, and theirs as a :class:`~torch_ekm.ResidualLearner` (extra
+``peers``). Each imports its library when it is called, and names the extra if that is missing.
 """
 
 from __future__ import annotations
@@ -12,7 +13,10 @@ from typing import TYPE_CHECKING, Any
 from ..residual import ResidualLearner
 from .acados_residual import AcadosResidual
 from .capymoa_regressor import CapyMOARegressor
+from .gpytorch_svgp import GPyTorchSVGP
+from .gpytorch_window import GPyTorchWindow
 from .online_regressor import LearnerLike, OnlineRegressor
+from .river_residual import RiverResidual
 
 if TYPE_CHECKING:
     from ..plant import TrialLog
@@ -137,8 +141,11 @@ def log_from_mcap(folder: str | Path, target: str | Path) -> TrialLog:
 __all__ = [
     "AcadosResidual",
     "CapyMOARegressor",
+    "GPyTorchSVGP",
+    "GPyTorchWindow",
     "LearnerLike",
     "OnlineRegressor",
+    "RiverResidual",
     "as_capymoa",
     "as_river",
     "as_sklearn",

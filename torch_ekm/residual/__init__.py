@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from .adapters.gpytorch_svgp import GPyTorchSVGP
-from .adapters.gpytorch_window import GPyTorchWindow
-from .adapters.river import RiverResidual
 from .base import ResidualLearner
 from .baselines.krls_t import KRLSTracker
 from .baselines.linear import RandomFeatureRLS, RecursiveLeastSquares
@@ -36,8 +33,6 @@ __all__ = [
     "DeepKernelSOGP",
     "DetectChanges",
     "ForgettingFactor",
-    "GPyTorchSVGP",
-    "GPyTorchWindow",
     "KRLSTracker",
     "Kernel",
     "LearnHyperparameters",
@@ -55,7 +50,6 @@ __all__ = [
     "RecursiveLeastSquares",
     "ReplayMLP",
     "ResidualLearner",
-    "RiverResidual",
     "RobustWeight",
     "SparseOnlineGP",
     "SquaredExponential",

@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 from torch_ekm.cli import app
 from torch_ekm.exceptions import ParameterError
-from torch_ekm.experiments.viewer.reach import ReachShow
-from torch_ekm.experiments.viewer.serve import choose_show
+from torch_ekm.inspection.viewer.reach import ReachShow
+from torch_ekm.inspection.viewer.serve import choose_show
 
 pytest.importorskip("viser")
 pytest.importorskip("sapien")

@@ -8,12 +8,12 @@ import torch
 from torch import nn
 from torch.distributions import Normal
 
-from ..._extras import require
-from ...exceptions import NoStateError
-from ...typing import Tensor
-from ..base import SingleLearner
-from ..checks import check_positive
-from ..report import UpdateReport
+from .._extras import require
+from ..exceptions import NoStateError
+from ..residual.base import SingleLearner
+from ..residual.checks import check_positive
+from ..residual.report import UpdateReport
+from ..typing import Tensor
 
 
 class RiverResidual(SingleLearner):

@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 from torch_ekm.cli import app
 from torch_ekm.description import load_hand
 from torch_ekm.exceptions import DescriptionError, OutputError, ParameterError, UnknownNameError
-from torch_ekm.experiments.viewer.hand import GraspShow
-from torch_ekm.experiments.viewer.serve import choose_show, save_page, serve
-from torch_ekm.experiments.viewer.trial import LogShow
+from torch_ekm.inspection.viewer.hand import GraspShow
+from torch_ekm.inspection.viewer.serve import choose_show, save_page, serve
+from torch_ekm.inspection.viewer.trial import LogShow
 from torch_ekm.plant import RecordingPlant, Trajectory, TrialLog
 from torch_ekm.rendering import make_scene, start_server
 from torch_ekm.rendering.web_guard import WebGuard

@@ -12,10 +12,10 @@ import torch
 from torch import nn
 from torch.distributions import Normal
 
-from ..._recorded import ill_formed, in_bounds
-from ...typing import Float, Tensor
-from ..base import SingleLearner
-from ..report import UpdateReport
+from .._recorded import ill_formed, in_bounds
+from ..residual.base import SingleLearner
+from ..residual.report import UpdateReport
+from ..typing import Float, Tensor
 
 
 class GPyTorchLearner(SingleLearner):

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from torch_ekm.cli import app
 from torch_ekm.description import list_hands, load_hand, load_object
 from torch_ekm.exceptions import DescriptionError, EquilibriumError, GraspError
-from torch_ekm.experiments.check import check_hand
+from torch_ekm.inspection.check import check_hand
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
 from torch_ekm.simulation.grasp_planning.pinch import pinch_problem
 from torch_ekm.simulation.grasp_planning.requirements import unmet
@@ -106,7 +106,7 @@ def test_a_pad_that_holds_with_its_back_is_told(monkeypatch):
     hand = dataclasses.replace(
         HAND, joint_lower=lower, joint_upper=upper, actuators=(left, *HAND.actuators[1:])
     )
-    monkeypatch.setattr("torch_ekm.experiments.check.load_hand", lambda _: hand)
+    monkeypatch.setattr("torch_ekm.inspection.check.load_hand", lambda _: hand)
     rows = {row.name: row for row in check_hand("mine")}
     assert rows["contact sides"].state == rows["model"].state == "error"
     assert "'right'" in rows["contact sides"].found
@@ -114,7 +114,7 @@ def test_a_pad_that_holds_with_its_back_is_told(monkeypatch):
 
 def test_a_pinch_that_turns_little_is_told(monkeypatch):
     def turn(least_deg: float) -> tuple[str, list[int]]:
-        monkeypatch.setattr("torch_ekm.experiments.check._LITTLE_TURN", math.radians(least_deg))
+        monkeypatch.setattr("torch_ekm.inspection.check._LITTLE_TURN", math.radians(least_deg))
         row = {row.name: row for row in check_hand("planar_two_finger", "can")}["turn"]
         return row.state, [int(angle) for angle in re.findall(r"([+-]\d+) deg", row.found)]
 
@@ -129,8 +129,8 @@ def test_limits_that_leave_no_pinch_are_told_with_the_angle_that_it_takes(monkey
     lower, upper = HAND.joint_lower.copy(), HAND.joint_upper.copy()
     lower[0], upper[0], upper[1] = -0.5, 0.0, 0.2
     hand = dataclasses.replace(HAND, joint_lower=lower, joint_upper=upper)
-    monkeypatch.setattr("torch_ekm.experiments.check.load_hand", lambda _: hand)
-    monkeypatch.setattr("torch_ekm.experiments.check._GENTLER", (4.0,))
+    monkeypatch.setattr("torch_ekm.inspection.check.load_hand", lambda _: hand)
+    monkeypatch.setattr("torch_ekm.inspection.check._GENTLER", (4.0,))
     left = dataclasses.replace(hand.actuators[0], lower=-0.5)
     hand = dataclasses.replace(hand, actuators=(left, *hand.actuators[1:]))
     rows = {row.name: row for row in check_hand("mine")}
@@ -143,13 +143,13 @@ def test_limits_that_leave_no_pinch_are_told_with_the_angle_that_it_takes(monkey
 
 def test_springs_too_soft_for_the_usual_force_are_told_which_one_they_bear(monkeypatch):
     hand = dataclasses.replace(HAND, spring_stiffness=HAND.spring_stiffness / 4)
-    monkeypatch.setattr("torch_ekm.experiments.check.load_hand", lambda _: hand)
+    monkeypatch.setattr("torch_ekm.inspection.check.load_hand", lambda _: hand)
     rows = {row.name: row for row in check_hand("mine", "can")}
     assert rows["pinch"].state == "error"
     assert "sound at 2 N" in rows["pinch force"].found
     assert "'pinch_force = 2'" in rows["pinch force"].mend
     gentle = dataclasses.replace(hand, pinch_force=2.0)
-    monkeypatch.setattr("torch_ekm.experiments.check.load_hand", lambda _: gentle)
+    monkeypatch.setattr("torch_ekm.inspection.check.load_hand", lambda _: gentle)
     assert {row.name: row for row in check_hand("mine", "can")}["pinch"].state == "ok"
 
 
@@ -159,7 +159,7 @@ def test_a_pinch_that_the_usual_faults_break_is_told(monkeypatch):
             raise GraspError("it slips")
         return SimulatedHand(*args, preset=preset, **options)
 
-    monkeypatch.setattr("torch_ekm.experiments.check.SimulatedHand", hand)
+    monkeypatch.setattr("torch_ekm.inspection.check.SimulatedHand", hand)
     rows = {row.name: row for row in check_hand("planar_two_finger", "can")}
     assert (rows["pinch"].state, rows["pinch, preset nominal"].state) == ("ok", "warning")
     assert "it slips" in rows["pinch, preset nominal"].found
@@ -169,7 +169,7 @@ def test_rigid_actuators_that_contradict_each_other_are_told(monkeypatch):
     hand = load_hand("icub_right")
     rigid = tuple(dataclasses.replace(actuator, stiffness=float("inf")) for actuator in hand.actuators)
     hand = dataclasses.replace(hand, actuators=rigid)
-    monkeypatch.setattr("torch_ekm.experiments.check.load_hand", lambda _: hand)
+    monkeypatch.setattr("torch_ekm.inspection.check.load_hand", lambda _: hand)
     rows = {row.name: row for row in check_hand("mine")}
     assert "thumb_distal 100" in rows["actuators"].found
     assert rows["actuators in the pinch"].state == "warning"

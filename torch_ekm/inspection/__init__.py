@@ -1,0 +1,1 @@
+"""Look at a hand, a grasp or a log before anything is driven: ``check`` and the viewer."""
