@@ -237,6 +237,7 @@ def test_joints_in_another_order_than_the_tree(tmp_path: Path) -> None:
         torch.testing.assert_close(theirs.jacobian(q[:, order], link), J, atol=1e-14, rtol=0)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_errors_list_what_would_be_right() -> None:
     kinematics = HandKinematics(load_hand("planar_two_finger"))
     for bad in (torch.zeros(3), torch.zeros(2, 5), torch.tensor(0.0)):

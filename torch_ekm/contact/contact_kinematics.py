@@ -71,7 +71,7 @@ class ContactKinematics:
 
 
 def contact_frames(
-    normal: Float[Tensor, "*batch n_c 3"], plane: Float[Tensor, 3] | None = None
+    normal: Float[Tensor, "*batch n_c 3"], plane: Float[Tensor, " 3"] | None = None
 ) -> Float[Tensor, "*batch n_c 3 3"]:
     """``C_i = [n_in, t1, t2]``, right-handed, ``n_in = -n``.
 
@@ -122,7 +122,7 @@ def contact_kinematics(
     upstream: Bool[Tensor, "n_c n_q"],
     *,
     models: Sequence[ContactModel] | None = None,
-    plane: Float[Tensor, 3] | None = None,
+    plane: Float[Tensor, " 3"] | None = None,
     rolling: bool = True,
 ) -> ContactKinematics:
     """Velocity of the contact points: ``J_v[:, j] = z_j x (x_i - o_j)``, ``J_w[:, j] = z_j``.
@@ -156,14 +156,14 @@ def contact_kinematics(
     )
 
 
-def full_hand_jacobian(kin: ContactKinematics) -> Float[Tensor, "*batch 6*n_c n_q"]:
+def full_hand_jacobian(kin: ContactKinematics) -> Float[Tensor, "*batch rows n_q"]:
     """``J~_h``: rows ``blkdiag(C_i, C_i)^T [J_v,i; J_w,i]``, stacked over the contacts."""
     C_t = kin.frame.mT
     rows = torch.cat([C_t @ kin.point_jacobian, C_t @ kin.spin_jacobian], dim=-2)
     return rows.flatten(-3, -2)
 
 
-def full_grasp_matrix(kin: ContactKinematics) -> Float[Tensor, "*batch 6 6*n_c"]:
+def full_grasp_matrix(kin: ContactKinematics) -> Float[Tensor, "*batch 6 rows"]:
     """``G~``: blocks ``[C_i, 0; [r_i]x C_i, C_i]``; maps contact forces to the wrench about ``o``."""
     C = kin.frame
     moment = hat(kin.lever) @ C

@@ -82,7 +82,7 @@ class ContactDetector:
     def __call__(
         self,
         q: LinkPoses | Float[Tensor, " n_q"],
-        position: Float[Tensor, 3],
+        position: Float[Tensor, " 3"],
         rotation: Float[Tensor, "3 3"],
     ) -> ContactSet:
         """Contacts in the hand frame, in the order of ``hand.pads``; empty if nothing is near.

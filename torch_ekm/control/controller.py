@@ -95,7 +95,7 @@ class LookAndMoveController:
     def __init__(
         self,
         model: KinematicModel | EnhancedModel,
-        focus: FocusedPose | Float[Tensor, 3],
+        focus: FocusedPose | Float[Tensor, " 3"],
         tasks: Sequence[Task] | None = None,
         limits: Sequence[Limit] | None = None,
         limiting: LimitingFunction | None = None,

@@ -18,10 +18,10 @@ from ..typing import Float, Tensor
 class PoseTarget:
     """Where the object shall be: point ``o_r`` [m] and orientation ``R_r``, hand frame."""
 
-    position: Float[Tensor, 3]
+    position: Float[Tensor, " 3"]
     rotation: Float[Tensor, "3 3"]
 
-    def error(self, state: GraspState) -> Float[Tensor, 6]:
+    def error(self, state: GraspState) -> Float[Tensor, " 6"]:
         """``(o_r - o_f, Log(R_r R_f^T))`` [m, rad]: the twist that would bring the object home."""
         return torch.cat([self.position - state.position, log(self.rotation @ state.rotation.mT)])
 
@@ -29,7 +29,7 @@ class PoseTarget:
     def turned(
         cls,
         state: GraspState,
-        axis: Float[Tensor, 3],
+        axis: Float[Tensor, " 3"],
         angle: float | None = None,
         *,
         degrees: float | None = None,
@@ -71,7 +71,7 @@ class FocusedPose:
         self.off_translation = self.off_matrix[:, :3].abs().sum(-1) > 0
 
     @classmethod
-    def rotation_about(cls, axis: Float[Tensor, 3]) -> FocusedPose:
+    def rotation_about(cls, axis: Float[Tensor, " 3"]) -> FocusedPose:
         """The rotation about one axis (hand frame), as in all experiments of the paper."""
         norm = torch.linalg.vector_norm(axis)
         if not norm > 1e-9:

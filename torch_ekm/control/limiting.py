@@ -47,7 +47,7 @@ class LimitingFunction:
         return size if self.contact_travel is None else max(size, travel / self.contact_travel)
 
 
-def contact_travel(twist: Float[Tensor, 6], lever: Float[Tensor, "n_c 3"]) -> float:
+def contact_travel(twist: Float[Tensor, " 6"], lever: Float[Tensor, "n_c 3"]) -> float:
     """``max_i |v + w x l_i|`` of contacts at l from the object's point o [m]."""
     v, w = twist.split(3)
     carried = v + torch.linalg.cross(w.expand_as(lever), lever)

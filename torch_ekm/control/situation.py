@@ -29,7 +29,7 @@ class Situation:
     """Encoders [rad]."""
     fingertip_force: Float[Tensor, " n_pads"] | None
     """Measured normal force of each pad [N], NaN where unknown; None: no pad measures."""
-    error: Float[Tensor, 6]
+    error: Float[Tensor, " 6"]
     """e, the twist to the target [m, rad]."""
     desired: Float[Tensor, " n_x"]
     """dx_d, what one step shall do to the focused pose."""

@@ -82,8 +82,8 @@ class TrustRegion(Recorded, nn.Module):
 
     def judge(
         self,
-        predicted: Float[Tensor, 6],
-        came: Float[Tensor, 6],
+        predicted: Float[Tensor, " 6"],
+        came: Float[Tensor, " 6"],
         lever: float,
         share: float = 1.0,
         surprise: Float[Tensor, " n_c"] | None = None,

@@ -31,7 +31,7 @@ class Prediction:
     """Increments of the encoders [rad]."""
     linearization: Linearization = field(repr=False)
     """Of f at all ``K + 1`` configurations, ``(*batch, K + 1, ...)``."""
-    motion_variance: Float[Tensor, "*batch K+1 n_s"]
+    motion_variance: Float[Tensor, "*batch nodes n_s"]
     """``Var[g]`` of the motion that ends here [rad^2, m^2, rad^2]: what the learner does not know; 0 at the
     start, and throughout without a learner."""
 
@@ -51,27 +51,27 @@ class Prediction:
         return self.linearization.forces
 
     @property
-    def force(self) -> Float[Tensor, "*batch K+1 n_c 3"]:
+    def force(self) -> Float[Tensor, "*batch nodes n_c 3"]:
         """f_i of finger on object, hand axes [N]."""
         return self.forces.force
 
     @property
-    def normal_force(self) -> Float[Tensor, "*batch K+1 n_c"]:
+    def normal_force(self) -> Float[Tensor, "*batch nodes n_c"]:
         """f_n [N]; below 0 the contact would have to pull."""
         return self.forces.normal
 
     @property
-    def margin(self) -> Float[Tensor, "*batch K+1 n_c"]:
+    def margin(self) -> Float[Tensor, "*batch nodes n_c"]:
         """``mu_s f_n - |f_t|`` [N]; below 0 the contact slips, and what follows is no longer true."""
         return self.forces.margin
 
     @property
-    def stability(self) -> Float[Tensor, "*batch K+1"]:
+    def stability(self) -> Float[Tensor, "*batch nodes"]:
         """Smallest eigenvalue of the stiffness with locked actuators [N m/rad]; below 0 the grasp buckles."""
         return self.linearization.stability
 
     @property
-    def variance(self) -> Float[Tensor, "*batch K+1 n_s"]:
+    def variance(self) -> Float[Tensor, "*batch nodes n_s"]:
         """``(sum_k sd_k)^2`` of the state [rad^2, m^2, rad^2], sd_k of motion k: g is wrong alike in
         motions that follow each other, and their deviations add up."""
         return self.motion_variance.sqrt().cumsum(-2).square()
@@ -98,7 +98,7 @@ class Prediction:
         """After the last motion."""
         return self.at(-1).state
 
-    def turned(self, matrix: Float[Tensor, "n_x 6"]) -> Float[Tensor, "*batch K+1 n_x"]:
+    def turned(self, matrix: Float[Tensor, "n_x 6"]) -> Float[Tensor, "*batch nodes n_x"]:
         """``M_c xi_k`` of the twist from the start to each state [m, rad]."""
         s = self.states
         start = GraspState(s.q[..., :1, :], s.position[..., :1, :], s.rotation[..., :1, :, :])

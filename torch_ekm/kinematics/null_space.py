@@ -7,7 +7,7 @@ import torch
 from ..typing import Float, Tensor
 
 
-def null_space(rows: Float[Tensor, "m n"], tolerance: float = 1e-9) -> Float[Tensor, "n n-r"]:
+def null_space(rows: Float[Tensor, "m n"], tolerance: float = 1e-9) -> Float[Tensor, "n n_free"]:
     """Orthonormal basis N of ``rows N = 0`` (SVD); all of space where there are no rows.
 
     Args:

@@ -181,7 +181,7 @@ def joint_basis(hand: HandDescription) -> Float[Tensor, "n_q n_z"]:
     return torch.cat([eye[:, free], eye[:, coupled] @ null_space(C[:, coupled])], dim=1)
 
 
-def planar_pose_basis(normal: Float[Tensor, 3]) -> Float[Tensor, "6 3"]:
+def planar_pose_basis(normal: Float[Tensor, " 3"]) -> Float[Tensor, "6 3"]:
     """Two translations in the plane and the rotation about its normal."""
     normal = normal / torch.linalg.vector_norm(normal)
     basis = torch.zeros(6, 3, dtype=normal.dtype)

@@ -23,7 +23,7 @@ def spring_torque(
 
 
 def gravity_gradient(
-    weight: Float[Tensor, 3], com_lever: Float[Tensor, "*batch 3"]
+    weight: Float[Tensor, " 3"], com_lever: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 6"]:
     """``V_p = [-m g; -r_g x m g]``: minus the gravity wrench about ``o``.
 
@@ -36,7 +36,7 @@ def gravity_gradient(
 
 
 def gravity_hessian(
-    weight: Float[Tensor, 3], com_lever: Float[Tensor, "*batch 3"]
+    weight: Float[Tensor, " 3"], com_lever: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 6 6"]:
     """``V_pp = blkdiag(0, -[m g]x [r_g]x)``, moving frame, not symmetric."""
     result = torch.zeros(*com_lever.shape[:-1], 6, 6, dtype=com_lever.dtype, device=com_lever.device)
