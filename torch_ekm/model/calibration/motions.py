@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 
@@ -13,6 +13,7 @@ from ...kinematics.se3 import exp
 from ...typing import Float, Tensor
 
 
+@runtime_checkable
 class Recording(Protocol):
     """``torch_ekm.plant.Trajectory``, or anything with observations in the order of time.
 
