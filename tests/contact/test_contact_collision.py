@@ -391,6 +391,7 @@ def test_fast_enough_for_a_control_loop() -> None:
     assert min(times) < 5e-3
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_errors() -> None:
     detector, q, position, rotation = pinch("box")
     with pytest.raises(ShapeError, match="q"):

@@ -26,6 +26,8 @@ from torch_ekm.exceptions import DescriptionError, EKMError, NonFiniteError, Par
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel, ModelOptions
 
+pytestmark = pytest.mark.usefixtures("unchecked")  # input that annotations forbid
+
 TOY = three_finger()
 MODEL, STATE, CONTACTS = TOY.model, TOY.state, TOY.contacts
 EYE, NAN = torch.eye(3, dtype=F64), float("nan")
