@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from torch_ekm.control import ClosedLoop, Guards, LookAndMoveController, PoseTarget
+from torch_ekm.control import ClosedLoop, Guards, LookAndMoveController, PoseTarget, Safety
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.model import KinematicModel
@@ -57,5 +57,5 @@ if __name__ == "__main__":
     model = KinematicModel(load_hand("planar_two_finger"), load_object("can"))
     controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), focus=axis)
     target = PoseTarget.turned(seen.state, axis, degrees=8)
-    result = ClosedLoop(plant, controller, guards=Guards()).run(target)
+    result = ClosedLoop(plant, controller, safety=Safety(guards=Guards())).run(target)
     print(f"{result.reason.value}, {math.degrees(result.errors[-1]):.2f} deg off", result.stop.message)

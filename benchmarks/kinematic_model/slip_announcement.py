@@ -26,7 +26,14 @@ import numpy as np
 import torch
 
 from torch_ekm.contact import constraint_matrix
-from torch_ekm.control import FocusedPose, LimitingFunction, LookAndMoveController, PoseTarget
+from torch_ekm.control import (
+    FocusedPose,
+    LimitingFunction,
+    LookAndMoveController,
+    Pace,
+    PaceOptions,
+    PoseTarget,
+)
 from torch_ekm.description import ObjectDescription, Shape, load_hand, load_object
 from torch_ekm.exceptions import EKMError, GraspError
 from torch_ekm.kinematics import GraspState
@@ -202,7 +209,8 @@ def record(obj: ObjectDescription, seed: int, name: str, motions: int = 25) -> l
     draw = np.random.default_rng(seed)
     degrees, step = 40.0 * draw.choice([-1.0, 1.0]), np.radians(draw.uniform(1.5, 4.0))
     focus = FocusedPose.rotation_about(plant.rotation_axis)
-    controller = LookAndMoveController(model, focus, limiting=LimitingFunction(step=step))
+    pace = Pace(PaceOptions(limiting=LimitingFunction(step=step)), adapts=False)
+    controller = LookAndMoveController(model, focus, pace=pace)
     target = PoseTarget.turned(seen.state, plant.rotation_axis, np.radians(degrees))
     done: list[Motion] = []
     slipped, still, before = 0, 0, witness.margins()

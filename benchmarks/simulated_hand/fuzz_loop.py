@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import torch
 from joblib import Parallel, delayed
 
-from torch_ekm.control import ClosedLoop, LookAndMoveController, PoseTarget, StopReason
+from torch_ekm.control import ClosedLoop, HandKnowledge, LookAndMoveController, PoseTarget, StopReason
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import EKMError, GraspError
 from torch_ekm.model import KinematicModel
@@ -95,12 +95,14 @@ def error_of_clean_turns(plant: SimulatedHand, ekm: EnhancedModel, grasps: tuple
         for step in loop.run(PoseTarget.turned(seen.state, plant.rotation_axis, degrees=18)).steps:
             lin, moved = step.decision.linearization, step.after.a - step.before.a
             true = step.after.truth.state.minus(step.before.truth.state)
-            off = controller.predict(lin, moved)[0] - true
+            off = controller.expect(lin, moved).increment - true
             squares.append(float(off[-3:].square().sum()))
     return math.sqrt(sum(squares) / len(squares)) / DEG
 
 
-def turn(plant, sight, ekm: EnhancedModel, grasp: int, session: Session | None) -> bool:
+def turn(
+    plant, sight, ekm: EnhancedModel, knowledge: HandKnowledge, grasp: int, session: Session | None
+) -> bool:
     """One turn, gone on with after each repair; whether the object was dropped."""
     try:
         seen = plant.reset(grasp)
@@ -111,7 +113,7 @@ def turn(plant, sight, ekm: EnhancedModel, grasp: int, session: Session | None) 
     controller = LookAndMoveController(ekm, plant.rotation_axis)
     for _ in range(REPAIRS):
         try:
-            done = ClosedLoop(sight, controller).run(target)
+            done = ClosedLoop(sight, controller, knowledge=knowledge).run(target)
         except EKMError as error:
             reason = type(error).__name__
         else:
@@ -133,10 +135,11 @@ def fuzz(seed: int, observations: int, chance: float = 0.15, clean: tuple[int, .
     first = plant.reset(0)
     model = KinematicModel(plant.hand, plant.object)
     ekm, untaught = (EnhancedModel.for_grasp(model, first.state) for _ in range(2))
+    knowledge, unfaulted = (HandKnowledge.of(plant.hand) for _ in range(2))
     while sight.observations < observations:
-        session.dropped += turn(plant, sight, ekm, 1000 * seed + turns, session)
+        session.dropped += turn(plant, sight, ekm, knowledge, 1000 * seed + turns, session)
         turns += 1
-        added = (ekm.servo.dead_zone + ekm.servo.bias.abs()).max()
+        added = (knowledge.servo.dead_zone + knowledge.servo.bias.abs()).max()
         session.allowed = max(session.allowed, STEP + float(added))
     session.observations, session.faults = sight.observations, sight.faults
     session.commands, session.largest, session.beyond = plant.commands, plant.largest, plant.beyond
@@ -144,7 +147,7 @@ def fuzz(seed: int, observations: int, chance: float = 0.15, clean: tuple[int, .
     if not clean:
         return session
     for k in range(turns):
-        session.dropped_unfaulted += turn(plant, plant, untaught, 1000 * seed + k, None)
+        session.dropped_unfaulted += turn(plant, plant, untaught, unfaulted, 1000 * seed + k, None)
     session.error = error_of_clean_turns(plant.plant, ekm, clean)
     session.unfaulted = error_of_clean_turns(plant.plant, untaught, clean)
     return session

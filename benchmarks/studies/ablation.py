@@ -9,14 +9,26 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
 from oracle import OracleGeneralize
 from run_study import run_study
 
+from torch_ekm.control import (
+    ActuatorLimit,
+    Caution,
+    FrictionMarginLimit,
+    GripForceTask,
+    JointLimit,
+    LimitingFunction,
+    PaceOptions,
+    Safety,
+    StepBound,
+    TrustRegion,
+)
 from torch_ekm.experiments.config import Setting, object_name
 from torch_ekm.experiments.learners import HAND_LEARNERS
 from torch_ekm.experiments.protocols.generalize import Generalize
@@ -31,7 +43,8 @@ from torch_ekm.experiments.reporting.tables import (
     warmed_up,
     which_seeds,
 )
-from torch_ekm.simulation import PRESETS
+from torch_ekm.model import ModelOptions
+from torch_ekm.simulation import PRESETS, PlantParameters
 
 _DEG = math.pi / 180
 _BASE = "as it is"
@@ -68,59 +81,83 @@ class Variant:
     protocol: type[Generalize] = Generalize
 
 
-#: Group, name, field of the setting, what is changed in it, and the controllers that it concerns.
-_OPTIONS: list[tuple[str, str, str, dict[str, Any], tuple[str, ...]]] = [
-    ("online learning", "no robust update", "learner_options", {"robust": None}, _LEARNING),
-    ("online learning", "no forgetting", "learner_options", {"forgetting_factor": 1.0}, _LEARNING),
-    ("model", "no geometric stiffness", "model", {"hand_stiffness": False, "object_stiffness": False}, _BOTH),
-    ("model", "no rolling", "model", {"rolling": False}, _BOTH),
-    ("model", "rigid actuators", "model", {"actuator_compliance": False}, _BOTH),
-    ("controller", "gain 1 near the goal", "control", {"LimitingFunction.gain": 1.0}, _ALL),
-    ("controller", "gain 0.6 near the goal", "control", {"LimitingFunction.gain": 0.6}, _ALL),
-    ("controller", "steps of 1.5 deg", "control", {"LimitingFunction.step": 1.5 * _DEG}, _ALL),
+def _part(kind: type, **figures: Any) -> Callable[[Setting], dict[str, Any]]:
+    """Figures of one part of a setting, whichever field holds it; a limit that is not there is added."""
+
+    def change(base: Setting) -> dict[str, Any]:
+        for name, held in {**vars(base), "plant": base.parameters}.items():
+            if isinstance(held, kind):
+                return {name: replace(held, **figures)}
+            if isinstance(held, tuple) and any(isinstance(one, kind) for one in held):
+                made = (replace(one, **figures) if isinstance(one, kind) else one for one in held)
+                return {name: tuple(made)}
+            for inner, one in vars(held).items() if isinstance(held, PaceOptions | Safety) else ():
+                if isinstance(one, kind):
+                    return {name: replace(held, **{inner: replace(one, **figures)})}
+        return {"limits": (*base.limits, kind(**figures))}
+
+    return change
+
+
+def _learner(**options: Any) -> Callable[[Setting], dict[str, Any]]:
+    return lambda base: {"learner_options": {**base.learner_options, **options}}
+
+
+def _short_actuator_steps(base: Setting) -> dict[str, Any]:
+    base = base.replace(**_part(ActuatorLimit, step=6 * _DEG)(base))
+    return _part(JointLimit, horizon=6 * _DEG)(base)
+
+
+_NO_GEOMETRY = {"hand_stiffness": False, "object_stiffness": False}
+_NO_WAY_BACK = {"off_rotation": math.inf, "link_gap": -math.inf, "way_back": 0}
+#: Group, name, what is changed in the setting, and the controllers that it concerns.
+_OPTIONS: list[tuple[str, str, Callable[[Setting], dict[str, Any]], tuple[str, ...]]] = [
+    ("online learning", "no robust update", _learner(robust=None), _LEARNING),
+    ("online learning", "no forgetting", _learner(forgetting_factor=1.0), _LEARNING),
+    ("model", "no geometric stiffness", _part(ModelOptions, **_NO_GEOMETRY), _BOTH),
+    ("model", "no rolling", _part(ModelOptions, rolling=False), _BOTH),
+    ("model", "rigid actuators", _part(ModelOptions, actuator_compliance=False), _BOTH),
+    ("controller", "gain 1 near the goal", _part(LimitingFunction, gain=1.0), _ALL),
+    ("controller", "gain 0.6 near the goal", _part(LimitingFunction, gain=0.6), _ALL),
+    ("controller", "steps of 1.5 deg", _part(LimitingFunction, step=1.5 * _DEG), _ALL),
     (
-        "controller", "steps of 6 deg, 2 mm", "control",
-        {"LimitingFunction.step": 6 * _DEG, "LimitingFunction.contact_travel": 2e-3}, _ALL,
+        "controller", "steps of 6 deg, 2 mm",
+        _part(LimitingFunction, step=6 * _DEG, contact_travel=2e-3), _ALL,
     ),
-    (
-        "controller", "actuators cut at 6 deg", "control",
-        {"ActuatorLimit.step": 6 * _DEG, "JointLimit.horizon": 6 * _DEG}, _ALL,
+    ("controller", "actuators cut at 6 deg", _short_actuator_steps, _ALL),
+    ("controller", "rows for the friction margin", _part(FrictionMarginLimit, minimum=0.5), _ALL),
+    ("care", "a grip of 5 N for every object", _part(GripForceTask, force=5.0), _ALL),
+    ("care", "the pace fixed", _part(TrustRegion, start=1.0, smallest=1.0, largest=1.0), _LEARNING),
+    ("care", "steps never cut", _part(StepBound, least=math.inf), _ALL),
+    ("care", "large steps with uneven forces", _part(StepBound, even=1e-3), _LEARNING),
+    ("care", "no second look", _part(Caution, looks=0), _ALL),
+    ("care", "no way back", _part(Caution, **_NO_WAY_BACK), _ALL),
+    *(
+        ("dead zone", f"{x:g} deg", _part(PlantParameters, dead_zone=x * _DEG), _ALL)
+        for x in (0, 0.5, 0.9, 1.3, 1.7)
     ),
-    ("controller", "rows for the friction margin", "control", {"FrictionMarginLimit.minimum": 0.5}, _ALL),
-    ("care", "a grip of 5 N for every object", "control", {"GripForceTask.force": 5.0}, _ALL),
-    (
-        "care", "the pace fixed", "control",
-        {"TrustRegion.start": 1.0, "TrustRegion.smallest": 1.0, "TrustRegion.largest": 1.0}, _LEARNING,
-    ),
-    ("care", "steps never cut", "control", {"StepBound.least": math.inf}, _ALL),
-    ("care", "large steps with uneven forces", "control", {"StepBound.even": 1e-3}, _LEARNING),
-    ("care", "no second look", "control", {"Caution.looks": 0}, _ALL),
-    (
-        "care", "no way back", "control",
-        {"Caution.off_rotation": math.inf, "Caution.link_gap": -math.inf, "Caution.way_back": 0}, _ALL,
-    ),
-    *(("dead zone", f"{x:g} deg", "plant", {"dead_zone": x * _DEG}, _ALL) for x in (0, 0.5, 0.9, 1.3, 1.7)),
 ]  # fmt: skip
 
 
 def variants(base: Setting) -> list[Variant]:
     """All variants of a setting; most groups begin with the unchanged one."""
-    nominal = dataclasses.asdict(PRESETS["nominal"])
+    nominal, exact = vars(PRESETS["nominal"]), PRESETS["none"]
+    rule = replace(base.safety.rule, tolerance=0.1 * _DEG)
+    finer = {"frames": 6, "safety": replace(base.safety, rule=rule)}
     others = [name for name in HAND_LEARNERS if name != base.learner]
-    plants = {name: {key: nominal[key] for key in keys} for name, keys in DISTURBANCES.items()}
+    plants = {
+        name: exact.replace(**{key: nominal[key] for key in keys}) for name, keys in DISTURBANCES.items()
+    }
     return [
         *(Variant(group, _BASE) for group in ("learner", "online learning", "model")),
         *(Variant(group, _BASE, controllers=_ALL) for group in ("controller", "care")),
         Variant("care", "oracle: true model, pose and forces", {}, ("KM+S",), OracleGeneralize),
         Variant("care", "pose and joints from six readings at rest", {"frames": 6}, _ALL),
-        Variant("care", "the same, to a tolerance of 0.1 deg", {"frames": 6, "tolerance_deg": 0.1}, _ALL),
+        Variant("care", "the same, to a tolerance of 0.1 deg", finer, _ALL),
         Variant("preset", f"{base.preset}: {_BASE}"),
         *(Variant("learner", name, {"learner": name, "learner_options": {}}, _LEARNING) for name in others),
         Variant("learner", "rbf over commands", {"learner": "rbf", "servo_inverse": False}, _LEARNING),
-        *(
-            Variant(group, name, {field: {**getattr(base, field), **option}}, controllers)
-            for group, name, field, option, controllers in _OPTIONS
-        ),
+        *(Variant(group, name, change(base), controllers) for group, name, change, controllers in _OPTIONS),
         *(
             Variant("online learning", f"{capacity} basis vectors", {"capacity": capacity}, _LEARNING)
             for capacity in (15, 30, 120)

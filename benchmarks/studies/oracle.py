@@ -56,7 +56,7 @@ class OracleBench(Bench):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self.plant = Omniscient(self.plant)
-        self.model = true_model(self.hand, self.setting.model_options())
+        self.model = true_model(self.hand, self.setting.model)
 
 
 @dataclasses.dataclass(frozen=True)

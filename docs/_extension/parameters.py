@@ -15,7 +15,6 @@ from sphinx.pycode import ModuleAnalyzer
 GROUPS = {
     "Kinematic model": ("torch_ekm.model", ["ModelOptions"]),
     "Contact forces": ("torch_ekm.contact", ["ForceOptions"]),
-    "Enhanced model": ("torch_ekm.enhanced", ["TrustOptions"]),
     "Controller: tasks": (
         "torch_ekm.control",
         ["FocusTask", "OffAxisTask", "GripForceTask", "EffortTask"],
@@ -24,7 +23,7 @@ GROUPS = {
         "torch_ekm.control",
         ["ActuatorLimit", "JointLimit", "NormalForceLimit", "FrictionMarginLimit"],
     ),
-    "Controller: size of a step": ("torch_ekm.control", ["LimitingFunction", "StepBound"]),
+    "Controller: size of a step": ("torch_ekm.control", ["LimitingFunction", "StepBound", "TrustRegion"]),
     "Closed loop": ("torch_ekm.control", ["StoppingRule", "Caution", "Guards"]),
     "Foresight": ("torch_ekm.foresight", ["BlindOptions"]),
     "Simulation": ("torch_ekm.simulation", ["PlantConfig", "ImageQuality", "HallQuality"]),

@@ -14,13 +14,16 @@ from torch_ekm.control import (
     ClosedLoop,
     GripForceTask,
     LookAndMoveController,
+    Pace,
+    PaceOptions,
     PoseTarget,
+    Safety,
     Situation,
     StepBound,
     StoppingRule,
+    TrustRegion,
 )
 from torch_ekm.control import StopReason as Reason
-from torch_ekm.enhanced import TrustOptions, TrustRegion
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
@@ -71,7 +74,7 @@ def slide(held, off: list[float], caution: Caution):
     axis = plant.rotation_axis
     across = torch.linalg.cross(axis, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
     sliding = Sliding(seen, across / torch.linalg.vector_norm(across), off)
-    loop = ClosedLoop(sliding, LookAndMoveController(model, axis), RULE, caution=caution)
+    loop = ClosedLoop(sliding, LookAndMoveController(model, axis), safety=Safety(RULE, caution))
     return loop.run(PoseTarget.turned(seen.state, axis, degrees=20.0)), sliding, loop
 
 
@@ -119,7 +122,7 @@ def test_a_refused_state_is_looked_at_again(held) -> None:
             return away if self.looks in (2, 3) else good  # the first motion's reading and the next look
 
     sliding = Glimpse(seen, plant.rotation_axis, [0.0])
-    loop = ClosedLoop(sliding, LookAndMoveController(model, plant.rotation_axis), RULE)
+    loop = ClosedLoop(sliding, LookAndMoveController(model, plant.rotation_axis), safety=Safety(RULE))
     target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0)
     steps = loop.steps(target)
     next(steps)
@@ -186,9 +189,9 @@ def test_the_bound_shortens_the_step_that_is_made(held) -> None:
     plant, model, seen = held
     target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0)
     whole, cut = (
-        LookAndMoveController(model, plant.rotation_axis, bound=StepBound(off_travel=x)).decide(
-            seen.state, seen.a, target, seen.fingertip_force
-        )
+        LookAndMoveController(
+            model, plant.rotation_axis, pace=Pace(PaceOptions(bound=StepBound(off_travel=x)), adapts=False)
+        ).decide(seen.state, seen.a, target, seen.fingertip_force)
         for x in (1.0, 1e-5)
     )
     assert whole.share > 0.9
@@ -197,37 +200,48 @@ def test_the_bound_shortens_the_step_that_is_made(held) -> None:
 
 
 def test_the_pace_grows_where_the_model_is_right_and_shrinks_where_it_is_not() -> None:
-    trust, options = TrustRegion(), TrustOptions()
+    pace, trust = Pace(), TrustRegion()
     predicted = torch.tensor([0.0, 0.0, 0.0, 2.5 * DEG, 0.0, 0.0], dtype=torch.float64)
     wrong = predicted + torch.tensor([0.0, 0.0, 0.0, 0.0, 3 * DEG, 0.0], dtype=torch.float64)
-    assert trust.judge(predicted, predicted, 0.015) == 0.0
-    assert trust.pace == pytest.approx(options.start * options.grow)
+    assert trust.disagreement(predicted, predicted, 0.015) == 0.0
+    pace.judge(0.0)
+    assert pace.factor == pytest.approx(trust.start * trust.grow)
     # one direction of six is wrong by 3 deg: rho^2 = 9 / 6 / (0.3^2 + (0.12 * 2.5)^2)
-    assert trust.judge(predicted, wrong, 0.015) == pytest.approx(math.sqrt(9 / 6 / 0.18), rel=1e-6)
-    assert trust.pace == pytest.approx(options.start * options.grow * options.shrink)
-    before = trust.pace
-    trust.judge(predicted, predicted, 0.015, share=0.5)  # half a step says nothing for a larger one
-    assert trust.pace == before
-    trust.judge(predicted, predicted, 0.015, surprise=torch.full((3,), 5.0))  # forces went wrong
-    assert trust.pace < before
+    rho = trust.disagreement(predicted, wrong, 0.015)
+    assert rho == pytest.approx(math.sqrt(9 / 6 / 0.18), rel=1e-6)
+    pace.judge(rho)
+    assert pace.factor == pytest.approx(trust.start * trust.grow * trust.shrink)
+    before = pace.factor
+    pace.judge(0.0, share=0.5)  # half a step says nothing for a larger one
+    assert pace.factor == before
+    pace.judge(trust.disagreement(predicted, predicted, 0.015, torch.full((3,), 5.0)))  # forces went wrong
+    assert pace.factor < before
     for _ in range(50):
-        trust.judge(predicted, predicted, 0.015)
-    assert trust.pace == options.largest
-    other = TrustRegion()
-    other.load_state_dict(trust.state_dict())
-    assert other.pace == options.largest
-    trust.restart()
-    assert trust.pace == options.smallest / 2
-    trust.slower()
-    assert trust.pace == options.smallest / 2
+        pace.judge(0.0)
+    assert pace.factor == trust.largest
+    other = Pace()
+    other.load_state_dict(pace.state_dict())
+    assert other.factor == trust.largest
+    pace.restart()
+    assert pace.factor == trust.smallest / 2
+    pace.judge(9.0)
+    assert pace.factor == trust.smallest / 2
+
+
+def test_the_pace_of_a_model_that_does_not_learn_stays_1() -> None:
+    pace = Pace(adapts=False)
+    pace.judge(9.0)
+    pace.judge(0.0)
+    pace.restart()
+    assert pace.factor == 1.0
 
 
 @pytest.mark.parametrize(
     ("kind", "figures"),
     [
-        (TrustOptions, {"start": 0.1}),
-        (TrustOptions, {"agree": 2.0}),
-        (TrustOptions, {"force_noise": 0.0}),
+        (TrustRegion, {"start": 0.1}),
+        (TrustRegion, {"agree": 2.0}),
+        (TrustRegion, {"force_noise": 0.0}),
         (Caution, {"retreats": -1}),
         (StepBound, {"creep": 0.0}),
     ],

@@ -12,8 +12,10 @@ import torch
 from torch_ekm.control import (
     ClosedLoop,
     ControlProblem,
+    HandKnowledge,
     LookAndMoveController,
     PoseTarget,
+    Safety,
     StoppingRule,
 )
 from torch_ekm.control import StopReason as Reason
@@ -26,6 +28,7 @@ from torch_ekm.simulation import SimulatedHand
 
 DEG = math.pi / 180
 RULE = StoppingRule(tolerance=0.25 * DEG, stall_window=3, stall_progress=0.1 * DEG, max_steps=5)
+SAFETY = Safety(rule=RULE)
 
 
 class FrozenPlant:
@@ -71,7 +74,7 @@ def drive(held, change=None, angle: float = 80.0, rule: StoppingRule = RULE):
     plant = FrozenPlant(seen, change)
     assert isinstance(plant, Plant)
     target = PoseTarget.turned(seen.state, axis, degrees=angle)
-    return ClosedLoop(plant, loop, rule).run(target), plant
+    return ClosedLoop(plant, loop, safety=Safety(rule=rule)).run(target), plant
 
 
 def test_target_that_cannot_be_reached_stalls_and_says_so(held) -> None:
@@ -153,7 +156,7 @@ def test_observation_that_is_not_finite_is_refused(held) -> None:
 def test_steps_are_a_generator_that_tells_why_it_ends(held) -> None:
     seen, axis, loop = held
     plant = FrozenPlant(seen)
-    motions = ClosedLoop(plant, loop, RULE).steps(PoseTarget.turned(seen.state, axis, degrees=80))
+    motions = ClosedLoop(plant, loop, safety=SAFETY).steps(PoseTarget.turned(seen.state, axis, degrees=80))
     first = next(motions)
     assert plant.commands == 1  # nothing runs ahead of its consumer
     assert first.before.q is seen.q
@@ -166,14 +169,15 @@ def test_steps_are_a_generator_that_tells_why_it_ends(held) -> None:
     assert end.value.value.final.q is seen.q
 
 
-def test_an_enhanced_model_learns_unless_told_not_to(held) -> None:
+def test_an_enhanced_model_learns_unless_seen_motions_not_to(held) -> None:
     seen, axis, loop = held
     target = PoseTarget.turned(seen.state, axis, degrees=80)
     for learn in (True, False):
         ekm = EnhancedModel.for_grasp(loop.kinematic, seen.state)
         controller = LookAndMoveController(ekm, axis)
-        ekm.servo = None  # it learns from the commands
-        driven = ClosedLoop(FrozenPlant(seen), controller, RULE, learn=learn)
+        knowledge = HandKnowledge.of(loop.kinematic.hand, learns=False)  # it learns from the commands
+        options = {"knowledge": knowledge, "safety": SAFETY}
+        driven = ClosedLoop(FrozenPlant(seen), controller, **options, learn=learn)
         steps = driven.run(target).steps
         assert [step.report is not None for step in steps] == [learn] * 3
         da = steps[0].decision.delta_a
@@ -187,17 +191,17 @@ def test_an_object_that_is_lost_teaches_nothing(held) -> None:
     seen, axis, loop = held
     controller = LookAndMoveController(EnhancedModel.for_grasp(loop.kinematic, seen.state), axis)
     plant = FrozenPlant(seen, lambda o: dataclasses.replace(o, status=PlantStatus.LOST))
-    done = ClosedLoop(plant, controller, RULE).run(PoseTarget.turned(seen.state, axis, degrees=80))
+    done = ClosedLoop(plant, controller, safety=SAFETY).run(PoseTarget.turned(seen.state, axis, degrees=80))
     assert [step.report is not None for step in done.steps] == [True, False]
 
 
-def test_the_learner_is_told_what_the_encoders_did(held) -> None:
+def test_the_learner_is_seen_motions_what_the_encoders_did(held) -> None:
     """Servos that go half of the way: the object's motion is learned for what they did."""
     seen, axis, loop = held
     ekm = EnhancedModel.for_grasp(loop.kinematic, seen.state)
-    told = []
+    seen_motions = []
     update = ekm.update
-    ekm.update = lambda s, da, ds, f: told.append((da, f)) or update(s, da, ds, f)  # type: ignore[method-assign]
+    ekm.update = lambda s, da, ds, f: seen_motions.append((da, f)) or update(s, da, ds, f)  # type: ignore[method-assign]
 
     class Half(FrozenPlant):
         def command(self, delta_a: torch.Tensor) -> Observation:
@@ -206,15 +210,13 @@ def test_the_learner_is_told_what_the_encoders_did(held) -> None:
             return self.observe()
 
     controller = LookAndMoveController(ekm, axis)
-    steps = (
-        ClosedLoop(Half(seen), controller, RULE).run(PoseTarget.turned(seen.state, axis, degrees=80)).steps
-    )
-    for (da, nominal), step in zip(told, [s for s in steps if s.report is not None], strict=True):
+    driven = ClosedLoop(Half(seen), controller, safety=SAFETY)
+    steps = driven.run(PoseTarget.turned(seen.state, axis, degrees=80)).steps
+    for (da, nominal), step in zip(seen_motions, [s for s in steps if s.report is not None], strict=True):
         torch.testing.assert_close(da, step.after.a - step.before.a)
         torch.testing.assert_close(nominal, step.decision.linearization.step(da))
         assert not torch.allclose(da, step.decision.delta_a)
-    assert bool((ekm.servo.dead_zone > 0).any())
-    assert any(name.startswith("servo.") for name in ekm.state_dict())  # and it is saved with the learner
+    assert bool((driven.knowledge.servo.dead_zone > 0).any())
 
 
 # -- the hand holds whatever ends the loop ------------------------------------------------------------
@@ -239,7 +241,7 @@ def test_the_hand_holds_after_an_error_of_the_driver_and_after_ctrl_c(held, erro
     seen, axis, controller = held
     plant = Noted(seen, error)
     with pytest.raises(type(error)):
-        ClosedLoop(plant, controller, RULE).run(PoseTarget.turned(seen.state, axis, degrees=80))
+        ClosedLoop(plant, controller, safety=SAFETY).run(PoseTarget.turned(seen.state, axis, degrees=80))
     assert [bool(da.any()) for da in plant.given] == [True, True, False]
 
 
@@ -252,13 +254,13 @@ def test_the_hand_holds_after_an_error_of_the_caller_and_after_a_break(held) -> 
 
     plant = Noted(seen)
     with pytest.raises(ZeroDivisionError):
-        ClosedLoop(plant, controller, RULE).run(target, fail)
+        ClosedLoop(plant, controller, safety=SAFETY).run(target, fail)
     assert [bool(da.any()) for da in plant.given] == [True, False]
     plant = Noted(seen)
     motions = []  # alive when the block fails: it is the block that holds the hand
 
     def block() -> None:
-        with ClosedLoop(plant, controller, RULE) as loop:
+        with ClosedLoop(plant, controller, safety=SAFETY) as loop:
             motions.append(loop.steps(target))
             fail(next(motions[0]))
 
@@ -266,19 +268,21 @@ def test_the_hand_holds_after_an_error_of_the_caller_and_after_a_break(held) -> 
         block()
     assert [bool(da.any()) for da in plant.given] == [True, False]
     plant = Noted(seen)
-    motions = ClosedLoop(plant, controller, RULE).steps(target)
+    motions = ClosedLoop(plant, controller, safety=SAFETY).steps(target)
     next(motions)
     motions.close()
     assert not bool(plant.given[-1].any())
     plant = Noted(seen)
-    ClosedLoop(plant, controller, RULE).run(target)  # an end of its own: the motors stand where they are
+    ClosedLoop(plant, controller, safety=SAFETY).run(
+        target
+    )  # an end of its own: the motors stand where they are
     assert all(bool(da.any()) for da in plant.given)
 
 
 def test_another_thread_stops_it_after_the_motion_under_way(held) -> None:
     seen, axis, controller = held
     plant = Noted(seen)
-    loop = ClosedLoop(plant, controller, RULE)
+    loop = ClosedLoop(plant, controller, safety=SAFETY)
     worker = threading.Thread(target=loop.stop)
     done = loop.run(PoseTarget.turned(seen.state, axis, degrees=80), lambda step: worker.start())
     worker.join()
@@ -290,7 +294,9 @@ def test_another_thread_stops_it_after_the_motion_under_way(held) -> None:
 def test_a_time_out_is_a_reason_of_its_own(held) -> None:
     seen, axis, controller = held
     rule = dataclasses.replace(RULE, max_seconds=1e-9)
-    done = ClosedLoop(Noted(seen), controller, rule).run(PoseTarget.turned(seen.state, axis, degrees=80))
+    done = ClosedLoop(Noted(seen), controller, safety=Safety(rule=rule)).run(
+        PoseTarget.turned(seen.state, axis, degrees=80)
+    )
     assert done.reason is Reason.TIME_OUT
     assert not done.steps
     with pytest.raises(ParameterError, match="max_seconds"):

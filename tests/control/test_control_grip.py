@@ -12,6 +12,7 @@ from torch_ekm.contact.forces.balance import ForceStatus
 from torch_ekm.control import (
     ClosedLoop,
     GripForceTask,
+    HandKnowledge,
     LinearizedModel,
     LookAndMoveController,
     NormalForceLimit,
@@ -21,7 +22,7 @@ from torch_ekm.control import (
 )
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.model import KinematicModel
-from torch_ekm.plant import Observation, PlantWrapper, ServoInverse
+from torch_ekm.plant import Observation, PlantWrapper
 from torch_ekm.simulation import SimulatedHand
 
 
@@ -54,7 +55,8 @@ def test_hand_that_feels_nothing_or_wrong_neither_squeezes_nor_drops(plant, shar
     felt = Felt(plant, share)
     start = felt.reset(seed)
     model = KinematicModel(plant.hand, plant.object)
-    loop = ClosedLoop(ServoInverse(felt, plant.hand), LookAndMoveController(model, plant.rotation_axis))
+    controller = LookAndMoveController(model, plant.rotation_axis)
+    loop = ClosedLoop(felt, controller, knowledge=HandKnowledge.of(plant.hand))
     done = loop.run(PoseTarget.turned(start.state, plant.rotation_axis, degrees=15))
     assert done.reason is StopReason.REACHED
     forces = torch.stack(felt.forces)

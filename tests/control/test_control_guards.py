@@ -9,7 +9,7 @@ import pytest
 import torch
 from obedient_plant import Obedient, turned
 
-from torch_ekm.control import ClosedLoop, Guards, LookAndMoveController, PoseTarget, StoppingRule
+from torch_ekm.control import ClosedLoop, Guards, LookAndMoveController, PoseTarget, Safety, StoppingRule
 from torch_ekm.control import StopReason as Reason
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import ParameterError
@@ -19,7 +19,7 @@ from torch_ekm.simulation import SimulatedHand
 from torch_ekm.testing import FuzzedPlant
 
 DEG = math.pi / 180
-RULE = StoppingRule(max_steps=25)
+SAFETY = Safety(rule=StoppingRule(max_steps=25))
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +37,9 @@ class Run:
         self.plant = Obedient(model, seen, fault, **options)
         self.ekm = EnhancedModel.for_grasp(model, seen.state)
         controller = LookAndMoveController(self.ekm, axis)
+        safety = SAFETY if guards is None else dataclasses.replace(SAFETY, guards=guards)
         self.loop = ClosedLoop(
-            self.plant if around is None else around(self.plant), controller, RULE, guards=guards
+            self.plant if around is None else around(self.plant), controller, safety=safety
         )
         self.learned = [self.state()]
         self.done = self.loop.run(
@@ -48,8 +49,12 @@ class Run:
         self.taught = [step.report is not None for step in self.done.steps]
 
     def state(self) -> dict[str, torch.Tensor]:
+        parts = ("", self.ekm), ("pace.", self.loop.controller.pace), ("", self.loop.knowledge)
         return {
-            name: value.clone() for name, value in self.ekm.state_dict().items() if torch.is_tensor(value)
+            prefix + name: value.clone()
+            for prefix, part in parts
+            for name, value in part.state_dict().items()
+            if torch.is_tensor(value)
         }
 
 
@@ -74,7 +79,7 @@ def test_motion_that_nobody_saw_does_not_teach_and_neither_does_the_one_after_it
     assert run.taught[:4] == [True, False, False, True]
     assert run.reason is Reason.REACHED
     assert same(run.learned[1], run.learned[3], "learner")
-    assert same(run.learned[1], run.learned[3], "trust")
+    assert same(run.learned[1], run.learned[3], "pace")
     blind = run.done.steps[1].after  # the model says where it is
     off = run.plant.last  # what was passed on meanwhile: the old pose
     assert blind.status is PlantStatus.NOT_SEEN
@@ -133,7 +138,7 @@ def test_a_glitch_of_one_reading_leaves_no_trace(held) -> None:
     assert all(run.taught)
     looks, expected = (len(it.plant.last) - len(it.done.steps) for it in (run, clean))
     assert looks == expected + 1
-    error = (run.ekm.servo.dead_zone - clean.ekm.servo.dead_zone).abs().max()
+    error = (run.loop.knowledge.servo.dead_zone - clean.loop.knowledge.servo.dead_zone).abs().max()
     assert float(error) < 0.01 * DEG
 
 
@@ -225,8 +230,8 @@ def test_a_motor_that_does_not_move_is_named(held) -> None:
     run = Run(held, dead=(moving,), since=0)
     assert run.reason is Reason.ACTUATOR_STUCK
     assert f"'{held[2].hand.actuator_names[moving]}'" in run.message
-    assert run.ekm.servo.stuck.nonzero().flatten().tolist() == [moving]
-    assert float(run.ekm.servo.dead_zone[moving]) < 1 * DEG
+    assert run.loop.knowledge.servo.stuck.nonzero().flatten().tolist() == [moving]
+    assert float(run.loop.knowledge.servo.dead_zone[moving]) < 1 * DEG
 
 
 def test_one_saturated_fingertip_is_left_out_and_the_grip_stays(held) -> None:
@@ -297,33 +302,34 @@ def test_spoilt_readings_neither_break_the_limits_nor_what_is_learned(held) -> N
     """300 observations; 10000 with the simulated hand: ``benchmarks/simulated_hand/fuzz_loop.py``."""
     seen, axis, model = held
 
-    def session(chance: float, observations: int = 0, turns: int = 0) -> tuple[Obedient, EnhancedModel, int]:
+    def session(chance: float, observations: int = 0, turns: int = 0) -> tuple[Obedient, ClosedLoop, int]:
         plant, ekm, done = Obedient(model, seen, noise=3e-3), EnhancedModel.for_grasp(model, seen.state), 0
-        sight = FuzzedPlant(plant, chance, seed=5)
+        controller = LookAndMoveController(ekm, axis)
+        loop = ClosedLoop(FuzzedPlant(plant, chance, seed=5), controller, safety=SAFETY)
+        sight = loop.plant
         while sight.observations < observations or done < turns:
             start = plant.reset(done)
             target = PoseTarget.turned(start.state, axis, degrees=20 if done % 2 else -12)
             for _ in range(5):
-                loop = ClosedLoop(sight, LookAndMoveController(ekm, axis), RULE)
                 if loop.run(target).reason is Reason.REACHED:
                     break
                 sight.repair()
             done += 1
-        return plant, ekm, done
+        return plant, loop, done
 
-    def error(ekm: EnhancedModel) -> float:
+    def error(taught: ClosedLoop) -> float:
         """Of a clean turn without learning, rms [deg]."""
         plant, off = Obedient(model, seen), []
-        controller = LookAndMoveController(ekm, axis)
+        controller = LookAndMoveController(taught.controller.enhanced, axis)
         start = plant.reset(99)
-        loop = ClosedLoop(plant, controller, RULE, learn=False)
+        loop = ClosedLoop(plant, controller, safety=SAFETY, learn=False)
         for step in loop.run(PoseTarget.turned(start.state, axis, degrees=15)).steps:
             lin, da = step.decision.linearization, step.after.a - step.before.a
-            off.append((controller.predict(lin, da)[0] - plant.gain * lin.step(da))[-3:])
+            off.append((controller.expect(lin, da).increment - plant.gain * lin.step(da))[-3:])
         return float(torch.stack(off).square().mean().sqrt()) / DEG
 
     plant, fuzzed, turns = session(0.15, observations=300)
-    servo = fuzzed.servo.dead_zone + fuzzed.servo.bias.abs()
+    servo = fuzzed.knowledge.servo.dead_zone + fuzzed.knowledge.servo.bias.abs()
     assert float((torch.stack(plant.given).abs() - servo).max()) <= 16 * DEG + 1e-9
     _, untaught, _ = session(0.0, turns=turns)
     assert error(fuzzed) < 1.1 * error(untaught)

@@ -13,9 +13,9 @@ import torch
 
 sys.path.append(str(Path(__file__).parents[1] / "model"))
 import model_toys
-
-from torch_ekm.control import Caution, ClosedLoop, FocusedPose, LookAndMoveController, PoseTarget
 from torch_ekm.control.termination import StopReason
+
+from torch_ekm.control import ClosedLoop, FocusedPose, LookAndMoveController, PoseTarget
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NoContactError, ParameterError
 from torch_ekm.foresight import BeyondReach, ModelHand, ReachEnd, friction_share, reachable
@@ -75,7 +75,7 @@ def test_joints_keep_their_stops_and_encoders_their_ranges(grasp) -> None:
 def test_a_turn_ends_where_the_model_said(grasp) -> None:
     plant, _, controller = grasp
     seen = plant.reset(0)
-    reach = reachable(controller, seen, caution=Caution())
+    reach = reachable(controller, seen, safety=Safety())
     assert reach.end is ReachEnd.LINK
     assert reach.what == ("thumb_2",)
     assert reach.angles == tuple(sorted(reach.angles))
@@ -129,9 +129,9 @@ def test_nothing_of_the_controller_changes(grasp) -> None:
     plant, seen, _ = grasp
     ekm = EnhancedModel.for_grasp(KinematicModel(plant.hand, plant.object), seen.state)
     controller = LookAndMoveController(ekm, plant.rotation_axis)
-    before = copy.deepcopy(ekm.state_dict()["trust.value"]), controller.tighter, ekm.servo
+    before = controller.pace.factor, controller.tighter
     assert reachable(controller, seen).end is not ReachEnd.NOTHING
-    assert (ekm.state_dict()["trust.value"], controller.tighter, ekm.servo) == before
+    assert (controller.pace.factor, controller.tighter) == before
     assert controller.enhanced is ekm
 
 

@@ -208,8 +208,8 @@ def test_bad_input_changes_nothing_and_a_state_dict_carries_all() -> None:
     with pytest.raises(NonFiniteError):
         plant.servo.update(torch.zeros(3), torch.tensor([0.0, math.nan, 0.0]))
     assert all(torch.equal(v, kept[k]) for k, v in plant.servo.state_dict().items())
-    with pytest.raises(ParameterError, match="forgetting"):
-        ServoModel(["a"], forgetting=1.1)
+    with pytest.raises(ParameterError, match="largest"):
+        ServoModel(["a"], largest=0.0)
     other = ServoModel(plant.servo.names)
     other.load_state_dict(kept)
     v, w = moves(2)

@@ -15,6 +15,7 @@ MAY = {
     "plant/trajectory.py": "stores it",
     "simulation/": "makes it, and draws what simulated sensors see",
     "experiments/": "reports it",
+    "inspection/": "shows it",
 }
 
 

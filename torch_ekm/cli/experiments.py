@@ -91,11 +91,13 @@ def reproduce(
 
     Time grows with the number of seeds and objects. With --quick: one or two minutes.
     """
+    from ..control import LimitingFunction, PaceOptions
     from ..experiments.config import Setting
     from ..experiments.reproduce import plan
 
-    control = {} if step is None else {"LimitingFunction.step": parse_step(step)}
-    setting = Setting(hand=hand, preset=preset, learner=learner, sensing=sensing, control=control)
+    limiting = LimitingFunction() if step is None else LimitingFunction(step=parse_step(step))
+    pace = PaceOptions(limiting=limiting)
+    setting = Setting(hand=hand, preset=preset, learner=learner, sensing=sensing, pace=pace)
     turns = parse_angles(angles) if angles else None
     planned = plan(
         experiment,

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from .caution import Caution
 from .closed_loop import ClosedLoop, Manipulation, Step, Stop
-from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, Decision, LookAndMoveController
+from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
+from .decision import Decision, StopReason
 from .focus import FocusedPose, PoseTarget
-from .guards import Guards, Halt
-from .limiting import LimitingFunction
+from .knowledge import HandKnowledge
 from .limits import ActuatorLimit, FrictionMarginLimit, JointLimit, Limit, NormalForceLimit
+from .pace import LimitingFunction, Pace, PaceOptions, StepBound, TrustRegion
 from .qp import Bounds, ControlProblem, ControlSolution, Equality, Inequality, Squares, build_qp
+from .safety import Caution, Guards, Safety, StoppingRule
 from .situation import LinearizedModel, Situation
-from .step_bound import StepBound
 from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
-from .termination import StoppingRule, StopReason
 
 __all__ = [
     "DEFAULT_LIMITS",
@@ -32,7 +31,7 @@ __all__ = [
     "FrictionMarginLimit",
     "GripForceTask",
     "Guards",
-    "Halt",
+    "HandKnowledge",
     "Inequality",
     "JointLimit",
     "Limit",
@@ -42,7 +41,10 @@ __all__ = [
     "Manipulation",
     "NormalForceLimit",
     "OffAxisTask",
+    "Pace",
+    "PaceOptions",
     "PoseTarget",
+    "Safety",
     "Situation",
     "Squares",
     "Step",
@@ -51,5 +53,6 @@ __all__ = [
     "StopReason",
     "StoppingRule",
     "Task",
+    "TrustRegion",
     "build_qp",
 ]

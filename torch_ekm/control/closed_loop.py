@@ -15,12 +15,12 @@ from ..model import Linearization
 from ..plant import Observation, Plant, PlantStatus, ServoInverse
 from ..residual import UpdateReport
 from ..typing import Float, Tensor
-from .caution import Caution
-from .controller import Decision, LookAndMoveController
+from .controller import LookAndMoveController
+from .decision import Decision, Expectation, StopReason
 from .focus import FocusedPose, PoseTarget
-from .guards import Guards, Halt, Watch
-from .limiting import contact_lever
-from .termination import StoppingRule, StopReason
+from .knowledge import HandKnowledge
+from .pace import contact_lever
+from .safety import Progress, Safety, Watch
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,7 @@ class Manipulation:
 
     @property
     def reason(self) -> StopReason:
+        """Why it ended."""
         return self.stop.reason
 
     @property
@@ -80,7 +81,7 @@ class Manipulation:
 
 
 class ClosedLoop:
-    """observe, decide, command, learn, until the stopping rule ends it.
+    """observe, decide, command, learn, until :class:`Safety` ends it.
 
     ``steps`` is a generator of motions; metrics and pictures are its consumers::
 
@@ -91,40 +92,40 @@ class ClosedLoop:
     Whatever ends the manipulation early (an exception, Ctrl-C, a ``break``), the hand is told to hold its
     position, and what was raised goes on. In a ``with`` block that is so for errors of the block, too.
 
+    Commands go through a :class:`~torch_ekm.plant.ServoInverse`, and the model learns from what the encoders
+    did; with servos that are taken for ideal both are the increments that were decided.
+
     Args:
         plant: with a grasped object (already reset).
         controller: its :class:`~torch_ekm.enhanced.EnhancedModel`, if it has one, learns after every motion.
-        rule: when to stop.
+        knowledge: of the hand, on which the loop goes on learning; None: nothing is known yet, and nothing is
+            learned of the servos if the controller's model is no enhanced one.
+        safety: when it looks again, goes back, stops and gives up.
         learn: False leaves the learner as it is.
-        caution: when to look again, to go back and to give up.
-        guards: which readings may move the hand and teach, and what the hand must never do.
         decline: is asked before anything moves; a text ends the manipulation as out of reach, with the object
             in the hand (:class:`~torch_ekm.foresight.BeyondReach`). None: nothing is declined.
 
-    An enhanced model with a ``servo`` commands through a :class:`~torch_ekm.plant.ServoInverse`, and
-    it learns from what the encoders did. One without learns from the commands.
+    Raises:
+        ParameterError: the knowledge is of another hand.
     """
 
     def __init__(
         self,
         plant: Plant,
         controller: LookAndMoveController,
-        rule: StoppingRule | None = None,
         *,
+        knowledge: HandKnowledge | None = None,
+        safety: Safety | None = None,
         learn: bool = True,
-        caution: Caution | None = None,
-        guards: Guards | None = None,
         decline: Callable[[Observation, PoseTarget], str] | None = None,
     ) -> None:
-        self.plant, self.controller = plant, controller
-        self.decline = decline
-        self.rule = StoppingRule() if rule is None else rule
-        self.learn = learn
-        self.caution = Caution() if caution is None else caution
-        self.guards = Guards() if guards is None else guards
-        servo = None if controller.enhanced is None else controller.enhanced.servo
-        if servo is not None and not isinstance(plant, ServoInverse):
-            self.plant = ServoInverse(plant, controller.kinematic.hand, servo)
+        hand = controller.kinematic.hand
+        if knowledge is None:
+            knowledge = HandKnowledge.of(hand, learns=controller.enhanced is not None)
+        knowledge.check(hand)
+        self.plant, self.knowledge = ServoInverse(plant, hand, knowledge.servo), knowledge
+        self.controller, self.learn, self.decline = controller, learn, decline
+        self.safety = Safety() if safety is None else safety
         self._stop = threading.Event()
 
     def __enter__(self) -> Self:
@@ -174,129 +175,110 @@ class ClosedLoop:
 
     def _motions(self, target: PoseTarget) -> Generator[Step, None, Stop]:
         started = time.monotonic()
-        watch = Watch(self.guards, self.controller)
-        seen, _, halt, _ = watch.first(self.plant.observe(), self.plant.observe)
+        watch = Watch(self.safety.guards, self.controller.kinematic, self.controller.expect)
+        first = watch.first(self.plant.observe(), self.plant.observe)
+        seen = first.seen
         self.controller.reset()
-        turn = _Turn(target, self.controller.focus, seen, self.caution.off_rotation, watch, halt)
-        if self.decline is not None and halt is None and seen.status is not PlantStatus.LOST:
+        progress = Progress(self.safety, target, self.controller.focus, seen, started)
+        progress.halt = first.halt
+        if self.decline is not None and progress.halt is None and seen.status is not PlantStatus.LOST:
             against = self.decline(seen, target)
             if against:
                 return Stop(StopReason.OUT_OF_REACH, seen, against)
         while True:
-            if turn.halt is not None:
-                self.hold()
-                return Stop(turn.halt.reason, seen, turn.halt.message)
-            if seen.status is PlantStatus.LOST:
-                return Stop(StopReason.OBJECT_LOST, seen)
-            if turn.off_rotation(seen) > self.rule.off_limit:
-                return Stop(StopReason.OBJECT_LOST, seen, "dislocated off the focused axis")
-            if self._stop.is_set():
-                return Stop(StopReason.STOPPED, seen)
-            if time.monotonic() - started > self.rule.max_seconds:
-                return Stop(StopReason.TIME_OUT, seen)
-            reason = self.rule.judge(turn.errors, turn.limited)
-            if reason is not StopReason.RUNNING:
-                return Stop(reason, seen)
-            seen, decision, sign, seconds = self._decide(seen, turn)
-            if sign and turn.way and decision.status is not StopReason.OBJECT_LOST:
-                turn.alarms += 1
-                turn.off_allowed = max(turn.off_allowed, turn.off_rotation(seen) + self.caution.off_further)
-                seen, clear = yield from self._go_back(seen, decision, turn)
-                if turn.halt is not None:
+            over = progress.over(seen, self._stop.is_set())
+            if over is not None:
+                if progress.halt is not None:
+                    self.hold()
+                return Stop(over.reason, seen, over.message)
+            seen, decision, sign, seconds = self._decide(seen, progress, watch)
+            if sign and progress.way and decision.status is not StopReason.OBJECT_LOST:
+                progress.alarm(seen)
+                seen, clear = yield from self._go_back(seen, decision, progress, watch)
+                if progress.halt is not None:
                     continue
-                if seen.status is PlantStatus.LOST or turn.off_rotation(seen) > self.rule.off_limit:
+                if progress.lost(seen):
                     return Stop(StopReason.OBJECT_LOST, seen, sign)
-                if not clear or turn.alarms > self.caution.retreats:
+                if not clear or progress.alarms > self.safety.caution.retreats:
                     return Stop(StopReason.GIVEN_UP, seen, sign)
-                self._be_careful()
+                self.controller.tighter += self.safety.caution.tighten
+                self.controller.pace.restart()
                 continue
             if decision.status is not StopReason.RUNNING:
                 return Stop(decision.status, seen, decision.message)
-            turn.halt = watch.command(decision, seen)
-            if turn.halt is not None:
+            progress.halt = watch.command(decision, seen)
+            if progress.halt is not None:
                 continue
-            step = self._move(seen, decision, turn, seconds)
-            turn.way.append(step.after.a - seen.a)
+            step = self._move(seen, decision, progress, watch, seconds)
+            progress.way.append(step.after.a - seen.a)
             yield step
-            seen, turn.limited = step.after, decision.limited
+            seen, progress.limited = step.after, decision.limited
 
-    def _decide(self, seen: Observation, turn: _Turn) -> tuple[Observation, Decision, str, float]:
+    def _decide(
+        self, seen: Observation, progress: Progress, watch: Watch
+    ) -> tuple[Observation, Decision, str, float]:
         """A decision, and what speaks for a loss to come in this reading and in all further looks."""
-        looks = self.caution.looks
+        looks = self.safety.caution.looks
         while True:
             began = time.perf_counter()
-            decision = self.controller.decide(seen.state, seen.a, turn.target, seen.fingertip_force)
+            decision = self.controller.decide(seen.state, seen.a, progress.target, seen.fingertip_force)
             seconds = time.perf_counter() - began
-            sign = self._sign(turn, seen, decision)
+            sign = progress.sign(seen, decision)
             if not sign or looks == 0 or seen.status is not PlantStatus.HELD:
                 return seen, decision, sign, seconds
-            seen, looks = turn.watch.rest(seen, self.plant.observe()), looks - 1
-
-    def _sign(self, turn: _Turn, seen: Observation, decision: Decision) -> str:
-        """What speaks for a loss to come; empty: nothing."""
-        if decision.status is not StopReason.RUNNING:
-            return decision.message
-        links = self.caution.bearing_links(decision.linearization)
-        turn.bearing = links if turn.bearing is None else turn.bearing
-        return self.caution.sign(turn.off_rotation(seen), turn.off_allowed, links - turn.bearing)
+            seen, looks = watch.rest(seen, self.plant.observe()), looks - 1
 
     def _go_back(
-        self, seen: Observation, decision: Decision, turn: _Turn
+        self, seen: Observation, decision: Decision, progress: Progress, watch: Watch
     ) -> Generator[Step, None, tuple[Observation, bool]]:
         """Undo the last motions until nothing speaks for a loss; False: it still does."""
-        for _ in range(min(self.caution.way_back, len(turn.way))):
-            back = -turn.way.pop()
-            step = self._move(seen, self.controller.retreat(decision, back), turn)
+        for _ in range(min(self.safety.caution.way_back, len(progress.way))):
+            back = -progress.way.pop()
+            step = self._move(seen, self.controller.retreat(decision, back), progress, watch)
             yield step
             seen = step.after
-            if seen.status is PlantStatus.LOST or turn.halt is not None:
+            if seen.status is PlantStatus.LOST or progress.halt is not None:
                 break
-            seen, decision, sign, _ = self._decide(seen, turn)
+            seen, decision, sign, _ = self._decide(seen, progress, watch)
             if not sign:
                 return seen, True
         return seen, False
 
-    def _be_careful(self) -> None:
-        """Grip harder and go slower."""
-        self.controller.tighter += self.caution.tighten
-        enhanced = self.controller.enhanced
-        if enhanced is not None and enhanced.trust is not None:
-            enhanced.trust.restart()
-
-    def _move(self, seen: Observation, decision: Decision, turn: _Turn, seconds: float = 0.0) -> Step:
+    def _move(
+        self, seen: Observation, decision: Decision, progress: Progress, watch: Watch, seconds: float = 0.0
+    ) -> Step:
         """Command, observe, learn."""
         first = self.plant.command(decision.delta_a)
         began = time.perf_counter()
-        servo = self.plant if isinstance(self.plant, ServoInverse) else None
-        stuck = () if servo is None else servo.stuck
-        after, teaches, turn.halt, note = turn.watch.motion(seen, decision, first, self.plant.observe, stuck)
-        if servo is not None and turn.halt is not None:
-            if turn.halt.reason is not StopReason.ACTUATOR_STUCK:  # this one the servo model itself says
-                servo.correct(None)
-        elif servo is not None and after is not first:
-            servo.correct(after)
+        verdict = watch.motion(seen, decision, first, self.plant.observe, self.plant.stuck)
+        after, progress.halt = verdict.seen, verdict.halt
+        if progress.halt is not None:
+            if progress.halt.reason is not StopReason.ACTUATOR_STUCK:  # the servo model itself finds this one
+                self.plant.correct(None)
+        elif after is not first:
+            self.plant.correct(after)
         increment = after.state.minus(seen.state)
-        report = self._learn(seen, decision, after, increment) if teaches else None
+        report = None
+        if verdict.teaches and self.learn and verdict.expected is not None:
+            report = self._learn(seen, decision, after, increment, verdict.expected)
         seconds += time.perf_counter() - began
-        error = turn.focus.error(turn.target, after.state)
-        # a goal that nobody saw is not reached
-        turn.errors.append(max(error, 1.001 * self.rule.tolerance) if turn.watch.blind else error)
-        return Step(seen, decision, after, increment, report, seconds, note)
+        progress.add(after, blind=watch.blind > 0)
+        return Step(seen, decision, after, increment, report, seconds, verdict.note)
 
     def _learn(
-        self, seen: Observation, decision: Decision, after: Observation, increment: Tensor
+        self, seen: Observation, decision: Decision, after: Observation, ds: Tensor, expected: Expectation
     ) -> UpdateReport | None:
         enhanced, lin = self.controller.enhanced, decision.linearization
-        if not self.learn or enhanced is None or after.status is not PlantStatus.HELD or lin is None:
+        if enhanced is None or after.status is not PlantStatus.HELD or lin is None:
             return None
-        servo = isinstance(self.plant, ServoInverse)
-        moved = after.a - seen.a if servo else decision.delta_a
-        predicted, nominal = self.controller.predict(lin, moved)
-        surprise = self._force_surprise(lin, seen, moved, after)
-        if enhanced.trust is not None:
-            lever = contact_lever(lin.contacts.point - seen.position)
-            enhanced.trust.judge(predicted[-6:], increment[-6:], lever, decision.share, surprise)
-        return enhanced.update(seen.state, moved, increment, nominal)
+        if not self.knowledge.servo.learns:  # then the dead zones are g's to learn
+            expected = self.controller.expect(lin, decision.delta_a)
+        lever = contact_lever(lin.contacts.point - seen.position)
+        surprise = self._force_surprise(lin, seen, expected.moved, after)
+        trust = self.controller.pace.options.trust
+        rho = trust.disagreement(expected.increment[-6:], ds[-6:], lever, surprise)
+        self.controller.pace.judge(rho, decision.share)
+        return enhanced.update(seen.state, expected.moved, ds, expected.nominal)
 
     def _force_surprise(
         self, lin: Linearization, seen: Observation, moved: Tensor, after: Observation
@@ -309,32 +291,3 @@ class ClosedLoop:
         if bool((torch.minimum(before, now) < self.controller.kinematic.options.forces.normal_std).any()):
             return None  # a pad that reads so little may be dead, or has let go
         return now - before - lin.normal_force_sensitivity @ moved
-
-
-class _Turn:
-    """How far a manipulation has come."""
-
-    def __init__(
-        self,
-        target: PoseTarget,
-        focus: FocusedPose,
-        seen: Observation,
-        off: float,
-        watch: Watch,
-        halt: Halt | None,
-    ) -> None:
-        self.target, self.focus, self.start = target, focus, seen.state
-        self.watch, self.halt = watch, halt
-        self.off_allowed = off
-        """[rad]"""
-        self.errors = [focus.error(target, seen.state)]
-        self.limited = False
-        self.alarms = 0
-        self.way: list[Tensor] = []
-        """What the encoders did [rad], motion by motion, without what was undone."""
-        self.bearing: frozenset[str] | None = None
-        """Links without a pad that bore on the object at the start."""
-
-    def off_rotation(self, seen: Observation) -> float:
-        """Of the object off the focus since the start [rad]."""
-        return self.focus.off_rotation(seen.state.minus(self.start))

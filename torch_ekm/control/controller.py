@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,14 +16,13 @@ from ..kinematics import GraspState
 from ..model import ModelStatus
 from ..residual.checks import check_finite
 from ..typing import Float, Tensor
+from .decision import Decision, Expectation, StopReason
 from .focus import FocusedPose, PoseTarget
-from .limiting import LimitingFunction, contact_travel
 from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
+from .pace import Pace, contact_travel
 from .qp import DEGREE, ControlProblem, ControlSolution, as_array, build_qp
 from .situation import LinearizedModel, Situation
-from .step_bound import StepBound
 from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
-from .termination import StopReason
 
 if TYPE_CHECKING:
     from ..model import KinematicModel, Linearization
@@ -35,33 +33,10 @@ DEFAULT_TASKS: tuple[Task, ...] = (EffortTask(), OffAxisTask(), GripForceTask(),
 #: What a step must not do unless told otherwise: limits of actuators, normal forces and joints.
 DEFAULT_LIMITS: tuple[Limit, ...] = (ActuatorLimit(), NormalForceLimit(), JointLimit())
 
-
-@dataclass(frozen=True)
-class Decision:
-    """What the controller wants done, what it expects, and how sure the numbers are."""
-
-    delta_a: Float[Tensor, " n_a"]
-    """Increment to command, relative to the encoders [rad]."""
-    status: StopReason
-    """RUNNING, or why no increment can be given."""
-    desired: Float[Tensor, " n_x"]
-    """dx_d, the limited error of the focused pose."""
-    predicted: Float[Tensor, " n_s"]
-    """(f + g)(s, da)."""
-    nominal: Float[Tensor, " n_s"]
-    """f(s, da) = J_m da: what the kinematic model alone predicts."""
-    share: float = 1.0
-    """Of the largest step that the pace allows."""
-    limited: bool = False
-    """The step could not be met in full because actuators stand at their limits."""
-    slack: float = 0.0
-    """Largest focused error that the step leaves unmet [unit of the focus]."""
-    linearization: Linearization | None = None
-    """The kinematic model at the state; None where it has none."""
-    solution: ControlSolution | None = None
-    """Of the last quadratic program, with its residuals."""
-    message: str = ""
-    """Why there is no increment."""
+# of the SQP for a model that is not linear in the action
+_ITERATIONS = 6
+_DAMPING = 0.6  # share of each change that is made
+_TOLERANCE = 1e-3 * DEGREE  # [rad] a smaller change is the last
 
 
 class LookAndMoveController:
@@ -84,11 +59,7 @@ class LookAndMoveController:
         focus: what of the pose must be reached, or the axis about which the object is to be turned.
         tasks: what a step should do (:class:`Task`); None: :data:`DEFAULT_TASKS`.
         limits: what it must not do (:class:`Limit`); None: :data:`DEFAULT_LIMITS`.
-        limiting: how much of the error a step asks for.
-        sqp_iterations: at most so many quadratic programs, for a model that is not linear in the action.
-        sqp_damping: share of each change that is made.
-        sqp_tolerance: a smaller change is the last [rad].
-        bound: how much of a step is made where the model predicts that it goes wrong.
+        pace: how far a step goes; None: a new :class:`Pace`, which adapts if the model is an enhanced one.
         solver: any that qpsolvers finds installed.
     """
 
@@ -98,21 +69,15 @@ class LookAndMoveController:
         focus: FocusedPose | Float[Tensor, " 3"],
         tasks: Sequence[Task] | None = None,
         limits: Sequence[Limit] | None = None,
-        limiting: LimitingFunction | None = None,
+        pace: Pace | None = None,
         *,
-        sqp_iterations: int = 6,
-        sqp_damping: float = 0.6,
-        sqp_tolerance: float = 1e-3 * DEGREE,
-        bound: StepBound | None = None,
         solver: str = "piqp",
     ) -> None:
         self.kinematic, self.enhanced = kinematic_and_enhanced(model)
         self.focus = focus if isinstance(focus, FocusedPose) else FocusedPose.rotation_about(focus)
         self.tasks = DEFAULT_TASKS if tasks is None else tuple(tasks)
         self.limits = DEFAULT_LIMITS if limits is None else tuple(limits)
-        self.limiting = LimitingFunction() if limiting is None else limiting
-        self.bound = StepBound() if bound is None else bound
-        self.sqp_iterations, self.sqp_damping, self.sqp_tolerance = sqp_iterations, sqp_damping, sqp_tolerance
+        self.pace = Pace(adapts=self.enhanced is not None) if pace is None else pace
         self.solver = solver
         self.tighter = 0.0
         """Grip force on top of the one that suits the object [N]."""
@@ -124,20 +89,13 @@ class LookAndMoveController:
         when it begins."""
         self._previous, self.tighter = None, 0.0
 
-    @property
-    def pace(self) -> float:
-        """Factor of the largest step, by a :class:`~torch_ekm.enhanced.TrustRegion`; 1 without one."""
-        trust = None if self.enhanced is None else self.enhanced.trust
-        return 1.0 if trust is None else trust.pace
-
-    def predict(
-        self, lin: Linearization, moved: Float[Tensor, " n_a"]
-    ) -> tuple[Float[Tensor, " n_s"], Float[Tensor, " n_s"]]:
-        """``(f + g)(s, w)`` and ``f(s, w)`` of what the encoders did from a linearized state."""
+    def expect(self, lin: Linearization, moved: Float[Tensor, " n_a"]) -> Expectation:
+        """``(f + g)(s, w)`` of what the encoders did from a linearized state, and how sure g is of it."""
         nominal = lin.step(moved)
         if self.enhanced is None:
-            return nominal, nominal
-        return self.enhanced.linearize(lin.state, moved, lin.manipulation_jacobian)[0], nominal
+            return Expectation(moved, nominal, nominal, torch.zeros_like(nominal))
+        g, variance = self.enhanced.correction(lin.state, moved, len(nominal))
+        return Expectation(moved, nominal, nominal + g, variance.sqrt())
 
     def _linearize(self, state: GraspState, a: Tensor, fingertip_force: Tensor | None) -> Linearization:
         """The kinematic model with the forces that the fingertips and the last forces speak for."""
@@ -164,12 +122,10 @@ class LookAndMoveController:
 
     def retreat(self, at: Decision, delta_a: Float[Tensor, " n_a"]) -> Decision:
         """The decision to undo a motion, instead of the one that was taken ``at`` the state."""
-        still = at.predicted.new_zeros(at.predicted.shape)
-        predicted, nominal = still, still
-        if at.linearization is not None:
-            predicted, nominal = self.predict(at.linearization, delta_a)
+        lin, still = at.linearization, at.predicted.new_zeros(at.predicted.shape)
+        expected = Expectation(delta_a, still, still, still) if lin is None else self.expect(lin, delta_a)
+        predicted, nominal = expected.increment, expected.nominal
         desired = self.focus.matrix @ predicted[-6:]
-        lin = at.linearization
         return Decision(
             delta_a, StopReason.RUNNING, desired, predicted, nominal, share=0.0, linearization=lin
         )
@@ -218,18 +174,14 @@ class LookAndMoveController:
             return self._none(status, failure, focused)
 
         travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
-        pace, steps = self.pace, self.limiting.steps(focused, travel)
-        share = min(self.limiting.gain * steps / pace, 1.0)
-        desired = self.limiting(focused, travel, pace)
+        desired, share = self.pace.ask(focused, travel)
         alone = None if fingertip_force is None else self._joint_force(lin)
         seen = Situation(
             hand, self.focus, state, a, fingertip_force, error, desired, alone, self._weight, self.tighter
         )
         try:
             da, predicted, problem, solution = self._solve(lin, seen)
-            asked = share * pace
-            phi = self.bound.share(lin, da, predicted, seen, self._wanted_grip(lin, seen), asked)
-            phi = max(phi, min(1.0, self.bound.least / max(asked, 1e-9)))
+            phi = self.pace.cut(lin, da, predicted, seen, self._wanted_grip(lin, seen), share)
             if phi < 1:
                 desired, share = phi * desired, phi * share
                 seen = dataclasses.replace(seen, desired=desired)
@@ -247,7 +199,7 @@ class LookAndMoveController:
         """No motion, and why."""
         hand = self.kinematic.hand
         zero, still = focused.new_zeros(hand.n_a), focused.new_zeros(hand.n_q + 6)
-        return Decision(zero, status, self.limiting(focused), still, still, message=str(failure))
+        return Decision(zero, status, self.pace.ask(focused)[0], still, still, message=str(failure))
 
     def _solve(
         self, lin: Linearization, seen: Situation
@@ -256,14 +208,14 @@ class LookAndMoveController:
         enhanced, da = self.enhanced, seen.a.new_zeros(len(seen.a))
         encoded = None if enhanced is None else enhanced.encode(seen.state)
         linear = enhanced is None or enhanced.affine
-        for _ in range(1 if linear else self.sqp_iterations):
+        for _ in range(1 if linear else _ITERATIONS):
             model = LinearizedModel.about(da, lin, enhanced, encoded)
             problem = self.program(model, seen)
             solution = problem.solve(self.solver)
             best = torch.as_tensor(solution.u, dtype=da.dtype)
             change = best - da
-            done = linear or float(change.abs().max()) <= self.sqp_tolerance
-            da = best if done else da + self.sqp_damping * change
+            done = linear or float(change.abs().max()) <= _TOLERANCE
+            da = best if done else da + _DAMPING * change
             if done:
                 break
         predicted = model.offset + model.jacobian @ da

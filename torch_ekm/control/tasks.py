@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import torch
 
-from .limiting import contact_travel
+from .pace import contact_travel
 from .qp import DEGREE, Equality, Squares, as_array
 from .situation import LinearizedModel, Situation
 

@@ -6,13 +6,10 @@ from .encoding import GraspEncoding
 from .enhanced_model import EnhancedModel
 from .grasp_learner import grasp_learner
 from .saving import load, save
-from .trust_region import TrustOptions, TrustRegion
 
 __all__ = [
     "EnhancedModel",
     "GraspEncoding",
-    "TrustOptions",
-    "TrustRegion",
     "grasp_learner",
     "load",
     "save",

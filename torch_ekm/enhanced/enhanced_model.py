@@ -11,7 +11,7 @@ from torch import nn
 
 from .._recorded import Recorded, check_state, describe
 from ..exceptions import ParameterError, ShapeError
-from ..kinematics import GraspState, ServoModel
+from ..kinematics import GraspState
 from ..residual.base import ResidualLearner, UpdateReport
 from ..residual.checks import check_finite
 from ..residual.kernels.action_linear import ActionLinearKernel
@@ -19,7 +19,6 @@ from ..typing import Float, Tensor
 from .encoding import GraspEncoding
 from .grasp_learner import grasp_learner
 from .model_jacobian import checked_jacobian, differentiated, finite_differences
-from .trust_region import TrustRegion
 
 if TYPE_CHECKING:
     from ..model import KinematicModel
@@ -43,9 +42,6 @@ class EnhancedModel(Recorded, nn.Module):
         outputs: indices of the increment that the learner corrects; all if None.
         action_scale: factor from the action's unit to the learner's.
         output_scale: factor, or one for each output, from the increment's unit to the learner's.
-        servo: of the actuators. A :class:`~torch_ekm.control.ClosedLoop` commands through its inverse and
-            trains on what the encoders did; without it g has to learn the dead zones, too.
-        trust: sets the pace of a closed loop by how well f + g predicts; without it the pace is fixed.
         jacobian: df/dda for :meth:`linearize`: a callable ``(state, action) -> (*batch, n_s, n_a)``, or
             ``"finite-difference"`` (central, 2 n_a calls of f); None: J_m, or automatic differentiation.
 
@@ -64,12 +60,10 @@ class EnhancedModel(Recorded, nn.Module):
         outputs: list[int] | None = None,
         action_scale: float = 1.0,
         output_scale: float | Float[Tensor, " n_out"] = 1.0,
-        servo: ServoModel | None = None,
-        trust: TrustRegion | None = None,
         jacobian: Callable[[Any, Tensor], Any] | Literal["finite-difference"] | None = None,
     ) -> None:
         super().__init__()
-        _check_arguments(model, learner, encode, outputs, servo, jacobian)
+        _check_arguments(model, learner, encode, outputs, jacobian)
         if not math.isfinite(action_scale) or action_scale == 0:
             raise ParameterError("action_scale", action_scale, "a finite number other than 0")
         scale = torch.as_tensor(output_scale)
@@ -81,7 +75,7 @@ class EnhancedModel(Recorded, nn.Module):
         self.model: Any = model  # a Module is registered, any other callable is kept as it is
         self.learner: ResidualLearner = learner
         self.encode: Callable[[Any], Tensor] = nn.Identity() if encode is None else encode
-        self.outputs, self.servo, self.trust = outputs, servo, trust
+        self.outputs = outputs
         self.action_scale = action_scale
         self.output_scale = nn.Buffer(scale)
         self.jacobian: Any = jacobian
@@ -93,8 +87,6 @@ class EnhancedModel(Recorded, nn.Module):
         state: GraspState,
         learner: ResidualLearner | Callable[[int, int], ResidualLearner] | None = None,
         encode: GraspEncoding | None = None,
-        servo: ServoModel | None = None,
-        trust: TrustRegion | None = None,
     ) -> EnhancedModel:
         """An E-KM of a grasped object, with nothing learned yet.
 
@@ -107,8 +99,6 @@ class EnhancedModel(Recorded, nn.Module):
             learner: of ``[encode(s); da]``, or ``learner(n_s, n_a)`` that makes one for ``n_s`` features of
                 the state and ``n_a`` actuators; None: :func:`~torch_ekm.enhanced.grasp_learner`.
             encode: what it sees of a state; None: of this grasp.
-            servo: what is known of the hand's servos; None: nothing yet.
-            trust: how far it may go; None: as far as with a new object.
 
         Raises:
             NoContactError: nothing touches the object.
@@ -120,11 +110,7 @@ class EnhancedModel(Recorded, nn.Module):
         scale = torch.tensor([1e3] * 3 + [180 / math.pi] * 3, dtype=state.q.dtype)  # m -> mm, rad -> deg
         rows = list(range(n_q, n_q + 6))
         step = math.radians(2.0)
-        servo = ServoModel(model.hand.actuator_names) if servo is None else servo
-        scales = {"action_scale": 1 / step, "output_scale": scale}
-        trust = TrustRegion() if trust is None else trust
-        parts = {"servo": servo, "trust": trust}
-        return cls(model, learner, encode=encode, outputs=rows, **parts, **scales)
+        return cls(model, learner, encode=encode, outputs=rows, action_scale=1 / step, output_scale=scale)
 
     @property
     def affine(self) -> bool:
@@ -265,18 +251,6 @@ class EnhancedModel(Recorded, nn.Module):
         law = nominal + mean.to(nominal), deviation.abs().to(nominal)
         return torch.distributions.Normal(*law, validate_args=False)  # of NaN comes NaN, as from f + g
 
-    @torch.no_grad()
-    def deviation(
-        self, state: Any, action: Float[Tensor, "*batch n_a"], like: Float[Tensor, "*batch n_s"]
-    ) -> Float[Tensor, "*batch n_s"]:
-        """Standard deviation of g, in the increment's unit; 0 for outputs that are not learned.
-
-        Args:
-            like: an increment, for shape and dtype.
-        """
-        spread = self.learner.predict(self.features(state, action)).stddev
-        return self._scatter((spread / self.output_scale).abs(), like)
-
     def get_extra_state(self) -> dict[str, Any]:
         """Encoding, outputs and scales: what the learner's inputs and outputs mean."""
         made = describe(self)
@@ -316,12 +290,11 @@ def kinematic_and_enhanced(
     return (model.model, model) if isinstance(model, EnhancedModel) else (model, None)
 
 
-def _check_arguments(model: Any, learner: Any, encode: Any, outputs: Any, servo: Any, jacobian: Any) -> None:
+def _check_arguments(model: Any, learner: Any, encode: Any, outputs: Any, jacobian: Any) -> None:
     checks = (
         ("model", model, callable(model), "a callable f(state, action) -> increment"),
         ("learner", learner, isinstance(learner, ResidualLearner), "a ResidualLearner"),
         ("encode", encode, encode is None or callable(encode), "a callable of the state, or None"),
-        ("servo", servo, servo is None or isinstance(servo, ServoModel), "a ServoModel, or None"),
         (
             "jacobian", jacobian, jacobian in (None, "finite-difference") or callable(jacobian),
             "a callable of state and action, 'finite-difference', or None",

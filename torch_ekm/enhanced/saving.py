@@ -14,7 +14,6 @@ from ..kinematics.grasp_state import GraspState
 from ..residual.base import ResidualLearner
 from ..residual.files import known_classes, read, rebuild, write
 from .enhanced_model import EnhancedModel
-from .trust_region import TrustOptions
 
 
 def save(learner: ResidualLearner | EnhancedModel, path: str | os.PathLike) -> None:
@@ -59,7 +58,7 @@ def load(
         ParameterError: a class is not known, or f is missing (or given for a learner).
     """
     described, state = read(path)
-    known = known_classes(classes) | {"GraspState": GraspState, "TrustOptions": TrustOptions}
+    known = known_classes(classes) | {"GraspState": GraspState}
     enhanced = isinstance(described, dict) and described.get("class") == "EnhancedModel"
     if enhanced != (model is not None):
         valid = "f, since the file holds an EnhancedModel" if enhanced else "None for a learner"

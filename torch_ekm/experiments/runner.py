@@ -4,20 +4,28 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 
-from ..control import ClosedLoop, LookAndMoveController, Manipulation, PoseTarget, StoppingRule
+from ..control import (
+    ActuatorLimit,
+    ClosedLoop,
+    HandKnowledge,
+    LookAndMoveController,
+    Manipulation,
+    Pace,
+    PoseTarget,
+)
 from ..description import ObjectDescription
 from ..enhanced import EnhancedModel, GraspEncoding
 from ..exceptions import EquilibriumError, GraspError
 from ..foresight import BlindPose, Reach, reachable
-from ..kinematics import GraspState, ServoModel
+from ..kinematics import GraspState
 from ..model import KinematicModel
-from ..plant import FramesAtRest, Plant, ServoInverse
+from ..plant import FramesAtRest, Plant
 from ..residual import ResidualLearner
 from ..simulation import DisturbedPlant, PlantChange, SimulatedHand, Tug
 from .config import Setting, object_name
@@ -50,18 +58,18 @@ class Bench:
         self.setting, self.controller = setting, controller
         config = setting.plant_config(controller)
         self.name = object_name(object) if isinstance(object, str) else object.name
-        self.hand = SimulatedHand(setting.hand, object, config, setting.parameters())
+        self.hand = SimulatedHand(setting.hand, object, config, setting.parameters)
         self.disturbed = DisturbedPlant(self.hand)
         self.plant: Plant = self.disturbed
         if setting.sensing:
             self.plant = _sensed(self.disturbed, self.hand, setting, keep_images)
         else:
             self.plant = FramesAtRest(self.plant, setting.frames)
-        self.servo = ServoModel(self.hand.hand.actuator_names)
-        """Of the KM+S and the E-KM; it stays when the object changes."""
-        if controller == "KM+S":
-            self.plant = ServoInverse(self.plant, self.hand.hand, self.servo)
-        self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model_options())
+        inverse = controller == "KM+S" or (self.learns and setting.servo_inverse)
+        self.knowledge = HandKnowledge.of(self.hand.hand, learns=inverse)
+        """Of the hand; it stays when the object changes."""
+        self.pace = Pace(setting.pace, adapts=self.learns)
+        self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model)
         self.learner: ResidualLearner | None = None
         self.encoding: GraspEncoding | None = None
         self.enhanced: EnhancedModel | None = None
@@ -100,6 +108,7 @@ class Bench:
     def adopt(self, learner: ResidualLearner, encoding: GraspEncoding) -> None:
         """Learn with this learner (e.g. one that knows other objects) instead of a fresh one."""
         self.learner, self.encoding, self.enhanced = learner, encoding, None
+        self.pace = Pace(self.setting.pace, adapts=True)
 
     def trial(self, seed: int, trial: int, angle_deg: float, kind: str = "turn", **options: Any) -> Record:
         """Turn the object by ``angle_deg`` from a fresh grasp, with the options of :meth:`turn`."""
@@ -147,21 +156,20 @@ class Bench:
                 # rotation off the axis does not keep the camera on: a model that tilts is not to be helped
                 switch_off=lambda seen: abs(float(axis @ target.error(seen.state)[3:])) <= blind_deg * _DEG,
                 touch=touch,
-                by_commands=self.learns and not self.setting.servo_inverse,
             )
-        loop = self._loop(plant, self._controller(axis, {}), self.setting.stopping_rule(), learn)
+        setting = self.setting
+        known = {"knowledge": self.knowledge, "safety": setting.safety}
+        loop = ClosedLoop(plant, self._controller(axis), **known, learn=learn)
         self.last = loop.run(target)
         return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
 
     def reach(self, angle_deg: float) -> Reach | None:
         """How far the model says that the grasp turns, up to ``angle_deg``; None: it refuses the grasp."""
         axis = self.hand.rotation_axis
-        options = {"caution": None, "rule": self.setting.stopping_rule()}
         sign, limit = (1 if angle_deg > 0 else -1), abs(angle_deg) * _DEG
         try:
-            return reachable(
-                self._controller(axis, {}), self.plant.observe(), sign=sign, limit=limit, **options
-            )
+            controller = self._controller(axis)
+            return reachable(controller, self.plant.observe(), sign=sign, limit=limit)
         except GraspError:
             return None
 
@@ -176,13 +184,16 @@ class Bench:
         if start is None:
             return NotGrasped(**vars(about), message=self.no_grasp)
         axis = self.hand.rotation_axis
-        wide = {
-            "LimitingFunction.step": step_deg * _DEG,
-            "LimitingFunction.contact_travel": None,
-            "ActuatorLimit.step": 20 * _DEG,
-        }
-        rule = dataclasses.replace(self.setting.stopping_rule(), max_steps=1, off_limit=math.inf)
-        loop = self._loop(self.plant, self._controller(axis, wide), rule, False)
+        setting, replace = self.setting, dataclasses.replace
+        limiting = replace(setting.pace.limiting, step=step_deg * _DEG, contact_travel=None)
+        wide = ActuatorLimit(step=20 * _DEG)
+        limits = tuple(wide if isinstance(one, ActuatorLimit) else one for one in setting.limits)
+        pace = Pace(replace(setting.pace, limiting=limiting), adapts=self.learns)
+        pace.load_state_dict(self.pace.state_dict())
+        controller = LookAndMoveController(self._predictor, axis, setting.tasks, limits, pace)
+        rule = replace(setting.safety.rule, max_steps=1, off_limit=math.inf)
+        safety = replace(setting.safety, rule=rule)
+        loop = ClosedLoop(self.plant, controller, knowledge=self.knowledge, safety=safety, learn=False)
         done = loop.run(PoseTarget.turned(start, axis, step_deg * _DEG))
         before = true_state(done.steps[0].before if done.steps else done.stop.final)
         turned = true_state(done.stop.final).minus(before)[-3:] @ axis
@@ -197,15 +208,9 @@ class Bench:
     def _predictor(self) -> KinematicModel | EnhancedModel:
         return self.model if self.enhanced is None else self.enhanced
 
-    def _controller(self, axis: torch.Tensor, changes: Mapping[str, Any]) -> LookAndMoveController:
-        setting = self.setting.replace(control={**self.setting.control, **changes})
-        parts = setting.controller_parts()
-        return LookAndMoveController(self._predictor, axis, **parts)
-
-    def _loop(
-        self, plant: Plant, controller: LookAndMoveController, rule: StoppingRule, learn: bool
-    ) -> ClosedLoop:
-        return ClosedLoop(plant, controller, rule, learn=learn, caution=self.setting.caution())
+    def _controller(self, axis: torch.Tensor) -> LookAndMoveController:
+        setting = self.setting
+        return LookAndMoveController(self._predictor, axis, setting.tasks, setting.limits, self.pace)
 
     def _prepare_learner(self, start: GraspState) -> None:
         setting = self.setting
@@ -214,17 +219,14 @@ class Bench:
         if self.learner is None:
             sizes = self.encoding.n_features, self.model.hand.n_a, setting.capacity
             self.learner = make_learner(setting.learner, *sizes, **setting.learner_options)
-        known = {"servo": self.servo, "trust": setting.trust_region()}
-        self.enhanced = EnhancedModel.for_grasp(self.model, start, self.learner, self.encoding, **known)
-        if not setting.servo_inverse:
-            self.enhanced.servo = None
+        self.enhanced = EnhancedModel.for_grasp(self.model, start, self.learner, self.encoding)
 
 
 def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting, keep_images: bool) -> Plant:
     from ..sensing import ContactAligned  # OpenCV is needed only here
     from ..simulation import HallSensors, SensedPlant, Stuck
 
-    hand, stuck = simulated.hand, setting.parameters().stuck_joints
+    hand, stuck = simulated.hand, setting.parameters.stuck_joints
     hall = HallSensors(hand) if hand.hall_sensors else None
     sensed = SensedPlant(plant, hand, simulated.object, hall=hall, keep_images=keep_images)
     if hall is not None:  # after the calibration: a channel that was dead by then would not be believed

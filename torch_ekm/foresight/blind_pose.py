@@ -37,7 +37,6 @@ class BlindPose(PlantWrapper):
             first one.
         touch: False leaves the pose to the prediction alone (the test that the paper leaves for the future,
             section VI).
-        by_commands: predict from what was commanded, for a model that has learned from commands.
         options: standard deviations.
 
     Raises:
@@ -53,7 +52,6 @@ class BlindPose(PlantWrapper):
         look_again: float = math.inf,
         switch_off: Callable[[Observation], bool] | None = None,
         touch: bool = True,
-        by_commands: bool = False,
         options: BlindOptions | None = None,
     ) -> None:
         if not float(torch.linalg.vector_norm(axis)) > 1e-9:
@@ -63,7 +61,7 @@ class BlindPose(PlantWrapper):
         super().__init__(plant)
         self.filter = PoseFilter(model, options, touch=touch)
         self.axis = axis / torch.linalg.vector_norm(axis)
-        self.look_again, self.by_commands = look_again, by_commands
+        self.look_again = look_again
         self._switch_off = switch_off
         self.dark, self.looks = False, 0
         """The camera is off; how often it was asked since."""
@@ -84,7 +82,7 @@ class BlindPose(PlantWrapper):
         """Move the actuators by ``delta_a`` [rad], wait, read the sensors that are on."""
         before, after = self._before, self.plant.command(delta_a)
         if self.dark and before is not None:
-            self.filter.move(delta_a if self.by_commands else after.a - before.a, before.fingertip_force)
+            self.filter.move(after.a - before.a, before.fingertip_force)
         return self.observation(after)
 
     def observation(self, seen: Observation) -> Observation:

@@ -8,9 +8,16 @@ from enum import Enum
 
 import torch
 
-from ..control import Caution, ClosedLoop, LookAndMoveController, PoseTarget, StoppingRule
-from ..control.closed_loop import Stop
-from ..control.termination import StopReason
+from ..control import (
+    Caution,
+    ClosedLoop,
+    HandKnowledge,
+    LookAndMoveController,
+    PoseTarget,
+    Safety,
+    Stop,
+    StopReason,
+)
 from ..enhanced import EnhancedModel
 from ..exceptions import GraspError, ParameterError
 from ..kinematics import GraspState
@@ -77,8 +84,7 @@ def reachable(
     sign: int = 1,
     limit: float = 90 * _DEG,
     friction: float = 0.7,
-    caution: Caution | None = None,
-    rule: StoppingRule | None = None,
+    safety: Safety | None = None,
 ) -> Reach:
     """``max |angle|`` of the closed loop on a :class:`ModelHand`: the controller's own programs, limits and
     signs of a loss, on f + g in place of the plant.
@@ -94,9 +100,8 @@ def reachable(
         limit: farthest angle that is tried [rad].
         friction: largest share of its friction that the grasp may need to hold the object
             (:func:`~torch_ekm.foresight.friction_share`); infinite: any.
-        caution: signs of a loss; None: the usual ones, but a link bears only where it would lie 0.3 mm deep,
-            which is when noisy readings tell of it.
-        rule: as in :class:`~torch_ekm.control.ClosedLoop`.
+        safety: as in :class:`~torch_ekm.control.ClosedLoop`; None: the usual one, but a link bears only where
+            it would lie 0.3 mm deep, which is when noisy readings show it.
 
     Raises:
         ParameterError: no axis, a focus that is no single rotation, a sign that is none, an angle outside 0
@@ -116,8 +121,9 @@ def reachable(
     idle = set(hand.at_limits())
     path, angles = [start.state], [0.0]
     standing = _Standing([], [], hand.linearization)
-    caution = Caution(link_gap=_PRESSED) if caution is None else caution
-    motions = ClosedLoop(hand, controller, rule, learn=False, caution=caution).steps(
+    safety = Safety(caution=Caution(link_gap=_PRESSED)) if safety is None else safety
+    ideal = HandKnowledge.of(hand.hand, learns=False)
+    motions = ClosedLoop(hand, controller, knowledge=ideal, safety=safety, learn=False).steps(
         PoseTarget.turned(start.state, about, sign * limit)
     )
     while True:
@@ -153,7 +159,7 @@ class BeyondReach:
         controller: of the loop.
         beyond: a target this far beyond the reach is tried nonetheless [rad]; negative: one that is nearer to
             the end is declined, too.
-        caution, rule: of the loop.
+        safety: of the loop.
     """
 
     def __init__(
@@ -161,10 +167,9 @@ class BeyondReach:
         controller: LookAndMoveController,
         beyond: float = 2 * _DEG,
         *,
-        caution: Caution | None = None,
-        rule: StoppingRule | None = None,
+        safety: Safety | None = None,
     ) -> None:
-        self.controller, self.beyond, self.caution, self.rule = controller, beyond, caution, rule
+        self.controller, self.beyond, self.safety = controller, beyond, safety
         self.reach: Reach | None = None
         """The last that was found."""
 
@@ -176,10 +181,9 @@ class BeyondReach:
         """
         about = axis_of(self.controller.focus)
         asked = float(about @ target.error(seen.state)[3:])
-        options = {"caution": self.caution, "rule": self.rule}
         sign, limit = (1 if asked >= 0 else -1), min(max(abs(asked), 1 * _DEG), 170 * _DEG)
         try:
-            self.reach = reachable(self.controller, seen, sign=sign, limit=limit, **options)
+            self.reach = reachable(self.controller, seen, sign=sign, limit=limit, safety=self.safety)
         except GraspError:  # the loop will say so itself
             return ""
         if self.reach.end is ReachEnd.NOTHING or abs(asked) <= abs(self.reach.angle) + self.beyond:

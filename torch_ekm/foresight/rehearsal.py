@@ -19,7 +19,7 @@ from .model_hand import ModelHand
 def own_controller(
     model: LookAndMoveController | KinematicModel | EnhancedModel, axis: Tensor | None
 ) -> LookAndMoveController:
-    """A controller apart from the given one, with its own pace and without servos.
+    """A controller apart from the given one, with a pace of its own.
 
     Raises:
         ParameterError: a model without an axis.
@@ -32,12 +32,7 @@ def own_controller(
         raise ParameterError("axis", None, "given with a model; a controller has a focus of its own")
     else:
         controller = LookAndMoveController(model, axis)
-    e = controller.enhanced
-    if e is not None:
-        parts = {"encode": e.encode, "outputs": e.outputs, "jacobian": e.jacobian}
-        scales = {"action_scale": e.action_scale, "output_scale": e.output_scale}
-        trust = copy.deepcopy(e.trust)
-        controller.enhanced = EnhancedModel(e.model, e.learner, trust=trust, **parts, **scales)
+    controller.pace = copy.deepcopy(controller.pace)
     return controller
 
 

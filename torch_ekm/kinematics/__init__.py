@@ -7,12 +7,13 @@ from .grasp_state import GraspState
 from .hand_kinematics import HandKinematics
 from .link_poses import LinkPoses
 from .play import Play, PlayState
-from .servo_model import ServoModel
+from .servo_model import IdealServos, ServoModel
 
 __all__ = [
     "ActuationMap",
     "GraspState",
     "HandKinematics",
+    "IdealServos",
     "LinkPoses",
     "Play",
     "PlayState",

@@ -14,6 +14,32 @@ from ..typing import Bool, Float, Tensor
 from .tensors import check_finite
 
 _DEG = math.pi / 180
+_PRIOR_STD = (1.0 * _DEG, 0.3 * _DEG)  # [rad] of d and b before the first motion
+_NOISE_STD = 0.1 * _DEG  # [rad] of a servo's error from motion to motion, a first guess worth ten motions
+_FORGETTING = 0.995  # of the least squares, for each motion
+
+
+class IdealServos(Recorded, nn.Module):
+    """``w = v``: servos that go where they are commanded, of which nothing is learned.
+
+    Args:
+        names: of the actuators.
+    """
+
+    learns = False
+    moved_from = 0.0
+
+    def __init__(self, names: Sequence[str]) -> None:
+        super().__init__()
+        self.names = tuple(names)
+        self.stuck = nn.Buffer(torch.zeros(len(self.names)).bool())
+
+    def command(self, wanted: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
+        """v = w [rad]."""
+        return wanted
+
+    def update(self, command: Tensor, moved: Tensor, free: Tensor | None = None) -> None:
+        """Nothing is learned."""
 
 
 class ServoModel(Recorded, nn.Module):
@@ -36,13 +62,12 @@ class ServoModel(Recorded, nn.Module):
         encoder_std: standard deviation of an encoder [rad].
         resolution: wanted motions up to this size are none [rad].
         largest: no dead zone is larger [rad].
-        prior_std: standard deviations of d and b before the first motion [rad].
-        noise_std: of the servo's error from motion to motion, a first guess worth ten motions [rad].
-        forgetting: of the least squares, for each motion.
 
     Source: the factorisation of a Hammerstein system; adaptive inverses: Tao and Kokotovic, Adaptive Control
     of Systems with Actuator and Sensor Nonlinearities (1996).
     """
+
+    learns = True
 
     def __init__(
         self,
@@ -51,27 +76,20 @@ class ServoModel(Recorded, nn.Module):
         encoder_std: float = 0.01 * _DEG,
         resolution: float = 0.02 * _DEG,
         largest: float = 6 * _DEG,
-        prior_std: tuple[float, float] = (1.0 * _DEG, 0.3 * _DEG),
-        noise_std: float = 0.1 * _DEG,
-        forgetting: float = 0.995,
     ) -> None:
         super().__init__()
         figures = {"encoder_std": encoder_std, "resolution": resolution, "largest": largest}
-        figures |= {"prior_std": min(prior_std), "noise_std": noise_std, "forgetting": forgetting}
         for name, value in figures.items():
             if not 0 < value < math.inf:
                 raise ParameterError(name, value, "positive and finite")
-        if forgetting > 1:
-            raise ParameterError("forgetting", forgetting, "at most 1")
         self.names = tuple(names)
         self.moved_from, self.resolution, self.largest = 3 * encoder_std, resolution, largest
-        self.forgetting = forgetting
-        self._prior = torch.diag(torch.tensor(prior_std, dtype=torch.float64).square()) / noise_std**2
+        self._prior = torch.diag(torch.tensor(_PRIOR_STD, dtype=torch.float64).square()) / _NOISE_STD**2
         n = len(self.names)
         self.estimate = nn.Buffer(torch.zeros(n, 2).double())  # theta = (d, b) [rad]
         self.covariance = nn.Buffer(self._prior.repeat(n, 1, 1))  # of theta, in units of the noise's variance
         self.weight = nn.Buffer(torch.full((n,), 10.0).double())
-        self.squares = nn.Buffer(self.weight * noise_std**2)
+        self.squares = nn.Buffer(self.weight * _NOISE_STD**2)
         self.before = nn.Buffer(self.estimate.clone())  # theta before the first failure in succession
         self.before_covariance = nn.Buffer(self.covariance.clone())
         self.failures = nn.Buffer(torch.zeros(n).long())  # commands in succession that moved nothing
@@ -153,13 +171,13 @@ class ServoModel(Recorded, nn.Module):
         Px, spread = self._spread(x, went)
         self.estimate[went] += Px * (error / spread)[:, None]
         P = self.covariance[went] - Px[..., None] * Px[:, None, :] / spread[:, None, None]
-        faded = P / self.forgetting  # never less sure than at the start: no blow-up without excitation
+        faded = P / _FORGETTING  # never less sure than at the start: no blow-up without excitation
         small = (faded.diagonal(dim1=-2, dim2=-1) <= self._prior.diagonal()).all(-1)
         self.covariance[went] = torch.where(small[:, None, None], faded, P)
         # bounded: a servo that has become another one is not a noisy one
         square = (error.square() / spread).clamp(max=16 * noise)
-        self.weight[went] = self.forgetting * self.weight[went] + 1
-        self.squares[went] = self.forgetting * self.squares[went] + square
+        self.weight[went] = _FORGETTING * self.weight[went] + 1
+        self.squares[went] = _FORGETTING * self.squares[went] + square
 
     def _censored(self, v: Tensor, stood: Tensor) -> None:
         """``x.theta + noise > |v|``, ``x = [1, -sign(v)]``, of the servos that stood: moments of the

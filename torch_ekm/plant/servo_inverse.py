@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from ..description import HandDescription
-from ..kinematics import ServoModel
+from ..kinematics import IdealServos, ServoModel
 from ..typing import Float, Tensor
 from .observation import Observation
 from .plant import Plant
@@ -29,10 +29,13 @@ class ServoInverse(PlantWrapper):
         plant: with encoders (``Observation.a``).
         hand: gives names and ranges of the actuators.
         servo: what is known of the servos; None: nothing yet. It belongs to the hand, not to an object: keep
-            it from trial to trial, and save its state dict with the learner's.
+            it from trial to trial (:class:`~torch_ekm.control.HandKnowledge`). With ideal servos commands
+            are passed on as they are.
     """
 
-    def __init__(self, plant: Plant, hand: HandDescription, servo: ServoModel | None = None) -> None:
+    def __init__(
+        self, plant: Plant, hand: HandDescription, servo: ServoModel | IdealServos | None = None
+    ) -> None:
         super().__init__(plant)
         self.servo = ServoModel(hand.actuator_names) if servo is None else servo
         self._range = [torch.from_numpy(edge) for edge in (hand.actuator_lower, hand.actuator_upper)]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import torch
 
-from ...control import ClosedLoop, LookAndMoveController, PoseTarget, StoppingRule
+from ...control import ClosedLoop, LookAndMoveController, PoseTarget, Safety, StoppingRule
 from ...enhanced import EnhancedModel
 from ...model import KinematicModel
 from ...simulation import DisturbedPlant, PlantChange, SimulatedHand
@@ -33,7 +33,7 @@ def record_simulated_hand(n: int = 400, seed: int = 1000) -> Stream:
     plant = SimulatedHand("icub_right", "box", preset="nominal")
     disturbed = DisturbedPlant(plant, [PlantChange.new_tendons(n // 2, 0.85)])
     model = KinematicModel(plant.hand, plant.object)
-    rule = StoppingRule(max_steps=10)
+    safety = Safety(rule=StoppingRule(max_steps=10))
     enhanced, x, y, segments = None, [], [], []
     while len(x) < n:
         start = disturbed.reset(seed + len(segments)).state
@@ -41,7 +41,7 @@ def record_simulated_hand(n: int = 400, seed: int = 1000) -> Stream:
         controller = LookAndMoveController(model, plant.rotation_axis)
         target = PoseTarget.turned(start, plant.rotation_axis, draw.uniform(5, 20) * _DEG)
         before = len(x)
-        for step in ClosedLoop(disturbed, controller, rule).steps(target):
+        for step in ClosedLoop(disturbed, controller, safety=safety).steps(target):
             x.append(enhanced.features(step.before.state, step.decision.delta_a))
             y.append((step.increment - step.decision.nominal)[enhanced.outputs] * enhanced.output_scale)
         segments.append(len(x) - before)

@@ -123,7 +123,7 @@ class Generalize(Protocol):
 
     def targets(self, results: Results[Record]) -> list[Target]:
         """Set for the four controllers, over all objects."""
-        records, limit = records_of(results), self.setting.max_steps
+        records, limit = records_of(results), self.setting.safety.rule.max_steps
         found = []
         for item, mine in tables.by_object(records).items():
             ours, theirs = tables.paired(mine, "E-KM", "KM", steady_state_error)
@@ -157,7 +157,7 @@ class Generalize(Protocol):
 
     def report(self, seeds: Sequence[int], results: Results[Record], folder: Path) -> Report:
         """Tables I and II, Fig. 6, and the probes."""
-        records, limit = records_of(results), self.setting.max_steps
+        records, limit = records_of(results), self.setting.safety.rule.max_steps
         figures = []
         for item in self.objects:
             name = object_name(item)

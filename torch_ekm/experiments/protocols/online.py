@@ -116,7 +116,7 @@ class Online(Protocol):
 
     def report(self, seeds: Sequence[int], results: Results[Record], folder: Path) -> Report:
         """Fig. 5a and 5b, and every controller's turns."""
-        records, limit = records_of(results), self.setting.max_steps
+        records, limit = records_of(results), self.setting.safety.rule.max_steps
         curves = prediction_curves(records, self.trials)
         figures = []
         ekm, km = (np.stack([curve[i] for curve in curves]) for i in (0, 1))

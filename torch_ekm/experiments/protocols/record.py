@@ -43,7 +43,7 @@ class RecordConfig:
         """What decides the trials, for the log."""
         figures = dataclasses.asdict(self)
         plant = self.setting.plant_config(self.controller)
-        parameters = dataclasses.asdict(self.setting.parameters())
+        parameters = dataclasses.asdict(self.setting.parameters)
         gravity = plant.gravity or load_hand(self.setting.hand).gravity
         files = file_digests(self.setting.hand, [self.object])
         return {

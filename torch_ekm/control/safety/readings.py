@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
 from ...plant import Observation, PlantStatus
 from ...typing import Float, Tensor
-from ..controller import Decision, LookAndMoveController
-from ..termination import StopReason
+from ..decision import Decision, Expectation, StopReason
 from .fingertips import hold
-from .options import Guards
+from .safety import Guards
+
+if TYPE_CHECKING:
+    from ...description import HandDescription
 
 _DEG = math.pi / 180
 _NAMES = ("the encoders' reading", "the joints' reading", "the object's pose")
 _LEVER = 0.03  # [m] a rotation that is predicted wrong carries the object's point so much
 
 
-class Doubt(NamedTuple):
-    """An objection."""
+class Objection(NamedTuple):
+    """What speaks against a reading."""
 
     reason: StopReason
     message: str
@@ -30,16 +32,16 @@ class Doubt(NamedTuple):
     """Surprising, but possible."""
 
 
-class Doubts:
+class ReadingTests:
     """Tests of readings against :class:`~torch_ekm.control.Guards`.
 
     Args:
         guards: limits.
-        controller: predicts motions.
+        hand: gives names and ranges of encoders and joints.
     """
 
-    def __init__(self, guards: Guards, controller: LookAndMoveController) -> None:
-        self.guards, self.controller, self.hand = guards, controller, controller.kinematic.hand
+    def __init__(self, guards: Guards, hand: HandDescription) -> None:
+        self.guards, self.hand = guards, hand
         self._raw: Observation | None = None
         self._path = {"joints": 0.0, "pose": 0.0}
         self._limits = [
@@ -47,7 +49,7 @@ class Doubts:
             ("joint", self.hand.joint_names, self.hand.joint_lower, self.hand.joint_upper),
         ]
 
-    def at_rest(self, seen: Observation, before: Observation | None = None) -> Doubt | None:
+    def at_rest(self, seen: Observation, before: Observation | None = None) -> Objection | None:
         """Of a reading without a motion since ``before``."""
         doubt = self._age(seen) or self._range(seen)
         if before is None or doubt is not None:
@@ -56,36 +58,40 @@ class Doubts:
         return self._encoders(before, still, seen) or self._jump(ds, torch.zeros_like(ds), seen)
 
     def after_motion(
-        self, before: Observation, decision: Decision, seen: Observation, blind: int
-    ) -> Doubt | None:
+        self,
+        before: Observation,
+        decision: Decision,
+        seen: Observation,
+        expected: Expectation | None,
+        blind: int,
+    ) -> Objection | None:
         """Of a reading after a motion, the worst first; ``blind`` motions without a pose came before."""
         doubt = self._age(seen, before) or self._range(seen) or self._encoders(before, decision.delta_a, seen)
         doubt = self._speed(before, seen) if doubt is None else doubt
         if doubt is not None and not doubt.blind:
             return doubt
-        lin, moved = decision.linearization, seen.a - before.a
-        if lin is None:
+        if expected is None:
             return doubt
-        ds, predicted = seen.state.minus(before.state), self.controller.predict(lin, moved)[0]
+        ds, predicted = seen.state.minus(before.state), expected.increment
         if doubt is not None:  # blind: the joints are still looked at
             ds[-6:] = predicted[-6:]
             return self._jump(ds, predicted, seen) or doubt
-        return self._jump(ds, predicted, seen) or self._gate(before, moved, ds, predicted, seen, blind)
+        return self._jump(ds, predicted, seen) or self._gate(before, ds, expected, seen, blind)
 
-    def _age(self, seen: Observation, before: Observation | None = None) -> Doubt | None:
+    def _age(self, seen: Observation, before: Observation | None = None) -> Objection | None:
         """Stale, repeated or missing readings."""
         taken, repeats = seen.taken, self._repeats(seen, before)
         if before is not None and all(self._same(seen).values()) and torch.equal(seen.a, before.a):
             message = (
                 "encoders, joints and pose are the same bit by bit after a motion: look after the driver"
             )
-            return Doubt(StopReason.STALE_SENSOR, message)
+            return Objection(StopReason.STALE_SENSOR, message)
         for k, sensor in enumerate(taken._fields[:3]):  # fingertips: another reading stands in
             age, oldest = seen.time - taken[k], self.guards.max_age[k]
             problem = ""
             if before is not None and sensor == "pose" and seen.status is PlantStatus.NOT_SEEN:
                 message = "the camera does not find the object: clear its view, or light it"
-                return Doubt(StopReason.BLIND, message, blind=True)
+                return Objection(StopReason.BLIND, message, blind=True)
             if sensor in repeats:
                 problem = f"is the same bit by bit while the encoders moved {deg(repeats[sensor])}"
             elif not seen.dated:
@@ -96,7 +102,9 @@ class Doubts:
                 problem = f"is {age:.3f} s old, Guards.max_age is {oldest:g} s"
             if problem:
                 message = f"{_NAMES[k]} {problem}: look after its driver or its time stamps"
-                return Doubt(StopReason.STALE_SENSOR, message, blind=sensor == "pose" and before is not None)
+                return Objection(
+                    StopReason.STALE_SENSOR, message, blind=sensor == "pose" and before is not None
+                )
         return None
 
     def _repeats(self, seen: Observation, before: Observation | None) -> dict[str, float]:
@@ -107,7 +115,7 @@ class Doubts:
         path = {sensor: way + moved for sensor, way in self._path.items() if same[sensor]}
         return {sensor: way for sensor, way in path.items() if way > self.guards.unchanged}
 
-    def _range(self, seen: Observation) -> Doubt | None:
+    def _range(self, seen: Observation) -> Objection | None:
         for (what, names, lower, upper), value in zip(self._limits, (seen.a, seen.q), strict=True):
             value = value.detach().cpu().double().numpy()
             beyond = (lower - value).clip(min=value - upper)
@@ -117,10 +125,10 @@ class Doubts:
                     f"{what} '{names[i]}' reads {deg(value[i])}, its range is {deg(lower[i])} "
                     f"to {deg(upper[i])} (Guards.beyond is {deg(self.guards.beyond)}): look after it"
                 )
-                return Doubt(StopReason.OUT_OF_RANGE, message)
+                return Objection(StopReason.OUT_OF_RANGE, message)
         return None
 
-    def _encoders(self, before: Observation, told: Tensor, seen: Observation) -> Doubt | None:
+    def _encoders(self, before: Observation, told: Tensor, seen: Observation) -> Objection | None:
         """Jumps and speeds."""
         moved, none = seen.a - before.a, torch.zeros_like(told)
         away = torch.maximum(torch.minimum(told, none) - moved, moved - torch.maximum(told, none))
@@ -130,10 +138,10 @@ class Doubts:
                 f"encoder '{names[i]}' went {deg(moved[i])} where {deg(told[i])} were commanded "
                 f"(Guards.encoder_jump is {deg(self.guards.encoder_jump)}): look after its cable and zero"
             )
-            return Doubt(StopReason.ENCODER_JUMP, message)
+            return Objection(StopReason.ENCODER_JUMP, message)
         return None
 
-    def _speed(self, before: Observation, seen: Observation) -> Doubt | None:
+    def _speed(self, before: Observation, seen: Observation) -> Objection | None:
         moved, names = seen.a - before.a, self.hand.actuator_names
         seconds, i = seen.taken.encoders - before.taken.encoders, int(moved.abs().argmax())
         if seen.dated and before.dated and moved[i].abs() > self.guards.speed * max(seconds, 0.0):
@@ -141,10 +149,10 @@ class Doubts:
                 f"encoder '{names[i]}' went {deg(moved[i])} in {seconds:.3g} s (Guards.speed is "
                 f"{deg(self.guards.speed)}/s): the driver must wait for the end of a motion, and date it"
             )
-            return Doubt(StopReason.SPEED_CEILING, message)
+            return Objection(StopReason.SPEED_CEILING, message)
         return None
 
-    def _jump(self, ds: Tensor, predicted: Tensor, seen: Observation) -> Doubt | None:
+    def _jump(self, ds: Tensor, predicted: Tensor, seen: Observation) -> Objection | None:
         """What no motion does."""
         guards, n_q = self.guards, self.hand.n_q
         off = ds - predicted
@@ -154,7 +162,7 @@ class Doubts:
                 f"joint '{self.hand.joint_names[i]}' turned {deg(ds[i])} where {deg(predicted[i])} "
                 f"were predicted (Guards.joint_jump is {deg(guards.joint_jump)}): look after its sensor"
             )
-            return Doubt(StopReason.JOINT_JUMP, message)
+            return Objection(StopReason.JOINT_JUMP, message)
         way, turn = (float(torch.linalg.vector_norm(part)) for part in (off[-6:-3], off[-3:]))
         if (way > guards.translation_jump or turn > guards.rotation_jump) and hold(seen):
             message = (
@@ -162,14 +170,14 @@ class Doubts:
                 f"the fingertips hold the object (Guards allow jumps of {1e3 * guards.translation_jump:g} mm "
                 f"and {deg(guards.rotation_jump)}): look after camera and markers"
             )
-            return Doubt(StopReason.POSE_JUMP, message)
+            return Objection(StopReason.POSE_JUMP, message)
         return None
 
     def _gate(
-        self, before: Observation, moved: Tensor, ds: Tensor, predicted: Tensor, seen: Observation, blind: int
-    ) -> Doubt | None:
+        self, before: Observation, ds: Tensor, expected: Expectation, seen: Observation, blind: int
+    ) -> Objection | None:
         """The innovation against its covariance."""
-        sigma = self.deviation(before, moved, predicted, seen, blind)
+        sigma, predicted = self.deviation(before, expected, seen, blind), expected.increment
         z = (ds - predicted).abs() / sigma
         i, n_q = int(z.argmax()), self.hand.n_q
         if z[i] <= self.guards.gate:
@@ -184,13 +192,13 @@ class Doubts:
             f"{what} {float(ds[i]) / unit:.2f} {name} where {float(predicted[i]) / unit:.2f} ± "
             f"{float(sigma[i]) / unit:.2f} {name} were predicted (Guards.gate is {self.guards.gate:g})"
         )
-        return Doubt(StopReason.BLIND, message, gated=True)
+        return Objection(StopReason.BLIND, message, gated=True)
 
     def deviation(
-        self, before: Observation, moved: Tensor, predicted: Tensor, seen: Observation, blind: int = 0
+        self, before: Observation, expected: Expectation, seen: Observation, blind: int = 0
     ) -> Float[Tensor, " n_s"]:
         """sigma of each entry of an increment, see :class:`~torch_ekm.control.Guards`."""
-        guards, n_q = self.guards, self.hand.n_q
+        guards, n_q, predicted = self.guards, self.hand.n_q, expected.increment
         variance = predicted.new_zeros(predicted.shape)
         variance[:n_q] = 2 * guards.joint_noise**2
         for reading in (before, seen):
@@ -202,9 +210,7 @@ class Doubts:
         along, about = way + _LEVER * turn, turn + way / _LEVER
         size = torch.cat([parts[0].abs().amax().expand(n_q), along.expand(3), about.expand(3)])
         variance += (share * size).square()
-        if self.controller.enhanced is not None:
-            variance += self.controller.enhanced.deviation(before.state, moved, predicted).square()
-        return variance.sqrt()
+        return (variance + expected.deviation.square()).sqrt()
 
     def _stated(self, reading: Observation) -> Float[Tensor, " 6"]:
         """Variances of a pose: as stated, and no less than what the guards allow."""

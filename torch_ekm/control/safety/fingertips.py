@@ -10,12 +10,11 @@ import torch
 from ...exceptions import GraspError
 from ...plant import Observation
 from ...typing import Float, Tensor
-from ..controller import Decision, LookAndMoveController
-from ..termination import StopReason
-from .options import Guards, Halt
+from ..decision import Decision, StopReason
+from .safety import Guards, Halt
 
 if TYPE_CHECKING:
-    from ...model import Linearization
+    from ...model import KinematicModel, Linearization
 
 _HOLDS = 1.0  # [N] by two pads: an object is between them
 _PRESSED = 3.0  # [N] by the model: a pad that reads nothing then is dead
@@ -24,7 +23,7 @@ _JOINT_STD = 0.75  # [N] of a normal force by joints and springs alone
 _JOINT_SHARE = 0.25  # and as a share of it: springs are not as described
 
 
-class Felt(NamedTuple):
+class Fingertips(NamedTuple):
     """What is believed of the fingertips."""
 
     force: Float[Tensor, " n_pads"] | None
@@ -41,10 +40,10 @@ def hold(seen: Observation) -> bool:
 class FingertipWatch:
     """Dead, frozen, saturated and stale fingertips, and forces above the ceiling."""
 
-    def __init__(self, guards: Guards, controller: LookAndMoveController) -> None:
-        self.guards, self.controller = guards, controller
-        self.pads = [pad.name for pad in controller.kinematic.hand.pads]
-        self.least = controller.kinematic.options.forces.normal_std
+    def __init__(self, guards: Guards, model: KinematicModel) -> None:
+        self.guards, self.model = guards, model
+        self.pads = [pad.name for pad in model.hand.pads]
+        self.least = model.options.forces.normal_std
         self._last: Tensor | None = None
         self._repeats = torch.zeros(len(self.pads), dtype=torch.long)
         self._way = torch.zeros(len(self.pads), dtype=torch.float64)
@@ -63,20 +62,20 @@ class FingertipWatch:
         if float(estimate.max()) <= self.guards.force_ceiling:
             return None
         if seen.fingertip_force is not None:
-            pads = self.controller.kinematic.hand.pad_indices(lin.contacts.finger)
+            pads = self.model.hand.pad_indices(lin.contacts.finger)
             estimate = estimate.where(seen.fingertip_force[pads] < self.least, 0.0)
         i = int(estimate.argmax())
         return self._too_hard(lin.contacts.finger[i], float(estimate[i]), "by the model's estimate")
 
-    def judge(self, before: Observation, decision: Decision, seen: Observation) -> Felt:
+    def judge(self, before: Observation, decision: Decision, seen: Observation) -> Fingertips:
         """What is believed after a motion."""
         force, dated = seen.fingertip_force, seen.dated and before.dated
         if force is None:
-            return Felt(None)
+            return Fingertips(None)
         taken = seen.taken.fingertips
         if dated and not (taken > before.time and abs(seen.time - taken) <= self.guards.max_age.fingertips):
             note = f"the fingertips were read at {taken:.3f} s: the model's estimate stands in"
-            return Felt(None, note)
+            return Fingertips(None, note)
         repeats = self._frozen(force, float((seen.a - before.a).abs().max()))
         expected = self._by_model(decision)
         faults = {i: f"reads {float(force[i]):.2f} N again and again" for i in repeats if i in expected}
@@ -87,15 +86,15 @@ class FingertipWatch:
             if other is not None and self._contradicts(float(force[i]), other):
                 faults[i] = f"reads {float(force[i]):.2f} N where joints and springs speak for {other:.2f} N"
             elif force[i] > self.guards.force_ceiling:
-                return Felt(force, halt=self._too_hard(self.pads[i], float(force[i]), "as measured"))
-        told = [f"fingertip '{self.pads[i]}' {problem}" for i, problem in sorted(faults.items())]
+                return Fingertips(force, halt=self._too_hard(self.pads[i], float(force[i]), "as measured"))
+        notes = [f"fingertip '{self.pads[i]}' {problem}" for i, problem in sorted(faults.items())]
         if len(faults) > self.guards.faulty_pads:
             message = (
-                f"{'; '.join(told)} (Guards.faulty_pads is {self.guards.faulty_pads}): look after range and "
+                f"{'; '.join(notes)} (Guards.faulty_pads is {self.guards.faulty_pads}): look after range and "
                 "cable of the fingertips, or of the joints' sensors if several fingertips disagree with them"
             )
-            return Felt(force, halt=Halt(StopReason.FINGERTIP_FAULT, message))
-        told += [
+            return Fingertips(force, halt=Halt(StopReason.FINGERTIP_FAULT, message))
+        notes += [
             f"fingertip '{self.pads[i]}' reads {float(force[i]):.2f} N where the model has {other:.2f} N"
             for i, other in expected.items()
             if other > _PRESSED and force[i] < self.least
@@ -103,7 +102,7 @@ class FingertipWatch:
         if faults:
             force = force.clone()
             force[list(faults)] = 0.0
-        return Felt(force, f"{'; '.join(told)}: the model's estimate stands in" if told else "")
+        return Fingertips(force, f"{'; '.join(notes)}: the model's estimate stands in" if notes else "")
 
     def _frozen(self, force: Tensor, moved: float) -> list[int]:
         """Pads that read the same again and again while the encoders move."""
@@ -117,7 +116,7 @@ class FingertipWatch:
     def _by_joints(self, seen: Observation) -> dict[int, float]:
         """Normal force of each pad in contact by joints and springs alone [N]; empty: unknown."""
         try:
-            return self._normal(self.controller.kinematic.linearize(seen.state))
+            return self._normal(self.model.linearize(seen.state))
         except GraspError:
             return {}
 
@@ -126,7 +125,7 @@ class FingertipWatch:
         return {} if decision.linearization is None else self._normal(decision.linearization)
 
     def _normal(self, lin: Linearization) -> dict[int, float]:
-        pads = self.controller.kinematic.hand.pad_indices(lin.contacts.finger)
+        pads = self.model.hand.pad_indices(lin.contacts.finger)
         return dict(zip(pads, lin.forces.normal.tolist(), strict=True)) if lin.forces.solved else {}
 
     def _surprising(self, i: int, force: Tensor, expected: dict[int, float]) -> bool:

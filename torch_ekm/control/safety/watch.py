@@ -5,20 +5,23 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
 from ...plant import Observation, PlantStatus
-from ..controller import Decision, LookAndMoveController
-from ..termination import StopReason
-from .doubts import Doubts, agree, deg
+from ...typing import Tensor
+from ..decision import Decision, Expectation, StopReason
 from .fingertips import FingertipWatch
-from .options import Guards, Halt
+from .readings import ReadingTests, agree, deg
+from .safety import Guards, Halt
+
+if TYPE_CHECKING:
+    from ...model import KinematicModel, Linearization
 
 _DEG = math.pi / 180
 _STILL = 0.05 * _DEG  # an encoder that moves less stands
-_TOLD = 0.5 * _DEG  # a smaller command to a motor that was stuck before does not show whether it still is
+_ASKED = 0.5 * _DEG  # a smaller command to a motor that was stuck before does not show whether it still is
 
 
 class Verdict(NamedTuple):
@@ -32,6 +35,8 @@ class Verdict(NamedTuple):
     """Why the manipulation must end here."""
     note: str = ""
     """What a guard objects to where the loop goes on."""
+    expected: Expectation | None = None
+    """What f + g predict of what the encoders did; None: the model has no step."""
 
 
 class Watch:
@@ -39,12 +44,15 @@ class Watch:
 
     Args:
         guards: limits.
-        controller: predicts motions.
+        model: f, with the hand.
+        expect: f + g of what the encoders did, from where the model was linearized.
     """
 
-    def __init__(self, guards: Guards, controller: LookAndMoveController) -> None:
-        self.guards, self.controller, self.hand = guards, controller, controller.kinematic.hand
-        self.doubts, self.fingertips = Doubts(guards, controller), FingertipWatch(guards, controller)
+    def __init__(
+        self, guards: Guards, model: KinematicModel, expect: Callable[[Linearization, Tensor], Expectation]
+    ) -> None:
+        self.guards, self.hand, self._expect = guards, model.hand, expect
+        self.readings, self.fingertips = ReadingTests(guards, model.hand), FingertipWatch(guards, model)
         self.blind = 0
         """Motions in succession without a pose."""
         self.gated = 0
@@ -55,11 +63,11 @@ class Watch:
         """The reading before the first motion; further ones from ``look`` where it is in doubt."""
         doubt = None
         for left in range(self.guards.looks, -1, -1):
-            doubt = None if seen.status is PlantStatus.LOST else self.doubts.at_rest(seen)
+            doubt = None if seen.status is PlantStatus.LOST else self.readings.at_rest(seen)
             if left == 0 or (doubt is None and seen.status is not PlantStatus.NOT_SEEN):
                 break
             seen = look()
-        self.doubts.follow(None, seen)
+        self.readings.follow(None, seen)
         self.blind = int(seen.status is PlantStatus.NOT_SEEN)
         return Verdict(seen, doubt is None, None if doubt is None else Halt(doubt.reason, doubt.message))
 
@@ -88,44 +96,46 @@ class Watch:
         Args:
             stuck: actuators that the servo model calls so.
         """
-        seen, last, doubt = after, None, None
+        seen, last, doubt, expected = after, None, None, None
         for left in range(self.guards.looks, -1, -1):
             if seen.status is PlantStatus.LOST:
                 return Verdict(seen, False)
-            doubt = self.doubts.after_motion(before, decision, seen, self.blind)
+            if decision.linearization is not None and (last is None or not torch.equal(seen.a, last.a)):
+                expected = self._expect(decision.linearization, seen.a - before.a)
+            doubt = self.readings.after_motion(before, decision, seen, expected, self.blind)
             if left == 0 or (doubt is None and not self.fingertips.high(seen)):
                 break
             last, seen = seen, look()
         if doubt is not None and not (doubt.blind or doubt.gated):
-            return Verdict(seen, False, Halt(doubt.reason, doubt.message))
+            return Verdict(seen, False, Halt(doubt.reason, doubt.message), "", expected)
         if doubt is not None and doubt.gated and (last is None or not agree(last, seen, self.guards)):
             doubt = doubt._replace(blind=True)
-        felt = self.fingertips.judge(before, decision, seen)
-        halt = self._stuck(before, decision, seen, stuck) or felt.halt
-        self.doubts.follow(before, seen)
-        if felt.force is not seen.fingertip_force:
-            seen = dataclasses.replace(seen, fingertip_force=felt.force)
+        tips = self.fingertips.judge(before, decision, seen)
+        halt = self._stuck(before, decision, seen, stuck) or tips.halt
+        self.readings.follow(before, seen)
+        if tips.force is not seen.fingertip_force:
+            seen = dataclasses.replace(seen, fingertip_force=tips.force)
         measured = self.blind == 0
         if doubt is not None and doubt.blind:
             self.blind += 1
-            seen, most = self._predicted(before, decision, seen), self.guards.blind_motions
+            seen, most = self._predicted(before, expected, seen), self.guards.blind_motions
             if self.blind > most:
                 more = f"{doubt.message} ({self.blind} motions running, Guards.blind_motions is {most})"
                 halt = halt or Halt(doubt.reason, more)
-            return Verdict(seen, False, halt, doubt.message)
+            return Verdict(seen, False, halt, doubt.message, expected)
         self.blind = 0
         if doubt is None:
             self.gated = 0
-            return Verdict(seen, measured and halt is None, halt, felt.note)
+            return Verdict(seen, measured and halt is None, halt, tips.note, expected)
         self.gated += 1  # what is seen again and again is the truth, and the model is wrong
         again = self.gated > self.guards.blind_motions
-        return Verdict(seen, measured and again and halt is None, halt, doubt.message)
+        return Verdict(seen, measured and again and halt is None, halt, doubt.message, expected)
 
     def rest(self, before: Observation, seen: Observation) -> Observation:
         """A further reading of a hand at rest, or ``before`` where it cannot be one."""
         if seen.status is PlantStatus.LOST:
             return seen
-        doubtful = seen.status is PlantStatus.NOT_SEEN or self.doubts.at_rest(seen, before) is not None
+        doubtful = seen.status is PlantStatus.NOT_SEEN or self.readings.at_rest(seen, before) is not None
         return before if doubtful else seen
 
     def _stuck(
@@ -135,19 +145,20 @@ class Watch:
         size, still = decision.delta_a.abs(), (seen.a - before.a).abs() < _STILL
         again = still & (size > self.guards.stuck_command)
         self._still = torch.where(again, self._still + 1, 0 * self._still)
-        told = torch.tensor([name in stuck for name in self.hand.actuator_names])
-        found = (self._still > 1) | (told & still & (size > _TOLD))
+        known = torch.tensor([name in stuck for name in self.hand.actuator_names])
+        found = (self._still > 1) | (known & still & (size > _ASKED))
         if not bool(found.any()):
             return None
         names = ", ".join(f"'{self.hand.actuator_names[i]}'" for i in found.nonzero().flatten().tolist())
         message = f"actuator {names} does not move however it is commanded: look after motor and tendon"
         return Halt(StopReason.ACTUATOR_STUCK, message)
 
-    def _predicted(self, before: Observation, decision: Decision, seen: Observation) -> Observation:
+    @staticmethod
+    def _predicted(before: Observation, expected: Expectation | None, seen: Observation) -> Observation:
         """With the pose that the model predicts for what the encoders did."""
         pose = before.state
-        if decision.linearization is not None:
-            pose = pose.plus(self.controller.predict(decision.linearization, seen.a - before.a)[0])
+        if expected is not None:
+            pose = pose.plus(expected.increment)
         return dataclasses.replace(
             seen, position=pose.position, rotation=pose.rotation, status=PlantStatus.NOT_SEEN
         )

@@ -1,0 +1,76 @@
+"""What was learned of a hand goes from loop to loop and from session to session."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from obedient_plant import Obedient
+
+from torch_ekm.control import ClosedLoop, HandKnowledge, LookAndMoveController, PoseTarget
+from torch_ekm.enhanced import EnhancedModel, save
+from torch_ekm.exceptions import FileFormatError, ParameterError
+from torch_ekm.kinematics import IdealServos, ServoModel
+from torch_ekm.model import KinematicModel
+from torch_ekm.residual import SparseOnlineGP
+from torch_ekm.simulation import SimulatedHand
+
+DEG = math.pi / 180
+
+
+@pytest.fixture(scope="module")
+def held():
+    plant = SimulatedHand("icub_right", "box")
+    seen = plant.reset(seed=4)
+    return seen, plant.rotation_axis, KinematicModel(plant.hand, plant.object)
+
+
+@pytest.fixture(scope="module")
+def driven(held) -> ClosedLoop:
+    seen, axis, model = held
+    controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
+    loop = ClosedLoop(Obedient(model, seen), controller)
+    loop.run(PoseTarget.turned(seen.state, axis, degrees=15))
+    return loop
+
+
+def test_a_file_gives_back_the_same_to_the_bit(driven, tmp_path) -> None:
+    driven.knowledge.save(tmp_path / "hand.ekm")
+    again = HandKnowledge.load(tmp_path / "hand.ekm")
+    before, after = driven.knowledge.state_dict(), again.state_dict()
+    assert before.keys() == after.keys()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert float(again.servo.standard_errors.min()) < 0.1 * DEG  # 0.3 before anything was learned
+
+
+def test_the_next_loop_goes_on_with_it(held, driven) -> None:
+    seen, axis, model = held
+    loop = ClosedLoop(Obedient(model, seen), LookAndMoveController(model, axis), knowledge=driven.knowledge)
+    before = driven.knowledge.servo.weight.clone()
+    loop.run(PoseTarget.turned(seen.state, axis, degrees=5))
+    assert loop.knowledge is driven.knowledge
+    assert bool((driven.knowledge.servo.weight != before).any())
+
+
+def test_a_plain_model_learns_nothing_of_the_servos(held) -> None:
+    seen, axis, model = held
+    plant = Obedient(model, seen)
+    loop = ClosedLoop(plant, LookAndMoveController(model, axis))
+    steps = loop.run(PoseTarget.turned(seen.state, axis, degrees=5)).steps
+    assert isinstance(loop.knowledge.servo, IdealServos)
+    for step, given in zip(steps, plant.given, strict=True):  # commands are those that were decided
+        assert torch.equal(step.decision.delta_a, given)
+
+
+def test_knowledge_of_another_hand_and_another_file_are_refused(held, driven, tmp_path) -> None:
+    seen, axis, model = held
+    with pytest.raises(ParameterError, match="a hand with the actuators"):
+        ClosedLoop(
+            Obedient(model, seen),
+            LookAndMoveController(model, axis),
+            knowledge=HandKnowledge(ServoModel(["one", "two"])),
+        )
+    save(SparseOnlineGP(2, 1), tmp_path / "learner.ekm")
+    with pytest.raises(FileFormatError, match="holds a SparseOnlineGP, no HandKnowledge"):
+        HandKnowledge.load(tmp_path / "learner.ekm")

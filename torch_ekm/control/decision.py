@@ -1,0 +1,85 @@
+"""What a controller decides, what it expects of it, and why there may be no decision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, NamedTuple
+
+from ..typing import Float, Tensor
+from .qp import ControlSolution
+
+if TYPE_CHECKING:
+    from ..model import Linearization
+
+
+class StopReason(Enum):
+    """Why a manipulation ended; ``RUNNING`` while it has not."""
+
+    RUNNING = "running"
+    REACHED = "reached"
+    STALLED = "stalled"
+    STEP_LIMIT = "step limit"
+    ACTUATOR_LIMITS = "actuator limits"
+    UNSTABLE_GRASP = "unstable grasp"
+    GIVEN_UP = "given up"
+    """With the object in the hand, see :class:`~torch_ekm.control.Caution`."""
+    OUT_OF_REACH = "out of reach"
+    """Declined before anything moved, see ``decline`` of :class:`~torch_ekm.control.ClosedLoop`."""
+    OBJECT_LOST = "object lost"
+    TIME_OUT = "time-out"
+    STOPPED = "stopped"
+    """By :meth:`ClosedLoop.stop`."""
+    STALE_SENSOR = "stale sensor"
+    """This and what follows: see :class:`~torch_ekm.control.Guards`."""
+    BLIND = "object not seen"
+    ENCODER_JUMP = "encoder jump"
+    JOINT_JUMP = "joint jump"
+    POSE_JUMP = "pose jump"
+    OUT_OF_RANGE = "reading out of range"
+    FINGERTIP_FAULT = "fingertip fault"
+    ACTUATOR_STUCK = "actuator stuck"
+    COMMAND_CEILING = "command ceiling"
+    SPEED_CEILING = "speed ceiling"
+    FORCE_CEILING = "force ceiling"
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the controller wants done, what it expects, and how sure the numbers are."""
+
+    delta_a: Float[Tensor, " n_a"]
+    """Increment to command, relative to the encoders [rad]."""
+    status: StopReason
+    """RUNNING, or why no increment can be given."""
+    desired: Float[Tensor, " n_x"]
+    """dx_d, the limited error of the focused pose."""
+    predicted: Float[Tensor, " n_s"]
+    """(f + g)(s, da)."""
+    nominal: Float[Tensor, " n_s"]
+    """f(s, da) = J_m da: what the kinematic model alone predicts."""
+    share: float = 1.0
+    """Of the largest step that the pace allows."""
+    limited: bool = False
+    """The step could not be met in full because actuators stand at their limits."""
+    slack: float = 0.0
+    """Largest focused error that the step leaves unmet [unit of the focus]."""
+    linearization: Linearization | None = None
+    """The kinematic model at the state; None where it has none."""
+    solution: ControlSolution | None = None
+    """Of the last quadratic program, with its residuals."""
+    message: str = ""
+    """Why there is no increment."""
+
+
+class Expectation(NamedTuple):
+    """What f + g predict of a motion that the encoders made."""
+
+    moved: Float[Tensor, " n_a"]
+    """w, of the encoders [rad]."""
+    nominal: Float[Tensor, " n_s"]
+    """f(s, w) = J_m w [rad, m, rad]."""
+    increment: Float[Tensor, " n_s"]
+    """(f + g)(s, w) [rad, m, rad]."""
+    deviation: Float[Tensor, " n_s"]
+    """Standard deviation of g(s, w) [rad, m, rad]; 0 where nothing is learned."""

@@ -1,0 +1,74 @@
+"""What was learned of one hand, in one file."""
+
+from __future__ import annotations
+
+import os
+
+from torch import nn
+
+from .._recorded import Recorded, describe
+from ..description import HandDescription
+from ..exceptions import FileFormatError, ParameterError
+from ..kinematics import IdealServos, ServoModel
+from ..residual.files import known_classes, read, rebuild, write
+
+
+class HandKnowledge(Recorded, nn.Module):
+    """What a closed loop has learned of its hand, whatever it holds: dead zones and biases of the servos.
+
+    Hand it to the next loop with the same hand, and keep it between sessions::
+
+        loop = ClosedLoop(plant, controller)
+        loop.run(target)
+        loop.knowledge.save("left_hand.ekm")
+        ClosedLoop(plant, another, knowledge=HandKnowledge.load("left_hand.ekm"))
+
+    Args:
+        servo: of the actuators.
+    """
+
+    def __init__(self, servo: ServoModel | IdealServos) -> None:
+        super().__init__()
+        self.servo = servo
+
+    @classmethod
+    def of(cls, hand: HandDescription, *, learns: bool = True) -> HandKnowledge:
+        """Nothing is known yet.
+
+        Args:
+            learns: False takes servos for ideal, and learns nothing of them.
+        """
+        return cls((ServoModel if learns else IdealServos)(hand.actuator_names))
+
+    def check(self, hand: HandDescription) -> None:
+        """That it is of this hand.
+
+        Raises:
+            ParameterError: the actuators have other names.
+        """
+        if tuple(self.servo.names) != tuple(hand.actuator_names):
+            names = ", ".join(self.servo.names)
+            valid = f"that of a hand with the actuators {', '.join(hand.actuator_names)}"
+            raise ParameterError("knowledge", f"of a hand with the actuators {names}", valid)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write all of it; the file appears whole or not at all.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        write(path, describe(self), self.state_dict())
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> HandKnowledge:
+        """What :meth:`save` wrote. Nothing in the file is ever run.
+
+        Raises:
+            FileFormatError: it is no such file, or damaged.
+            StateMismatchError: state and description do not go together.
+        """
+        described, state = read(path)
+        made = rebuild(path, described, state, known_classes())
+        if not isinstance(made, cls):
+            raise FileFormatError(path, f"holds a {type(made).__name__}, no {cls.__name__}")
+        return made

@@ -1,0 +1,301 @@
+"""How far a motion goes: what one step asks for, how much of it is made, and how both grow with trust."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import nn
+
+from ..exceptions import ParameterError
+from ..typing import Float, Tensor
+from .situation import Situation
+
+if TYPE_CHECKING:
+    from ..model import Linearization
+
+_DEG = math.pi / 180
+
+
+@dataclass(frozen=True)
+class LimitingFunction:
+    """``dx_d = e min(gain, p step/|e|, p contact_travel/|v(e)|)``: keeps the direction, linear near the goal.
+
+    v(e) is the way that the whole error would carry the contact that moves most. The limiting function of the
+    E-KM paper (section III.B) is that of ``step``; the other two hold off noise and wide objects.
+    p is the factor of the :class:`Pace`.
+    """
+
+    gain: float = 0.8
+    """Share of a small focused error that one step asks for. A model that is right meets all of it,
+    camera noise included; below 1 the loop averages the noise over some steps."""
+    step: float = 2.5 * _DEG
+    """At most this much of the focused error is asked for in one step [unit of the focus]."""
+    contact_travel: float | None = 1.2e-3
+    """And no contact is asked to move farther than this [m]: a wide object turns in smaller steps.
+    None: no such limit."""
+
+    def __call__(
+        self, error: Float[Tensor, " n_x"], travel: float = 0.0, pace: float = 1.0
+    ) -> Float[Tensor, " n_x"]:
+        """dx_d.
+
+        Args:
+            error: e, focused error.
+            travel: ``|v(e)|``, see :func:`contact_travel` [m].
+            pace: p.
+        """
+        size = self.steps(error, travel)
+        return error * min(self.gain, pace / size) if size > 0 else error
+
+    def steps(self, error: Float[Tensor, " n_x"], travel: float = 0.0) -> float:
+        """How many of the largest steps, at pace 1, make up an error."""
+        size = float(torch.linalg.vector_norm(error)) / self.step
+        return size if self.contact_travel is None else max(size, travel / self.contact_travel)
+
+
+def contact_travel(twist: Float[Tensor, " 6"], lever: Float[Tensor, "n_c 3"]) -> float:
+    """``max_i |v + w x l_i|`` of contacts at l from the object's point o [m]."""
+    v, w = twist.split(3)
+    carried = v + torch.linalg.cross(w.expand_as(lever), lever)
+    return float(torch.linalg.vector_norm(carried, dim=-1).max())
+
+
+def contact_lever(lever: Float[Tensor, "n_c 3"]) -> float:
+    """Root mean square distance of the contacts from the object's point [m]."""
+    return float(lever.square().sum(-1).mean().sqrt())
+
+
+@dataclass(frozen=True)
+class StepBound:
+    """``phi = min(1, off_rotation/|w_off|, off_travel/|v_off|, (m + creep mu f/W)/(m - m_after),
+    (f/f_wanted)^2, max(1/p, (f_i/(even f_mean))^2))``: the share of a step that is made.
+
+    w_off and v_off are the predicted rotation and translation off the focus; m_after the predicted friction
+    margins. A contact that slides holds no weight W across its way: the heavier the object is for its grip,
+    the less may be missing. A grip f that falls short of the wanted one is tightened first. The fingers that
+    oppose the strongest one may bear enough together while one of them lets go: steps p above those of
+    pace 1, which change the forces faster than they are corrected, ask for a force f_i of each that is near
+    the mean f_mean of them.
+
+    A step is not cut below ``least`` of the largest one at pace 1: standing still turns nothing.
+    """
+
+    off_rotation: float = 1.5 * _DEG
+    """[rad]"""
+    off_travel: float = 2.5e-3
+    """[m]"""
+    creep: float = 1.0
+    """Margin that may be missing where friction and weight are equal [N]."""
+    even: float = 0.85
+    """Of the mean of the fingers that oppose the strongest one, what each of them should bear."""
+    least: float = 0.35
+    """Infinite: steps are never cut."""
+
+    def __post_init__(self) -> None:
+        for name in ("off_rotation", "off_travel", "creep", "even", "least"):
+            if not getattr(self, name) > 0:
+                raise ParameterError(name, getattr(self, name), "greater than 0")
+
+    def share(
+        self,
+        lin: Linearization,
+        delta_a: Float[Tensor, " n_a"],
+        predicted: Float[Tensor, " n_s"],
+        seen: Situation,
+        wanted: float | None,
+        asked: float = 1.0,
+    ) -> float:
+        """phi of a step.
+
+        Args:
+            predicted: increment that the corrected model predicts for ``delta_a``.
+            wanted: grip force of the finger that opposes the others [N]; None: no such wish.
+            asked: p, size of the step in units of the largest at pace 1.
+        """
+        focus = seen.focus
+        off = focus.off_matrix @ predicted[-6:]
+        rotation = float(torch.linalg.vector_norm(off[~focus.off_translation]))
+        travel = float(torch.linalg.vector_norm(off[focus.off_translation]))
+        phi = min(1.0, self.off_rotation / max(rotation, 1e-12), self.off_travel / max(travel, 1e-12))
+        f_n = seen.normal_force(lin)
+        if f_n is None or not lin.forces.solved:
+            return phi
+        force = float(f_n.max())
+        if wanted:
+            others = np.delete(f_n, f_n.argmax())
+            phi = min(phi, max(force / wanted, 0.0) ** 2)
+            if len(others):
+                even = max(float(others.min()), 0.0) / max(self.even * float(others.mean()), 1e-9)
+                phi = min(phi, max(1 / max(asked, 1.0), even**2))
+        friction = float(lin.contacts.friction.mean()) * force
+        spare = self.creep * friction / max(seen.weight, 1e-3)
+        before, after = lin.margins, lin.margins_after(delta_a)
+        missing = after < -spare
+        if bool(missing.any()):
+            allowed = (before[missing] + spare) / (before[missing] - after[missing])
+            phi = min(phi, float(allowed.clamp(0.0, 1.0).min()))
+        return phi
+
+
+@dataclass(frozen=True)
+class TrustRegion:
+    """``p <- grow p`` where ``rho < agree``, ``shrink p`` where ``rho > disagree``, with::
+
+        rho^2 = mean_i (dx_i - predicted_i)^2 / (noise_i^2 + (relative_i |predicted|)^2)
+
+    over the object's twist in all six directions and the normal forces: 1 is an error that the sensors' noise
+    and ``relative`` of the motion explain.
+
+    Source: trust regions of nonlinear optimisation, Conn, Gould and Toint, Trust-Region Methods (2000), with
+    the measured motion in the place of the cost.
+    """
+
+    start: float = 0.7
+    """Pace with an object that is new."""
+    smallest: float = 0.5
+    largest: float = 2.0
+    agree: float = 1.0
+    """rho up to which the pace grows."""
+    disagree: float = 1.6
+    """rho from which it shrinks."""
+    grow: float = 1.2
+    shrink: float = 0.7
+    relative: float = 0.12
+    """Error that is no surprise, as a share of the motion; of a translation the contacts' way counts."""
+    translation_noise: float = 0.3e-3
+    """Standard deviation of a measured motion [m]."""
+    rotation_noise: float = 0.3 * _DEG
+    """[rad]"""
+    force_noise: float = 0.5
+    """[N]"""
+    used: float = 0.7
+    """A motion below this share of what was allowed says nothing for a larger one."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.smallest <= self.start <= self.largest:
+            valid = f"between smallest and largest, {self.smallest:g} to {self.largest:g}"
+            raise ParameterError("start", self.start, valid)
+        if not (0 < self.agree < self.disagree and 0 < self.shrink < 1 <= self.grow):
+            figures = (self.agree, self.disagree, self.shrink, self.grow)
+            valid = "0 < agree < disagree, 0 < shrink < 1 <= grow"
+            raise ParameterError("agree, disagree, shrink, grow", figures, valid)
+        for name in ("relative", "translation_noise", "rotation_noise", "force_noise"):
+            if not getattr(self, name) > 0:
+                raise ParameterError(name, getattr(self, name), "greater than 0")
+
+    def disagreement(
+        self,
+        predicted: Float[Tensor, " 6"],
+        came: Float[Tensor, " 6"],
+        lever: float,
+        surprise: Float[Tensor, " n_c"] | None = None,
+    ) -> float:
+        """rho of one motion.
+
+        Args:
+            predicted: twist of the object that the model predicts for what the encoders did [m, rad].
+            came: as measured.
+            lever: of the contacts about the object's point [m].
+            surprise: normal forces at the contacts, as measured less predicted [N]; None: unknown.
+        """
+        unit = predicted.new_tensor([lever] * 3 + [1.0] * 3)
+        size = torch.linalg.vector_norm(predicted / unit)
+        noise = predicted.new_tensor([self.translation_noise] * 3 + [self.rotation_noise] * 3)
+        terms = (came - predicted).square() / (noise.square() + (self.relative * size * unit).square())
+        if surprise is not None:
+            terms = torch.cat([terms, (surprise / self.force_noise).square()])
+        return float(terms.mean().sqrt())
+
+
+@dataclass(frozen=True)
+class PaceOptions:
+    """Figures of a :class:`Pace`."""
+
+    limiting: LimitingFunction = LimitingFunction()
+    """What a step asks for."""
+    bound: StepBound = StepBound()
+    """How much of it is made where the model predicts that it goes wrong."""
+    trust: TrustRegion = TrustRegion()
+    """How p follows from what was predicted of the last motions."""
+
+
+class Pace(nn.Module):
+    """p, the factor of the largest step: it grows while f + g predicts motions, and shrinks where it errs.
+
+    Keep it with the enhanced model of an object: a new grasp of it goes on at the pace of the last one.
+
+    Args:
+        options: figures; None: those that suit the iCub hand.
+        adapts: False keeps p at 1, as for a model that does not learn.
+    """
+
+    def __init__(self, options: PaceOptions | None = None, *, adapts: bool = True) -> None:
+        super().__init__()
+        self.options = PaceOptions() if options is None else options
+        self.adapts = adapts
+        start = self.options.trust.start if adapts else 1.0
+        self.value = nn.Buffer(torch.tensor(start, dtype=torch.float64))
+
+    @property
+    def factor(self) -> float:
+        """p."""
+        return float(self.value)
+
+    def ask(self, error: Float[Tensor, " n_x"], travel: float = 0.0) -> tuple[Float[Tensor, " n_x"], float]:
+        """dx_d, and which share of the largest step at this pace it is.
+
+        Args:
+            error: e, focused error [unit of the focus].
+            travel: ``|v(e)|``, see :func:`contact_travel` [m].
+        """
+        limiting = self.options.limiting
+        share = min(limiting.gain * limiting.steps(error, travel) / self.factor, 1.0)
+        return limiting(error, travel, self.factor), share
+
+    def cut(
+        self,
+        lin: Linearization,
+        delta_a: Float[Tensor, " n_a"],
+        predicted: Float[Tensor, " n_s"],
+        seen: Situation,
+        wanted: float | None,
+        share: float,
+    ) -> float:
+        """phi, see :class:`StepBound`: which part of the step that was asked for is made.
+
+        Args:
+            predicted: increment that the corrected model predicts for ``delta_a``.
+            wanted: grip force of the finger that opposes the others [N]; None: no such wish.
+            share: of the largest step that was asked for.
+        """
+        bound, asked = self.options.bound, share * self.factor
+        phi = bound.share(lin, delta_a, predicted, seen, wanted, asked)
+        return max(phi, min(1.0, bound.least / max(asked, 1e-9)))
+
+    def judge(self, disagreement: float, share: float = 1.0) -> None:
+        """Learn from one motion.
+
+        Args:
+            disagreement: rho, see :meth:`TrustRegion.disagreement`.
+            share: of the largest step that was asked for.
+        """
+        trust = self.options.trust
+        if not self.adapts:
+            return
+        if disagreement > trust.disagree:
+            least = min(self.factor, trust.smallest)
+            self.value.mul_(trust.shrink).clamp_(min=least)
+        elif disagreement < trust.agree and share >= trust.used:
+            self.value.mul_(trust.grow).clamp_(max=trust.largest)
+
+    def restart(self) -> None:
+        """Begin again with half the smallest steps: something went wrong, and is near."""
+        if self.adapts:
+            self.value.fill_(self.options.trust.smallest / 2)
+
+    def extra_repr(self) -> str:
+        return f"p={self.factor:.3g}"

@@ -1,0 +1,92 @@
+"""How far a manipulation has come, and whether it goes on."""
+
+from __future__ import annotations
+
+import time
+
+from ...plant import Observation, PlantStatus
+from ...typing import Tensor
+from ..decision import Decision, StopReason
+from ..focus import FocusedPose, PoseTarget
+from .safety import Halt, Safety
+
+
+class Progress:
+    """Errors, motions and alarms of one manipulation, judged by :class:`~torch_ekm.control.Safety`.
+
+    Args:
+        safety: figures.
+        target, focus: what is to be reached.
+        seen: the first reading.
+        started: of a monotonic clock [s].
+    """
+
+    halt: Halt | None = None
+    """What a guard says against going on."""
+    limited = False
+    """The last step was cut short by an actuator's limit."""
+    alarms = 0
+    """How often a sign of a loss was heeded."""
+
+    def __init__(
+        self, safety: Safety, target: PoseTarget, focus: FocusedPose, seen: Observation, started: float
+    ) -> None:
+        self.safety, self.target, self.focus = safety, target, focus
+        self.errors = [focus.error(target, seen.state)]
+        """|e| before each motion and after the last [unit of the focus]."""
+        self.way: list[Tensor] = []
+        """What the encoders did [rad], motion by motion, without what was undone."""
+        self._start, self._started = seen.state, started
+        self._off_allowed = safety.caution.off_rotation
+        self._bearing: frozenset[str] | None = None
+
+    def over(self, seen: Observation, stopped: bool) -> Halt | None:
+        """Why the manipulation ends before the next decision; None: it goes on.
+
+        Args:
+            stopped: :meth:`ClosedLoop.stop` was called.
+        """
+        if self.halt is not None:
+            return self.halt
+        if seen.status is PlantStatus.LOST:
+            return Halt(StopReason.OBJECT_LOST, "")
+        if self.lost(seen):
+            return Halt(StopReason.OBJECT_LOST, "dislocated off the focused axis")
+        if stopped:
+            return Halt(StopReason.STOPPED, "")
+        if time.monotonic() - self._started > self.safety.rule.max_seconds:
+            return Halt(StopReason.TIME_OUT, "")
+        reason = self.safety.rule.judge(self.errors, self.limited)
+        return None if reason is StopReason.RUNNING else Halt(reason, "")
+
+    def lost(self, seen: Observation) -> bool:
+        """The plant reports it, or the object is dislocated."""
+        return seen.status is PlantStatus.LOST or self._off_rotation(seen) > self.safety.rule.off_limit
+
+    def sign(self, seen: Observation, decision: Decision) -> str:
+        """What speaks for a loss to come; empty: nothing."""
+        if decision.status is not StopReason.RUNNING:
+            return decision.message
+        links = self.safety.caution.bearing_links(decision.linearization)
+        self._bearing = links if self._bearing is None else self._bearing
+        return self.safety.caution.sign(self._off_rotation(seen), self._off_allowed, links - self._bearing)
+
+    def alarm(self, seen: Observation) -> None:
+        """A sign is heeded: an object that has slid off the focus may stay there, and turn a little more."""
+        self.alarms += 1
+        further = self._off_rotation(seen) + self.safety.caution.off_further
+        self._off_allowed = max(self._off_allowed, further)
+
+    def add(self, after: Observation, blind: bool) -> None:
+        """One more motion.
+
+        Args:
+            blind: the pose was not measured.
+        """
+        error = self.focus.error(self.target, after.state)
+        # a goal that nobody saw is not reached
+        self.errors.append(max(error, 1.001 * self.safety.rule.tolerance) if blind else error)
+
+    def _off_rotation(self, seen: Observation) -> float:
+        """Of the object off the focus since the start [rad]."""
+        return self.focus.off_rotation(seen.state.minus(self._start))
