@@ -14,14 +14,16 @@ from foresight_study import CONTENDERS, Foresight
 from foresight_turn import ForesightTurn
 from oracle import Omniscient
 
+from torch_ekm.control import Safety, StoppingRule
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.reproduce import Experiment, reproduce
 
 pytest.importorskip("sapien")
 
+COARSE = Safety(rule=StoppingRule(tolerance=math.radians(0.5)))
 QUICK = dataclasses.replace(
-    Foresight(Setting(tolerance_deg=0.5)).quick(), warm_up=0, far_deg=8.0, blind_angle_deg=5.0
+    Foresight(Setting(safety=COARSE)).quick(), warm_up=0, far_deg=8.0, blind_angle_deg=5.0
 )
 
 

@@ -65,7 +65,7 @@ def test_ablation_covers_every_disturbance_of_the_nominal_plant() -> None:
         changed = protocol.setting.replace(**variant.changes)
         if variant.group == "disturbance":
             different = [
-                name for name in disturbed if getattr(changed.parameters(), name) != getattr(exact, name)
+                name for name in disturbed if getattr(changed.parameters, name) != getattr(exact, name)
             ]
             assert set(different) == set(DISTURBANCES[variant.name]), variant.name
     jobs = protocol.jobs((0,))

@@ -214,7 +214,6 @@ def test_batches_and_dtypes(jacobian, generator: torch.Generator) -> None:
         {"action_scale": 0.0},
         {"output_scale": [1.0, 2.0]},
         {"output_scale": torch.tensor([1.0, torch.nan, 2.0])},
-        {"servo": object()},
         {"jacobian": "exact"},
     ],
 )

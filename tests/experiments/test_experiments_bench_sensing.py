@@ -8,6 +8,7 @@ import torch
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.runner import Bench
+from torch_ekm.simulation import PRESETS
 
 
 def test_object_is_turned_with_camera_and_hall_sensors() -> None:
@@ -21,7 +22,9 @@ def test_object_is_turned_with_camera_and_hall_sensors() -> None:
 
 def test_a_stuck_hall_channel_keeps_its_first_reading() -> None:
     pytest.importorskip("cv2")
-    bench = Bench(Setting(sensing=True, plant={"stuck_joints": ("index_3",)}), "box", "KM")
+    bench = Bench(
+        Setting(sensing=True, plant=PRESETS["nominal"].replace(stuck_joints=("index_3",))), "box", "KM"
+    )
     assert bench.grasp(0, 0) is not None
     names = [sensor.joint for sensor in sorted(bench.hand.hand.hall_sensors, key=lambda s: s.channel)]
     before = bench.plant.observe().info["raw"]["hall"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 from pathlib import Path
 
@@ -111,16 +110,13 @@ def test_the_demo_is_a_preset_of_generalize(records: list[TrialRecord]) -> None:
     assert turn.errors_deg == ours.errors_deg
 
 
-def test_results_are_named_by_the_model_that_is_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_are_named_by_the_model_that_is_run() -> None:
     demo = Demo()
     bench = Bench(demo.setting, demo.object, "E-KM")
     assert bench.model.options.contact_margin == demo.setting.figures()["model"]["contact_margin"]
     bench.close()
     names = set(demo.jobs((0,)))
-    assert names.isdisjoint(Demo(Setting(model={"contact_margin": 0.003})).jobs((0,)))
-    other = functools.partial(ModelOptions, contact_margin=0.003)  # a version with another default
-    monkeypatch.setattr("torch_ekm.experiments.config.ModelOptions", other)
-    assert names.isdisjoint(demo.jobs((0,)))
+    assert names.isdisjoint(Demo(Setting(model=ModelOptions(contact_margin=0.003))).jobs((0,)))
 
 
 def test_wrong_names_list_the_right_ones() -> None:

@@ -10,15 +10,7 @@ import pytest
 import torch
 from experiments_records import not_grasped
 
-from torch_ekm.control import (
-    DEFAULT_LIMITS,
-    DEFAULT_TASKS,
-    EffortTask,
-    FrictionMarginLimit,
-    LimitingFunction,
-    OffAxisTask,
-    StepBound,
-)
+from torch_ekm.control import DEFAULT_TASKS, Caution, EffortTask, LimitingFunction, Safety
 from torch_ekm.description import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
@@ -49,11 +41,11 @@ def test_controllers_differ_in_the_reference_of_their_increments() -> None:
         ({"learner": "oracle"}, UnknownNameError, "action-linear"),
         ({"preset": "mild"}, UnknownNameError, "nominal"),
         ({"capacity": 0}, ParameterError, "capacity"),
-        ({"plant": {"springs": 2.0}}, ParameterError, "spring"),
-        ({"model": {"rolls": False}}, ParameterError, "rolling"),
-        ({"grasp": {"force": 1.0}}, ParameterError, "pinch_force"),
-        ({"control": {"OffAxisTask.wait": 1.0}}, ParameterError, "rotation_weight"),
-        ({"control": {"step": 1.0}}, ParameterError, "LimitingFunction"),
+        ({"plant": {"spring": 2.0}}, ParameterError, "a PlantParameters"),
+        ({"model": {"rolling": False}}, ParameterError, "a ModelOptions"),
+        ({"grasp": {"pinch_force": 1.0}}, ParameterError, "a PlantConfig"),
+        ({"pace": LimitingFunction()}, ParameterError, "a PaceOptions"),
+        ({"safety": Caution()}, ParameterError, "a Safety"),
     ],
 )
 def test_wrong_settings_say_what_would_be_right(changes: dict, error: type, match: str) -> None:
@@ -68,11 +60,9 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
     base = Generalize()
     unchanged = of(Setting())
     assert of(Setting()) == unchanged
-    other = (EffortTask(weight=0.02), *DEFAULT_TASKS[1:])  # a version with another default
-    with monkeypatch.context() as patch:
-        patch.setattr("torch_ekm.experiments.config.DEFAULT_TASKS", other)
-        assert of(Setting()) != unchanged
-    with monkeypatch.context() as patch:  # and one whose learner has another kernel
+    assert of(Setting(tasks=(EffortTask(weight=0.02), *DEFAULT_TASKS[1:]))) != unchanged
+    assert of(Setting(safety=Safety(caution=Caution(retreats=0)))) != unchanged
+    with monkeypatch.context() as patch:  # a version whose learner has another kernel
         patch.setitem(LEARNERS, "action-linear", LEARNERS["SOGP plain"])
         assert of(Setting()) != unchanged
     assert of(Setting()) == unchanged
@@ -82,26 +72,6 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
     assert set(one) < set(both)  # more objects: what is there is used again
     assert set(dataclasses.replace(base, objects=("box",), controllers=("KM",)).jobs((0,))) < set(one)
     assert len(both) == 2 * len(CONTROLLERS)
-
-
-def test_a_setting_names_figures_of_the_controllers_parts() -> None:
-    changes = {
-        "FrictionMarginLimit.minimum": 0.6,
-        "OffAxisTask.rotation_weight": 0.1,
-        "LimitingFunction.gain": 1.0,
-    }
-    parts = Setting(control=changes).controller_parts()
-    plain = Setting().controller_parts()
-    assert plain == {
-        "tasks": DEFAULT_TASKS,
-        "limits": DEFAULT_LIMITS,
-        "limiting": LimitingFunction(),
-        "bound": StepBound(),
-    }
-    assert set(parts["limits"]) - set(DEFAULT_LIMITS) == {FrictionMarginLimit(minimum=0.6)}
-    assert set(parts["tasks"]) - set(DEFAULT_TASKS) == {OffAxisTask(rotation_weight=0.1)}
-    assert len(parts["tasks"]) == len(DEFAULT_TASKS)
-    assert parts["limiting"] == LimitingFunction(gain=1.0)
 
 
 def test_a_corrected_object_does_not_take_up_old_results(tmp_path: Path) -> None:

@@ -15,12 +15,13 @@ from torch_ekm.experiments.protocols.record import RecordConfig, record
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.plant import Trajectory, TrialLog
 from torch_ekm.sensing import MarkerTracker
+from torch_ekm.simulation import PlantParameters
 
 pytest.importorskip("sapien")
 pytest.importorskip("h5py")
 
 LEARNS = RecordConfig(
-    Setting(preset="none", plant={"moment_arm": 1.3}), controller="E-KM", angles_deg=(3.0, 5.0)
+    Setting(plant=PlantParameters(moment_arm=1.3)), controller="E-KM", angles_deg=(3.0, 5.0)
 )
 
 
@@ -51,7 +52,7 @@ def test_a_sensed_trial_can_be_computed_again_from_its_log(tmp_path):
     assert again.about["outcome"]["reason"] == "reached"
     assert len(again.about["outcome"]["errors_deg"]) == len(again.commands) + 1
     assert "seconds" not in again.about["outcome"]
-    assert log.configuration["parameters"]["moment_arm"] == config.setting.parameters().moment_arm
+    assert log.configuration["parameters"]["moment_arm"] == config.setting.parameters.moment_arm
     first = again.observations[0]
     hall, image = first.info["raw"]["hall"], first.info["raw"]["image"]
     assert hall.shape == (15,)

@@ -13,9 +13,8 @@ import torch
 
 sys.path.append(str(Path(__file__).parents[1] / "model"))
 import model_toys
-from torch_ekm.control.termination import StopReason
 
-from torch_ekm.control import ClosedLoop, FocusedPose, LookAndMoveController, PoseTarget
+from torch_ekm.control import ClosedLoop, FocusedPose, LookAndMoveController, PoseTarget, Safety, StopReason
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NoContactError, ParameterError
 from torch_ekm.foresight import BeyondReach, ModelHand, ReachEnd, friction_share, reachable

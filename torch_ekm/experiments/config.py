@@ -63,7 +63,11 @@ class Setting:
         for name in ("capacity", "frames"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
-        preset(self.preset)
+        kinds = {"plant": PlantParameters, "grasp": PlantConfig, "model": ModelOptions}
+        for name, kind in {**kinds, "pace": PaceOptions, "safety": Safety}.items():
+            value = self.parameters if name == "plant" else getattr(self, name)
+            if not isinstance(value, kind):
+                raise ParameterError(name, value, f"a {kind.__name__}")
 
     def __str__(self) -> str:
         seen = "camera images and Hall counts" if self.sensing else "true poses plus noise"
