@@ -7,7 +7,8 @@ f, the learners g, the root of the errors, :mod:`~torch_ekm.exceptions`. In the 
 :mod:`~torch_ekm.object_memory`, :mod:`~torch_ekm.plant`, :mod:`~torch_ekm.control`,
 :mod:`~torch_ekm.sensing`, :mod:`~torch_ekm.simulation`, :mod:`~torch_ekm.rendering`,
 :mod:`~torch_ekm.foresight` (whole turns foreseen), :mod:`~torch_ekm.interop` (learners in other
-libraries' words, and theirs in ours), :mod:`~torch_ekm.experiments`, :mod:`~torch_ekm.inspection`.
+libraries' words, and theirs in ours), :mod:`~torch_ekm.experiments`, and ``torch_ekm.inspection``, which the
+commands ``check`` and ``show`` run and which exports nothing.
 """
 
 from __future__ import annotations

@@ -97,9 +97,7 @@ class Witness:
         self.plant = plant
         p = plant.parameters
         hand, obj = plant.true_descriptions()
-        options = ModelOptions(
-            gravity=plant.gravity, link_weights=p.link_weight, on_unstable="flag", max_overlap=0.02
-        )
+        options = ModelOptions(link_weights=p.link_weight, on_unstable="flag", max_overlap=0.02)
         self.model = KinematicModel(hand, obj, options)
         self._rig: Any = plant._rig
         self.frames: list[GraspState] = []

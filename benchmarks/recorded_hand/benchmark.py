@@ -16,9 +16,9 @@ from torch_ekm.exceptions import DescriptionError, UnknownNameError
 from torch_ekm.experiments.jobs import run_jobs
 from torch_ekm.experiments.learner_comparison.fingerprint import fingerprint
 from torch_ekm.experiments.learners import LEARNERS
-from torch_ekm.sensing.finger_markers import FingerMarkers
 from torch_ekm.typing import Array
 
+from .finger_markers import FingerMarkers
 from .fingers import identify_markers
 from .learning import learned_predictions
 from .nominal import (

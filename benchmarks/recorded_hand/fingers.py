@@ -16,9 +16,9 @@ from torch_ekm._extras import require
 from torch_ekm.description import HandDescription
 from torch_ekm.exceptions import CalibrationError, ParameterError
 from torch_ekm.kinematics import HandKinematics
-from torch_ekm.sensing.finger_markers import FingerMarkers
 from torch_ekm.typing import Array
 
+from .finger_markers import FingerMarkers
 from .recordings import LINKS
 
 _DISTANCE_STD = 0.5e-3  # [m] of a marker's distance from its joint, in the identification
@@ -124,21 +124,16 @@ def identify_markers(hand: HandDescription, markers: Array, pose: Array, diamete
     start += [0.0, between[0], between[1] - fingers.length.mean()]
     fit = require("scipy.optimize").least_squares(residual, start, loss="soft_l1", x_scale="jac")
     polar, camera = parts(fit.x)
-    std = np.sqrt(np.diag(np.linalg.inv(fit.jac.T @ fit.jac)))
     _, off = fingers.read(seen, polar, camera)
     noise = float(np.sqrt(np.mean(off**2)))
     offset = np.column_stack([polar[:, 0, None] * _direction(polar[:, 1]), np.zeros(4)])
-    place = np.maximum(std[:8:2], polar[:, 0] * std[1:8:2])
     unplaced = FingerMarkers(
         hand=hand,
         link=LINKS,
         offset=torch.from_numpy(offset),
-        offset_std=torch.from_numpy(place),
         rotation=torch.eye(3, dtype=torch.float64),
         translation=torch.zeros(3, dtype=torch.float64),
-        registration_std=torch.tensor([std[8], std[9:].max()]),
         noise=noise,
-        marker_std=noise,
     )
     return _placed(unplaced, camera)
 

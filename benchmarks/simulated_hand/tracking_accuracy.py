@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from torch_ekm._extras import require
 from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera
-from torch_ekm.simulation import CardScene, ImageQuality, PlacedCard, SimulatedCamera
+from torch_ekm.simulation import ImageQuality, SimulatedCamera
+from torch_ekm.simulation.imaging.card_scene import CardScene, PlacedCard
 
 Array = NDArray[np.float64]
 

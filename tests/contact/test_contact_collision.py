@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 
 import numpy as np
 import pytest
@@ -377,18 +376,6 @@ def test_moving_hand_and_object_together_changes_nothing() -> None:
     torch.testing.assert_close(moved.point[0], R @ a.point[0] + t, atol=1e-9, rtol=0)
     torch.testing.assert_close(moved.normal[0], R @ a.normal[0], atol=1e-9, rtol=0)
     torch.testing.assert_close(moved.finger_curvature[0], R @ a.finger_curvature[0] @ R.mT, atol=1e-5, rtol=0)
-
-
-def test_fast_enough_for_a_control_loop() -> None:
-    """Five fingers in well under the budget of 1 ms (a loaded machine is allowed five times that)."""
-    detector, q, position, rotation = pinch("can")
-    detector(q, position, rotation)
-    times = []
-    for _ in range(30):
-        start = time.perf_counter()
-        detector(q, position, rotation)
-        times.append(time.perf_counter() - start)
-    assert min(times) < 5e-3
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 
 import torch
+from fakes import FakePlant
 
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
@@ -14,7 +15,7 @@ from torch_ekm.plant import Observation
 Fault = Callable[["Obedient", Observation], Observation]
 
 
-class Obedient:
+class Obedient(FakePlant):
     """``ds = gain J_m da``; encoders obey but for ``dead`` actuators; a motion takes a second.
 
     From command ``since`` on each reading is what ``fault`` makes of it. ``given`` are the commands.
@@ -33,6 +34,7 @@ class Obedient:
         takes: float = 1.0,
         noise: float = 1e-3,
     ) -> None:
+        super().__init__()
         self.model, self.start, self.fault, self.since, self.gain = model, seen, fault, since, gain
         self.dead, self.takes, self.noise = list(dead), takes, noise
         self.given: list[torch.Tensor] = []
@@ -68,17 +70,13 @@ class Obedient:
         self.last.append(seen)
         return seen
 
-    def command(self, delta_a: torch.Tensor) -> Observation:
+    def move(self, delta_a: torch.Tensor) -> None:
         self.given.append(delta_a)
         moved = delta_a.clone()
         moved[self.dead] = 0.0
         if bool(moved.any()):
             self.state = self.state.plus(self.gain * self.model.linearize(self.state).step(moved))
         self.a = self.a + moved
-        return self.observe()
-
-    def close(self) -> None:
-        pass
 
 
 def turned(seen: Observation, axis: torch.Tensor, angle: float) -> Observation:

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from fakes import FakePlant
 
 from torch_ekm.control import (
     Caution,
@@ -34,10 +35,11 @@ DEG = math.pi / 180
 RULE = StoppingRule(max_steps=20)
 
 
-class Sliding:
+class Sliding(FakePlant):
     """Encoders obey; joints and object stay, but for what ``off`` says of each observation after a motion."""
 
     def __init__(self, seen: Observation, across: torch.Tensor, off: list[float]) -> None:
+        super().__init__()
         self.seen, self.across, self.off = seen, across, off
         self.commands: list[torch.Tensor] = []
         self.looks = 0
@@ -50,16 +52,9 @@ class Sliding:
         R = exp(angle * self.across) @ self.seen.rotation
         return dataclasses.replace(self.seen, q=q, position=o, rotation=R, time=time, stamps=None)
 
-    def command(self, delta_a: torch.Tensor) -> Observation:
+    def move(self, delta_a: torch.Tensor) -> None:
         self.commands.append(delta_a)
         self.seen = dataclasses.replace(self.seen, a=self.seen.a + delta_a)
-        return self.observe()
-
-    def reset(self, seed: int) -> Observation:
-        return self.observe()
-
-    def close(self) -> None:
-        pass
 
 
 @pytest.fixture(scope="module")

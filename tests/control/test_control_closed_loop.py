@@ -8,6 +8,7 @@ import threading
 
 import pytest
 import torch
+from fakes import FakePlant
 
 from torch_ekm.control import (
     ClosedLoop,
@@ -31,11 +32,12 @@ RULE = StoppingRule(tolerance=0.25 * DEG, stall_window=3, stall_progress=0.1 * D
 SAFETY = Safety(rule=RULE)
 
 
-class FrozenPlant:
+class FrozenPlant(FakePlant):
     """Never moves, as a hand whose motors have lost their power; its clock goes on, its sensors are alive.
     What it reports can be changed from some command on."""
 
     def __init__(self, observation: Observation, change=None, after: int = 2) -> None:
+        super().__init__()
         self.observation, self.change, self.after = observation, change, after
         self.commands = self.looks = 0
 
@@ -51,12 +53,8 @@ class FrozenPlant:
             return self.change(seen)
         return seen
 
-    def command(self, delta_a: torch.Tensor) -> Observation:
+    def move(self, delta_a: torch.Tensor) -> None:
         self.commands += 1
-        return self.observe()
-
-    def close(self) -> None:
-        pass
 
 
 @pytest.fixture(scope="module")
@@ -204,10 +202,9 @@ def test_the_learner_is_seen_motions_what_the_encoders_did(held) -> None:
     ekm.update = lambda s, da, ds, f: seen_motions.append((da, f)) or update(s, da, ds, f)  # type: ignore[method-assign]
 
     class Half(FrozenPlant):
-        def command(self, delta_a: torch.Tensor) -> Observation:
-            self.commands += 1
+        def move(self, delta_a: torch.Tensor) -> None:
+            super().move(delta_a)
             self.observation = dataclasses.replace(self.observation, a=self.observation.a + 0.5 * delta_a)
-            return self.observe()
 
     controller = LookAndMoveController(ekm, axis)
     driven = ClosedLoop(Half(seen), controller, safety=SAFETY)

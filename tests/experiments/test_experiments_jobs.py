@@ -132,7 +132,7 @@ from torch_ekm.experiments.jobs import run_jobs
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts what it runs behind without one
 
 def work(x):
-    time.sleep(0.1 if x < 2 else 60)
+    time.sleep(0.1 if x < 2 else 600)
     return x
 
 def tell(name):
@@ -153,10 +153,8 @@ def test_ctrl_c_leaves_what_is_finished_and_nothing_hangs(tmp_path: Path) -> Non
         time.sleep(0.5)
         workers = children(run.pid)
         assert len(workers) >= 2
-        start = time.monotonic()
         os.killpg(run.pid, signal.SIGINT)
-        _, errors = run.communicate(timeout=20)
-        assert time.monotonic() - start < 2
+        _, errors = run.communicate(timeout=120)  # long before the jobs would have ended
     assert "KeyboardInterrupt" in errors
     assert ended(workers)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", "job_0.json", "job_1.json"]
@@ -181,5 +179,5 @@ def children(pid: int) -> list[psutil.Process]:
 
 
 def ended(processes: list[psutil.Process]) -> bool:
-    """Within three seconds."""
-    return not psutil.wait_procs(processes, timeout=3)[1]
+    """Long before the jobs would have ended."""
+    return not psutil.wait_procs(processes, timeout=120)[1]

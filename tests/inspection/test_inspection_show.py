@@ -19,7 +19,8 @@ from torch_ekm.inspection.viewer.hand import GraspShow
 from torch_ekm.inspection.viewer.serve import choose_show, save_page, serve
 from torch_ekm.inspection.viewer.trial import LogShow
 from torch_ekm.plant import RecordingPlant, Trajectory, TrialLog
-from torch_ekm.rendering import make_scene, start_server
+from torch_ekm.rendering import make_scene
+from torch_ekm.rendering.web import start_server
 from torch_ekm.rendering.web_guard import WebGuard
 from torch_ekm.simulation import SimulatedHand
 
@@ -149,7 +150,7 @@ def test_served_it_answers_who_has_the_address(folder):
         assert len(secret) >= 32
 
         def status(path, host=where.netloc):
-            link = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+            link = http.client.HTTPConnection("127.0.0.1", port, timeout=120)
             link.request("GET", path, headers={"Host": host})
             return link.getresponse().status
 
@@ -159,7 +160,7 @@ def test_served_it_answers_who_has_the_address(folder):
         version = [f"viser-v{viser.__version__}"]
         mine, theirs = f"http://127.0.0.1:{port}", "http://evil.example"
         with connect(f"ws://127.0.0.1:{port}/{secret}", origin=mine, subprotocols=version) as socket:
-            answers["socket"] = len(socket.recv(timeout=20)) > 0
+            answers["socket"] = len(socket.recv(timeout=120)) > 0
         for path, origin in ((f"/{secret}", theirs), ("/", mine), (f"/{secret}", None), ("/", theirs)):
             with pytest.raises(refused, match="403"):
                 connect(f"ws://127.0.0.1:{port}{path}", origin=origin, subprotocols=version)

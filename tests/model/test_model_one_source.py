@@ -19,8 +19,8 @@ def test_the_model_of_a_plant_is_made_with_its_gravity(gravity):
     plant = SimulatedHand("icub_right", "box", PlantConfig(gravity=gravity))
     model = KinematicModel(plant.hand, plant.object)
     plant.reset(0)
-    assert plant.gravity == (gravity or (0.0, 0.0, 9.81))
-    expected = plant.object.mass * torch.tensor(plant.gravity, dtype=F64)
+    assert plant.hand.gravity == (gravity or (0.0, 0.0, 9.81))
+    expected = plant.object.mass * torch.tensor(plant.hand.gravity, dtype=F64)
     assert torch.equal(model.weight, expected)
 
 

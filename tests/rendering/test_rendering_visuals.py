@@ -9,9 +9,9 @@ import pytest
 
 from torch_ekm.description import hand_paths, list_hands, load_hand, read_urdf, write_template
 from torch_ekm.exceptions import DescriptionError
-from torch_ekm.rendering import make_scene, visuals
+from torch_ekm.rendering import make_scene
 from torch_ekm.rendering.scene import shape_mesh
-from torch_ekm.rendering.visuals import Mesh
+from torch_ekm.rendering.visuals import Mesh, visuals
 
 trimesh = pytest.importorskip("trimesh")
 LOOKS = """<visual><origin xyz="0.1 0 0" rpy="0 0 1.5707963"/>

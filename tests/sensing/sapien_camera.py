@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from torch_ekm._extras import require
 from torch_ekm.sensing import PinholeCamera
-from torch_ekm.simulation import CardScene, ImageQuality, PlacedCard
-from torch_ekm.simulation.imaging.card_scene import Card, ConvexBody
+from torch_ekm.simulation import ImageQuality
+from torch_ekm.simulation.imaging.card_scene import Card, CardScene, ConvexBody, PlacedCard
 
 # SAPIEN's cameras look along x, with y to the left and z up
 _FROM_CAMERA = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from torch_ekm.exceptions import CalibrationError, DescriptionError, ParameterError
-from torch_ekm.sensing import CharucoTarget, MarkerBoard, PinholeCamera, calibrate_camera
-from torch_ekm.simulation import CardScene, PlacedCard, SimulatedCamera
+from torch_ekm.sensing import MarkerBoard, PinholeCamera, calibrate_camera
+from torch_ekm.simulation import SimulatedCamera
+from torch_ekm.simulation.imaging.card_scene import CardScene, PlacedCard
 
 cv2 = pytest.importorskip("cv2")
 
@@ -52,9 +53,25 @@ def test_impossible_lenses_are_refused():
         PinholeCamera(distortion=(0.1, 0.0))
 
 
+SQUARE = 0.025  # [m]
+BOARD = cv2.aruco.CharucoBoard(
+    (8, 6), SQUARE, 0.018, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+)
+
+
+class Target:
+    """``BOARD``, printed with a white rim of half a square."""
+
+    size = (9 * SQUARE, 7 * SQUARE)
+
+    def texture(self, texel=2.5e-4):
+        rim = round(SQUARE / 2 / texel)
+        return BOARD.generateImage((9 * 2 * rim, 7 * 2 * rim), marginSize=rim, borderBits=1)
+
+
 @pytest.fixture(scope="module")
 def target_views(pose_of):
-    camera, target, rng = SimulatedCamera(LENS), CharucoTarget(), np.random.default_rng(1)
+    camera, target, rng = SimulatedCamera(LENS), Target(), np.random.default_rng(1)
     views = []
     for _ in range(12):
         pose = pose_of(
@@ -69,7 +86,7 @@ def target_views(pose_of):
 
 def test_calibration_recovers_the_lens(target_views):
     blank = np.full_like(target_views[0], 128)
-    result = calibrate_camera([*target_views, None, blank])
+    result = calibrate_camera([*target_views, None, blank], BOARD)
     assert result.used == tuple(range(12))  # the blank one is left out
     assert result.rms < 0.12  # px
     found = result.camera
@@ -85,9 +102,9 @@ def test_calibration_recovers_the_lens(target_views):
 
 def test_calibration_says_what_is_missing(target_views):
     with pytest.raises(CalibrationError, match="at least 8"):
-        calibrate_camera(target_views[:5])
+        calibrate_camera(target_views[:5], BOARD)
     with pytest.raises(CalibrationError, match="those before"):
-        calibrate_camera([target_views[0], target_views[1][:400]])
+        calibrate_camera([target_views[0], target_views[1][:400]], BOARD)
 
 
 @pytest.mark.filterwarnings("error")

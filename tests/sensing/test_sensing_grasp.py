@@ -10,7 +10,7 @@ import torch
 from fakes import FakePlant
 
 from torch_ekm.description import load_hand, load_object
-from torch_ekm.exceptions import ObjectLostError, ParameterError, ShapeError
+from torch_ekm.exceptions import ObjectLostError, ParameterError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.plant import Observation, Plant, PlantStatus, Truth
@@ -101,11 +101,6 @@ def test_camera_faces_both_cards(obj, pose_of):
         GraspView.facing(palm, away)
     with pytest.raises(ParameterError, match="beside"):
         GraspView.facing(palm, palm)
-
-
-def test_view_needs_a_pose(hand, obj):
-    with pytest.raises(ShapeError, match="camera_pose"):
-        GraspView(hand, obj, MarkerBoard(0), MarkerBoard(4), np.eye(3))
 
 
 def test_sensed_plant_knows_only_what_its_sensors_say(hand, obj):

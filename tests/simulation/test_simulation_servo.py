@@ -61,10 +61,6 @@ def test_small_increments_pile_up_on_the_setpoint_but_never_on_the_encoder():
     np.testing.assert_allclose(b, 0.58)
 
 
-def test_threshold_ignores_small_commands_and_passes_large_ones():
-    np.testing.assert_allclose(command(make(threshold=0.02), [0.019, 0.021, -0.1]), [0.5, 0.521, 0.4])
-
-
 def test_backlash_is_a_play_between_motor_and_tendon():
     servo = make(backlash=0.02)
     for motor, output in ((0.505, 0.5), (0.53, 0.52), (0.515, 0.52), (0.5, 0.51)):

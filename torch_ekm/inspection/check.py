@@ -42,7 +42,7 @@ State = Literal["ok", "warning", "error"]
 
 
 class Check(NamedTuple):
-    """One row of the table."""
+    """One row of the table: what was looked at, how it is, what was found, and what mends it."""
 
     name: str
     state: State
@@ -180,7 +180,7 @@ def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     try:
         plant = SimulatedHand(hand, obj)
         seen = plant.reset(0)
-        model = KinematicModel(plant.hand, obj, ModelOptions(gravity=plant.gravity))
+        model = KinematicModel(plant.hand, obj)
         ends = [reachable(model, seen, plant.rotation_axis, sign=sign) for sign in (-1, 1)]
     except MissingExtraError:
         return
@@ -218,10 +218,10 @@ def _pinch(
         plant = SimulatedHand(hand, obj, config)
         seen = plant.reset(0)  # as it is: the sensors have no noise
         assert seen.fingertip_force is not None  # of a simulated hand as described
-        felt = zip(hand.pads, seen.fingertip_force.tolist(), strict=True)
-        forces = ", ".join(f"{pad.name} {force:.1f}" for pad, force in felt if force > 0)
+        measured = zip(hand.pads, seen.fingertip_force.tolist(), strict=True)
+        forces = ", ".join(f"{pad.name} {force:.1f}" for pad, force in measured if force > 0)
         yield Check("pinch", "ok", f"'{obj.name}' is held in simulation; forces [N]: {forces}")
-        model = KinematicModel(plant.hand, obj, ModelOptions(gravity=plant.gravity, on_unstable="flag"))
+        model = KinematicModel(plant.hand, obj, ModelOptions(on_unstable="flag"))
         contacts = model.contacts(seen.state)
         yield from _sides(hand, contacts, model.kinematics(seen.state.q))
         lin = model.linearize(seen.state, contacts, fingertip_force=seen.fingertip_force)

@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from .image import Picture, save_picture
 from .scene import Scene, make_scene
-from .visuals import visuals
-from .web import draw, place, save_animation, start_server
+from .web import save_animation
 
 __all__ = [
     "Picture",
     "Scene",
-    "draw",
     "make_scene",
-    "place",
     "save_animation",
     "save_picture",
-    "start_server",
-    "visuals",
 ]

@@ -46,7 +46,7 @@ class Visuals:
 def visuals(urdf: UrdfModel) -> Visuals:
     """``<visual>`` of each link, where there is one and all of it can be read; else its ``<collision>``.
 
-    A mesh-only ``<collision>`` without ``<visual>`` is drawn, too. A mesh is looked for beside the URDF, and
+    A mesh-only ``<collision>`` without ``<visual>`` is drawn, too. A mesh is looked for next to the URDF, and
     for ``package://name/rest`` in the folders above it as ``name/rest`` and ``rest``. Pictures do without
     what is missing: a problem is listed, not raised.
     """
@@ -93,7 +93,8 @@ def _part(path: Path, element: ET.Element) -> Shape | Mesh:
         raise ValueError("<geometry> is missing")
     pose = np.eye(4)
     if origin is not None:
-        pose[:3, :3] = _rotation(_numbers(origin.get("rpy", "0 0 0"), 3))
+        rpy = _numbers(origin.get("rpy", "0 0 0"), 3)  # about fixed axes, as the URDF standard has it
+        pose[:3, :3] = require("scipy.spatial.transform").Rotation.from_euler("xyz", rpy).as_matrix()
         pose[:3, 3] = _numbers(origin.get("xyz", "0 0 0"), 3)
     shape = geometry[0]
     if shape.tag == "mesh":
@@ -143,12 +144,3 @@ def _numbers(text: str, n: int) -> list[float]:
     if len(values) != n or not all(map(math.isfinite, values)):
         raise ValueError(f"needs {n} finite numbers, got '{text}'")
     return values
-
-
-def _rotation(rpy: list[float]) -> Array:
-    """``Rz(y) Ry(p) Rx(r)``, as the URDF standard has it."""
-    (sr, sp, sy), (cr, cp, cy) = np.sin(rpy), np.cos(rpy)
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x

@@ -35,8 +35,11 @@ class WebGuard:
     def start(self, make: Callable[[], Any]) -> Any:
         """The viser server that ``make`` starts, with this guard in front of it.
 
-        There is no plain way, since viser has no option for it: ``serve`` of websockets is replaced while the
-        server starts. Then the server must refuse a request without the secret.
+        ``serve`` of websockets is replaced while the server starts, since there is no plain way: viser hands
+        none of its arguments on to it, and calls it in the middle of its own thread's function, which a
+        subclass could only copy. A proxy in front would leave viser's own port open to every page of the
+        browser; ``on_client_connect`` is called after the handshake and is not given the request. Then the
+        server must refuse a request without the secret.
 
         Raises:
             ParameterError: it does not, since this version of viser is built otherwise.
@@ -87,7 +90,7 @@ class WebGuard:
 
 
 def _status(port: int, path: str) -> int:
-    connection = http.client.HTTPConnection(HOST, port, timeout=10)
+    connection = http.client.HTTPConnection(HOST, port, timeout=60)
     try:
         connection.request("GET", path)
         return connection.getresponse().status

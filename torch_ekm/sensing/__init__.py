@@ -2,25 +2,21 @@
 
 Vision: :class:`MarkerTracker` turns images into the object's pose in the hand frame. Hall sensors:
 :class:`HallCalibration` turns counts into angles, :class:`JointEstimator` joins them with the encoders,
-:class:`ContactAligned` corrects the joints that no sensor reads, :class:`FingerMarkers` reads angles from
-markers on the links. The same code serves simulated and real readings."""
+:class:`ContactAligned` corrects the joints that no sensor reads. The same code serves simulated and real
+readings."""
 
 from __future__ import annotations
 
 from .contact_alignment import ContactAligned
-from .finger_markers import FingerMarkers, calibrate_markers
 from .hall.calibration import HallCalibration
 from .joint_estimator import JointEstimator
 from .vision.board import MarkerBoard
 from .vision.calibration import calibrate_camera
 from .vision.camera import PinholeCamera
-from .vision.charuco import CharucoTarget
 from .vision.track import Track, TrackStatus
 from .vision.tracker import MarkerTracker
 
 __all__ = [
-    "CharucoTarget",
-    "FingerMarkers",
     "HallCalibration",
     "JointEstimator",
     "MarkerBoard",
@@ -30,5 +26,4 @@ __all__ = [
     "Track",
     "TrackStatus",
     "calibrate_camera",
-    "calibrate_markers",
 ]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from .config import PlantConfig
 from .disturbances import DisturbedPlant, PlantChange, Tug
-from .hall_sensors import HallQuality, HallSensors, Stuck
-from .imaging.card_scene import CardScene, PlacedCard
+from .hall_sensors import HallSensors, Stuck
 from .imaging.simulated_camera import ImageQuality, SimulatedCamera
 from .parameters import PlantParameters
 from .presets import PRESETS, preset
@@ -13,13 +12,10 @@ from .sensed_plant import SensedPlant
 from .simulated_hand import SimulatedHand
 
 __all__ = [
-    "CardScene",
     "PlantChange",
     "DisturbedPlant",
-    "HallQuality",
     "HallSensors",
     "ImageQuality",
-    "PlacedCard",
     "PlantConfig",
     "PlantParameters",
     "PRESETS",

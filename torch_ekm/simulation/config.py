@@ -34,23 +34,16 @@ class PlantConfig:
     normal of a planar hand, else y, square to the planes in which the iCub's fingers bend."""
     tilt: float = 5 * _DEG
     """The object's long axis is drawn within +-this of ``along`` [rad]."""
-    gravity_tilt: float = 0.0
-    """At each reset gravity is turned by up to this out of its direction [rad]: another orientation of
-    the hand, which the model must be given (``SimulatedHand.gravity``)."""
     relative_to: str = "encoder"
     """Commands are increments of the "encoder" or of the "setpoint"."""
 
     def __post_init__(self) -> None:
         for name in ("time_step", "pinch_force"):
             value = getattr(self, name)
-            if name == "pinch_force" and value is None:
-                continue
-            if not (math.isfinite(value) and value > 0):
+            if value is not None and not (math.isfinite(value) and value > 0):
                 raise ParameterError(name, value, "finite and greater than 0")
-        for name in ("tilt", "gravity_tilt"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ParameterError(name, value, "finite and not negative")
+        if not (math.isfinite(self.tilt) and self.tilt >= 0):
+            raise ParameterError("tilt", self.tilt, "finite and not negative")
         if self.time_step > 0.004:
             raise ParameterError("time_step", self.time_step, "at most 0.004 s: the tendons need it")
         if self.gravity is not None and (len(self.gravity) != 3 or not all(map(math.isfinite, self.gravity))):

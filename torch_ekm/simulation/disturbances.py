@@ -22,6 +22,7 @@ class PlantChange:
     changes: Mapping[str, Any]
 
     def happen(self, plant: SimulatedHand) -> None:
+        """Give ``plant`` the new parameters, now."""
         plant.change(**self.changes)
 
     @classmethod
@@ -45,6 +46,7 @@ class Tug:
     """[s]"""
 
     def happen(self, plant: SimulatedHand) -> None:
+        """Tug at the object that ``plant`` holds, now."""
         plant.tug(np.array(self.force), np.array(self.torque), self.duration)
 
 

@@ -31,6 +31,8 @@ else:
     gymnasium = require("gymnasium")
 
 _DEG = math.pi / 180
+_OFF_AXIS = 0.1  # weight of rotation off the axis in the reward
+_LOST = 10.0  # what losing the object costs
 
 
 class InHandRotation(gymnasium.Env):
@@ -52,8 +54,8 @@ class InHandRotation(gymnasium.Env):
     1              rad     angle still to turn
     ============== ======= ==============================================================
 
-    **Reward** per step: ``-|angle to go|`` in units of 10 deg, ``-off_axis`` times the rotation about
-    other axes in the same unit, +1 at the goal, ``-lost_penalty`` when the object is lost.
+    **Reward** per step: ``-|angle to go|`` in units of 10 deg, -0.1 times the rotation about
+    other axes in the same unit, +1 at the goal, -10 when the object is lost.
 
     **Ends** at the goal (within ``tolerance``) or with the object lost; truncated after 40 steps by the
     registered time limit. ``info`` has ``is_success``, ``status`` and ``truth`` (for reports).
@@ -67,8 +69,6 @@ class InHandRotation(gymnasium.Env):
         angles: least and largest target [rad].
         step_limit: largest increment of an actuator [rad].
         tolerance: the goal is reached within this [rad].
-        off_axis: weight of rotation off the axis.
-        lost_penalty: what losing the object costs.
         render_mode: None or "rgb_array" (PyVista).
     """
 
@@ -83,8 +83,6 @@ class InHandRotation(gymnasium.Env):
         angles: tuple[float, float] = (5 * _DEG, 25 * _DEG),
         step_limit: float = 3 * _DEG,
         tolerance: float = 0.5 * _DEG,
-        off_axis: float = 0.1,
-        lost_penalty: float = 10.0,
         render_mode: str | None = None,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -97,7 +95,6 @@ class InHandRotation(gymnasium.Env):
             parameters = preset(parameters)
         self.plant = SimulatedHand(hand, object, config, parameters)
         self.angles, self.step_limit, self.tolerance = angles, step_limit, tolerance
-        self.off_axis, self.lost_penalty = off_axis, lost_penalty
         self.render_mode = render_mode
         self._picture: Picture | None = None
         description = self.plant.hand
@@ -136,7 +133,7 @@ class InHandRotation(gymnasium.Env):
         to_go = self._target - turned
         lost = observation.status is PlantStatus.LOST
         reached = not lost and abs(to_go) < self.tolerance
-        reward = -(abs(to_go) + self.off_axis * off) / (10 * _DEG) + reached - self.lost_penalty * lost
+        reward = -(abs(to_go) + _OFF_AXIS * off) / (10 * _DEG) + reached - _LOST * lost
         return self._observation(observation), float(reward), lost or reached, False, self._info(observation)
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
@@ -144,10 +141,8 @@ class InHandRotation(gymnasium.Env):
         if self.render_mode is None:
             return None
         q, position, rotation = self.plant.hand_state()
-        gravity = np.array(self.plant.gravity)
-        scene = make_scene(
-            self.plant.hand, self.plant.object, q[None], position[None], rotation[None], gravity
-        )
+        frame = q[None], position[None], rotation[None]
+        scene = make_scene(self.plant.hand, self.plant.object, *frame, np.array(self.plant.hand.gravity))
         if self._picture is None:
             self._picture = Picture(scene)
         return self._picture.draw(scene)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -14,6 +13,11 @@ from ..typing import Float, Tensor
 
 _HALF_TURN_DEG = (50.0, 62.0)  # a magnet turns by plus and minus that much before its sensor
 _ASYMMETRY_DEG = 6.0  # largest misalignment of a magnet
+# Shares of its range by which a channel's curve lies beyond full scale with the joint open and closed, drawn
+# from these intervals; negative: it stops short. On 19 robots the open reading is 255 for most proximal
+# channels, and 491 to 505 of 510 (medians) for the sums of two; closed, medians are 0 to 22 of 255, and 127
+# of 765 for the little finger.
+_OPEN_OVERDRIVE, _CLOSED_OVERDRIVE = (-0.03, 0.06), (-0.16, 0.03)
 
 
 class Stuck(Enum):
@@ -25,34 +29,6 @@ class Stuck(Enum):
     FROZEN = "frozen"  # at what it first read
 
 
-@dataclass(frozen=True)
-class HallQuality:
-    """What spoils Hall readings; the defaults are the nominal ones.
-
-    Raises:
-        ParameterError: a value is out of range.
-    """
-
-    noise: float = 0.6
-    """Standard deviation before the converter [counts]."""
-    open_overdrive: tuple[float, float] = (-0.03, 0.06)
-    """Share of its range by which a channel's curve lies beyond full scale when its joint is open, drawn
-    from this interval; negative: it stops short. On 19 robots the open reading is 255 for most
-    proximal channels, and 491 to 505 of 510 (medians) for the sums of two."""
-    closed_overdrive: tuple[float, float] = (-0.16, 0.03)
-    """The same for the closed end: medians 0 to 22 of 255, and 127 of 765 for the little finger."""
-    reversed_share: float = 0.0
-    """Probability that a channel is mounted the other way round."""
-
-    def __post_init__(self) -> None:
-        if not self.noise >= 0:
-            raise ParameterError("HallQuality.noise", self.noise, "zero or positive [counts]")
-        for name in ("open_overdrive", "closed_overdrive"):
-            low, high = getattr(self, name)
-            if not -0.5 < low <= high < 0.4:
-                raise ParameterError(f"HallQuality.{name}", (low, high), "increasing, within (-0.5, 0.4)")
-
-
 class HallSensors:
     r"""``n = floor(clip(open + (closed - open) u(q) + noise, 0, 255))``, one channel per sensed joint.
 
@@ -60,40 +36,38 @@ class HallSensors:
     ``u = (sin(alpha (2 x - 1) + beta) - sin(beta - alpha)) / (sin(alpha + beta) - sin(beta - alpha))``
     at ``x = (q - lower) / (upper - lower)``, stretched beyond the scale or short of it at
     either end. Curved, monotone, and not a cubic: a cubic calibration has something left to miss.
-    Open reads 255 and closed 0 unless the hand's description or a reversed mounting says otherwise
-    (the iCub's MAIS boards send the upper 8 of 12 bits, hence the floor).
+    Open reads 255 and closed 0 unless the hand's description says otherwise (the iCub's MAIS boards send
+    the upper 8 of 12 bits, hence the floor).
 
     Args:
         hand: its ``hall_sensors`` and joint limits.
-        quality: noise and the spread between channels.
         seed: of the channels' own curves (a hand's identity, not the noise of a reading).
 
     Raises:
         ParameterError: the hand has no Hall sensors.
     """
 
-    def __init__(self, hand: HandDescription, quality: HallQuality | None = None, seed: int = 0) -> None:
+    def __init__(self, hand: HandDescription, seed: int = 0) -> None:
         if not hand.hall_sensors:
             raise ParameterError(
                 "hand.hall_sensors", (), "non-empty: give the transmission file [[hall_sensors]]"
             )
-        self.quality = quality or HallQuality()
+        self.noise = 0.6
+        """Standard deviation before the converter [counts]; may be changed at any time."""
         sensors = sorted(hand.hall_sensors, key=lambda sensor: sensor.channel)
         self.joints = tuple(sensor.joint for sensor in sensors)
         self._index = torch.tensor([hand.joint_names.index(joint) for joint in self.joints])
         self._n_q = hand.n_q
-        rng, n, q = np.random.default_rng(seed), len(sensors), self.quality
+        rng, n = np.random.default_rng(seed), len(sensors)
         self._lower = torch.from_numpy(hand.joint_lower.copy())[self._index]
         self._upper = torch.from_numpy(hand.joint_upper.copy())[self._index]
         self._alpha = torch.from_numpy(np.radians(rng.uniform(*_HALF_TURN_DEG, n)))
         self._beta = torch.from_numpy(np.radians(rng.uniform(-_ASYMMETRY_DEG, _ASYMMETRY_DEG, n)))
         self._over = torch.from_numpy(
-            np.stack([rng.uniform(*q.open_overdrive, n), rng.uniform(*q.closed_overdrive, n)])
+            np.stack([rng.uniform(*_OPEN_OVERDRIVE, n), rng.uniform(*_CLOSED_OVERDRIVE, n)])
         )
         ends = torch.tensor([[s.open, s.closed] for s in sensors], dtype=torch.float64).T
-        turned = torch.from_numpy(rng.random(n) < q.reversed_share)
-        self._open = torch.where(turned, ends[1], ends[0])
-        self._closed = torch.where(turned, ends[0], ends[1])
+        self._open, self._closed = ends
         self.stuck = [Stuck.NO] * n
         """Failure of each channel; may be changed at any time."""
         self._frozen: dict[int, Tensor] = {}
@@ -139,7 +113,7 @@ class HallSensors:
         """Readings 0..255, whole numbers, of joint angles [rad]."""
         counts = self.field(q)
         noise = torch.randn(counts.shape, generator=generator, dtype=torch.float64)
-        counts = (counts + self.quality.noise * noise).clamp(0, 255).floor()
+        counts = (counts + self.noise * noise).clamp(0, 255).floor()
         for k, failure in enumerate(self.stuck):
             if failure is Stuck.NO:
                 self._frozen.pop(k, None)

@@ -53,8 +53,6 @@ class PlantParameters:
     """Bound of an error drawn again at every command [rad], uniform."""
     dead_zone: float = 0.0
     """Coulomb dead band: an actuator stops short of its set-point by this [rad]."""
-    threshold: float = 0.0
-    """Commands smaller than this do nothing [rad]."""
     backlash: float = 0.0
     """Full width of the play between motor and tendon [rad], added to that of the description."""
 

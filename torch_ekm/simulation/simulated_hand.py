@@ -19,7 +19,7 @@ from .grasp_planning.pinch import PinchPlan, pinch_hint, pinch_problem, plan_pin
 from .grasp_planning.pinch_problem import PinchRequest
 from .mechanism.assembly import true_hand, true_object
 from .parameters import PlantParameters
-from .physics.rig import COMMAND_TIME, Gravity, Rig, RigState
+from .physics.rig import COMMAND_TIME, Rig, RigState
 from .presets import preset as parameters_of
 from .sensors import Sensors, TimedState
 
@@ -114,7 +114,7 @@ class SimulatedHand:
                 continue
             self._plan = plan
             self._sensors.forget()
-            self._rig.grasp(plan, request.gravity)
+            self._rig.grasp(plan)
             if self.status is PlantStatus.HELD:
                 return self.observe()
         raise GraspError(
@@ -174,11 +174,6 @@ class SimulatedHand:
         if self._plan is None:
             raise GraspError("there is no grasp yet: call reset(seed) first")
         return self._plan
-
-    @property
-    def gravity(self) -> Gravity:
-        """Gravity of this grasp in the hand frame [m/s^2]: ``hand.gravity``, tilted as drawn."""
-        return self._grasped().gravity
 
     @property
     def rotation_axis(self) -> Float[Tensor, " 3"]:
@@ -268,11 +263,11 @@ class SimulatedHand:
             self._rig.change(parameters)
 
     def _request(self) -> PinchRequest:
-        """Where to grasp, and which way is down."""
+        """Where to grasp."""
         c = self.config
-        along, across, first, second, tilt, turn = self._generator.uniform(-1.0, 1.0, size=6).tolist()
+        drawn = self._generator.uniform(-1.0, 1.0, size=6)  # the last two keep the noise of earlier versions
+        along, across, first, second = drawn[:4].tolist()
         return PinchRequest(
-            gravity=_tilted(self.hand.gravity, tilt * c.gravity_tilt, np.pi * turn),
             force=self.hand.pinch_force if c.pinch_force is None else c.pinch_force,
             along=along * _OFFSET_ALONG,
             across=across * _OFFSET_ACROSS,
@@ -282,16 +277,3 @@ class SimulatedHand:
 
 def _tensors(*arrays: Array) -> list[Tensor]:
     return [torch.tensor(value) for value in arrays]
-
-
-def _tilted(gravity: Gravity, angle: float, turn: float) -> Gravity:
-    """``gravity`` turned by ``angle`` about an axis square to it, chosen by ``turn`` [rad]."""
-    down = np.array(gravity, dtype=np.float64)
-    size = float(np.linalg.norm(down))
-    if angle == 0.0 or size == 0.0:
-        return gravity
-    first = np.cross(down, np.eye(3)[np.argmin(np.abs(down))])
-    first /= np.linalg.norm(first)
-    sideways = np.cos(turn) * first + np.sin(turn) * np.cross(down / size, first)
-    x, y, z = (np.cos(angle) * down + np.sin(angle) * size * sideways).tolist()
-    return x, y, z

@@ -11,7 +11,8 @@ import torch
 from ...description import HandDescription, load_hand
 from ...kinematics import ActuationMap
 from ...plant import PlantStatus
-from ...rendering import Scene, make_scene, visuals
+from ...rendering import Scene, make_scene
+from ...rendering.visuals import visuals
 from ...simulation import PlantConfig, SimulatedHand
 from ...typing import Array
 from .words import as_html
@@ -35,7 +36,7 @@ class HandShow:
         """What could not be drawn."""
 
     def scene(self) -> Scene:
-        """Every actuator through its range."""
+        """A frame for each of 20 postures of every actuator's way through its range, one after another."""
         postures = [self._a]
         for i in range(self.hand.n_a):
             for part in np.r_[np.linspace(0, 1, _FRAMES), np.linspace(1, 0, _FRAMES)]:
@@ -45,7 +46,7 @@ class HandShow:
         return self._scene(np.array(postures))
 
     def add_controls(self, gui: Any) -> None:
-        """A slider for each actuator [deg]."""
+        """A slider for each actuator, its position [deg] within its range."""
         ranges = np.degrees([self._lower, self._upper, self._a]).T.tolist()
         self._sliders = [
             gui.add_slider(f"{name} [deg]", min=low, max=high, step=0.5, initial_value=start)
@@ -85,9 +86,9 @@ class GraspShow:
         self.title = f"{self.plant.hand.name} holds {self.plant.object.name}"
 
     def scene(self) -> Scene:
-        """The grasp as it is now."""
+        """One frame: the true state of the grasp as it is now, hand frame."""
         q, position, rotation = (part[None] for part in self.plant.hand_state())
-        gravity = np.array(self.plant.gravity)
+        gravity = np.array(self.plant.hand.gravity)
         axis = self.plant.rotation_axis.numpy()
         return make_scene(self.plant.hand, self.plant.object, q, position, rotation, gravity, axis=axis)
 
@@ -127,12 +128,12 @@ class GraspShow:
         return self.scene().transforms[0]
 
     def _words(self) -> str:
-        force, felt = self._seen.fingertip_force, "no sensors"
+        force, shown = self._seen.fingertip_force, "no sensors"
         if force is not None:
             forces = zip(self.plant.hand.pads, force.tolist(), strict=True)
-            felt = ", ".join(f"{pad.name} {force:.1f} N" for pad, force in forces if force > 0)
+            shown = ", ".join(f"{pad.name} {force:.1f} N" for pad, force in forces if force > 0)
         status = "lost" if self._seen.status is PlantStatus.LOST else "held"
-        return as_html([f"The object is {status}; fingertips: {felt or 'nothing'}."])
+        return as_html([f"The object is {status}; fingertips: {shown or 'nothing'}."])
 
 
 def _in_plane(normal: Array) -> Array:

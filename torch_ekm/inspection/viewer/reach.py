@@ -70,5 +70,5 @@ class ReachShow:
             np.stack([getattr(state, name).numpy() for state in states])
             for name in ("q", "position", "rotation")
         )
-        gravity, axis = np.array(plant.gravity), plant.rotation_axis.numpy()
+        gravity, axis = np.array(plant.hand.gravity), plant.rotation_axis.numpy()
         return make_scene(plant.hand, plant.object, q, position, rotation, gravity, axis=axis)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ...description import list_hands, load_hand
 from ...exceptions import OutputError, ParameterError, UnknownNameError
-from ...rendering import draw, place, save_animation, start_server
+from ...rendering.web import draw, place, save_animation, start_server
 from .hand import GraspShow, HandShow
 from .reach import ReachShow
 from .trial import LogShow

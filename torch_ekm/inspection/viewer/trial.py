@@ -46,11 +46,15 @@ class LogShow:
 
     @property
     def title(self) -> str:
-        """Log and trial."""
+        """The name of the log and the number of the trial."""
         return f"{self.path.name}, trial {self.trial}"
 
     def open(self, trial: int | None) -> None:
-        """Show another trial, from its start."""
+        """Show another trial, or with None the file itself, from its first observation.
+
+        Raises:
+            DescriptionError: it is damaged, empty, or does not name its hand and object.
+        """
         trajectory = Trajectory.load(self.path) if self.log is None or trial is None else self.log.read(trial)
         source = self.path if self.log is None or trial is None else self.log.path(trial)
         if not trajectory.observations:
@@ -68,11 +72,11 @@ class LogShow:
         self._scene = self._drawn(trajectory, np.array(gravity, dtype=np.float64))
 
     def scene(self) -> Scene:
-        """A frame for each observation."""
+        """A frame for each observation of the trial, in the order of time, hand frame."""
         return self._scene
 
     def add_controls(self, gui: Any) -> None:
-        """Which trial, which moment, play."""
+        """A list of trials, a slider for the command that is shown, and a box to let it play."""
         names = [str(trial) for trial in self.trials]
         self._choice = gui.add_dropdown("trial", names, initial_value=str(self.trial)) if names else None
         self._slider = gui.add_slider("command", min=0, max=max(1, self._last), step=1, initial_value=0)
@@ -128,8 +132,8 @@ class LogShow:
         if frame:
             moved = self.trajectory.commands[frame - 1].rad2deg().tolist()
             names = self._bodies[0].actuator_names if self._bodies else ()
-            told = [f"{n} {v:+.1f}" for n, v in zip(names, moved, strict=False) if abs(v) >= 0.05]
-            lines.append("commanded [deg]: " + (", ".join(told) or "nothing"))
+            motion = [f"{n} {v:+.1f}" for n, v in zip(names, moved, strict=False) if abs(v) >= 0.05]
+            lines.append("commanded [deg]: " + (", ".join(motion) or "nothing"))
         lines += [f"event: {event}" for event in seen.info.get("events", ())]
         if frame == self._last and (reason := self.trajectory.about.get("outcome", {}).get("reason")):
             lines.append(f"ended: {reason}")

@@ -1,4 +1,4 @@
-"""Text beside a scene."""
+"""Text next to a scene, as HTML."""
 
 from __future__ import annotations
 

@@ -127,18 +127,6 @@ class HallCalibration:
             std = torch.where(pinned, torch.maximum(std, (spread**2 + self._misfit**2).sqrt()), std)
         return HallEstimate(q, std, ~(blind[0] | blind[1] | blind[2]))
 
-    def find_stuck(
-        self, readings: Float[Tensor, "n n_channels"], angles: Float[Tensor, "n n_channels"]
-    ) -> Bool[Tensor, " n_channels"]:
-        """Channels that stood still while their joints are known to have moved.
-
-        A channel is stuck if its readings span at most two counts, while ``angles`` (from the encoders, say)
-        would have moved a sound one by eight. Saturated ends count as no motion.
-        """
-        spans = [c.expected_span(angles[:, k].to(torch.float64)) for k, c in enumerate(self.channels)]
-        actual = readings.amax(0) - readings.amin(0)
-        return (actual <= 2) & (torch.tensor(spans) >= 8)
-
     def save(self, path: str | Path) -> None:
         """Write the calibration as JSON; :meth:`load` gives it back to the last bit."""
         channels = [asdict(channel) for channel in self.channels]

@@ -74,15 +74,6 @@ class HallChannel:
         """True where larger readings mean larger angles (a reversed channel)."""
         return self.angle(self.high) > self.angle(self.low)
 
-    def expected_span(self, angles: Float[Tensor, " n"]) -> float:
-        """By how many counts a sound channel would change over these angles."""
-        if self.stuck:
-            return 0.0
-        grid = torch.linspace(self.low, self.high, 256, dtype=torch.float64)
-        curve = torch.tensor([self.angle(float(reading)) for reading in grid])
-        inside = (curve >= angles.min()) & (curve <= angles.max())
-        return float(grid[inside].max() - grid[inside].min()) if bool(inside.any()) else 0.0
-
 
 def fit_channel(joint: str, readings: Float[Tensor, " n"], angles: Float[Tensor, " n"]) -> HallChannel:
     """Least squares of the cubic on the unsaturated samples; noise and misfit from the residuals.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 from ..._extras import require
 from ...exceptions import CalibrationError
 from .camera import PinholeCamera
-from .charuco import CharucoTarget
 
 _MIN_VIEWS = 8  # fewer usable pictures are refused
 _MIN_CORNERS = 12  # a picture with fewer is not used
@@ -33,10 +33,7 @@ class CameraCalibration:
     """Numbers of the pictures that were used; the others showed too little of the target, or blurred."""
 
 
-def calibrate_camera(
-    images: Iterable[NDArray[np.uint8] | None],
-    target: CharucoTarget | None = None,
-) -> CameraCalibration:
+def calibrate_camera(images: Iterable[NDArray[np.uint8] | None], board: Any) -> CameraCalibration:
     """``min sum |u_ij - pi(K, k, R_i X_j + t_i)|^2`` over intrinsics (k3 = 0) and the pose of each view.
 
     Corners of a ChArUco target (OpenCV's detector), then Zhang's method (``cv2.calibrateCamera``).
@@ -46,15 +43,14 @@ def calibrate_camera(
 
     Args:
         images: grey or BGR pictures of one size; None (dropped frames) are skipped.
-        target: what is seen.
+        board: what is seen, a ``cv2.aruco.CharucoBoard`` with its lengths in [m].
 
     Raises:
         CalibrationError: too few usable views, or pictures of different sizes.
     """
     cv2 = require("cv2")
-    target = target or CharucoTarget()
-    detector = cv2.aruco.CharucoDetector(target.board)
-    points = target.board.getChessboardCorners()
+    detector = cv2.aruco.CharucoDetector(board)
+    points = board.getChessboardCorners()
     views: list[tuple[int, NDArray, NDArray]] = []
     shape = None
     for k, image in enumerate(images):

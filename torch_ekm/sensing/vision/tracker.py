@@ -18,6 +18,7 @@ from .track import Track, TrackStatus
 _CORNER_STD = 0.20  # of one coordinate of a detected corner [px]
 _MAX_RESIDUAL = 1.0  # a corner farther than this from the fitted board is left out [px]
 _MAX_STEP, _MAX_TURN = 0.020, float(np.radians(20.0))  # believable between two frames [m], [rad]
+_MIN_MARKERS = 2  # of a board that must be seen: one alone is prone to flips
 _JUMP_FRAMES = 3  # a jump is believed when that many frames in a row agree on it
 
 
@@ -36,12 +37,10 @@ class MarkerTracker:
         palm_board: its ``mount`` is its pose in the hand frame.
         object_board: its ``mount`` is its pose in the object's frame
             (``ObjectDescription.marker_transform``).
-        min_markers: markers of a board that must be seen; one alone is prone to flips.
         edges: refine each board's pose on the edges of its markers: more accurate, and slower.
 
     Raises:
-        ParameterError: the two boards share markers, or are of different dictionaries; ``min_markers`` is
-            less than 1.
+        ParameterError: the two boards share markers, or are of different dictionaries.
     """
 
     def __init__(
@@ -49,11 +48,8 @@ class MarkerTracker:
         camera: PinholeCamera,
         palm_board: MarkerBoard,
         object_board: MarkerBoard,
-        min_markers: int = 2,
         edges: bool = True,
     ) -> None:
-        if min_markers < 1:
-            raise ParameterError("min_markers", min_markers, "1 or more")
         if set(palm_board.ids) & set(object_board.ids):
             raise ParameterError(
                 "object_board.first_id", object_board.first_id, f"beyond the palm's {palm_board.ids}"
@@ -61,7 +57,7 @@ class MarkerTracker:
         if palm_board.dictionary != object_board.dictionary:
             raise ParameterError("object_board.dictionary", object_board.dictionary, palm_board.dictionary)
         self.camera, self.palm_board, self.object_board = camera, palm_board, object_board
-        self.min_markers, self.edges = min_markers, edges
+        self.edges = edges
         self._detector = _make_detector(palm_board.dictionary)
         self.reset()
 
@@ -122,7 +118,7 @@ class MarkerTracker:
 
     def _board_pose(self, board: MarkerBoard, markers: dict[int, Array], grey: NDArray) -> BoardPose | None:
         seen = [k for k in board.ids if k in markers]
-        if len(seen) < min(self.min_markers, board.n_markers):
+        if len(seen) < min(_MIN_MARKERS, board.n_markers):
             return None
         pose = estimate_board_pose(
             self.camera,
@@ -131,7 +127,6 @@ class MarkerTracker:
             _CORNER_STD,
             _MAX_RESIDUAL,
             self._prior.get(id(board)),
-            min_corners=min(6, 4 * self.min_markers),
         )
         if pose is None or not self.edges:
             return pose

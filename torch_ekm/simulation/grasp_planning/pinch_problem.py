@@ -27,8 +27,6 @@ _ROOM = 0.02  # [rad] between a motor and the ends of its range
 class PinchRequest:
     """What is wanted of a pinch. Lengths [m], angles [rad], in the object frame."""
 
-    gravity: tuple[float, float, float]
-    """In the hand frame [m/s^2]."""
     force: float = 5.0
     """Normal force of the thumb [N]; the fingers share its reaction."""
     along: float = 0.0
@@ -232,7 +230,7 @@ class PinchProblem:
     def equations(self, x: Array, request: PinchRequest, g: PinchGeometry | None = None) -> Array:
         """What must vanish, in units of its tolerance."""
         g = self.geometry(x) if g is None else g
-        weight = self.obj.mass * np.array(request.gravity)
+        weight = self.obj.mass * np.array(self.hand.gravity)
         force = g.force.sum(axis=1) + weight
         centre = g.rotation @ self.obj.com
         moment = np.cross(g.point - g.position[:, None], g.force).sum(axis=1) + np.cross(centre, weight)

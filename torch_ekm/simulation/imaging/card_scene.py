@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ..._extras import require
 from ...description import Shape
-from ...exceptions import ShapeError
 from ...sensing.vision.camera import PinholeCamera
 from ...typing import Array
 
@@ -33,11 +32,7 @@ class Card(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ConvexBody:
-    """The convex hull of ``n`` balls: a capsule is two, a box eight of radius 0.
-
-    Raises:
-        ShapeError: ``centres`` is not ``(n, 3)`` or ``radii`` not ``(n,)``.
-    """
+    """The convex hull of ``n`` balls: a capsule is two, a box eight of radius 0."""
 
     centres: Array
     """``(n, 3)`` [m]"""
@@ -45,14 +40,6 @@ class ConvexBody:
     """``(n,)`` [m]"""
     shade: int = 90
     """Grey level, 0 black to 255 white."""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "centres", np.array(self.centres, dtype=np.float64))
-        object.__setattr__(self, "radii", np.array(self.radii, dtype=np.float64))
-        if self.centres.ndim != 2 or self.centres.shape[1] != 3:
-            raise ShapeError("ConvexBody.centres", "(n, 3)", self.centres.shape)
-        if self.radii.shape != self.centres.shape[:1]:
-            raise ShapeError("ConvexBody.radii", f"({len(self.centres)},)", self.radii.shape)
 
     @classmethod
     def capsule(cls, start: Array, end: Array, radius: float, shade: int = 90) -> ConvexBody:
@@ -125,7 +112,7 @@ class PlacedCard:
     def hidden_by(self, body: ConvexBody) -> bool:
         """True where the body lies on the camera's side of the card's plane.
 
-        Bodies do not cut through cards; of one that crosses the plane beside the card, the part next to
+        Bodies do not cut through cards; of one that crosses the plane away from the card, the part next to
         the card decides.
         """
         normal, origin = self.pose[:3, 2], self.pose[:3, 3]

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from ...description import HandDescription, ObjectDescription
-from ...exceptions import ParameterError, ShapeError
+from ...exceptions import ParameterError
 from ...kinematics import HandKinematics
 from ...sensing.vision.board import MarkerBoard
 from ...typing import Array, Float, Tensor
@@ -25,9 +25,6 @@ class GraspView:
         palm_board: on the base link, at its ``mount`` in the hand frame.
         object_board: on the object, at its ``mount`` in the object's frame.
         camera_pose: pose of the camera in the hand frame, ``(4, 4)``; see :meth:`facing`.
-
-    Raises:
-        ShapeError: ``camera_pose`` is not ``(4, 4)``.
     """
 
     def __init__(
@@ -39,9 +36,7 @@ class GraspView:
         camera_pose: Array,
     ) -> None:
         self.palm_board, self.object_board = palm_board, object_board
-        self.camera_pose = np.array(camera_pose, dtype=np.float64)
-        if self.camera_pose.shape != (4, 4):
-            raise ShapeError("camera_pose", "(4, 4)", self.camera_pose.shape)
+        self.camera_pose = camera_pose
         self._kinematics = HandKinematics(hand)
         self._links = [
             (self._kinematics.link_index(link.name), ConvexBody.of_shape(shape))

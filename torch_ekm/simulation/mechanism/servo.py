@@ -18,8 +18,7 @@ class Servo:
         m+ = m + e - sign(e) min(|e|, dead)     Coulomb dead zone: it stops short by the dead band
         x+ = clip(x, m+ - play, m+ + play)      backlash between the motor and its tendon
 
-    ``m`` is what the encoders read, ``x`` what pulls the tendon. A second kind of dead band, the
-    threshold, ignores a command smaller than it altogether.
+    ``m`` is what the encoders read, ``x`` what pulls the tendon.
 
     Args:
         lower, upper: range of each actuator ``(n_a,)`` [rad].
@@ -74,7 +73,6 @@ class Servo:
         setpoint = np.clip(origin + delta, self.lower, self.upper)
         error = setpoint + self.bias + fresh - self.encoder
         move = error - np.sign(error) * np.minimum(np.abs(error), self._p.dead_zone)
-        move = np.where(np.abs(setpoint - self.encoder) < self._p.threshold, 0.0, move)
         self.setpoint = setpoint
         return np.clip(self.encoder + move, self.lower, self.upper)
 

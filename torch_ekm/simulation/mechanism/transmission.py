@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ...description.hand import HandDescription
-from ...exceptions import ParameterError
 from ...typing import Array
 
 _COUPLING_STIFFNESS = 8.0  # k_c [N m/rad]
@@ -43,9 +42,6 @@ class Transmission:
 
     def __init__(self, hand: HandDescription, creep: float = 0.0) -> None:
         stiffness = np.array([actuator.stiffness for actuator in hand.actuators])
-        for name, value in (("stiffness", stiffness), ("spring_stiffness", hand.spring_stiffness)):
-            if not np.all(np.isfinite(value)) or np.any(value < 0):
-                raise ParameterError(name, value, "finite and not negative in every entry [N m/rad]")
         self.n_a, self.n_q = hand.n_a, hand.n_q
         self.J_a = hand.actuation_jacobian
         self.offset = hand.actuator_offset

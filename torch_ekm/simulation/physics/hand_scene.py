@@ -22,19 +22,12 @@ class HandScene:
     Args:
         hand: the hand; its URDF gives links, inertias and shapes. Hand frame = world frame.
         obj: the object, as it really is.
-        gravity: in the hand frame [m/s^2].
         time_step: [s].
     """
 
-    def __init__(
-        self,
-        hand: HandDescription,
-        obj: ObjectDescription,
-        gravity: tuple[float, float, float],
-        time_step: float,
-    ) -> None:
+    def __init__(self, hand: HandDescription, obj: ObjectDescription, time_step: float) -> None:
         self.time_step = time_step
-        self._scene: Any = new_scene(gravity, time_step)
+        self._scene: Any = new_scene(hand.gravity, time_step)
         self._system: Any = self._scene.physx_system
         self._material = sapien().physx.PhysxMaterial(obj.friction, obj.friction, 0.0)
         self._hand = build_hand(self._scene, hand, self._material)

@@ -20,8 +20,6 @@ from ..parameters import PlantParameters
 from ..sensors import TimedState
 from .hand_scene import HandScene
 
-Gravity = tuple[float, float, float]
-
 _FORCE_WINDOW = 10  # steps over which a fingertip force is averaged
 _STILL = 2e-3  # [rad/s] and [m/s x 10]: slower than this is settled
 _RAMP_TIME = 0.2  # in which a command is carried out [s]
@@ -38,7 +36,6 @@ class RigState(NamedTuple):
     transmission: Transmission
     servo: Servo
     parameters: PlantParameters
-    gravity: Gravity
     normal: Array
     fingers: int
     time: float
@@ -78,25 +75,23 @@ class Rig:
         """Normal force of each pad, mean of the last 10 steps [N]."""
         self.fingers = 0
         """How many fingers touched the object in these steps, with any of their links."""
-        self.gravity: Gravity = hand.gravity
         self._finger_of = {link: joints[-1] for link in hand.link_names if (joints := chain(hand, link))}
-        self._build(hand.gravity)
+        self._build()
 
-    def _build(self, gravity: Gravity) -> None:
+    def _build(self) -> None:
         p = self.parameters
-        self.gravity = gravity
-        self.scene = HandScene(self.hand, true_object(self.obj, p), gravity, self.config.time_step)
+        self.scene = HandScene(self.hand, true_object(self.obj, p), self.config.time_step)
         self.scene.set_link_weight(p.link_weight)
-        self._built = (gravity, p.object_scale)
+        self._built_scale = p.object_scale
         self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
 
-    def grasp(self, plan: PinchPlan, gravity: Gravity) -> None:
+    def grasp(self, plan: PinchPlan) -> None:
         """Close on the object held in its planned place, release it, let it settle.
 
         The scene is new each time, so that nothing of an earlier run is left in PhysX.
         """
         self.transmission = make_transmission(self.hand, self.parameters)
-        self._build(gravity)
+        self._build()
         scene, transmission, step = self.scene, self.transmission, self.config.time_step
         scene.q = plan.q
         scene.object_pose = (plan.position, plan.rotation)
@@ -188,7 +183,6 @@ class Rig:
             copy.deepcopy(self.transmission),
             copy.deepcopy(self.servo),
             self.parameters,
-            self.gravity,
             self.normal.copy(),
             self.fingers,
             self.time,
@@ -196,8 +190,8 @@ class Rig:
 
     def restore(self, state: RigState) -> None:
         """Go back to ``state``, taken with the parameters that hold now."""
-        if self._built != (state.gravity, state.parameters.object_scale):
-            self._build(state.gravity)
+        if self._built_scale != state.parameters.object_scale:
+            self._build()
         self.scene.restore(state.physics)
         self.transmission, self.servo = copy.deepcopy((state.transmission, state.servo))
         self.normal, self.fingers, self.time = state.normal.copy(), state.fingers, state.time
