@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 
 import torch
 
+from .._checks import check_count, check_positive
 from .._extras import require
-from ..residual.checks import check_count, check_positive
 from ..typing import Tensor
 from .gpytorch_learner import GPyTorchLearner
 

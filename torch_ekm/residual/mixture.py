@@ -10,10 +10,10 @@ import torch
 from torch import nn
 from torch.distributions import Distribution, Normal
 
+from .._checks import check_fraction
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import ResidualLearner
-from .checks import check_factor
 from .last_residual import LastResidual
 from .report import UpdateReport
 from .sparse_gp.sparse_online_gp import Prediction
@@ -88,7 +88,7 @@ class MixtureResidual(ResidualLearner):
             if not values or not all(low <= value <= high for value in values):
                 raise ParameterError(name, values, f"one or more numbers in [{low:g}, {high:g}]")
         self.learners = nn.ModuleList(members)
-        self.memory = check_factor("memory", memory)
+        self.memory = check_fraction("memory", memory)
         rises = [(rho, beta) for rho in levels for beta in trends if beta == 0 or beta < rho]
         experts = itertools.product(range(len(members)), shares, carries, rises, caps)
         flat = [(b, h, kappa, *rise, c) for b, h, kappa, rise, c in experts]

@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 
+from ..._checks import check_count
 from ...exceptions import ParameterError, ShapeError
 from ...typing import Float, Tensor
-from ..checks import check_count
 from .kernel import Kernel, log_parameter
 from .stationary import SquaredExponential
 

@@ -9,9 +9,9 @@ import torch
 from torch import nn
 from torch._C._functorch import is_functorch_wrapped_tensor
 
+from ..._checks import check_count, check_counts
 from ...exceptions import ParameterError
 from ...typing import Float, Tensor
-from ..checks import check_count, check_counts
 from .kernel import Kernel
 from .stationary import StationaryKernel, squared_distances
 

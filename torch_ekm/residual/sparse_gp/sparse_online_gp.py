@@ -9,10 +9,10 @@ import torch
 from torch import nn
 from torch.distributions import Normal
 
+from ..._checks import check_count, check_finite
 from ...exceptions import ParameterError, ShapeError
 from ...typing import Bool, Float, Tensor
 from ..base import DoubleStateLearner
-from ..checks import check_count, check_finite
 from ..kernels.kernel import Kernel, check_kernel, log_parameter
 from ..kernels.stationary import Matern32
 from ..report import UpdateReport
