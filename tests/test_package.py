@@ -102,9 +102,9 @@ def test_rooms_ask_for_their_extras_when_they_need_them(room: str) -> None:
 def test_adapters_name_the_extra_when_they_are_made() -> None:
     made = """
 from torch_ekm.exceptions import MissingExtraError
-from torch_ekm.interop import GPyTorchSVGP, GPyTorchWindow, RiverResidual
+from torch_ekm.interop import GPyTorchSVGP, RiverResidual
 
-for kind in (GPyTorchSVGP, GPyTorchWindow, RiverResidual):
+for kind in (GPyTorchSVGP, RiverResidual):
     try:
         kind(3, 2)
     except MissingExtraError as error:

@@ -14,7 +14,7 @@ from torch import nn
 from .exceptions import ParameterError, StateMismatchError
 
 #: options that decide nothing of what a state means
-_FREE = ("device", "on_invalid", "backend")
+_FREE = ("device", "on_invalid")
 
 
 class Recorded:
@@ -51,7 +51,7 @@ class Recorded:
 
 def describe(thing: Recorded) -> dict[str, Any]:
     """``{"class": name, "arguments": {name: value}}``, of what it holds now where it holds an argument."""
-    arguments = dict(vars(thing).get("_arguments", {}))
+    arguments = dict(getattr(thing, "_arguments", {}))
     for name in arguments:
         held = getattr(thing, name, None)
         if isinstance(held, Recorded):

@@ -41,7 +41,8 @@ from torch_ekm.residual import (
     Standardize,
     default_learner,
 )
-from torch_ekm.residual.sparse_gp import recursion
+from torch_ekm.residual.sparse_gp.engine import recursion
+from torch_ekm.residual.sparse_gp.engine.reference import ReferenceEngine
 
 D = 20
 SOURCE = Path(__file__).with_name("sogp_learners_reference.c")
@@ -59,9 +60,13 @@ def as_published(shape: tuple[int, ...] = ()) -> dict[str, Any]:
     return {"kernel": SquaredExponential(D, batch_shape=shape), "parts": (), "standardize": False}
 
 
-def filled(capacity: int, m: int, shape: tuple[int, ...] = (), **options) -> SparseOnlineGP:
+def filled(
+    capacity: int, m: int, shape: tuple[int, ...] = (), engine: str = "auto", **options
+) -> SparseOnlineGP:
     options = {**as_published(shape), **options}
     gp = SparseOnlineGP(D, m, capacity=capacity, batch_shape=shape, **options)
+    if engine == "torch":
+        gp.engine = ReferenceEngine()
     gp.update(*stream(capacity + 3, m, shape, seed=1))
     return gp
 
@@ -311,7 +316,8 @@ def all_of(gp: SparseOnlineGP, m: int, shape: tuple[int, ...], n: int) -> Callab
 
 FIRST_CALL = """import time, torch
 from torch_ekm.residual import SparseOnlineGP
-from torch_ekm.residual.sparse_gp import recursion
+from torch_ekm.residual.sparse_gp.engine import recursion
+from torch_ekm.residual.sparse_gp.engine.reference import ReferenceEngine
 gp, begin = SparseOnlineGP(20, 6), time.perf_counter()
 gp.update(torch.zeros(20).double(), torch.zeros(6).double())
 print(time.perf_counter() - begin)"""
@@ -324,12 +330,16 @@ def first_call(cache: Path) -> float:
     return float(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
 
 
-def against_c(b: int, m: int, backends: dict[str, dict]) -> list[tuple[str, float, float]]:
-    """(what, microseconds, times plain C), C and each backend in turns."""
+#: Compiled loops where they can, or torch alone.
+ENGINES = ("auto", "torch")
+
+
+def against_c(b: int, m: int) -> list[tuple[str, float, float]]:
+    """(what, microseconds, times plain C), C and each engine in turns."""
     reference = PlainC(b, m)
     rows = []
     for what, make in (("update", updates), ("predict", predictions)):
-        calls = {name: make(filled(b, m, **options), m) for name, options in backends.items()}
+        calls = {name: make(filled(b, m, engine=name), m) for name in ENGINES}
         rounds = []
         for _ in range(5):
             limit = reference.microseconds(what)
@@ -345,13 +355,12 @@ def against_c(b: int, m: int, backends: dict[str, dict]) -> list[tuple[str, floa
 
 def table() -> list[tuple[str, float, float]]:
     """(what, microseconds, ratio to the row named in it or nan)."""
-    backends: dict[str, dict] = {"auto": {"backend": "auto"}, "torch": {"backend": "torch"}}
     rows: list[tuple[str, float, float]] = []
     for b, m in ((30, 6), (100, 6), (300, 6), (100, 26)):
-        rows += against_c(b, m, backends)
+        rows += against_c(b, m)
     for b in (30, 100):
         shape = (256,)
-        fleets = {name: filled(b, 6, shape, backend=name) for name in ("auto", "torch")}
+        fleets = {name: filled(b, 6, shape, name) for name in ENGINES}
         calls: dict[str, Callable] = {}
         for name, gp in fleets.items():
             calls[f"update b={b}, 256 models, per model: {name}"] = updates(gp, 6, shape)
@@ -367,13 +376,13 @@ def table() -> list[tuple[str, float, float]]:
         ("calibrated, detects changes", [CalibrateNoise(), DetectChanges()]),
         ("learns its kernel", [LearnHyperparameters()]),
     ):
-        gps = {name: filled(100, 6, backend=name, parts=parts) for name in ("auto", "torch")}
-        calls = {backend: all_of(gp, 6, (), 64) for backend, gp in gps.items()}
+        gps = {name: filled(100, 6, engine=name, parts=parts) for name in ENGINES}
+        calls = {engine: all_of(gp, 6, (), 64) for engine, gp in gps.items()}
         for _ in range(17):  # units stand still after a thousand samples
             [call() for call in calls.values()]
         found = alternately(calls, rounds=3)
-        for backend, us in found.items():
-            rows.append((f"update b=100 m=6, {learned}, mean: {backend}", us / 64, math.nan))
+        for engine, us in found.items():
+            rows.append((f"update b=100 m=6, {learned}, mean: {engine}", us / 64, math.nan))
     for name, make in (("SparseOnlineGP(d, m)", SparseOnlineGP), ("default_learner(d, m)", default_learner)):
         learner, times = make(D, 6), []
         for x, y in zip(*stream(1500, 6, seed=1), strict=True):

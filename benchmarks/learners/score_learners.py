@@ -72,7 +72,6 @@ STREAMS: dict[str, Factory] = {
     "KRLS-T 100": chosen("KRLS-T", forgetting_factor=1.0),
     "local GPs, 40 x 100": chosen("local GPs"),
     "GPyTorch SVGP 100": chosen("GPyTorch SVGP", memory=1, minibatch=1),
-    "GPyTorch window 100": chosen("GPyTorch window"),
     "river, adaptive random forest": chosen("river forest"),
     "ensemble of four networks, all replayed": chosen("MLP ensemble", members=4, memory=10_000),
 }

@@ -151,14 +151,6 @@ def test_contract_of_gpytorch():
     )
 
 
-def test_contract_of_gpytorch_window():
-    pytest.importorskip("gpytorch")
-    from torch_ekm.interop import GPyTorchWindow
-
-    options = {"window": 10, "refit_every": 8, "steps": 2, "noise_variance": 0.05}
-    check_residual_learner(lambda **o: GPyTorchWindow(3, 2, **options, **o), vmap=False)
-
-
 def test_the_learner_of_the_docs_uses_public_names_only(monkeypatch, tmp_path):
     text = _page("write_a_learner")
     blocks = re.findall(r"^```\{code-block\} python\n:class: skip\n(.*?)^```", text, re.DOTALL | re.MULTILINE)

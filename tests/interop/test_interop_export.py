@@ -40,11 +40,10 @@ def wandering(d: int = 3, m: int = 2) -> SparseOnlineGP:
 
 LEARNERS = {
     "plain": lambda: SparseOnlineGP(3, 2, capacity=15),
-    "matern": lambda: SparseOnlineGP(
-        3, 2, capacity=12, kernel=Matern52(3) + Matern32(3), parts=[Standardize()]
-    ),
+    "matern32": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=Matern32(3), parts=[Standardize()]),
+    "matern52": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=Matern52(3)),
     "action-linear": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=ActionLinearKernel(3, 1)),
-    "product": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=SquaredExponential(3) * Matern32(3)),
+    "squared exponential": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=SquaredExponential(3)),
     "deep": deep,
     "default": lambda: default_learner(3, 2, capacity=12),
     "mixture": lambda: MixtureResidual([deep(), wandering()]),

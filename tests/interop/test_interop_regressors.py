@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_ekm import LearnHyperparameters, SparseOnlineGP, Standardize
+from torch_ekm import LearnHyperparameters, SparseOnlineGP, Standardize, interop
 from torch_ekm.exceptions import MissingExtraError, ParameterError, ShapeError
 from torch_ekm.interop import OnlineRegressor, as_capymoa, as_river, as_sklearn
 
@@ -149,13 +149,13 @@ def test_a_wrong_learner_is_named() -> None:
         regressor.interval(np.zeros((1, 3)), 95.0)
 
 
-@pytest.mark.parametrize(("module", "make"), [("river", as_river), ("sklearn", as_sklearn)])
-def test_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, module: str, make) -> None:
-    for name in [name for name in sys.modules if name.split(".")[0] == module or "interop." in name]:
-        monkeypatch.delitem(sys.modules, name)
+@pytest.mark.parametrize(("module", "name"), [("river", "as_river"), ("sklearn", "as_sklearn")])
+def test_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, module: str, name: str) -> None:
+    for known in [known for known in sys.modules if known.split(".")[0] == module or "interop." in known]:
+        monkeypatch.delitem(sys.modules, known)
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingExtraError, match="interop"):
-        make(small)
+        getattr(interop, name)
 
 
 def test_predictions_are_those_of_the_learner() -> None:

@@ -188,16 +188,6 @@ def test_no_action_is_not_novel():
     assert float(report.novelty[0]) == 0
 
 
-def test_a_basis_must_be_finite():
-    gp = sogp(3, 2, capacity=5)
-    x, y = stream(10)
-    gp.update(x, y)
-    before = gp(x)
-    with pytest.raises(NonFiniteError):
-        gp.set_basis(torch.full((3, 3), torch.nan))
-    assert torch.equal(gp(x), before)
-
-
 @pytest.mark.parametrize(
     ("kind", "options"),
     [

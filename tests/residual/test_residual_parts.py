@@ -27,6 +27,8 @@ from torch_ekm.residual import (
     SparseOnlineGP,
     Standardize,
 )
+from torch_ekm.residual.sparse_gp.engine.compiled import CompiledEngine
+from torch_ekm.residual.sparse_gp.engine.reference import ReferenceEngine
 
 PARTS = {
     "forgetting factor": [ForgettingFactor(0.9)],
@@ -347,9 +349,10 @@ class OneAtATime(Part):
         return False
 
 
-@pytest.mark.parametrize("backend", ["auto", "torch"])
-def test_updates_of_two_threads_come_one_after_the_other(backend):
-    gp = SparseOnlineGP(3, 2, capacity=8, parts=[OneAtATime()], backend=backend)
+@pytest.mark.parametrize("engine", [CompiledEngine, ReferenceEngine])
+def test_updates_of_two_threads_come_one_after_the_other(engine):
+    gp = SparseOnlineGP(3, 2, capacity=8, parts=[OneAtATime()])
+    gp.engine = engine()
     x = torch.randn(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def work():

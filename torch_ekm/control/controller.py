@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from .._checks import check_finite
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
 from ..exceptions import EKMError, GraspError, NoContactError, ShapeError, SolverError
 from ..kinematics import GraspState
 from ..model import ModelStatus
-from ..residual.checks import check_finite
 from ..typing import Float, Tensor
 from .decision import Decision, Expectation, StopReason
 from .focus import FocusedPose, PoseTarget

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from .._checks import check_positive
 from .._recorded import Recorded
 from ..exceptions import UnknownNameError
 from ..kinematics.grasp_state import GraspState
-from ..residual.checks import check_positive
 from ..typing import Float, Tensor
 
 if TYPE_CHECKING:

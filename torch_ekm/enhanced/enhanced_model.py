@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import nn
 
+from .._checks import check_finite
 from .._recorded import Recorded, check_state, describe
 from ..exceptions import ParameterError, ShapeError
 from ..kinematics import GraspState
 from ..residual.base import ResidualLearner, UpdateReport
-from ..residual.checks import check_finite
 from ..residual.kernels.action_linear import ActionLinearKernel
 from ..typing import Float, Tensor
 from .encoding import GraspEncoding

@@ -134,11 +134,10 @@ LEARNERS: dict[str, Factory] = {
     ),
     "SOGP mixture": _mixture,
     "river forest": _kind(interop.RiverResidual),
-    "GPyTorch window": _kind(interop.GPyTorchWindow, "window", noise_variance=NOISE_VARIANCE),
     "GPyTorch SVGP": _kind(interop.GPyTorchSVGP, "inducing", memory=500, minibatch=20),
 }
 #: Learners of other libraries: ten to a hundred times as slow, and in an extra of their own.
-PEERS = ("river forest", "GPyTorch window", "GPyTorch SVGP")
+PEERS = ("river forest", "GPyTorch SVGP")
 #: The default learner, and the sparse online GP in its forms.
 OURS = ("default", *(name for name in LEARNERS if name.startswith("SOGP")))
 #: What a comparison takes if nobody says otherwise: not those that want to know which inputs are an action.

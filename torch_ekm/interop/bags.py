@@ -37,9 +37,9 @@ class BagTable(NamedTuple):
 
 
 def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTable:
-    """Every moment with a message of ``clock`` gives a row; other topics stand as they were last heard.
+    """A recording as a table: a row for each message of ``clock``, with the last message of each other topic.
 
-    Nothing of the future enters a row. Rows before every topic was heard once are left out, and so are
+    Nothing of the future enters a row. Rows before every topic had its first message are left out, and so are
     texts, headers and fields of more than 64 numbers.
 
     Args:
@@ -87,19 +87,6 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
     first = complete[0][0]
     time = np.array([1e-9 * (stamp - first) for stamp, _ in complete])
     return BagTable(tuple(heard), time, np.array([[row[name] for name in heard] for _, row in complete]))
-
-
-def topics_of(path: str | Path) -> dict[str, tuple[str, int]]:
-    """Topic -> message type and number of messages.
-
-    Raises:
-        DescriptionError: there is no such recording, or it cannot be read.
-    """
-    try:
-        with AnyReader([Path(path)], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            return {one.topic: (one.msgtype, one.msgcount) for one in reader.connections}
-    except Exception as error:
-        raise DescriptionError(path, f"this recording cannot be read: {error}") from error
 
 
 def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:

@@ -16,9 +16,7 @@ from ..residual import (
     Kernel,
     Matern32,
     Matern52,
-    ProductKernel,
     SquaredExponential,
-    SumKernel,
 )
 from ..typing import Array, Tensor
 
@@ -74,11 +72,6 @@ _Function = Callable[["ca.SX"], "ca.SX"]
 
 
 def _expressions(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> tuple[_Function, _Function]:
-    if isinstance(kernel, SumKernel | ProductKernel):
-        (k1, d1), (k2, d2) = (_expressions(one, basis, inputs) for one in (kernel.first, kernel.second))
-        if isinstance(kernel, SumKernel):
-            return lambda z: k1(z) + k2(z), lambda z: d1(z) + d2(z)
-        return lambda z: k1(z) * k2(z), lambda z: d1(z) * d2(z)
     if isinstance(kernel, ActionLinearKernel):
         return _action_linear(kernel, basis, inputs)
     if isinstance(kernel, DeepKernel):
@@ -93,7 +86,7 @@ def _expressions(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) ->
         def embed(z: ca.SX, /) -> ca.SX:
             return z * w
     else:
-        valid = "squared exponential, Matern, action-linear, deep, or sums and products of these"
+        valid = "squared exponential, Matern, action-linear or deep"
         raise ParameterError("kernel", type(kernel).__name__, valid)
     v = inputs.take("variance", lambda: base.log_variance.exp())
 

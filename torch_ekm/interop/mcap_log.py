@@ -30,17 +30,8 @@ _JOINTS = ("q", "a", "commands")  # as JointState, which viewers know
 _KINDS = {"f8": "Float64", "f4": "Float32", "i8": "Int64", "u1": "UInt8"}
 
 
-def trajectory_to_mcap(trajectory: Trajectory, folder: str | Path) -> Path:
-    """Write a trial as a rosbag2 folder with one MCAP file; returns the folder, which must be new.
-
-    A topic for each array, a message for each observation at its time: ``/q``, ``/a`` and ``/commands``
-    (increments [rad], at the time of the observation before them) as JointState, ``/object_pose`` as
-    PoseStamped in the frame ``hand``, all others as they are, as multi-arrays; ``/about`` says the rest.
-
-    Raises:
-        ParameterError: the folder exists, or an array of the trial changes its shape.
-        MissingExtraError: ``rosbags`` is not installed.
-    """
+def _write_trial(trajectory: Trajectory, folder: str | Path) -> Path:
+    """Write a trial as a rosbag2 folder with one MCAP file; returns the folder, which must be new."""
     folder = Path(folder)
     if folder.exists():
         raise ParameterError("folder", str(folder), "a folder that does not exist yet")
@@ -72,13 +63,8 @@ def trajectory_to_mcap(trajectory: Trajectory, folder: str | Path) -> Path:
     return folder
 
 
-def trajectory_from_mcap(folder: str | Path) -> Trajectory:
-    """Read what :func:`trajectory_to_mcap` wrote, figure by figure.
-
-    Raises:
-        DescriptionError: no such recording, or not one of torch_ekm.
-        MissingExtraError: ``rosbags`` is not installed.
-    """
+def _read_trial(folder: str | Path) -> Trajectory:
+    """Read what :func:`_write_trial` wrote, figure by figure, or raise DescriptionError."""
     folder = Path(folder)
     if not folder.exists():
         raise DescriptionError(folder, "there is no such recording")
@@ -104,19 +90,22 @@ def trajectory_from_mcap(folder: str | Path) -> Trajectory:
 
 
 def log_to_mcap(log: TrialLog, folder: str | Path) -> list[Path]:
-    """Write every trial of a log as a recording of its own, ``trial_000000`` and so on.
+    """Every trial of a log as a rosbag2 recording in MCAP, one folder each; returns the folders.
+
+    A topic for each array, a message for each observation at its time: ``/q``, ``/a`` and ``/commands``
+    (increments [rad], at the time of the observation before them) as JointState, ``/object_pose`` as
+    PoseStamped in the frame ``hand``, all others as multi-arrays; ``/about`` says the rest.
 
     Raises:
-        ParameterError: one of them exists already.
-        MissingExtraError: ``rosbags`` is not installed.
+        ParameterError: one of the recordings exists already.
     """
     folder = Path(folder)
     make_folder(folder)
-    return [trajectory_to_mcap(log.read(trial), folder / f"trial_{trial:06d}") for trial in log.trials]
+    return [_write_trial(log.read(trial), folder / f"trial_{trial:06d}") for trial in log.trials]
 
 
 def log_from_mcap(folder: str | Path, target: str | Path) -> TrialLog:
-    """The log again, from the recordings in ``folder``: the same figures, in the same HDF5 files.
+    """The log again, in ``target``, from the recordings in ``folder``: the same figures.
 
     Raises:
         DescriptionError: there is no recording, or one cannot be read.
@@ -134,7 +123,7 @@ def log_from_mcap(folder: str | Path, target: str | Path) -> TrialLog:
             path = target / f"{recording.stem}.h5"
             if path.exists():
                 raise ParameterError("target", str(path), "a log without this trial")
-            trajectory = trajectory_from_mcap(recording)
+            trajectory = _read_trial(recording)
             trajectory.save(path)
     with TrialLog(target, trajectory.about.get("configuration", {})) as log:  # makes the index
         return log

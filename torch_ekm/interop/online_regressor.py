@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
 from torch.distributions import Normal
 
 from ..exceptions import ParameterError
-from ..residual import ResidualLearner
+from ..residual import ResidualLearner, default_learner
 from ..typing import Array
-from ._default import default_learner
 
 #: A learner, ``factory(in_features, out_features)``, or None for the package's default.
 LearnerLike = ResidualLearner | Callable[[int, int], ResidualLearner] | None
@@ -73,7 +73,8 @@ def make_learner(learner: LearnerLike, in_features: int, out_features: int) -> R
     if isinstance(learner, ResidualLearner):
         made = copy.deepcopy(learner)
     else:
-        made = (learner or default_learner)(in_features, out_features)
+        own = partial(default_learner, output_offset="learned")  # targets are nobody's residual
+        made = (learner or own)(in_features, out_features)
     sizes = made.in_features, made.out_features, tuple(made.batch_shape)
     if sizes != (in_features, out_features, ()):
         valid = f"one model of {in_features} inputs and {out_features} outputs"

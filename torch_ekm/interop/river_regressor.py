@@ -19,6 +19,18 @@ else:
     base = require("river.base", "interop")
 
 
+def as_river(learner: LearnerLike = None, targets: int = 1) -> RiverRegressor | RiverMultiTargetRegressor:
+    """``y = c + g(x)`` as a regressor of river; a multi-target one if there is more than one output.
+
+    Args:
+        learner: untrained; or ``factory(in_features, out_features)``; None: the default.
+        targets: how many outputs, where a factory has to know.
+    """
+    if isinstance(learner, ResidualLearner):
+        targets = learner.out_features
+    return RiverRegressor(learner) if targets == 1 else RiverMultiTargetRegressor(learner)
+
+
 class _Columns:
     """Features by name as rows of a fixed width; names get columns in the order in which they come.
 

@@ -8,10 +8,10 @@ import torch
 from torch import nn
 from torch.distributions import Normal
 
+from .._checks import check_positive
 from .._extras import require
 from ..exceptions import NoStateError
 from ..residual.base import SingleLearner
-from ..residual.checks import check_positive
 from ..residual.report import UpdateReport
 from ..typing import Tensor
 

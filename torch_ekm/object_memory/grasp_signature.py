@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import torch
 
+from .._checks import check_finite, check_positive
 from ..description import HandDescription
 from ..exceptions import ParameterError, ShapeError, UnknownNameError
 from ..kinematics import HandKinematics
 from ..kinematics.null_space import null_space
-from ..residual.checks import check_finite, check_positive
 from ..typing import Float, Tensor
 
 

@@ -11,10 +11,10 @@ import torch
 from torch import nn
 from torch.distributions import Normal, StudentT
 
+from .._checks import check_count, check_finite, check_fraction, check_positive
 from ..exceptions import ParameterError, ShapeError
 from ..residual import ResidualLearner, SparseOnlineGP, UpdateReport
 from ..residual.base import SingleLearner
-from ..residual.checks import check_count, check_factor, check_finite, check_positive
 from ..typing import Float, Tensor
 from .episode_memory import EpisodeMemory
 from .signature_model import SignatureModel
@@ -105,7 +105,7 @@ class ModelBank(SingleLearner):
         if not common_weights or not all(0 <= weight <= 1 for weight in common_weights):
             raise ParameterError("common_weights", common_weights, "one or more shares in [0, 1]")
         self.new_prior = check_positive("new_prior", new_prior)
-        self.temperature = check_factor("temperature", temperature)
+        self.temperature = check_fraction("temperature", temperature)
         self.common_weights, self.common = tuple(common_weights), first
         self.kept: Any = nn.ModuleList(copy.deepcopy(first) for _ in range(models))
         hypotheses = models + len(self.common_weights)  # the last ones: "new"

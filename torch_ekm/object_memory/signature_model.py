@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from ..residual.checks import check_positive
+from .._checks import check_positive
 from ..typing import Float, Int, Tensor
 
 _MOST_MOVES = 64

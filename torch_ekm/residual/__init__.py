@@ -11,9 +11,9 @@ from .baselines.window_gp import WindowGP
 from .baselines.zero import ZeroResidual
 from .default import default_learner
 from .fleet import LearnerFleet
-from .kernels.action_linear import ActionLinearKernel, action_covariance, action_jacobian
+from .kernels.action_linear import ActionLinearKernel, action_covariance
 from .kernels.deep import DeepKernel
-from .kernels.kernel import Kernel, ProductKernel, SumKernel
+from .kernels.kernel import Kernel
 from .kernels.stationary import Matern32, Matern52, SquaredExponential
 from .last_residual import LastResidual
 from .mixture import MixtureResidual
@@ -23,7 +23,7 @@ from .sparse_gp.forgetting import ForgettingFactor, ProcessNoise
 from .sparse_gp.hyperparameters import LearnHyperparameters
 from .sparse_gp.monitor import CalibrateNoise, DetectChanges, RobustWeight
 from .sparse_gp.part import Part
-from .sparse_gp.sparse_online_gp import Prediction, SparseOnlineGP
+from .sparse_gp.sparse_online_gp import SparseOnlineGP
 from .sparse_gp.units import Standardize
 
 __all__ = [
@@ -43,9 +43,7 @@ __all__ = [
     "Matern52",
     "MixtureResidual",
     "Part",
-    "Prediction",
     "ProcessNoise",
-    "ProductKernel",
     "RandomFeatureRLS",
     "RecursiveLeastSquares",
     "ReplayMLP",
@@ -54,12 +52,10 @@ __all__ = [
     "SparseOnlineGP",
     "SquaredExponential",
     "Standardize",
-    "SumKernel",
     "UpdateEvent",
     "UpdateReport",
     "WindowGP",
     "ZeroResidual",
     "action_covariance",
-    "action_jacobian",
     "default_learner",
 ]

@@ -11,10 +11,10 @@ import torch
 from torch import nn
 from torch.distributions import Distribution, Normal
 
+from .._checks import check_count, check_counts, check_finite
 from .._recorded import Recorded, check_state, describe
 from ..exceptions import ParameterError, ShapeError
 from ..typing import Bool, Float, Tensor
-from .checks import check_count, check_counts, check_finite
 from .lock import UpdateLock
 from .report import UpdateReport
 

@@ -14,6 +14,7 @@ from .sparse_gp.forgetting import ForgettingFactor, ProcessNoise
 from .sparse_gp.hyperparameters import LearnHyperparameters
 from .sparse_gp.monitor import DetectChanges, RobustWeight
 from .sparse_gp.sparse_online_gp import SparseOnlineGP
+from .sparse_gp.units import Standardize
 
 
 def default_learner(
@@ -40,7 +41,8 @@ def default_learner(
         ParameterError: a figure is outside its range.
     """
     d, m = in_features, out_features
-    common: dict[str, Any] = {"capacity": capacity, "output_offset": output_offset, **options}
+    units = Standardize(output_offset=output_offset)
+    common: dict[str, Any] = {"capacity": capacity, "standardize": units, **options}
     fleet = fleet_options(options)
     wanders = [RobustWeight(3.0), ProcessNoise(0.003), LearnHyperparameters()]
     forgets = [RobustWeight(3.0), DetectChanges(), ForgettingFactor(0.99), LearnHyperparameters()]

@@ -11,8 +11,7 @@ from torch.distributions import Normal
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import ResidualLearner
-from .report import UpdateReport
-from .sparse_gp.sparse_online_gp import Prediction
+from .report import MomentsWithJacobians, UpdateReport
 
 
 class LastResidual(ResidualLearner):
@@ -50,7 +49,7 @@ class LastResidual(ResidualLearner):
         mean, slope = self.learner.linearize(self._with_last(self.check_query(x)))
         return mean, slope[..., : self.in_features]
 
-    def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> Prediction:
+    def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> MomentsWithJacobians:
         """f's mean and variance, and their derivatives by x.
 
         Raises:
@@ -60,8 +59,10 @@ class LastResidual(ResidualLearner):
             valid = "one with predict_with_jacobians, such as SparseOnlineGP"
             raise ParameterError("learner", type(self.learner).__name__, valid)
         n, f = self.in_features, cast("Any", self.learner)
-        p: Prediction = f.predict_with_jacobians(self._with_last(self.check_query(x)))
-        return Prediction(p.mean, p.variance, p.mean_jacobian[..., :n], p.variance_jacobian[..., :n])
+        p: MomentsWithJacobians = f.predict_with_jacobians(self._with_last(self.check_query(x)))
+        return p._replace(
+            mean_jacobian=p.mean_jacobian[..., :n], variance_jacobian=p.variance_jacobian[..., :n]
+        )
 
     def reset(self) -> None:
         """f back to its prior, no last sample."""

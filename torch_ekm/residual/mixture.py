@@ -10,13 +10,12 @@ import torch
 from torch import nn
 from torch.distributions import Distribution, Normal
 
+from .._checks import check_fraction
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import ResidualLearner
-from .checks import check_factor
 from .last_residual import LastResidual
-from .report import UpdateReport
-from .sparse_gp.sparse_online_gp import Prediction
+from .report import MomentsWithJacobians, UpdateReport
 from .tails import ScaleMixture
 
 _PRIOR = 0.8  # belief that a learner is to be taken at its word
@@ -88,7 +87,7 @@ class MixtureResidual(ResidualLearner):
             if not values or not all(low <= value <= high for value in values):
                 raise ParameterError(name, values, f"one or more numbers in [{low:g}, {high:g}]")
         self.learners = nn.ModuleList(members)
-        self.memory = check_factor("memory", memory)
+        self.memory = check_fraction("memory", memory)
         rises = [(rho, beta) for rho in levels for beta in trends if beta == 0 or beta < rho]
         experts = itertools.product(range(len(members)), shares, carries, rises, caps)
         flat = [(b, h, kappa, *rise, c) for b, h, kappa, rise, c in experts]
@@ -151,7 +150,7 @@ class MixtureResidual(ResidualLearner):
         slopes = torch.stack([slope for _, slope in pairs], dim=-1).to(x.dtype)
         return (self.gain * means).sum(-1) + self.offset, (self.gain.unsqueeze(-2) * slopes).sum(-1)
 
-    def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> Prediction:
+    def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> MomentsWithJacobians:
         """Mean, variance (as :meth:`predict`) and both derivatives, from those of the learners::
 
             d var/dx = sum_e p_e (h_e^2 dv_e/dx + 2 h_e (mean_e - mean) dm_e/dx)
@@ -176,7 +175,7 @@ class MixtureResidual(ResidualLearner):
         share = self.weights
         most = inflation * (share * torch.stack(noisy, dim=-1).to(x.dtype)).sum(-1)
         steepest = inflation.unsqueeze(-1) * (share.unsqueeze(-2) * dv).sum(-1)
-        return Prediction(
+        return MomentsWithJacobians(
             mean,
             torch.minimum(variance, most),
             (self.gain.unsqueeze(-2) * dm).sum(-1),

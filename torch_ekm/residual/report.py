@@ -1,9 +1,10 @@
-"""What an update did with a sample."""
+"""What an update did with a sample, and what a query with derivatives gives."""
 
 from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 
@@ -66,3 +67,12 @@ class UpdateReport:
         """No model had a sample."""
         zero = torch.zeros_like(like, dtype=dtype)
         return UpdateReport(torch.zeros_like(like, dtype=torch.int64), zero, zero, zero)
+
+
+class MomentsWithJacobians(NamedTuple):
+    """Mean and latent variance of g, and their derivatives with respect to x."""
+
+    mean: Float[Tensor, "*any out"]
+    variance: Float[Tensor, "*any out"]
+    mean_jacobian: Float[Tensor, "*any out in"]
+    variance_jacobian: Float[Tensor, "*any out in"]

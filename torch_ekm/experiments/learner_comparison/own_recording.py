@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ... import interop
 from ...exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
-from ...interop import read_bag
 from ...typing import Array, Float, Tensor
 from .stream import LEAST, Stream
 from .table_file import open_table
@@ -100,7 +100,7 @@ def load_own(
     elif clock is None:
         raise ParameterError("clock", clock, "a topic, such as that of the commands, for a recording of ROS")
     else:
-        names, _, values = read_bag(path, clock)
+        names, _, values = interop.read_bag(path, clock)
 
         def read(wanted: Sequence[str], /) -> Array:
             return values[:, [names.index(name) for name in wanted]]

@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import nn
 
+from ..._checks import check_count, check_fraction, check_positive
 from ...typing import Tensor
 from ..base import DoubleStateLearner, SingleLearner
-from ..checks import check_count, check_factor, check_positive
 from ..kernels.kernel import Kernel
 from ..kernels.stationary import Matern32
 from ..report import UpdateEvent, UpdateReport
@@ -49,7 +49,7 @@ class KRLSTracker(ScaledLearner, SingleLearner, DoubleStateLearner):
         super().__init__(in_features, out_features, **options)
         self.capacity = check_count("capacity", capacity)
         self.noise_variance = check_positive("noise_variance", noise_variance)
-        self.forgetting_factor = check_factor("forgetting_factor", forgetting_factor)
+        self.forgetting_factor = check_fraction("forgetting_factor", forgetting_factor)
         self.jitter = check_positive("jitter", jitter)
         factory = {"dtype": torch.float64, "device": self.device}
         self.kernel = Matern32(in_features, **factory) if kernel is None else kernel.double()

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import nn
 
+from ..._checks import check_count, check_fraction, check_positive
 from ...typing import Float, Tensor
-from ..checks import check_count, check_factor, check_positive
 from ..kernels.kernel import log_parameter
 from ..report import UpdateReport
 from ..running_scale import BLOCK
@@ -51,7 +51,7 @@ class LinearInFeatures(ScaledLearner):
         super().__init__(in_features, out_features, **options)
         self.noise_variance = check_positive("noise_variance", noise_variance)
         self.weight_variance = check_positive("weight_variance", weight_variance)
-        self.forgetting_factor = check_factor("forgetting_factor", forgetting_factor)
+        self.forgetting_factor = check_fraction("forgetting_factor", forgetting_factor)
         self.robust = None if robust is None else check_positive("robust", robust)
         self.refresh_every = check_count("refresh_every", refresh_every)
         f, zeros = n_phi, self._like.new_zeros

@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import nn
 
+from ..._checks import check_count, check_positive
 from ...exceptions import ParameterError
 from ...typing import Tensor
 from ..base import SingleLearner
-from ..checks import check_count, check_positive
 from ..kernels.kernel import Kernel
 from ..kernels.stationary import Matern32
 from ..report import UpdateEvent, UpdateReport

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from torch import nn
 
+from ..._checks import check_count, check_counts, check_positive
 from ...typing import Tensor
 from ..adam import Adam
 from ..base import SingleLearner
-from ..checks import check_count, check_counts, check_positive
 from ..report import UpdateReport
 from .scaled import ScaledLearner
 

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import nn
 
+from ..._checks import check_count, check_positive
 from ...typing import Tensor
-from ..checks import check_count, check_positive
 from ..kernels.kernel import Kernel
 from ..kernels.stationary import Matern32
 from ..report import UpdateReport

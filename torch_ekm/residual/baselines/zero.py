@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch.distributions import Normal
 
+from ..._checks import check_positive
 from ...typing import Tensor
 from ..base import ResidualLearner
-from ..checks import check_positive
 from ..report import UpdateReport
 
 

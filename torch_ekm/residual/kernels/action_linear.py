@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 
+from ..._checks import check_count
 from ...exceptions import ParameterError, ShapeError
 from ...typing import Float, Tensor
-from ..checks import check_count
 from .kernel import Kernel, log_parameter
 from .stationary import SquaredExponential
 
@@ -99,16 +99,11 @@ class ActionLinearKernel(Kernel):
         state = self.state_kernel.shift_invariant(self.state_features)
         return state + [False] * self.action_features
 
-    def action_features_of(
-        self, s: Float[Tensor, "*batch n_s"], z: Float[Tensor, "*batch m d"]
-    ) -> Float[Tensor, "*batch m n_a"]:
-        """B(s) with ``k((s, a), z_j) = B_j(s) a``: rows ``k_s(s, s_j) (Lambda a_j)'``."""
-        sz, az = self.split(z)
-        return self.state_kernel.vector(s, sz).unsqueeze(-1) * (az * self.action_variance.unsqueeze(-2))
 
+def action_covariance(learner: Any, s: Float[Tensor, "*any n_s"]) -> Float[Tensor, "*any out n_a n_a"]:
+    """V(s) with ``var(s, a)_j = a' V_j(s) a`` exactly::
 
-def action_jacobian(learner: Any, s: Float[Tensor, "*any n_s"]) -> Float[Tensor, "*any out n_a"]:
-    """G(s) with ``mean(s, a) = G(s) a`` exactly: ``G = sum_i alpha_i k_s(s, s_i) (Lambda a_i)'``.
+        V = k_s(s, s) Lambda + B'CB,   B_i = k_s(s, s_i) Lambda a_i
 
     Args:
         learner: a SparseOnlineGP with an ActionLinearKernel.
@@ -117,23 +112,6 @@ def action_jacobian(learner: Any, s: Float[Tensor, "*any n_s"]) -> Float[Tensor,
         ParameterError: it has another kernel.
         ShapeError: the state has another width.
     """
-    _, _, B = _action_features(learner, s)
-    return learner.units.slope(learner.posterior.alpha.mT @ B, 1).to(learner.dtype)
-
-
-def action_covariance(learner: Any, s: Float[Tensor, "*any n_s"]) -> Float[Tensor, "*any out n_a n_a"]:
-    """V(s) with ``var(s, a)_j = a' V_j(s) a`` exactly: ``V = k_s(s,s) Lambda + B'CB``, B as in G.
-
-    Arguments and errors as of :func:`action_jacobian`.
-    """
-    kernel, z, B = _action_features(learner, s)
-    prior = torch.diag_embed(kernel.state_kernel.diagonal(z).unsqueeze(-1) * kernel.action_variance)
-    V = prior + B.mT @ (learner.posterior.covariance @ B)
-    V = learner.units.curvature(V.unsqueeze(-3))
-    return V.expand(*V.shape[:-3], learner.out_features, *V.shape[-2:]).to(learner.dtype)
-
-
-def _action_features(learner: Any, s: Tensor) -> tuple[ActionLinearKernel, Tensor, Tensor]:
     kernel = getattr(learner, "kernel", None)
     if not isinstance(kernel, ActionLinearKernel) or not hasattr(learner, "posterior"):
         valid = "a SparseOnlineGP with an ActionLinearKernel"
@@ -143,4 +121,9 @@ def _action_features(learner: Any, s: Tensor) -> tuple[ActionLinearKernel, Tenso
     if s.shape[-1:] != (kernel.state_features,):
         raise ShapeError("s", f"(*any, {kernel.state_features})", s.shape)
     z = learner.units.inputs(s)
-    return kernel, z, kernel.action_features_of(z, posterior.basis)
+    sz, az = kernel.split(posterior.basis)
+    B = kernel.state_kernel.vector(z, sz).unsqueeze(-1) * (az * kernel.action_variance.unsqueeze(-2))
+    prior = torch.diag_embed(kernel.state_kernel.diagonal(z).unsqueeze(-1) * kernel.action_variance)
+    V = prior + B.mT @ (posterior.covariance @ B)
+    V = learner.units.curvature(V.unsqueeze(-3))
+    return V.expand(*V.shape[:-3], learner.out_features, *V.shape[-2:]).to(learner.dtype)

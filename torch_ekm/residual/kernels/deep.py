@@ -7,11 +7,10 @@ from collections.abc import Sequence
 
 import torch
 from torch import nn
-from torch._C._functorch import is_functorch_wrapped_tensor
 
+from ..._checks import check_count, check_counts
 from ...exceptions import ParameterError
 from ...typing import Float, Tensor
-from ..checks import check_count, check_counts
 from .kernel import Kernel
 from .stationary import StationaryKernel, squared_distances
 
@@ -88,14 +87,14 @@ class DeepKernel(Kernel):
 
     def _net_of_set(self, z: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n features"]:
         """:meth:`net`, remembered: between two samples each query asks for the same basis."""
+        tensors = (z, *self.weights, *self.biases)
         plain = not torch.compiler.is_compiling() and type(z) is Tensor and not z.is_inference()
-        if not plain or z.requires_grad or is_functorch_wrapped_tensor(z):
+        if not plain or any(t.requires_grad for t in tensors):
             return self.net(z)
-        layers = (*self.weights, *self.biases)
-        if any(layer.requires_grad or is_functorch_wrapped_tensor(layer) for layer in layers):
+        try:
+            marks = [(t._version, t.data_ptr()) for t in tensors]
+        except RuntimeError:  # within vmap, grad and jvp of torch.func a tensor has no memory of its own
             return self.net(z)
-        tensors = (z, *layers)
-        marks = [(t._version, t.data_ptr()) for t in tensors]
         kept = self._remembered
         if kept is None or kept[1] != marks or any(a is not b for a, b in zip(kept[0], tensors, strict=True)):
             self._remembered = kept = tensors, marks, self.net(z)

@@ -52,59 +52,6 @@ class Kernel(Recorded, nn.Module, ABC):
         """Columns of x whose origin does not matter; a normaliser may centre these and no others."""
         return [False] * in_features
 
-    def __add__(self, other: Kernel) -> SumKernel:
-        return SumKernel(self, other)
-
-    def __mul__(self, other: Kernel) -> ProductKernel:
-        return ProductKernel(self, other)
-
-
-class _Pair(Kernel):
-    """A kernel of two: shift invariant where both are."""
-
-    def __init__(self, first: Kernel, second: Kernel) -> None:
-        super().__init__()
-        self.first, self.second = first, second
-
-    def shift_invariant(self, in_features: int) -> list[bool]:
-        both = self.first.shift_invariant(in_features), self.second.shift_invariant(in_features)
-        return [a and b for a, b in zip(*both, strict=True)]
-
-
-class SumKernel(_Pair):
-    """``k = k_1 + k_2``."""
-
-    def forward(self, x: Tensor, z: Tensor) -> Tensor:
-        return self.first(x, z) + self.second(x, z)
-
-    def diagonal(self, x: Tensor) -> Tensor:
-        return self.first.diagonal(x) + self.second.diagonal(x)
-
-    def with_gradient(self, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        (k1, g1), (k2, g2) = self.first.with_gradient(x, z), self.second.with_gradient(x, z)
-        return k1 + k2, g1 + g2
-
-    def diagonal_gradient(self, x: Tensor) -> Tensor:
-        return self.first.diagonal_gradient(x) + self.second.diagonal_gradient(x)
-
-
-class ProductKernel(_Pair):
-    """``k = k_1 k_2``."""
-
-    def forward(self, x: Tensor, z: Tensor) -> Tensor:
-        return self.first(x, z) * self.second(x, z)
-
-    def diagonal(self, x: Tensor) -> Tensor:
-        return self.first.diagonal(x) * self.second.diagonal(x)
-
-    def with_gradient(self, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        (k1, g1), (k2, g2) = self.first.with_gradient(x, z), self.second.with_gradient(x, z)
-        return k1 * k2, g1 * k2.unsqueeze(-1) + g2 * k1.unsqueeze(-1)
-
-    def diagonal_gradient(self, x: Tensor) -> Tensor:
-        k1, k2 = self.first.diagonal(x).unsqueeze(-1), self.second.diagonal(x).unsqueeze(-1)
-        return self.first.diagonal_gradient(x) * k2 + self.second.diagonal_gradient(x) * k1
-
 
 def log_parameter(
     name: str, value: float | Sequence[float] | Tensor, shape: tuple[int, ...], **factory

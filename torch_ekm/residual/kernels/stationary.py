@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 import torch
 
+from ..._checks import check_count
 from ...typing import Float, Tensor
-from ..checks import check_count
 from .kernel import Kernel, log_parameter
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal
+from typing import Any
 
 from torch import nn
 
@@ -24,15 +24,13 @@ def fleet_options(options: Mapping[str, Any]) -> dict[str, Any]:
     return {name: options[name] for name in ("batch_shape", "device") if name in options}
 
 
-def chosen_parts(
-    parts: Iterable[nn.Module] | None, standardize: bool, output_offset: Literal["zero", "learned"]
-) -> list[Part]:
-    """Copies of ``parts``, or the default ones, with units in front where they have none.
+def chosen_parts(parts: Iterable[nn.Module] | None, standardize: bool | Standardize) -> list[Part]:
+    """Copies of ``parts``, or the default ones, with units in front where they have none and shall have some.
 
     Raises:
         ParameterError: parts do not go together.
     """
     own = default_parts() if parts is None else copy_parts(parts)
     if standardize and not any(isinstance(part, Units) for part in own):
-        own.insert(0, Standardize(output_offset=output_offset))
+        own[:0] = copy_parts([standardize if isinstance(standardize, Standardize) else Standardize()])
     return own

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from ..._checks import check_fraction
 from ...exceptions import ParameterError
-from ..checks import check_factor
 from .part import Host, Part
 
 
@@ -23,7 +23,7 @@ class ForgettingFactor(Part):
 
     def __init__(self, factor: float) -> None:
         super().__init__()
-        self.factor = check_factor("factor", factor)
+        self.factor = check_fraction("factor", factor)
 
     def on_rebuild(self, learner: Host) -> None:
         """Fade by the samples since the last rebuild."""

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import nn
 
+from ..._checks import check_count, check_positive
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..adam import Adam
-from ..checks import check_count, check_positive
 from ..kernels.kernel import is_shared
 from .forgetting import ForgettingFactor, ProcessNoise
 from .monitor import DetectChanges, RobustWeight

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import nn
 
+from ..._checks import check_positive
 from ...typing import Bool, Float, Tensor
-from ..checks import check_positive
 from .part import Host, Part, Sample
 
 _Z90_SQUARED = 1.6448536269514722**2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import ClassVar, NamedTuple, Protocol, TypeVar
 
 import torch
@@ -75,6 +75,7 @@ class Host(Protocol):
 
     in_features: int
     out_features: int
+    batch_shape: torch.Size
     kernel: Kernel
     log_noise_variance: nn.Parameter
     posterior: SparsePosterior
@@ -84,6 +85,21 @@ class Host(Protocol):
     """Samples before the present one."""
     pending: Tensor
     """Samples of each model since the caches were made, ``(*batch_shape)``."""
+    weighing: tuple[Part, ...]
+    """Parts that weigh samples."""
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of x and y."""
+        ...
+
+    def modules(self) -> Iterator[nn.Module]:
+        """It and all in it."""
+        ...
+
+    def check_query(self, x: Tensor) -> Tensor:
+        """x in the learner's dtype, with all the fleet's axes, or ShapeError."""
+        ...
 
     def shared_noise(self) -> Tensor:
         """Noise variance by which the gain is computed, ``(*batch_shape)``."""

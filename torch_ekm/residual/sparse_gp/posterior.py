@@ -18,8 +18,7 @@ class SparsePosterior(nn.Module):
 
     Master copy is (basis, Omega, h): Omega is a sum of squares, so it stays positive, and it holds
     neither kernel nor noise. alpha, C, Q are caches with ``mean = alpha'k``, ``var = k** + k'Ck``,
-    ``Q = K^-1``: :func:`~torch_ekm.residual.sparse_gp.recursion.absorb` carries them along by rank-one steps,
-    :meth:`rebuild` makes them again.
+    ``Q = K^-1``: an engine carries them along by rank-one steps, :meth:`rebuild` makes them again.
     Always float64, see :class:`~torch_ekm.residual.SparseOnlineGP`. Arguments as there.
     """
 
@@ -31,7 +30,6 @@ class SparsePosterior(nn.Module):
         *,
         novelty_threshold: float,
         jitter: float,
-        pruning: str,
         batch_shape: tuple[int, ...] = (),
         device: torch.device | str | None = None,
     ) -> None:
@@ -39,11 +37,8 @@ class SparsePosterior(nn.Module):
         for name, value in (("novelty_threshold", novelty_threshold), ("jitter", jitter)):
             if not 0 <= value < 1:
                 raise ParameterError(name, value, "in [0, 1)")
-        if pruning not in ("kl", "freeze"):
-            raise ParameterError("pruning", pruning, "'kl' or 'freeze'")
         self.capacity, self.batch_shape, self.out_features = capacity, batch_shape, out_features
         self.novelty_threshold, self.jitter = novelty_threshold, jitter
-        self.pruning = pruning
         factory = {"dtype": torch.float64, "device": device}
         # One slot more than the capacity: a new point moves in before another is pruned. What a
         # free slot holds in `basis` is meaningless; its rows and columns elsewhere are 0.
@@ -94,15 +89,6 @@ class SparsePosterior(nn.Module):
         for buffer in self.buffers(recurse=False):
             if buffer is not self.slots:
                 buffer.zero_()
-
-    def place(self, z: Float[Tensor, "*batch n in"]) -> None:
-        """Back to the prior, on the basis z (n at most ``capacity``). Call :meth:`rebuild` then."""
-        self.reset()
-        n = z.shape[-2]
-        self.basis[..., :n, :] = z
-        self.active[..., :n] = 1.0
-        self.count.fill_(n)
-        self.slot.fill_(n)
 
     def forget(self, models: Bool[Tensor, "*batch"]) -> None:
         """These models go back to the prior but keep their basis vectors."""

@@ -3,36 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import torch
 from torch import nn
 from torch.distributions import Normal
 
-from ...exceptions import ParameterError, ShapeError
+from ..._checks import check_count
 from ...typing import Bool, Float, Tensor
 from ..base import DoubleStateLearner
-from ..checks import check_count, check_finite
 from ..kernels.kernel import Kernel, check_kernel, log_parameter
 from ..kernels.stationary import Matern32
-from ..report import UpdateReport
-from .compiled import CompiledLoops
+from ..report import MomentsWithJacobians, UpdateReport
 from .defaults import chosen_parts
+from .engine.compiled import CompiledEngine
+from .engine.reference import ReferenceEngine
 from .part import P, Part, Sample, Units
 from .posterior import SparsePosterior
-from .recursion import Absorbed, absorb
+from .units import Standardize
 
 _LATEST = 8  # rounds of ``refresh_every`` after which the caches are rebuilt in any case
 _DRIFT = 1e-8  # beyond which they are rebuilt at once, see SparsePosterior.drift
-
-
-class Prediction(NamedTuple):
-    """Mean, latent variance and their derivatives with respect to x."""
-
-    mean: Float[Tensor, "*any out"]
-    variance: Float[Tensor, "*any out"]
-    mean_jacobian: Float[Tensor, "*any out in"]
-    variance_jacobian: Float[Tensor, "*any out in"]
 
 
 class SparseOnlineGP(DoubleStateLearner):
@@ -68,15 +59,17 @@ class SparseOnlineGP(DoubleStateLearner):
         noise_variance: s2 in the (standardised) output's squared units, one number or one per output.
         novelty_threshold: smallest ``gamma / k**`` of a new basis vector.
         jitter: nugget on k(x, x) at basis vectors, relative to k**.
-        pruning: ``"kl"``: the point goes that loses least; ``"freeze"``: a full basis stays.
         parts: what it does beside; copied.
+        standardize: whether it follows the stream's units, unless a part does; or how.
         refresh_every: samples after which parts may change the state, and the caches are rebuilt. Without a
             part that does, and on the CPU, one looks whether they have drifted (four times as often where
             they do); they are rebuilt when they have, and at the latest after eight times as many.
-        backend: ``"auto"``: where numba is installed (extra ``fast``) compiled loops do updates and queries
-            of one sample per model, on the CPU in float64; they agree with torch to rounding. ``"torch"``:
-            never.
         options: see ResidualLearner.
+
+    Attributes:
+        engine: what computes. Where numba is installed (extra ``fast``) compiled loops do updates and queries
+            of one sample per model, on the CPU in float64; they agree with torch to rounding. A
+            ``ReferenceEngine`` in its place uses torch alone.
 
     Raises:
         ParameterError: a parameter is outside its range, or parts do not go together.
@@ -95,18 +88,12 @@ class SparseOnlineGP(DoubleStateLearner):
         noise_variance: float | Tensor = 0.1,
         novelty_threshold: float = 1e-4,
         jitter: float = 1e-6,
-        pruning: Literal["kl", "freeze"] = "kl",
         parts: Iterable[nn.Module] | None = None,
-        standardize: bool = True,
-        output_offset: Literal["zero", "learned"] = "zero",
+        standardize: bool | Standardize = True,
         refresh_every: int = 32,
-        backend: Literal["auto", "torch"] = "auto",
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        if backend not in ("auto", "torch"):
-            raise ParameterError("backend", backend, "'auto' or 'torch'")
-        self.backend = backend
         self.capacity = check_count("capacity", capacity)
         self.refresh_every = check_count("refresh_every", refresh_every)
         shape, double = self.batch_shape, {"dtype": torch.float64, "device": self.device}
@@ -121,16 +108,16 @@ class SparseOnlineGP(DoubleStateLearner):
             self.capacity,
             novelty_threshold=novelty_threshold,
             jitter=jitter,
-            pruning=pruning,
             batch_shape=shape,
             device=self.device,
         )
         # samples of each model since the caches were made
         self.pending = nn.Buffer(torch.zeros(shape, **double))
+        self.engine: ReferenceEngine = CompiledEngine()
         self.drifts = False  # the last look at the caches found them less exact than rounding would have it
         self.n_samples = 0  # on the host, so that the rhythm of rebuilds never asks the GPU
         self._parts: tuple[Part, ...] = ()
-        for part in chosen_parts(parts, standardize, output_offset):
+        for part in chosen_parts(parts, standardize):
             part.bind(self)
             self._parts += (part,)
         self.parts = nn.ModuleList(self._parts)
@@ -140,74 +127,37 @@ class SparseOnlineGP(DoubleStateLearner):
         self.weighing = _overriding(self._parts, "weigh")
         self._noting = _overriding(self._parts, "after_update")
         self._rebuilding = _overriding(self._parts, "on_rebuild", "after_rebuild")
-        self._loops = CompiledLoops() if backend == "auto" else None
         self._preparing = _overriding(self._parts, "before_update")
 
     # -- predictions ----------------------------------------------------------------------------
 
     def forward(self, x: Tensor) -> Tensor:
         """``alpha' k(X, x)``, differentiable in x."""
-        if self._loops is not None and (found := self._loops.query(self, x)) is not None:
-            return found[0]
-        return self._mean(self._cross(self.units.inputs(self.check_query(x))))
+        return self.engine.mean(self, x)
 
     def variance(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any out"]:
         """Latent variance ``k** + k'Ck`` of each output, differentiable in x."""
-        if self._loops is not None and (found := self._loops.query(self, x, variance=True)) is not None:
-            return found[1]
-        z = self.units.inputs(self.check_query(x))
-        return self._latent(z, self._cross(z))
+        return self.engine.moments(self, x)[1]
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """N(mean, var), with the observation noise added on request."""
-        found = None if self._loops is None else self._loops.query(self, x, variance=True)
-        if found is None:
-            z = self.units.inputs(self.check_query(x))
-            k = self._cross(z)
-            mean, variance = self._mean(k), self._latent(z, k)
-        else:
-            mean, variance = found[:2]
+        mean, variance = self.engine.moments(self, x)
         if observation:
             variance = variance + self.noise_variance.to(self.dtype)
         return Normal(mean, variance.sqrt(), validate_args=False)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """``(alpha'k, alpha' dk/dx)`` in closed form."""
-        if self._loops is not None and (found := self._loops.query(self, x, slopes=True)) is not None:
-            return found[0], found[2]
-        # free slots need no mask here: their rows in alpha and C are 0
-        k, dk = self.kernel.with_gradient(self.units.inputs(self.check_query(x)), self.posterior.basis)
-        coefficients = self.posterior.alpha.mT
-        mean, jacobian = (coefficients @ k.unsqueeze(-1)).squeeze(-1), coefficients @ dk
-        return self._out(mean, 1), self._out_slope(jacobian, 1)
+        return self.engine.linearize(self, x)
 
-    def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> Prediction:
+    def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> MomentsWithJacobians:
         """Mean, latent variance and both derivatives, in closed form.
 
         ```
         d mean/dx = alpha' dk/dx,   d var/dx = dk(x,x)/dx + 2 (Ck)' dk/dx
         ```
         """
-        if self._loops is not None:
-            found = self._loops.query(self, x, variance=True, slopes=True)
-            if found is not None:
-                return Prediction(*found)
-        z = self.units.inputs(self.check_query(x))
-        k, dk = self.kernel.with_gradient(z, self.posterior.basis)
-        column = k.unsqueeze(-1)
-        Ck = self.posterior.covariance @ column
-        alpha = self.posterior.alpha
-        # alpha and Ck side by side share one pass over k and one over dk
-        left = torch.cat([alpha.expand(*Ck.shape[:-1], alpha.shape[-1]), Ck], dim=-1).mT
-        values, slopes = (left @ column).squeeze(-1), left @ dk
-        v = (self.kernel.diagonal(z) + values[..., -1]).clamp_min(0.0).unsqueeze(-1)
-        dv = self.kernel.diagonal_gradient(z).unsqueeze(-2) + 2.0 * slopes[..., -1:, :]
-        return Prediction(
-            self._out(values[..., :-1], 1),
-            self._out(v, 2),
-            self._out_slope(slopes[..., :-1, :], 1),
-            self._out_slope(dv, 2),
-        )
+        return self.engine.jacobians(self, x)
 
     # -- what is known --------------------------------------------------------------------------
 
@@ -245,25 +195,6 @@ class SparseOnlineGP(DoubleStateLearner):
         self.n_samples, self.drifts = 0, False
 
     @torch.no_grad()
-    def set_basis(self, x: Float[Tensor, "n *batch in"]) -> None:
-        """Start again from the prior on given basis vectors (at most ``capacity``).
-
-        With ``pruning="freeze"`` and a full basis the posterior is then the DTC approximation on these
-        inducing points.
-
-        Raises:
-            ShapeError: the shape does not fit, or there are more points than the capacity.
-            NonFiniteError: NaN or infinity; the state is untouched.
-        """
-        x = self._cast(x)
-        check_finite("x", x)
-        if x.shape[1:] != (*self.batch_shape, self.in_features) or not 1 <= len(x) <= self.capacity:
-            raise ShapeError("x", self._expected(f"[n <= {self.capacity}]", "in"), x.shape)
-        self.reset()
-        self.posterior.place(x.movedim(0, -2))
-        self.refresh()
-
-    @torch.no_grad()
     def refresh(self) -> None:
         """Let the parts change the natural form, and rebuild the caches from it.
 
@@ -278,9 +209,9 @@ class SparseOnlineGP(DoubleStateLearner):
 
     def update(self, x: Tensor, y: Tensor, mask: Tensor | None = None) -> UpdateReport:
         """See :meth:`ResidualLearner.update`."""
-        if mask is None and self._loops is not None:
+        if mask is None:
             with self.lock:
-                if self._loops.accept(self, x, y):
+                if self.engine.accepts(self, x, y):
                     return self.absorb(x, y, None)
         return super().update(x, y, mask)
 
@@ -290,7 +221,7 @@ class SparseOnlineGP(DoubleStateLearner):
             with torch.no_grad():
                 for part in self._preparing:
                     part.before_update(self, x, y, on)
-        done = self._learn(x, y, on)
+        done = self.engine.absorb(self, x, y, on)
         n = self.n_samples + 1
         if self._rebuilding or self.device.type != "cpu":  # on a GPU looking would mean waiting
             anew = n % self.refresh_every == 0
@@ -303,25 +234,17 @@ class SparseOnlineGP(DoubleStateLearner):
                 for part in self._noting:
                     anew |= part.after_update(self, sample)
         self.pending += 1.0 if on is None else on
-        # past Module.__setattr__, which asks of every value whether it is a tensor
-        vars(self)["n_samples"] += 1
+        self.n_samples = n
         if anew:
             self.refresh()
         return done.report
-
-    def _learn(self, x: Tensor, y: Tensor, on: Tensor | None) -> Absorbed:
-        if self._loops is not None and (done := self._loops.absorb(self, x, y, on)) is not None:
-            return done
-        z, t = self.units.inputs(x), self.units.targets(y)
-        return absorb(self.posterior, z, t, self.kernel, self.shared_noise(), on, self.weighing)
 
     def _is_stale(self, n: int) -> bool:
         """Whether the caches must be made again after n samples although no part changed the state."""
         if n % (_LATEST * self.refresh_every) == 0:
             return True
-        drift = None if self._loops is None else self._loops.drift(self)
-        drift = self.posterior.drift(self.kernel, self.shared_noise()) if drift is None else drift
-        vars(self)["drifts"] = drift > 0.01 * _DRIFT
+        drift = self.engine.drift(self)
+        self.drifts = drift > 0.01 * _DRIFT
         return drift > _DRIFT
 
     def learn_anew(
@@ -331,7 +254,7 @@ class SparseOnlineGP(DoubleStateLearner):
         if x.shape[-2]:
             self.posterior.reset()
             for x_t, y_t, on_t in zip(x.unbind(-2), y.unbind(-2), on.unbind(-1), strict=True):
-                self._learn(x_t, y_t, on_t)
+                self.engine.absorb(self, x_t, y_t, on_t)
             self.refresh()
 
     def start_anew(
@@ -347,34 +270,13 @@ class SparseOnlineGP(DoubleStateLearner):
             part.forget(models)
         self.pending.masked_fill_(models, 0.0)
         for x_t, y_t, used_t in zip(x, y, used, strict=True):
-            self._learn(x_t, y_t, (used_t & models).to(x.dtype))
+            self.engine.absorb(self, x_t, y_t, (used_t & models).to(x.dtype))
 
     # -- pieces ---------------------------------------------------------------------------------
 
     def shared_noise(self) -> Tensor:
         """Noise by which the gain is computed: geometric mean over the (standardised) outputs."""
         return self.log_noise_variance.mean(-1).exp()
-
-    def _out(self, value: Tensor, power: int) -> Tensor:
-        """``(*any, out or 1)`` in output units (squared if power is 2), in the interface's dtype."""
-        value = self.units.value(value, power)
-        return value.expand(*value.shape[:-1], self.out_features).to(self.dtype)
-
-    def _out_slope(self, slope: Tensor, power: int) -> Tensor:
-        """``(*any, out or 1, columns)``: derivative by the last columns of x."""
-        slope = self.units.slope(slope, power)
-        return slope.expand(*slope.shape[:-2], self.out_features, slope.shape[-1]).to(self.dtype)
-
-    def _mean(self, k: Tensor) -> Tensor:
-        return self._out((k.unsqueeze(-2) @ self.posterior.alpha).squeeze(-2), 1)
-
-    def _latent(self, z: Tensor, k: Tensor) -> Tensor:
-        k = k.unsqueeze(-1)
-        v = self.kernel.diagonal(z) + (k.mT @ (self.posterior.covariance @ k)).squeeze(-1).squeeze(-1)
-        return self._out(v.clamp_min(0.0).unsqueeze(-1), 2)
-
-    def _cross(self, z: Tensor) -> Tensor:
-        return self.kernel.vector(z, self.posterior.basis) * self.posterior.active
 
     def _cast(self, x: Tensor) -> Tensor:
         return torch.as_tensor(x, dtype=torch.float64, device=self.device)

@@ -6,9 +6,9 @@ from typing import Literal
 
 import torch
 
+from ..._checks import check_count
 from ...exceptions import ParameterError
 from ...typing import Tensor
-from ..checks import check_count
 from ..running_scale import ALIEN, BLOCK, RunningScale
 from .part import Host, Part, Units
 

@@ -1,12 +1,12 @@
-"""Checks of arguments that all learners share."""
+"""Checks of arguments: each raises a typed error that names the argument and says what would be right."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
-from ..exceptions import NonFiniteError, ParameterError
-from ..typing import Tensor
+from .exceptions import NonFiniteError, ParameterError, ShapeError
+from .typing import Tensor
 
 
 def check_count(name: str, value: int, least: int = 1) -> int:
@@ -38,15 +38,21 @@ def check_positive(name: str, value: float) -> float:
     return float(value)
 
 
-def check_factor(name: str, value: float) -> float:
+def check_fraction(name: str, value: float) -> float:
     """``value`` as a float in (0, 1], or ParameterError."""
     if not 0 < value <= 1:
         raise ParameterError(name, value, "in (0, 1]")
     return float(value)
 
 
+def check_shape(name: str, value: Tensor, shape: Sequence[int], hint: str = "") -> None:
+    """ShapeError, with the hint, if ``value`` has any other shape."""
+    if tuple(value.shape) != tuple(shape):
+        raise ShapeError(name, str(tuple(shape)), value.shape, hint)
+
+
 def check_finite(name: str, value: Tensor) -> None:
-    """NonFiniteError, with the first places, if a square in ``value`` is not finite."""
-    where = (~value.square().isfinite()).nonzero()
-    if len(where):
-        raise NonFiniteError(name, [tuple(place) for place in where[:5].tolist()])
+    """NonFiniteError, with the first places, if an entry of ``value`` or its square is NaN or infinite."""
+    good = value.square().isfinite()
+    if not bool(good.all()):
+        raise NonFiniteError(name, [tuple(place) for place in (~good).nonzero()[:5].tolist()])

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import torch
 
-from ...typing import Float, Tensor
-from ..kernels.kernel import Kernel
-from ..report import UpdateEvent, UpdateReport
-from .part import Part
-from .posterior import SparsePosterior
+from ....typing import Float, Tensor
+from ...kernels.kernel import Kernel
+from ...report import UpdateEvent, UpdateReport
+from ..part import Part
+from ..posterior import SparsePosterior
 
 #: what losses may differ by and count as the same, relative and per output in nats: a basis that has learned
 #: nothing yet must not depend on how a processor rounds
@@ -73,8 +73,6 @@ def absorb(
         noise = (s2 + v) / weight - v
     full = posterior.count == posterior.capacity
     novel = gamma > posterior.novelty_threshold * prior
-    if posterior.pruning == "freeze":
-        novel = novel & ~full
     dropped = gamma * ~novel  # novelty that a projection ignores
     gain, precision = 1.0 / (noise + v - dropped), s2 / noise
     if mask is not None:
@@ -102,7 +100,7 @@ def absorb(
     grown = novel ^ excess
     posterior.count.add_(grown)
     posterior.slot.add_(grown)
-    if posterior.pruning != "freeze" and _any(excess):
+    if _any(excess):
         _add_and_prune(posterior, scaled, left, excess, s2)
     else:
         _add_products(posterior.moments, scaled.unsqueeze(-1), left.unsqueeze(-1))

@@ -1,27 +1,27 @@
-"""Which of a learner's work compiled loops can do, and the learner's buffers as they see them."""
+"""The engine of compiled loops: which work they can do, and the learner's buffers as they see them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
-from torch._C import _len_torch_dispatch_stack
-from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.autograd.forward_ad import unpack_dual
 from torch.autograd.graph import increment_version
+from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
-from ...typing import Array, Tensor
-from ..kernels.action_linear import ActionLinearKernel
-from ..kernels.kernel import Kernel
-from ..kernels.stationary import Matern32, Matern52, SquaredExponential
-from ..report import UpdateReport
-from .monitor import RobustWeight
-from .part import Host, Part
+from ....typing import Array, Tensor
+from ...kernels.action_linear import ActionLinearKernel
+from ...kernels.kernel import Kernel
+from ...kernels.stationary import Matern32, Matern52, SquaredExponential
+from ...report import MomentsWithJacobians, UpdateReport
+from ..monitor import RobustWeight
+from ..part import Host
 from .recursion import Absorbed
+from .reference import ReferenceEngine
 
 
 @cache
@@ -34,30 +34,13 @@ def load_kernels() -> tuple[ModuleType, ModuleType] | None:
     return numba_kernels, numba_checks
 
 
-class Learner(Host, Protocol):
-    """What compiled loops ask of a learner beside."""
-
-    batch_shape: torch.Size
-    weighing: tuple[Part, ...]
-    """Parts that weigh samples."""
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Of x and y."""
-        ...
-
-    def modules(self) -> Iterator[torch.nn.Module]:
-        """It and all in it."""
-        ...
-
-
-class CompiledLoops:
+class CompiledEngine(ReferenceEngine):
     """A learner's buffers as arrays that share their memory, and the compiled calls on them.
 
     The arrays are made at the first call, and again whenever a buffer is another one: the learner was moved,
-    or loaded with other tensors. A call returns None where torch must do the work: without numba, on another
-    device, in float32, where a gradient is to be carried, inside of a transformation or of torch.compile, and
-    with parts that weigh samples in ways that are not known here.
+    or loaded with other tensors. Torch does the work without numba, on another device, in float32, where a
+    gradient is to be carried, inside of a transformation or of torch.compile, and with parts that weigh
+    samples in ways that are not known here.
     """
 
     def __init__(self) -> None:
@@ -65,26 +48,38 @@ class CompiledLoops:
         self._sources: list[tuple[dict, str, Tensor, int]] = []
         self._usable = False
 
-    def __deepcopy__(self, memo: dict) -> CompiledLoops:
-        return CompiledLoops()
+    def __deepcopy__(self, memo: dict) -> CompiledEngine:
+        return CompiledEngine()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return CompiledLoops, ()
+        return CompiledEngine, ()
 
     # -- calls ----------------------------------------------------------------------------------
 
-    def accept(self, gp: Learner, x: Tensor, y: Tensor) -> bool:
-        """Whether this is one good sample for each model, and a call for :meth:`absorb`."""
+    def mean(self, gp: Host, x: Tensor) -> Tensor:
+        return super().mean(gp, x) if (found := self._ask(gp, x)) is None else found[0]
+
+    def moments(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
+        found = self._ask(gp, x, variance=True)
+        return super().moments(gp, x) if found is None else found[:2]
+
+    def linearize(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
+        found = self._ask(gp, x, slopes=True)
+        return super().linearize(gp, x) if found is None else (found[0], found[2])
+
+    def jacobians(self, gp: Host, x: Tensor) -> MomentsWithJacobians:
+        found = self._ask(gp, x, variance=True, slopes=True)
+        return super().jacobians(gp, x) if found is None else found
+
+    def accepts(self, gp: Host, x: Tensor, y: Tensor) -> bool:
         if not self._takes(gp, x) or not _is_plain(y, (*self._batch, self._m)):
             return False
         return self._have_squares(x.numpy().reshape(-1), y.numpy().reshape(-1))
 
-    def absorb(self, gp: Learner, x: Tensor, y: Tensor, on: Tensor | None) -> Absorbed | None:
-        """One checked sample per model where ``on``; None, and nothing changed, if torch must do it."""
+    def absorb(self, gp: Host, x: Tensor, y: Tensor, on: Tensor | None) -> Absorbed:
         if not self._takes(gp, x) or not _is_plain(y, (*self._batch, self._m)):
-            return None
+            return super().absorb(gp, x, y, on)
         posterior, flags, n_models, m = self._posterior, self._flags, self._n_models, self._m
-        flags[2] = posterior.pruning == "freeze"
         k, prior, mask = self._none2, self._none1, self._all
         if self._given:
             x, y = gp.units.inputs(x), gp.units.targets(y)
@@ -107,10 +102,17 @@ class CompiledLoops:
         report = UpdateReport(torch.from_numpy(event.reshape(batch)), novelty, nis, weight)
         return Absorbed(report, torch.from_numpy(errors.reshape(*batch, m)), variance)
 
-    def query(
-        self, gp: Learner, x: Tensor, *, variance: bool = False, slopes: bool = False
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
-        """Mean, variance and both derivatives of one query per model; what is not wanted is empty."""
+    def drift(self, gp: Host) -> float:
+        if torch.compiler.is_compiling() or not self._is_bound(gp) or self._given:
+            return super().drift(gp)
+        basis, active, _, _, moments, vectors = self._state
+        jitter = self._posterior.jitter
+        return self._drift(self._flags, basis, active, moments, vectors, *self._hyper, self._noise, jitter)
+
+    def _ask(
+        self, gp: Host, x: Tensor, *, variance: bool = False, slopes: bool = False
+    ) -> MomentsWithJacobians | None:
+        """One query per model, what is not wanted being empty; None if torch must do it."""
         if not self._takes(gp, x) or self._given:
             return None
         n, nd = self._n_models * self._m, self._n_models * self._m * self._d
@@ -124,19 +126,11 @@ class CompiledLoops:
         one, two = (*self._batch, self._m), (*self._batch, self._m, self._d)
         shapes = one, one if variance else (0,), two if slopes else (0,), two if slopes and variance else (0,)
         results = (torch.from_numpy(a.reshape(s)) for a, s in zip((mean, v, J, dv), shapes, strict=True))
-        return tuple(results)  # type: ignore[return-value]
-
-    def drift(self, gp: Learner) -> float | None:
-        """See ``SparsePosterior.drift``; None: torch must tell."""
-        if torch.compiler.is_compiling() or not self._is_bound(gp) or self._given:
-            return None
-        basis, active, _, _, moments, vectors = self._state
-        jitter = self._posterior.jitter
-        return self._drift(self._flags, basis, active, moments, vectors, *self._hyper, self._noise, jitter)
+        return MomentsWithJacobians(*results)
 
     # -- what they work on ----------------------------------------------------------------------
 
-    def _takes(self, gp: Learner, x: Tensor) -> bool:
+    def _takes(self, gp: Host, x: Tensor) -> bool:
         """Whether this call is one for compiled loops; prepares the arrays."""
         if torch.compiler.is_compiling() or not _is_plain(x, (*gp.batch_shape, gp.in_features)):
             return False
@@ -144,9 +138,9 @@ class CompiledLoops:
             return False
         return not (torch.is_grad_enabled() and any(p.requires_grad for p in self._parameters))
 
-    def _is_bound(self, gp: Learner) -> bool:
+    def _is_bound(self, gp: Host) -> bool:
         """Whether the arrays, made again if need be, are of use."""
-        if vars(gp)["_modules"]["kernel"] is not self._kernel or not self._is_current():
+        if gp.kernel is not self._kernel or not self._is_current():
             self._bind(gp)
         return self._usable
 
@@ -157,7 +151,7 @@ class CompiledLoops:
                 return False
         return True
 
-    def _bind(self, gp: Learner) -> None:
+    def _bind(self, gp: Host) -> None:
         self._kernel, self._posterior, self._usable = gp.kernel, gp.posterior, False
         self._batch, self._d, self._m = tuple(gp.batch_shape), gp.in_features, gp.out_features
         self._n_models = n = gp.batch_shape.numel()
@@ -179,7 +173,7 @@ class CompiledLoops:
         kernels, checks = modules
         self._given = own is None or units is None
         kind, n_actions = (kernels.GIVEN, 0) if self._given or own is None else own[0]
-        self._flags = np.array([kind, n_actions, 0])
+        self._flags = np.array([kind, n_actions])
         self._robust = np.array([part.threshold**2 for part in robust])
         self._levels = levels[0].numpy().reshape(n) if levels else np.empty(0)
         self._none1, self._none2, self._all = np.empty(0), np.empty((0, 0)), np.ones(n, np.bool_)
@@ -213,10 +207,20 @@ def _is_plain(x: Any, shape: tuple[int, ...]) -> bool:
         and not x.requires_grad
         and x.is_contiguous()
         and unpack_dual(x).tangent is None
-        and not is_functorch_wrapped_tensor(x)
-        and not _len_torch_dispatch_stack()  # somebody records what torch is asked to do
+        and _has_memory(x)
+        # somebody records what torch is asked to do: torch has no public way to ask
+        and not is_in_torch_dispatch_mode()
         and not torch.jit.is_tracing()
     )
+
+
+def _has_memory(x: Tensor) -> bool:
+    """Not so within vmap, grad and jvp of torch.func, where a tensor stands for others."""
+    try:
+        x.data_ptr()
+    except RuntimeError:
+        return False
+    return True
 
 
 _KINDS = {SquaredExponential: 0, Matern32: 1, Matern52: 2}
@@ -239,12 +243,12 @@ def _known(kernel: Kernel, batch: tuple[int, ...]) -> tuple[tuple[int, int], lis
     return ((kind, n_actions), parameters) if alike else None
 
 
-def _sources(gp: Learner, tensors: tuple[Tensor, ...]) -> list[tuple[dict, str, Tensor, int]]:
+def _sources(gp: Host, tensors: tuple[Tensor, ...]) -> list[tuple[dict, str, Tensor, int]]:
     """Where in the learner each of these tensors is kept, and its place in memory."""
     wanted = {id(tensor) for tensor in tensors}
     found = []
     for module in gp.modules():
-        for owner in (vars(module)["_parameters"], vars(module)["_buffers"]):
+        for owner in (module._parameters, module._buffers):
             kept = ((name, t) for name, t in owner.items() if t is not None and id(t) in wanted)
             found += [(owner, name, t, t.data_ptr()) for name, t in kept]
     return found

@@ -1,6 +1,6 @@
 """The recursion of a sparse GP and its predictions as compiled loops over a fleet (extra ``fast``).
 
-Equations and names are those of :mod:`~torch_ekm.residual.sparse_gp.recursion` and
+Equations and names are those of :mod:`~torch_ekm.residual.sparse_gp.engine.recursion` and
 :mod:`~torch_ekm.residual.sparse_gp.posterior`, which stay the reference. All arrays are C-contiguous and
 float64, the fleet's axis first; most are views of the learner's buffers and change in place. What all
 models share (a kernel, plain units) has length 1 there. No call holds the GIL, none is parallel: numba
@@ -17,13 +17,13 @@ import math
 import numpy as np
 from numba import njit, types
 
-from .monitor import DISTRUSTED, DISTRUSTED_MOST, RATE
+from ..monitor import DISTRUSTED, DISTRUSTED_MOST, RATE
 from .recursion import TIE, TIE_KL
 
 #: what a kernel's ``kind`` means; GIVEN: its values come with the call
 SQUARED_EXPONENTIAL, MATERN32, MATERN52, GIVEN = 0, 1, 2, 3
 #: entries of ``flags``
-KIND, ACTIONS, FREEZE = 0, 1, 2
+KIND, ACTIONS = 0, 1
 
 _EPS, _TINY = np.finfo(np.float64).eps, np.finfo(np.float64).tiny
 # NaN and infinity keep their meaning: samples are tested for them in here.
@@ -207,7 +207,7 @@ def _absorb(
         level[0] += RATE * (distrusted - level[0])
         noise = (s2 + v) / weight - v
     full = count[0] == capacity
-    novel = gamma > threshold * prior and not (flags[FREEZE] and full)
+    novel = gamma > threshold * prior
     dropped = 0.0 if novel else gamma
     gain, precision = 1.0 / (noise + v - dropped), s2 / noise
     basis[slot] = z
@@ -293,7 +293,7 @@ def absorb_fleet(
     """One sample per model where ``on``.
 
     Args:
-        flags: kind of kernel, width of the action, whether a full basis stays.
+        flags: kind of kernel, width of the action.
         x, y, errors: one model's after the other's.
         given_k, given_prior: k and k** of a kernel that is not known here, in the learner's units.
         robust, levels: square of a robust weight's threshold, share of samples distrusted; or empty.
