@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from oracle import OracleGeneralize
 from run_study import run_study
@@ -23,7 +23,7 @@ from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.protocols.protocol import Protocol
 from torch_ekm.experiments.records import Record
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
-from torch_ekm.experiments.reporting.statistics import estimate, rate
+from torch_ekm.experiments.reporting.statistics import DataFrame, estimate, rate
 from torch_ekm.experiments.reporting.tables import (
     LEGEND,
     by_controller,
@@ -32,9 +32,6 @@ from torch_ekm.experiments.reporting.tables import (
     which_seeds,
 )
 from torch_ekm.simulation import PRESETS
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 _DEG = math.pi / 180
 _BASE = "as it is"

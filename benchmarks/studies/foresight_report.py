@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from bars import Target, targets_table
@@ -15,12 +14,10 @@ from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.reporting import statistics as stats
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, FigureFile, Report, Table
+from torch_ekm.experiments.reporting.statistics import DataFrame, Series
 from torch_ekm.experiments.reporting.tables import which_seeds
 from torch_ekm.experiments.reporting.trials import select
 from torch_ekm.rendering import make_scene, save_animation
-
-if TYPE_CHECKING:
-    from pandas import DataFrame, Series
 
 #: A target is declined where it lies this far beyond the predicted reach [deg].
 BEYOND_DEG = 2.0

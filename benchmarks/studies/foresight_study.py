@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from foresight_report import foresight_report
 from foresight_turn import ForesightTurn
@@ -25,11 +25,9 @@ from torch_ekm.experiments.protocols.generalize import OTHER_ANGLES, TABLE_I
 from torch_ekm.experiments.protocols.protocol import Protocol
 from torch_ekm.experiments.records import NotGrasped, Record, Trial, TrialRecord, true_state
 from torch_ekm.experiments.reporting.report import Report
+from torch_ekm.experiments.reporting.statistics import DataFrame
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.foresight import Reach
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 _DEG = math.pi / 180
 _FIRST_WARM_UP, _FAR, _BLIND = 1000, 3000, 4000  # numbers of the grasps

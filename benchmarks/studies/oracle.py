@@ -12,7 +12,7 @@ import argparse
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from torch_ekm.cli._app import parse_seeds
 from torch_ekm.control import StopReason
@@ -21,7 +21,7 @@ from torch_ekm.experiments.jobs import run_jobs
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.report import Cell, Column, Table
-from torch_ekm.experiments.reporting.statistics import estimate, rate
+from torch_ekm.experiments.reporting.statistics import DataFrame, estimate, rate
 from torch_ekm.experiments.reporting.trials import select, trial_frame
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.model import KinematicModel, ModelOptions
@@ -29,9 +29,6 @@ from torch_ekm.plant import Observation, PlantStatus
 from torch_ekm.plant.wrapper import PlantWrapper
 from torch_ekm.simulation import SimulatedHand
 from torch_ekm.simulation.mechanism.assembly import true_hand, true_object
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 _REACHED = StopReason.REACHED.value
 

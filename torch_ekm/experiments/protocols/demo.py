@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 
@@ -15,11 +15,9 @@ from ...description import load_hand, load_object
 from ...rendering import make_scene, save_animation, save_picture
 from ..reporting.plots import plot_convergence, plot_prediction_error, save_figure
 from ..reporting.report import Cell, Column, FigureFile, Report, Table
+from ..reporting.statistics import DataFrame
 from ..reporting.trials import select
 from .generalize import Generalize
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 
 @dataclass(frozen=True)

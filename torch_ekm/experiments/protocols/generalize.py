@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -18,12 +18,10 @@ from ..reporting import statistics as stats
 from ..reporting import tables
 from ..reporting.plots import crosses_caption, plot_steady_state_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
+from ..reporting.statistics import DataFrame
 from ..reporting.trials import select
 from ..runner import Bench
 from .protocol import Protocol
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 #: Rotations of the paper's Table I [deg].
 TABLE_I: dict[str, tuple[float, ...]] = {

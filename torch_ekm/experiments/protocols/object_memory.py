@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -25,15 +25,12 @@ from ..learners import make_learner
 from ..records import Trial, TrialRecord
 from ..reporting.plots import plot_bank, save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from ..reporting.statistics import bootstrap_mean, bootstrap_ratio, rate
+from ..reporting.statistics import DataFrame, Series, bootstrap_mean, bootstrap_ratio, rate
 from ..reporting.tables import ratio_and_p, which_seeds
 from ..reporting.trials import select
 from ..runner import Bench
 from .generalize import OTHER_ANGLES, TABLE_I
 from .protocol import Protocol
-
-if TYPE_CHECKING:
-    from pandas import DataFrame, Series
 
 #: How the knowledge of several objects may be kept.
 MEMORIES = ("bank", "labelled", "one model", "fresh")

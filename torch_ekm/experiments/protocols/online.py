@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 
@@ -17,13 +17,10 @@ from ..records import Record
 from ..reporting import tables
 from ..reporting.plots import plot_learning_test, plot_prediction_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from ..reporting.statistics import LEAST_SEEDS, bootstrap_mean, learning_curve
+from ..reporting.statistics import LEAST_SEEDS, DataFrame, Series, bootstrap_mean, learning_curve
 from ..reporting.trials import select
 from ..runner import Bench
 from .protocol import Protocol
-
-if TYPE_CHECKING:
-    from pandas import DataFrame, Series
 
 _LEARNED = 16
 """Trials after which the paper's learner has learned."""

@@ -5,18 +5,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from ..config import Setting
 from ..records import Record, TrialRecord
 from ..reporting.report import Report
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
+from ..reporting.statistics import DataFrame
 
 
 class Protocol(ABC):
-    """An experiment: what is run, what was aimed at, and what is made of the results.
+    """An experiment: what is run, and what is made of the results.
 
     Protocols are frozen dataclasses: their fields are the configuration. A job is a session with its
     arguments; its name holds all that decides its result, the seed included.

@@ -12,11 +12,10 @@ from ..._extras import require
 from ..._files import make_folder, told_as_output_error
 from ...typing import Array
 from .report import FigureFile
-from .statistics import ALPHA, learning_curve
+from .statistics import ALPHA, DataFrame, learning_curve
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from pandas import DataFrame
 
 
 #: Of every figure, as in ``plt.style.use("torch_ekm.style")``: the file ``style.mplstyle`` of the package.

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..._extras import require
 from ...typing import Array
 
-if TYPE_CHECKING:
-    from pandas import DataFrame, Series
-
+#: A frame of pandas and one of its columns, which is in an extra: its own annotations are too wide to help.
+DataFrame = Any
+Series = Any
 #: Significance level of the learning curves.
 ALPHA = 0.05
 #: With fewer seeds nothing is called better, and no p-value is given.
@@ -55,7 +56,7 @@ class Estimate:
 
 
 def bootstrap(
-    statistic: Callable[..., Array], *values: Array, seed: int = 0, resamples: int = 4000
+    statistic: Callable[..., Any], *values: NDArray[Any], seed: int = 0, resamples: int = 4000
 ) -> Estimate:
     """A statistic with its 95 % percentile interval (``scipy.stats.bootstrap``).
 

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...control import StopReason
+from ...typing import Array
 from ..config import CONTROLLERS, FIRST_REPORTED
 from ..records import NotGrasped
 from . import statistics as stats
 from .report import Cell, Column, Table
-from .statistics import LEAST_SEEDS, Estimate
+from .statistics import LEAST_SEEDS, DataFrame, Estimate
 from .trials import BAND_DEG, STEP_DEG, select
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
-    from ...typing import Array
 
 _REACHED = StopReason.REACHED.value
 #: What each controller is, in a line.

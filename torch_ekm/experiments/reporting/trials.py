@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,7 @@ from ..._extras import require
 from ...control import LimitingFunction
 from ...control.qp import DEGREE
 from ..records import Record, TrialRecord
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
+from .statistics import DataFrame
 
 #: An error is settled when it stays within twice the default tolerance [deg].
 BAND_DEG = 0.5
