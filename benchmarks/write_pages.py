@@ -13,10 +13,10 @@ Recordings are read from ``TORCH_EKM_DATA``.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import datetime
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -25,7 +25,10 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
+import pandas
 from page import ROOT, commit, provenance
+
+from torch_ekm.experiments.reporting.report import FigureFile, Report, Table
 
 HERE = Path(__file__).parent
 PAGES = ROOT / "docs" / "benchmarks"
@@ -102,16 +105,23 @@ def measure(part: Part, folder: Path, quick: bool, keep: bool) -> dict[str, str]
     return found
 
 
-def _demoted(report: Path, folder: str, shown: tuple[str, ...]) -> str:
-    """A report without its title, headings one level deeper, with those of its figures that are ``shown``."""
+def read_report(folder: Path) -> Report:
+    """A report that :meth:`Report.write` left, its tables as text."""
+    texts = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    tables = []
+    for table in texts.pop("tables"):
+        cells = pandas.read_csv(folder / f"{table['name']}.csv", dtype=str, keep_default_na=False)
+        tables.append(Table(**table, columns=list(cells.columns), rows=cells.to_numpy().tolist()))
+    figures = [FigureFile(**figure) for figure in texts.pop("figures")]
+    return Report(**texts, tables=tables, figures=figures)
 
-    def figure(found: re.Match[str]) -> str:
-        caption, file = found["caption"], found["file"]
-        return f"![{caption}]({folder}/{file})\n\n*{caption}*\n\n" if Path(file).stem in shown else ""
 
-    text = re.sub(r"^# .*\n+", "", report.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    text = re.sub(r"^!\[(?P<caption>.*)\]\((?P<file>.*)\)\n+\*.*\*\n+", figure, text, flags=re.MULTILINE)
-    return re.sub(r"^#", "##", text, flags=re.MULTILINE)
+def report_body(folder: Path, name: str, pictures: tuple[str, ...]) -> str:
+    """A report below the headings of a page, with some of its figures, which lie in the folder ``name``."""
+    report = read_report(folder)
+    shown = [figure for figure in report.figures if Path(figure.path).stem in pictures]
+    report.figures = [dataclasses.replace(figure, path=f"{name}/{figure.path}") for figure in shown]
+    return report.markdown(level=2).strip()
 
 
 def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:
@@ -124,7 +134,7 @@ def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:
         if part.text:
             body = f"```text\n{body}\n```"
         elif part.reports:
-            body = _demoted(folder / "report" / "report.md", name, part.pictures).strip()
+            body = report_body(folder / "report", name, part.pictures)
         how = f"`{part.spoken()}`: commit {found['commit']}, {found['date']}, {found['minutes']} min."
         lines += [f"## {part.title}", "", part.see, "", how, "", body, ""]
         for picture in part.pictures:

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from bars import Target, targets_table
 
 from torch_ekm.experiments.reporting.plots import new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
-from torch_ekm.experiments.reporting.tables import Target, targets_table
 
 from .benchmark import CURVE, HORIZONS, LEARNER, SUBSETS, RecordedHandResult
 from .nominal import NOMINALS

@@ -32,10 +32,10 @@ from torch_ekm.control import (
 from torch_ekm.experiments.config import Setting, object_name
 from torch_ekm.experiments.learners import HAND_LEARNERS
 from torch_ekm.experiments.protocols.generalize import Generalize
-from torch_ekm.experiments.protocols.protocol import Protocol, Results
+from torch_ekm.experiments.protocols.protocol import Protocol
 from torch_ekm.experiments.records import Record
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
-from torch_ekm.experiments.reporting.statistics import estimate, rate, steady_state_error
+from torch_ekm.experiments.reporting.statistics import DataFrame, estimate, rate
 from torch_ekm.experiments.reporting.tables import (
     LEGEND,
     by_controller,
@@ -202,16 +202,14 @@ class Ablation(Protocol):
         """All turns with one variant, controller and seed."""
         return variant.session(variant.objects[0], controller, seed)
 
-    def report(self, seeds: Sequence[int], results: Results[Record], folder: Path) -> Report:
+    def report(self, seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
         """Two tables for each group: where the turns end, and what a motion of the E-KM is worth."""
-        shown = [make(group, seeds, results) for group in self.groups for make in (self.table, self.motions)]
+        shown = [make(group, seeds, trials) for group in self.groups for make in (self.table, self.motions)]
         turned = dict.fromkeys(self._turned(group) for group in self.groups)
-        summary = f"{self._answer(seeds, results)} One change at a time; {'; '.join(turned)}. "
+        summary = f"{self._answer(seeds, trials)} One change at a time; {'; '.join(turned)}. "
         summary += f"{which_seeds(seeds)}{warmed_up(self.warm_up)}"
-        title, names = (
-            "Ablations: what each part is worth",
-            {c for v in self._variants() for c in v.controllers},
-        )
+        title = "Ablations: what each part is worth"
+        names = {c for v in self._variants() for c in v.controllers}
         explained = {name: line for name, line in LEGEND.items() if name in names}
         return Report(title, summary, shown, leading=2, legend=explained)
 
@@ -229,33 +227,33 @@ class Ablation(Protocol):
     def _variants(self) -> list[Variant]:
         return [variant for group in self.groups for variant in self.variants(group)]
 
-    def _answer(self, seeds: Sequence[int], results: Results[Record]) -> str:
+    def _answer(self, seeds: Sequence[int], trials: DataFrame) -> str:
         """How the E-KM does as it is; what changes it, from enough seeds alone."""
         base = next((v for v in self._variants() if v.name == _BASE), None)
         if base is None:
             return ""
-        mine = by_controller(self._records(base, seeds, results)).get("E-KM", [])
-        if not mine:
+        mine = self._turns(base, seeds, trials).get("E-KM")
+        if mine is None:
             return "Nothing was grasped."
-        lost, missed = sum(r.lost for r in mine), sum(r.not_reached for r in mine)
-        text = f"The E-KM as it is ends {estimate(mine, steady_state_error):.2f} deg from the target; of "
-        return (
-            f"{text}{len(mine)} turns {lost} objects were lost and {missed} turns did not reach the target."
+        lost, missed = mine["lost"].sum(), mine["not_reached"].sum()
+        text = (
+            f"The E-KM as it is ends {estimate(mine, 'error_deg'):.2f} deg from the target; of {len(mine)} "
         )
+        return f"{text}turns {lost} objects were lost and {missed} turns did not reach the target."
 
-    def _records(self, variant: Variant, seeds: Sequence[int], results: Results[Record]) -> list[Record]:
-        return [r for name in self._jobs_of(variant, seeds) for r in results[name]]
+    def _turns(self, variant: Variant, seeds: Sequence[int], trials: DataFrame) -> dict[str, DataFrame]:
+        """The turns of a variant, of each controller that has any."""
+        return by_controller(trials[trials["job"].isin(list(self._jobs_of(variant, seeds)))])
 
-    def table(self, group: str, seeds: Sequence[int], results: Results[Record]) -> Table:
+    def table(self, group: str, seeds: Sequence[int], trials: DataFrame) -> Table:
         """Where the turns of the variants of one group end."""
         rows: list[list[Cell]] = []
         for variant in self.variants(group):
-            turns = by_controller(self._records(variant, seeds, results))
+            turns = self._turns(variant, seeds, trials)
             row: list[Cell] = [variant.name]
-            row += [estimate(turns.get(name, []), steady_state_error) for name in _ALL]
-            lost = [turns.get(name, []) for name in ("KM+I", "E-KM")]
-            row += [rate(r.lost for r in mine) if mine else None for mine in lost]
-            rows.append([*row, rate(r.not_reached for r in lost[-1]) if lost[-1] else None])
+            row += [estimate(turns[name], "error_deg") if name in turns else None for name in _ALL]
+            row += [rate(turns[name]["lost"]) if name in turns else None for name in ("KM+I", "E-KM")]
+            rows.append([*row, rate(turns["E-KM"]["not_reached"]) if "E-KM" in turns else None])
         columns = [group, *(f"{name} [deg]" for name in _ALL), "KM+I lost", "E-KM lost", "E-KM not reached"]
         note = (
             f"{object_name(self._place(group)[0])}, {len(seeds)} seeds. Steady-state error by the truth, "
@@ -263,16 +261,15 @@ class Ablation(Protocol):
         )
         return Table(f"ablation_{group.replace(' ', '_')}", f"Ablation: {group}", columns, rows, note)
 
-    def motions(self, group: str, seeds: Sequence[int], results: Results[Record]) -> Table:
+    def motions(self, group: str, seeds: Sequence[int], trials: DataFrame) -> Table:
         """What the motions of the E-KM are worth with the variants of one group."""
         rows: list[list[Cell]] = []
         for variant in self.variants(group):
-            records = self._records(variant, seeds, results)
-            mine = by_controller(records).get("E-KM")
-            if mine:
-                count, first = estimate(mine, lambda r: r.steps), estimate(mine, lambda r: r.first_step_deg)
-                *predicted, _ = prediction_cells(records)
-                rows.append([variant.name, count, first, *predicted, prediction_cells(records, "true_")[-1]])
+            mine = self._turns(variant, seeds, trials).get("E-KM")
+            if mine is not None:
+                *predicted, _ = prediction_cells(mine)
+                measured = [estimate(mine, column) for column in ("motions", "first_step_deg")]
+                rows.append([variant.name, *measured, *predicted, prediction_cells(mine, "true_")[-1]])
         columns = [
             group, Column("motions", ".1f"), "first motion [deg]", "predicted by the KM [deg]",
             "by the E-KM [deg]", Column("ratio, true [%]", ".0f", percent=True),

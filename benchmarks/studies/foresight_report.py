@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from foresight_turn import ForesightTurn
+from bars import Target, targets_table
 
 from torch_ekm.control import StopReason
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.experiments.config import Setting
-from torch_ekm.experiments.records import Record
 from torch_ekm.experiments.reporting import statistics as stats
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, FigureFile, Report, Table
-from torch_ekm.experiments.reporting.tables import Target, targets_table, which_seeds
+from torch_ekm.experiments.reporting.statistics import DataFrame, Series
+from torch_ekm.experiments.reporting.tables import which_seeds
+from torch_ekm.experiments.reporting.trials import select
 from torch_ekm.rendering import make_scene, save_animation
-
-Turns = Sequence[ForesightTurn]
-Results = Mapping[str, Sequence[Record]]
 
 #: A target is declined where it lies this far beyond the predicted reach [deg].
 BEYOND_DEG = 2.0
@@ -33,174 +31,150 @@ _LEGEND = {
 }
 
 
-def turns_of(results: Results, **wanted: object) -> list[ForesightTurn]:
-    """Turns of grasped objects with these entries."""
-    found = (r for session in results.values() for r in session if isinstance(r, ForesightTurn))
-    return [r for r in found if all(getattr(r, key) == value for key, value in wanted.items())]
-
-
-def reach_errors(turns: Turns) -> np.ndarray:
+def reach_errors(turns: DataFrame) -> Series:
     """Predicted end less the real one [deg], of turns that ended and of which an end was predicted."""
-    ended = [r for r in turns if r.reach_deg is not None and r.reason != StopReason.REACHED.value]
-    return np.array([abs(r.reach_deg or 0.0) - r.largest_deg for r in ended])
+    ended = turns[turns["reach_deg"].notna() & (turns["reason"] != StopReason.REACHED.value)]
+    return ended["reach_deg"].astype(float).abs() - ended["largest_deg"]
 
 
-def declined(turn: ForesightTurn) -> bool:
+def declined(turns: DataFrame) -> Series:
     """The model said that the target is out of reach."""
-    if turn.reach_deg is None or turn.reach_end == _FREE:
-        return False
-    return abs(turn.angle_deg) > abs(turn.reach_deg) + BEYOND_DEG
+    beyond = turns["angle_deg"].abs() > turns["reach_deg"].astype(float).abs() + BEYOND_DEG
+    return beyond & (turns["reach_end"] != _FREE)
 
 
-def covered(turns: Turns) -> list[bool]:
+def covered(turns: DataFrame) -> Series:
     """The error of the estimate lies within the stated 90 % interval."""
-    return [
-        abs(r.estimate_error_deg) <= _NINETY * r.axis_std_deg
-        for r in turns
-        if r.estimate_error_deg is not None and r.axis_std_deg is not None
-    ]
+    stated = turns[["estimate_error_deg", "axis_std_deg"]].dropna().astype(float)
+    return stated["estimate_error_deg"].abs() <= _NINETY * stated["axis_std_deg"]
 
 
-def contenders_of(results: Results) -> list[str]:
-    """In the order in which they appear, the one-step controller first."""
-    names = dict.fromkeys(r.contender for r in turns_of(results))
-    return sorted(names, key=lambda name: name != ONE_STEP)
+def by_contender(trials: DataFrame, kind: str | None = None) -> dict[str, DataFrame]:
+    """Turns of one kind, or all, of each contender that has any, the one-step controller first."""
+    wanted = {} if kind is None else {"kind": kind}
+    found = {name: mine for name, mine in select(trials, **wanted).groupby("contender", sort=False)}
+    return {str(name): found[name] for name in sorted(found, key=lambda name: name != ONE_STEP)}
 
 
-def _same_grasps(results: Results, contender: str) -> np.ndarray:
+def _same_grasps(trials: DataFrame, contender: str) -> DataFrame:
     """Largest angles [deg] of a contender and of the one-step controller on each grasp, ``(n, 2)``."""
-    ours, theirs = (
-        {(r.object, r.seed): r.largest_deg for r in turns_of(results, kind="far", contender=name)}
-        for name in (contender, ONE_STEP)
+    far = select(trials, kind="far").pivot(
+        index=["object", "seed"], columns="contender", values="largest_deg"
     )
-    return np.array([(ours[unit], theirs[unit]) for unit in ours if unit in theirs]).reshape(-1, 2)
+    return far.reindex(columns=[contender, ONE_STEP]).dropna()
 
 
-def paired_ratio(results: Results, contender: str) -> float | None:
+def paired_ratio(trials: DataFrame, contender: str) -> float | None:
     """Median of the largest angle over that of the one-step controller, on the same grasps."""
-    ours, theirs = _same_grasps(results, contender).T
+    ours, theirs = _same_grasps(trials, contender).to_numpy().T
     turned = theirs > 1.0
     return float(np.median(ours[turned] / theirs[turned])) if turned.any() else None
 
 
-def _agreement(results: Results, contender: str) -> Cell:
+def _agreement(trials: DataFrame, contender: str) -> Cell:
     """How often a contender's turn ends within 2 deg of the one-step controller's."""
     if contender == ONE_STEP:
         return None
-    return stats.rate((np.abs(np.diff(_same_grasps(results, contender))) <= 2).ravel().tolist())
+    ours, theirs = _same_grasps(trials, contender).to_numpy().T
+    return stats.rate(np.abs(ours - theirs) <= 2)
 
 
-def foresight_targets(results: Results) -> list[Target]:
-    """What was aimed at."""
+def foresight_targets(trials: DataFrame) -> list[Target]:
+    """What was aimed at before the figures were known."""
     found: list[Target] = []
-    errors = reach_errors(turns_of(results, kind="far", contender=ONE_STEP))
-    if errors.size:
-        within = 100 * float(np.mean(np.abs(errors) <= 2))
+    mine = select(trials, contender=ONE_STEP)
+    errors, blind = reach_errors(select(mine, kind="far")), select(mine, kind="blind")
+    if len(errors):
+        within = 100 * float((errors.abs() <= 2).mean())
         found.append(Target("reach predicted within 2 deg [% of grasps]", within, least=90))
-    blind = turns_of(results, kind="blind", contender=ONE_STEP)
-    if blind:
-        median = float(np.median([r.true_error_deg for r in blind]))
+    if len(blind):
+        median = float(blind["true_error_deg"].median())
         found.append(Target("blind turn with touch, median error [deg]", median, most=0.5))
-        found.append(Target("its 90 % interval holds [%]", 100 * float(np.mean(covered(blind))), least=90))
+        found.append(Target("its 90 % interval holds [%]", 100 * float(covered(blind).mean()), least=90))
     return found
 
 
-def foresight_report(setting: Setting, seeds: Sequence[int], results: Results, folder: Path) -> Report:
+def foresight_report(setting: Setting, seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
     """The answer, the tables, two figures and an animation."""
-    found = foresight_targets(results)
     tables = [
-        far_table(results),
-        reach_table(results),
-        beyond_table(results),
-        blind_table(results),
-        targets_table(found) if found else None,
+        far_table(trials),
+        reach_table(trials),
+        beyond_table(trials),
+        blind_table(trials),
+        targets_table(foresight_targets(trials)),
     ]
-    figures = [
-        *_reach_plot(results, folder),
-        *_blind_plot(results, folder),
-        *_animation(setting, results, folder),
-    ]
-    shown = [table for table in tables if table is not None and table.rows]
+    turns = by_contender(trials)
+    mine = turns.get(ONE_STEP, trials[:0])
+    figures = [*_reach_plot(mine, folder), *_blind_plot(turns, folder), *_animation(setting, trials, folder)]
     title = "Foresight: how far, and what ends it; turns with the camera off"
-    ends = [f"{name} {_ends(turns_of(results, contender=name))}" for name in contenders_of(results)]
-    summary = f"{_answer(results)} Objects lost: {', '.join(ends)}. {which_seeds(seeds)}"
-    legend = {name: line for name, line in _LEGEND.items() if name in contenders_of(results)}
-    return Report(title, summary, shown, figures, legend=legend)
+    ends = [f"{name} {_ends(found)}" for name, found in turns.items()]
+    summary = f"{_answer(trials)} Objects lost: {', '.join(ends)}. {which_seeds(seeds)}"
+    legend = {name: line for name, line in _LEGEND.items() if name in turns}
+    return Report(title, summary, [table for table in tables if table.rows], figures, legend=legend)
 
 
-def _ends(turns: Turns) -> str:
-    beyond = [r for r in turns if r.kind == "turn"]
-    missed = (
-        f" ({sum(r.not_reached for r in beyond)} of {len(beyond)} beyond Table I not reached)"
-        if beyond
-        else ""
-    )
-    return f"{sum(r.lost for r in turns)} of {len(turns)} turns{missed}"
+def _ends(turns: DataFrame) -> str:
+    beyond = turns[turns["kind"] == "turn"]
+    missed = f" ({beyond['not_reached'].sum()} of {len(beyond)} beyond Table I not reached)"
+    return f"{turns['lost'].sum()} of {len(turns)} turns{missed if len(beyond) else ''}"
 
 
-def _answer(results: Results) -> str:
-    parts = []
-    errors = np.abs(reach_errors(turns_of(results, kind="far", contender=ONE_STEP)))
-    if errors.size:
-        share = 100 * np.mean(errors <= 2)
+def _answer(trials: DataFrame) -> str:
+    parts, mine = [], select(trials, contender=ONE_STEP)
+    errors, blind = reach_errors(select(mine, kind="far")).abs(), select(mine, kind="blind")
+    if len(errors):
         parts.append(
-            f"The end of a turn is predicted to {np.median(errors):.1f} deg (median), within 2 deg in "
-            f"{share:.0f} % of {errors.size} grasps."
+            f"The end of a turn is predicted to {errors.median():.1f} deg (median), within 2 deg in "
+            f"{100 * (errors <= 2).mean():.0f} % of {len(errors)} grasps."
         )
-    blind = turns_of(results, kind="blind", contender=ONE_STEP)
-    if blind:
-        middle = np.median([r.true_error_deg for r in blind])
-        hold = 100 * np.mean(covered(blind))
+    if len(blind):
         parts.append(
-            f"A blind turn of {blind[0].angle_deg:g} deg ends {middle:.2f} deg off (median of {len(blind)}); "
-            f"the stated 90 % interval holds {hold:.0f} % of the estimates."
+            f"A blind turn of {blind['angle_deg'].iloc[0]:g} deg ends {blind['true_error_deg'].median():.2f} "
+            f"deg off (median of {len(blind)}); the stated 90 % interval holds "
+            f"{100 * covered(blind).mean():.0f} % of the estimates."
         )
-    for name in contenders_of(results):
-        ratio = paired_ratio(results, name)
+    for name in by_contender(trials):
+        ratio = paired_ratio(trials, name)
         if name != ONE_STEP and ratio is not None:
             parts.append(f"{name} turns {ratio:.2f} times as far as the one-step E-KM (median).")
     return " ".join(parts) or "Nothing was grasped."
 
 
-def far_table(results: Results) -> Table:
+def far_table(trials: DataFrame) -> Table:
     """The largest angle of each contender."""
-    items = {name: turns_of(results, kind="far", contender=name) for name in contenders_of(results)}
-    columns: dict[Column, Callable[[Turns], Cell]] = {
+    columns: dict[Column, Callable[[DataFrame], Cell]] = {
         Column("largest angle [deg]", ".1f"): lambda mine: stats.bootstrap_mean(
-            np.array([r.largest_deg for r in mine])
+            mine["largest_deg"].to_numpy()
         ),
-        Column("median [deg]", ".1f"): lambda mine: float(np.median([r.largest_deg for r in mine])),
-        Column(f"paired, {ONE_STEP} = 1"): lambda mine: paired_ratio(results, mine[0].contender),
-        Column(f"within 2 deg of {ONE_STEP}"): lambda mine: _agreement(results, mine[0].contender),
-        Column("not reached"): lambda mine: stats.rate(r.not_reached for r in mine),
-        Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
+        Column("median [deg]", ".1f"): lambda mine: float(mine["largest_deg"].median()),
+        Column(f"paired, {ONE_STEP} = 1"): lambda mine: paired_ratio(trials, mine["contender"].iloc[0]),
+        Column(f"within 2 deg of {ONE_STEP}"): lambda mine: _agreement(trials, mine["contender"].iloc[0]),
+        Column("not reached"): lambda mine: stats.rate(mine["not_reached"]),
+        Column("lost"): lambda mine: stats.rate(mine["lost"]),
     }
     note = (
         "The target is farther than any grasp goes; the largest true angle before the turn ended. How "
         "often two controllers end within 2 deg of each other on the same grasp bounds what can be predicted."
     )
-    items = {name: mine for name, mine in items.items() if mine}
+    items = by_contender(trials, "far")
     return Table.of("far", "As far as it goes", "contender", items, columns, note)
 
 
-def reach_table(results: Results) -> Table:
+def reach_table(trials: DataFrame) -> Table:
     """How well the end was predicted; of the one-step controller for each object and how the turn ended."""
-    far = [r for r in turns_of(results, kind="far") if r.reach_deg is not None]
-    items: dict[str, Turns] = {}
-    for name in contenders_of(results):
-        mine = [r for r in far if r.contender == name]
+    items: dict[str, DataFrame] = {}
+    for name, found in by_contender(trials, "far").items():
+        mine = found[found["reach_deg"].notna()]
         items[f"{name}, all"] = mine
         if name == ONE_STEP:
             items |= _each("object", mine) | _each("reason", mine)
-    columns: dict[Column, Callable[[Turns], Cell]] = {
+    columns: dict[Column, Callable[[DataFrame], Cell]] = {
         Column("grasps"): lambda mine: len(reach_errors(mine)),
-        Column("median absolute error [deg]", ".1f"): lambda mine: float(
-            np.median(np.abs(reach_errors(mine)))
-        ),
+        Column("median absolute error [deg]", ".1f"): lambda mine: float(reach_errors(mine).abs().median()),
         Column("mean error [deg]", "+.1f"): lambda mine: float(reach_errors(mine).mean()),
-        Column("within 2 deg"): lambda mine: stats.rate((np.abs(reach_errors(mine)) <= 2).tolist()),
-        Column("within 5 deg"): lambda mine: stats.rate((np.abs(reach_errors(mine)) <= 5).tolist()),
-        Column("ends by (predicted)"): lambda mine: _most(r.reach_end for r in mine),
+        Column("within 2 deg"): lambda mine: stats.rate(reach_errors(mine).abs() <= 2),
+        Column("within 5 deg"): lambda mine: stats.rate(reach_errors(mine).abs() <= 5),
+        Column("ends by (predicted)"): lambda mine: str(mine["reach_end"].mode().iloc[-1]),
     }
     items = {name: mine for name, mine in items.items() if len(reach_errors(mine))}
     note = (
@@ -210,47 +184,46 @@ def reach_table(results: Results) -> Table:
     return Table.of("reach", "Predicted ends of turns", "turns", items, columns, note)
 
 
-def beyond_table(results: Results) -> Table:
+def beyond_table(trials: DataFrame) -> Table:
     """Turns beyond Table I, and what declining would have spared."""
-    items = {name: turns_of(results, kind="turn", contender=name) for name in contenders_of(results)}
-    columns: dict[Column, Callable[[Turns], Cell]] = {
+    columns: dict[Column, Callable[[DataFrame], Cell]] = {
         Column("turns"): len,
-        Column("reached"): lambda mine: stats.rate(r.reason == StopReason.REACHED.value for r in mine),
-        Column("not reached"): lambda mine: stats.rate(r.not_reached for r in mine),
-        Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
-        Column("declined"): lambda mine: sum(declined(r) for r in mine),
-        Column("of these lost or not reached"): lambda mine: sum(
-            r.lost or r.not_reached for r in mine if declined(r)
+        Column("reached"): lambda mine: stats.rate(mine["reason"] == StopReason.REACHED.value),
+        Column("not reached"): lambda mine: stats.rate(mine["not_reached"]),
+        Column("lost"): lambda mine: stats.rate(mine["lost"]),
+        Column("declined"): lambda mine: int(declined(mine).sum()),
+        Column("of these lost or not reached"): lambda mine: int(
+            (declined(mine) & (mine["lost"] | mine["not_reached"])).sum()
         ),
-        Column("lost, not declined"): lambda mine: sum(r.lost for r in mine if not declined(r)),
+        Column("lost, not declined"): lambda mine: int((mine["lost"] & ~declined(mine)).sum()),
     }
     note = (
         f"Declined: more than {BEYOND_DEG:g} deg beyond the predicted reach. These turns were made all the "
         "same, to see what declining them would have spared."
     )
-    items = {name: mine for name, mine in items.items() if mine}
+    items = by_contender(trials, "turn")
     return Table.of("beyond", "Beyond Table I", "contender", items, columns, note)
 
 
-def blind_table(results: Results) -> Table:
+def blind_table(trials: DataFrame) -> Table:
     """Turns with the camera off."""
-    items: dict[str, Turns] = {}
-    for name in contenders_of(results):
+    items: dict[str, DataFrame] = {}
+    for name, found in by_contender(trials).items():
         for kind in _BLIND:
-            mine = turns_of(results, kind=kind, contender=name)
+            mine = found[found["kind"] == kind]
             items[f"{name}, {kind}, all"] = mine
             if name == ONE_STEP:
                 items |= _each("object", mine, f"{kind}, ")
-    columns: dict[Column, Callable[[Turns], Cell]] = {
-        Column("median error [deg]"): lambda mine: float(np.median([r.true_error_deg for r in mine])),
-        Column("largest error [deg]"): lambda mine: float(max(r.true_error_deg for r in mine)),
-        Column("error of the estimate, rms [deg]"): lambda mine: _rms([r.estimate_error_deg for r in mine]),
-        Column("stated sd [deg]"): lambda mine: _rms([r.axis_std_deg for r in mine]),
-        Column("90 % interval holds"): lambda mine: stats.rate(covered(mine)) if covered(mine) else None,
-        Column("looks", ".1f"): lambda mine: float(np.mean([r.looks for r in mine])),
-        Column("lost"): lambda mine: stats.rate(r.lost for r in mine),
+    columns: dict[Column, Callable[[DataFrame], Cell]] = {
+        Column("median error [deg]"): lambda mine: float(mine["true_error_deg"].median()),
+        Column("largest error [deg]"): lambda mine: float(mine["true_error_deg"].max()),
+        Column("error of the estimate, rms [deg]"): lambda mine: _rms(mine["estimate_error_deg"]),
+        Column("stated sd [deg]"): lambda mine: _rms(mine["axis_std_deg"]),
+        Column("90 % interval holds"): lambda mine: stats.rate(covered(mine)) if len(covered(mine)) else None,
+        Column("looks", ".1f"): lambda mine: float(mine["looks"].mean()),
+        Column("lost"): lambda mine: stats.rate(mine["lost"]),
     }
-    items = {name: mine for name, mine in items.items() if mine}
+    items = {name: mine for name, mine in items.items() if len(mine)}
     note = (
         "The camera is off from the first reading on. True error about the axis at the end; error of the "
         "estimate and its stated standard deviation likewise. 'No touch': the prediction alone. "
@@ -259,56 +232,51 @@ def blind_table(results: Results) -> Table:
     return Table.of("blind", "Whole turns with the camera off", "kind", items, columns, note)
 
 
-def _each(entry: str, turns: Turns, prefix: str = "") -> dict[str, Turns]:
-    """Turns by the value of an entry, under ``{prefix}{value}``."""
-    values = dict.fromkeys(str(getattr(r, entry)) for r in turns)
-    return {f"{prefix}{value}": [r for r in turns if getattr(r, entry) == value] for value in values}
+def _each(column: str, turns: DataFrame, prefix: str = "") -> dict[str, DataFrame]:
+    """Turns by the value of a column, under ``{prefix}{value}``."""
+    return {f"{prefix}{value}": mine for value, mine in turns.groupby(column, sort=False)}
 
 
-def _most(names) -> str:
-    found = list(names)
-    return max(set(found), key=lambda name: (found.count(name), name)) if found else ""
+def _rms(values: Series) -> float | None:
+    known = values.dropna().astype(float)
+    return float(np.sqrt(known.pow(2).mean())) if len(known) else None
 
 
-def _rms(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.sqrt(np.mean(np.square(known)))) if known else None
-
-
-def _reach_plot(results: Results, folder: Path) -> list[FigureFile]:
-    """Predicted against real ends."""
-    far = [r for r in turns_of(results, kind="far", contender=ONE_STEP) if r.reach_deg is not None]
-    if not far:
+def _reach_plot(turns: DataFrame, folder: Path) -> list[FigureFile]:
+    """Predicted against real ends of the one-step controller's turns."""
+    far = turns[(turns["kind"] == "far") & turns["reach_deg"].notna()]
+    if far.empty:
         return []
     figure, (axis,) = new_figure(4.5, 4.2)
-    top = 5 + max(max(abs(r.reach_deg or 0.0), r.largest_deg) for r in far)
+    predicted, real = far["reach_deg"].astype(float).abs(), far["largest_deg"]
+    top = 5 + max(predicted.max(), real.max())
     axis.plot([0, top], [0, top], color=COLOURS["KM"], linewidth=1)
-    for k, name in enumerate(dict.fromkeys(r.object for r in far)):
-        mine = [r for r in far if r.object == name]
-        x, y = [r.largest_deg for r in mine], [abs(r.reach_deg or 0.0) for r in mine]
-        axis.plot(x, y, "osD^v*PX"[k % 8], label=name.replace("_", " "), markersize=5)
+    for k, name in enumerate(far["object"].unique()):
+        mine = far["object"] == name
+        label = name.replace("_", " ")
+        axis.plot(real[mine], predicted[mine], "osD^v*PX"[k % 8], label=label, markersize=5)
     axis.set(xlabel="real end [deg]", ylabel="predicted end [deg]", xlim=(0, top), ylim=(0, top))
     axis.legend(frameon=False, fontsize=8)
     caption = "Where the one-step E-KM's turns ended, and where the model said before anything moved."
     return [save_figure(figure, folder, "reach", caption)]
 
 
-def _blind_plot(results: Results, folder: Path) -> list[FigureFile]:
+def _blind_plot(turns: dict[str, DataFrame], folder: Path) -> list[FigureFile]:
     """Errors of turns with the camera off, by contender."""
-    blind = [r for r in turns_of(results) if r.kind in _BLIND and not r.lost]
-    names = [name for name in contenders_of(results) if any(r.contender == name for r in blind)]
+    blind = {name: mine[mine["kind"].isin(_BLIND) & ~mine["lost"]] for name, mine in turns.items()}
+    blind = {name: mine for name, mine in blind.items() if len(mine)}
     if not blind:
         return []
     figure, (axis,) = new_figure(5.0, 3.2)
-    width = 0.8 / len(names)
-    for j, name in enumerate(names):
+    width = 0.8 / len(blind)
+    for j, (name, mine) in enumerate(blind.items()):
         for k, kind in enumerate(_BLIND):
-            errors = sorted(r.true_error_deg for r in blind if (r.contender, r.kind) == (name, kind))
-            middle = k + (j - (len(names) - 1) / 2) * width
+            errors = mine[mine["kind"] == kind]["true_error_deg"].sort_values()
+            middle = k + (j - (len(blind) - 1) / 2) * width
             places = middle + width * np.linspace(-0.3, 0.3, len(errors))
             axis.plot(places, errors, "o", color=f"C{j}", markersize=2.5, label=None if k else name)
-            if errors:
-                axis.plot(middle + width * np.array([-0.4, 0.4]), [np.median(errors)] * 2, color="black")
+            if len(errors):
+                axis.plot(middle + width * np.array([-0.4, 0.4]), [errors.median()] * 2, color="black")
     axis.set_xticks(range(len(_BLIND)), list(_BLIND))
     axis.set(ylabel="true error [deg]", ylim=(0, None))
     axis.legend(frameon=False, fontsize=8, markerscale=2)
@@ -316,13 +284,14 @@ def _blind_plot(results: Results, folder: Path) -> list[FigureFile]:
     return [save_figure(figure, folder, "blind", caption)]
 
 
-def _animation(setting: Setting, results: Results, folder: Path) -> list[FigureFile]:
+def _animation(setting: Setting, trials: DataFrame, folder: Path) -> list[FigureFile]:
     """The farthest turn that was predicted, with the predicted object as a ghost."""
-    turns = [r for r in turns_of(results, kind="far") if r.poses and r.predicted and not r.lost]
-    if not turns:
+    far = select(trials, kind="far", lost=False)
+    far = far[(far["poses"].map(len) > 0) & (far["predicted"].map(len) > 0)]
+    if far.empty:
         return []
-    turn = max(turns, key=lambda r: r.largest_deg)
-    hand, obj = load_hand(setting.hand), load_object(turn.object)
+    turn = far.loc[far["largest_deg"].idxmax()]
+    hand, obj = load_hand(setting.hand), load_object(turn["object"])
     n = len(turn.poses)
     predicted = [turn.predicted[min(k, len(turn.predicted) - 1)] for k in range(n)]
     q, position, rotation = (np.array(part) for part in zip(*turn.poses, strict=True))

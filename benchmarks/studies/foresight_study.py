@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from foresight_report import foresight_report, foresight_targets
+from foresight_report import foresight_report
 from foresight_turn import ForesightTurn
 from oracle import OracleBench
 from run_study import run_study
@@ -22,10 +22,10 @@ from run_study import run_study
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.config import Setting, digest, object_name
 from torch_ekm.experiments.protocols.generalize import OTHER_ANGLES, TABLE_I
-from torch_ekm.experiments.protocols.protocol import Protocol, Results
+from torch_ekm.experiments.protocols.protocol import Protocol
 from torch_ekm.experiments.records import NotGrasped, Record, Trial, TrialRecord, true_state
 from torch_ekm.experiments.reporting.report import Report
-from torch_ekm.experiments.reporting.tables import Target
+from torch_ekm.experiments.reporting.statistics import DataFrame
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.foresight import Reach
 
@@ -152,13 +152,9 @@ class Foresight(Protocol):
                 dark["predicted"] = tuple(way)
         return ForesightTurn(**vars(done), contender=contender, largest_deg=max(angles) / _DEG, **dark)
 
-    def targets(self, results: Results[ForesightTurn]) -> list[Target]:
-        """Set before the figures were known."""
-        return foresight_targets(results)
-
-    def report(self, seeds: Sequence[int], results: Results[ForesightTurn], folder: Path) -> Report:
-        """Answer, tables, figures, and a turn beside what was predicted of it."""
-        return foresight_report(self.setting, seeds, results, folder)
+    def report(self, seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
+        """Answer, tables, figures, and a turn next to what was predicted of it."""
+        return foresight_report(self.setting, seeds, trials, folder)
 
 
 if __name__ == "__main__":

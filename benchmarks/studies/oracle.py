@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -22,7 +21,8 @@ from torch_ekm.experiments.jobs import run_jobs
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.report import Cell, Column, Table
-from torch_ekm.experiments.reporting.statistics import estimate, rate, select, steady_state_error
+from torch_ekm.experiments.reporting.statistics import DataFrame, estimate, rate
+from torch_ekm.experiments.reporting.trials import select, trial_frame
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.model import KinematicModel, ModelOptions
 from torch_ekm.plant import Observation, PlantStatus
@@ -77,33 +77,27 @@ CONTENDERS: dict[str, tuple[type[Generalize], str]] = {
 }
 
 
-def run(
-    objects: Sequence[str], seeds: Sequence[int], folder: Path, jobs: int
-) -> dict[str, list[TrialRecord]]:
-    """Contender -> its turns of ``generalize``, whose probes are left out."""
-    found: dict[str, list[TrialRecord]] = {}
+def run(objects: Sequence[str], seeds: Sequence[int], folder: Path, jobs: int) -> DataFrame:
+    """The turns of ``generalize`` of each contender, without the probes."""
+    found = {}
     for name, (protocol, controller) in CONTENDERS.items():
         probes = {"long_step_deg": 0.0, "blind_deg": 0.0}
         plan = protocol(Setting(sensing=True), tuple(objects), controllers=(controller,), **probes)
         kept = run_jobs(plan.run, plan.jobs(seeds), folder, jobs)
-        records = [TrialRecord.from_json(figures) for session in kept.values() for figures in session]
-        found[name] = select(records, kind="turn")
-    return found
+        found[name] = [TrialRecord.from_json(figures) for session in kept.values() for figures in session]
+    trials = trial_frame(found, Setting().safety.rule.max_steps).rename(columns={"job": "contender"})
+    return select(trials, kind="turn")
 
 
-def table(turns: dict[str, list[TrialRecord]]) -> Table:
+def table(turns: DataFrame) -> Table:
     """One row for each object, angle and contender."""
     rows: list[list[Cell]] = []
-    places = dict.fromkeys((r.object, r.angle_deg) for mine in turns.values() for r in mine)
-    for object, angle in places:
-        for name, records in turns.items():
-            mine = select(records, object=object, angle_deg=angle)
-            if not mine:
-                continue
-            ends = Counter(r.reason for r in mine)
-            others = ", ".join(f"{n} {reason}" for reason, n in ends.most_common() if reason != _REACHED)
-            reached, lost = rate(r.reason == _REACHED for r in mine), rate(r.lost for r in mine)
-            rows.append([object, angle, name, reached, lost, estimate(mine, steady_state_error), others])
+    for (object, angle), place in turns.groupby(["object", "angle_deg"], sort=False):
+        for name, mine in place.groupby("contender", sort=False):
+            ends = mine["reason"].value_counts().drop(_REACHED, errors="ignore")
+            others = ", ".join(f"{n} {reason}" for reason, n in ends.items())
+            reached, lost = rate(mine["reason"] == _REACHED), rate(mine["lost"])
+            rows.append([object, angle, name, reached, lost, estimate(mine, "error_deg"), others])
     columns = [
         "object", Column("angle [deg]", ".0f"), "contender", "reached", "lost",
         Column("error [deg]", ".2f"), "why the others ended",

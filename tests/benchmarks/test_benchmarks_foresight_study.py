@@ -17,6 +17,7 @@ from oracle import Omniscient
 from torch_ekm.control import Safety, StoppingRule
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.config import Setting
+from torch_ekm.experiments.reporting.trials import trial_frame
 from torch_ekm.experiments.reproduce import Experiment, reproduce
 
 pytest.importorskip("sapien")
@@ -79,21 +80,22 @@ def test_what_is_made_of_the_figures() -> None:
         turn(largest_deg=20.0, reach_deg=14.0, reach_end="friction", seed=1),
         turn(largest_deg=70.0, reach_deg=70.0, reach_end="nothing", reason="reached", seed=2),
     ]
-    assert report.reach_errors(turns).tolist() == [1.5, -6.0]
-    assert [report.declined(dataclasses.replace(t, angle_deg=33.0)) for t in turns] == [False, True, False]
+    trials = trial_frame({"a": turns}, 60)
+    assert report.reach_errors(trials).tolist() == [1.5, -6.0]
+    assert report.declined(trials.assign(angle_deg=33.0)).tolist() == [False, True, False]
     further = [turn(contender="another", largest_deg=1.5 * t.largest_deg, seed=t.seed) for t in turns]
-    results = {"a": [*turns, *further]}
-    assert report.paired_ratio(results, "another") == pytest.approx(1.5)
+    both = trial_frame({"a": [*turns, *further]}, 60)
+    assert report.paired_ratio(both, "another") == pytest.approx(1.5)
     nearer = [
         turn(contender="oracle", largest_deg=t.largest_deg + d, seed=t.seed)
         for t, d in zip(turns, (-1.9, 3.0, 0.5), strict=True)
     ]
-    rows = {row[0]: row for row in report.far_table({"a": [*turns, *nearer]}).rows}
+    rows = {row[0]: row for row in report.far_table(trial_frame({"a": [*turns, *nearer]}, 60)).rows}
     assert (rows["oracle"][4].count, rows["oracle"][4].n, rows[report.ONE_STEP][4]) == (2, 3, None)
-    met = {target.what: target for target in report.foresight_targets(results)}
+    met = {target.what: target for target in report.foresight_targets(both)}
     assert met["reach predicted within 2 deg [% of grasps]"].measured == 50
     blind = [turn(estimate_error_deg=e, axis_std_deg=0.3) for e in (0.1, -0.45, 0.6)]
-    assert report.covered(blind) == [True, True, False]
+    assert report.covered(trial_frame({"a": blind}, 60)).tolist() == [True, True, False]
 
 
 def test_impossible_protocols_are_refused() -> None:

@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
-write_pages = pytest.importorskip("write_pages", reason="the benchmarks are not part of this installation")
+pytest.importorskip("write_pages", reason="the benchmarks are not part of this installation")
+
+import write_pages
+from bars import Target, targets_table
 
 
 def _plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
@@ -53,8 +56,9 @@ def test_half_a_result_of_another_commit_is_not_gone_on_with(
     script = tmp_path / "resume.py"
     script.write_text(
         "import pathlib, sys\n"
+        "from torch_ekm.experiments.reporting.report import Report\n"
         "done = pathlib.Path(sys.argv[1]); done.mkdir(exist_ok=True)\n"
-        "(done / 'report.md').write_text(f'# T\\n\\n{len(list(done.glob(\"run_*\")))} runs were there\\n')\n"
+        "Report('T', f'{len(list(done.glob(\"run_*\")))} runs were there').write(done)\n"
         "(done / 'run_1').touch()\n"
     )
     _plan(tmp_path, monkeypatch, f"{script} {{out}}")
@@ -78,15 +82,33 @@ def test_a_report_comes_with_its_headings_below_the_pages(
     script = tmp_path / "report.py"
     script.write_text(
         "import pathlib, sys\n"
-        "out = pathlib.Path(sys.argv[1]); out.mkdir()\n"
-        "(out / 'report.md').write_text('# Title\\n\\nAn answer.\\n\\n## A table\\n')\n"
+        "from torch_ekm.experiments.reporting.report import FigureFile, Report, Table\n"
+        "out = pathlib.Path(sys.argv[1]); out.mkdir(); (out / 'shown.svg').touch()\n"
+        "table = Table('a', 'A table', ['a', 'c'], [[None, 0.5], ['1|2', '']], 'A note.')\n"
+        "figures = [FigureFile('shown.svg', 'Seen.'), FigureFile('other.svg', 'Left out.')]\n"
+        "Report('Title', 'An answer.', [table], figures).write(out)\n"
     )
     _plan(tmp_path, monkeypatch, f"{script} {{out}}")
+    (part,) = write_pages.PLAN["one"]["parts"]
+    part["pictures"] = ["shown"]
     write_pages.main(["one", "--quick", "--out", str(tmp_path / "out")])
     text = (tmp_path / "out" / "one.md").read_text(encoding="utf-8")
     assert "# Title" not in text
-    assert "An answer.\n\n### A table" in text
+    assert "An answer.\n" in text
+    assert "\n![Seen.](one/shown.svg)\n\n*Seen.*\n\n### A table\n\n| a | c |" in text
+    assert "| - | 0.50 |\n| 1\\|2 |  |\n\nA note." in text
+    assert "Left out" not in text
+    assert (tmp_path / "out" / "one" / "shown.svg").exists()
     assert sys.executable not in text
+
+
+def test_targets_say_by_how_much_they_are_missed() -> None:
+    assert Target("x", 20.0, most=25).missed_by == 0
+    assert Target("x", 30.0, most=25).missed_by == 5
+    assert Target("x", 80.0, least=90).missed_by == 10
+    assert Target("x", 0.5, least=1, most=3).missed_by == 0.5
+    rows = targets_table([Target("a", 20.0, most=25), Target("b", 30.0, most=25)]).text()
+    assert rows == [["a", "-", "25", "20", "yes", "-"], ["b", "-", "25", "30", "no", "5"]]
 
 
 SCRIPTS = [path for path in write_pages.HERE.glob("**/*.py") if path.parent.name != "recorded_hand"]

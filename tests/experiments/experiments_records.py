@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
+import pandas
+
 from torch_ekm.experiments.protocols.object_memory import MemoryTurn
-from torch_ekm.experiments.records import NotGrasped, TrialRecord
+from torch_ekm.experiments.records import NotGrasped, Record, TrialRecord
+from torch_ekm.experiments.reporting.trials import trial_frame
 
 FIGURES: dict[str, Any] = {
     "object": "box", "kind": "turn", "controller": "KM", "seed": 0, "trial": 1, "angle_deg": 20.0,
@@ -32,3 +36,8 @@ def not_grasped(controller: str = "KM", seed: int = 0, **changes: Any) -> NotGra
 def memory_turn(**changes: Any) -> MemoryTurn:
     """A turn of the object memory."""
     return MemoryTurn(**{**FIGURES, "controller": "E-KM", **changes})
+
+
+def frame(records: Iterable[Record], limit: int = 40) -> pandas.DataFrame:
+    """These trials, of one job."""
+    return trial_frame({"job": records}, limit)

@@ -16,14 +16,13 @@ from torch_ekm._terminal import print_report
 from torch_ekm.cli import app
 from torch_ekm.exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.experiments import compare
-from torch_ekm.experiments.learner_comparison.compare import run_one
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
 from torch_ekm.experiments.learner_comparison.report import ComparisonReport, overview_table, score_table
+from torch_ekm.experiments.learner_comparison.run import run_one
 from torch_ekm.experiments.learner_comparison.scores import (
     Comparison,
     Score,
     block_bootstrap,
-    studentized_range,
 )
 from torch_ekm.experiments.learner_comparison.stream import Stream, in_own_units, load_table
 from torch_ekm.experiments.learner_comparison.table_file import open_table
@@ -125,12 +124,6 @@ def test_critical_difference_is_demsars() -> None:
     fourteen = tuple(linear(40, name=str(k)) for k in range(14))
     comparison = Comparison(fourteen, ("a", "b", "c", "d"), {}, {})
     assert comparison.critical_difference() == pytest.approx(2.569 * math.sqrt(4 * 5 / (6 * 14)), abs=1e-3)
-
-
-def test_studentized_range_is_scipys() -> None:
-    for k in (2, 10, 20):
-        expected = pytest.importorskip("scipy.stats").studentized_range.ppf(0.95, k, np.inf)
-        assert studentized_range(k) == pytest.approx(expected, rel=1e-9)
 
 
 def test_bootstrap_of_equals_is_one() -> None:

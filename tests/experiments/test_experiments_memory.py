@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from experiments_records import memory_turn
+from experiments_records import frame, memory_turn
 
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.config import Setting
@@ -33,13 +33,15 @@ def made_up_session(seed: int, share: dict[str, float], wrong: int = 0) -> list[
         base = draw.uniform(0.5, 1.5, 8)
         errors = {name: (share.get(name, 1.0) * base).tolist() for name in NAMES}
         model = k % 2 if k < 16 - wrong else 5
-        records.append(memory_turn(object="ab"[k % 2], model=model, memory_errors_deg=errors))
+        about = {"object": "ab"[k % 2], "seed": seed, "model": model}
+        records.append(memory_turn(**about, memory_errors_deg=errors))
     return records
 
 
 def test_comparison_is_paired() -> None:
-    sessions = [made_up_session(seed, {"bank": 0.5, "labelled": 0.8}) for seed in range(LEAST_SEEDS)]
-    table = comparison_table(sessions)
+    sessions = (made_up_session(seed, {"bank": 0.5, "labelled": 0.8}) for seed in range(LEAST_SEEDS))
+    turns = frame(turn for session in sessions for turn in session)
+    table = comparison_table(turns)
     rows = {row[0]: row for row in table.rows}
     ratio = rows["bank : labelled"][1]
     assert ratio.mean == pytest.approx(0.625)
@@ -48,15 +50,15 @@ def test_comparison_is_paired() -> None:
     assert rows["one model : labelled"][1].mean == pytest.approx(1.25)
     assert rows["bank : fresh"][2] < 1e-4
     assert all(len(row) == len(table.header) for row in table.rows)
-    few = comparison_table(sessions[:-1])
+    few = comparison_table(turns[turns["seed"] > 0])
     assert all(row[2] is None for row in few.rows)  # no p-value
 
 
 def test_share_of_recognised_turns() -> None:
-    sessions = [made_up_session(0, {}), made_up_session(1, {}, wrong=2)]
+    turns = frame([*made_up_session(0, {}), *made_up_session(1, {}, wrong=2)])
     # five judged turns of each object in each sequence, two of them wrong
-    assert recognition(sessions).startswith("18 of 20 turns, 90")
-    assert "at most 3" in recognition(sessions)
+    assert recognition(turns).startswith("18 of 20 turns, 90")
+    assert "at most 3" in recognition(turns)
 
 
 def test_bench_feels_the_width_of_what_it_holds() -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from torch_ekm.exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
-from torch_ekm.experiments.learner_comparison.compare import compare
 from torch_ekm.experiments.learner_comparison.own_recording import Columns, load_own
+from torch_ekm.experiments.learner_comparison.run import compare
 
 COLUMNS = Columns(state=["angle", "extra*"], command=["rate"], observation=["angle"])
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from experiments_records import not_grasped
+from experiments_records import frame, not_grasped
 
 from torch_ekm.control import DEFAULT_TASKS, Caution, EffortTask, LimitingFunction, Safety
 from torch_ekm.description import object_paths
@@ -196,8 +196,8 @@ def test_what_cannot_be_grasped_is_recorded_not_raised(monkeypatch: pytest.Monke
 
 
 def test_the_report_names_what_was_never_grasped(tmp_path: Path) -> None:
-    results = {who: [not_grasped(who)] for who in CONTROLLERS}
-    report = Generalize(objects=("box",)).report((0,), results, tmp_path)
+    trials = frame(not_grasped(who) for who in CONTROLLERS)
+    report = Generalize(objects=("box",)).report((0,), trials, tmp_path)
     assert "box was never grasped (too wide)" in report.summary
     report.write(tmp_path)
     assert "never grasped" in (tmp_path / "index.html").read_text()

@@ -5,42 +5,37 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pandas
 import pytest
 import scipy.stats
 import torch
-from experiments_records import memory_turn, not_grasped, turn
+from experiments_records import frame, memory_turn, not_grasped, turn
 
-from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
-from torch_ekm.experiments.protocols.generalize import Generalize, ends_table, object_table
-from torch_ekm.experiments.protocols.object_memory import MemoryTurn, ObjectMemory, judge_assignment
+from torch_ekm.exceptions import ParameterError
+from torch_ekm.experiments.protocols.generalize import ends_table, object_table
+from torch_ekm.experiments.protocols.object_memory import MemoryTurn, judge_assignment
 from torch_ekm.experiments.protocols.online import Online, prediction_curves, recovery_trials
 from torch_ekm.experiments.records import NotGrasped, TrialRecord, prediction_error
 from torch_ekm.experiments.reporting.report import Column, Table
 from torch_ekm.experiments.reporting.statistics import (
     Estimate,
-    bootstrap,
     bootstrap_mean,
     bootstrap_ratio,
+    estimate,
     learning_curve,
-    mean_of,
     paired_means,
     paired_test,
     rate,
-    select,
-    settle_steps,
-    steady_state_error,
-    survivor_error,
     unit_means,
 )
 from torch_ekm.experiments.reporting.tables import (
-    Target,
     comparison_table,
     controller_table,
     prediction_table,
     reason_table,
-    targets_table,
     verdict,
 )
+from torch_ekm.experiments.reporting.trials import select
 
 # -- records -----------------------------------------------------------------------------------------
 
@@ -73,11 +68,10 @@ def test_prediction_error_picks_the_focused_rows_of_the_object() -> None:
 
 
 def test_lost_object_counts_with_the_whole_angle() -> None:
-    lost = turn(error=3.0, reason="object lost")
-    assert lost.lost
-    assert steady_state_error(lost) == 20.0
-    assert survivor_error(lost) is None
-    assert steady_state_error(turn(error=3.0)) == 3.0
+    trials = frame([turn(error=3.0, reason="object lost"), turn(error=3.0)])
+    assert trials["lost"].tolist() == [True, False]
+    assert trials["error_deg"].tolist() == [20.0, 3.0]
+    assert np.isnan(trials["survivor_error_deg"][0])
 
 
 @pytest.mark.parametrize(
@@ -85,43 +79,58 @@ def test_lost_object_counts_with_the_whole_angle() -> None:
     [((3, 0.4, 0.3), 1), ((3, 0.4, 0.9, 0.2), 3), ((0.2, 0.1), 0), ((3, 2, 0.6), 40)],
 )
 def test_settling_means_staying_inside(errors: tuple[float, ...], expected: int) -> None:
-    assert settle_steps(40)(turn(errors_deg=errors)) == expected
+    trials = frame([turn(errors_deg=errors)], limit=40)
+    assert trials["settle"].tolist() == [expected]
+    assert trials["beyond"].tolist() == [expected - 8]  # 20 deg in motions of 2.5 deg
 
 
 def test_what_stopped_the_loop_does_not_hide_a_loss() -> None:
     flipped = turn(error=3.0, reason="pose jump", off_rotation_deg=76.0)
     assert flipped.lost
     assert not flipped.not_reached
-    assert steady_state_error(flipped) == 20.0
+    assert frame([flipped])["error_deg"].tolist() == [20.0]
     assert not turn(error=3.0, reason="pose jump", off_rotation_deg=2.0).lost
 
 
 def test_lost_objects_never_settle() -> None:
-    assert settle_steps(25)(turn(errors_deg=(3, 0.1), reason="object lost")) == 25
+    lost = turn(errors_deg=(3, 0.1), reason="object lost")
+    assert frame([lost], limit=25)["settle"].tolist() == [25]
 
 
 def test_units_are_objects_and_seeds_and_pairs_need_both() -> None:
     ours = [turn("E-KM", 0, 1.0), turn("E-KM", 0, 3.0), turn("E-KM", 1, 5.0), turn("E-KM", 2, 7.0)]
     theirs = [turn("KM", 1, 10.0), turn("KM", 0, 4.0)]
-    assert unit_means(ours, steady_state_error) == {("box", 0): 2.0, ("box", 1): 5.0, ("box", 2): 7.0}
-    a, b = paired_means(ours, theirs, steady_state_error)
+    means = unit_means(frame(ours), "error_deg")
+    assert means.to_dict() == {("box", 0): 2.0, ("box", 1): 5.0, ("box", 2): 7.0}
+    a, b = paired_means(frame(ours), frame(theirs), "error_deg")
     np.testing.assert_array_equal(a, [2.0, 5.0])
     np.testing.assert_array_equal(b, [4.0, 10.0])
 
 
+def test_trials_without_a_value_are_left_out() -> None:
+    trials = frame([turn(first_step_deg=None), turn(seed=1, first_step_deg=2.0)])
+    assert unit_means(trials, "first_step_deg").to_dict() == {("box", 1): 2.0}
+    assert estimate(trials[:1], "first_step_deg") is None
+
+
 def test_what_was_not_grasped_is_not_measured_but_counted() -> None:
-    records = [not_grasped(seed=3), turn(), turn(error=2.0, reason="stalled"), turn(reason="object lost")]
-    assert select(records, controller="KM", reason="reached") == [turn()]
-    assert [row[:2] for row in reason_table(records).rows] == [
+    trials = frame(
+        [not_grasped(seed=3), turn(), turn(error=2.0, reason="stalled"), turn(reason="object lost")]
+    )
+    assert select(trials, controller="KM", reason="reached").index.tolist() == [1]
+    assert len(select(trials)) == 3
+    assert [row[:2] for row in reason_table(trials).rows] == [
         ["reached", "1 (1.00)"], ["stalled", "1 (2.00)"], ["object lost", "1"], [NotGrasped.reason, "1"],
     ]  # fmt: skip
 
 
-def test_mean_of_a_trial_picks_the_right_list() -> None:
-    assert mean_of("prediction_km_deg")(turn()) == 0.5
-    assert mean_of("prediction_ekm_deg")(turn()) == pytest.approx(0.2)
-    assert mean_of("true_prediction_ekm_deg")(turn()) == pytest.approx(0.1)
-    assert mean_of("prediction_ekm_deg")(turn(prediction_ekm_deg=())) is None
+def test_means_over_the_motions_are_of_the_right_list() -> None:
+    trials = frame([turn(), turn(prediction_ekm_deg=())])
+    assert trials["prediction_km"].tolist() == [0.5, 0.5]
+    assert trials["prediction_ekm"][0] == pytest.approx(0.2)
+    assert trials["true_prediction_ekm"][0] == pytest.approx(0.1)
+    assert np.isnan(trials["prediction_ekm"][1])
+    assert trials["motions"].tolist() == [3, 3]
 
 
 # -- intervals and tests -----------------------------------------------------------------------------
@@ -160,19 +169,6 @@ def test_bootstrap_ratio_covers_the_truth() -> None:
     theirs = generator.uniform(1, 3, size=25)
     paired = bootstrap_ratio(0.4 * theirs, theirs)  # pairs stay together: nothing is left to chance
     assert paired.high - paired.low < 1e-9
-    with pytest.raises(ShapeError):
-        bootstrap_ratio(np.ones(3), np.ones(4))
-    with pytest.raises(ParameterError):
-        bootstrap_ratio(np.ones(3), np.zeros(3))
-
-
-def test_bad_samples_are_refused() -> None:
-    with pytest.raises(NonFiniteError):
-        bootstrap_mean(np.array([1.0, np.nan]))
-    with pytest.raises(ShapeError):
-        bootstrap(np.mean, np.array([]))
-    with pytest.raises(ShapeError):
-        paired_test(np.ones(3), np.ones(4))
 
 
 def test_rates_have_wilsons_interval() -> None:
@@ -189,7 +185,7 @@ def test_paired_test_finds_a_known_difference() -> None:
     theirs = rng.normal(2.0, 0.5, 200)
     result = paired_test(theirs - 1.0 + rng.normal(0, 0.1, 200), theirs)
     assert result is not None
-    assert result.paired_p < result.welch_p < 1e-10
+    assert result.p < 1e-10
     assert result.effect_size == pytest.approx(-10, rel=0.2)
 
 
@@ -197,16 +193,16 @@ def test_equal_samples_are_not_significant_and_one_unit_is_no_sample() -> None:
     values = np.array([0.5, 1.0, 2.0])
     same, shifted = paired_test(values, values), paired_test(values + 1, values)
     assert same is not None
-    assert same.paired_p == 1.0
+    assert same.p == 1.0
     assert shifted is not None
-    assert shifted.paired_p == 0.0
+    assert shifted.p == 0.0
     assert paired_test(np.ones(1), np.ones(1)) is None
 
 
 def test_p_values_are_uniform_under_the_null() -> None:
     rng = np.random.default_rng(1)
     tests = [paired_test(rng.normal(size=20), rng.normal(size=20)) for _ in range(400)]
-    assert 0.02 < np.mean([test is not None and test.welch_p < 0.05 for test in tests]) < 0.08
+    assert 0.02 < np.mean([test is not None and test.p < 0.05 for test in tests]) < 0.08
 
 
 @pytest.mark.filterwarnings("error")
@@ -216,14 +212,12 @@ def test_tests_are_scipys_and_warn_of_nothing() -> None:
     ours, theirs = rng.normal(1.0, 0.5, 12), rng.normal(1.3, 0.2, 12)
     found, curve = paired_test(ours, theirs), learning_curve(ours, theirs)
     one = scipy.stats.ttest_ind(ours, theirs, equal_var=False, alternative="less")
-    assert found.welch_p == pytest.approx(scipy.stats.ttest_ind(ours, theirs, equal_var=False).pvalue)
-    assert found.paired_p == pytest.approx(scipy.stats.ttest_rel(ours, theirs).pvalue)
+    assert found.p == pytest.approx(scipy.stats.ttest_rel(ours, theirs).pvalue)
     assert curve.p[-1] == pytest.approx(one.pvalue)
     assert curve.upper[-1] == pytest.approx(one.confidence_interval(0.95).high)
     lost = np.full(12, 20.0)
-    assert paired_test(ours, lost).welch_p < 1e-12
-    assert paired_test(lost, lost + 1e-14).paired_p == 0.0
-    assert paired_test(lost, lost).paired_p == 1.0
+    assert paired_test(lost - 1.0, lost).p == 0.0
+    assert paired_test(lost, lost).p == 1.0
     constant = learning_curve(lost - 1.0, lost)
     assert constant.p[1:].tolist() == [0.0] * 11
     assert constant.last_upper == -1.0
@@ -244,10 +238,11 @@ def test_learning_curve_marks_the_last_negative_result() -> None:
 
 
 def test_recovery_counts_from_the_trial_after_the_event() -> None:
-    km, ekm = np.ones(8), np.array([0.2, 0.2, 2.0, 0.8, 0.4, 0.2, 0.2, 0.2])
+    trials = range(1, 9)
+    km, ekm = pandas.Series(1.0, trials), pandas.Series([0.2, 0.2, 2.0, 0.8, 0.4, 0.2, 0.2, 0.2], trials)
     assert recovery_trials(ekm, km, event=3) == 2
     assert recovery_trials(ekm, km, event=1) == 1
-    assert recovery_trials(np.ones(8), km, event=3) is None
+    assert recovery_trials(km, km, event=3) is None
 
 
 # -- tables ------------------------------------------------------------------------------------------
@@ -276,24 +271,25 @@ def test_object_table_shows_means_ratios_and_losses() -> None:
     records = [turn("KM", seed, 2.0 + seed) for seed in range(4)]
     records += [turn("E-KM", seed, 0.5 + 0.25 * seed) for seed in range(4)]
     records[0] = turn("KM", 0, 2.0, reason="object lost")
-    table = object_table(records)
+    trials = frame(records)
+    table = object_table(trials)
     row = dict(zip(table.header, table.rows[0], strict=True))
     assert row["KM [deg]"].mean == pytest.approx(8.0)  # (20 + 3 + 4 + 5) / 4
     assert row["E-KM [deg]"].mean == pytest.approx(0.875)
     assert row["E-KM:KM [%]"].mean == pytest.approx(0.875 / 8)
-    ends = dict(zip(ends_table(records).header, ends_table(records).rows[0], strict=True))
+    ends = dict(zip(ends_table(trials).header, ends_table(trials).rows[0], strict=True))
     assert (ends["KM lost, not reached"], ends["E-KM lost, not reached"]) == ("1, 0", "0, 0")
     assert table.text()[0][5] == "11 [" + table.text()[0][5].split("[")[1]  # in percent
     assert table.rows[-1][0] == "all"
-    controllers = controller_table(records)
+    controllers = controller_table(trials)
     shown = dict(zip(controllers.header, controllers.rows[0], strict=True))
     assert shown["controller"] == "KM"
     assert shown["survivors [deg]"].mean == pytest.approx(4.0)
-    compared = comparison_table([*records, not_grasped("KM+I")], limit=40)
+    compared = comparison_table(frame([*records, not_grasped("KM+I")]))
     assert compared.rows[0][1].mean == pytest.approx(0.875 / 8)
     assert compared.rows[0][3] is None  # no KM+I was ever measured
-    assert len(comparison_table(records, limit=40).columns) == 3  # and here it took no part
-    predicted = dict(zip(*(prediction_table(records).header, prediction_table(records).rows[0]), strict=True))
+    assert len(comparison_table(trials).columns) == 3  # and here it took no part
+    predicted = dict(zip(*(prediction_table(trials).header, prediction_table(trials).rows[0]), strict=True))
     assert predicted["E-KM:KM, measured [%]"].mean == pytest.approx(0.4)
     assert predicted["E-KM, true [deg]"].mean == pytest.approx(0.1)
 
@@ -306,7 +302,7 @@ def test_the_answer_comes_in_a_sentence_with_losses_and_no_verdict_from_few_seed
             found.append(turn("E-KM", seed, 0.2, reason="object lost" if seed == 1000 else "reached"))
         return found
 
-    few, many = verdict(records(4), range(1000, 1004)), verdict(records(12), range(1000, 1012))
+    few, many = (verdict(frame(records(n)), range(1000, 1000 + n)) for n in (4, 12))
     assert few.startswith("The E-KM ends 5.15 [0.20, ")
     assert "from the target, KM+S 0.30 [0.30, 0.30] deg, KM " in few
     assert (
@@ -322,7 +318,7 @@ def test_the_answer_comes_in_a_sentence_with_losses_and_no_verdict_from_few_seed
 def test_why_turns_ended_is_told_of_each_controller() -> None:
     records = [turn("KM", seed, 1.0, reason="stalled") for seed in range(3)] + [turn("E-KM", 0, 0.25)]
     records.append(turn("E-KM", 1, 0.3, reason="object lost"))
-    table = reason_table([*records, not_grasped("E-KM")])
+    table = reason_table(frame([*records, not_grasped("E-KM")]))
     cells = {row[0]: row[1:] for row in table.text()}
     assert cells["stalled"][:2] == ["3 (1.00)", "-"]
     assert cells["reached"][:2] == ["-", "1 (0.25)"]
@@ -340,45 +336,17 @@ def test_learning_table_finds_the_last_negative_result() -> None:
         km, ekm = (1.0 + noise[0],), (ekm + noise[1],)
         records.append(turn("E-KM", 0, trial=trial, prediction_km_deg=km, prediction_ekm_deg=ekm))
     online = Online(trials=24, dislocations=(10, 24), tendons_replaced=0)
-    row = online.learning_table(records).rows[0]
+    row = online.learning_table(frame(records)).rows[0]
     assert 3 <= row[1] <= 7
     assert 0.25 <= row[3] <= 0.36  # trials 17 to 24 without 24
     assert row[4:] == [1, None]  # after the last trial there is nothing to see
-    curves = prediction_curves(records[:5], trials=6)
-    assert np.isnan(curves[0][0][5])
-
-
-def test_targets_say_by_how_much_they_are_missed() -> None:
-    assert Target("x", 20.0, most=25).missed_by == 0
-    assert Target("x", 30.0, most=25).missed_by == 5
-    assert Target("x", 80.0, least=90).missed_by == 10
-    assert Target("x", 0.5, least=1, most=3).missed_by == 0.5
-    rows = targets_table([Target("a", 20.0, most=25), Target("b", 30.0, most=25)]).text()
-    assert rows == [["a", "-", "25", "20", "yes", "-"], ["b", "-", "25", "30", "no", "5"]]
-
-
-def test_targets_of_each_experiment() -> None:
-    records = []
-    for seed in range(5):
-        records += [turn("KM", seed, 2.0 + 0.1 * seed), turn("KM+I", seed, 0.3 + 0.01 * seed)]
-        records.append(turn("E-KM", seed, 0.2 + 0.01 * seed, first_step_deg=0.2))
-    found = {target.what: target for target in Generalize().targets({"all": records})}
-    assert found["steady-state error E-KM : KM, box [%]"].missed_by == 0
-    assert found["error of the first motion E-KM : KM+I [%]"].measured == pytest.approx(40)
-    assert found["motions to settle E-KM : KM+I [%]"].missed_by == pytest.approx(40)
-    assert found["objects lost, E-KM [%]"].measured == 0
-    assert found["steady-state error of the KM [deg]"].missed_by == 0
-    turns = [turn("E-KM", 0, trial=t) for t in range(1, 20)]
-    online = Online(trials=19, dislocations=(10,), tendons_replaced=0)
-    assert any("after 16 trials" in target.what for target in online.targets({"all": turns}))
-    errors = {name: [0.2] for name in ("bank", "labelled", "one model", "fresh")}
-    adapted = [memory_turn(model=0, memory_errors_deg=errors) for _ in range(5)]
-    assert ObjectMemory().targets({"0": adapted})[0].measured == 100
+    ekm, _ = prediction_curves(frame(records[:5]), 6)
+    assert ekm.loc[0].notna().tolist() == [True] * 5 + [False]
 
 
 def test_assignment_gives_every_object_one_model_at_most() -> None:
-    def turns(pairs: str) -> list[MemoryTurn]:
-        return [memory_turn(object=pair[0], model=int(pair[1])) for pair in pairs.split()]
+    def turns(pairs: str) -> pandas.DataFrame:
+        return frame(memory_turn(object=pair[0], model=int(pair[1])) for pair in pairs.split())
 
     perfect = judge_assignment(turns("a0 b1 a0 b1 a0 b1 a0 b1 a0 b1"))
     assert (perfect.right, perfect.judged, perfect.n_models) == (4, 4, 2)

@@ -17,6 +17,7 @@ from .protocols.object_memory import ObjectMemory
 from .protocols.online import Online
 from .protocols.protocol import Protocol
 from .reporting.report import Report
+from .reporting.trials import trial_frame
 
 PROTOCOLS: dict[str, type[Protocol]] = {
     "online": Online,
@@ -102,7 +103,8 @@ def reproduce(
     kept = run_jobs(protocol.run, experiment.jobs, folder / "runs", processes, on_done)
     read = protocol.record.from_json
     results = {name: [read(figures) for figures in session] for name, session in kept.items()}
-    report = protocol.report(seeds, results, folder)
+    trials = trial_frame(results, protocol.setting.safety.rule.max_steps)
+    report = protocol.report(seeds, trials, folder)
     report.summary += f" {protocol.setting}."
     if experiment.quick:
         report.title += ": a quick run"

@@ -5,14 +5,15 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..._extras import require
 from ...typing import Array
-from ..reporting.statistics import Estimate
+from ..reporting.statistics import Estimate, bootstrap
 from .stream import Stream
 
 Measure = Literal["rms", "median"]
@@ -108,8 +109,8 @@ class Comparison:
         mine, others = table[:, :, None], table[:, None, :]
         return (others < mine).sum(-1) + 0.5 * ((others == mine).sum(-1) + 1)
 
-    def critical_difference(self, alpha: float = 0.05) -> float:
-        """Mean ranks that differ by less are not distinguishable (Nemenyi; Demsar, JMLR 7, 2006)::
+    def critical_difference(self) -> float:
+        """Mean ranks that differ by less are not distinguishable (Nemenyi, 5 %; Demsar, JMLR 7, 2006)::
 
             CD = q sqrt(k (k + 1) / (6 N))
 
@@ -118,7 +119,8 @@ class Comparison:
         k, n = len(self.learners), len(self.streams)
         if n < 2 or k < 2:
             return float("inf")
-        return studentized_range(k, alpha) / np.sqrt(2) * np.sqrt(k * (k + 1) / (6 * n))
+        q = require("scipy.stats").studentized_range.ppf(0.95, k, np.inf) / np.sqrt(2)
+        return float(q * np.sqrt(k * (k + 1) / (6 * n)))
 
     def verdicts(self) -> list[str]:
         """For each stream: which learner is best, which cannot be told from it, how far off the default is,
@@ -163,23 +165,6 @@ def gives_away(stream: Stream) -> bool:
     return bool((left.std(0) < 1e-6 * y.std(0)).any())
 
 
-def studentized_range(k: int, alpha: float = 0.05) -> float:
-    """The q that the range of k independent standard normals exceeds with probability alpha::
-
-        P(range < q) = k int phi(z) (Phi(z) - Phi(z - q))^(k - 1) dz
-
-    (scipy.stats.studentized_range for infinite degrees of freedom, without scipy).
-    """
-    z = torch.linspace(-8.0, 8.0, 4001, dtype=torch.float64)
-    density, below = torch.exp(-0.5 * z**2) / np.sqrt(2 * np.pi), torch.special.ndtr(z)
-    low, high = 0.0, 20.0
-    for _ in range(50):
-        q = 0.5 * (low + high)
-        inside = k * torch.trapezoid(density * (below - torch.special.ndtr(z - q)) ** (k - 1), z)
-        low, high = (q, high) if inside < 1 - alpha else (low, q)
-    return 0.5 * (low + high)
-
-
 def blocks_of(stream: Stream) -> NDArray[np.int64]:
     """Which independent block each scored sample belongs to: its segment, or a twentieth of the time."""
     n = len(stream) - stream.warm_up
@@ -204,15 +189,18 @@ def block_bootstrap(
         measure: a mean or a median of the squared errors before the root.
     """
     _, index = np.unique(blocks, return_inverse=True)
-    n, tiny = int(index.max()) + 1, np.finfo(float).tiny
-    draw = np.random.default_rng(seed).integers(n, size=(resamples, n))
-    errors = np.stack([ours, theirs])
+    n, options = int(index.max()) + 1, {"seed": seed, "resamples": resamples}
     if measure == "rms":
-        sums = np.stack([np.bincount(index, weights=values) for values in errors])
-        drawn, whole = sums[:, draw].sum(-1), errors.sum(-1)
-    else:
-        parts = [errors[:, index == k] for k in range(n)]
-        drawn = np.stack([np.median(np.hstack([parts[k] for k in one]), axis=-1) for one in draw], axis=-1)
-        whole = np.median(errors, axis=-1)
-    low, high = np.percentile(np.sqrt(drawn[0] / np.maximum(drawn[1], tiny)), [2.5, 97.5])
-    return Estimate(float(np.sqrt(whole[0] / max(whole[1], tiny))), float(low), float(high), n)
+        sums = (np.bincount(index, weights=squared) for squared in (ours, theirs))
+        return bootstrap(lambda a, b, axis: _root_ratio(a.sum(axis), b.sum(axis)), *sums, **options)
+    errors = np.stack([ours, theirs])
+    parts = [errors[:, index == k] for k in range(n)]
+
+    def ratio(drawn: NDArray[np.int64]) -> float:
+        return _root_ratio(*np.median(np.hstack([parts[k] for k in drawn]), axis=-1))
+
+    return bootstrap(lambda k, axis: np.apply_along_axis(ratio, axis, k), np.arange(n), **options)
+
+
+def _root_ratio(ours: Any, theirs: Any) -> Any:
+    return np.sqrt(ours / np.maximum(theirs, np.finfo(float).tiny))

@@ -18,10 +18,10 @@ from ..reporting import statistics as stats
 from ..reporting import tables
 from ..reporting.plots import crosses_caption, plot_steady_state_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from ..reporting.statistics import Value, steady_state_error
-from ..reporting.tables import Target
+from ..reporting.statistics import DataFrame
+from ..reporting.trials import select
 from ..runner import Bench
-from .protocol import Protocol, Results, records_of
+from .protocol import Protocol
 
 #: Rotations of the paper's Table I [deg].
 TABLE_I: dict[str, tuple[float, ...]] = {
@@ -121,79 +121,34 @@ class Generalize(Protocol):
         bench.close()
         return records
 
-    def targets(self, results: Results[Record]) -> list[Target]:
-        """Set for the four controllers, over all objects."""
-        records, limit = records_of(results), self.setting.safety.rule.max_steps
-        found = []
-        for item, mine in tables.by_object(records).items():
-            ours, theirs = tables.paired(mine, "E-KM", "KM", steady_state_error)
-            if item != "all" and len(ours):
-                ratio = 100 * stats.bootstrap_ratio(ours, theirs).mean
-                found.append(Target(f"steady-state error E-KM : KM, {item} [%]", ratio, most=25))
-        tests = stats.paired_test(*tables.paired(records, "E-KM", "KM", steady_state_error))
-        if tests is not None and len({r.seed for r in records}) >= tables.LEAST_SEEDS:
-            found.append(Target("Welch p over all objects", tests.welch_p, most=1e-6))
-        shares: list[tuple[str, float, Value]] = [
-            ("steady-state error", 100, steady_state_error),
-            ("motions to settle", 60, stats.settle_steps(limit)),
-            ("error of the first motion", 50, lambda r: r.first_step_deg),
-        ]
-        for what, aim, value in shares:
-            for name in ("KM+I", "KM+S"):
-                ours, theirs = tables.paired(records, "E-KM", name, value)
-                if len(ours) and theirs.mean() > 0:
-                    ratio = 100 * stats.bootstrap_ratio(ours, theirs).mean
-                    found.append(Target(f"{what} E-KM : {name} [%]", ratio, most=aim))
-        turns = tables.by_controller(records)
-        lost = {name: 100 * float(np.mean([r.lost for r in mine])) for name, mine in turns.items()}
-        if "E-KM" in lost and "KM+I" in lost:
-            difference = lost["E-KM"] - lost["KM+I"]
-            found.append(Target("objects lost, E-KM minus KM+I [%]", difference, most=0))
-            found.append(Target("objects lost, E-KM [%]", lost["E-KM"], most=5))
-        if "KM" in turns:
-            mean = float(np.mean(list(stats.unit_means(turns["KM"], steady_state_error).values())))
-            found.append(Target("steady-state error of the KM [deg]", mean, least=1, most=3))
-        return found
-
-    def report(self, seeds: Sequence[int], results: Results[Record], folder: Path) -> Report:
+    def report(self, seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
         """Tables I and II, Fig. 6, and the probes."""
-        records, limit = records_of(results), self.setting.safety.rule.max_steps
         figures = []
-        for item in self.objects:
-            name = object_name(item)
-            turns = tables.by_controller(stats.select(records, object=name))
-            errors = {
-                controller: {
-                    f"{angle:g}": np.array([steady_state_error(r) for r in mine if r.angle_deg == angle])
-                    for angle in self.angles_of(item)
-                }
-                for controller, mine in turns.items()
-            }
-            if errors:
-                caption = (
-                    f"Steady-state error with the {name.replace('_', ' ')} for each target: every turn, and "
-                )
-                caption += f"the mean (as in the paper's Fig. 6).{crosses_caption(errors)}"
-                plot = plot_steady_state_error(errors, name.replace("_", " "))
-                figures.append(save_figure(plot, folder, f"steady_state_error_{name}", caption))
+        for name, mine in select(trials, kind="turn").groupby("object", sort=False):
+            what = str(name).replace("_", " ")
+            caption = (
+                f"Steady-state error with the {what} for each target: every turn, and the mean (as in the "
+            )
+            caption += f"paper's Fig. 6).{crosses_caption(mine)}"
+            plot = plot_steady_state_error(mine, what)
+            figures.append(save_figure(plot, folder, f"steady_state_error_{name}", caption))
         shown = [
-            paper_table(records),
-            tables.reason_table(records),
-            object_table(records),
-            ends_table(records),
-            tables.controller_table(records),
-            tables.motion_table(records, limit),
-            tables.comparison_table(records, limit),
-            probe_table(records),
-            tables.prediction_table(records),
+            paper_table(trials),
+            tables.reason_table(trials),
+            object_table(trials),
+            ends_table(trials),
+            tables.controller_table(trials),
+            tables.motion_table(trials),
+            tables.comparison_table(trials),
+            probe_table(trials),
+            tables.prediction_table(trials),
             self.angles_table(),
-            tables.targets_table(self.targets(results)),
-            tables.timing_table(records),
+            tables.timing_table(trials),
         ]
         shown = [table for table in shown if table.rows]
         names = ", ".join(object_name(item) for item in self.objects)
-        summary = f"{tables.verdict(records, seeds)} Objects: {names}.{tables.warmed_up(self.warm_up)}"
-        leading, legend = int(shown[0].name == "paper"), tables.legend(records)
+        summary = f"{tables.verdict(trials, seeds)} Objects: {names}.{tables.warmed_up(self.warm_up)}"
+        leading, legend = int(shown[0].name == "paper"), tables.legend(trials)
         title = "Generalisation: other objects, other weights"
         return Report(title, summary, shown, figures, leading=leading, legend=legend)
 
@@ -205,17 +160,16 @@ class Generalize(Protocol):
         return Table("angles", "Rotations that were asked for", columns, rows)
 
 
-def paper_table(records: Sequence[Record]) -> Table:
-    """The paper's Table II beside the same figures here, for the objects that both have."""
-    both = [r for r in records if r.object in TABLE_II]
-    ours, theirs = tables.paired(both, "E-KM", "KM", steady_state_error)
-    _, p = tables.ratio_and_p(ours, theirs, len({r.seed for r in both}))
+def paper_table(trials: DataFrame) -> Table:
+    """The paper's Table II next to the same figures here, for the objects that both have."""
+    both = trials[trials["object"].isin(list(TABLE_II))]
+    _, p = tables.ratio_and_p(*tables.paired(both, "E-KM", "KM", "error_deg"), both["seed"].nunique())
     rows: list[list[Cell]] = []
     for item, (km, ekm) in TABLE_II.items():
-        by = [stats.select(records, controller=name, kind="turn", object=item) for name in ("KM", "E-KM")]
-        if all(by):
-            ratio = stats.bootstrap_ratio(*stats.paired_means(by[1], by[0], steady_state_error))
-            here = [stats.estimate(mine, steady_state_error) for mine in by]
+        by = tables.by_controller(trials[trials["object"] == item])
+        if {"KM", "E-KM"} <= set(by):
+            ratio = stats.bootstrap_ratio(*stats.paired_means(by["E-KM"], by["KM"], "error_deg"))
+            here = [stats.estimate(by[name], "error_deg") for name in ("KM", "E-KM")]
             rows.append([item, km, here[0], ekm, here[1], ekm / km, ratio])
     columns: list[Column | str] = [
         "object", Column("KM, paper [deg]", ".1f"), "KM, here [deg]", Column("E-KM, paper [deg]", ".1f"),
@@ -227,19 +181,17 @@ def paper_table(records: Sequence[Record]) -> Table:
     return Table("paper", "The paper's Table II, and the same here", columns, rows, note)
 
 
-def object_table(records: Sequence[Record]) -> Table:
+def object_table(trials: DataFrame) -> Table:
     """Steady-state error of each object, paired (the paper's Table II)."""
     rows: list[list[Cell]] = []
-    for item, chosen in tables.by_object(records).items():
-        by = {name: stats.select(chosen, controller=name, kind="turn") for name in CONTROLLERS}
-        if not by["KM"] or not by["E-KM"]:
+    for item, chosen in tables.by_object(trials).items():
+        by = tables.by_controller(chosen)
+        if not {"KM", "E-KM"} <= set(by):
             continue
-        ours, theirs = stats.paired_means(by["E-KM"], by["KM"], steady_state_error)
-        enough = len({r.seed for r in chosen}) >= stats.LEAST_SEEDS
-        tests = stats.paired_test(ours, theirs) if enough else None
-        figures = (None, None) if tests is None else (tests.paired_p, tests.effect_size)
-        row: list[Cell] = [item, *(stats.estimate(mine, steady_state_error) for mine in by.values())]
-        rows.append([*row, stats.bootstrap_ratio(ours, theirs), *figures])
+        ours, theirs = stats.paired_means(by["E-KM"], by["KM"], "error_deg")
+        test = stats.paired_test(ours, theirs) if chosen["seed"].nunique() >= stats.LEAST_SEEDS else None
+        errors = (stats.estimate(by[name], "error_deg") if name in by else None for name in CONTROLLERS)
+        rows.append([item, *errors, stats.bootstrap_ratio(ours, theirs), *(test or (None, None))])
     columns = [
         "object", *(f"{name} [deg]" for name in CONTROLLERS), Column("E-KM:KM [%]", ".0f", percent=True),
         Column("p paired", ".1g"), Column("effect size", ".1f"),
@@ -251,27 +203,30 @@ def object_table(records: Sequence[Record]) -> Table:
     return Table("by_object", "Steady-state error of each object", columns, rows, note)
 
 
-def ends_table(records: Sequence[Record]) -> Table:
+def ends_table(trials: DataFrame) -> Table:
     """Lost objects and turns that did not reach the target, for each object and controller."""
+    names = list(tables.by_controller(trials))
     rows: list[list[Cell]] = []
-    names = list(tables.by_controller(records))
-    for item, chosen in tables.by_object(records).items():
-        by = [stats.select(chosen, controller=name, kind="turn") for name in names]
-        rows.append(
-            [item, *(f"{sum(r.lost for r in mine)}, {sum(r.not_reached for r in mine)}" for mine in by)]
-        )
+    for item, chosen in tables.by_object(trials).items():
+        turns = select(chosen, kind="turn").groupby("controller")[["lost", "not_reached"]]
+        ended = turns.sum().astype(int).reindex(names, fill_value=0)
+        rows.append([item, *(f"{lost}, {missed}" for lost, missed in ended.to_numpy())])
     columns = ["object", *(f"{name} lost, not reached" for name in names)]
     return Table("ends", "Objects lost, and turns that did not reach the target", columns, rows)
 
 
-def probe_table(records: Sequence[Record]) -> Table:
+def probe_table(trials: DataFrame) -> Table:
     """What the model is worth without feedback: one long step, and turns that end with the camera off."""
-    steps, dark = (tables.by_controller(records, kind) for kind in ("long step", "camera off"))
-    items = {name: name for name in CONTROLLERS if name in steps or name in dark}
-    columns: dict[Column, Callable[[str], Cell]] = {
-        Column("one long step [deg]"): lambda name: stats.estimate(steps.get(name, []), steady_state_error),
-        Column("lost in it"): lambda name: stats.rate(r.lost for r in steps.get(name, [])),
-        Column("camera off [deg]"): lambda name: stats.estimate(dark.get(name, []), steady_state_error),
-        Column("lost then"): lambda name: stats.rate(r.lost for r in dark.get(name, [])),
+    kinds = {
+        "long step": ("one long step [deg]", "lost in it"),
+        "camera off": ("camera off [deg]", "lost then"),
     }
+    columns: dict[Column, Callable[[DataFrame], Cell]] = {}
+    for kind, (error, lost) in kinds.items():
+        columns[Column(error)] = lambda mine, kind=kind: stats.estimate(
+            mine[mine["kind"] == kind], "error_deg"
+        )
+        columns[Column(lost)] = lambda mine, kind=kind: stats.rate(mine[mine["kind"] == kind]["lost"])
+    probes = select(trials)[select(trials)["kind"].isin(list(kinds))]
+    items = {name: mine for name in CONTROLLERS if len(mine := select(probes, controller=name))}
     return Table.of("probes", "True error without feedback", "controller", items, columns)

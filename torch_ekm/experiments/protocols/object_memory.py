@@ -19,17 +19,18 @@ from ...enhanced import GraspEncoding
 from ...exceptions import ParameterError
 from ...object_memory import GraspSignature, ModelBank
 from ...residual import ResidualLearner, UpdateReport
-from ...typing import Tensor
+from ...typing import Array, Tensor
 from ..config import Setting, digest
 from ..learners import make_learner
 from ..records import Trial, TrialRecord
 from ..reporting.plots import plot_bank, save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from ..reporting.statistics import Array, bootstrap_mean, bootstrap_ratio, rate
-from ..reporting.tables import Target, ratio_and_p, targets_table, which_seeds
+from ..reporting.statistics import DataFrame, Series, bootstrap_mean, bootstrap_ratio, rate
+from ..reporting.tables import ratio_and_p, which_seeds
+from ..reporting.trials import select
 from ..runner import Bench
 from .generalize import OTHER_ANGLES, TABLE_I
-from .protocol import Protocol, Results
+from .protocol import Protocol
 
 #: How the knowledge of several objects may be kept.
 MEMORIES = ("bank", "labelled", "one model", "fresh")
@@ -153,43 +154,18 @@ class ObjectMemory(Protocol):
             bench.close()
         return records
 
-    def targets(self, results: Results[MemoryTurn]) -> list[Target]:
-        """Is it recognised, and what is it worth?"""
-        judged = [judge_assignment(records) for records in results.values()]
-        total = sum(one.judged for one in judged)
-        found = []
-        if total:
-            right = 100 * sum(one.right for one in judged) / total
-            found.append(Target("turns that went to the right model [%]", right, least=90))
-        models = max(one.n_models for one in judged)
-        found.append(Target("models, most in one sequence", models, most=8))
-        turns = [r for records in results.values() for r in records]
-        errors = {name: np.mean(_errors(turns, name)) for name in MEMORIES}
-        for other, aim in (("labelled", 105), ("one model", 100), ("fresh", 100)):
-            share = 100 * float(errors["bank"] / errors[other])
-            found.append(Target(f"prediction error, bank : {other} [%]", share, most=aim))
-        return found
-
-    def report(self, seeds: Sequence[int], results: Results[MemoryTurn], folder: Path) -> Report:
+    def report(self, seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
         """Who is recognised, and what it is worth."""
-        sessions = list(results.values())
-        figures = []
-        if sessions and sessions[0]:
-            shown = zip(*((r.object, r.model, r.posterior) for r in sessions[0]), strict=True)
+        turns, figures = select(trials), []
+        first = select(turns, seed=seeds[0])
+        if len(first):
             caption = f"Which model of the bank took each turn of seed {seeds[0]}; pale: it was unsure."
-            figures.append(save_figure(plot_bank(*shown), folder, "bank", caption))
-        tables = [
-            _memory_table(sessions),
-            comparison_table(sessions),
-            _assignment_table(seeds, sessions),
-            targets_table(self.targets(results)),
-        ]
-        lost, missed = (
-            rate(getattr(r, what) for s in sessions for r in s) for what in ("lost", "not_reached")
-        )
-        errors = [f"{_WORDS[name]} {bootstrap_mean(_means(sessions, name)):.3f} deg" for name in _WORDS]
+            figures.append(save_figure(plot_bank(first), folder, "bank", caption))
+        tables = [_memory_table(turns), comparison_table(turns), _assignment_table(turns)]
+        lost, missed = rate(turns["lost"]), rate(turns["not_reached"])
+        errors = [f"{_WORDS[name]} {bootstrap_mean(_means(turns, name)):.3f} deg" for name in _WORDS]
         summary = (
-            f"Turns that went to the right model without labels: {recognition(sessions)}. One-step "
+            f"Turns that went to the right model without labels: {recognition(turns)}. One-step "
             f"prediction error: {', '.join(errors)}. Objects lost: {lost}; turns that did not "
             f"reach the target: {missed}. {len(self.objects)} objects in random order, {self.turns_each} "
             f"turns each. {which_seeds(seeds)}"
@@ -264,21 +240,16 @@ class Assignment(NamedTuple):
     n_models: int
 
 
-def judge_assignment(records: Sequence[MemoryTurn]) -> Assignment:
+def judge_assignment(turns: DataFrame) -> Assignment:
     """A model belongs to the object that most of its turns were of; each object owns one model at most."""
-    placed = [(r.object, r.model) for r in records if r.model is not None]
-    owner: dict[int, str] = {}
-    for (item, model), _ in Counter(placed).most_common():
-        if model not in owner and item not in owner.values():
-            owner[model] = item
-    seen: Counter[str] = Counter()
-    right = judged = 0
-    for item, model in placed:
-        seen[item] += 1
-        if seen[item] > _LEARNING_TURNS:
-            judged += 1
-            right += owner.get(model) == item
-    return Assignment(right, judged, len({model for _, model in placed}))
+    placed = turns[["object", "model"]].dropna()
+    owner: dict[str, int] = {}
+    for (item, model), _ in Counter(placed.itertuples(index=False, name=None)).most_common():
+        if item not in owner and model not in owner.values():
+            owner[item] = model
+    judged = placed[placed.groupby("object").cumcount() >= _LEARNING_TURNS]
+    right = judged["model"] == judged["object"].map(owner)
+    return Assignment(int(right.sum()), len(judged), placed["model"].nunique())
 
 
 def _feel(bench: Bench, signature: GraspSignature, readings: int) -> Tensor:
@@ -287,11 +258,10 @@ def _feel(bench: Bench, signature: GraspSignature, readings: int) -> Tensor:
     return torch.stack([signature(o.q, o.a, o.fingertip_force) for o in seen]).mean(0)
 
 
-def _memory_table(sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
-    turns = [r for s in sessions for r in s]
+def _memory_table(turns: DataFrame) -> Table:
     columns: dict[Column, Callable[[str], Cell]] = {
-        Column("all motions [deg]", ".3f"): lambda name: bootstrap_mean(_means(sessions, name)),
-        Column("first motions [deg]", ".3f"): lambda name: float(np.mean(_errors(turns, name, _FIRST))),
+        Column("all motions [deg]", ".3f"): lambda name: bootstrap_mean(_means(turns, name)),
+        Column("first motions [deg]", ".3f"): lambda name: float(_errors(turns, name, _FIRST).mean()),
     }
     note = (
         "Mean over all motions, 95 % bootstrap interval over sequences; and over the first five "
@@ -302,14 +272,14 @@ def _memory_table(sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
     return Table.of("memories", "One-step prediction error", "memory", items, columns, note)
 
 
-def comparison_table(sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
+def comparison_table(turns: DataFrame) -> Table:
     """Ratios of mean prediction errors, paired by sequence: the sequence is the independent unit."""
     rows: list[list[Cell]] = []
     pairs = [("bank", other) for other in ("labelled", "one model", "fresh", "none")]
     for ours, theirs in [*pairs, ("one model", "labelled")]:
         row: list[Cell] = [f"{ours} : {theirs}"]
         for first in (None, _FIRST):
-            means = _means(sessions, ours, first), _means(sessions, theirs, first)
+            means = _means(turns, ours, first), _means(turns, theirs, first)
             row += ratio_and_p(*means, len(means[0]))
         rows.append(row)
     columns: list[Column | str] = ["memories"]
@@ -317,33 +287,39 @@ def comparison_table(sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
         columns += [Column(f"{what} [%]", ".0f", percent=True), Column(f"p paired, {what}", ".1g")]
     note = (
         "Ratio of mean one-step prediction errors with 95 % bootstrap interval over sequences "
-        f"({len(sessions)}); p of the paired t-test. Right model: {recognition(sessions)}."
+        f"({turns['seed'].nunique()}); p of the paired t-test. Right model: {recognition(turns)}."
     )
     return Table("memory_comparison", "The same motions, other memories", columns, rows, note)
 
 
-def recognition(sessions: Sequence[Sequence[MemoryTurn]]) -> str:
+def recognition(turns: DataFrame) -> str:
     """Share of judged turns that went to the right model, with its interval over sequences."""
-    judged = [judge_assignment(records) for records in sessions]
-    right, of, models = np.array(judged, dtype=float).T
+    right, of, models = np.array(list(_assignments(turns).values()), dtype=float).T
     if not of.sum():
         return "none judged"
     share = f"{right.sum():.0f} of {of.sum():.0f} turns, {100 * bootstrap_ratio(right, of):.0f} %"
     return f"{share}; models {bootstrap_mean(models):.1f}, at most {models.max():.0f}"
 
 
-def _assignment_table(seeds: Sequence[int], sessions: Sequence[Sequence[MemoryTurn]]) -> Table:
-    rows = [[str(seed), *judge_assignment(mine)] for seed, mine in zip(seeds, sessions, strict=True)]
+def _assignment_table(turns: DataFrame) -> Table:
+    rows = [[str(seed), *found] for seed, found in _assignments(turns).items()]
     note = "Turns after the first three of their object; a model belongs to the object of most of its turns."
     return Table(
         "assignments", "Recognised objects", ["seed", "right [turns]", "of [turns]", "models"], rows, note
     )
 
 
-def _errors(turns: Sequence[MemoryTurn], memory: str, first: int | None = None) -> list[float]:
-    """Prediction errors of all motions, or of the first few of each turn [deg]."""
-    return [error for turn in turns for error in turn.memory_errors_deg[memory][:first]]
+def _assignments(turns: DataFrame) -> dict[int, Assignment]:
+    """How well objects were told apart with each seed."""
+    return {seed: judge_assignment(mine) for seed, mine in turns.groupby("seed", sort=False)}
 
 
-def _means(sessions: Sequence[Sequence[MemoryTurn]], memory: str, first: int | None = None) -> Array:
-    return np.array([float(np.mean(_errors(turns, memory, first))) for turns in sessions])
+def _errors(turns: DataFrame, memory: str, first: int | None = None) -> Series:
+    """Prediction errors of all motions, or of the first few of each turn [deg]; index: the seed."""
+    errors = turns["memory_errors_deg"].map(lambda found: found[memory][:first])
+    return errors.set_axis(turns["seed"]).explode().dropna().astype(float)
+
+
+def _means(turns: DataFrame, memory: str, first: int | None = None) -> Array:
+    """The same, mean over each seed's sequence."""
+    return _errors(turns, memory, first).groupby(level=0, sort=False).mean().to_numpy()

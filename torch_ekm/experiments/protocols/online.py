@@ -17,10 +17,10 @@ from ..records import Record
 from ..reporting import tables
 from ..reporting.plots import plot_learning_test, plot_prediction_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from ..reporting.statistics import LEAST_SEEDS, Array, bootstrap_mean, learning_curve, select
-from ..reporting.tables import Target
+from ..reporting.statistics import LEAST_SEEDS, DataFrame, Series, bootstrap_mean, learning_curve
+from ..reporting.trials import select
 from ..runner import Bench
-from .protocol import Protocol, Results, records_of
+from .protocol import Protocol
 
 _LEARNED = 16
 """Trials after which the paper's learner has learned."""
@@ -89,97 +89,57 @@ class Online(Protocol):
         bench.close()
         return records
 
-    def targets(self, results: Results[Record]) -> list[Target]:
-        """Each figure is the mean over seeds."""
-        records = records_of(results)
-        learned = [Learning.of(ekm, km, self.events) for ekm, km in prediction_curves(records, self.trials)]
-        negatives = [one.last_negative for one in learned if one.last_negative is not None]
-        late = [100 * one.late for one in learned if one.late is not None]
-        back = [found is not None and found <= 3 for one in learned for found in one.recovery if found != 0]
-        true = [
-            100 * float(np.nanmean(ekm[_LEARNED:]) / np.nanmean(km[_LEARNED:]))
-            for ekm, km in prediction_curves(records, self.trials, "true_")
-            if self.trials > _LEARNED
-        ]
-        ratio, found = "prediction error E-KM : KM after 16 trials", []
-        if negatives:
-            mean, worst = float(np.mean(negatives)), float(max(negatives))
-            found = [Target("last index of negative result, mean of seeds", mean, most=10)]
-            found.append(Target("the same, worst seed", worst, most=10))
-        for what, values in ((f"{ratio} [%]", late), (f"{ratio}, against the truth [%]", true)):
-            if values:
-                found.append(Target(what, float(np.mean(values)), most=35))
-        if back:
-            share, what = 100 * float(np.mean(back)), "events after which half is reached within 3 trials"
-            found.append(Target(f"{what} [%]", share, least=100))
-        return found
-
-    def report(self, seeds: Sequence[int], results: Results[Record], folder: Path) -> Report:
+    def report(self, seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
         """Fig. 5a and 5b, and every controller's turns."""
-        records, limit = records_of(results), self.setting.safety.rule.max_steps
-        curves = prediction_curves(records, self.trials)
         figures = []
-        ekm, km = (np.stack([curve[i] for curve in curves]) for i in (0, 1))
-        some = np.isfinite(ekm).any(axis=0)
-        if some.sum() > 1:
+        ekm, km = curves = prediction_curves(trials, self.trials)
+        moved = ekm.columns[ekm.notna().any()]
+        if len(moved) > 1:
             events = f"trials {', '.join(map(str, self.events))}" if self.events else "none"
-            over = f", median and quartiles over {len(curves)} seeds" if len(curves) > 1 else ""
+            over = f", median and quartiles over {len(ekm)} seeds" if len(ekm) > 1 else ""
             caption = (
                 f"One-step prediction error in each trial{over} (the paper's Fig. 5a). Events: {events}."
             )
             happened = {trial: "dislocated" for trial in self.dislocations if trial <= self.trials}
             happened |= {self.tendons_replaced: "new tendons"} if self.tendons_replaced in self.events else {}
-            trials = np.arange(1.0, self.trials + 1)[some]
-            figure = plot_prediction_error(ekm[:, some], km[:, some], trials=trials, events=happened)
+            figure = plot_prediction_error(ekm[moved], km[moved], events=happened)
             figures.append(save_figure(figure, folder, "prediction_error", caption))
-        some = np.isfinite(ekm[0])
-        if some.sum() > 1:
+        first = [curve.iloc[0].dropna().to_numpy() for curve in curves]
+        if len(first[0]) > 1:
             caption = (
                 f"The first k trials of seed {min(seeds)} (the paper's Fig. 5b). Left: p of the test whether "
                 "the E-KM's error is smaller than the KM's; right: upper end of their difference's interval."
             )
-            figure = plot_learning_test(ekm[0][some], km[0][some])
-            figures.append(save_figure(figure, folder, "learning_test", caption))
+            figures.append(save_figure(plot_learning_test(*first), folder, "learning_test", caption))
         shown = [
-            self.paper_table(records),
-            tables.reason_table(records),
-            self.learning_table(records),
-            self.learning_table(records, against_truth=True),
-            tables.prediction_table(records),
-            tables.controller_table(records),
-            tables.motion_table(records, limit),
-            tables.comparison_table(records, limit),
-            tables.targets_table(self.targets(results)),
-            tables.timing_table(records),
+            self.paper_table(trials),
+            tables.reason_table(trials),
+            self.learning_table(trials),
+            self.learning_table(trials, against_truth=True),
+            tables.prediction_table(trials),
+            tables.controller_table(trials),
+            tables.motion_table(trials),
+            tables.comparison_table(trials),
+            tables.timing_table(trials),
         ]
         what = f"{self.trials} turns of the {object_name(self.object)} for each seed and controller."
         if len(seeds) >= LEAST_SEEDS:
             negative = shown[0].text()[0][2]
             what += f" The E-KM predicts better for good after {negative} trials (the paper: 16)."
-        summary, legend = f"{tables.verdict(records, seeds)} {what}", tables.legend(records)
+        summary, legend = f"{tables.verdict(trials, seeds)} {what}", tables.legend(trials)
         return Report("Online manipulation: learning while turning", summary, shown, figures, legend=legend)
 
-    def paper_table(self, records: Sequence[Record]) -> Table:
-        """The figures that the paper prints, beside those found here."""
-        learned = [Learning.of(ekm, km, self.events) for ekm, km in prediction_curves(records, self.trials)]
-        negative, upper = (
-            [float(x) for one in learned if (x := getattr(one, name)) is not None]
-            for name in ("last_negative", "last_upper")
-        )
-        rows: list[list[Cell]] = [
-            [
-                "last index of negative result [trials]",
-                "16",
-                bootstrap_mean(np.array(negative)) if negative else None,
-                len(negative),
-            ],
-            [
-                "last upper boundary [deg]",
-                "-0.57",
-                bootstrap_mean(np.array(upper)) if upper else None,
-                len(upper),
-            ],
-        ]
+    def paper_table(self, trials: DataFrame) -> Table:
+        """The figures that the paper prints, next to those found here."""
+        ekm, km = prediction_curves(trials, self.trials)
+        learned = [Learning.of(ekm.loc[seed], km.loc[seed], self.events) for seed in ekm.index]
+        rows: list[list[Cell]] = []
+        for name, what, paper in (
+            ("last_negative", "last index of negative result [trials]", "16"),
+            ("last_upper", "last upper boundary [deg]", "-0.57"),
+        ):
+            found = np.array([x for one in learned if (x := getattr(one, name)) is not None], dtype=float)
+            rows.append([what, paper, bootstrap_mean(found) if len(found) else None, len(found)])
         columns = ["figure", "paper", Column("here, mean over seeds", ".2f"), "seeds"]
         note = (
             "After how many trials the E-KM predicts better for good, and by how much at least at the end. "
@@ -187,16 +147,15 @@ class Online(Protocol):
         )
         return Table("paper", "Figures of the paper and those found here", columns, rows, note)
 
-    def learning_table(self, records: Sequence[Record], against_truth: bool = False) -> Table:
+    def learning_table(self, trials: DataFrame, against_truth: bool = False) -> Table:
         """How fast the E-KM learns (the paper's Fig. 5b), for each seed and for the mean over seeds."""
-        curves = prediction_curves(records, self.trials, "true_" if against_truth else "")
-        items = dict(zip(map(str, sorted({r.seed for r in records})), curves, strict=True))
-        if len(curves) > 1:
-            ekm, km = (np.nanmean([curve[i] for curve in curves], axis=0) for i in (0, 1))
-            items["of the seeds' mean errors"] = ekm, km
+        ekm, km = prediction_curves(trials, self.trials, "true_" if against_truth else "")
+        items = {str(seed): (ekm.loc[seed], km.loc[seed]) for seed in ekm.index}
+        if len(ekm) > 1:
+            items["of the seeds' mean errors"] = ekm.mean(), km.mean()
         rows: list[list[Cell]] = []
-        for name, (ekm, km) in items.items():
-            one = Learning.of(ekm, km, self.events)
+        for name, curves in items.items():
+            one = Learning.of(*curves, self.events)
             back = ["never" if n is None else n or None for n in one.recovery]
             rows.append([name, one.last_negative, one.last_upper, one.late, *back])
         columns = [
@@ -228,42 +187,40 @@ class Learning:
     no trial after it."""
 
     @classmethod
-    def of(cls, ekm: Array, km: Array, events: Sequence[int]) -> Learning:
-        """From per-trial prediction errors ``(trials,)`` [deg], NaN where nothing moved."""
-        some = np.isfinite(ekm)
-        calm = some.copy()
-        calm[[event - 1 for event in events]] = False
-        calm[:_LEARNED] = False
-        late = float(ekm[calm].mean() / km[calm].mean()) if calm.any() else None
+    def of(cls, ekm: Series, km: Series, events: Sequence[int]) -> Learning:
+        """From prediction errors of every trial [deg], NaN where nothing moved."""
         # NaN: nothing moved, and nothing was recovered
-        recovery = tuple(recovery_trials(ekm, km, event) if event < len(km) else 0 for event in events)
-        if some.sum() < 2:
+        recovery = tuple(recovery_trials(ekm, km, event) if event < ekm.index[-1] else 0 for event in events)
+        ekm = ekm.dropna()
+        km = km[ekm.index]
+        calm = ekm.index[(ekm.index > _LEARNED) & ~ekm.index.isin(events)]
+        late = float(ekm[calm].mean() / km[calm].mean()) if len(calm) else None
+        if len(ekm) < 2:
             return cls(None, None, late, recovery)
-        curve = learning_curve(ekm[some], km[some])
+        curve = learning_curve(ekm.to_numpy(), km.to_numpy())
         return cls(curve.last_negative, curve.last_upper, late, recovery)
 
 
-def recovery_trials(ekm: Array, km: Array, event: int) -> int | None:
-    """Trials after trial ``event`` (from 1) until the E-KM's error is below half of the KM's.
+def recovery_trials(ekm: Series, km: Series, event: int) -> int | None:
+    """Trials after trial ``event`` until the E-KM's error is below half of the KM's.
 
     1: already in the next trial; None: not within the recording.
     """
-    after = ekm[event:] < 0.5 * km[event:]
-    return int(np.argmax(after)) + 1 if after.any() else None
+    better = ekm.index[(ekm < 0.5 * km) & (ekm.index > event)]
+    return int(better[0]) - event if len(better) else None
 
 
-def prediction_curves(records: Sequence[Record], trials: int, kind: str = "") -> list[tuple[Array, Array]]:
-    """Per-trial prediction errors of E-KM and KM [deg] ``(trials,)``, for each seed; NaN: nothing moved.
+def prediction_curves(trials: DataFrame, n: int, kind: str = "") -> tuple[DataFrame, DataFrame]:
+    """Prediction errors of E-KM and KM [deg], a row for each seed, columns 1 to n; NaN: nothing moved.
 
     Args:
         kind: "true_" for errors against the plant's truth.
     """
-    curves = []
-    for seed in sorted({r.seed for r in records}):
-        ekm, km = np.full((2, trials), np.nan)
-        for r in select(records, controller="E-KM", seed=seed):
-            if r.steps:
-                ekm[r.trial - 1] = np.mean(getattr(r, f"{kind}prediction_ekm_deg"))
-                km[r.trial - 1] = np.mean(getattr(r, f"{kind}prediction_km_deg"))
-        curves.append((ekm, km))
-    return curves
+    mine, seeds = select(trials, controller="E-KM"), sorted(trials["seed"].unique())
+    ekm, km = (
+        mine.pivot(index="seed", columns="trial", values=f"{kind}prediction_{name}")
+        .reindex(index=seeds, columns=range(1, n + 1))
+        .astype(float)
+        for name in ("ekm", "km")
+    )
+    return ekm, km

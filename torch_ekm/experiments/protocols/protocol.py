@@ -1,24 +1,20 @@
-"""What an experiment is made of."""
+"""What an experiment is made of: its configuration, its jobs, a session, and a report of the trials."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self
 
 from ..config import Setting
 from ..records import Record, TrialRecord
 from ..reporting.report import Report
-from ..reporting.tables import Target
-
-R = TypeVar("R")
-#: Name of a job -> what its session left.
-Results = Mapping[str, Sequence[R]]
+from ..reporting.statistics import DataFrame
 
 
 class Protocol(ABC):
-    """An experiment: what is run, what was aimed at, and what is made of the results.
+    """An experiment: what is run, and what is made of the results.
 
     Protocols are frozen dataclasses: their fields are the configuration. A job is a session with its
     arguments; its name holds all that decides its result, the seed included.
@@ -44,18 +40,13 @@ class Protocol(ABC):
         independent."""
 
     @abstractmethod
-    def report(self, seeds: Sequence[int], results: Results, folder: Path) -> Report:
-        """Summary, tables, and figures in ``folder``."""
+    def report(self, seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
+        """Summary, tables, and figures in ``folder``.
 
-    def targets(self, results: Results) -> list[Target]:
-        """What was aimed at before the figures were known; nothing by default."""
-        return []
+        Args:
+            trials: of all sessions, see :func:`~torch_ekm.experiments.reporting.trials.trial_frame`.
+        """
 
     def run(self, *arguments: Any) -> list[dict[str, Any]]:
         """:meth:`session`, as JSON keeps it."""
         return [record.to_json() for record in self.session(*arguments)]
-
-
-def records_of(results: Results[R]) -> list[R]:
-    """The records of all sessions."""
-    return [record for session in results.values() for record in session]

@@ -121,9 +121,9 @@ class FigureFile:
 class Report:
     """What a run has to show.
 
-    ``write`` leaves ``index.html``, the same as ``report.md``, one CSV for each table, and
-    ``configuration.json`` with the exact configuration, versions and seeds. On the page the answer comes
-    first, then the leading tables, the figures, and the other tables, folded.
+    ``write`` leaves ``index.html``, the same as ``report.md``, one CSV for each table, ``report.json`` with
+    the texts, and ``configuration.json`` with the exact configuration, versions and seeds. On the page the
+    answer comes first, then the leading tables, the figures, and the other tables, folded.
     """
 
     title: str
@@ -150,17 +150,31 @@ class Report:
     def _write(self, folder: Path) -> Path:
         configuration = json.dumps({**self.configuration, "versions": versions()}, indent=2, sort_keys=True)
         (folder / "configuration.json").write_text(configuration + "\n", encoding="utf-8")
+        texts = {key: getattr(self, key) for key in ("title", "summary", "legend")}
+        tables = [{key: getattr(table, key) for key in ("name", "caption", "note")} for table in self.tables]
+        texts |= {"figures": [vars(figure) for figure in self.figures], "tables": tables}
+        (folder / "report.json").write_text(json.dumps(texts, indent=1) + "\n", encoding="utf-8")
         for table in self.tables:
             with (folder / f"{table.name}.csv").open("w", newline="", encoding="utf-8") as stream:
                 csv.writer(stream).writerows([table.header, *table.text()])
-        jinja2, given = require("jinja2"), vars(self) | {"configuration": configuration}
-        for page, kind in (("report.md", "report.md"), ("index.html", "report.html")):
-            environment = jinja2.Environment(autoescape=kind.endswith("html"), keep_trailing_newline=True)
-            environment.filters["unbroken"] = unbroken
-            template = (Path(__file__).parent / "templates" / kind).read_text(encoding="utf-8")
-            text = environment.from_string(template).render(given)
-            (folder / page).write_text(text, encoding="utf-8")
-        return folder / "index.html"
+        (folder / "report.md").write_text(self.markdown(), encoding="utf-8")
+        page = folder / "index.html"
+        page.write_text(self._render("html", configuration=configuration), encoding="utf-8")
+        return page
+
+    def markdown(self, level: int = 1) -> str:
+        """The page as Markdown.
+
+        Args:
+            level: of its heading; below 1 the heading itself is left out, for a page that has one.
+        """
+        return self._render("md", level=level)
+
+    def _render(self, kind: str, **given: Any) -> str:
+        environment = require("jinja2").Environment(autoescape=kind == "html", keep_trailing_newline=True)
+        environment.filters["unbroken"] = unbroken
+        template = (Path(__file__).parent / "templates" / f"report.{kind}").read_text(encoding="utf-8")
+        return environment.from_string(template).render({**vars(self), **given})
 
 
 def unbroken(text: str) -> Any:
