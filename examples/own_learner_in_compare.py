@@ -10,8 +10,9 @@ import torch
 from torch import nn
 from torch.distributions import Normal
 
-from torch_ekm import RecursiveLeastSquares, ResidualLearner, SparseOnlineGP, UpdateReport
+from torch_ekm import RecursiveLeastSquares, ResidualLearner, SparseOnlineGP
 from torch_ekm.experiments import compare
+from torch_ekm.residual import UpdateReport
 from torch_ekm.testing import check_residual_learner
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jaxtyping
@@ -27,4 +28,12 @@ def install() -> None:
     named = os.environ.get("CHECK_SHAPES")
     packages = CHECKED if named is None else tuple(filter(None, named.split(",")))
     if packages:
-        jaxtyping.install_import_hook([f"torch_ekm.{name}" for name in packages], "annotations.check")
+        modules = [module for name in packages for module in _modules(name)]
+        jaxtyping.install_import_hook(modules, "annotations.check")
+
+
+def _modules(package: str) -> list[str]:
+    """Names of a package's files, but for those of compiled loops: numba takes no wrapped functions."""
+    root = Path(__file__).parents[1]
+    files = sorted((root / "torch_ekm" / package).rglob("*.py"))
+    return [".".join(f.relative_to(root).with_suffix("").parts) for f in files if "numba_" not in f.name]

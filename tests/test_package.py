@@ -71,10 +71,10 @@ state, action = torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.f
 for learner in (
     SparseOnlineGP(in_features=4, out_features=2, parts=[Standardize(), LearnHyperparameters()]),
     torch_ekm.RecursiveLeastSquares(4, 2),
-    torch_ekm.WindowGP(4, 2),
-    torch_ekm.MixtureResidual(torch_ekm.KRLSTracker(4, 2)),
+    torch_ekm.residual.WindowGP(4, 2),
+    torch_ekm.MixtureResidual(torch_ekm.residual.KRLSTracker(4, 2)),
     torch_ekm.DeepKernelSOGP(4, 2),
-    torch_ekm.LearnerFleet(torch_ekm.ReplayMLP, 4, 2, batch_shape=(1,))[0],
+    torch_ekm.residual.LearnerFleet(torch_ekm.residual.ReplayMLP, 4, 2, batch_shape=(1,))[0],
 ):
     ekm = EnhancedModel(lambda s, a: s + a, learner)
     for _ in range(40):

@@ -21,7 +21,7 @@ def check_count(name: str, value: int, least: int = 1) -> int:
 
 
 def check_counts(name: str, values: Iterable[int]) -> tuple[int, ...]:
-    """``values`` as positive ints, or ParameterError."""
+    """``values`` as a tuple of positive ints, or ParameterError."""
     if isinstance(values, str) or not isinstance(values, Iterable):
         raise ParameterError(name, values, "a tuple of positive integers")
     return tuple(check_count(name, value) for value in values)

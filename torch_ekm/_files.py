@@ -90,7 +90,7 @@ class WriterLock:
 
     @property
     def held(self) -> bool:
-        """Not released yet."""
+        """Whether this process still has the right to write."""
         return self._end.alive
 
     def release(self) -> None:
@@ -117,5 +117,5 @@ def _release(lock: Any, path: Path) -> None:
 
 
 def _note(path: Path, text: str) -> None:
-    with contextlib.suppress(OSError):  # the lock holds without: this only tells others whose it is
+    with contextlib.suppress(OSError):  # the lock holds without: this only lets others know whose it is
         path.write_text(text, encoding="ascii")

@@ -88,7 +88,7 @@ def plain(value: Any) -> Any:
 
 
 def make(described: Any, known: Mapping[str, Any]) -> Any:
-    """What :func:`describe` told of, made again of the classes ``known`` by their names.
+    """What :func:`describe` wrote down, made again of the classes ``known`` by their names.
 
     Raises:
         ParameterError: a name is not known, or something had no plain terms.
@@ -179,7 +179,7 @@ def _made_otherwise(module: nn.Module, own: Mapping[str, Any], state: Mapping[st
 
 
 def ill_formed(own: Mapping[str, Any], state: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the entries of ``state``, beside those of a state dict of the same module."""
+    """What is wrong with the entries of ``state``, against a state dict of the same module."""
     wrong = [f"{name} is missing" for name in own if name not in state]
     wrong += [f"{name} does not belong here" for name in state if name not in own]
     for name, ours in own.items():

@@ -206,7 +206,7 @@ class ObjectLostError(GraspError):
 
 
 class NoDerivativeError(EKMError, TypeError):
-    """A model f does not tell how its prediction changes with the action."""
+    """A model f does not say how its prediction changes with the action."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(

@@ -10,22 +10,19 @@ import torch
 from torch.func import jacrev, vmap
 
 from torch_ekm import (
-    ActionLinearKernel,
     DeepKernelSOGP,
-    KRLSTracker,
     LearnHyperparameters,
     MixtureResidual,
     ProcessNoise,
     ResidualLearner,
     RobustWeight,
     SparseOnlineGP,
-    SquaredExponential,
     Standardize,
     default_learner,
 )
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.interop import to_casadi
-from torch_ekm.residual import Matern32, Matern52
+from torch_ekm.residual import ActionLinearKernel, KRLSTracker, Matern32, Matern52, SquaredExponential
 
 
 def deep(d: int = 3, m: int = 2) -> SparseOnlineGP:

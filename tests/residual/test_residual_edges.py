@@ -188,6 +188,7 @@ def test_no_action_is_not_novel():
     assert float(report.novelty[0]) == 0
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("kind", "options"),
     [
@@ -218,6 +219,7 @@ def test_the_same_learner_twice_is_no_mixture():
         MixtureResidual([gp, gp])
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_masks_may_be_lists_of_bools_only():
     gp = sogp(3, 2, capacity=5, batch_shape=(2,))
     x, y = stream(1, 2)

@@ -10,8 +10,6 @@ from torch_ekm.exceptions import ParameterError, ShapeError
 from torch_ekm.residual import (
     KRLSTracker,
     LearnerFleet,
-    MixtureResidual,
-    RobustWeight,
     SparseOnlineGP,
     SquaredExponential,
 )
@@ -51,21 +49,6 @@ def test_fleet_equals_the_learner_that_is_one_itself() -> None:
     torch.testing.assert_close(slow(x), fast(x), rtol=0, atol=1e-10)
     torch.testing.assert_close(slow(x[0, 0]), fast(x[0, 0]), rtol=0, atol=1e-10)  # one query for all
     assert isinstance(slow.predictive(x[0]), torch.distributions.Normal)
-
-
-def test_heavy_tails_stay() -> None:
-    x, y = stream(60, 2)
-
-    def kind(n_in: int, n_out: int, **options) -> MixtureResidual:
-        return MixtureResidual(sogp(n_in, n_out, capacity=8, parts=[RobustWeight(3.0)], **options))
-
-    fleet = LearnerFleet(kind, 3, 2, batch_shape=(2,))
-    fleet.update(x, y)
-    far = y[0] + 5.0
-    density = fleet.predictive(x[0]).log_prob(far)
-    alone = torch.stack([fleet[k].predictive(x[0, k]).log_prob(far[k]) for k in range(2)])
-    torch.testing.assert_close(density, alone)
-    torch.testing.assert_close(fleet.predictive(x[0]).mean, fleet(x[0]))
 
 
 def test_each_learner_has_a_kernel_of_its_own() -> None:

@@ -154,7 +154,7 @@ def test_a_fleet_is_so_many_single_mixtures():
 
 
 @pytest.mark.parametrize(
-    "options", [{"shares": ()}, {"shares": (1.5,)}, {"carries": (2.0,)}, {"caps": (0.0,)}, {"memory": 0.0}]
+    "options", [{"shares": ()}, {"shares": (1.5,)}, {"levels": (-0.1,)}, {"trends": (2.0,)}]
 )
 def test_wrong_choices_are_named(options):
     with pytest.raises(ParameterError, match=next(iter(options))):

@@ -279,6 +279,7 @@ def test_units_before_or_behind_process_noise_is_told_apart():
     assert not same(before, behind, x)
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
@@ -298,6 +299,7 @@ def test_what_does_not_go_together_is_told(parts, message):
             kind(3, 2, parts=parts)
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("kind", "arguments", "name"),
     [

@@ -194,6 +194,7 @@ def test_process_noise_follows_a_change_that_a_factor_is_slow_to_forget():
     assert max(errors[2:]) < 0.8 * min(errors[:2])
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     "options",
     [

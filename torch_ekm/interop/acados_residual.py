@@ -14,7 +14,7 @@ from ..typing import Array
 class AcadosResidual:
     """``g(y)`` at all stages of a horizon at once, ``y = [x; u]``: what l4acados asks of a residual model.
 
-    Learning goes on beside it, through ``learner.update``: l4acados asks at every iteration, and nothing is
+    Learning goes on meanwhile, through ``learner.update``: l4acados asks at every iteration, and nothing is
     compiled again.
 
     Args:
@@ -36,7 +36,7 @@ class AcadosResidual:
         return self.value_and_jacobian(y)[1]
 
     def value_and_jacobian(self, y: Array) -> tuple[Array, Array]:
-        """Both, in one pass."""
+        """Mean ``(N, out)`` and Jacobian ``(out, N, n_y)`` in one pass."""
         stages = torch.as_tensor(y, dtype=torch.float64)
         chosen = list(range(stages.shape[-1])) if self.columns is None else self.columns
         mean, slope = self.learner.linearize(stages[:, chosen])

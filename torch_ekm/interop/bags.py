@@ -26,7 +26,7 @@ _LEFT_OUT = ("header", "layout")  # stamps and array shapes
 
 
 class BagTable(NamedTuple):
-    """Rows in the order of time."""
+    """A recording as numbers: one row for each moment, in the order of time."""
 
     names: tuple[str, ...]
     """``/topic.field.joint`` or ``/topic.field[0]``, of each column."""

@@ -30,14 +30,14 @@ class CapyMOARegressor:
         return f"torch_ekm {getattr(made, '__name__', type(made).__name__)}"
 
     def train(self, instance: Any) -> None:
-        """One sample: ``instance.x`` ``(in,)`` and ``instance.y_value``."""
+        """Learn one sample: ``instance.x`` ``(in,)`` and ``instance.y_value``."""
         x = np.asarray(instance.x, dtype=np.float64)
         if self._regressor is None:
             self._regressor = OnlineRegressor(make_learner(self.learner, len(x), 1))
         self._regressor.learn(x, np.array([instance.y_value], dtype=np.float64))
 
     def predict(self, instance: Any) -> float:
-        """Mean of y."""
+        """Mean of y at ``instance.x``; 0 before the first sample."""
         if self._regressor is None:
             return 0.0
         return float(self._regressor.predict(np.asarray(instance.x, dtype=np.float64)[None])[0][0, 0])

@@ -43,7 +43,7 @@ class Inputs:
         return self.symbols[-1]
 
     def vector(self) -> ca.SX:
-        """All symbols as one column."""
+        """All symbols as one column, in the order of :meth:`values`."""
         return ca.vertcat(*(ca.vec(symbol) for symbol in self.symbols))
 
     def values(self) -> Array:

@@ -55,7 +55,7 @@ class CasadiResidual:
         self.function: Any = ca.Function("g", [x, p], list(outputs.values()), ["x", "p"], list(outputs))
 
     def parameters(self) -> Array:
-        """The present p, ``(n_parameters,)``."""
+        """The present p ``(n_parameters,)``, read from the learner."""
         return self._inputs.values()
 
     def __call__(self, x: Array) -> dict[str, Array]:

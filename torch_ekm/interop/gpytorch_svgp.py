@@ -11,18 +11,19 @@ import torch
 from torch import nn
 from torch.distributions import Normal
 
-from .._checks import check_count, check_positive
+from .._checks import check_count
 from .._extras import require
 from .._recorded import ill_formed, in_bounds
 from ..residual.base import SingleLearner
 from ..residual.report import UpdateReport
 from ..typing import Tensor
 
-_OPTIONS = ("inducing", "rate", "minibatch", "memory", "steps", "seed", "on_invalid", "dtype")
+_OPTIONS = ("inducing", "minibatch", "memory", "on_invalid", "dtype")
+_RATE = 0.01  # of Adam
 
 
 class GPyTorchSVGP(SingleLearner):
-    """GPyTorch's variational GP on inducing points, ``steps`` Adam steps on each sample and a replay.
+    """GPyTorch's variational GP on inducing points, an Adam step on each sample and a replay.
 
     Independent outputs share inducing points that start as the first distinct samples. The bound's data
     term is scaled to the number of samples seen. GPyTorch's state lies partly outside of state dicts, so the
@@ -30,8 +31,7 @@ class GPyTorchSVGP(SingleLearner):
 
     Args:
         inducing: number of inducing points.
-        rate, minibatch, memory, steps: of Adam and of the replay.
-        seed: of the minibatches.
+        minibatch, memory: samples of a step, and those kept to draw them from.
         options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
@@ -41,16 +41,12 @@ class GPyTorchSVGP(SingleLearner):
         out_features: int,
         *,
         inducing: int = 100,
-        rate: float = 0.01,
         minibatch: int = 1,
         memory: int = 1,
-        steps: int = 1,
-        seed: int = 0,
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        self.inducing, self.seed = check_count("inducing", inducing), int(seed)
-        self.rate, self.steps = check_positive("rate", rate), check_count("steps", steps)
+        self.inducing = check_count("inducing", inducing)
         self.minibatch, self.memory = check_count("minibatch", minibatch), check_count("memory", memory)
         self.inputs = nn.Buffer(self._like.new_zeros(self.memory, self.in_features))
         self.targets = nn.Buffer(self._like.new_zeros(self.memory, self.out_features))
@@ -60,7 +56,7 @@ class GPyTorchSVGP(SingleLearner):
         """All that has a state dict: model, likelihood, optimizer."""
         gpytorch = require("gpytorch")
         m, d = self.out_features, self.in_features
-        generator = torch.Generator().manual_seed(self.seed)
+        generator = torch.Generator().manual_seed(0)
         points = torch.randn(self.inducing, d, generator=generator, dtype=torch.float64).to(self._like)
 
         class Model(gpytorch.models.ApproximateGP):
@@ -83,22 +79,21 @@ class GPyTorchSVGP(SingleLearner):
         likelihood = likelihood.to(self._like)
         likelihood.task_noises = torch.full((m,), 0.01)
         parameters = [*model.parameters(), *likelihood.parameters()]
-        return model, likelihood, torch.optim.Adam(parameters, lr=self.rate)
+        return model, likelihood, torch.optim.Adam(parameters, lr=_RATE)
 
     def _learn(self, place: int) -> None:
         """The sample at this place of the memory is new."""
         model, likelihood, optimizer = self._peer
         objective = require("gpytorch").mlls.VariationalELBO(likelihood, model, num_data=self._count)
-        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self._count - 1)
+        generator = torch.Generator().manual_seed(self._count - 1)
         model.train()
-        for _ in range(self.steps):
-            index = torch.randint(min(self._count, self.memory), (self.minibatch,), generator=generator)
-            index[0] = place
-            with torch.enable_grad():
-                optimizer.zero_grad()
-                loss = -objective(model(self.inputs[index]), self.targets[index])
-                loss.backward()
-            optimizer.step()
+        index = torch.randint(min(self._count, self.memory), (self.minibatch,), generator=generator)
+        index[0] = place
+        with torch.enable_grad():
+            optimizer.zero_grad()
+            loss = -objective(model(self.inputs[index]), self.targets[index])
+            loss.backward()
+        optimizer.step()
         model.eval()
 
     def _settle(self) -> None:

@@ -117,11 +117,11 @@ class RiverRegressor(_RiverLearner, base.Regressor):
         self._start()
 
     def learn_one(self, x: dict, y: float) -> None:
-        """One sample."""
+        """Learn one sample: features x by name, and y."""
         self._learn(x, np.array([float(y)]))
 
     def predict_one(self, x: dict) -> float | None:
-        """Mean of y."""
+        """Mean of y at these features; None before the first sample."""
         mean = self._ask(x)
         return None if mean is None else float(mean[0])
 
@@ -144,18 +144,18 @@ class RiverMultiTargetRegressor(_RiverLearner, base.MultiTargetRegressor):
         self._start()
 
     def learn_one(self, x: dict, y: dict) -> None:
-        """One sample."""
+        """Learn one sample: features x by name, and y."""
         targets = self._targets or sorted(y, key=str)
         self._learn(x, np.array([float(y[name]) for name in targets]))
         self._targets = targets
 
     def predict_one(self, x: dict) -> dict:
-        """Mean of each target."""
+        """Mean of each target by its name; empty before the first sample."""
         mean = self._ask(x)
         return {} if mean is None else dict(zip(self._targets, mean.tolist(), strict=True))
 
     def predict_interval_one(self, x: dict, level: float = 0.95) -> dict:
-        """(low, high) of each target."""
+        """(low, high) of each target, which is to hold ``level`` of the samples."""
         ends = self._interval(x, level)
         if ends is None:
             return {}

@@ -8,16 +8,17 @@ import torch
 from torch import nn
 from torch.distributions import Normal
 
-from .._checks import check_positive
 from .._extras import require
 from ..exceptions import NoStateError
 from ..residual.base import SingleLearner
 from ..residual.report import UpdateReport
 from ..typing import Tensor
 
+_STEP = 1e-3  # of the central differences
+
 
 class RiverResidual(SingleLearner):
-    """Any river regressor, one copy per output; the variance is that of recent innovations.
+    """Any river regressor, one copy per output; the variance is that of recent innovations, at first 1.
 
     The mean is 0 before the first sample. River predicts on dictionaries of Python floats: it is not
     differentiable (``linearize`` takes central differences). Its regressors are Python objects, not figures:
@@ -25,7 +26,6 @@ class RiverResidual(SingleLearner):
 
     Args:
         model: a river regressor, copied; default ARFRegressor.
-        prior_variance: of y before the first sample.
         options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
@@ -35,8 +35,6 @@ class RiverResidual(SingleLearner):
         out_features: int,
         *,
         model: Any = None,
-        prior_variance: float = 1.0,
-        step: float = 1e-3,
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
@@ -44,16 +42,14 @@ class RiverResidual(SingleLearner):
         if model is None:
             model = require("river.forest").ARFRegressor(seed=0)
         self._prototype = model
-        self.step = check_positive("step", step)
-        self.prior_variance = check_positive("prior_variance", prior_variance)
-        self.noise = nn.Buffer(self._like.new_full((self.out_features,), prior_variance))
+        self.noise = nn.Buffer(self._like.new_ones(self.out_features))
         self.reset()
 
     def reset(self) -> None:
-        """Fresh copies of the regressor."""
+        """Fresh copies of the regressor, one for each output."""
         self._models = [self._prototype.clone() for _ in range(self.out_features)]
         self._count = 0
-        self.noise.fill_(self.prior_variance)
+        self.noise.fill_(1.0)
         self.n_refused.zero_()
 
     def forward(self, x: Tensor) -> Tensor:
@@ -65,16 +61,16 @@ class RiverResidual(SingleLearner):
         return mean + 0.0 * x[..., :1]
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
-        """The same variance with and without noise: river does not tell them apart."""
+        """The same variance with and without noise: river makes no difference."""
         mean = self(x)
         return Normal(mean, self.noise.sqrt().expand_as(mean), validate_args=False)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Central differences with ``step``."""
+        """Mean and its central differences with steps of 1e-3 in x."""
         x = self.check_query(x)
-        eye = self.step * torch.eye(self.in_features, dtype=x.dtype, device=x.device)
+        eye = _STEP * torch.eye(self.in_features, dtype=x.dtype, device=x.device)
         up, down = self(x.unsqueeze(-2) + eye), self(x.unsqueeze(-2) - eye)
-        return self(x), ((up - down) / (2 * self.step)).mT
+        return self(x), ((up - down) / (2 * _STEP)).mT
 
     def _value(self, model: Any, row: list[float]) -> float:
         return float(model.predict_one(dict(enumerate(row))) or 0.0) if self._count else 0.0

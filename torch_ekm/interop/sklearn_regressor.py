@@ -39,7 +39,7 @@ class SklearnRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self._learn(X, y, reset=True)
 
     def partial_fit(self, X: Any, y: Any) -> Self:
-        """Learn further rows in their order."""
+        """Learn further rows in their order, on top of what is known."""
         return self._learn(X, y, reset=not hasattr(self, "regressor_"))
 
     def predict(self, X: Any, return_std: bool = False) -> Array | tuple[Array, Array]:

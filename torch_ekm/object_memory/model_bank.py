@@ -146,7 +146,7 @@ class ModelBank(SingleLearner):
             signature: the readings of the grasp, for a bank with ``signature_features``.
 
         Returns:
-            The model to which the last episode went; None if it was too short to tell.
+            The model to which the last episode went; None if it was too short to say.
 
         Raises:
             ParameterError, ShapeError, NonFiniteError: the signature is missing, not wanted, or cannot be

@@ -56,6 +56,6 @@ class Adam(nn.Module):
         p.sub_(step if mask is None else step.where(mask, 0.0))
 
     def reset(self) -> None:
-        """No moments."""
+        """Forget the moments of all parameters, as before the first step."""
         for buffer in self.buffers():
             buffer.zero_()

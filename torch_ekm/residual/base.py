@@ -23,7 +23,8 @@ class ResidualLearner(Recorded, nn.Module, ABC):
     """g(x), learned from a stream: ``y ~ N(g(x), R)``, and ``g = 0`` before the first sample.
 
     Shapes: a learner is a fleet of independent models of shape ``batch_shape`` (one model: ``()``).
-    Queries are ``(*any, *batch_shape, in_features)``; an update takes one sample per model,
+    Queries are ``(*any, *batch_shape, in_features)``; the fleet's axes may be left out to ask all models, and
+    are there in the results, ``*all``. An update takes one sample per model,
     ``(*batch_shape, in_features)``, or a time-ordered block with the time first,
     ``(n, *batch_shape, in_features)``.
 
@@ -72,8 +73,8 @@ class ResidualLearner(Recorded, nn.Module, ABC):
     # -- what a learner is ------------------------------------------------------------------
 
     @abstractmethod
-    def forward(self, x: Float[Tensor, "*any in_features"]) -> Float[Tensor, "*any out_features"]:
-        """Posterior mean E[g(x)], differentiable in x."""
+    def forward(self, x: Float[Tensor, "*any in_features"]) -> Float[Tensor, "*all out_features"]:
+        """Posterior mean E[g(x)] in the units of y, differentiable in x."""
 
     @abstractmethod
     def predict(self, x: Float[Tensor, "*any in_features"], *, observation: bool = False) -> Normal:
@@ -87,7 +88,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         return self.predict(x, observation=True)
 
     def reset(self) -> None:
-        """Forget all samples; hyperparameters stay."""
+        """Forget all samples; hyperparameters stay as they are."""
         for buffer in self.buffers(recurse=False):
             buffer.zero_()
 
@@ -100,7 +101,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
 
     def linearize(
         self, x: Float[Tensor, "*any in_features"]
-    ) -> tuple[Float[Tensor, "*any out_features"], Float[Tensor, "*any out_features in_features"]]:
+    ) -> tuple[Float[Tensor, "*all out_features"], Float[Tensor, "*all out_features in_features"]]:
         """``(g(x), dg/dx)``. Learners with a closed form override this autograd version."""
         x = self.check_query(x).detach().requires_grad_(True)
         with torch.enable_grad():
@@ -213,7 +214,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
     def _cast(self, x: Tensor) -> Tensor:
         return torch.as_tensor(x, dtype=self._like.dtype, device=self._like.device)
 
-    def check_query(self, x: Float[Tensor, "*any in_features"]) -> Float[Tensor, "*any in_features"]:
+    def check_query(self, x: Float[Tensor, "*any in_features"]) -> Float[Tensor, "*all in_features"]:
         """x in the learner's dtype, with all the fleet's axes.
 
         Raises:

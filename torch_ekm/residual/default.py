@@ -1,4 +1,4 @@
-"""The learner for somebody who tells nothing but the sizes."""
+"""The learner to take where nothing is known but the sizes."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def default_learner(
     """The recommended learner where nothing is known of the data: a mixture of four, in constant memory.
 
     Two learners keep the past and learn features, of which one distrusts large samples and one does not (rare
-    ones may be outliers, or what is worth learning); one lets g wander; one forgets and is told the last
-    residual. The model alone, and the last residual alone, are among the experts. Evidence decides, for each
-    output. It predicts the *next* sample: see MixtureResidual.
+    ones may be outliers, or what is worth learning); one lets g wander; one forgets and has the last residual
+    among its inputs. The model alone, and the last residual alone, are among the experts. Evidence decides,
+    for each output. It predicts the *next* sample: see MixtureResidual.
 
     Args:
         capacity: basis vectors of each of the four.

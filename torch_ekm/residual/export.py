@@ -21,7 +21,7 @@ OUTPUTS = ("mean", "variance", "mean_jacobian", "variance_jacobian")
 
 
 def export_learner(learner: Any, path: str | Path, format: str) -> Path:
-    """See :meth:`torch_ekm.residual.ResidualLearner.export`."""
+    """Write the file of :meth:`torch_ekm.residual.ResidualLearner.export`, and return its path."""
     if format not in ("onnx", "pt2"):
         raise ParameterError("format", format, "'onnx' or 'pt2'")
     if not hasattr(learner, "predict_with_jacobians") or tuple(learner.batch_shape):

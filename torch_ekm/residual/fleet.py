@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Literal, cast
+from collections.abc import Callable
+from typing import Any, Literal, cast
 
 import torch
 from torch import nn
-from torch.distributions import Distribution, Normal, constraints
+from torch.distributions import Normal
 
 from ..exceptions import ParameterError
-from ..typing import Float, Tensor
+from ..typing import Tensor
 from .base import ResidualLearner
 from .report import UpdateReport
 
@@ -24,7 +24,7 @@ class LearnerFleet(ResidualLearner):
     draws its weights from a seed draws the same in every place. Learners that take ``batch_shape``
     themselves (``SparseOnlineGP`` among them) update all models in one call and are much faster. This is
     for those that do not, such as ``KRLSTracker``, ``LocalGPs``, ``ReplayMLP`` and the adapters of other
-    libraries. What is special to a kind is found on ``fleet[k]``.
+    libraries. What is special to a kind is found on ``fleet[k]``; the law of y is taken to be normal.
 
     Args:
         kind: ``kind(in_features, out_features, dtype=..., device=..., **options)`` gives one learner.
@@ -74,14 +74,9 @@ class LearnerFleet(ResidualLearner):
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         each = self._each(self.check_query(x))
-        return self._normal([g.predict(z, observation=observation) for g, z in each])
-
-    def predictive(self, x: Float[Tensor, "*any in_features"]) -> Distribution:
-        """Each learner's law of y: a Normal, or where one is heavy-tailed a law with mean and log_prob."""
-        laws = [g.predictive(z) for g, z in self._each(self.check_query(x))]
-        if all(isinstance(law, Normal) for law in laws):
-            return self._normal(laws)
-        return _SideBySide(laws, self.batch_shape)
+        laws = [g.predict(z, observation=observation) for g, z in each]
+        mean, deviation = (self._stack([getattr(law, n) for law in laws], 1) for n in ("mean", "stddev"))
+        return Normal(mean, deviation, validate_args=False)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Each learner's mean and Jacobian, closed where it has a closed form."""
@@ -101,10 +96,6 @@ class LearnerFleet(ResidualLearner):
         stacked = UpdateReport.stack(reports)
         return UpdateReport(*(part.reshape(self.batch_shape) for part in vars(stacked).values()))
 
-    def _normal(self, laws: Sequence[Distribution]) -> Normal:
-        mean, deviation = (self._stack([getattr(law, n) for law in laws], 1) for n in ("mean", "stddev"))
-        return Normal(mean, deviation, validate_args=False)
-
     def _all(self) -> list[ResidualLearner]:
         return cast("list[ResidualLearner]", list(self.learners))  # checked at construction
 
@@ -117,36 +108,6 @@ class LearnerFleet(ResidualLearner):
 
     def _stack(self, parts: list[Tensor], n_last: int) -> Tensor:
         """``(*any, *last)`` of each learner as ``(*any, *batch_shape, *last)``."""
-        return _unfold(torch.stack(parts, -1 - n_last), self.batch_shape, n_last)
-
-
-class _SideBySide(Distribution):
-    """Independent laws of the learners of a fleet, ``(*any, *batch_shape, out)``."""
-
-    arg_constraints: ClassVar[dict[str, constraints.Constraint]] = {}
-
-    def __init__(self, laws: list[Distribution], batch_shape: torch.Size) -> None:
-        self._laws, self._fleet = laws, batch_shape
-        super().__init__(self.mean.shape, validate_args=False)
-
-    @property
-    def mean(self) -> Tensor:
-        return self._stack([law.mean for law in self._laws])
-
-    @property
-    def variance(self) -> Tensor:
-        return self._stack([law.variance for law in self._laws])
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        value = value.expand(torch.broadcast_shapes(value.shape, self.batch_shape))
-        fleet = value.dim() - 1 - len(self._fleet)
-        each = value.reshape(*value.shape[:fleet], len(self._laws), value.shape[-1]).unbind(-2)
-        return self._stack([law.log_prob(y) for law, y in zip(self._laws, each, strict=True)])
-
-    def _stack(self, parts: list[Tensor]) -> Tensor:
-        return _unfold(torch.stack(parts, -2), self._fleet, 1)
-
-
-def _unfold(x: Tensor, batch_shape: torch.Size, n_last: int) -> Tensor:
-    cut = x.dim() - n_last
-    return x.reshape(*x.shape[: cut - 1], *batch_shape, *x.shape[cut:])
+        x = torch.stack(parts, -1 - n_last)
+        cut = x.dim() - n_last
+        return x.reshape(*x.shape[: cut - 1], *self.batch_shape, *x.shape[cut:])

@@ -1,4 +1,4 @@
-"""A learner that is told the last residual, too."""
+"""A learner that has the last residual among its inputs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .report import MomentsWithJacobians, UpdateReport
 
 
 class LastResidual(ResidualLearner):
-    """``g(x) = f([x, y_last])``: neighbours in time tell what x does not hold.
+    """``g(x) = f([x, y_last])``: neighbours in time know what x does not hold.
 
     It predicts the *next* sample; call :meth:`new_sequence` between trajectories.
 
@@ -37,15 +37,15 @@ class LastResidual(ResidualLearner):
         self.last = nn.Buffer(torch.zeros(*self.batch_shape, m, dtype=self.dtype, device=self.device))
 
     def forward(self, x: Tensor) -> Tensor:
-        """``f([x, y_last])``."""
+        """Mean of f at x and the last sample, ``f([x, y_last])``."""
         return self.learner(self._with_last(self.check_query(x)))
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
-        """f's law."""
+        """The law of f at x and the last sample."""
         return self.learner.predict(self._with_last(self.check_query(x)), observation=observation)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """f's slope by x."""
+        """Mean of f and its slope by x; that by the last sample is left out."""
         mean, slope = self.learner.linearize(self._with_last(self.check_query(x)))
         return mean, slope[..., : self.in_features]
 

@@ -10,7 +10,6 @@ import torch
 from torch import nn
 from torch.distributions import Distribution, Normal
 
-from .._checks import check_fraction
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import ResidualLearner
@@ -18,6 +17,9 @@ from .last_residual import LastResidual
 from .report import MomentsWithJacobians, UpdateReport
 from .tails import ScaleMixture
 
+_CARRIES = (-0.3, 0.0, 0.2, 0.4, 0.6, 0.8)  # values of kappa to choose from
+_CAPS = (3.0, 30.0)  # and of c
+_MEMORY = 0.99  # forgetting factor of the evidence
 _PRIOR = 0.8  # belief that a learner is to be taken at its word
 _FREEDOM = 10.0  # of the t law that judges the experts: an outlier must not decide alone
 _LEVEL_DECAY, _TREND_DECAY = 0.995, 0.98
@@ -40,7 +42,7 @@ class MixtureResidual(ResidualLearner):
     Differences of a noisy pose carry noise over: what one sample has too much, the next one lacks, so
     innovations correlate by up to -1/2 and ``kappa`` (the pose's share of the noise: the moving average
     of order one that a Kalman filter would use) takes it away. ``l`` follows a wandering offset: slowly with
-    a small rho, and with rho = 1 it is what the last sample left, which on a smooth stream tells a lot; d
+    a small rho, and with rho = 1 it is what the last sample left, which on a smooth stream says a lot; d
     goes on as it went (Holt's double exponential smoothing).
     ``h`` below 1 trusts the model more than the learner, so an output on which nothing can be learned
     costs next to nothing. Which of it holds is decided by predictive evidence alone (dynamic model
@@ -56,9 +58,8 @@ class MixtureResidual(ResidualLearner):
 
     Args:
         learners: one or more of the same shapes; they belong to the mixture from now on.
-        shares, carries, levels, trends, caps: values of h, kappa, rho, beta and c to choose from; a
-            trend goes with levels that are larger.
-        memory: forgetting factor of the evidence.
+        shares, levels, trends: values of h, rho and beta to choose from; a trend goes with levels that are
+            larger.
         on_invalid: see ResidualLearner.
 
     Raises:
@@ -70,26 +71,20 @@ class MixtureResidual(ResidualLearner):
         learners: ResidualLearner | Sequence[ResidualLearner],
         *,
         shares: Sequence[float] = (0.0, 0.5, 1.0),
-        carries: Sequence[float] = (-0.3, 0.0, 0.2, 0.4, 0.6, 0.8),
         levels: Sequence[float] = (0.0, 0.03, 0.1),
         trends: Sequence[float] = (0.0,),
-        caps: Sequence[float] = (3.0, 30.0),
-        memory: float = 0.99,
         **options: Any,
     ) -> None:
         members = [learners] if isinstance(learners, ResidualLearner) else list(learners)
         first = _same_shapes(members)
         shape = {"batch_shape": tuple(first.batch_shape), "dtype": first.dtype, "device": first.device}
         super().__init__(first.in_features, first.out_features, **{**shape, **options})
-        choices = ("shares", shares, 0, 1), ("carries", carries, -1, 1), ("levels", levels, 0, 1)
-        choices = *choices, ("trends", trends, 0, 1)
-        for name, values, low, high in (*choices, ("caps", caps, 1e-3, 1e6)):
-            if not values or not all(low <= value <= high for value in values):
-                raise ParameterError(name, values, f"one or more numbers in [{low:g}, {high:g}]")
+        for name, values in (("shares", shares), ("levels", levels), ("trends", trends)):
+            if not values or not all(0 <= value <= 1 for value in values):
+                raise ParameterError(name, values, "one or more numbers in [0, 1]")
         self.learners = nn.ModuleList(members)
-        self.memory = check_fraction("memory", memory)
         rises = [(rho, beta) for rho in levels for beta in trends if beta == 0 or beta < rho]
-        experts = itertools.product(range(len(members)), shares, carries, rises, caps)
+        experts = itertools.product(range(len(members)), shares, _CARRIES, rises, _CAPS)
         flat = [(b, h, kappa, *rise, c) for b, h, kappa, rise, c in experts]
         owner, *values = zip(*flat, strict=True)
         factory = {"dtype": self.dtype, "device": self.device}
@@ -112,13 +107,13 @@ class MixtureResidual(ResidualLearner):
         self.inflation = nn.Buffer(torch.ones(wide[:-1], **factory))
         self.count = nn.Buffer(torch.zeros(self.batch_shape, **factory))
         fleet = {"batch_shape": self.batch_shape, **factory}
-        self.tails = ScaleMixture(self.out_features, memory=self.memory, **fleet)
+        self.tails = ScaleMixture(self.out_features, memory=_MEMORY, **fleet)
         self._settle()
 
     # -- predictions ----------------------------------------------------------------------------
 
     def forward(self, x: Tensor) -> Tensor:
-        """``sum_b gain_b m_b(x) + offset``."""
+        """Mean of all experts by their weights, ``sum_b gain_b m_b(x) + offset``."""
         x = self.check_query(x)
         means = torch.stack([learner(x).to(x.dtype) for learner in self.members], dim=-1)
         return (self.gain * means).sum(-1) + self.offset
@@ -184,7 +179,7 @@ class MixtureResidual(ResidualLearner):
 
     @property
     def members(self) -> list[ResidualLearner]:
-        """The learners, in their order."""
+        """The learners b in the order in which they were given."""
         return cast("list[ResidualLearner]", list(self.learners))
 
     @property
@@ -199,7 +194,7 @@ class MixtureResidual(ResidualLearner):
 
     @property
     def shares(self) -> Float[Tensor, " experts"]:
-        """h of each expert."""
+        """Share h of its learner's mean that each expert takes."""
         return self._experts[0]
 
     @property
@@ -209,7 +204,7 @@ class MixtureResidual(ResidualLearner):
 
     @property
     def beliefs(self) -> Float[Tensor, "*batch out experts"]:
-        """p of each expert."""
+        """Posterior probability p of each expert, by output."""
         return self._weights()
 
     @property
@@ -220,7 +215,7 @@ class MixtureResidual(ResidualLearner):
     # -- learning -------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Everything back to the prior."""
+        """The learners, the experts' weights and what they carry over back to the prior."""
         for learner in self.members:
             learner.reset()
         for buffer in (self.evidence, self.innovation, self.level, self.trend, self.count, self.n_refused):
@@ -251,7 +246,7 @@ class MixtureResidual(ResidualLearner):
         scale = (deviation * typical).unsqueeze(-1)
         far = _bounded(innovation / scale)
         r = (far * (typical / judged_by).unsqueeze(-1)).square()
-        evidence = self.memory * self.evidence - 0.5 * (_FREEDOM + 1.0) * torch.log1p(r / _FREEDOM)
+        evidence = _MEMORY * self.evidence - 0.5 * (_FREEDOM + 1.0) * torch.log1p(r / _FREEDOM)
         evidence = (evidence - evidence.amax(-1, keepdim=True)).clamp_min(_LEAST)
         innovation = scale * far / (1.0 + (far / self._experts[4]).square())
         trend = _TREND_DECAY * self.trend + self._experts[3] * innovation
@@ -307,7 +302,7 @@ class MixtureResidual(ResidualLearner):
 
 
 def _bounded(z: Tensor) -> Tensor:
-    """Squares stay finite; what is farther off tells nothing more."""
+    """Squares stay finite; what is farther off says nothing more."""
     return z.nan_to_num(_FARTHEST).clamp(-_FARTHEST, _FARTHEST)
 
 

@@ -40,7 +40,7 @@ class UpdateReport:
 
     @property
     def accepted(self) -> Bool[Tensor, "*time_and_batch"]:
-        """Samples that changed the state."""
+        """Whether each sample was taken in and changed the state."""
         return self.event != UpdateEvent.REFUSED
 
     @staticmethod
@@ -64,7 +64,7 @@ class UpdateReport:
 
     @staticmethod
     def of_nothing(like: Bool[Tensor, "*batch"], dtype: torch.dtype) -> UpdateReport:
-        """No model had a sample."""
+        """The report of a step in which no model had a sample."""
         zero = torch.zeros_like(like, dtype=dtype)
         return UpdateReport(torch.zeros_like(like, dtype=torch.int64), zero, zero, zero)
 

@@ -21,7 +21,7 @@ ALIEN = 1e-20  #: a variation below this share is no rest either: what was befor
 
 
 class RunningScale(nn.Module):
-    """``z = (x - shift) / scale`` of columns whose units nobody told; columns may be exempt from the shift.
+    """``z = (x - shift) / scale`` of columns whose units are unknown; columns may be exempt from the shift.
 
     Of each block of samples the fourth that lies farthest from its median is cut to what a normal law like
     that of the others would hold (the eighth, where the others hardly move: these are no outliers). Mean and
@@ -156,8 +156,8 @@ class RunningScale(nn.Module):
 
     def _in_company(self, large: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
         """Counts of large samples with those of this block, and whether they come in bursts."""
-        beside = torch.nn.functional.pad(large, (0, 0, 1, 1))
-        alone = large & ~(beside[..., :-2, :] | beside[..., 2:, :])
+        padded = torch.nn.functional.pad(large, (0, 0, 1, 1))
+        alone = large & ~(padded[..., :-2, :] | padded[..., 2:, :])
         found = torch.stack([large.sum(-2), alone.sum(-2)], dim=-1).to(self.large)
         counts = self.large * (1.0 - BLOCK / self.memory) + found
         share = counts[..., 0] / (self.weight.clamp_max(self.memory) + count)
@@ -165,7 +165,7 @@ class RunningScale(nn.Module):
         return counts, counts[..., 1] + _DOUBT < _COMPANY * by_chance * (counts[..., 0] + _DOUBT)
 
     def reset(self) -> None:
-        """Back to z = x."""
+        """Forget all samples: shift 0 and scale 1 again."""
         kept = self.shift, self.centre, self.spread, self.weight, self.large, self.block, self.block_on
         for buffer in kept:
             buffer.zero_()

@@ -81,6 +81,6 @@ class ScaleMixture(nn.Module):
         self.evidence.copy_(evidence)
 
     def reset(self) -> None:
-        """Unit scales, equal weights."""
+        """Scales of 1 and equal weights for all experts."""
         self.log_scale.zero_()
         self.evidence.zero_()

@@ -28,7 +28,7 @@ class FuzzedPlant(PlantWrapper):
 
     One fault at a time: it begins at an observation with probability ``chance``, strikes one sensor in one
     of the ways of :data:`KINDS`, and lasts one observation, or in one of four cases up to ``longest``.
-    The same seed gives the same faults. ``info["events"]`` and ``faults`` tell of them.
+    The same seed gives the same faults. ``info["events"]`` and ``faults`` name them.
 
     Args:
         plant: to be spoilt.

@@ -72,10 +72,6 @@ class KRLSTracker(ScaledLearner, SingleLearner, DoubleStateLearner):
         v = v + self.noise_variance if observation else v.clamp_min(torch.finfo(v.dtype).eps)
         return e @ self.mu, v.unsqueeze(-1)
 
-    def _clear(self) -> None:
-        for buffer in (self.basis, self.mu, self.Sigma, self.Q, self.active):
-            buffer.zero_()
-
     def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
         """The same beliefs at the same places, in other numbers."""
         (offset, ratio), (offset_t, ratio_t) = change, change_t

@@ -69,7 +69,7 @@ class LinearInFeatures(ScaledLearner):
 
     @abstractmethod
     def features(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any f"]:
-        """phi(x), differentiable."""
+        """phi(x) of inputs in the learner's units, differentiable in x."""
 
     def _mean(self, z: Tensor) -> Tensor:
         return (self.features(z).unsqueeze(-2) @ self.weights).squeeze(-2)

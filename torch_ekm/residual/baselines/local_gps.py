@@ -8,7 +8,6 @@ import torch
 from torch import nn
 
 from ..._checks import check_count, check_positive
-from ...exceptions import ParameterError
 from ...typing import Tensor
 from ..base import SingleLearner
 from ..kernels.kernel import Kernel
@@ -16,13 +15,16 @@ from ..kernels.stationary import Matern32
 from ..report import UpdateEvent, UpdateReport
 from .scaled import ScaledLearner
 
+_NEIGHBOURS = 4  # experts averaged in a prediction
+_SPREAD = 0.7  # correlation with the nearest centre below which an expert is opened
+
 
 class LocalGPs(ScaledLearner, SingleLearner):
     """Experts with centres ``c_e`` and windows of their own; the nearest few are averaged::
 
         mean = sum_e w_e mean_e / sum_e w_e,   w_e = k(x, c_e)
 
-    A sample goes to the nearest expert; where the nearest is farther than ``spread`` (in correlation)
+    A sample goes to the nearest expert; where its correlation with the nearest centre is below 0.7
     and an expert is left, it opens a new one (Nguyen-Tuong, Seeger & Peters, Advanced Robotics 23,
     2009; bounded like SkyGP, standing in for the tree of LoG-GP, Lederer et al., ICML 2021). The
     variance is that of the mixture. One model.
@@ -30,8 +32,6 @@ class LocalGPs(ScaledLearner, SingleLearner):
     Args:
         experts: largest number of experts.
         window: samples per expert; the oldest goes.
-        neighbours: experts averaged in a prediction.
-        spread: correlation with the nearest centre below which an expert is opened.
         kernel, noise_variance: of all experts.
         options: see ScaledLearner; ``batch_shape`` must be (): several are a ``LearnerFleet``.
     """
@@ -43,8 +43,6 @@ class LocalGPs(ScaledLearner, SingleLearner):
         *,
         experts: int = 40,
         window: int = 100,
-        neighbours: int = 4,
-        spread: float = 0.7,
         kernel: Kernel | None = None,
         noise_variance: float = 0.1,
         **options: Any,
@@ -52,10 +50,7 @@ class LocalGPs(ScaledLearner, SingleLearner):
         super().__init__(in_features, out_features, **options)
         E, n = check_count("experts", experts), check_count("window", window)
         self.experts, self.window = E, n
-        self.neighbours = min(check_count("neighbours", neighbours), E)
-        if not 0 < spread < 1:
-            raise ParameterError("spread", spread, "in (0, 1)")
-        self.spread, self.noise_variance = float(spread), check_positive("noise_variance", noise_variance)
+        self.noise_variance = check_positive("noise_variance", noise_variance)
         factory = {"dtype": self.dtype, "device": self.device}
         self.kernel = Matern32(in_features, **factory) if kernel is None else kernel.to(self._like)
         zeros = self._like.new_zeros
@@ -76,12 +71,6 @@ class LocalGPs(ScaledLearner, SingleLearner):
         mean, v = self._mixture(z)
         return mean, v + self.noise_variance if observation else v
 
-    def _clear(self) -> None:
-        for buffer in (
-            self.centres, self.inputs, self.targets, self.count, self.solution, self.inverse
-        ):  # fmt: skip
-            buffer.zero_()
-
     def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
         """All windows in new units, and solved again."""
         for kept, (offset, ratio) in (
@@ -93,7 +82,7 @@ class LocalGPs(ScaledLearner, SingleLearner):
 
     def _mixture(self, x: Tensor) -> tuple[Tensor, Tensor]:
         near = self.kernel(x.unsqueeze(-2), self.centres).squeeze(-2) * (self.count > 0)
-        w, index = near.topk(self.neighbours, dim=-1)
+        w, index = near.topk(min(_NEIGHBOURS, self.experts), dim=-1)
         # far from all experts every weight underflows: the floor makes them equal, not 0/0
         w = (w + torch.finfo(x.dtype).tiny ** 0.5) * (self.count[index] > 0)
         w = w / w.sum(-1, keepdim=True).clamp_min(torch.finfo(x.dtype).tiny)
@@ -117,7 +106,7 @@ class LocalGPs(ScaledLearner, SingleLearner):
         prior = self.kernel.diagonal(x)
         near = self.kernel.vector(x, self.centres) * (self.count > 0)
         e = int(near.argmax())
-        opened = used < self.experts and (used == 0 or bool(near[e] < self.spread * prior))
+        opened = used < self.experts and (used == 0 or bool(near[e] < _SPREAD * prior))
         if opened:
             e = used
             self.centres[e] = x

@@ -9,18 +9,21 @@ from typing import Any
 import torch
 from torch import nn
 
-from ..._checks import check_count, check_counts, check_positive
+from ..._checks import check_count, check_counts
 from ...typing import Tensor
 from ..adam import Adam
 from ..base import SingleLearner
 from ..report import UpdateReport
 from .scaled import ScaledLearner
 
+_MINIBATCH, _STEPS, _RATE = 32, 2, 3e-3  # of Adam
+_PRIOR_VARIANCE = 1.0  # of g before the first sample, and start of the running noise estimate
+
 
 class ReplayMLP(ScaledLearner, SingleLearner):
     """``g(x) = mean_i (net_i(x; theta_i) - net_i(x; theta_i0))``: exactly 0 before the first sample.
 
-    Each sample brings ``steps`` Adam steps on itself and a minibatch from the last ``memory`` ones.
+    Each sample brings two Adam steps on itself and a minibatch of 32 from the last ``memory`` ones.
     With ``members > 1`` the latent variance is the members' spread, each trained on minibatches of its
     own (Lakshminarayanan et al., NeurIPS 2017, with Osband's randomised priors, NeurIPS 2018); with one
     member it is the running mean of squared innovations. One model.
@@ -29,8 +32,6 @@ class ReplayMLP(ScaledLearner, SingleLearner):
         hidden: widths of the tanh layers.
         members: networks in the ensemble.
         memory: samples kept for replay (the oldest goes).
-        minibatch, steps, rate: of Adam.
-        prior_variance: of g before the first sample, and start of the running noise estimate.
         seed: of weights and minibatches.
         options: see ScaledLearner; ``batch_shape`` must be (): several are a ``LearnerFleet``.
     """
@@ -43,19 +44,12 @@ class ReplayMLP(ScaledLearner, SingleLearner):
         hidden: Sequence[int] = (64, 64),
         members: int = 1,
         memory: int = 1000,
-        minibatch: int = 32,
-        steps: int = 2,
-        rate: float = 3e-3,
-        prior_variance: float = 1.0,
         seed: int = 0,
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
         self.members, self.memory = check_count("members", members), check_count("memory", memory)
-        self.minibatch, self.steps = check_count("minibatch", minibatch), check_count("steps", steps)
-        self.rate, self.seed = check_positive("rate", rate), int(seed)
-        self.prior_variance = check_positive("prior_variance", prior_variance)
-        self.hidden = check_counts("hidden", hidden)
+        self.hidden, self.seed = check_counts("hidden", hidden), int(seed)
         zeros = self._like.new_zeros
         self.inputs = nn.Buffer(zeros(self.memory, self.in_features))
         self.targets = nn.Buffer(zeros(self.memory, self.out_features))
@@ -82,7 +76,7 @@ class ReplayMLP(ScaledLearner, SingleLearner):
         mean = members.mean(-2)
         if self.members > 1:
             # before the first sample all members are 0 and so is their spread: then it is the prior
-            v = members.var(-2).where(self.count > 0, self.prior_variance)
+            v = members.var(-2).where(self.count > 0, _PRIOR_VARIANCE)
             v = v.clamp_min(torch.finfo(v.dtype).eps)
             return mean, v + self.noise if observation else v
         return mean, self.noise.expand_as(mean)
@@ -100,7 +94,7 @@ class ReplayMLP(ScaledLearner, SingleLearner):
             else:
                 p.data.zero_()
             self.get_buffer(f"start_{i}").copy_(p.data)
-        self.noise.fill_(self.prior_variance)
+        self.noise.fill_(_PRIOR_VARIANCE)
 
     def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
         """The same functions of x: first and last layer take the change."""
@@ -137,8 +131,8 @@ class ReplayMLP(ScaledLearner, SingleLearner):
         start = [self.get_buffer(f"start_{i}") for i in range(len(self.theta))]
         # the sample's number seeds its minibatches, so that a reloaded learner draws the same
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + n)
-        for step in range(self.steps):
-            size = (self.members, self.minibatch)
+        for step in range(_STEPS):
+            size = (self.members, _MINIBATCH)
             index = torch.randint(min(n + 1, self.memory), size, generator=generator)
             index[:, 0] = n % self.memory
             index = index.to(self.device)
@@ -147,7 +141,7 @@ class ReplayMLP(ScaledLearner, SingleLearner):
                 theta = [p.detach().requires_grad_(True) for p in self.theta]
                 loss = (self._net(bx, theta) - by).square().sum((0, 2)).mean()
                 gradients = torch.autograd.grad(loss, theta)
-            rate = self.rate * self.adam.correction(n * self.steps + step + 1)
+            rate = _RATE * self.adam.correction(n * _STEPS + step + 1)
             for i, (p, gradient) in enumerate(zip(self.theta, gradients, strict=True)):
                 self.adam.move(i, p, gradient, rate)
         return UpdateReport.of(nis, mask)

@@ -77,9 +77,11 @@ class ScaledLearner(ResidualLearner):
     def _learn(self, z: Tensor, t: Tensor, mask: Bool[Tensor, "*batch"] | None) -> UpdateReport:
         """One sample per model."""
 
-    @abstractmethod
     def _clear(self) -> None:
-        """f as it was made."""
+        """f as it was made; here all buffers of its own are 0."""
+        for buffer in self.buffers(recurse=False):
+            if buffer is not self.n_refused:
+                buffer.zero_()
 
     @abstractmethod
     def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
@@ -88,7 +90,6 @@ class ScaledLearner(ResidualLearner):
     # -- g, in those of x and y -----------------------------------------------------------------
 
     def forward(self, x: Tensor) -> Tensor:
-        """Mean of g."""
         return self._value(self._mean(self._inputs(self.check_query(x))))
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
@@ -100,7 +101,6 @@ class ScaledLearner(ResidualLearner):
         return Normal(self._value(mean), deviation.to(self.dtype), validate_args=False)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean of g and its derivative."""
         if type(self)._slopes is ScaledLearner._slopes:
             return super().linearize(x)
         mean, slope = self._slopes(self._inputs(self.check_query(x)))
@@ -109,7 +109,7 @@ class ScaledLearner(ResidualLearner):
         return self._value(mean), slope.to(self.dtype)
 
     def reset(self) -> None:
-        """Forget all samples and units."""
+        """Forget all samples and the units that were found in them."""
         self.n_refused.zero_()
         self.n_samples = 0
         self._clear()

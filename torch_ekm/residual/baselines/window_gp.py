@@ -69,10 +69,6 @@ class WindowGP(ScaledLearner):
         k, dk = self.kernel.with_gradient(z, self.inputs)
         return (k.unsqueeze(-2) @ self.solution).squeeze(-2), self.solution.mT @ dk
 
-    def _clear(self) -> None:
-        for buffer in (self.inputs, self.targets, self.noise, self.count, self.solution, self.inverse):
-            buffer.zero_()
-
     def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
         """The window in new units; its solution comes with the next sample."""
         for kept, (offset, ratio) in ((self.inputs, change), (self.targets, change_t)):

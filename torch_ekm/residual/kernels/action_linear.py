@@ -60,11 +60,11 @@ class ActionLinearKernel(Kernel):
 
     @property
     def action_variance(self) -> Tensor:
-        """Diagonal of Lambda, ``(*batch_shape, action_features)``."""
+        """Diagonal of Lambda, the variance of each action's slope, ``(*batch_shape, action_features)``."""
         return self.log_action_variance.exp()
 
     def split(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """x as (state, action)."""
+        """x as its state and its action, the last ``action_features`` columns."""
         return x[..., : self.state_features], x[..., self.state_features :]
 
     def forward(self, x: Tensor, z: Tensor) -> Tensor:

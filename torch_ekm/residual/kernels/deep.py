@@ -18,7 +18,7 @@ from .stationary import StationaryKernel, squared_distances
 class DeepKernel(Kernel):
     """``k(x, z) = v phi(|x - z|^2_L + |net(x) - net(z)|^2)``.
 
-    The features stand beside the inputs, not in their place: with a network that says nothing the
+    The features stand next to the inputs, not in their place: with a network that says nothing the
     kernel is the plain one, and it stays positive definite on distinct inputs whatever the network
     does, so features cannot collapse the basis. The network is a multilayer perceptron with tanh;
     its last layer starts small, so the learner starts as the plain GP (Wilson et al., Deep kernel
@@ -64,8 +64,8 @@ class DeepKernel(Kernel):
             if layer < len(widths) - 2:  # a constant in the features has no effect
                 self.biases.append(nn.Parameter(like.new_zeros(*fleet, n_out), requires_grad=False))
 
-    def net(self, x: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n features"]:
-        """The features of x."""
+    def net(self, x: Float[Tensor, "*any n d"]) -> Float[Tensor, "*batch n features"]:
+        """The features of x that the network has learned, near 0 at the start."""
         for weight, bias in zip(self.weights[:-1], self.biases, strict=True):
             x = torch.tanh(x @ weight + bias.unsqueeze(-2))
         return x @ self.weights[-1]
@@ -80,12 +80,12 @@ class DeepKernel(Kernel):
         last = self.weights[-1]
         return (x @ last).squeeze(-2), last if slope is None else slope @ last
 
-    def embed(self, x: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n d_plus_features"]:
+    def embed(self, x: Float[Tensor, "*any n d"]) -> Float[Tensor, "*batch n d_plus_features"]:
         """``[x / L, net(x)]``: the kernel is a unit one on these."""
         w = self.base.log_lengthscale.neg().exp().unsqueeze(-2)
         return torch.cat([x * w, self.net(x)], dim=-1)
 
-    def _net_of_set(self, z: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n features"]:
+    def _net_of_set(self, z: Float[Tensor, "*any n d"]) -> Float[Tensor, "*batch n features"]:
         """:meth:`net`, remembered: between two samples each query asks for the same basis."""
         tensors = (z, *self.weights, *self.biases)
         plain = not torch.compiler.is_compiling() and type(z) is Tensor and not z.is_inference()

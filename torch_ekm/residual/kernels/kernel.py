@@ -20,11 +20,11 @@ from ...typing import Float, Tensor
 
 
 class Kernel(Recorded, nn.Module, ABC):
-    """A covariance function k(x, z)."""
+    """A covariance function k(x, z) of two points, with its derivative by the first."""
 
     @abstractmethod
     def forward(self, x: Float[Tensor, "*batch n d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
-        """Matrix k(x_i, z_j), ``(*batch, n, m)``."""
+        """Matrix k(x_i, z_j) of two sets of points, ``(*batch, n, m)``."""
 
     @abstractmethod
     def diagonal(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch"]:
@@ -38,7 +38,7 @@ class Kernel(Recorded, nn.Module, ABC):
 
     @abstractmethod
     def diagonal_gradient(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
-        """d k(x, x)/dx."""
+        """d k(x, x)/dx of one point per model, 0 if the kernel is stationary."""
 
     def vector(self, x: Float[Tensor, "*batch d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
         """k(x, z_j) for one query per model, ``(*batch, m)``."""

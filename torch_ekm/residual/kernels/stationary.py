@@ -13,7 +13,7 @@ from ...typing import Float, Tensor
 from .kernel import Kernel, log_parameter
 
 
-def squared_distances(x: Float[Tensor, "*batch n d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
+def squared_distances(x: Float[Tensor, "*any n d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
     """``|x_i - z_j|^2`` by one product, ``(*batch, n, m)``: for points near 0, see StationaryKernel."""
     d2 = x.square().sum(-1).unsqueeze(-1) + z.square().sum(-1).unsqueeze(-2)
     return (d2 - 2.0 * x @ z.mT).clamp_min(0.0)
@@ -56,18 +56,18 @@ class StationaryKernel(Kernel):
 
     @property
     def variance(self) -> Tensor:
-        """v = k(x, x), ``(*batch_shape)``."""
+        """v = k(x, x), in the squared unit of the (normalised) outputs, ``(*batch_shape)``."""
         return self.log_variance.exp()
 
     @staticmethod
     @abstractmethod
     def phi(d2: Tensor) -> Tensor:
-        """Correlation at squared scaled distance ``d2``."""
+        """Correlation phi at the squared scaled distance ``d2``, 1 at 0."""
 
     @staticmethod
     @abstractmethod
     def phi_psi(d2: Tensor) -> tuple[Tensor, Tensor]:
-        """Correlation and ``-2 dphi/d(d2)``."""
+        """Correlation phi and ``psi = -2 dphi/d(d2)`` at the squared scaled distance."""
 
     def forward(self, x: Tensor, z: Tensor) -> Tensor:
         w = self.log_lengthscale.neg().exp().unsqueeze(-2)

@@ -1,4 +1,4 @@
-"""The parts of a sparse online GP that is told nothing but its sizes."""
+"""The parts of a sparse online GP of which nothing is known but its sizes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def default_parts() -> list[Part]:
 
 
 def fleet_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """What a kernel must be told of a learner's options."""
+    """Those of a learner's options that its kernel shares: fleet and device."""
     return {name: options[name] for name in ("batch_shape", "device") if name in options}
 
 

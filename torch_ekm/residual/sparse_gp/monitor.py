@@ -37,7 +37,7 @@ class RobustWeight(Part):
         self.threshold = check_positive("threshold", threshold)
 
     def bind(self, learner: Host) -> None:
-        """a = 0."""
+        """No sample was distrusted yet: a = 0."""
         self.level = nn.Buffer(learner.posterior.basis.new_zeros(learner.posterior.batch_shape))
 
     def weigh(self, nis: Tensor, mask: Tensor | None) -> Float[Tensor, "*batch"]:
@@ -73,11 +73,11 @@ class CalibrateNoise(Part):
         self.rate = check_positive("rate", rate)
 
     def bind(self, learner: Host) -> None:
-        """c = 1 for each output."""
+        """Factors c = 1 on the noise of all outputs."""
         self.log_factor = nn.Buffer(torch.zeros_like(learner.log_noise_variance))
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
-        """One innovation."""
+        """Move c by whether this innovation lay outside of its interval."""
         noise = learner.log_noise_variance.exp()
         variance = sample.variance.unsqueeze(-1) + noise * self.log_factor.exp()
         missed = sample.innovation.square() > _Z90_SQUARED * variance
@@ -87,7 +87,7 @@ class CalibrateNoise(Part):
         return False
 
     def noise(self, variance: Tensor) -> Tensor:
-        """``c_j s2_j``."""
+        """Observation noise as calibrated, ``c_j s2_j``, for each output."""
         return variance * self.log_factor.exp()
 
 

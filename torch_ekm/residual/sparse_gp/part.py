@@ -1,10 +1,10 @@
-"""What a sparse online GP can be given beside its basis: one protocol for all of it."""
+"""What a sparse online GP can be given apart from its basis: one protocol for all of it."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Iterator
-from typing import ClassVar, NamedTuple, Protocol, TypeVar
+from typing import ClassVar, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import nn
@@ -25,7 +25,7 @@ class Units:
         return x
 
     def targets(self, y: Float[Tensor, "*any out"]) -> Float[Tensor, "*any out"]:
-        """y in the learner's units."""
+        """y ``(*any, out)`` in the learner's units."""
         return y
 
     def of_sets(
@@ -70,6 +70,7 @@ class Sample(NamedTuple):
     report: UpdateReport
 
 
+@runtime_checkable
 class Host(Protocol):
     """What a part finds in its learner."""
 
@@ -90,11 +91,11 @@ class Host(Protocol):
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of x and y."""
+        """Precision of x and y; the state's is float64."""
         ...
 
     def modules(self) -> Iterator[nn.Module]:
-        """It and all in it."""
+        """The learner and all modules in it."""
         ...
 
     def check_query(self, x: Tensor) -> Tensor:
@@ -110,7 +111,7 @@ class Host(Protocol):
         ...
 
     def refresh(self) -> None:
-        """Rebuild the caches."""
+        """Let the parts change the natural form, and rebuild the caches."""
         ...
 
     def learn_anew(self, x: Tensor, y: Tensor, on: Tensor) -> None:
@@ -123,7 +124,7 @@ class Host(Protocol):
 
 
 class Part(Recorded, nn.Module):
-    """One thing that a :class:`SparseOnlineGP` does beside projecting samples onto its basis.
+    """One thing that a :class:`SparseOnlineGP` does apart from projecting samples onto its basis.
 
     A part holds its few figures when it is made; the learner copies it and calls :meth:`bind` once, so one
     specification may serve several learners. From then on it has buffers, which travel with the learner.

@@ -54,12 +54,12 @@ class SparsePosterior(nn.Module):
 
     @property
     def alpha(self) -> Float[Tensor, "*batch slots out"]:
-        """Coefficients of the mean."""
+        """alpha, the coefficients of the mean, in the learner's units of y."""
         return self.vectors[..., 0, :, :]
 
     @property
     def information(self) -> Float[Tensor, "*batch slots out"]:
-        """h, in units of y."""
+        """h, what samples say of the mean, in the learner's units of y."""
         return self.vectors[..., 1, :, :]
 
     @property
@@ -85,7 +85,7 @@ class SparsePosterior(nn.Module):
         return []
 
     def reset(self) -> None:
-        """Back to the prior, no basis."""
+        """Back to the prior, without a basis vector."""
         for buffer in self.buffers(recurse=False):
             if buffer is not self.slots:
                 buffer.zero_()

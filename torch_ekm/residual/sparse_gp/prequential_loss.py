@@ -50,7 +50,7 @@ class PrequentialLoss(nn.Module):
         residual <- c residual,  p <- c p,   c = 1 / (1 - w p/s2), at most u/p
 
     since without any sample p would be u. That is honest only where noise is fresh at each sample: where it
-    is carried from one to the next, the neighbours in time tell on the one left out.
+    is carried from one to the next, the neighbours in time still hold the one left out.
 
     Gradients need no differentiation of a factorisation. From ``d alpha = C dK alpha``, ``dC = C dK C`` and
     ``dQ = -Q dK Q``, with ``E = Ck``, ``F = Qk`` and the loss' derivatives ``g`` by mean, variance

@@ -18,7 +18,7 @@ from ..report import MomentsWithJacobians, UpdateReport
 from .defaults import chosen_parts
 from .engine.compiled import CompiledEngine
 from .engine.reference import ReferenceEngine
-from .part import P, Part, Sample, Units
+from .part import Host, P, Part, Sample, Units
 from .posterior import SparsePosterior
 from .units import Standardize
 
@@ -26,7 +26,7 @@ _LATEST = 8  # rounds of ``refresh_every`` after which the caches are rebuilt in
 _DRIFT = 1e-8  # beyond which they are rebuilt at once, see SparsePosterior.drift
 
 
-class SparseOnlineGP(DoubleStateLearner):
+class SparseOnlineGP(DoubleStateLearner, Host):
     """``g ~ GP(0, k)``, ``y = g(x) + noise``, on at most ``capacity`` basis vectors::
 
         mean(x) = alpha' k(X, x),   var(x) = k(x, x) + k(X, x)' C k(X, x)
@@ -59,7 +59,7 @@ class SparseOnlineGP(DoubleStateLearner):
         noise_variance: s2 in the (standardised) output's squared units, one number or one per output.
         novelty_threshold: smallest ``gamma / k**`` of a new basis vector.
         jitter: nugget on k(x, x) at basis vectors, relative to k**.
-        parts: what it does beside; copied.
+        parts: what it does apart from projecting samples; copied.
         standardize: whether it follows the stream's units, unless a part does; or how.
         refresh_every: samples after which parts may change the state, and the caches are rebuilt. Without a
             part that does, and on the CPU, one looks whether they have drifted (four times as often where
@@ -132,10 +132,10 @@ class SparseOnlineGP(DoubleStateLearner):
     # -- predictions ----------------------------------------------------------------------------
 
     def forward(self, x: Tensor) -> Tensor:
-        """``alpha' k(X, x)``, differentiable in x."""
+        """Posterior mean ``alpha' k(X, x)`` in the outputs' units, differentiable in x."""
         return self.engine.mean(self, x)
 
-    def variance(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any out"]:
+    def variance(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*all out"]:
         """Latent variance ``k** + k'Ck`` of each output, differentiable in x."""
         return self.engine.moments(self, x)[1]
 
@@ -147,7 +147,7 @@ class SparseOnlineGP(DoubleStateLearner):
         return Normal(mean, variance.sqrt(), validate_args=False)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """``(alpha'k, alpha' dk/dx)`` in closed form."""
+        """Mean and its derivative, ``(alpha'k, alpha' dk/dx)``, in closed form."""
         return self.engine.linearize(self, x)
 
     def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> MomentsWithJacobians:
@@ -208,7 +208,7 @@ class SparseOnlineGP(DoubleStateLearner):
             part.after_rebuild(self)
 
     def update(self, x: Tensor, y: Tensor, mask: Tensor | None = None) -> UpdateReport:
-        """See :meth:`ResidualLearner.update`."""
+        """See :meth:`ResidualLearner.update`; single samples that the engine accepts skip its checks."""
         if mask is None:
             with self.lock:
                 if self.engine.accepts(self, x, y):

@@ -43,7 +43,7 @@ class Standardize(Part, Units):
         self.output_offset = output_offset
 
     def bind(self, learner: Host) -> None:
-        """Running moments of x and y."""
+        """Running moments of x and y, 0 and 1 at the start."""
         like = learner.posterior.basis
         fleet = {"batch_shape": learner.posterior.batch_shape, "dtype": like.dtype, "device": like.device}
         shifted = learner.kernel.shift_invariant(learner.in_features)

@@ -86,19 +86,19 @@ class CompiledEngine(ReferenceEngine):
             with torch.no_grad():
                 k = gp.kernel.vector(x, posterior.basis).reshape(n_models, -1).numpy()
                 prior = np.ascontiguousarray(gp.kernel.diagonal(x).reshape(-1).numpy())
-        event, told, errors = np.zeros(n_models, np.int64), np.zeros((4, n_models)), np.zeros(n_models * m)
+        event, figures, errors = np.zeros(n_models, np.int64), np.zeros((4, n_models)), np.zeros(n_models * m)
         if on is not None:
             mask = (on > 0).reshape(-1).numpy()
-            told[2] = 1.0
+            figures[2] = 1.0
         self._absorb(
             flags, mask, x.numpy().reshape(-1), y.numpy().reshape(-1), k, prior, *self._state, *self._hyper,
             self._noise, *self._units, self._robust, self._levels,
-            posterior.novelty_threshold, posterior.jitter, event, told, errors,
+            posterior.novelty_threshold, posterior.jitter, event, figures, errors,
         )  # fmt: skip
         if self._given:  # a kernel may remember what it made of the basis
             increment_version(posterior.basis)
         batch = self._batch
-        novelty, nis, weight, variance = torch.from_numpy(told.reshape(4, *batch)).unbind()
+        novelty, nis, weight, variance = torch.from_numpy(figures.reshape(4, *batch)).unbind()
         report = UpdateReport(torch.from_numpy(event.reshape(batch)), novelty, nis, weight)
         return Absorbed(report, torch.from_numpy(errors.reshape(*batch, m)), variance)
 

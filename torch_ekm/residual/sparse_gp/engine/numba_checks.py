@@ -1,4 +1,4 @@
-"""Checks of samples and of caches as compiled loops, see the module ``numba_kernels`` beside."""
+"""Checks of samples and of caches as compiled loops, see the module ``numba_kernels``."""
 
 from __future__ import annotations
 

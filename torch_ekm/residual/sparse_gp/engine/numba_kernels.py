@@ -176,7 +176,7 @@ def _add_and_prune(moments, vectors, s, p, work_c, work_q, gain, grow, i, w):
 )
 def _absorb(
     flags, z, t, prior, s2, k, basis, active, count, slot_, moments, vectors, robust, level, threshold,
-    jitter, told, error,
+    jitter, figures, error,
 ):  # fmt: skip
     """One sample of one model, see ``absorb``; returns the event."""
     M, m = k.shape[0], t.shape[0]
@@ -211,7 +211,7 @@ def _absorb(
     dropped = 0.0 if novel else gamma
     gain, precision = 1.0 / (noise + v - dropped), s2 / noise
     basis[slot] = z
-    told[0], told[1], told[2], told[3] = gamma / max(prior, _TINY), nis, weight, v
+    figures[0], figures[1], figures[2], figures[3] = gamma / max(prior, _TINY), nis, weight, v
 
     s = Ck
     if novel:
@@ -288,7 +288,7 @@ def absorb_fleet(
     flags, on, x, y, given_k, given_prior,
     basis, active, count, slot, moments, vectors,
     log_lengthscale, log_variance, log_action, log_noise, shift, scale, shift_y, scale_y,
-    robust, levels, threshold, jitter, event, told, errors,
+    robust, levels, threshold, jitter, event, figures, errors,
 ):  # fmt: skip
     """One sample per model where ``on``.
 
@@ -297,13 +297,13 @@ def absorb_fleet(
         x, y, errors: one model's after the other's.
         given_k, given_prior: k and k** of a kernel that is not known here, in the learner's units.
         robust, levels: square of a robust weight's threshold, share of samples distrusted; or empty.
-        told: novelty, nis, weight and latent variance of each model; as they are where not ``on``.
+        figures: novelty, nis, weight and latent variance of each model; as they are where not ``on``.
         errors: innovations.
     """
     B, d, m = basis.shape[0], basis.shape[2], log_noise.shape[1]
     z, t = np.empty(d), np.empty(m)
     k, none = np.empty(basis.shape[1]), np.empty((0, 0))
-    heard = np.empty(4)
+    found = np.empty(4)
     for b in range(B):
         if not on[b]:
             continue
@@ -326,9 +326,9 @@ def absorb_fleet(
             )  # fmt: skip
         event[b] = _absorb(
             flags, z, t, prior, s2, k, basis[b], active[b], count[b : b + 1], slot[b : b + 1], moments[b],
-            vectors[b], robust, levels[b : b + 1], threshold, jitter, heard, errors[b * m : (b + 1) * m],
+            vectors[b], robust, levels[b : b + 1], threshold, jitter, found, errors[b * m : (b + 1) * m],
         )  # fmt: skip
-        told[:, b] = heard
+        figures[:, b] = found
 
 
 @njit(

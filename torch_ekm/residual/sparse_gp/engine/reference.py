@@ -16,8 +16,8 @@ class ReferenceEngine:
     Queries are ``(*any, *batch_shape, in)`` in the inputs' own units, results in those of the outputs.
     """
 
-    def mean(self, gp: Host, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any out"]:
-        """``alpha' k(X, x)``, differentiable in x."""
+    def mean(self, gp: Host, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*all out"]:
+        """Posterior mean ``alpha' k(X, x)`` in the outputs' units, differentiable in x."""
         return _mean(gp, _cross(gp, gp.units.inputs(gp.check_query(x))))
 
     def moments(self, gp: Host, x: Float[Tensor, "*any in"]) -> tuple[Tensor, Tensor]:
@@ -29,7 +29,7 @@ class ReferenceEngine:
         return _mean(gp, k), _out(gp, v.clamp_min(0.0).unsqueeze(-1), 2)
 
     def linearize(self, gp: Host, x: Float[Tensor, "*any in"]) -> tuple[Tensor, Tensor]:
-        """``(alpha'k, alpha' dk/dx)`` in closed form."""
+        """Mean and its derivative, ``(alpha'k, alpha' dk/dx)``, in closed form."""
         # free slots need no mask here: their rows in alpha and C are 0
         k, dk = gp.kernel.with_gradient(gp.units.inputs(gp.check_query(x)), gp.posterior.basis)
         coefficients = gp.posterior.alpha.mT
