@@ -64,8 +64,8 @@ class Target:
 
     size = (9 * SQUARE, 7 * SQUARE)
 
-    def texture(self, texel=2.5e-4):
-        rim = round(SQUARE / 2 / texel)
+    def texture(self):
+        rim = round(SQUARE / 2 / 2.5e-4)
         return BOARD.generateImage((9 * 2 * rim, 7 * 2 * rim), marginSize=rim, borderBits=1)
 
 

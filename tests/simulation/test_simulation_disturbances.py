@@ -172,10 +172,11 @@ def test_an_eccentric_object_shifts_the_load_between_the_fingers(exact, grasped)
     assert min(map(abs, tilts)) > 0.05 * DEG
 
 
-def test_a_larger_object_opens_the_fingers():
+def test_a_larger_object_opens_the_fingers(monkeypatch):
+    monkeypatch.setattr("torch_ekm.simulation.simulated_hand._TILT", 0.0)
     widths = []
     for scale in (1.0, 1.2):
-        plant = SimulatedHand("icub_right", "box", PlantConfig(tilt=0.0), PlantParameters(object_scale=scale))
+        plant = SimulatedHand("icub_right", "box", parameters=PlantParameters(object_scale=scale))
         plant.reset(0)
         widths.append((plant.plan.points[1:].mean(axis=0) - plant.plan.points[0]) @ plant.plan.normals[1])
     assert widths[1] - widths[0] == pytest.approx(0.2 * 0.03, abs=3e-4)

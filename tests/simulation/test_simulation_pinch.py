@@ -89,7 +89,6 @@ def test_a_pinch_keeps_the_actuators_in_their_ranges():
         problem = with_range(lower, upper)
         plan = plan_pinch(problem, PinchRequest())
         assert lower < plan.motor[0] < upper
-        assert plan.residual < 0.2
     problem = with_range(149 * DEG, 150 * DEG)
     with pytest.raises(EquilibriumError, match=r"actuator 'left' \(149 to 150 deg\) at \d+ deg"):
         plan_pinch(problem, PinchRequest())

@@ -83,24 +83,24 @@ def make_scene(
         for shape in drawn[link.name]:
             shapes.append((shape, colour))
             transforms.append(pose @ shape.transform)
-    pose = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
-    if obj is not None:
-        pose[:, :3, :3], pose[:, :3, 3] = rotation, position
-    for shape in obj.shapes if obj is not None else ():
-        shapes.append((shape, _OBJECT))
-        transforms.append(pose @ shape.transform)
-    ghosts = obj.shapes if obj is not None and ghost is not None else ()
-    if obj is not None and ghost is not None:
-        planned = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
-        planned[:, :3, 3], planned[:, :3, :3] = ghost
-        shapes += [(shape, _GHOST) for shape in ghosts]
-        transforms += [planned @ shape.transform for shape in ghosts]
+    solids = () if obj is None else obj.shapes
+    for place, colour in (((position, rotation), _OBJECT), (ghost, _GHOST)):
+        if solids and place is not None:
+            pose = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
+            pose[:, :3, 3], pose[:, :3, :3] = place
+            shapes += [(shape, colour) for shape in solids]
+            transforms += [pose @ shape.transform for shape in solids]
     if not transforms:
         problem = "no link has a <visual> or <collision> that can be drawn"
         raise DescriptionError(hand.urdf_path, problem)
     if axis is None and rotation is not None:
         axis = _axis(np.asarray(rotation))
-    return Scene(shapes, np.stack(transforms, axis=1), *_view(hand, gravity, axis), ghosts=len(ghosts))
+    return Scene(
+        shapes,
+        np.stack(transforms, axis=1),
+        *_view(hand, gravity, axis),
+        ghosts=0 if ghost is None else len(solids),
+    )
 
 
 def _axis(rotation: Array) -> Array | None:

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from ..exceptions import ParameterError
 
-_DEG = math.pi / 180
-
 
 @dataclass(frozen=True)
 class PlantConfig:
@@ -30,10 +28,8 @@ class PlantConfig:
     fingers: tuple[str, ...] | None = None
     """Opposing pads; None: index and middle where there are such, else all others."""
     along: tuple[float, float, float] | None = None
-    """Direction in the hand of the object's long axis, about which a pinch can turn it. None: the
-    normal of a planar hand, else y, square to the planes in which the iCub's fingers bend."""
-    tilt: float = 5 * _DEG
-    """The object's long axis is drawn within +-this of ``along`` [rad]."""
+    """Direction in the hand of the object's long axis, within 5 deg, about which a pinch can turn it. None:
+    the normal of a planar hand, else y, square to the planes in which the iCub's fingers bend."""
     relative_to: str = "encoder"
     """Commands are increments of the "encoder" or of the "setpoint"."""
 
@@ -42,8 +38,6 @@ class PlantConfig:
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ParameterError(name, value, "finite and greater than 0")
-        if not (math.isfinite(self.tilt) and self.tilt >= 0):
-            raise ParameterError("tilt", self.tilt, "finite and not negative")
         if self.time_step > 0.004:
             raise ParameterError("time_step", self.time_step, "at most 0.004 s: the tendons need it")
         if self.gravity is not None and (len(self.gravity) != 3 or not all(map(math.isfinite, self.gravity))):

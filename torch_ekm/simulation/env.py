@@ -32,6 +32,7 @@ else:
 
 _DEG = math.pi / 180
 _OFF_AXIS = 0.1  # weight of rotation off the axis in the reward
+_TOLERANCE = 0.5 * _DEG  # the goal is reached within this [rad]
 _LOST = 10.0  # what losing the object costs
 
 
@@ -57,7 +58,7 @@ class InHandRotation(gymnasium.Env):
     **Reward** per step: ``-|angle to go|`` in units of 10 deg, -0.1 times the rotation about
     other axes in the same unit, +1 at the goal, -10 when the object is lost.
 
-    **Ends** at the goal (within ``tolerance``) or with the object lost; truncated after 40 steps by the
+    **Ends** at the goal (within 0.5 deg) or with the object lost; truncated after 40 steps by the
     registered time limit. ``info`` has ``is_success``, ``status`` and ``truth`` (for reports).
 
     ``reset(options={"angle": rad})`` sets the target; else it is drawn from ``angles``.
@@ -68,7 +69,6 @@ class InHandRotation(gymnasium.Env):
         config: time, gravity, the grasp.
         angles: least and largest target [rad].
         step_limit: largest increment of an actuator [rad].
-        tolerance: the goal is reached within this [rad].
         render_mode: None or "rgb_array" (PyVista).
     """
 
@@ -82,19 +82,16 @@ class InHandRotation(gymnasium.Env):
         config: PlantConfig | None = None,
         angles: tuple[float, float] = (5 * _DEG, 25 * _DEG),
         step_limit: float = 3 * _DEG,
-        tolerance: float = 0.5 * _DEG,
         render_mode: str | None = None,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ParameterError("render_mode", render_mode, "None or 'rgb_array'")
-        if not (0 < step_limit < math.pi and tolerance > 0 and angles[0] <= angles[1]):
-            raise ParameterError(
-                "step_limit, tolerance, angles", (step_limit, tolerance, angles), "positive and in order"
-            )
+        if not (0 < step_limit < math.pi and angles[0] <= angles[1]):
+            raise ParameterError("step_limit, angles", (step_limit, angles), "positive and in order")
         if isinstance(parameters, str):
             parameters = preset(parameters)
         self.plant = SimulatedHand(hand, object, config, parameters)
-        self.angles, self.step_limit, self.tolerance = angles, step_limit, tolerance
+        self.angles, self.step_limit = angles, step_limit
         self.render_mode = render_mode
         self._picture: Picture | None = None
         description = self.plant.hand
@@ -132,7 +129,7 @@ class InHandRotation(gymnasium.Env):
         turned, off = self._turned(observation)
         to_go = self._target - turned
         lost = observation.status is PlantStatus.LOST
-        reached = not lost and abs(to_go) < self.tolerance
+        reached = not lost and abs(to_go) < _TOLERANCE
         reward = -(abs(to_go) + _OFF_AXIS * off) / (10 * _DEG) + reached - _LOST * lost
         return self._observation(observation), float(reward), lost or reached, False, self._info(observation)
 
@@ -180,7 +177,7 @@ class InHandRotation(gymnasium.Env):
         held = observation.status is not PlantStatus.LOST
         assert observation.truth is not None
         return {
-            "is_success": held and abs(self._target - turned) < self.tolerance,
+            "is_success": held and abs(self._target - turned) < _TOLERANCE,
             "status": observation.status.value,
             "truth": {name: value.numpy() for name, value in observation.truth.arrays().items()},
         }

@@ -72,10 +72,6 @@ class HallSensors:
         """Failure of each channel; may be changed at any time."""
         self._frozen: dict[int, Tensor] = {}
 
-    @property
-    def n_channels(self) -> int:
-        return len(self.joints)
-
     def field(self, q: Float[Tensor, "*batch n_q"]) -> Float[Tensor, "*batch n_channels"]:
         """Counts before noise, rounding and the ends of the scale.
 

@@ -26,6 +26,7 @@ from .sensors import Sensors, TimedState
 _ATTEMPTS = 5
 _FAR = 0.05  # [m] from where it was grasped: out of the hand
 _OFFSET_ALONG, _OFFSET_ACROSS = 0.010, 0.002  # [m]: grasp points are drawn within +- these, object's axes
+_TILT = 5 * np.pi / 180  # [rad]: the object's long axis is drawn within +- this of the wanted direction
 
 
 class PlantSnapshot(NamedTuple):
@@ -271,7 +272,7 @@ class SimulatedHand:
             force=self.hand.pinch_force if c.pinch_force is None else c.pinch_force,
             along=along * _OFFSET_ALONG,
             across=across * _OFFSET_ACROSS,
-            tilt=(first * c.tilt, second * c.tilt),
+            tilt=(first * _TILT, second * _TILT),
         )
 
 

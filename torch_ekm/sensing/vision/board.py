@@ -12,6 +12,8 @@ from ..._extras import require
 from ...exceptions import ParameterError, ShapeError, UnknownNameError
 from ...typing import Array
 
+_TEXEL = 2.5e-4  # [m]
+
 
 def get_dictionary(name: str):
     """OpenCV's predefined marker dictionary of that name, e.g. ``"DICT_4X4_50"``.
@@ -98,8 +100,8 @@ class MarkerBoard:
             corners[k, :, :2] = upper_left + square
         return corners
 
-    def texture(self, texel: float = 2.5e-4) -> NDArray[np.uint8]:
-        """The printed card: 0 black, 255 white, texels of about ``texel`` [m], upper left first.
+    def texture(self) -> NDArray[np.uint8]:
+        """The printed card: 0 black, 255 white, texels of about 0.25 mm, upper left first.
 
         Marker edges need not fall between texels: each marker is drawn with linear interpolation, which
         puts the middle of the transition at the edge.
@@ -107,10 +109,10 @@ class MarkerBoard:
         cv2 = require("cv2")
         dictionary = get_dictionary(self.dictionary)
         width, height = self.size
-        n_x, n_y = round(width / texel), round(height / texel)
+        n_x, n_y = round(width / _TEXEL), round(height / _TEXEL)
         scale = np.array([n_x / width, n_y / height])  # texels per metre
         cells = dictionary.markerSize + 2
-        side = cells * max(1, round(self.marker_size / texel / cells))
+        side = cells * max(1, round(self.marker_size / _TEXEL / cells))
         card = np.full((n_y, n_x), 255, dtype=np.uint8)
         for k, marker_id in enumerate(self.ids):
             upper_left = (self.corners[k, 0, :2] * [1, -1] + [width / 2, height / 2]) * scale

@@ -46,11 +46,6 @@ class Track:
     """Corners ``(4, 2)`` [px] of each marker of both boards that was found, by its number."""
 
     @property
-    def n_markers(self) -> int:
-        """How many markers of both boards were found."""
-        return len(self.markers)
-
-    @property
     def ok(self) -> bool:
         return self.status is TrackStatus.OK
 

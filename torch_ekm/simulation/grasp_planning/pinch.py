@@ -45,14 +45,12 @@ class PinchPlan:
     normals: Array
     """Outward normals of the object there ``(n_pads, 3)``."""
     pads: tuple[str, ...]
-    residual: float
-    """Largest violation: gap / 0.1 mm, force / 10 mN, moment / 0.2 mN m, joint torque / 1 mN m."""
 
 
 class _Solution(NamedTuple):
     x: Array
     violation: float
-    """Largest residual of the equations, in units of its tolerance."""
+    """Largest of gap / 0.1 mm, force / 10 mN, moment / 0.2 mN m, joint torque / 1 mN m."""
     outside: float
     """How far a motor is beyond its range [rad]; negative: inside."""
     cost: float
@@ -100,7 +98,6 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
         points=g.point[0],
         normals=g.normal[0],
         pads=tuple(pad.name for pad in problem.pads),
-        residual=found.violation,
     )
 
 

@@ -25,7 +25,7 @@ class Card(Protocol):
         """Width and height of the printed card, rim included [m]."""
         ...
 
-    def texture(self, texel: float = ...) -> NDArray[np.uint8]:
+    def texture(self) -> NDArray[np.uint8]:
         """Grey levels of the print, 0 black to 255 white, upper left first."""
         ...
 

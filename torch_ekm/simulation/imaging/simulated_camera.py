@@ -65,11 +65,7 @@ class SimulatedCamera:
         quality: blur, noise, light.
     """
 
-    def __init__(
-        self,
-        camera: PinholeCamera | None = None,
-        quality: ImageQuality | None = None,
-    ) -> None:
+    def __init__(self, camera: PinholeCamera | None = None, quality: ImageQuality | None = None) -> None:
         self.camera = camera or PinholeCamera()
         self.quality = quality or ImageQuality()
         self._textures: dict[Card, NDArray[np.uint8]] = {}
