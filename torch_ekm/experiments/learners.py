@@ -143,7 +143,7 @@ PEERS = ("river forest", "GPyTorch window", "GPyTorch SVGP")
 OURS = ("default", *(name for name in LEARNERS if name.startswith("SOGP")))
 #: What a comparison takes if nobody says otherwise: not those that want to know which inputs are an action.
 COMPARED = tuple(name for name in LEARNERS if name not in (*PEERS, "rbf", "action-linear"))
-#: What demo and experiments take unless told otherwise.
+#: What demo and experiments take if nobody names another.
 DEFAULT_LEARNER = "action-linear"
 #: Those that the ablation of a hand compares.
 HAND_LEARNERS = (
