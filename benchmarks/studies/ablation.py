@@ -18,7 +18,6 @@ from oracle import OracleGeneralize
 from run_study import run_study
 
 from torch_ekm.experiments.config import Setting, object_name
-from torch_ekm.experiments.learners import HAND_LEARNERS
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.protocols.protocol import Protocol
 from torch_ekm.experiments.records import Record
@@ -54,6 +53,11 @@ DISTURBANCES: dict[str, tuple[str, ...]] = {
         "force_range",
     ),
 }  # fmt: skip
+
+LEARNERS = (
+    "action-linear", "rbf", "SOGP plain", "SOGP deep", "linear RLS", "random features", "window GP", "MLP",
+    "model alone",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -106,7 +110,7 @@ _OPTIONS: list[tuple[str, str, str, dict[str, Any], tuple[str, ...]]] = [
 def variants(base: Setting) -> list[Variant]:
     """All variants of a setting; most groups begin with the unchanged one."""
     nominal = dataclasses.asdict(PRESETS["nominal"])
-    others = [name for name in HAND_LEARNERS if name != base.learner]
+    others = [name for name in LEARNERS if name != base.learner]
     plants = {name: {key: nominal[key] for key in keys} for name, keys in DISTURBANCES.items()}
     return [
         *(Variant(group, _BASE) for group in ("learner", "online learning", "model")),
