@@ -30,7 +30,6 @@ from torch_ekm.control import (
     TrustRegion,
 )
 from torch_ekm.experiments.config import Setting, object_name
-from torch_ekm.experiments.learners import HAND_LEARNERS
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.protocols.protocol import Protocol
 from torch_ekm.experiments.records import Record
@@ -67,6 +66,11 @@ DISTURBANCES: dict[str, tuple[str, ...]] = {
         "force_range",
     ),
 }  # fmt: skip
+
+LEARNERS = (
+    "action-linear", "rbf", "SOGP plain", "SOGP deep", "linear RLS", "random features", "window GP", "MLP",
+    "model alone",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -144,7 +148,7 @@ def variants(base: Setting) -> list[Variant]:
     nominal, exact = vars(PRESETS["nominal"]), PRESETS["none"]
     rule = replace(base.safety.rule, tolerance=0.1 * _DEG)
     finer = {"frames": 6, "safety": replace(base.safety, rule=rule)}
-    others = [name for name in HAND_LEARNERS if name != base.learner]
+    others = [name for name in LEARNERS if name != base.learner]
     plants = {
         name: exact.replace(**{key: nominal[key] for key in keys}) for name, keys in DISTURBANCES.items()
     }

@@ -14,7 +14,7 @@ from torch_ekm.control import DEFAULT_TASKS, Caution, EffortTask, LimitingFuncti
 from torch_ekm.description import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
-from torch_ekm.experiments.learners import HAND_LEARNERS, LEARNERS, make_learner
+from torch_ekm.experiments.learners import LEARNERS, make_learner
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.protocols.object_memory import ObjectMemory
 from torch_ekm.experiments.protocols.online import Online
@@ -90,10 +90,11 @@ def test_a_corrected_object_does_not_take_up_old_results(tmp_path: Path) -> None
     assert len(jobs()) == len(before)
 
 
-def test_every_learner_of_the_ablation_starts_at_zero_and_learns() -> None:
+def test_every_learner_for_a_hand_starts_at_zero_and_learns() -> None:
     generator = torch.Generator().manual_seed(0)
     slope = torch.randn(4, 6, generator=generator, dtype=torch.float64)
-    for name in HAND_LEARNERS:
+    names = ("action-linear", "rbf", "SOGP plain", "SOGP deep", "linear RLS", "random features", "window GP")
+    for name in (*names, "MLP", "model alone"):
         learner = make_learner(name, 5, 4, 30)
         x = torch.randn(120, 9, generator=generator, dtype=torch.float64)
         y = x[:, 5:] @ slope

@@ -116,7 +116,7 @@ def parse_step(degrees: float) -> float:
 
 
 def names(text: str) -> tuple[str, ...]:
-    """``"a, b, a"`` as ("a", "b")."""
+    """Names separated by commas, each once: ``"a, b, a"`` as ("a", "b")."""
     return tuple(dict.fromkeys(filter(None, map(str.strip, text.split(",")))))
 
 

@@ -17,7 +17,7 @@ from typer import Argument, Option  # isort: skip
 def hands(
     new: Annotated[
         Path | None,
-        Option(metavar="URDF", help="Write NAME.transmission.toml beside this NAME.urdf, to be filled in."),
+        Option(metavar="URDF", help="Write NAME.transmission.toml next to this NAME.urdf, to be filled in."),
     ] = None,
 ) -> None:
     """List the hands of the package, or begin your own.

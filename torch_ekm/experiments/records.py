@@ -25,7 +25,7 @@ _MOVING = 0.5 * _DEG  # commands that ask for less tell nothing about the shortf
 
 @dataclass(frozen=True)
 class Trial:
-    """What was to be done."""
+    """What was to be done: object, controller, grasp and rotation."""
 
     object: str
     """Short name."""
@@ -41,7 +41,7 @@ class Trial:
     grasped: ClassVar[bool]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain figures, for :meth:`TrialRecord.from_json`."""
+        """Plain figures, from which :meth:`TrialRecord.from_json` makes the record again."""
         return {"grasped": self.grasped, **dataclasses.asdict(self)}
 
 
@@ -106,7 +106,7 @@ class TrialRecord(Trial):
 
     @property
     def steps(self) -> int:
-        """Number of motions."""
+        """Number of motions, those that went back included."""
         return len(self.seconds)
 
     @classmethod

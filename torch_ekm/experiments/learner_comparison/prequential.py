@@ -29,7 +29,7 @@ class Prequential:
 
     @property
     def error(self) -> Float[Tensor, "n m"]:
-        """y - mean."""
+        """``y - mean`` ``(n, m)``, in the units of y."""
         return self.y - self.mean
 
     def rms_ratio(self, start: int = 0) -> float:
@@ -53,7 +53,7 @@ class Prequential:
 def run_prequential(
     learner: ResidualLearner, x: Float[Tensor, "n d"], y: Float[Tensor, "n m"]
 ) -> Prequential:
-    """Predict each sample, then learn it."""
+    """Predict each sample with its deviation, then learn it, in the order of time."""
     means, deviations, densities, begin = [], [], [], time.perf_counter()
     heavy = type(learner).predictive is not ResidualLearner.predictive
     for t in range(len(x)):

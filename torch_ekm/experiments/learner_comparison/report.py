@@ -75,7 +75,7 @@ class ComparisonReport(Comparison):
 
 
 def score_table(comparison: Comparison, stream: str) -> Table:
-    """Every learner on one stream."""
+    """Errors, calibration, time and memory of every learner on one stream."""
     best, measure = comparison.best(stream), comparison.measure(stream)
     columns: dict[Column, Callable[[Score], Cell]] = {
         Column("rms / model alone", ".3f"): lambda score: score.rms,
@@ -121,7 +121,7 @@ def overview_table(comparison: Comparison) -> Table:
 
 
 def constructor_table(comparison: Comparison) -> Table:
-    """How a user makes each learner."""
+    """The constructor call with which a user makes each learner."""
     rows: list[list[Cell]] = [
         [name, call] for name in comparison.learners if (call := comparison.calls.get(name, ""))
     ]

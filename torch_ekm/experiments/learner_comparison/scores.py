@@ -44,7 +44,7 @@ class Score:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All learners on all streams."""
+    """Scores and errors of all learners on all streams, and what can be said of them."""
 
     streams: tuple[Stream, ...]
     learners: tuple[str, ...]
@@ -77,7 +77,7 @@ class Comparison:
         return score.rms if self.measure(stream) == "rms" else score.median
 
     def stream(self, name: str) -> Stream:
-        """The stream of that name."""
+        """The stream of that name, with its samples."""
         return next(stream for stream in self.streams if stream.name == name)
 
     def row(self, stream: str) -> list[Score]:

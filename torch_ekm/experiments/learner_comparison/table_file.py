@@ -14,7 +14,7 @@ from ...exceptions import DescriptionError
 from ...typing import Array
 
 Names = tuple[str, ...]
-#: Values ``(n_rows, n)`` of the n columns that it is told.
+#: Values ``(n_rows, n)`` of the n columns that it is given.
 Read = Callable[[Sequence[str]], Array]
 
 

@@ -44,11 +44,11 @@ class Demo(Generalize):
 
     @property
     def object(self) -> str:
-        """The one that is turned."""
+        """Name or path of the one that is turned."""
         return self.objects[0]
 
     def quick(self) -> Self:
-        """The first two angles."""
+        """The same with the first two angles only."""
         return dataclasses.replace(self, angles_deg=self.angles_of(self.object)[:2])
 
     def report(self, seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
@@ -63,7 +63,7 @@ class Demo(Generalize):
         return report
 
     def angle_table(self, turns: DataFrame) -> Table:
-        """Each target on its own."""
+        """Mean error, motions and lost objects for each target and controller."""
         figures = {"error_deg": "mean", "motions": "mean", "lost": "sum"}
         found = turns.groupby(["angle_deg", "controller"]).agg(figures)
         columns: list[Column | str] = [Column("target [deg]", "g")]

@@ -84,11 +84,11 @@ class Generalize(Protocol):
             self.setting.plant_config(name)
 
     def angles_of(self, object: str) -> tuple[float, ...]:
-        """Rotations of one object [deg]."""
+        """Rotations that are asked for with one object [deg]."""
         return self.angles_deg if self.angles_deg is not None else TABLE_I.get(object, OTHER_ANGLES)
 
     def quick(self) -> Self:
-        """Two objects, two turns, one probe."""
+        """The same with two objects, two turns and one probe."""
         small = {"angles_deg": (5.0, 9.0), "warm_up": 1, "long_step_deg": 3.0, "blind_deg": 0.0}
         return dataclasses.replace(self, objects=("box", "can"), **small)
 

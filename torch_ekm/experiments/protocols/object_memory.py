@@ -43,13 +43,13 @@ _WORDS = {
 }
 _LEGEND = {
     "bank": "several models; evidence decides which one a grasp belongs to",
-    "labelled": "one model for each object, with the object's label told",
+    "labelled": "one model for each object, with the label of the object",
     "one model": "one for all objects",
     "fresh": "an empty one for each grasp",
     "none": "the kinematic model alone",
 }
 #: The residuals of one grasp are far from independent, and they speak for whichever model has seen most:
-#: beside a signature they count for little.
+#: next to a signature they count for little.
 _TEMPERATURE = 0.1
 #: Motions of a turn before the learner of a wrong object could have been corrected.
 _FIRST = 5
@@ -96,11 +96,11 @@ class ObjectMemory(Protocol):
             raise ParameterError("readings", self.readings, "0 or more")
 
     def quick(self) -> Self:
-        """Three objects, two turns each."""
+        """The same with three objects, two turns each."""
         return dataclasses.replace(self, objects=("box", "can", "applier"), turns_each=2)
 
     def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[int]]:
-        """One for each seed."""
+        """One for each seed: its whole sequence of turns."""
         stem = f"adapt_{digest(self.setting, self.objects, self)}"
         return {f"{stem}_{seed}": (seed,) for seed in seeds}
 

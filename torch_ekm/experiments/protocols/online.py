@@ -72,7 +72,7 @@ class Online(Protocol):
         return dataclasses.replace(self, **small)
 
     def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[str, int]]:
-        """One for each seed and controller."""
+        """One for each seed and controller: all trials in order."""
         stem = f"online_{digest(self.setting, (self.object,), self)}"
         return {f"{stem}_{name}_{seed}": (name, seed) for seed in seeds for name in CONTROLLERS}
 

@@ -32,7 +32,7 @@ class Protocol(ABC):
 
     @abstractmethod
     def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[Any, ...]]:
-        """Name -> arguments of :meth:`session`."""
+        """The jobs of these seeds: name -> arguments of :meth:`session`."""
 
     @abstractmethod
     def session(self, *arguments: Any) -> Sequence[Record]:
@@ -48,5 +48,5 @@ class Protocol(ABC):
         """
 
     def run(self, *arguments: Any) -> list[dict[str, Any]]:
-        """:meth:`session`, as JSON keeps it."""
+        """What :meth:`session` leaves, in terms that JSON can keep."""
         return [record.to_json() for record in self.session(*arguments)]

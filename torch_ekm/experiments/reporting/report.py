@@ -38,7 +38,7 @@ class Column:
     """The cells are shares, written in percent."""
 
     def text(self, cell: Cell) -> str:
-        """A cell as it is written."""
+        """A cell of this column as it is written."""
         if cell is None or (isinstance(cell, float) and math.isnan(cell)):
             return "-"
         if isinstance(cell, bool):
@@ -79,11 +79,11 @@ class Table:
 
     @property
     def header(self) -> list[str]:
-        """Names of the columns."""
+        """Names of the columns, from left to right."""
         return [column.name for column in self._columns]
 
     def text(self) -> list[list[str]]:
-        """All cells as they are written."""
+        """All cells as they are written, row by row."""
         return [
             [column.text(cell) for column, cell in zip(self._columns, row, strict=True)] for row in self.rows
         ]

@@ -109,7 +109,7 @@ class Rate:
 
 
 def rate(events: Iterable[bool]) -> Rate:
-    """How often something happened."""
+    """How often something happened, with Wilson's 95 % interval (``scipy.stats.binomtest``)."""
     outcomes = list(events)
     if not outcomes:
         return Rate(0, 0, 0.0, 1.0)
@@ -119,7 +119,7 @@ def rate(events: Iterable[bool]) -> Rate:
 
 
 class PairedTest(NamedTuple):
-    """Two-sided t-test of ``ours - theirs``."""
+    """Two-sided paired t-test of ``ours - theirs`` over the same units."""
 
     p: float
     effect_size: float
