@@ -72,7 +72,6 @@ class Variant:
 _OPTIONS: list[tuple[str, str, str, dict[str, Any], tuple[str, ...]]] = [
     ("online learning", "no robust update", "learner_options", {"robust": None}, _LEARNING),
     ("online learning", "no forgetting", "learner_options", {"forgetting_factor": 1.0}, _LEARNING),
-    ("model", "no geometric stiffness", "model", {"hand_stiffness": False, "object_stiffness": False}, _BOTH),
     ("model", "no rolling", "model", {"rolling": False}, _BOTH),
     ("model", "rigid actuators", "model", {"actuator_compliance": False}, _BOTH),
     ("controller", "gain 1 near the goal", "control", {"LimitingFunction.gain": 1.0}, _ALL),

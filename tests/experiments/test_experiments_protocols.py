@@ -19,7 +19,7 @@ from torch_ekm.control import (
     OffAxisTask,
     StepBound,
 )
-from torch_ekm.description import object_paths
+from torch_ekm.description.registry import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
 from torch_ekm.experiments.learners import HAND_LEARNERS, LEARNERS, make_learner

@@ -10,8 +10,9 @@ import pytest
 import torch
 from fakes import FakePlant
 
-from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
+from torch_ekm.exceptions import NonFiniteError, ShapeError
 from torch_ekm.kinematics import ServoModel
+from torch_ekm.kinematics.servo_model import RESOLUTION
 from torch_ekm.plant import Observation, ServoInverse
 
 DEG = math.pi / 180
@@ -70,7 +71,7 @@ def test_the_encoders_then_do_what_is_wanted_in_both_directions() -> None:
     for k, w in enumerate([*moves(30), *moves(60, seed=2, size=0.6)]):
         after = plant.command(w)
         if k >= 30:
-            wanted = torch.where(w.abs() > plant.servo.resolution, w, 0 * w)
+            wanted = torch.where(w.abs() > RESOLUTION, w, 0 * w)
             assert float((after.a - seen.a - wanted).abs().max()) < 0.25 * DEG
         seen = after
 
@@ -208,8 +209,6 @@ def test_bad_input_changes_nothing_and_a_state_dict_carries_all() -> None:
     with pytest.raises(NonFiniteError):
         plant.servo.update(torch.zeros(3), torch.tensor([0.0, math.nan, 0.0]))
     assert all(torch.equal(v, kept[k]) for k, v in plant.servo.state_dict().items())
-    with pytest.raises(ParameterError, match="forgetting"):
-        ServoModel(["a"], forgetting=1.1)
     other = ServoModel(plant.servo.names)
     other.load_state_dict(kept)
     v, w = moves(2)

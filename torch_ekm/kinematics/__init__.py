@@ -6,7 +6,7 @@ from .actuation import ActuationMap
 from .grasp_state import GraspState
 from .hand_kinematics import HandKinematics
 from .link_poses import LinkPoses
-from .play import Play, PlayState
+from .play import Play
 from .servo_model import ServoModel
 
 __all__ = [
@@ -15,6 +15,5 @@ __all__ = [
     "HandKinematics",
     "LinkPoses",
     "Play",
-    "PlayState",
     "ServoModel",
 ]

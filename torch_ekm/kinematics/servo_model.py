@@ -8,12 +8,19 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
+from .._checks import check_finite, check_shape
 from .._recorded import Recorded
-from ..exceptions import ParameterError, ShapeError
 from ..typing import Bool, Float, Tensor
-from .tensors import check_finite
 
 _DEG = math.pi / 180
+MOVED = 0.03 * _DEG
+"""An encoder's change from which on it is a motion: three of its standard deviations [rad]."""
+RESOLUTION = 0.02 * _DEG
+"""Wanted motions up to this size are none [rad]."""
+_LARGEST = 6 * _DEG  # [rad] no dead zone is larger
+_PRIOR_STD = (1.0 * _DEG, 0.3 * _DEG)  # [rad] of d and b before the first motion
+_NOISE_STD = 0.1 * _DEG  # [rad] of a servo's error from motion to motion: a first guess worth ten motions
+_FORGETTING = 0.995  # of the least squares, for each motion
 
 
 class ServoModel(Recorded, nn.Module):
@@ -22,56 +29,31 @@ class ServoModel(Recorded, nn.Module):
     ```
     moved:      v - w = sign(w) d - b + noise     linear in (d, b): recursive least squares, forgetting
     stood:      |v + b| <= d + noise              a motion that fails is a measurement, too: a censored one
-    command:    v = w + sign(w) d - b             the inverse, for wanted motions above ``resolution``
+    command:    v = w + sign(w) d - b             the inverse, for wanted motions above 0.02 deg
     ```
 
     The least squares is Bayesian (normal, inverse gamma), so d and b come with standard errors, which the
     spread of the servo's own motions sets. Two motions in succession that the errors do not explain open the
-    estimate again, as after a repair. A servo whose dead zone would exceed ``largest`` is called
+    estimate again, as after a repair. A servo whose dead zone would exceed 6 deg is called
     :attr:`stuck`; it keeps the estimate from before its first failure and is commanded as before, so nothing
     is wound up when it comes loose. All is in the state dict.
 
     Args:
         names: of the actuators.
-        encoder_std: standard deviation of an encoder [rad].
-        resolution: wanted motions up to this size are none [rad].
-        largest: no dead zone is larger [rad].
-        prior_std: standard deviations of d and b before the first motion [rad].
-        noise_std: of the servo's error from motion to motion, a first guess worth ten motions [rad].
-        forgetting: of the least squares, for each motion.
 
     Source: the factorisation of a Hammerstein system; adaptive inverses: Tao and Kokotovic, Adaptive Control
     of Systems with Actuator and Sensor Nonlinearities (1996).
     """
 
-    def __init__(
-        self,
-        names: Sequence[str],
-        *,
-        encoder_std: float = 0.01 * _DEG,
-        resolution: float = 0.02 * _DEG,
-        largest: float = 6 * _DEG,
-        prior_std: tuple[float, float] = (1.0 * _DEG, 0.3 * _DEG),
-        noise_std: float = 0.1 * _DEG,
-        forgetting: float = 0.995,
-    ) -> None:
+    def __init__(self, names: Sequence[str]) -> None:
         super().__init__()
-        figures = {"encoder_std": encoder_std, "resolution": resolution, "largest": largest}
-        figures |= {"prior_std": min(prior_std), "noise_std": noise_std, "forgetting": forgetting}
-        for name, value in figures.items():
-            if not 0 < value < math.inf:
-                raise ParameterError(name, value, "positive and finite")
-        if forgetting > 1:
-            raise ParameterError("forgetting", forgetting, "at most 1")
         self.names = tuple(names)
-        self.moved_from, self.resolution, self.largest = 3 * encoder_std, resolution, largest
-        self.forgetting = forgetting
-        self._prior = torch.diag(torch.tensor(prior_std, dtype=torch.float64).square()) / noise_std**2
+        self._prior = torch.diag(torch.tensor(_PRIOR_STD, dtype=torch.float64).square()) / _NOISE_STD**2
         n = len(self.names)
         self.estimate = nn.Buffer(torch.zeros(n, 2).double())  # theta = (d, b) [rad]
         self.covariance = nn.Buffer(self._prior.repeat(n, 1, 1))  # of theta, in units of the noise's variance
         self.weight = nn.Buffer(torch.full((n,), 10.0).double())
-        self.squares = nn.Buffer(self.weight * noise_std**2)
+        self.squares = nn.Buffer(self.weight * _NOISE_STD**2)
         self.before = nn.Buffer(self.estimate.clone())  # theta before the first failure in succession
         self.before_covariance = nn.Buffer(self.covariance.clone())
         self.failures = nn.Buffer(torch.zeros(n).long())  # commands in succession that moved nothing
@@ -80,7 +62,7 @@ class ServoModel(Recorded, nn.Module):
 
     @property
     def dead_zone(self) -> Float[Tensor, " n_a"]:
-        """d [rad]."""
+        """Half width d of each servo's dead zone [rad], not negative."""
         return self.estimate[:, 0].clamp(min=0.0)
 
     @property
@@ -96,13 +78,13 @@ class ServoModel(Recorded, nn.Module):
 
     @property
     def standard_errors(self) -> Float[Tensor, "2 n_a"]:
-        """Of d and of b [rad]."""
+        """Standard errors of d (first row) and of b [rad]."""
         return self.noise_std * self.covariance.diagonal(dim1=-2, dim2=-1).T.sqrt()
 
     def command(self, wanted: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
         """v that moves the servos by w [rad]."""
         inverse = wanted + wanted.sign() * self.dead_zone - self.bias
-        return torch.where(wanted.abs() > self.resolution, inverse, torch.zeros_like(wanted))
+        return torch.where(wanted.abs() > RESOLUTION, inverse, torch.zeros_like(wanted))
 
     @torch.no_grad()
     def update(
@@ -122,13 +104,12 @@ class ServoModel(Recorded, nn.Module):
             ShapeError, NonFiniteError: nothing is changed.
         """
         for name, value in (("command", command), ("moved", moved)):
-            if value.shape != self.stuck.shape:
-                raise ShapeError(name, f"({len(self.names)},)", value.shape)
+            check_shape(name, value, self.stuck.shape)
             check_finite(name, value)
         free = torch.ones_like(self.stuck) if free is None else free
         v, w = command.double(), moved.double()
-        went = free & (w.abs() > self.moved_from)
-        stood = free & ~went & (v.abs() > self.resolution) & ~self.stuck
+        went = free & (w.abs() > MOVED)
+        stood = free & ~went & (v.abs() > RESOLUTION) & ~self.stuck
         self.failures[went], self.stuck[went] = 0, False
         first = stood & (self.failures == 0)
         self.before[first] = self.estimate[first]
@@ -136,7 +117,7 @@ class ServoModel(Recorded, nn.Module):
         self.failures[stood] += 1
         self._regress(v, w, went)
         self._censored(v, stood)
-        lost = stood & (self.dead_zone > self.largest)
+        lost = stood & (self.dead_zone > _LARGEST)
         self.stuck |= lost
         self.estimate[lost], self.covariance[lost] = self.before[lost], self.before_covariance[lost]
 
@@ -153,13 +134,13 @@ class ServoModel(Recorded, nn.Module):
         Px, spread = self._spread(x, went)
         self.estimate[went] += Px * (error / spread)[:, None]
         P = self.covariance[went] - Px[..., None] * Px[:, None, :] / spread[:, None, None]
-        faded = P / self.forgetting  # never less sure than at the start: no blow-up without excitation
+        faded = P / _FORGETTING  # never less sure than at the start: no blow-up without excitation
         small = (faded.diagonal(dim1=-2, dim2=-1) <= self._prior.diagonal()).all(-1)
         self.covariance[went] = torch.where(small[:, None, None], faded, P)
         # bounded: a servo that has become another one is not a noisy one
         square = (error.square() / spread).clamp(max=16 * noise)
-        self.weight[went] = self.forgetting * self.weight[went] + 1
-        self.squares[went] = self.forgetting * self.squares[went] + square
+        self.weight[went] = _FORGETTING * self.weight[went] + 1
+        self.squares[went] = _FORGETTING * self.squares[went] + square
 
     def _censored(self, v: Tensor, stood: Tensor) -> None:
         """``x.theta + noise > |v|``, ``x = [1, -sign(v)]``, of the servos that stood: moments of the

@@ -9,6 +9,7 @@ import torch
 
 from ..description import HandDescription
 from ..kinematics import ServoModel
+from ..kinematics.servo_model import MOVED
 from ..typing import Float, Tensor
 from .observation import Observation
 from .plant import Plant
@@ -85,8 +86,8 @@ class ServoInverse(PlantWrapper):
     def _free(self, start: Tensor, v: Tensor, end: Tensor) -> Tensor:
         """Motions that no end of the range cut short, nor brought back into it: an end is not a dead zone."""
         lower, upper = self._range
-        low, high = lower + self.servo.moved_from, upper - self.servo.moved_from
-        free = (start > lower - self.servo.moved_from) & (start < upper + self.servo.moved_from)
+        low, high = lower + MOVED, upper - MOVED
+        free = (start > lower - MOVED) & (start < upper + MOVED)
         for a in (start + v, end):
             free &= ((a > low) | (v > 0)) & ((a < high) | (v < 0))
         return free

@@ -209,7 +209,7 @@ def plot_calibration(calibration: Calibration) -> Figure:
     Left: each figure that the data tell, with its standard error, in units of its prior (0: as described).
     Right: errors of the object's rotation.
     """
-    told = np.array(list(calibration.identifiable.values()), dtype=bool)
+    told = np.array([row.identifiable for row in calibration.parameters], dtype=bool)
     rows = [row for row in calibration.parameters if row.identifiable]
     x, error = calibration.x[told], np.sqrt(np.diag(calibration.covariance))[told]
     figure, (left, right) = new_figure(9.0, max(3.0, 0.22 * len(rows)), columns=2)
