@@ -263,12 +263,12 @@ def test_float32():
         def __init__(self, inner):
             super().__init__()
             self.inner, self.link_names = inner, inner.link_names
+            self.dtype = torch.float32
             self.register_buffer("upstream", inner.upstream)
 
         def forward(self, q):
             poses = self.inner(q.double())
-            poses.transforms = poses.transforms.float()
-            return poses
+            return dataclasses.replace(poses, transforms=poses.transforms.float())
 
         def joint_axes(self, poses):
             poses.transforms = poses.transforms.double()
