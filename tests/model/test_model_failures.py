@@ -271,9 +271,8 @@ def test_float32():
             return dataclasses.replace(poses, transforms=poses.transforms.float())
 
         def joint_axes(self, poses):
-            poses.transforms = poses.transforms.double()
-            axis, origin = self.inner.joint_axes(poses)
-            poses.transforms = poses.transforms.float()
+            double = dataclasses.replace(poses, transforms=poses.transforms.double())
+            axis, origin = self.inner.joint_axes(double)
             return axis.float(), origin.float()
 
     model = KinematicModel(
