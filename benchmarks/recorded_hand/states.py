@@ -18,11 +18,11 @@ from torch_ekm.description import HandDescription, ObjectDescription, Shape, loa
 from torch_ekm.exceptions import EKMError
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel, ModelOptions
-from torch_ekm.model.projection import project_onto_contacts
 from torch_ekm.typing import Array
 
 from .finger_markers import FingerMarkers
 from .fingers import PlanarFingers, camera_of, register_camera
+from .projection import project_onto_contacts
 from .recordings import RecordedPath, known_diameter
 
 STRIDE = 10

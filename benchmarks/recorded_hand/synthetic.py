@@ -11,10 +11,10 @@ import torch
 from torch_ekm.description import load_hand
 from torch_ekm.kinematics import GraspState, HandKinematics
 from torch_ekm.model import KinematicModel
-from torch_ekm.model.projection import project_onto_contacts
 from torch_ekm.typing import Array
 
 from .nominal import through_play
+from .projection import project_onto_contacts
 from .recordings import APART, FILE, UNIT, RecordedPath
 from .states import OPTIONS, STRIDE, cylinder, upright
 

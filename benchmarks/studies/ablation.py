@@ -112,13 +112,11 @@ def _short_actuator_steps(base: Setting) -> dict[str, Any]:
     return _part(JointLimit, horizon=6 * _DEG)(base)
 
 
-_NO_GEOMETRY = {"hand_stiffness": False, "object_stiffness": False}
 _NO_WAY_BACK = {"off_rotation": math.inf, "link_gap": -math.inf, "way_back": 0}
 #: Group, name, what is changed in the setting, and the controllers that it concerns.
 _OPTIONS: list[tuple[str, str, Callable[[Setting], dict[str, Any]], tuple[str, ...]]] = [
     ("online learning", "no robust update", _learner(robust=None), _LEARNING),
     ("online learning", "no forgetting", _learner(forgetting_factor=1.0), _LEARNING),
-    ("model", "no geometric stiffness", _part(ModelOptions, **_NO_GEOMETRY), _BOTH),
     ("model", "no rolling", _part(ModelOptions, rolling=False), _BOTH),
     ("model", "rigid actuators", _part(ModelOptions, actuator_compliance=False), _BOTH),
     ("controller", "gain 1 near the goal", _part(LimitingFunction, gain=1.0), _ALL),

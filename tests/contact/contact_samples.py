@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
 
 from torch_ekm.contact.contact_kinematics import ContactKinematics, contact_kinematics
@@ -54,9 +56,8 @@ def held(
     origin = 0.05 * torch.randn(n_q, 3, dtype=F64, generator=generator)
     upstream = torch.eye(contacts.n_c, dtype=torch.bool).repeat_interleave(joints_per_finger, dim=1)
     plane = None if plane is None else torch.tensor(plane, dtype=F64)
-    return contact_kinematics(
-        contacts, torch.zeros(3, dtype=F64), axis, origin, upstream, models=models, plane=plane
-    )
+    kin = contact_kinematics(contacts, torch.zeros(3, dtype=F64), axis, origin, upstream, plane=plane)
+    return kin if models is None else dataclasses.replace(kin, models=tuple(models))
 
 
 THREE = [[1.0, 0.1, 0.2], [-0.5, 0.9, -0.1], [-0.4, -0.8, 0.15]]

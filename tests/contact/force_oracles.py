@@ -53,10 +53,10 @@ def gaussian_posterior(eq: BalanceEquations, options: ForceOptions) -> tuple[np.
     if eq.measured_normal is not None:
         starts = [cone.start for cone in eq.cones]
         known = np.isfinite(eq.measured_normal)
-        measured.append((eye[starts][known], eq.measured_normal[known], eq.normal_std**2))
+        measured.append((eye[starts][known], eq.measured_normal[known], options.normal_std**2))
     if eq.measured_actuator is not None:
         known = np.isfinite(eq.measured_actuator)
-        measured.append((-eye[n_h:][known], eq.measured_actuator[known], eq.actuator_std**2))
+        measured.append((-eye[n_h:][known], eq.measured_actuator[known], options.actuator_std**2))
     for H, value, variance in measured:
         gain = S @ H.T @ np.linalg.inv(H @ S @ H.T + variance * np.eye(len(H)))
         x, S = x + gain @ (value - H @ x), S - gain @ H @ S

@@ -118,7 +118,6 @@ def test_two_points_cannot_turn_the_object_about_their_line_but_soft_fingers_can
     analysis = analyse(kin, torch.eye(2, 6, dtype=F64))
     assert analysis.indeterminate is (rank == 5)
     assert analysis.internal_forces == grasp_matrix(kin).shape[1] - rank
-    assert (analysis.smallest_singular_value > 1e-3) is (rank == 6)
 
 
 def test_ranks_of_a_three_finger_grasp():
@@ -129,7 +128,5 @@ def test_ranks_of_a_three_finger_grasp():
     assert analysis.undetermined_forces == 0
     assert analysis.graspable
     assert not analysis.indeterminate
-    assert not analysis.redundant
-    assert not analysis.defective
     # all 9 joints driven: 9 + 9 unknown forces against 15 equations
     assert analyse(kin, torch.eye(9, dtype=F64)).undetermined_forces == 3

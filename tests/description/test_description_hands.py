@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_ekm.description import list_hands, load_hand, registry, urdf_folder
+from torch_ekm.description import list_hands, load_hand, registry
+from torch_ekm.description.registry import urdf_folder
 from torch_ekm.exceptions import DescriptionError, EKMError, UnknownNameError
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from torch_ekm.description import hand_paths, list_hands, load_hand, read_urdf, write_template
+from torch_ekm.description import list_hands, load_hand, write_template
+from torch_ekm.description.registry import hand_paths
+from torch_ekm.description.urdf import read_urdf
 from torch_ekm.exceptions import DescriptionError, UnknownNameError
 from torch_ekm.kinematics import ActuationMap
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_ekm.description import load_hand, read_urdf
+from torch_ekm.description import load_hand
+from torch_ekm.description.urdf import read_urdf
 from torch_ekm.exceptions import DescriptionError
 
 SHAPE = "<collision>{}<geometry><!-- rigid -->{}</geometry></collision>"

@@ -11,7 +11,7 @@ import torch
 from experiments_records import frame, not_grasped
 
 from torch_ekm.control import DEFAULT_TASKS, Caution, EffortTask, LimitingFunction, Safety
-from torch_ekm.description import object_paths
+from torch_ekm.description.registry import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
 from torch_ekm.experiments.learners import LEARNERS, make_learner

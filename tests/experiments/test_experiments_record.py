@@ -8,7 +8,7 @@ import hashlib
 import pytest
 import torch
 
-from torch_ekm.description import object_paths
+from torch_ekm.description.registry import object_paths
 from torch_ekm.exceptions import ParameterError, SolverError, UnknownNameError
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.protocols.record import RecordConfig, record

@@ -13,7 +13,7 @@ from made_up_sessions import made_up_generalize, made_up_memory, made_up_online
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
-from torch_ekm.description import object_paths
+from torch_ekm.description.registry import object_paths
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.protocols.object_memory import ObjectMemory

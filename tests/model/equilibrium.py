@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from surface import TrackedContacts
 
 from torch_ekm.contact.contact_kinematics import ContactKinematics, constraint_matrix
-from torch_ekm.contact.contact_set import ContactSet
+from torch_ekm.contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
+from torch_ekm.contact.forces.balance import ForceStatus
+from torch_ekm.contact.forces.friction import friction_cones, margins
 from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics.grasp_state import GraspState
-from torch_ekm.model.force_balance import known_forces
+from torch_ekm.model.force_balance import ForceBalance, KnownForces, Statics, pack_forces
 from torch_ekm.model.grasp_forces import GraspForces
 from torch_ekm.model.kinematic_model import KinematicModel
 from torch_ekm.model.stiffness.geometric import geometric_stiffness
@@ -189,8 +193,10 @@ class EquilibriumSolver:
         model = self.model
         _, kin = self._geometry(self.start)
         A = constraint_matrix(kin)
-        V_q, V_p = model.potential(self.start)[0].split([model.hand.n_q, 6])
-        return model.balance(self.start.q, kin, A, V_q, V_p, self.held, wish, None, std)
+        at = Statics(self.start.q, kin, A, model.potential(self.start)[0], self.held)
+        forces = dataclasses.replace(model.options.forces, normal_std=std)
+        options = dataclasses.replace(model.options, forces=forces)
+        return ForceBalance(model.hand, options, model.reduction)(at, KnownForces(wish))
 
     def _geometry(self, state: GraspState) -> tuple[ContactSet, ContactKinematics]:
         contacts = self.surfaces(state.q, state.position, state.rotation)
@@ -209,7 +215,7 @@ class EquilibriumSolver:
     ) -> Equilibrium:
         """One continuation step from ``at``."""
         model, Z = self.model, self.Z
-        n_q, n_z, L = model.hand.n_q, Z.shape[1], model.options.length
+        n_q, n_z, L = model.hand.n_q, Z.shape[1], CHARACTERISTIC_LENGTH
         state, mu, lam, stop = at.state, at.mu, at.lam, at.stop
         E_h = Z[:n_q][self.held]
         before = self.surfaces.pinned_offset(at.state.q, at.state.position, at.state.rotation)
@@ -239,7 +245,7 @@ class EquilibriumSolver:
             if stalled > 12:
                 break
             forces = known_forces(kin, mu, lam)
-            D = geometric_stiffness(kin, forces.force, forces.spin_moment, model.precedes)  # type: ignore[arg-type]
+            D = geometric_stiffness(kin, forces.force, forces.spin_moment, model.precedes)
             D = D + model.potential(state)[1]
             A = row_scale[:, None] * (A_s @ Z)
             E = torch.cat([A, self.B, E_h])
@@ -296,3 +302,28 @@ def _follow(at: Equilibrium, step: Callable[[Equilibrium, float], Equilibrium], 
             if size * steps < 1 / 64:
                 raise EquilibriumError("newton", f"{100 * done:.0f} % of the way: {error.status}") from error
     return at
+
+
+def known_forces(kin: ContactKinematics, mu: Tensor, lam: Tensor) -> GraspForces:
+    """Forces that are given, e.g. those of an exact equilibrium, with their margins."""
+    cones = friction_cones(
+        kin.models, kin.contacts.friction.tolist(), kin.contacts.torsional_friction.tolist()
+    )
+    pairs = [margins(cones, row) for row in mu.detach().reshape(-1, mu.shape[-1]).double().cpu().numpy()]
+    batch = mu.shape[:-1]
+    slack, relative = (
+        torch.from_numpy(np.stack([pair[k] for pair in pairs])).to(mu).reshape(*batch, -1) for k in (0, 1)
+    )
+    n_q = kin.axis.shape[-2]
+    zero = mu.new_zeros(*batch, n_q)
+    return pack_forces(
+        kin,
+        mu,
+        lam,
+        residual=zero,
+        stop_torque=zero,
+        margin=slack,
+        relative_margin=relative,
+        status=(ForceStatus.SOLVED,) * len(pairs),
+        violation=mu.new_zeros(batch),
+    )

@@ -12,18 +12,15 @@ from torch import nn
 
 from torch_ekm.contact.contact_set import ContactSet
 from torch_ekm.description import Actuator, HandDescription, UrdfModel
-from torch_ekm.kinematics import se3
+from torch_ekm.kinematics import LinkPoses, se3
 
 F64 = torch.float64
 
 
-class Poses:
-    def __init__(self, transforms):
-        self.transforms = transforms
-
-
 class ChainKinematics(nn.Module):
     """Fingers of revolute joints: (origin relative to the predecessor, axis) of each."""
+
+    dtype = F64
 
     def __init__(self, fingers: list[list[tuple[np.ndarray, np.ndarray]]]):
         super().__init__()
@@ -31,7 +28,7 @@ class ChainKinematics(nn.Module):
             [(torch.tensor(T, dtype=F64), torch.tensor(z, dtype=F64)) for T, z in finger]
             for finger in fingers
         ]
-        self.link_names = [f"f{i}_l{j}" for i, finger in enumerate(fingers) for j in range(len(finger))]
+        self.link_names = tuple(f"f{i}_l{j}" for i, finger in enumerate(fingers) for j in range(len(finger)))
         n_q = len(self.link_names)
         upstream = torch.zeros(n_q, n_q, dtype=torch.bool)
         at = 0
@@ -52,7 +49,7 @@ class ChainKinematics(nn.Module):
                 T = T @ origin @ R
                 rows.append(T)
                 at += 1
-        return Poses(torch.stack(rows, dim=-3))
+        return LinkPoses(torch.stack(rows, dim=-3), self.link_names)
 
     def joint_axes(self, poses):
         z = torch.stack([z for finger in self.fingers for _, z in finger])
@@ -165,7 +162,7 @@ class Toy:
         return EquilibriumSolver(self.model, self.state, self.contacts, **options)
 
     def forces(self):
-        from torch_ekm.model.force_balance import known_forces
+        from equilibrium import known_forces
 
         return known_forces(self.model.contact_kinematics(self.state, self.contacts), self.mu, self.lam)
 

@@ -10,7 +10,6 @@ import torch
 from model_icub import gripped
 from model_toys import F64, select, soft_two_finger, three_finger
 
-from torch_ekm.contact import ForceOptions
 from torch_ekm.exceptions import ShapeError
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model.grasp_forces import friction_use, margin_std
@@ -78,11 +77,12 @@ def test_the_margins_deviation_is_that_of_forces_drawn_from_the_covariance(make)
         spin = drawn[..., 3] * mu_s / contacts.torsional_friction
     margin = mu_s * normal - (across.square().sum(-1) + spin.square()).sqrt()
     f_n, now, gradient = friction_use(contacts, forces.force, forces.spin_moment, contacts.normal)
-    std = margin_std(contacts, f_n, gradient, half @ half.mT, ForceOptions(friction_std=0.0))
+    of_friction = 0.05 * 0.3 * f_n
+    std = margin_std(contacts, f_n, gradient, half @ half.mT)
     assert torch.allclose(margin.mean(0), now, atol=1e-3)
-    assert torch.allclose(margin.std(0), std, rtol=0.05)
-    wider = margin_std(contacts, f_n, gradient, half @ half.mT, ForceOptions(friction_std=0.1))
-    assert torch.allclose(wider.square(), std.square() + (0.1 * 0.3 * f_n).square())
+    assert torch.allclose((margin.var(0) + of_friction.square()).sqrt(), std, rtol=0.05)
+    certain = margin_std(contacts, f_n, gradient, 0 * half)
+    assert torch.allclose(certain, of_friction.abs())
 
 
 def test_fingertips_and_motor_loads_make_the_margins_surer():

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from missing_terms import without
 from model_icub import gripped
 from model_toys import F64, contact_set, planar_two_finger, relative_error, select, three_finger, toy_hand
 from torch import nn
@@ -158,9 +159,9 @@ def test_zero_springs_are_singular_unless_there_is_a_floor():
     assert ring_and_little is not None
     ours = []
     for floor in (1e-4, 2e-4):
-        options = dataclasses.replace(model.options, stiffness_floor=floor)
-        lin = KinematicModel(hand, model.obj, options, **args).linearize(at.state, at.contacts, forces=forces)
-        ours.append(lin.object_jacobian)
+        held = dataclasses.replace(hand, spring_stiffness=stiffness + floor * (stiffness == 0))
+        lin = KinematicModel(held, model.obj, model.options, **args)
+        ours.append(lin.linearize(at.state, at.contacts, forces=forces).object_jacobian)
     assert relative_error(ours[0], ours[1], 0) < 5e-3
 
 
@@ -194,10 +195,8 @@ def test_a_grip_too_strong_buckles_and_the_model_without_geometry_does_not_see_i
     assert caught.value.direction.shape == (15,)
     A = constraint_matrix(toy.model.contact_kinematics(toy.state, toy.contacts))
     assert (A @ caught.value.direction).abs().max() < 1e-12  # the contacts allow it: state coordinates
-    blind = dataclasses.replace(
-        toy.model.options, hand_stiffness=False, object_stiffness=False, rolling=False
-    )
-    assert rebuilt(toy, options=blind).linearize(toy.state, forces=forces).status is ModelStatus.OK
+    blind = without(toy.model, "S", "T", "rolling").linearize(toy.state, forces=forces)
+    assert blind.status is ModelStatus.OK
     flag = dataclasses.replace(toy.model.options, on_unstable="flag")
     lin = rebuilt(toy, options=flag).linearize(toy.state, forces=forces)
     assert lin.status is ModelStatus.UNSTABLE
@@ -227,9 +226,9 @@ def test_bad_input_is_named():
 @pytest.mark.parametrize(
     "bad",
     [
-        {"length": 0.0},
+        {"max_overlap": 0.0},
         {"on_unstable": "ignore"},
-        {"stiffness_floor": -1.0},
+        {"contact_margin": -1.0},
         {"gravity": (0.0, 0.0, float("nan"))},
     ],
 )
@@ -264,17 +263,16 @@ def test_float32():
         def __init__(self, inner):
             super().__init__()
             self.inner, self.link_names = inner, inner.link_names
+            self.dtype = torch.float32
             self.register_buffer("upstream", inner.upstream)
 
         def forward(self, q):
             poses = self.inner(q.double())
-            poses.transforms = poses.transforms.float()
-            return poses
+            return dataclasses.replace(poses, transforms=poses.transforms.float())
 
         def joint_axes(self, poses):
-            poses.transforms = poses.transforms.double()
-            axis, origin = self.inner.joint_axes(poses)
-            poses.transforms = poses.transforms.float()
+            double = dataclasses.replace(poses, transforms=poses.transforms.double())
+            axis, origin = self.inner.joint_axes(double)
             return axis.float(), origin.float()
 
     model = KinematicModel(

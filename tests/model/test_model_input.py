@@ -12,15 +12,13 @@ from model_icub import gripped
 from model_toys import (
     F64,
     build,
-    planar_two_finger,
     relative_error,
-    select,
     three_finger,
     toy_hand,
     transform,
 )
 
-from torch_ekm.contact import ContactDetector, ContactSet, ferrari_canny
+from torch_ekm.contact import ContactDetector, ContactSet
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import DescriptionError, EKMError, NonFiniteError, ParameterError, ShapeError
 from torch_ekm.kinematics import GraspState
@@ -118,7 +116,7 @@ WRONG = {
         DescriptionError,
         "pads",
     ),
-    "contact stiffness": (lambda: ModelOptions(contact_stiffness=0.0), ParameterError, "contact_stiffness"),
+    "overlap": (lambda: ModelOptions(max_overlap=0.0), ParameterError, "max_overlap"),
     "slack tension": (lambda: ModelOptions(slack_tension=-1.0), ParameterError, "slack_tension"),
 }
 
@@ -173,50 +171,11 @@ def test_a_sensor_that_reads_a_little_below_zero_is_noise():
     assert felt([-0.1, 0.0, 0.0]).forces.solved
 
 
-def test_ferrari_canny_of_nothing_is_nothing():
-    kin = MODEL.contact_kinematics(STATE, CONTACTS)
-    assert ferrari_canny(kin) > 0.01
-    nothing = select(CONTACTS, [])
-    assert ferrari_canny(MODEL.contact_kinematics(STATE, nothing)) == 0.0
-    smooth = CONTACTS.replace(friction=torch.zeros(3, dtype=F64))
-    assert ferrari_canny(MODEL.contact_kinematics(STATE, smooth)) == 0.0
-    flat = planar_two_finger()
-    assert ferrari_canny(flat.model.contact_kinematics(flat.state, flat.contacts)) > 0.01
-
-
 def variant(toy, **changes):
     model, options = toy.model, dataclasses.replace(toy.model.options, **changes)
     return KinematicModel(
         model.hand, model.obj, options, kinematics=model.kinematics, detector=lambda *_: toy.contacts
     )
-
-
-@pytest.mark.parametrize("gamma", [0.0, 0.004])
-def test_stiff_contacts_tend_to_rigid_ones_without_false_alarm(gamma):
-    toy = three_finger(gamma=gamma)
-    forces, rigid = toy.forces(), toy.model.linearize(toy.state, forces=toy.forces())
-    errors = []
-    for K_c in (1e5, 1e6, 1e7, 1e12):
-        lin = variant(toy, contact_stiffness=K_c).linearize(toy.state, forces=forces)
-        errors.append(relative_error(lin.manipulation_jacobian, rigid.manipulation_jacobian, 9))
-        change = lin.contact_force_sensitivity - rigid.contact_force_sensitivity
-        errors[-1] = max(errors[-1], float(change.norm() / rigid.contact_force_sensitivity.norm()))
-    assert errors[0] > 5 * errors[1] > 25 * errors[2]  # first order in 1/K_c
-    assert errors[3] < 1e-6
-
-
-def test_compliant_contacts_are_springs_in_series():
-    """One finger of one joint presses on a fixed wall: da moves the tip by what servo and contact share."""
-    toy, L, K_c = three_finger(gamma=0.004), 0.03, 3e4
-    forces = toy.forces()
-    model = variant(toy, contact_stiffness=K_c)
-    lin = model.linearize(toy.state, forces=forces)
-    from torch_ekm.contact.contact_kinematics import constraint_matrix
-
-    kin = model.contact_kinematics(toy.state, toy.contacts)
-    moved = constraint_matrix(kin) @ lin.manipulation_jacobian
-    give = torch.tensor([K_c if row % 6 < 3 else K_c * L**2 for row in kin.rows], dtype=F64)[:, None]
-    assert torch.allclose(lin.contact_force_sensitivity, give * moved, rtol=1e-8, atol=1e-8)
 
 
 def test_a_very_stiff_actuator_is_rigid_without_false_alarm():

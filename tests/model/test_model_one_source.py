@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 import torch
 from model_toys import F64, three_finger
 
-from torch_ekm.contact import ForceOptions
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.model import KinematicModel, ModelOptions, ModelStatus
 from torch_ekm.simulation import PlantConfig, SimulatedHand
@@ -28,26 +25,6 @@ def test_gravity_can_be_told_to_the_model_alone():
     hand, box = load_hand("icub_right"), load_object("box")
     upside_down = KinematicModel(hand, box, ModelOptions(gravity=(0.0, 0.0, -9.81)))
     assert torch.equal(upside_down.weight, -KinematicModel(hand, box).weight)
-
-
-def test_one_length_scales_ranks_and_moments():
-    toy = three_finger()
-    slippery = toy.contacts.replace(friction=torch.full((3,), 0.01, dtype=F64))
-
-    def unbalanced(length):
-        options = dataclasses.replace(toy.model.options, length=length)
-        model = KinematicModel(
-            toy.model.hand,
-            toy.model.obj,
-            options,
-            kinematics=toy.model.kinematics,
-            detector=lambda *_: slippery,
-        )
-        return float(model.linearize(toy.state).forces.violation)
-
-    # of an object held far from its centre of mass moments count for more where L is small
-    assert unbalanced(0.001) > 1.5 * unbalanced(0.03)
-    assert "length" not in {field.name for field in dataclasses.fields(ForceOptions)}
 
 
 def test_a_linearization_depends_on_its_arguments_alone():

@@ -13,7 +13,7 @@ from test_model_failures import rebuilt
 
 pytest.importorskip("coal")
 
-from torch_ekm.contact import NearMiss
+from torch_ekm.contact.contact_set import NearMiss
 from torch_ekm.description import Shape, load_hand, load_object
 from torch_ekm.exceptions import NonFiniteError, ShapeError, SingularGraspError
 from torch_ekm.kinematics import GraspState, HandKinematics

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_ekm.description import hand_paths, list_hands, load_hand, read_urdf, write_template
+from torch_ekm.description import list_hands, load_hand, write_template
+from torch_ekm.description.registry import hand_paths
+from torch_ekm.description.urdf import read_urdf
 from torch_ekm.exceptions import DescriptionError
 from torch_ekm.rendering import make_scene
 from torch_ekm.rendering.scene import shape_mesh

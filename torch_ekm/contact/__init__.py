@@ -9,29 +9,24 @@ from .contact_kinematics import (
     grasp_matrix,
     hand_jacobian,
 )
-from .contact_model import ContactModel
-from .contact_set import ContactSet, NearMiss
+from .contact_set import ContactSet
 from .detector import ContactDetector
 from .forces.balance import ForceStatus
 from .forces.options import ForceOptions
 from .forces.solve import contact_forces
-from .grasp_analysis import GraspAnalysis, analyse, ferrari_canny
+from .grasp_analysis import analyse
 from .signed_distance import signed_distance
 
 __all__ = [
     "ContactDetector",
     "ContactKinematics",
-    "ContactModel",
     "ContactSet",
     "ForceOptions",
     "ForceStatus",
-    "GraspAnalysis",
-    "NearMiss",
     "analyse",
     "constraint_matrix",
     "contact_forces",
     "contact_kinematics",
-    "ferrari_canny",
     "grasp_matrix",
     "hand_jacobian",
     "signed_distance",

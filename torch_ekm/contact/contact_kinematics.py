@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -48,12 +47,12 @@ class ContactKinematics:
 
     @cached_property
     def row_index(self) -> Tensor:
-        """:attr:`rows` as an index."""
+        """:attr:`rows` as an index tensor on the device of the contacts."""
         return torch.tensor(self.rows, dtype=torch.int64, device=self.frame.device)
 
     @cached_property
     def normal_hat(self) -> Float[Tensor, "*batch n_c 3 3"]:
-        """``[n_i]x``."""
+        """``[n_i]x``, the cross-product matrix of each outward normal."""
         return hat(self.contacts.normal)
 
     @cached_property
@@ -121,7 +120,6 @@ def contact_kinematics(
     origin: Float[Tensor, "*batch n_q 3"],
     upstream: Bool[Tensor, "n_c n_q"],
     *,
-    models: Sequence[ContactModel] | None = None,
     plane: Float[Tensor, " 3"] | None = None,
     rolling: bool = True,
 ) -> ContactKinematics:
@@ -133,7 +131,6 @@ def contact_kinematics(
         axis: joint axes ``z_j``.
         origin: a point ``o_j`` on each axis [m].
         upstream: joint j moves the link of contact i.
-        models: contact models; by default what the friction coefficients say.
         plane: normal of the plane of motion of a planar hand.
         rolling: False treats every contact as pinned (for comparison).
     """
@@ -142,11 +139,9 @@ def contact_kinematics(
     spin = axis[..., None, :, :] * mask
     arm = contacts.point[..., :, None, :] - origin[..., None, :, :]
     velocity = torch.linalg.cross(spin, arm)
-    if models is None:
-        models = contact_models(contacts, planar=plane is not None)
     return ContactKinematics(
         contacts=contacts,
-        models=tuple(models),
+        models=contact_models(contacts, planar=plane is not None),
         frame=frame,
         lever=contacts.point - position[..., None, :],
         axis=axis,
@@ -173,12 +168,12 @@ def full_grasp_matrix(kin: ContactKinematics) -> Float[Tensor, "*batch 6 rows"]:
 
 
 def hand_jacobian(kin: ContactKinematics) -> Float[Tensor, "*batch n_h n_q"]:
-    """``J_h = H J~_h``."""
+    """``J_h = H J~_h``: joint velocities to those contact velocities that the models transmit [m/rad]."""
     return full_hand_jacobian(kin).index_select(-2, kin.row_index)
 
 
 def grasp_matrix(kin: ContactKinematics) -> Float[Tensor, "*batch 6 n_h"]:
-    """``G = G~ H^T``."""
+    """``G = G~ H^T``: contact forces ``mu`` [N, N m] to the wrench on the object about ``o`` [N, N m]."""
     return full_grasp_matrix(kin).index_select(-1, kin.row_index)
 
 

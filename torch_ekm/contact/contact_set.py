@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 
@@ -14,7 +15,8 @@ from ..typing import Float, Tensor
 
 CHARACTERISTIC_LENGTH = 0.03
 """L [m], size of a held object: what makes lengths comparable with angles, and moments with forces."""
-
+LINK_MARGIN = 0.001
+"""Gap up to which a link that is no pad is reported as touching [m]."""
 _UNIT = 1e-4
 """How far the length of a normal may be from 1."""
 _TAILS: dict[str, tuple[int, ...]] = {
@@ -117,7 +119,7 @@ class ContactSet:
 
     @property
     def n_c(self) -> int:
-        """Number of contacts."""
+        """Number of contacts, the same for all states of a batch."""
         return len(self.finger)
 
     @property
@@ -134,6 +136,13 @@ class ContactSet:
         names = {name: tuple(getattr(self, name)[i] for i in at) for name in ("finger", "link", "pinned")}
         return self.replace(**parts, **names)
 
-    def replace(self, **changes: object) -> ContactSet:
-        """A copy with some fields changed."""
-        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
+    def replace(self, **changes: Any) -> ContactSet:
+        """A copy with the given fields changed, checked like a new set."""
+        return dataclasses.replace(self, **changes)
+
+
+@runtime_checkable
+class Detector(Protocol):
+    """Finds the contacts of one state, hand frame: :class:`ContactDetector` or one's own."""
+
+    def __call__(self, q: Tensor, position: Tensor, rotation: Tensor, /) -> ContactSet: ...

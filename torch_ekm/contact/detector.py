@@ -11,13 +11,14 @@ import math
 import numpy as np
 import torch
 
+from .._checks import check_finite
 from .._extras import require
 from ..description import HandDescription, ObjectDescription
 from ..exceptions import DescriptionError, ParameterError, ShapeError
 from ..kinematics import HandKinematics, LinkPoses
-from ..kinematics.tensors import check_finite
+from ..kinematics.link_poses import Kinematics
 from ..typing import Array, Float, Tensor
-from .contact_set import ContactSet, NearMiss
+from .contact_set import LINK_MARGIN, ContactSet, NearMiss
 from .link_contact import LinkShapes
 from .pad_contact import Pad, PadContact, Solid, pad_contact
 
@@ -45,7 +46,6 @@ class ContactDetector:
         margin: pads farther away than this [m] are left out, and reported so; ``math.inf`` keeps them all.
         crown_radius: R [m]; infinite: none.
         kinematics: of the same hand, to share one; made here if None.
-        link_margin: links that are no pads are reported up to this gap [m].
 
     Raises:
         MissingExtraError: coal is not installed.
@@ -59,8 +59,7 @@ class ContactDetector:
         obj: ObjectDescription,
         margin: float = 0.002,
         crown_radius: float = 0.5,
-        kinematics: HandKinematics | None = None,
-        link_margin: float = 0.001,
+        kinematics: Kinematics | None = None,
     ) -> None:
         if not margin >= 0:
             raise ParameterError("margin", margin, "at least 0 [m]")
@@ -70,12 +69,12 @@ class ContactDetector:
             problem = "the hand has no [[pads]], so nothing of it can touch an object"
             raise DescriptionError(hand.transmission_path, problem)
         self.hand, self.obj, self.margin, self.crown_radius = hand, obj, margin, crown_radius
-        self.kinematics = kinematics if kinematics is not None else HandKinematics(hand)
+        self.kinematics = HandKinematics(hand) if kinematics is None else kinematics
         self._coal = require("coal")
         self._links = [hand.link_names.index(pad.link) for pad in hand.pads]
         self._pads = [Pad(self._coal, pad) for pad in hand.pads]
         self._shapes = [Solid(self._coal, shape) for shape in obj.shapes]
-        self._other_links = LinkShapes(self._coal, hand, link_margin, self._coarse_distance)
+        self._other_links = LinkShapes(self._coal, hand, LINK_MARGIN, self._coarse_distance)
         self._request = self._coal.DistanceRequest()
         self._result = self._coal.DistanceResult()
 

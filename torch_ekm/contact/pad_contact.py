@@ -37,7 +37,7 @@ class Solid:
 
 
 class PadContact:
-    """One contact in the hand frame."""
+    """One contact of a pad: point, normal, gap [m] and curvatures [1/m], hand frame."""
 
     __slots__ = ("finger_curvature", "gap", "normal", "object_curvature", "pinned", "point")
 

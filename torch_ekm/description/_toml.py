@@ -126,7 +126,7 @@ class TomlTable:
         return value
 
     def angle(self, key: str, default: Any = _NOTHING) -> float:
-        """[rad]"""
+        """The angle under ``key`` [rad] or ``key_deg`` [deg], in rad."""
         if self._in_degrees(key):
             return math.radians(self.number(f"{key}_deg"))
         return self.number(key, default)
@@ -138,7 +138,7 @@ class TomlTable:
         return tuple(self._finite(key, entry) for entry in value)
 
     def angles(self, key: str, size: int, default: Any = _NOTHING) -> tuple[float, ...]:
-        """[rad]"""
+        """A list of angles under ``key`` [rad] or ``key_deg`` [deg], in rad."""
         if self._in_degrees(key):
             return tuple(math.radians(value) for value in self.vector(f"{key}_deg", size))
         return self.vector(key, size, default)

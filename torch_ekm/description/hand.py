@@ -1,7 +1,7 @@
 """What a hand is, as data: joints, actuators, springs, pads, sensors.
 
 Nothing here computes. A :class:`HandDescription` is read from a URDF and the
-transmission file beside it by :func:`torch_ekm.description.load_hand`.
+transmission file next to it by :func:`torch_ekm.description.load_hand`.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class HandDescription:
     planar_normal: tuple[float, float, float] | None = None
     """Normal of the plane in which a planar hand moves (hand frame); None: a spatial hand."""
     gravity: tuple[float, float, float] = (0.0, 0.0, 9.81)
-    """Nominal gravity in the hand frame [m/s^2], that of plant and model unless one is told otherwise. The
+    """Nominal gravity in the hand frame [m/s^2], that of plant and model unless one is set otherwise. The
     iCub's palm faces down: its fingers hang, and the line of a pinch is level."""
     pinch_force: float = 5.0
     """Normal force with which the thumb pinches an object in simulation [N]; soft springs bear less."""

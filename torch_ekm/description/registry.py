@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Iterable
 from pathlib import Path
 
 from ..exceptions import DescriptionError, UnknownNameError
@@ -33,7 +35,7 @@ def urdf_folder() -> Path:
 
 
 def list_hands() -> tuple[str, ...]:
-    """Names that :func:`load_hand` knows."""
+    """The names of hands that :func:`load_hand` knows without a path."""
     return tuple(_HANDS)
 
 
@@ -48,7 +50,7 @@ def list_cylinders() -> tuple[str, ...]:
 
 
 def load_hand(name: str | Path) -> HandDescription:
-    """A hand by name, or from a path to a URDF with ``<stem>.transmission.toml`` beside it.
+    """A hand by name, or from a path to a URDF with ``<stem>.transmission.toml`` next to it.
 
     Raises:
         UnknownNameError: ``name`` is neither a known hand nor a path to a ``.urdf`` file.
@@ -60,7 +62,7 @@ def load_hand(name: str | Path) -> HandDescription:
 
 
 def load_object(name: str | Path) -> ObjectDescription:
-    """An object by name, or from a path to a URDF with ``<stem>.object.toml`` beside it.
+    """An object by name, or from a path to a URDF with ``<stem>.object.toml`` next to it.
 
     Raises:
         UnknownNameError: ``name`` is neither a known object nor a path to a ``.urdf`` file.
@@ -89,6 +91,27 @@ def object_paths(name: str | Path) -> tuple[Path, Path]:
     folder = urdf_folder() / "objects"
     path = _resolve("object", name, {key: folder / f"{key}.urdf" for key in (*_OBJECTS, *_CYLINDERS)})
     return path, path.with_suffix(".object.toml")
+
+
+def file_digests(hand: str | Path, objects: Iterable[str | Path]) -> dict[str, str]:
+    """SHA-256 of each file that describes the hand and the objects (names or paths), hexadecimal.
+
+    Returns:
+        ``{"hand icub_right_hand.urdf": digest, ..., "object box.object.toml": digest}``
+
+    Raises:
+        UnknownNameError: no such hand or object.
+        DescriptionError: a file cannot be read.
+    """
+    named = [("hand", path) for path in hand_paths(hand)]
+    named += [("object", path) for item in objects for path in object_paths(item)]
+    digests = {}
+    for kind, path in named:
+        try:
+            digests[f"{kind} {path.name}"] = hashlib.sha256(path.read_bytes()).hexdigest()
+        except OSError as error:
+            raise DescriptionError(path, f"cannot be read: {error.strerror}") from None
+    return digests
 
 
 def _resolve(kind: str, name: str | Path, known: dict[str, Path]) -> Path:

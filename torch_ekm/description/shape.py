@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+_SAME = 1e-7  # [m]
 Kind = Literal["box", "cylinder", "sphere", "capsule"]
 
 
@@ -37,12 +38,12 @@ class Shape:
         return Shape(self.kind, tuple(factor * size for size in self.size), transform)
 
 
-def merge_capsules(shapes: tuple[Shape, ...], tolerance: float = 1e-7) -> tuple[Shape, ...]:
+def merge_capsules(shapes: tuple[Shape, ...]) -> tuple[Shape, ...]:
     """Read a cylinder with a ball of the same radius on either end as one capsule.
 
     The URDF standard has no capsule and some readers reject the widespread extension, so a capsule
     is written as cylinder + two spheres; here it becomes one smooth convex body again. Two capsules
-    in line may share a ball. ``tolerance`` [m].
+    in line may share a ball.
     """
     spheres = [shape for shape in shapes if shape.kind == "sphere"]
     used: set[int] = set()
@@ -55,7 +56,7 @@ def merge_capsules(shapes: tuple[Shape, ...], tolerance: float = 1e-7) -> tuple[
         half = shape.transform[:3, 2] * length / 2
         centre = shape.transform[:3, 3]
         caps = [
-            next((s for s in spheres if _is_ball(s, centre + sign * half, radius, tolerance)), None)
+            next((s for s in spheres if _is_ball(s, centre + sign * half, radius)), None)
             for sign in (-1.0, 1.0)
         ]
         if caps[0] is None or caps[1] is None:
@@ -66,6 +67,6 @@ def merge_capsules(shapes: tuple[Shape, ...], tolerance: float = 1e-7) -> tuple[
     return tuple(shape for shape in merged if id(shape) not in used)
 
 
-def _is_ball(shape: Shape, centre: NDArray[np.float64], radius: float, tolerance: float) -> bool:
+def _is_ball(shape: Shape, centre: NDArray[np.float64], radius: float) -> bool:
     offset = float(np.abs(shape.transform[:3, 3] - centre).max())
-    return offset < tolerance and abs(shape.size[0] - radius) < tolerance
+    return offset < _SAME and abs(shape.size[0] - radius) < _SAME

@@ -52,7 +52,7 @@ _PADS = """
 
 
 def write_template(urdf: str | Path) -> Path:
-    """Write ``<stem>.transmission.toml`` beside a URDF: all joints, and couplings for ``<mimic>``.
+    """Write ``<stem>.transmission.toml`` next to a URDF: all joints, and couplings for ``<mimic>``.
 
     Figures that the URDF does not tell are ``"TODO"``; as long as one is left, ``load_hand`` names them all.
 
@@ -78,7 +78,7 @@ def write_template(urdf: str | Path) -> Path:
 
 
 def template(model: UrdfModel) -> str:
-    """The text of the file."""
+    """The text of the transmission file, with TODO where the URDF has no figure."""
     base = _base(model)
     normal = _planar_normal(model, base)
     head = _HEAD.format(urdf=_comment(model.path.name), name=_text(model.name), base=_text(base))

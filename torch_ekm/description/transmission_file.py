@@ -19,7 +19,7 @@ def write_transmission(hand: HandDescription, path: str | Path) -> Path:
     """Write springs, rest angles, friction, moment arms, offsets, stiffness and play of ``hand`` to ``path``.
 
     Everything else (ranges, couplings, pads, sensors, notes) is that of ``hand.transmission_path``; comments
-    are lost. The URDF is copied beside it if there is none, so that ``load_hand`` reads the hand back.
+    are lost. The URDF is copied next to it if there is none, so that ``load_hand`` reads the hand back.
 
     Args:
         hand: its description.

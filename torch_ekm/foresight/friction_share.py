@@ -9,6 +9,7 @@ import numpy as np
 
 from .._extras import require
 from ..contact import grasp_matrix
+from ..contact.contact_set import CHARACTERISTIC_LENGTH
 from ..model import KinematicModel, Linearization
 
 _SIDES = 12  # of the pyramid inside a friction cone
@@ -30,7 +31,7 @@ def friction_share(model: KinematicModel, lin: Linearization) -> float:
         lin: of one state, with its forces.
     """
     optimize = require("scipy.optimize")
-    contacts, n, L = lin.contacts, lin.contacts.n_c, model.options.length
+    contacts, n, L = lin.contacts, lin.contacts.n_c, CHARACTERISTIC_LENGTH
     kin = model.contact_kinematics(lin.state, contacts)
     parts = [divmod(row, 6) for row in kin.rows]
     # columns: the components of mu, then the share

@@ -10,6 +10,7 @@ from ..enhanced import EnhancedModel
 from ..exceptions import GraspError
 from ..kinematics import GraspState
 from ..model import KinematicModel, Linearization
+from ..model.force_balance import STOP_TOLERANCE
 from ..plant import Observation, PlantStatus
 from ..typing import Float, Tensor
 from .pose_filter import BlindOptions, PoseFilter
@@ -83,7 +84,7 @@ class ModelHand:
     def at_stops(self, push: float = 0.0) -> list[str]:
         """Joints of the fingers that touch, at a stop that bears more than ``push`` [N m]."""
         lin = self.linearization
-        q, near = self.filter.state.q, self.filter.kinematic.options.stop_tolerance
+        q, near = self.filter.state.q, STOP_TOLERANCE
         touching = (self._q_max > self._q_min) & ((q <= self._q_min + near) | (q >= self._q_max - near))
         if lin is not None:
             kinematics = self.filter.kinematic.kinematics
@@ -131,7 +132,7 @@ class ModelHand:
         return torch.nonzero(out).flatten().tolist()
 
     def _inside(self, q: Tensor, joint: int) -> bool:
-        near = self.filter.kinematic.options.stop_tolerance
+        near = STOP_TOLERANCE
         return bool(self._q_min[joint] + near < q[joint] < self._q_max[joint] - near)
 
     def _linearize(self, lin: Linearization, locked: list[int]) -> Linearization:

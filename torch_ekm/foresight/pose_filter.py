@@ -12,6 +12,8 @@ from typing import NamedTuple
 import torch
 
 from ..contact import ContactSet, constraint_matrix
+from ..contact.contact_set import CHARACTERISTIC_LENGTH
+from ..contact.detector import ContactDetector
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
 from ..exceptions import GraspError, NoContactError, ParameterError
@@ -101,8 +103,8 @@ class PoseFilter:
         self.kinematic, self.enhanced = kinematic_and_enhanced(model)
         self.options, self.touch = BlindOptions() if options is None else options, touch
         self._detector = copy.copy(self.kinematic.detector)
-        if hasattr(self._detector, "margin"):  # a pad that presses touches, however far off it seems
-            self._detector.margin = math.inf  # type: ignore[attr-defined]
+        if isinstance(self._detector, ContactDetector):  # a pad that presses touches, however far off
+            self._detector.margin = math.inf
         self._last: tuple[Linearization, Tensor] | None = None
 
     @property
@@ -213,7 +215,7 @@ class PoseFilter:
         """Q before the contacts have their say."""
         o, n_q = self.options, self.state.q.shape[-1]
         largest = moved.abs().max()
-        unit = moved.new_tensor([self.kinematic.options.length] * 3 + [1.0] * 3)
+        unit = moved.new_tensor([CHARACTERISTIC_LENGTH] * 3 + [1.0] * 3)
         share, size = 1.0, largest
         if ds is not None:
             share = o.model_drift if self.enhanced is None else o.pose_drift
@@ -241,7 +243,7 @@ class PoseFilter:
         """
         if not self.touch:
             raise NoContactError("touch does not count")
-        contacts: ContactSet = self._detector(state.q, state.position, state.rotation)  # type: ignore[operator]
+        contacts: ContactSet = self._detector(state.q, state.position, state.rotation)
         if fingertip_force is None:
             pressing = contacts.gap <= self.kinematic.options.contact_margin
         else:

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from .._checks import check_finite
 from ..contact.contact_set import ContactSet
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
 from ..exceptions import ShapeError
 from ..kinematics.grasp_state import GraspState
-from ..kinematics.tensors import as_tensors, check_finite
+from ..kinematics.tensors import as_tensors
 from ..typing import Float, Tensor
 from .configuration import Configuration, change, moved, settled, stack
 from .prediction import Prediction

@@ -6,7 +6,7 @@ from .actuation import ActuationMap
 from .grasp_state import GraspState
 from .hand_kinematics import HandKinematics
 from .link_poses import LinkPoses
-from .play import Play, PlayState
+from .play import Play
 from .servo_model import IdealServos, ServoModel
 
 __all__ = [
@@ -16,6 +16,5 @@ __all__ = [
     "IdealServos",
     "LinkPoses",
     "Play",
-    "PlayState",
     "ServoModel",
 ]

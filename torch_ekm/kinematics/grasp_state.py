@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import torch
 
+from .._checks import check_finite
 from ..exceptions import ParameterError, ShapeError
 from ..typing import Float, Tensor
 from .se3 import exp, log
-from .tensors import as_tensors, check_finite
+from .tensors import as_tensors
 
 _ROUNDED = 1e-4
 """What a rotation matrix may be off by, entry by entry: four digits are enough, a scale or a shear is not."""

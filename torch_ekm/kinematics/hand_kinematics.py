@@ -177,6 +177,7 @@ def _build_chain(hand: HandDescription, dtype: torch.dtype, device: torch.device
         T, link = carried_by[link].transform @ T, carried_by[link].parent
     frames[urdf.root].link.offset = offset(np.linalg.inv(T))
     chain = pk.Chain(frames[urdf.root], **to)
-    # The frames of a level are neighbours: slices read and write them without a gather, a tenth faster.
+    # The frames of a level are neighbours: slices read and write them without a gather, a tenth faster. The
+    # library has no other place where levels could be given: it makes index tensors of them.
     chain._bfs_levels = [slice(int(level[0]), int(level[-1]) + 1) for level in chain._bfs_levels]
     return chain

@@ -54,7 +54,7 @@ class Play:
         return cls(torch.as_tensor(hand.actuator_backlash).to(dtype))
 
     def unknown(self) -> PlayState:
-        """Anywhere within the play."""
+        """The state after an unknown history: anywhere within the play [rad]."""
         return PlayState(-0.5 * self.width, 0.5 * self.width)
 
     def at(self, position: Float[Tensor, "*batch n_a"]) -> PlayState:

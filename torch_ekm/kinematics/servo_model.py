@@ -8,10 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
+from .._checks import check_finite, check_positive, check_shape
 from .._recorded import Recorded
-from ..exceptions import ParameterError, ShapeError
 from ..typing import Bool, Float, Tensor
-from .tensors import check_finite
 
 _DEG = math.pi / 180
 _PRIOR_STD = (1.0 * _DEG, 0.3 * _DEG)  # [rad] of d and b before the first motion
@@ -80,8 +79,7 @@ class ServoModel(Recorded, nn.Module):
         super().__init__()
         figures = {"encoder_std": encoder_std, "resolution": resolution, "largest": largest}
         for name, value in figures.items():
-            if not 0 < value < math.inf:
-                raise ParameterError(name, value, "positive and finite")
+            check_positive(name, value)
         self.names = tuple(names)
         self.moved_from, self.resolution, self.largest = 3 * encoder_std, resolution, largest
         self._prior = torch.diag(torch.tensor(_PRIOR_STD, dtype=torch.float64).square()) / _NOISE_STD**2
@@ -140,8 +138,7 @@ class ServoModel(Recorded, nn.Module):
             ShapeError, NonFiniteError: nothing is changed.
         """
         for name, value in (("command", command), ("moved", moved)):
-            if value.shape != self.stuck.shape:
-                raise ShapeError(name, f"({len(self.names)},)", value.shape)
+            check_shape(name, value, self.stuck.shape)
             check_finite(name, value)
         free = torch.ones_like(self.stuck) if free is None else free
         v, w = command.double(), moved.double()

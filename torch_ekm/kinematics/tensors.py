@@ -6,7 +6,7 @@ import functools
 
 import torch
 
-from ..exceptions import NonFiniteError, ParameterError
+from ..exceptions import ParameterError
 from ..typing import Tensor
 
 
@@ -18,9 +18,10 @@ def as_tensors(**values: object) -> list[Tensor]:
     Raises:
         ParameterError: something is not made of numbers.
     """
-    kinds = [value.dtype if isinstance(value, Tensor) else None for value in values.values()]
-    if kinds[0] is not None and kinds.count(kinds[0]) == len(kinds) and kinds[0].is_floating_point:
-        return list(values.values())  # type: ignore[arg-type]
+    tensors = [value for value in values.values() if isinstance(value, Tensor)]
+    dtypes = {value.dtype for value in tensors}
+    if len(tensors) == len(values) and len(dtypes) == 1 and dtypes.pop().is_floating_point:
+        return tensors
     try:
         given = [torch.as_tensor(v).dtype if hasattr(v, "dtype") else torch.float64 for v in values.values()]
         wide = [dtype if dtype.is_floating_point else torch.float64 for dtype in given]
@@ -29,14 +30,3 @@ def as_tensors(**values: object) -> list[Tensor]:
     except (TypeError, ValueError, RuntimeError) as error:
         valid = f"numbers, in a tensor, an array or nested lists ({error})"
         raise ParameterError(", ".join(values), tuple(values.values()), valid) from None
-
-
-def check_finite(name: str, value: Tensor) -> None:
-    """No entry is NaN or infinite.
-
-    Raises:
-        NonFiniteError: with the first places of those that are.
-    """
-    finite = torch.isfinite(value)
-    if not bool(finite.all()):
-        raise NonFiniteError(name, torch.nonzero(~finite)[:3].tolist())

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ..contact.contact_kinematics import ContactKinematics
-from ..contact.contact_set import ContactSet
-from ..contact.forces.balance import BalanceEquations, ForceStatus
+from ..contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
+from ..contact.forces.balance import BalanceEquations, ForceSolution, ForceStatus
 from ..contact.forces.friction import friction_cones, margins
-from ..contact.forces.options import ForceOptions
 from ..contact.forces.solve import contact_forces
 from ..description.hand import HandDescription
 from ..typing import Array, Bool, Float, Tensor
@@ -22,12 +23,45 @@ from .options import ModelOptions
 from .reduction import Reduction
 
 Mask = NDArray[np.bool_]
+STOP_TOLERANCE = math.radians(0.1)
+"""How near to a limit a joint counts as touching its stop [rad]. Joint angles alone cannot tell how much
+torque a stop takes from the contact forces; fingertip sensors can."""
+_STOP_TORQUE = 0.01  # [N m] above which a stop holds its joint; below, the joint may leave
+
+
+@dataclass(frozen=True)
+class Statics:
+    """A state, or a batch, as its equilibrium ``V_s + A^T mu + B^T lam = 0`` sees it."""
+
+    q: Float[Tensor, "*batch n_q"]
+    """Joint angles [rad]."""
+    kin: ContactKinematics
+    A: Float[Tensor, "*batch n_h n_s"]
+    """Constraint matrix of the contacts."""
+    V_s: Float[Tensor, "*batch n_s"]
+    """Gradient of the potential energy [N m, N]."""
+    locked: list[int]
+    """Joints that stick, by index."""
+
+
+@dataclass(frozen=True)
+class KnownForces:
+    """What sensors and the step before say of the forces; None: nothing."""
+
+    normal: Float[Tensor, "*batch n_c"] | None = None
+    """Measured normal forces [N], NaN where there is no sensor."""
+    actuator_load: Float[Tensor, "*batch n_a"] | None = None
+    """Measured force of each actuator along +a [N m], NaN where there is no sensor."""
+    expected: ExpectedForces | None = None
+    """Prediction from the state before."""
+    last: GraspForces | None = None
+    """Forces of the step before, which stand in where the problem has no answer."""
 
 
 class ForceBalance:
     """Builds :class:`BalanceEquations` for each state of a batch and solves them one by one.
 
-    Joints near a limit get a one-sided stop torque and locked joints a free one, beside the soft joint
+    Joints near a limit get a one-sided stop torque and locked joints a free one, next to the soft joint
     residual.
     """
 
@@ -38,13 +72,15 @@ class ForceBalance:
         self.tendon = np.array([actuator.tendon for actuator in hand.actuators])
         # joint torque [N m] that the weight of the forces may leave where a tendon pulls nothing
         arm, limit = np.linalg.norm(self._arms(), axis=0), options.slack_tension
-        no_pull = 1e-3 * options.length / np.where(arm > 0, arm, 1.0) + (0.0 if limit is None else limit)
+        no_pull = 1e-3 * CHARACTERISTIC_LENGTH / np.where(arm > 0, arm, 1.0) + (
+            0.0 if limit is None else limit
+        )
         pulls = self.tendon & (limit is not None)
         self.slack_above = torch.from_numpy(np.where(pulls, -no_pull, np.inf))
         # a joint beyond one of these touches its stop
         stops = (np.abs(self.joint_basis) > 1e-9).any(1)
-        self.low = np.where(stops, hand.joint_lower + options.stop_tolerance, -np.inf)
-        self.high = np.where(stops, hand.joint_upper - options.stop_tolerance, np.inf)
+        self.low = np.where(stops, hand.joint_lower + STOP_TOLERANCE, -np.inf)
+        self.high = np.where(stops, hand.joint_upper - STOP_TOLERANCE, np.inf)
         gram = self.joint_basis.T @ self.joint_basis
         self.weight = None if np.allclose(gram, np.eye(len(gram))) else np.linalg.inv(gram)
         # smallest joint torques that make up a generalised residual
@@ -61,7 +97,7 @@ class ForceBalance:
     ) -> Bool[Tensor, "*batch n_q"]:
         """Joints near a stop that bears more than the threshold."""
         low, high = (torch.as_tensor(stop, device=q.device) for stop in (self.low, self.high))
-        return (torque.abs() > self.options.stop_torque) & ((q <= low) | (q >= high))
+        return (torque.abs() > _STOP_TORQUE) & ((q <= low) | (q >= high))
 
     def slack(self, forces: GraspForces) -> Bool[Tensor, "*batch n_a"]:
         """Tendons that pull with no more than ``slack_tension``, where forces were found."""
@@ -74,43 +110,27 @@ class ForceBalance:
             slack = slack & found.reshape(*lam.shape[:-1], 1)
         return slack
 
-    def __call__(
-        self,
-        q: Tensor,
-        kin: ContactKinematics,
-        A: Tensor,
-        V_q: Tensor,
-        V_p: Tensor,
-        locked: list[int],
-        measured_normal: Tensor | None,
-        last: GraspForces | None,
-        normal_std: float | None = None,
-        actuator_load: Tensor | None = None,
-        expected: ExpectedForces | None = None,
-    ) -> GraspForces:
-        """Solve every state; where there is no answer use the forces of ``last`` or zeros.
-
-        Measured normal forces ``(*batch, n_c)``, actuator loads and expected forces take part where given.
-        """
+    def __call__(self, at: Statics, known: KnownForces) -> GraspForces:
+        """Solve every state; where there is no answer use the forces of ``known.last`` or zeros."""
+        q, kin, options = at.q, at.kin, self.options.forces
         batch, n_q = q.shape[:-1], q.shape[-1]
-        options = self.options.forces
 
         def rows(x: Tensor) -> Array:
             return x.detach().reshape(-1, *x.shape[len(batch) :]).double().cpu().numpy()
 
-        states = zip(*(rows(x) for x in (q, A, V_q, V_p)), strict=True)
-        measured = None if measured_normal is None else rows(measured_normal)
-        load = None if actuator_load is None else rows(actuator_load)
-        estimating = not (measured is None and load is None and expected is None)
-        prior = ForcePrior(kin, expected, options) if estimating else None
+        states = zip(*(rows(x) for x in (q, at.A, at.V_s[..., :n_q], at.V_s[..., n_q:])), strict=True)
+        measured = None if known.normal is None else rows(known.normal)
+        load = None if known.actuator_load is None else rows(known.actuator_load)
+        estimating = not (measured is None and load is None and known.expected is None)
+        prior = ForcePrior(kin, known.expected, options) if estimating else None
         cones = friction_cones(
             kin.models, kin.contacts.friction.tolist(), kin.contacts.torsional_friction.tolist()
         )
-        spins = tuple(at for at, row in enumerate(kin.rows) if row % 6 >= 3)
+        spins = tuple(place for place, row in enumerate(kin.rows) if row % 6 >= 3)
         actuation = self._arms()
-        results = []
+        table, problems = [], []
         for k, (q_k, A_k, V_q_k, V_p_k) in enumerate(states):
-            joints, lower, upper = self._bounded(q_k, locked)
+            joints, lower, upper = self._bounded(q_k, at.locked)
             eq = BalanceEquations(
                 object_matrix=-self.pose_basis.T @ A_k[:, n_q:].T,
                 object_load=self.pose_basis.T @ V_p_k,
@@ -118,7 +138,6 @@ class ForceBalance:
                 actuator_matrix=actuation,
                 hand_load=self.joint_basis.T @ V_q_k,
                 cones=cones,
-                length=self.options.length,
                 moment_rows=self.moment_rows,
                 tendon=self.tendon,
                 spin_columns=spins,
@@ -127,9 +146,7 @@ class ForceBalance:
                 bound_upper=upper,
                 weight=self.weight,
                 measured_normal=None if measured is None else measured[k],
-                normal_std=options.normal_std if normal_std is None else normal_std,
                 measured_actuator=None if load is None else load[k],
-                actuator_std=options.actuator_std,
             )
             if prior is not None:
                 eq = prior.into(eq, k)
@@ -139,45 +156,51 @@ class ForceBalance:
             if solution.status is ForceStatus.SOLVED:
                 residual = self.lift @ solution.residual
                 np.add.at(torque, joints, solution.bound)
-            elif last is not None:
-                mu, lam = (x.expand(*batch, -1).reshape(-1, x.shape[-1])[k] for x in (last.mu, last.lam))
-                mu, lam = (x.detach().double().cpu().numpy() for x in (mu, lam))
+            elif known.last is not None:
+                last = (known.last.mu, known.last.lam)
+                mu, lam = (rows(x.expand(*batch, -1))[k] for x in last)
             else:
                 mu, lam = np.zeros_like(mu), np.zeros_like(lam)
-            kept = (*margins(cones, mu), [solution.violation], solution, eq)
-            results.append((mu, lam, residual, torque, *kept))
+            table.append((mu, lam, residual, torque, *margins(cones, mu), [solution.violation]))
+            problems.append((eq, solution))
 
         names = ("mu", "lam", "residual", "stop_torque", "margin", "relative_margin", "violation")
-        sizes = [len(part) for part in results[0][:7]]
-        table = torch.from_numpy(np.stack([np.concatenate(r[:7]) for r in results])).to(q)
-        parts = dict(zip(names, table.reshape(*batch, -1).split(sizes, dim=-1), strict=True))
+        sizes = [len(part) for part in table[0]]
+        stacked = torch.from_numpy(np.stack([np.concatenate(row) for row in table])).to(q)
+        parts = dict(zip(names, stacked.reshape(*batch, -1).split(sizes, dim=-1), strict=True))
         parts["violation"] = parts["violation"][..., 0]
-        inputs = (A, V_q, V_p, self.reduction.actuation)
+        inputs = (at.A, at.V_s, self.reduction.actuation)
         if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
-            known = [parts[name] for name in names[:3]]
-            moving = self._with_graph([(r[8], r[7]) for r in results], A, V_q, V_p, *known)
+            moving = self._with_graph(problems, at, *(parts[name] for name in names[:3]))
             parts.update(zip(names, moving, strict=False))
-        forces = pack_forces(kin, **parts, status=tuple(r[7].status for r in results))
+        status = tuple(solution.status for _, solution in problems)
+        forces = pack_forces(kin, **parts, status=status)
         if prior is None or not forces.solved:
             return forces
-        sure = [prior.stacked(r[7].covariance, k) for k, r in enumerate(results)]
-        return with_covariance(kin.contacts, forces, torch.from_numpy(np.stack(sure)).to(q), options)
+        sure = [prior.stacked(solution.covariance, k) for k, (_, solution) in enumerate(problems)]
+        return with_covariance(kin.contacts, forces, torch.from_numpy(np.stack(sure)).to(q))
 
     def _with_graph(
-        self, problems: list, A: Tensor, V_q: Tensor, V_p: Tensor, mu: Tensor, lam: Tensor, residual: Tensor
+        self,
+        problems: list[tuple[BalanceEquations, ForceSolution]],
+        at: Statics,
+        mu: Tensor,
+        lam: Tensor,
+        residual: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """``mu``, ``lam`` and e with their derivative; those of an unsolved problem are constants."""
-        n_q, batch = V_q.shape[-1], mu.dim() - 1
+        n_q, batch, A = at.q.shape[-1], mu.dim() - 1, at.A
+        V_q, V_p = at.V_s[..., :n_q], at.V_s[..., n_q:]
         Z, Z_p, lift = (torch.from_numpy(x).to(A) for x in (self.joint_basis, self.pose_basis, self.lift))
         J_a = (self.reduction.actuation @ Z).mT
         G, load, hand, V_z = -Z_p.mT @ A[..., n_q:].mT, V_p @ Z_p, Z.mT @ A[..., :n_q].mT, V_q @ Z
         results = []
         for k, (eq, solution) in enumerate(problems):
-            at = [x.reshape(-1, *x.shape[batch:])[k] for x in (mu, lam, residual, G, load, hand, V_z)]
-            forces = tuple(at[:3])
+            own = [x.reshape(-1, *x.shape[batch:])[k] for x in (mu, lam, residual, G, load, hand, V_z)]
+            forces = tuple(own[:3])
             if solution.status is ForceStatus.SOLVED:
                 *forces, e = differentiable_forces(
-                    eq, self.options.forces, solution, *at[3:6], actuator_matrix=J_a, hand_load=at[6]
+                    eq, self.options.forces, solution, *own[3:6], actuator_matrix=J_a, hand_load=own[6]
                 )
                 forces = (*forces, lift @ e)
             results.append(forces)
@@ -205,36 +228,9 @@ def pack_forces(kin: ContactKinematics, mu: Tensor, lam: Tensor, **rest) -> Gras
     return GraspForces(mu=mu, lam=lam, force=force, spin_moment=spin, normal=full[..., 0], **rest)
 
 
-def with_covariance(
-    contacts: ContactSet, forces: GraspForces, covariance: Tensor, options: ForceOptions
-) -> GraspForces:
+def with_covariance(contacts: ContactSet, forces: GraspForces, covariance: Tensor) -> GraspForces:
     """The forces with how sure they are; ``covariance`` of the stack, one for each state ``(-1, m, m)``."""
     covariance = covariance.reshape(*forces.normal.shape[:-1], *covariance.shape[-2:])
     normal, _, gradient = friction_use(contacts, forces.force, forces.spin_moment, contacts.normal)
-    std = margin_std(contacts, normal, gradient, covariance, options)
+    std = margin_std(contacts, normal, gradient, covariance)
     return dataclasses.replace(forces, covariance=covariance, margin_std=std)
-
-
-def known_forces(kin: ContactKinematics, mu: Tensor, lam: Tensor) -> GraspForces:
-    """Forces that are given, e.g. those of an exact equilibrium, with their margins."""
-    cones = friction_cones(
-        kin.models, kin.contacts.friction.tolist(), kin.contacts.torsional_friction.tolist()
-    )
-    pairs = [margins(cones, row) for row in mu.detach().reshape(-1, mu.shape[-1]).double().cpu().numpy()]
-    batch = mu.shape[:-1]
-    slack, relative = (
-        torch.from_numpy(np.stack([pair[k] for pair in pairs])).to(mu).reshape(*batch, -1) for k in (0, 1)
-    )
-    n_q = kin.axis.shape[-2]
-    zero = mu.new_zeros(*batch, n_q)
-    return pack_forces(
-        kin,
-        mu,
-        lam,
-        residual=zero,
-        stop_torque=zero,
-        margin=slack,
-        relative_margin=relative,
-        status=(ForceStatus.SOLVED,) * len(pairs),
-        violation=mu.new_zeros(batch),
-    )

@@ -57,7 +57,7 @@ def only_if_asked(method: Callable[..., Any]) -> Any:
 
 
 def detached(state: GraspState) -> GraspState:
-    """The same numbers without a graph."""
+    """The same state without a graph: no gradient flows back from it."""
     return GraspState(state.q.detach(), state.position.detach(), state.rotation.detach())
 
 

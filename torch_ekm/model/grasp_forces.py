@@ -20,6 +20,9 @@ from ..exceptions import ShapeError
 from ..typing import Array, Float, Tensor
 
 _ANY_FORCE = 10.0  # [N] standard deviation of a normal force of which nothing is known
+_DRIFT_STD = 0.15  # [N] of a contact force's drift from its prediction at every motion, per axis
+_CHANGE_STD = 0.3  # the same as a share of the predicted change; both add up
+_FRICTION_STD = 0.05  # of the friction coefficients, relative
 
 
 @dataclass(frozen=True)
@@ -104,13 +107,13 @@ def friction_use(
 
 
 def margin_std(
-    contacts: ContactSet, normal_force: Tensor, gradient: Tensor, covariance: Tensor, options: ForceOptions
+    contacts: ContactSet, normal_force: Tensor, gradient: Tensor, covariance: Tensor
 ) -> Float[Tensor, "*batch n_c"]:
     """``sqrt(g^T Sigma g + (s mu_s f_n)^2)``, g the margin's gradient, s of the friction coefficient [N]."""
     blocks = covariance.unflatten(-1, (-1, 4)).unflatten(-3, (-1, 4))
     own = torch.einsum("...ijik->...ijk", blocks)
     variance = (gradient[..., None, :] @ own @ gradient[..., None])[..., 0, 0]
-    return (variance.clamp_min(0.0) + (options.friction_std * contacts.friction * normal_force) ** 2).sqrt()
+    return (variance.clamp_min(0.0) + (_FRICTION_STD * contacts.friction * normal_force) ** 2).sqrt()
 
 
 def start_covariance(
@@ -127,14 +130,12 @@ def start_covariance(
     return torch.einsum("...iab,ij->...iajb", blocks, spread).reshape(*normal.shape[:-2], m, m)
 
 
-def drift(
-    df: Float[Tensor, "*batch n_c 3"], dspin: Tensor, options: ForceOptions
-) -> Float[Tensor, "*batch m"]:
-    """Variance that an increment adds: ``drift_std^2 + (change_std |df_i|)^2``, moments likewise."""
+def drift(df: Float[Tensor, "*batch n_c 3"], dspin: Tensor) -> Float[Tensor, "*batch m"]:
+    """Variance that an increment adds: ``sigma_d^2 + (sigma_c |df_i|)^2``, moments likewise."""
     change = torch.cat([df.norm(dim=-1, keepdim=True).expand_as(df), dspin[..., None]], dim=-1)
     one = torch.tensor([1.0, 1.0, 1.0, CHARACTERISTIC_LENGTH], dtype=df.dtype, device=df.device)
-    least = (options.drift_std * one).expand(*df.shape[:-1], 4).flatten(-2)
-    return least.square() + (options.change_std * change.flatten(-2)).square()
+    least = (_DRIFT_STD * one).expand(*df.shape[:-1], 4).flatten(-2)
+    return least.square() + (_CHANGE_STD * change.flatten(-2)).square()
 
 
 class ForcePrior:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import nn
 
 from ..contact.contact_kinematics import ContactKinematics, constraint_matrix, contact_kinematics
-from ..contact.contact_set import ContactSet
+from ..contact.contact_set import ContactSet, Detector
+from ..contact.detector import ContactDetector
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError
 from ..kinematics.grasp_state import GraspState
-from ..typing import Float, Tensor
+from ..kinematics.hand_kinematics import HandKinematics
+from ..kinematics.link_poses import Kinematics, LinkPoses
+from ..typing import Bool, Float, Tensor
 from .checks import at_pads, check_contacts, check_inertia, check_state, joint_index
-from .force_balance import ForceBalance
+from .force_balance import ForceBalance, KnownForces, Statics
 from .gradients import following, only_if_asked
 from .grasp_forces import ExpectedForces, GraspForces
 from .linearization import Linearization
@@ -56,39 +59,37 @@ class KinematicModel(nn.Module):
         DescriptionError: the hand has no pads for the detector.
     """
 
+    spring_stiffness: Float[Tensor, " n_q"]
+    """Diagonal of K_s [N m/rad]."""
+    spring_rest: Float[Tensor, " n_q"]
+    """q0 [rad]."""
+    weight: Float[Tensor, " 3"]
+    """Of the object, hand frame [N]."""
+    com: Float[Tensor, " 3"]
+    """Of the object, in its own frame [m]."""
+    plane: Float[Tensor, " 3"] | None
+    """Normal of a planar hand's plane; None: a spatial hand."""
+    precedes: Bool[Tensor, "n_q n_q"]
+    """Joint a is proximal to joint b or equal to it."""
+
     def __init__(
         self,
         hand: HandDescription,
         obj,
         options: ModelOptions | None = None,
         *,
-        kinematics: nn.Module | None = None,
-        detector: Callable[[Tensor, Tensor, Tensor], ContactSet] | None = None,
+        kinematics: Kinematics | None = None,
+        detector: Detector | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
         check_inertia(obj)
-        self._detector_takes_poses = False
         self.hand, self.obj, self.options = hand, obj, options or ModelOptions()
-        if kinematics is None:
-            from ..kinematics import HandKinematics
-
-            kinematics = HandKinematics(hand, dtype=dtype)
+        self.kinematics = HandKinematics(hand, dtype=dtype) if kinematics is None else kinematics
         if detector is None:
-            from ..contact.detector import ContactDetector
-
-            o = self.options
-            detector = ContactDetector(
-                hand,
-                obj,
-                o.contact_margin,
-                o.crown_radius,
-                kinematics=kinematics,  # type: ignore[arg-type]
-                link_margin=o.link_margin,
-            )
-            self._detector_takes_poses = True
-        self.kinematics, self.detector = kinematics, detector
-        self.link_names: tuple[str, ...] = tuple(kinematics.link_names)  # type: ignore[arg-type]
+            detector = ContactDetector(hand, obj, self.options.contact_margin, kinematics=self.kinematics)
+        self.detector = detector
+        self.link_names = tuple(self.kinematics.link_names)
         self.reduction = Reduction(hand, self.options, dtype)
         self.balance = ForceBalance(hand, self.options, self.reduction)
 
@@ -101,16 +102,14 @@ class KinematicModel(nn.Module):
         """g in the hand frame [m/s^2]."""
         buffer("weight", float(obj.mass) * torch.tensor(self.gravity, dtype=torch.float64))
         buffer("com", obj.com)
-        self.plane: Tensor | None
         normal = hand.planar_normal
         self.register_buffer(
             "plane", None if normal is None else torch.tensor(normal, dtype=dtype), persistent=False
         )
-        upstream: Tensor = kinematics.upstream  # type: ignore[assignment]
-        self.register_buffer("precedes", precedence(upstream), persistent=False)
+        self.register_buffer("precedes", precedence(self.kinematics.upstream), persistent=False)
         self.link_weights: LinkWeights | None = None
         if self.options.link_weights:
-            self.link_weights = LinkWeights(hand, kinematics, self.gravity, dtype)
+            self.link_weights = LinkWeights(hand, self.kinematics, self.gravity, dtype)
 
     def extra_repr(self) -> str:
         return f"hand={self.hand.name}, n_q={self.hand.n_q}, n_a={self.hand.n_a}"
@@ -135,10 +134,13 @@ class KinematicModel(nn.Module):
         """
         return self._detect(state, None)
 
-    def _detect(self, state: GraspState, poses: object | None) -> ContactSet:
-        posture = poses if self._detector_takes_poses and poses is not None else state.q
+    def _detect(self, state: GraspState, poses: LinkPoses | None) -> ContactSet:
+        detector, place = self.detector, (state.position, state.rotation)
         with torch.no_grad():
-            contacts = self.detector(posture, state.position, state.rotation)  # type: ignore[arg-type]
+            if isinstance(detector, ContactDetector) and poses is not None:
+                contacts = detector(poses, *place)
+            else:
+                contacts = detector(state.q, *place)
         if contacts.n_c == 0:
             raise NoContactError("no finger touches the object, so no actuator can move it")
         return following(contacts, self.contacts, state) if torch.is_grad_enabled() else contacts
@@ -149,13 +151,13 @@ class KinematicModel(nn.Module):
         contacts: ContactSet,
         *,
         rolling: bool | None = None,
-        poses: object | None = None,
+        poses: LinkPoses | None = None,
     ) -> ContactKinematics:
         """Motion of the contact points, frames and lever arms at a state (``poses``: if known already)."""
-        poses = self.kinematics(state.q) if poses is None else poses
-        axis, origin = self.kinematics.joint_axes(poses)  # type: ignore[operator]
+        found = self.kinematics(state.q) if poses is None else poses
+        axis, origin = self.kinematics.joint_axes(found)
         links = [self.link_names.index(name) for name in contacts.link]
-        upstream = self.kinematics.upstream[links]  # type: ignore[index]
+        upstream = self.kinematics.upstream[links]
         rolling = self.options.rolling if rolling is None else rolling
         return contact_kinematics(
             contacts, state.position, axis, origin, upstream, plane=self.plane, rolling=rolling
@@ -205,15 +207,13 @@ class KinematicModel(nn.Module):
             UnstableGraspError: the grasp buckles (unless ``on_unstable="flag"``).
             NonFiniteError, ShapeError, UnknownNameError: bad input.
         """
-        check_state(self.hand, state, contacts, self.weight.dtype)  # type: ignore[arg-type]
+        check_state(self.hand, state, contacts, self.weight.dtype)
         poses = self.kinematics(state.q)
         contacts = self._detect(state, poses) if contacts is None else contacts
         check_contacts(state, contacts, self.link_names, self.options.max_overlap)
         kin = self.contact_kinematics(state, contacts, poses=poses)
-        n_q = self.hand.n_q
         A = constraint_matrix(kin)
         V_s, V_ss = self.potential(state, poses)
-        V_q, V_p = V_s[..., :n_q], V_s[..., n_q:]
         lock = [joint_index(self.hand, name) for name in locked]
         last, measured = None, None
         if fingertip_force is not None:
@@ -225,28 +225,14 @@ class KinematicModel(nn.Module):
                 and previous.contacts.finger == contacts.finger
             ):
                 last = previous.forces
-            felt = None if measured is None else torch.stack([measured[f] for f in contacts.finger], dim=-1)
-            forces = self.balance(
-                state.q, kin, A, V_q, V_p, lock, felt, last, actuator_load=actuator_load, expected=expected
-            )
+            touch = None if measured is None else torch.stack([measured[f] for f in contacts.finger], dim=-1)
+            known = KnownForces(touch, actuator_load, expected, last)
+            forces = self.balance(Statics(state.q, kin, A, V_s, lock), known)
 
         o = self.options
         if on_unstable is not None and on_unstable != o.on_unstable:
             o = dataclasses.replace(o, on_unstable=on_unstable)
-        D = geometric_stiffness(
-            kin,
-            forces.force,
-            forces.spin_moment,
-            self.precedes,  # type: ignore[arg-type]
-            hand=o.hand_stiffness,
-            obj=o.object_stiffness,
-            rolling=o.rolling,
-        )
-        D = D + V_ss
-        if o.stiffness_floor:
-            joints = torch.arange(n_q, device=D.device)
-            D[..., joints, joints] += o.stiffness_floor
-
+        D = self.load_stiffness(kin, forces) + V_ss
         held = self.balance.held_by_stops(state.q, forces.stop_torque)
         held[..., lock] = True
         J, dmu, dlam, stability = self.reduction.solve(
@@ -281,20 +267,24 @@ class KinematicModel(nn.Module):
             ),
         )
 
+    def load_stiffness(self, kin: ContactKinematics, forces: GraspForces) -> Float[Tensor, "*batch n_s n_s"]:
+        """``dF/ds`` at constant contact forces: lever arms of hand and object, rolling, soft-finger spin."""
+        return geometric_stiffness(kin, forces.force, forces.spin_moment, self.precedes)
+
     def potential(
-        self, state: GraspState, poses: object | None = None
+        self, state: GraspState, poses: LinkPoses | None = None
     ) -> tuple[Float[Tensor, "*batch n_s"], Float[Tensor, "*batch n_s n_s"]]:
         """``V_s`` [N m, N] and ``V_ss`` of springs, the object's weight and (as an option) the links'."""
         n_q = self.hand.n_q
-        com_lever = (state.rotation @ self.com[:, None])[..., 0]  # type: ignore[index]
-        V_q = spring_torque(state.q, self.spring_stiffness, self.spring_rest)  # type: ignore[arg-type]
+        com_lever = (state.rotation @ self.com[:, None])[..., 0]
+        V_q = spring_torque(state.q, self.spring_stiffness, self.spring_rest)
         V_ss = state.q.new_zeros(*state.q.shape[:-1], n_q + 6, n_q + 6)
-        V_ss[..., :n_q, :n_q] = torch.diag(self.spring_stiffness)  # type: ignore[arg-type]
-        V_ss[..., n_q:, n_q:] = gravity_hessian(self.weight, com_lever)  # type: ignore[arg-type]
+        V_ss[..., :n_q, :n_q] = torch.diag(self.spring_stiffness)
+        V_ss[..., n_q:, n_q:] = gravity_hessian(self.weight, com_lever)
         if self.link_weights is not None:
             poses = self.kinematics(state.q) if poses is None else poses
             gradient, hessian = self.link_weights(poses)
             V_q = V_q + gradient
             V_ss[..., :n_q, :n_q] += hessian
-        V_p = gravity_gradient(self.weight, com_lever)  # type: ignore[arg-type]
+        V_p = gravity_gradient(self.weight, com_lever)
         return torch.cat([V_q, V_p], dim=-1), V_ss

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import torch
 
+from .._checks import check_finite
 from ..contact.contact_set import ContactSet
 from ..exceptions import ShapeError
 from ..kinematics.grasp_state import GraspState
-from ..kinematics.tensors import as_tensors, check_finite
+from ..kinematics.tensors import as_tensors
 from ..typing import Bool, Float, Tensor
 from .grasp_forces import ExpectedForces, GraspForces, drift, friction_use, margin_std, start_covariance
 from .options import ModelOptions
@@ -62,7 +63,7 @@ class Linearization:
 
     @property
     def joint_jacobian(self) -> Float[Tensor, "*batch n_q n_a"]:
-        """dq/da."""
+        """dq/da [rad/rad]: the joint rows of ``J_m``."""
         return self.manipulation_jacobian[..., : self.n_q, :]
 
     @property
@@ -103,10 +104,10 @@ class Linearization:
         normal = self.contacts.normal + _times(self.normal_motion, da[..., None, :])
         normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
         f_n, margin, gradient = friction_use(self.contacts, force, spin, normal)
-        options, covariance = self.options.forces, self.forces.covariance
+        covariance = self.forces.covariance
         if covariance is None:
-            covariance = start_covariance(self.contacts.normal, options)
-        covariance = covariance + torch.diag_embed(drift(df, dspin, options))
+            covariance = start_covariance(self.contacts.normal, self.options.forces)
+        covariance = covariance + torch.diag_embed(drift(df, dspin))
         return ExpectedForces(
             finger=self.contacts.finger,
             force=force,
@@ -115,7 +116,7 @@ class Linearization:
             margin=margin,
             actuator=-(self.forces.lam + _times(self.actuator_force_sensitivity, da)),
             covariance=covariance,
-            margin_std=margin_std(self.contacts, f_n, gradient, covariance, options),
+            margin_std=margin_std(self.contacts, f_n, gradient, covariance),
         )
 
     def margins_after(self, delta_a: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_c"]:

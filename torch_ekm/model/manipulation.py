@@ -11,7 +11,6 @@ E ds           = R da        R = [0; I]
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,6 +18,9 @@ import torch
 
 from ..exceptions import SingularGraspError, UnstableGraspError
 from ..typing import Float, Tensor
+
+_RANK = 1e-8  # singular values of E below this share of the largest are zero
+_STIFFNESS = 1e-9  # eigenvalues of N^T D N within this share of |D| are zero
 
 
 @dataclass(frozen=True)
@@ -37,10 +39,8 @@ def two_stage(
     D: Float[Tensor, "*batch n n"],
     E: Float[Tensor, "*batch m n"],
     R: Float[Tensor, "m n_a"],
-    F: Float[Tensor, "*batch n n_a"] | None = None,
+    F: Float[Tensor, "... n n_a"] | None = None,
     *,
-    rank_tolerance: float = 1e-8,
-    stiffness_tolerance: float = 1e-9,
     on_unstable: str = "raise",
     actuators: Sequence[str] = (),
 ) -> KKTSolution:
@@ -53,9 +53,7 @@ def two_stage(
         D: stiffness, in coordinates scaled so that its entries compare.
         E: rows that hold exactly.
         R: how fast each row is driven by each actuator.
-        F: generalised forces of compliant actuators, per unit of da.
-        rank_tolerance: singular values of E below this share of the largest are zero.
-        stiffness_tolerance: eigenvalues of N^T D N within this share of |D| are zero.
+        F: generalised forces of compliant actuators, per unit of da; one for all states, or one for each.
         on_unstable: "raise", or "flag" (return the formal answer; read ``stability``).
         actuators: their names, for messages.
 
@@ -65,9 +63,9 @@ def two_stage(
         UnstableGraspError: N^T D N has a negative eigenvalue: the grasp buckles.
     """
     if D.requires_grad or E.requires_grad:
-        return _differentiable(D, E, R, F, rank_tolerance, stiffness_tolerance, on_unstable)
+        return _differentiable(D, E, R, F, on_unstable)
     eps = torch.finfo(D.dtype).eps
-    rank_tolerance, stiffness_tolerance = max(rank_tolerance, 10 * eps), max(stiffness_tolerance, 10 * eps)
+    rank_tolerance, stiffness_tolerance = max(_RANK, 10 * eps), max(_STIFFNESS, 10 * eps)
     pinv, N = _range_and_null(E, rank_tolerance)
     P = pinv @ R
     lost = (E @ P - R).detach()
@@ -88,20 +86,17 @@ def two_stage(
     return KKTSolution(J, -(pinv.mT @ unbalanced), stability)
 
 
-def _differentiable(
-    D: Tensor, E: Tensor, R: Tensor, F: Tensor | None, rank: float, stiffness: float, on_unstable: str
-) -> KKTSolution:
+def _differentiable(D: Tensor, E: Tensor, R: Tensor, F: Tensor | None, on_unstable: str) -> KKTSolution:
     """The same, with the derivative by the implicit function theorem: that of a null space is not defined.
 
     A second solve has the residual of both equations on its right-hand side, which is 0 and has a derivative.
     """
     D0, E0 = D.detach(), E.detach()
     load = R.new_zeros(D.shape[-1], R.shape[-1]) if F is None else F
-    solve = functools.partial(two_stage, D0, E0, rank_tolerance=rank, stiffness_tolerance=stiffness)
-    at = solve(R.detach(), load.detach(), on_unstable=on_unstable)
+    at = two_stage(D0, E0, R.detach(), load.detach(), on_unstable=on_unstable)
     J, nu = at.motion, at.reaction
     moved, loaded = R - E @ J, load - D @ J - E.mT @ nu
-    change = solve(moved - moved.detach(), loaded - loaded.detach(), on_unstable="flag")
+    change = two_stage(D0, E0, moved - moved.detach(), loaded - loaded.detach(), on_unstable="flag")
     return KKTSolution(J + change.motion, nu + change.reaction, at.stability)
 
 
@@ -159,7 +154,7 @@ def _judge(K: Tensor, N: Tensor, stability: Tensor, tolerance: Tensor, on_unstab
         _, vectors = torch.linalg.eigh(0.5 * (flat_K[at] + flat_K[at].mT))
         direction = (flat_N[at] @ vectors[:, 0]).detach()
     if singular or abs(value) <= float(tolerance.reshape(-1)[at]):
-        whose, remedy = "the joints", "give them a spring, a stiffness floor, or a lock"
+        whose, remedy = "the joints", "give them a spring, or a lock"
         if float(direction[-6:].square().sum()) > 0.5:  # a unit vector: mostly of the object's twist
             whose = "the object"
             remedy = "its contacts leave it free, as before a loss: add contacts, or torsional friction"

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
 from torch import nn
-from torch.nn.functional import pad
 
+from ..contact.contact_set import CHARACTERISTIC_LENGTH
 from ..description.hand import HandDescription
 from ..exceptions import SingularGraspError, UnstableGraspError
 from ..kinematics.null_space import null_space
@@ -60,12 +59,12 @@ class Reduction(nn.Module):
         self.register_buffer("pose_basis", pose, persistent=False)
         self.register_buffer("basis", torch.block_diag(joint, pose), persistent=False)
         pose_scaled = pose.clone()
-        pose_scaled[:3] *= options.length
+        pose_scaled[:3] *= CHARACTERISTIC_LENGTH
         self.register_buffer("scaled_basis", torch.block_diag(joint, pose_scaled), persistent=False)
         J_a = torch.as_tensor(hand.actuation_jacobian).to(dtype)
         self.register_buffer("actuation", J_a, persistent=False)
         stiffness = torch.tensor([actuator.stiffness for actuator in hand.actuators], dtype=dtype)
-        # beside a spring of 1 N m/rad a million is rigid to 1e-6, but drowns it in the tests of rank
+        # next to a spring of 1 N m/rad a million is rigid to 1e-6, but drowns it in the tests of rank
         rigid = stiffness * J_a.square().sum(-1) > 1e6
         if not options.actuator_compliance:
             rigid = torch.ones_like(rigid)
@@ -86,7 +85,6 @@ class Reduction(nn.Module):
         ```
         D' = Z^T D Z + B_c^T K_a B_c          compliant actuators stand in the stiffness
         E  = [A Z; B_r Z; e_j^T Z]            rigid rows: contacts, rigid actuators, held joints
-        D' = blkdiag(D', I), A Z = [A Z, I/sqrt(K_c L^2)]     compliant contacts, deformed by u/sqrt(K_c L^2)
         ```
 
         Args:
@@ -117,7 +115,12 @@ class Reduction(nn.Module):
     def _solve(
         self, D: Tensor, A: Tensor, rows: list[int], held: Tensor, slack: Tensor, on_unstable: str
     ) -> GraspResponse:
-        n_q, n_a, n_h, L = self.joint_basis.shape[0], self.actuation.shape[0], len(rows), self.options.length
+        n_q, n_a, n_h, L = (
+            self.joint_basis.shape[0],
+            self.actuation.shape[0],
+            len(rows),
+            CHARACTERISTIC_LENGTH,
+        )
         S = self.scaled_basis
         D = _left(S, D @ S)
         row_scale = torch.tensor(
@@ -137,15 +140,6 @@ class Reduction(nn.Module):
         batch = D.shape[:-2]
         arm = torch.linalg.vector_norm(B[rigid], dim=-1, keepdim=True).clamp_min(1e-12)
         fixed = [B[rigid] / arm, S[:n_q][held]]
-        n_z = S.shape[1]
-        if math.isfinite(self.options.contact_stiffness):
-            # coordinates of their own: with K_c in D, a stiff contact would drown the springs
-            eye_h = torch.eye(n_h, dtype=D.dtype, device=D.device)
-            give = eye_h / (L * self.options.contact_stiffness**0.5)
-            D = pad(D, (0, n_h, 0, n_h)) + pad(eye_h, (n_z, 0, n_z, 0))
-            A = torch.cat([A, give.expand(*batch, n_h, n_h)], dim=-1)
-            fixed = [pad(part, (0, n_h)) for part in fixed]
-            F = None if F is None else pad(F, (0, 0, 0, n_h))
         E = torch.cat([A, *(part.expand(*batch, *part.shape) for part in fixed if len(part))], dim=-2)
         R = D.new_zeros(E.shape[-2], n_a)
         R[n_h : n_h + len(rigid)] = eye[rigid] / arm
@@ -153,16 +147,15 @@ class Reduction(nn.Module):
             step = two_stage(D, E, R, F, on_unstable=on_unstable, actuators=self.actuators)
         except (SingularGraspError, UnstableGraspError) as error:
             if error.direction is not None:  # into state coordinates
-                direction = S @ error.direction[:n_z]
+                direction = S @ error.direction
                 error.direction = direction / torch.linalg.vector_norm(direction).clamp_min(1e-300)
             raise
-        motion = step.motion[..., :n_z, :]
         dlam = D.new_zeros(*batch, n_a, n_a)
         dlam[..., rigid, :] = step.reaction[..., n_h : n_h + len(rigid), :] / arm
         if len(soft):
-            dlam[..., soft, :] = self.stiffness[soft, None] * (_left(B[soft].mT, motion) - eye[soft])
+            dlam[..., soft, :] = self.stiffness[soft, None] * (_left(B[soft].mT, step.motion) - eye[soft])
         dmu = row_scale[:, None] * step.reaction[..., :n_h, :]
-        return GraspResponse(_left(S.mT, motion), dmu, dlam, step.stability)
+        return GraspResponse(_left(S.mT, step.motion), dmu, dlam, step.stability)
 
 
 def _left(S: Tensor, X: Tensor) -> Tensor:

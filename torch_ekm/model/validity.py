@@ -8,7 +8,7 @@ from enum import Enum
 
 import torch
 
-from ..contact.contact_set import ContactSet
+from ..contact.contact_set import LINK_MARGIN, ContactSet
 from ..typing import Float, Tensor
 from .grasp_forces import GraspForces
 from .options import ModelOptions
@@ -76,7 +76,7 @@ def find_doubts(
         measured: normal forces that the pads measure, by pad [N].
         before: the pads that touched a step before.
     """
-    doubts = _of_stability(stability, options) + _of_links(contacts, options)
+    doubts = _of_stability(stability, options) + _of_links(contacts)
     if forces.solved:
         doubts += _of_torque(joint_names, forces, options) + _of_friction(contacts, forces)
         doubts += _of_sensors(contacts, forces, measured or {}, options)
@@ -162,13 +162,13 @@ def _of_sensors(
     return doubts
 
 
-def _of_links(contacts: ContactSet, options: ModelOptions) -> list[Doubt]:
+def _of_links(contacts: ContactSet) -> list[Doubt]:
     return [
         Doubt(
             ModelStatus.LINK_TOUCHES,
             near.link,
             near.gap,
-            options.link_margin,
+            LINK_MARGIN,
             "m",
             f"link '{near.link}' carries no pad and touches the object (gap {1e3 * near.gap:.1f} mm): its "
             "force is left out; grasp elsewhere, or give the link a pad in the transmission file",

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, NamedTuple
 
+from .._checks import check_finite
 from ..kinematics import GraspState
-from ..kinematics.tensors import check_finite
 from ..typing import Float, Tensor
 
 

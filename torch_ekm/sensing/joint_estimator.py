@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import torch
 
+from .._checks import check_finite
 from ..description import HandDescription
 from ..exceptions import JointMismatchError, ParameterError, ShapeError
-from ..kinematics.tensors import check_finite
 from ..typing import Float, Tensor
 from .hall.calibration import HallCalibration
 

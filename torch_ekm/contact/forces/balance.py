@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...typing import Array
+from ..contact_set import CHARACTERISTIC_LENGTH
 from .friction import FrictionCone
 
 Mask = NDArray[np.bool_]
 
 
 class ForceStatus(Enum):
-    """What became of the force problem."""
+    """Whether the force problem was solved, is impossible, or made the solver fail."""
 
     SOLVED = "solved"
     NOT_GRASPABLE = "not_graspable"
@@ -45,8 +46,6 @@ class BalanceEquations:
     hand_load: Array
     """Z^T V_q, ``(n_z,)``."""
     cones: tuple[FrictionCone, ...]
-    length: float
-    """L: moments are divided by it [m]."""
     moment_rows: Mask
     """Rows of ``object_load`` that are moments, bool ``(n_w,)``."""
     tendon: Mask
@@ -61,12 +60,8 @@ class BalanceEquations:
     """(Z^T Z)^-1: whitens r where the permitted motions are not orthonormal."""
     measured_normal: Array | None = None
     """Measured normal forces [N], NaN where there is none."""
-    normal_std: float = 0.3
-    """Their standard deviation [N]."""
     measured_actuator: Array | None = None
     """Measured ``-lam``, force of each actuator along +a ``(n_a,)`` [N or N m], NaN where there is none."""
-    actuator_std: float = 0.05
-    """Their standard deviation."""
     expected: Array | None = None
     """Forces ``mu`` to stay near, ``(n_h,)``."""
     expected_covariance: Array | None = None
@@ -75,7 +70,7 @@ class BalanceEquations:
     @property
     def row_scale(self) -> Array:
         """1 for forces on the object, 1/L for moments, ``(n_w,)``."""
-        return np.where(self.moment_rows, 1 / self.length, 1.0)
+        return np.where(self.moment_rows, 1 / CHARACTERISTIC_LENGTH, 1.0)
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ class FrictionCone:
         return len(self.scale)
 
     def u(self, mu: Array) -> Array:
-        """Friction components, scaled to [N]."""
+        """Friction components ``u`` of the force vector, scaled to newtons."""
         return self.scale * mu[..., self.start + 1 : self.start + 1 + self.dim]
 
     def slack(self, mu: Array) -> float:

@@ -8,9 +8,13 @@ import numpy as np
 
 from ..._extras import require
 from ...typing import Array
+from ..contact_set import CHARACTERISTIC_LENGTH
 from .balance import BalanceEquations
 from .friction import outer_directions
 from .options import ForceOptions
+
+_FORCE_WEIGHT = 1e-7
+"""``eps``: weight of ``|mu|^2`` against the squared, whitened joint residual [1/N^2]."""
 
 
 class ForceCost(NamedTuple):
@@ -23,7 +27,7 @@ class ForceCost(NamedTuple):
     scale: Array
 
     def solve(self) -> Array:
-        """``[mu; lam; tau]`` without the inequalities."""
+        """``[mu; lam; tau]`` [N, N m] of least cost under the object balance, without inequalities."""
         n, m = len(self.q), len(self.load)
         kkt = np.zeros((n + m, n + m))
         kkt[:n, :n], kkt[:n, n:], kkt[n:, :n] = self.P, self.balance.T, self.balance
@@ -41,7 +45,7 @@ def force_cost(eq: BalanceEquations, options: ForceOptions) -> ForceCost:
     """What the forces should be, in ``x = [mu; lam; tau]``, all scaled to newtons.
 
     ```
-    min  p(mu) + eps k |lam r/L|^2 + |r|^2/sigma^2
+    min  p(mu) + eps |lam r/L|^2 + |r|^2/sigma^2
          + sum (f_n - measured)^2/sigma_n^2 + sum (lam + measured)^2/sigma_a^2
     s.t. G mu = V_p
     p(mu) = eps |mu|^2, or (mu - expected)^T Sigma^-1 (mu - expected) where forces are expected
@@ -49,7 +53,7 @@ def force_cost(eq: BalanceEquations, options: ForceOptions) -> ForceCost:
 
     With expected forces it is the negative logarithm of a posterior density (times two).
     """
-    L = eq.length
+    L = CHARACTERISTIC_LENGTH
     n_h, n_a, n_t = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1], len(eq.bound_lower)
     n = n_h + n_a + n_t
     scale = np.ones(n)
@@ -64,8 +68,7 @@ def force_cost(eq: BalanceEquations, options: ForceOptions) -> ForceCost:
     joint = np.concatenate([eq.hand_matrix, eq.actuator_matrix, bound], axis=1) * scale
     WJ = joint / options.torque_std**2 if eq.weight is None else eq.weight @ joint / options.torque_std**2
     P, q = joint.T @ WJ, WJ.T @ eq.hand_load
-    diagonal = np.full(n, options.force_weight)
-    diagonal[n_h : n_h + n_a] *= options.actuator_weight
+    diagonal = np.full(n, _FORCE_WEIGHT)
     diagonal[n_h + n_a :] *= 1e-2
     if eq.expected is not None and eq.expected_covariance is not None:
         diagonal[:n_h] = 0.0
@@ -73,8 +76,8 @@ def force_cost(eq: BalanceEquations, options: ForceOptions) -> ForceCost:
         P[:n_h, :n_h] += W
         q[:n_h] -= W @ (eq.expected / scale[:n_h])
     for columns, value, std in (
-        ([cone.start for cone in eq.cones], eq.measured_normal, eq.normal_std),
-        (range(n_h, n_h + n_a), eq.measured_actuator, eq.actuator_std),
+        ([cone.start for cone in eq.cones], eq.measured_normal, options.normal_std),
+        (range(n_h, n_h + n_a), eq.measured_actuator, options.actuator_std),
     ):
         if value is not None:
             known = np.isfinite(value)
@@ -92,7 +95,7 @@ def force_problem(
     """Add the inequalities to the cost: a ``qpsolvers.Problem``.
 
     ```
-    f_min <= f_n <= f_max,  |u_i| <= mu_s f_n,i,  -lam >= 0 for tendons,  bounds of stops and locks
+    0 <= f_n <= f_max,  |u_i| <= mu_s f_n,i,  -lam >= 0 for tendons,  bounds of stops and locks
     ```
 
     The friction cones stand in it as polyhedra around them; ``cuts`` carve those down to the cones.
@@ -115,8 +118,9 @@ def force_problem(
     inequality = np.zeros((len(rows), n))
     inequality[:, :n_h] = rows * scale[:n_h]
     lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
-    lower[normals], upper[normals] = options.min_normal, options.max_normal
+    lower[normals], upper[normals] = 0.0, options.max_normal
     upper[n_h : n_h + n_a] = np.where(eq.tendon, 0.0, np.inf)
-    lower[n_h + n_a :], upper[n_h + n_a :] = eq.bound_lower / eq.length, eq.bound_upper / eq.length
+    L = CHARACTERISTIC_LENGTH
+    lower[n_h + n_a :], upper[n_h + n_a :] = eq.bound_lower / L, eq.bound_upper / L
     hard, rhs = (None, None) if soft else (balance, load)
     return qpsolvers.Problem(P, q, inequality, np.zeros(len(rows)), hard, rhs, lower, upper)

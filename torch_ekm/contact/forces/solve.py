@@ -64,7 +64,7 @@ def _inside(eq: BalanceEquations, options: ForceOptions, cost: ForceCost) -> Arr
     unbalanced = (eq.object_matrix @ mu - eq.object_load) * eq.row_scale
     kept = (
         all(cone.slack(mu) >= 0 for cone in eq.cones)
-        and (normal >= options.min_normal).all()
+        and (normal >= 0).all()
         and (normal <= options.max_normal).all()
         and not (lam[eq.tendon] > 0).any()
         and (bound >= eq.bound_lower).all()

@@ -29,7 +29,6 @@ def calibrate(
     parameters: Iterable[str] = ("springs", "moment_arms", "stiffness", "offset"),
     *,
     priors: Mapping[str, float] | None = None,
-    loss: str = "soft_l1",
 ) -> Calibration:
     """``min_x |W r(x)|^2 + |x|^2``: figures of the hand from measured motions, and how sure they are.
 
@@ -39,7 +38,7 @@ def calibrate(
     derivative is that of :meth:`KinematicModel.linearize`; solved by scipy's trust-region reflective least
     squares.
 
-    The scale of all springs and stiffnesses together is told by fingertip forces alone (and a little by
+    The scale of all springs and stiffnesses together is determined by fingertip forces alone (and a little by
     the object's weight): without them expect ratios.
 
     Args:
@@ -51,8 +50,6 @@ def calibrate(
             "moment_arms:thumb_distal".
         priors: standard deviations by kind, in place of 0.5 (springs), 0.3 (moment arms), 0.7 (stiffness),
             these of the logarithm, 10 deg (rest), 5 deg (offset), 1 deg (backlash), 2 mm and 2 deg (object).
-        loss: of scipy's ``least_squares``: "soft_l1" bears motions in which a contact slipped, "linear" is a
-            little better where there are none.
 
     Raises:
         UnknownNameError: no such kind of parameter, joint or actuator.
@@ -73,7 +70,7 @@ def calibrate(
             x,
             problem.jacobian,
             unknowns.bounds,
-            loss=loss,
+            loss="soft_l1",  # bears motions in which a contact slipped
             xtol=1e-3,
             ftol=1e-3,
             max_nfev=12,
@@ -142,12 +139,12 @@ class _Problem:
         share of the freedom, as far as the data and not the priors tell them.
         """
         at, sensors = self.at(x), self.evidence.sensors
-        told = np.abs(at.jacobian).max(axis=1) > 1e-9
+        moved = np.abs(at.jacobian).max(axis=1) > 1e-9
         values = np.linalg.eigvalsh(self.information(x))
         freedom = float(np.sum(values / (1 + values)))
-        share = max(0.1, 1 - freedom / max(1, told.sum()))
+        share = max(0.1, 1 - freedom / max(1, moved.sum()))
         for k, name in enumerate(GROUPS):
-            own = at.value[(at.group == k) & told]
+            own = at.value[(at.group == k) & moved]
             if name == "equilibrium":
                 # each state has as many equations to spare as it has sensors; the rest the forces fit exactly
                 noise = float(np.sqrt(own @ own / sensors)) if sensors else _UNSENSED

@@ -27,7 +27,7 @@ class Recording(Protocol):
 
 @dataclass(frozen=True)
 class Rest:
-    """One state at rest."""
+    """A state in which hand and object rest, with encoders [rad] and fingertip forces [N]."""
 
     state: GraspState
     a: Float[Tensor, " n_a"]

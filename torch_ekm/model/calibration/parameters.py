@@ -52,7 +52,7 @@ class Parameter:
 
     @property
     def label(self) -> str:
-        """In words."""
+        """What the parameter is called in tables and messages."""
         if self.kind == "moment_arms":
             return f"moment arm of {self.name}"
         if self.kind in _WORDS:
@@ -69,7 +69,7 @@ class Parameter:
         return max(-_FURTHEST, -self.nominal / self.prior) if self.kind == "backlash" else -_FURTHEST
 
     def slope(self, value: float) -> float:
-        """d value/dx."""
+        """d value/dx: SI units of the figure per prior."""
         return self.prior * (abs(value) if self.logarithmic else 1.0)
 
 
@@ -87,7 +87,7 @@ class Figures(NamedTuple):
 
     @classmethod
     def of(cls, hand: HandDescription) -> Figures:
-        """As described."""
+        """The figures of a hand as its description has them, no object offset."""
         zero = np.zeros(3)
         stiffness = [actuator.stiffness for actuator in hand.actuators]
         arrays = (hand.spring_stiffness, hand.spring_rest, hand.actuation_jacobian, stiffness)
@@ -176,7 +176,7 @@ class Unknowns:
         return Figures(**result)
 
     def described(self, x: Array) -> HandDescription:
-        """The hand with these figures."""
+        """The description of the hand with the figures at x in place of its own."""
         figures = self.figures(torch.from_numpy(x))
         springs, rest, J_a, stiffness, offset, backlash = (part.numpy() for part in figures[:6])
         actuators = tuple(

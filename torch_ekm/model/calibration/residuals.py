@@ -37,7 +37,7 @@ _SLACK = 1e-3  # [N m] a tendon with less has no length to compare
 
 
 class Residuals(NamedTuple):
-    """Of one set of figures."""
+    """Residuals of all motions and equilibria at one set of figures."""
 
     value: Array
     """``(n_r,)``, in units of :data:`GROUPS`."""
@@ -73,7 +73,6 @@ class Evidence:
         self.model = KinematicModel(
             model.hand, model.obj, options, kinematics=model.kinematics, detector=model.detector
         )
-        self.model._detector_takes_poses = model._detector_takes_poses
         self.grasps, self.unknowns = grasps, unknowns
         self.with_offset = [p.index[0] for p in unknowns.parameters if p.kind == "offset"]
         self._set(unknowns.nominal)
@@ -163,7 +162,7 @@ class Evidence:
     def _moving(self, lin: Linearization) -> Tensor:
         """Joints of the fingers that touch."""
         links = [self.model.link_names.index(name) for name in lin.contacts.link]
-        return self.model.kinematics.upstream[links].any(0)  # type: ignore[index]
+        return self.model.kinematics.upstream[links].any(0)
 
     def _linearize(self, rest: Rest, figures: Figures) -> Linearization:
         offset, state = torch.cat([figures.object_position, figures.object_rotation]), rest.state

@@ -17,7 +17,7 @@ from .parameters import Unknowns
 
 
 class Calibrated(NamedTuple):
-    """One line of the table."""
+    """One parameter: described and found value with standard error, SI units."""
 
     label: str
     described: float
@@ -57,22 +57,12 @@ class Calibration:
 
     @property
     def parameters(self) -> tuple[Calibrated, ...]:
-        """The table."""
+        """Each parameter with its found value and standard error, in the order of ``x``."""
         figures, rows = self.unknowns.figures(torch.from_numpy(self.x)), []
         for k, p in enumerate(self.unknowns.parameters):
             value, error = float(getattr(figures, p.kind)[p.index]), float(np.sqrt(self.covariance[k, k]))
             rows.append(Calibrated(p.label, p.nominal, value, error * p.slope(value), error < 0.5))
         return tuple(rows)
-
-    @property
-    def standard_errors(self) -> dict[str, float]:
-        """Of each parameter by its label, priors included."""
-        return {row.label: row.standard_error for row in self.parameters}
-
-    @property
-    def identifiable(self) -> dict[str, bool]:
-        """Whether the data tell each parameter by itself."""
-        return {row.label: row.identifiable for row in self.parameters}
 
     @property
     def object_offset(self) -> tuple[Array, Array]:
@@ -81,7 +71,7 @@ class Calibration:
         return figures.object_position.numpy(), figures.object_rotation.numpy()
 
     def save(self, path: str | Path) -> Path:
-        """Write the hand: ``<stem>.transmission.toml`` at ``path``, the URDF beside it if there is none.
+        """Write the hand: ``<stem>.transmission.toml`` at ``path``, the URDF next to it if there is none.
 
         Raises:
             DescriptionError: ``path`` does not end in ".transmission.toml".

@@ -24,10 +24,6 @@ def geometric_stiffness(
     force: Float[Tensor, "*batch n_c 3"],
     spin_moment: Float[Tensor, "*batch n_c"],
     precedes: Bool[Tensor, "n_q n_q"],
-    *,
-    hand: bool = True,
-    obj: bool = True,
-    rolling: bool = True,
 ) -> Float[Tensor, "*batch n_s n_s"]:
     """``dF/ds`` at constant contact forces: hand part S, object part T, rolling and soft-finger spin.
 
@@ -46,22 +42,16 @@ def geometric_stiffness(
         force: ``f_i`` of the finger on the object, hand axes [N], held constant there.
         spin_moment: ``mu_4i`` about the inward normal [N m], held constant about the moving normal.
         precedes: from :func:`precedence`.
-        hand: keep S and W.
-        obj: keep the object's lever arms (T).
-        rolling: keep the motion of contact points over the surfaces.
     """
     n_q = kin.axis.shape[-2]
     D = torch.zeros(*force.shape[:-2], n_q + 6, n_q + 6, dtype=force.dtype, device=force.device)
     f_hat = hat(force)
-    if hand:
-        D[..., :n_q, :n_q] = posture_stiffness(force, kin.point_jacobian.mT, kin.axis, precedes)
-    if obj:
-        D[..., n_q + 3 :, n_q + 3 :] = -(f_hat @ hat(kin.lever)).sum(-3)
-    Omega, roll = kin.relative_spin, kin.roll
-    if rolling:
-        D = D + _over_contacts(Omega, (f_hat @ roll) @ Omega)
+    D[..., :n_q, :n_q] = posture_stiffness(force, kin.point_jacobian.mT, kin.axis, precedes)
+    D[..., n_q + 3 :, n_q + 3 :] = -(f_hat @ hat(kin.lever)).sum(-3)
+    Omega = kin.relative_spin
+    D = D + _over_contacts(Omega, (f_hat @ kin.roll) @ Omega)
     if bool((spin_moment != 0).any()):
-        D = D + _spin_terms(kin, spin_moment, precedes, roll, Omega, hand=hand, rolling=rolling)
+        D = D + _spin_terms(kin, spin_moment, precedes)
     return D
 
 
@@ -70,27 +60,16 @@ def _over_contacts(left: Tensor, right: Tensor) -> Tensor:
     return left.flatten(-3, -2).mT @ right.flatten(-3, -2)
 
 
-def _spin_terms(
-    kin: ContactKinematics,
-    spin_moment: Tensor,
-    precedes: Tensor,
-    roll: Tensor,
-    Omega: Tensor,
-    *,
-    hand: bool,
-    rolling: bool,
-) -> Tensor:
-    n_q = kin.axis.shape[-2]
+def _spin_terms(kin: ContactKinematics, spin_moment: Tensor, precedes: Tensor) -> Tensor:
+    n_q, Omega = kin.axis.shape[-2], kin.relative_spin
     moment = -kin.contacts.normal * spin_moment[..., None]
     inner = torch.zeros_like(Omega)
     inner[..., n_q + 3 :] = -hat(moment)
-    if rolling:
-        inner = inner + spin_moment[..., None, None] * (kin.contacts.object_curvature @ roll @ Omega)
+    inner = inner + spin_moment[..., None, None] * (kin.contacts.object_curvature @ kin.roll @ Omega)
     D = _over_contacts(Omega, inner)
-    if hand:
-        # (z_b x z_a) . m = z_a . (m x z_b), for b strictly proximal to a, both upstream of the contact
-        J_w = kin.spin_jacobian
-        W = _over_contacts(J_w, hat(moment) @ J_w)
-        strictly = (precedes & ~precedes.mT).mT.to(W.dtype)
-        D[..., :n_q, :n_q] += W * strictly
+    # (z_b x z_a) . m = z_a . (m x z_b), for b strictly proximal to a, both upstream of the contact
+    J_w = kin.spin_jacobian
+    W = _over_contacts(J_w, hat(moment) @ J_w)
+    strictly = (precedes & ~precedes.mT).mT.to(W.dtype)
+    D[..., :n_q, :n_q] += W * strictly
     return D

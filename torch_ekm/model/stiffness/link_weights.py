@@ -6,6 +6,7 @@ import torch
 from torch import nn
 
 from ...description.hand import HandDescription
+from ...kinematics.link_poses import Kinematics, LinkPoses
 from ...typing import Float, Tensor
 from .geometric import precedence
 from .potential import posture_stiffness
@@ -24,13 +25,12 @@ class LinkWeights(nn.Module):
     def __init__(
         self,
         hand: HandDescription,
-        kinematics: nn.Module,
+        kinematics: Kinematics,
         gravity: tuple[float, float, float],
         dtype: torch.dtype,
     ) -> None:
         super().__init__()
-        upstream: Tensor = kinematics.upstream  # type: ignore[assignment]
-        names = list(kinematics.link_names)  # type: ignore[arg-type]
+        upstream, names = kinematics.upstream, list(kinematics.link_names)
         links = [link for link in hand.urdf.links if link.mass > 0 and upstream[names.index(link.name)].any()]
         self._joint_axes, self._index = kinematics.joint_axes, [names.index(link.name) for link in links]
         mass = torch.tensor([link.mass for link in links], dtype=dtype)
@@ -41,11 +41,13 @@ class LinkWeights(nn.Module):
         self.upstream = nn.Buffer(upstream[self._index], persistent=False)
         self.precedes = nn.Buffer(precedence(upstream), persistent=False)
 
-    def forward(self, poses) -> tuple[Float[Tensor, "*batch n_q"], Float[Tensor, "*batch n_q n_q"]]:
+    def forward(
+        self, poses: LinkPoses
+    ) -> tuple[Float[Tensor, "*batch n_q"], Float[Tensor, "*batch n_q n_q"]]:
         """Gradient and Hessian at the link poses of a posture."""
         T = poses.transforms[..., self._index, :, :]
         centre = T[..., :3, 3] + (T[..., :3, :3] @ self.com[..., None])[..., 0]
-        axis, origin = self._joint_axes(poses)  # type: ignore[operator]
+        axis, origin = self._joint_axes(poses)
         velocity = torch.linalg.cross(
             axis[..., None, :, :] * self.upstream[..., None].to(axis.dtype),
             centre[..., :, None, :] - origin[..., None, :, :],

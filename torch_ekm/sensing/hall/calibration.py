@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import torch
 
+from ..._checks import check_finite
 from ..._files import write_whole
 from ...exceptions import DescriptionError, ParameterError, ShapeError
-from ...kinematics.tensors import check_finite
 from ...typing import Bool, Float, Tensor
 from .channel import FULL_SCALE, HallChannel, fit_channel
 

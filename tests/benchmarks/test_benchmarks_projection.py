@@ -11,10 +11,12 @@ import torch
 
 pytest.importorskip("coal")
 
+from recorded_hand.projection import project_onto_contacts
+
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import EKMError, NoContactError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.kinematics import GraspState
-from torch_ekm.model import KinematicModel, project_onto_contacts
+from torch_ekm.model import KinematicModel
 
 F64, DEG = torch.float64, math.pi / 180
 NOISE = {"q_std": 2 * DEG, "position_std": 1e-3, "rotation_std": 2 * DEG}

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 
 import torch
 
-from ..contact.contact_kinematics import constraint_matrix
-from ..contact.contact_set import ContactSet
-from ..exceptions import NoContactError, ParameterError, ShapeError, SolverError, UnknownNameError
-from ..kinematics.grasp_state import GraspState
-from ..kinematics.tensors import as_tensors
-from ..typing import Float, Tensor
-from .kinematic_model import KinematicModel
+from torch_ekm.contact.contact_kinematics import constraint_matrix
+from torch_ekm.contact.contact_set import ContactSet
+from torch_ekm.contact.detector import ContactDetector
+from torch_ekm.exceptions import NoContactError, ParameterError, ShapeError, SolverError, UnknownNameError
+from torch_ekm.kinematics.grasp_state import GraspState
+from torch_ekm.kinematics.tensors import as_tensors
+from torch_ekm.model.kinematic_model import KinematicModel
+from torch_ekm.typing import Float, Tensor
 
 _CLOSED = 1e-7
 """Largest gap that is left [m]."""
@@ -60,7 +61,7 @@ def project_onto_contacts(
         model: hand, object and detector; a detector of one's own must report all pads that may touch.
         state: the measurement, one state.
         q_std, position_std, rotation_std: its standard deviations [rad, m, rad], hand axes; all positive.
-        touching: the pads that touch, by name. By default those that feel at least ``least_force``, or
+        touching: the pads that touch, by name. By default those that bear at least ``least_force``, or
             without ``fingertip_force`` those whose gap is within four of its standard deviations.
         fingertip_force: normal force at each pad [N], NaN where nothing is felt.
         least_force: what counts as touching [N].
@@ -75,11 +76,11 @@ def project_onto_contacts(
     Z = model.reduction.basis.to(sigma)
     Sigma = Z @ torch.linalg.inv((Z / sigma[:, None] ** 2).mT @ Z) @ Z.mT
     detector = copy.copy(model.detector)
-    if hasattr(detector, "margin"):  # pads that float belong to it
-        detector.margin = math.inf  # type: ignore[attr-defined]
+    if isinstance(detector, ContactDetector):  # pads that float belong to it
+        detector.margin = math.inf
 
     def look(at: GraspState) -> tuple[ContactSet, Tensor]:
-        contacts = detector(at.q, at.position, at.rotation)  # type: ignore[operator]
+        contacts = detector(at.q, at.position, at.rotation)
         kin = model.contact_kinematics(at, contacts)
         return contacts, constraint_matrix(kin)[kin.normal_rows]
 
