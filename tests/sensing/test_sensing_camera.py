@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from torch_ekm.exceptions import CalibrationError, DescriptionError, ParameterError
+from torch_ekm.exceptions import CalibrationError, ParameterError
 from torch_ekm.sensing import MarkerBoard, PinholeCamera, calibrate_camera
 from torch_ekm.simulation import SimulatedCamera
 from torch_ekm.simulation.imaging.card_scene import CardScene, PlacedCard
@@ -32,18 +32,6 @@ def test_rays_invert_projection(camera, batch, rng):
     assert rays.shape == (*batch, 2)
     points = np.concatenate([rays, np.ones((*batch, 1))], axis=-1)
     np.testing.assert_allclose(camera.project(points), pixels, atol=1e-6)
-
-
-def test_saved_camera_is_the_same(tmp_path):
-    LENS.save(tmp_path / "lens.json")
-    assert PinholeCamera.load(tmp_path / "lens.json") == LENS
-
-
-@pytest.mark.parametrize("text", ["", "{}", '{"fx": 1, "distortion": [0,0,0,0,0], "zoom": 3}'])
-def test_a_file_that_is_no_camera_is_refused(tmp_path, text):
-    (tmp_path / "lens.json").write_text(text)
-    with pytest.raises(DescriptionError, match=r"lens\.json"):
-        PinholeCamera.load(tmp_path / "lens.json")
 
 
 def test_impossible_lenses_are_refused():

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..._extras import require
-from ..._files import write_whole
-from ...exceptions import DescriptionError, ParameterError
+from ...exceptions import ParameterError
 from ...typing import Array
 
 
@@ -77,20 +74,3 @@ class PinholeCamera:
         flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2))
         undistorted = cv2.undistortPoints(flat, self.matrix, self.distortion_array, criteria=criteria)
         return undistorted.reshape(pixels.shape)
-
-    def save(self, path: str | Path) -> None:
-        """Write size, focal lengths, centre [px] and distortion as JSON."""
-        write_whole(Path(path), json.dumps(asdict(self), indent=2) + "\n")
-
-    @classmethod
-    def load(cls, path: str | Path) -> PinholeCamera:
-        """Read what :meth:`save` wrote.
-
-        Raises:
-            DescriptionError: the file is no JSON or names other parameters.
-        """
-        try:
-            values = json.loads(Path(path).read_text(encoding="utf-8"))
-            return cls(**{**values, "distortion": tuple(values["distortion"])})
-        except (json.JSONDecodeError, TypeError, KeyError) as error:
-            raise DescriptionError(path, f"no camera parameters: {error}") from error
