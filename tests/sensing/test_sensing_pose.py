@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from lens import render
 
 from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.sensing import MarkerBoard, PinholeCamera
@@ -110,9 +111,9 @@ def test_prior_decides_between_mirror_images(pose_of, monkeypatch):
 def test_edges_correct_a_rough_pose(pose_of, camera, rng):
     board, pose = MarkerBoard(), pose_of(0.03, 0.02, tilt_deg=30)
     quality = ImageQuality(noise=1.0, vignette=0.0)
-    image = SimulatedCamera(camera, quality).render(CardScene((PlacedCard(board, pose),)), rng)
+    image = render(camera, CardScene((PlacedCard(board, pose),)), rng, quality)
     rough = exp(torch.tensor([0.01, -0.008, 0.005], dtype=torch.float64)).numpy() @ pose[:3, :3]
-    start = BoardPose(rough, pose[:3, 3] + [1e-4, -1e-4, 1e-3], np.eye(6), 0.0, 0, False)
+    start = BoardPose(rough, pose[:3, 3] + [1e-4, -1e-4, 1e-3], np.eye(6), False)
     error = twist(refine_on_edges(image, camera, board, start), pose)
     assert np.abs(error[:2]).max() < 2e-5  # m
     assert abs(error[2]) < 3e-4
@@ -124,7 +125,7 @@ def test_edges_of_a_half_hidden_board_still_count(pose_of, rng, shade):
     camera, board, pose = PinholeCamera(), MarkerBoard(), pose_of(tilt_deg=30)
     finger = ConvexBody.capsule(np.array([-0.03, 0.012, 0.33]), np.array([0.04, 0.02, 0.33]), 0.007, shade)
     image = SimulatedCamera(camera).render(CardScene((PlacedCard(board, pose),), (finger,)), rng)
-    start = BoardPose(pose[:3, :3], pose[:3, 3], np.eye(6), 0.0, 0, False)
+    start = BoardPose(pose[:3, :3], pose[:3, 3], np.eye(6), False)
     refined = refine_on_edges(image, camera, board, start)
     assert refined is not start
     error = twist(refined, pose)
@@ -134,5 +135,5 @@ def test_edges_of_a_half_hidden_board_still_count(pose_of, rng, shade):
 
 def test_no_edges_leave_the_pose_alone(pose_of):
     blank = np.full((480, 640), 128, dtype=np.uint8)
-    start = BoardPose(pose_of()[:3, :3], pose_of()[:3, 3], np.eye(6), 0.0, 0, False)
+    start = BoardPose(pose_of()[:3, :3], pose_of()[:3, 3], np.eye(6), False)
     assert refine_on_edges(blank, PinholeCamera(), MarkerBoard(), start) is start

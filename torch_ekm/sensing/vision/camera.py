@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..._extras import require
 from ...exceptions import ParameterError
 from ...typing import Array
 
@@ -47,11 +46,6 @@ class PinholeCamera:
     def distortion_array(self) -> Array:
         return np.asarray(self.distortion, dtype=np.float64)
 
-    @property
-    def is_ideal(self) -> bool:
-        """True where straight lines stay straight in the image."""
-        return not any(self.distortion)
-
     def project(self, points: Array) -> Array:
         """Pixels ``(*batch, 2)`` of points ``(*batch, 3)`` in the camera frame [m], ``z > 0``."""
         points = np.asarray(points, dtype=np.float64)
@@ -62,15 +56,3 @@ class PinholeCamera:
         xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
         yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
         return np.stack([self.fx * xd + self.cx, self.fy * yd + self.cy], axis=-1)
-
-    def rays(self, pixels: Array) -> Array:
-        """Inverse of :meth:`project`: ``(x/z, y/z)`` of pixels, ``(*batch, 2) -> (*batch, 2)``."""
-        pixels = np.asarray(pixels, dtype=np.float64)
-        ideal = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
-        if self.is_ideal:
-            return ideal
-        cv2 = require("cv2")
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
-        flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2))
-        undistorted = cv2.undistortPoints(flat, self.matrix, self.distortion_array, criteria=criteria)
-        return undistorted.reshape(pixels.shape)
