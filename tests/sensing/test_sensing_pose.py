@@ -34,7 +34,6 @@ def test_exact_corners_give_the_exact_pose(pose_of, camera, tilt):
     pose = pose_of(0.04, -0.05, 0.42, tilt_deg=tilt)
     found = estimate_board_pose(camera, *corners(MarkerBoard(), pose, camera))
     assert np.abs(twist(found, pose)).max() < 1e-6
-    assert found.rms < 1e-5
 
 
 @pytest.mark.parametrize("camera", LENSES)

@@ -51,11 +51,13 @@ class Reduction(nn.Module):
             pose = planar_pose_basis(torch.tensor(hand.planar_normal, dtype=dtype))
         self.joint_basis: Tensor
         self.pose_basis: Tensor
+        self.basis: Tensor
         self.scaled_basis: Tensor
         self.actuation: Tensor
         self.stiffness: Tensor
         self.register_buffer("joint_basis", joint, persistent=False)
         self.register_buffer("pose_basis", pose, persistent=False)
+        self.register_buffer("basis", torch.block_diag(joint, pose), persistent=False)
         pose_scaled = pose.clone()
         pose_scaled[:3] *= CHARACTERISTIC_LENGTH
         self.register_buffer("scaled_basis", torch.block_diag(joint, pose_scaled), persistent=False)
