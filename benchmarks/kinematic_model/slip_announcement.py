@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from link_weights import LinkWeights
 
 from torch_ekm.contact import constraint_matrix
 from torch_ekm.control import (
@@ -97,8 +98,8 @@ class Witness:
         self.plant = plant
         p = plant.parameters
         hand, obj = plant.true_descriptions()
-        options = ModelOptions(link_weights=p.link_weight, on_unstable="flag", max_overlap=0.02)
-        self.model = KinematicModel(hand, obj, options)
+        self.model = KinematicModel(hand, obj, ModelOptions(on_unstable="flag", max_overlap=0.02))
+        self.link_weights = LinkWeights(hand, self.model.kinematics) if p.link_weight else None
         self._rig: Any = plant._rig
         self.frames: list[GraspState] = []
         self._scene = self._rig.scene
@@ -147,9 +148,9 @@ class Witness:
         A = constraint_matrix(kin).numpy()
         n_q = self.model.hand.n_q
         torque = torch.from_numpy(torque)
-        if self.model.link_weights is not None:
-            torque = torque - self.model.link_weights(poses)[0]
-        weight = self.model.potential(state, poses)[0][n_q:].numpy()
+        if self.link_weights is not None:
+            torque = torque - self.link_weights(poses)[0]
+        weight = self.model.potential(state)[0][n_q:].numpy()
         pads = [pad.name for pad in self.model.hand.pads]
         normal = np.array([rig.normal[pads.index(name)] for name in contacts.finger])
         scale = np.array([1, 1, 1, 30, 30, 30]) / 0.01

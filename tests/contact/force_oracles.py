@@ -16,7 +16,7 @@ def cone_program(eq: BalanceEquations, options: ForceOptions | None = None) -> n
     n_h = eq.object_matrix.shape[1]
     options = options or ForceOptions()
     cost = force_cost(eq, options)
-    problem, scale = force_problem(eq, options, cost, np.zeros((0, n_h))), cost.scale
+    problem, scale = force_problem(eq, cost, np.zeros((0, n_h))), cost.scale
     n = len(problem.q)
     up, low = np.isfinite(problem.ub), np.isfinite(problem.lb)
     eye = np.eye(n)
@@ -54,9 +54,6 @@ def gaussian_posterior(eq: BalanceEquations, options: ForceOptions) -> tuple[np.
         starts = [cone.start for cone in eq.cones]
         known = np.isfinite(eq.measured_normal)
         measured.append((eye[starts][known], eq.measured_normal[known], options.normal_std**2))
-    if eq.measured_actuator is not None:
-        known = np.isfinite(eq.measured_actuator)
-        measured.append((-eye[n_h:][known], eq.measured_actuator[known], options.actuator_std**2))
     for H, value, variance in measured:
         gain = S @ H.T @ np.linalg.inv(H @ S @ H.T + variance * np.eye(len(H)))
         x, S = x + gain @ (value - H @ x), S - gain @ H @ S

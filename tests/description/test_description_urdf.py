@@ -37,7 +37,6 @@ def test_limits_and_axes_have_the_defaults_of_the_standard(tmp_path: Path) -> No
     joint = f'<link name="b"/><joint name="j" type="revolute">{JOINT}<limit upper="1"/></joint>'
     (revolute,) = read(tmp_path, joint=joint).joints
     assert (revolute.lower, revolute.upper) == (0.0, 1.0)
-    assert (revolute.effort, revolute.velocity) == (np.inf, np.inf)
     np.testing.assert_array_equal(revolute.axis, [1, 0, 0])
     np.testing.assert_array_equal(revolute.transform, np.eye(4))
     (endless,) = read(tmp_path, joint=joint.replace("revolute", "continuous").replace("1", "inf")).joints

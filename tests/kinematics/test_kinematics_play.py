@@ -48,13 +48,13 @@ def test_an_unknown_start_is_bounded_and_found_out(seed):
     known, unknown = play.at(truth), play.unknown()
     for delta in walk(seed):
         exact, known = play.advance(known, delta)
-        before = unknown.uncertainty
+        before = unknown.high - unknown.low
         guess, unknown = play.advance(unknown, delta)
         assert (unknown.low - 1e-12 <= known.low).all()
         assert (known.low <= unknown.high + 1e-12).all()
-        assert (unknown.uncertainty <= before + 1e-12).all()
+        assert ((unknown.high - unknown.low) <= before + 1e-12).all()
         assert ((guess - exact).abs() <= 0.5 * before + 1e-12).all()
-    assert unknown.uncertainty.max() < 1e-12
+    assert (unknown.high - unknown.low).max() < 1e-12
 
 
 def test_a_command_transmits_what_is_wanted():

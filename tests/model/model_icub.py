@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -96,7 +97,7 @@ def pinch(shape: str = "box", *, gamma: float = 0.0, friction: float = 1.5, open
     centre = 0.5 * points[0] + 0.25 * (points[1] + points[2])
     rotation = torch.stack([along, across, torch.linalg.cross(along, across)], dim=-1)  # box: y is across
     state = GraspState(q, centre, rotation)
-    options.setdefault("gravity", (0.0, 0.0, -9.81))
+    hand = dataclasses.replace(hand, gravity=(0.0, 0.0, -9.81))
     model = KinematicModel(
         hand, Held(), ModelOptions(**options), kinematics=kin, detector=lambda *_: contacts
     )

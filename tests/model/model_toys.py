@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -201,7 +202,7 @@ def build(
     """Fingers at q whose ball tips touch an object with the given normals; at rest with the given grip."""
     from torch_ekm.contact.contact_kinematics import constraint_matrix
     from torch_ekm.kinematics import GraspState
-    from torch_ekm.model import KinematicModel, ModelOptions
+    from torch_ekm.model import KinematicModel
     from torch_ekm.model.stiffness.potential import gravity_gradient
 
     kin = ChainKinematics(fingers)
@@ -228,13 +229,14 @@ def build(
         pinned=pinned,
     )
     state = GraspState(q, points.mean(0), torch.eye(3, dtype=F64))
-    options = options or ModelOptions(gravity=(0.0, -9.81, 0.0) if planar else (0.0, 0.0, -9.81))
+    gravity = (0.0, -9.81, 0.0) if planar else (0.0, 0.0, -9.81)
     obj = ToyObject(mass, np.asarray(com, dtype=float), friction)
 
     def make(rest):
         hand = toy_hand(
             n_q, J_a, springs, rest, stiffness=stiffness, coupling=coupling, planar=planar, tendon=tendon
         )
+        hand = dataclasses.replace(hand, gravity=gravity)
         return KinematicModel(hand, obj, options, kinematics=kin, detector=lambda *_: contacts)
 
     model = make(np.zeros(n_q))

@@ -229,7 +229,6 @@ def test_bad_input_is_named():
         {"max_overlap": 0.0},
         {"on_unstable": "ignore"},
         {"contact_margin": -1.0},
-        {"gravity": (0.0, 0.0, float("nan"))},
     ],
 )
 def test_bad_options_are_refused(bad):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -103,7 +104,7 @@ def test_the_whole_problem_turned_in_space_gives_the_turned_answer():
 
     from torch_ekm.kinematics import GraspState
     from torch_ekm.kinematics.se3 import exp
-    from torch_ekm.model import KinematicModel, ModelOptions
+    from torch_ekm.model import KinematicModel
 
     toy = three_finger()
     Q = exp(torch.tensor([0.3, -0.7, 1.1], dtype=F64))
@@ -122,9 +123,8 @@ def test_the_whole_problem_turned_in_space_gives_the_turned_answer():
     )
     gravity = tuple((Q @ torch.tensor([0.0, 0.0, -9.81], dtype=F64)).tolist())
     model = KinematicModel(
-        toy.model.hand,
+        dataclasses.replace(toy.model.hand, gravity=gravity),
         toy.model.obj,
-        ModelOptions(gravity=gravity),
         kinematics=ChainKinematics(fingers),
         detector=lambda *_: contacts,
     )

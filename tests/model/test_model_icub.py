@@ -92,20 +92,6 @@ def test_free_fingers_and_couplings():
     assert J[fingers, pinky].abs().max() < 1e-12
 
 
-def test_the_weight_of_the_links():
-    model, _, _ = gripped("box")
-    heavy, solver, at = gripped("box", link_weights=True)
-    gradient = heavy.potential(at.state)[0] - model.potential(at.state)[0]
-    assert 1e-3 < gradient[:20].abs().max() < 0.1  # fingers of 25 g
-    assert gradient[20:].abs().max() == 0
-    J = heavy.linearize(at.state, at.contacts, forces=solver.forces(at)).manipulation_jacobian
-    expected = finite_difference_jacobian(solver, at, 2e-4)
-    assert relative_error(J, expected, 20) < 1e-9
-    without = variant(heavy, link_weights=False)
-    J = without.linearize(at.state, at.contacts, forces=solver.forces(at)).manipulation_jacobian
-    assert relative_error(J, expected, 20) > 1e-5
-
-
 def noisy_states(at, draws, seed):
     generator = torch.Generator().manual_seed(seed)
     for _ in range(draws):

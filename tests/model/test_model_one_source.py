@@ -6,8 +6,7 @@ import pytest
 import torch
 from model_toys import F64, three_finger
 
-from torch_ekm.description import load_hand, load_object
-from torch_ekm.model import KinematicModel, ModelOptions, ModelStatus
+from torch_ekm.model import KinematicModel, ModelStatus
 from torch_ekm.simulation import PlantConfig, SimulatedHand
 
 
@@ -19,12 +18,6 @@ def test_the_model_of_a_plant_is_made_with_its_gravity(gravity):
     assert plant.hand.gravity == (gravity or (0.0, 0.0, 9.81))
     expected = plant.object.mass * torch.tensor(plant.hand.gravity, dtype=F64)
     assert torch.equal(model.weight, expected)
-
-
-def test_gravity_can_be_told_to_the_model_alone():
-    hand, box = load_hand("icub_right"), load_object("box")
-    upside_down = KinematicModel(hand, box, ModelOptions(gravity=(0.0, 0.0, -9.81)))
-    assert torch.equal(upside_down.weight, -KinematicModel(hand, box).weight)
 
 
 def test_a_linearization_depends_on_its_arguments_alone():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import torch
 from equilibrium import EquilibriumSolver
@@ -10,7 +12,7 @@ from model_toys import F64, contact_set, finite_difference_jacobian, relative_er
 
 from torch_ekm.description import load_hand
 from torch_ekm.kinematics import GraspState, HandKinematics
-from torch_ekm.model import KinematicModel, ModelOptions
+from torch_ekm.model import KinematicModel
 
 
 def pinch():
@@ -29,9 +31,8 @@ def pinch():
     )
     state = GraspState(q, contacts.point.mean(0), torch.eye(3, dtype=F64))
     model = KinematicModel(
-        hand,
+        dataclasses.replace(hand, gravity=(0.0, -9.81, 0.0)),
         Held(mass=0.05, com=(0.0, 0.0, 0.0)),
-        ModelOptions(gravity=(0.0, -9.81, 0.0)),
         kinematics=kin,
         detector=lambda *_: contacts,
     )

@@ -199,10 +199,12 @@ def test_a_wrong_lens_or_mount_shows(hand, obj):
     board = MarkerBoard(4, mount=obj.marker_transform)
     shifted = MarkerTracker(PinholeCamera(), MarkerBoard(0, mount=mount), board)
     longer = MarkerTracker(PinholeCamera(fx=660, fy=660), MarkerBoard(0, mount=ICUB_PALM_MOUNT), board)
-    exact, moved, stretched = (
-        SensedPlant(Puppet(hand), hand, obj, tracker=tracker).reset(0).position
-        for tracker in (None, shifted, longer)
-    )
+    plant = SensedPlant(Puppet(hand), hand, obj)
+    seen = []
+    for tracker in (plant.tracker, shifted, longer):
+        plant.tracker = tracker
+        seen.append(plant.reset(0).position)
+    exact, moved, stretched = seen
     torch.testing.assert_close(moved - exact, torch.tensor([0.004, 0, 0]).double(), atol=1e-9, rtol=0)
     assert 0.0005 < (stretched - exact).norm() < 0.02
 

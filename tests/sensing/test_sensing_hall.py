@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import json
+import math
 
 import pytest
 import torch
@@ -11,15 +11,14 @@ import torch
 from torch_ekm.description import load_hand
 from torch_ekm.exceptions import (
     CalibrationError,
-    DescriptionError,
     JointMismatchError,
     NonFiniteError,
     NonMonotoneFitError,
     ParameterError,
     ShapeError,
 )
-from torch_ekm.sensing import HallCalibration, JointEstimator
-from torch_ekm.simulation import HallSensors, Stuck, hall_sensors
+from torch_ekm.sensing import HallCalibration, JointEstimator, joint_estimator
+from torch_ekm.simulation import HallSensors, hall_sensors
 
 DEG = torch.pi / 180
 REVERSED = (2, 7, 11)  # channels
@@ -165,7 +164,8 @@ def test_a_straight_line_would_be_worse(hand, generator):
         V = torch.stack([torch.ones(int(free.sum()), dtype=torch.float64), readings[free, k]], dim=-1)
         line = torch.linalg.lstsq(V, angles[free, k, None]).solution
         rms = float((V @ line - angles[free, k, None]).square().mean().sqrt())
-        assert channel.residual_rms < 0.5 * rms
+        cubic = channel.angle(readings[free, k]) - angles[free, k]
+        assert float(cubic.square().mean().sqrt()) < 0.5 * rms
 
 
 def test_the_fit_is_the_least_squares_cubic():
@@ -175,10 +175,8 @@ def test_the_fit_is_the_least_squares_cubic():
     calibration = HallCalibration.fit(n[:, None], q[:, None], ["knuckle"])
     (channel,) = calibration.channels
     assert channel.coefficients == pytest.approx((1.5, -1.1, -0.2, -0.1), abs=1e-9)
-    assert channel.residual_max < 1e-9
     assert channel.misfit < 1e-9
     assert channel.noise >= 12**-0.5  # no 8-bit reading is better than its rounding
-    assert "knuckle: rms 0.00 deg" in repr(calibration)
 
 
 def test_what_the_cubic_misses_is_told_from_noise(generator):
@@ -194,7 +192,7 @@ def test_what_the_cubic_misses_is_told_from_noise(generator):
     shaken = n + 4.0 * torch.randn(600, generator=generator, dtype=torch.float64)
     noisy = HallCalibration.fit(shaken.clamp(1, 254)[:, None], q[:, None], ["knuckle"]).channels[0]
     assert noisy.noise == pytest.approx(4.0, rel=0.25)
-    assert noisy.misfit < 0.7 * noisy.residual_rms
+    assert noisy.misfit < 0.7 * float((noisy.angle(shaken.clamp(1, 254)) - q).square().mean().sqrt())
 
 
 @pytest.mark.parametrize("rising", [False, True])
@@ -229,7 +227,7 @@ def test_a_joint_that_was_not_moved_is_refused():
         HallCalibration.fit(mostly, n / 150, ["knuckle"])
 
 
-@pytest.mark.parametrize("failure", [Stuck.LOW, Stuck.HIGH, Stuck.FROZEN])
+@pytest.mark.parametrize("failure", [0.0, 255.0, math.nan])
 def test_stuck_channels(hand, generator, failure):
     sensors = HallSensors(hand, seed=2)
     sensors.stuck[4] = failure
@@ -242,27 +240,8 @@ def test_stuck_channels(hand, generator, failure):
     estimate = marked.estimate(sound_again)
     assert not bool(estimate.valid[:, 4].any())
     assert bool(estimate.std[:, 4].gt(20 * DEG).all())
-    sensors.stuck[4] = Stuck.NO
+    sensors.stuck.clear()
     assert len(sensors.sweep(60, generator)[0][:, 4].unique()) > 8
-
-
-def test_saved_calibration_is_the_same(hand, generator, tmp_path):
-    sensors = HallSensors(hand, seed=3)
-    sensors.stuck[2] = Stuck.HIGH
-    calibration = calibrated(sensors)
-    calibration.save(tmp_path / "hall.json")
-    again = HallCalibration.load(tmp_path / "hall.json")
-    assert again.channels == calibration.channels
-    n = sensors.read(random_posture(hand, 20, generator), generator)
-    for a, b in zip(calibration.estimate(n), again.estimate(n), strict=True):
-        torch.testing.assert_close(a, b, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("text", ["no json", "[]", "{}", json.dumps({"format": "x", "version": 1})])
-def test_a_file_that_is_no_calibration_is_refused(tmp_path, text):
-    (tmp_path / "hall.json").write_text(text)
-    with pytest.raises(DescriptionError, match=r"hall\.json"):
-        HallCalibration.load(tmp_path / "hall.json")
 
 
 def test_bad_samples_are_refused(hand, generator):
@@ -297,9 +276,10 @@ def encoders(hand, q, generator, std=0.5 * DEG):
     return a + std * torch.randn(a.shape, generator=generator, dtype=torch.float64)
 
 
-def test_joint_estimates_of_a_whole_hand(hand, generator):
+def test_joint_estimates_of_a_whole_hand(hand, generator, monkeypatch):
+    monkeypatch.setattr(joint_estimator, "ENCODER_STD", 0.5 * DEG)
     sensors = HallSensors(hand, seed=1)
-    estimator = JointEstimator(hand, calibrated(sensors), encoder_std=0.5 * DEG)
+    estimator = JointEstimator(hand, calibrated(sensors))
     q = random_posture(hand, 400, generator)
     estimate = estimator(sensors.read(q, generator), encoders(hand, q, generator))
     error = estimate.q - q
@@ -310,10 +290,11 @@ def test_joint_estimates_of_a_whole_hand(hand, generator):
     assert bool(((chi2 > 0.4) & (chi2 < 2.0)).all())
 
 
-def test_encoders_stand_in_for_a_stuck_channel(hand, generator):
+def test_encoders_stand_in_for_a_stuck_channel(hand, generator, monkeypatch):
+    monkeypatch.setattr(joint_estimator, "ENCODER_STD", 0.5 * DEG)
     sensors = HallSensors(hand, seed=1)
-    sensors.stuck[4] = Stuck.HIGH  # index_2, which the encoder of index_distal covers with index_3
-    estimator = JointEstimator(hand, calibrated(sensors), encoder_std=0.5 * DEG)
+    sensors.stuck[4] = 255.0  # index_2, which the encoder of index_distal covers with index_3
+    estimator = JointEstimator(hand, calibrated(sensors))
     q = random_posture(hand, 200, generator)
     estimate = estimator(sensors.read(q, generator), encoders(hand, q, generator))
     k = hand.joint_names.index("index_2")
@@ -327,8 +308,6 @@ def test_estimator_refuses_what_does_not_fit(hand, generator):
     planar = load_hand("planar_two_finger")
     with pytest.raises(JointMismatchError, match="thumb_2"):
         JointEstimator(planar, calibration)
-    with pytest.raises(ParameterError, match="encoder_std"):
-        JointEstimator(hand, calibration, encoder_std=0.0)
     estimator = JointEstimator(hand, calibration)
     with pytest.raises(ShapeError, match="actuators"):
         estimator(torch.full((15,), 100.0), torch.zeros(4))

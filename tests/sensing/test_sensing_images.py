@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from lens import render
 
 from torch_ekm.description import Shape
 from torch_ekm.exceptions import ParameterError, ShapeError, UnknownNameError
@@ -26,16 +27,16 @@ def inside(polygon, points, margin=0.0):
 
 @pytest.mark.parametrize("lens", [(0.0,) * 5, (-0.15, 0.1, 1e-3, -5e-4, 0.0)])
 def test_markers_are_found_where_they_were_drawn(pose_of, lens, rng):
-    camera = SimulatedCamera(PinholeCamera(distortion=lens))
+    camera = PinholeCamera(distortion=lens)
     board, pose = MarkerBoard(8, columns=3, rows=2), pose_of(0.05, 0.03)
-    image = camera.render(CardScene((PlacedCard(board, pose),)), rng)
+    image = render(camera, CardScene((PlacedCard(board, pose),)), rng)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     parameters.relativeCornerRefinmentWinSize = 0.5
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
     assert sorted(ids.ravel()) == list(board.ids)
-    truth = camera.camera.project(board.corners @ pose[:3, :3].T + pose[:3, 3])
+    truth = camera.project(board.corners @ pose[:3, :3].T + pose[:3, 3])
     for found, k in zip(corners, ids.ravel(), strict=True):
         assert np.abs(found[0] - truth[k - 8]).max() < 1.0  # px, corner by corner: order and place
         assert np.abs(found[0].mean(0) - truth[k - 8].mean(0)).max() < 0.2  # no half-pixel shift

@@ -83,7 +83,7 @@ def test_covariance_is_carried_into_the_hand_frame(pose_of, mounted, which):
             moved = step if k == which else np.zeros(6)
             turned = exp(torch.from_numpy(moved[3:])).numpy() @ pose[:3, :3]
             known = covariance if k == which else np.zeros((6, 6))
-            looks.append(BoardPose(turned, pose[:3, 3] + moved[:3], known, 0.0, 0, False))
+            looks.append(BoardPose(turned, pose[:3, 3] + moved[:3], known, False))
         return tracker._object_in_hand(*looks)
 
     for direction in np.eye(6):

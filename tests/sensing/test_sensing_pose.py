@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from lens import render
 
 from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.sensing import MarkerBoard, PinholeCamera
+from torch_ekm.sensing.vision import board_pose
 from torch_ekm.sensing.vision.board_pose import BoardPose, estimate_board_pose, projection_jacobian
 from torch_ekm.sensing.vision.edge_refinement import refine_on_edges
 from torch_ekm.simulation import ImageQuality, SimulatedCamera
@@ -31,9 +33,7 @@ def twist(estimate, pose):
 def test_exact_corners_give_the_exact_pose(pose_of, camera, tilt):
     pose = pose_of(0.04, -0.05, 0.42, tilt_deg=tilt)
     found = estimate_board_pose(camera, *corners(MarkerBoard(), pose, camera))
-    assert found.n_rejected == 0
     assert np.abs(twist(found, pose)).max() < 1e-6
-    assert found.rms < 1e-5
 
 
 @pytest.mark.parametrize("camera", LENSES)
@@ -50,12 +50,13 @@ def test_jacobian_is_the_derivative_of_the_projection(pose_of, camera):
     np.testing.assert_allclose(J, np.stack(columns, axis=-1), atol=1e-4 * np.abs(J).max())
 
 
-def test_covariance_is_that_of_the_errors(pose_of, rng):
+def test_covariance_is_that_of_the_errors(pose_of, rng, monkeypatch):
+    monkeypatch.setattr(board_pose, "_CORNER_STD", 0.15)
     camera, board, pose = PinholeCamera(), MarkerBoard(), pose_of(tilt_deg=35)
     X, u = corners(board, pose, camera)
     errors, chi2 = [], []
     for _ in range(300):
-        found = estimate_board_pose(camera, X, u + 0.15 * rng.standard_normal(u.shape), corner_std=0.15)
+        found = estimate_board_pose(camera, X, u + 0.15 * rng.standard_normal(u.shape))
         errors.append(twist(found, pose))
         chi2.append(errors[-1] @ np.linalg.solve(found.covariance, errors[-1]))
     assert np.mean(chi2) == pytest.approx(6.0, rel=0.2)
@@ -71,7 +72,6 @@ def test_wrong_corners_are_left_out(pose_of, rng):
     spoilt[3] += [4.0, -3.0]
     spoilt[9] += [-2.5, 2.0]
     found = estimate_board_pose(camera, X, spoilt)
-    assert found.n_rejected == 2
     without = np.delete(np.arange(16), [3, 9])
     same = estimate_board_pose(camera, X[without], u[without])
     np.testing.assert_allclose(found.position, same.position, atol=1e-9)
@@ -86,19 +86,22 @@ def test_nothing_comes_of_nonsense(rng):
     assert estimate_board_pose(PinholeCamera(), line, u) is None
 
 
-def test_prior_decides_between_mirror_images(pose_of):
+def test_prior_decides_between_mirror_images(pose_of, monkeypatch):
     """A small board far away: both solutions fit, the one near the prior is taken."""
+    monkeypatch.setattr(board_pose, "_MIN_CORNERS", 4)
+    monkeypatch.setattr(board_pose, "_CORNER_STD", 0.5)
     camera, board = PinholeCamera(), MarkerBoard(columns=1, rows=1, marker_size=0.012)
     pose = pose_of(z=0.6, tilt_deg=25)
     X, u = corners(board, pose, camera)
-    free = estimate_board_pose(camera, X, u, corner_std=0.5, min_corners=4)
+    free = estimate_board_pose(camera, X, u)
     assert free.ambiguous
     assert np.abs(twist(free, pose)).max() < 1e-4  # exact corners: the better one is the true one
     mirrored = pose_of(z=0.6, tilt_deg=-25)[:3, :3]
-    other = estimate_board_pose(camera, X, u, corner_std=0.5, min_corners=4, prior=mirrored)
+    other = estimate_board_pose(camera, X, u, prior=mirrored)
     towards = log(torch.from_numpy(other.rotation @ mirrored.T)).norm()
     assert float(towards) < np.radians(12)
-    clear = estimate_board_pose(camera, X, u, corner_std=1e-3, min_corners=4, prior=mirrored)
+    monkeypatch.setattr(board_pose, "_CORNER_STD", 1e-3)
+    clear = estimate_board_pose(camera, X, u, prior=mirrored)
     assert not clear.ambiguous
     assert np.abs(twist(clear, pose)).max() < 1e-4
 
@@ -107,9 +110,9 @@ def test_prior_decides_between_mirror_images(pose_of):
 def test_edges_correct_a_rough_pose(pose_of, camera, rng):
     board, pose = MarkerBoard(), pose_of(0.03, 0.02, tilt_deg=30)
     quality = ImageQuality(noise=1.0, vignette=0.0)
-    image = SimulatedCamera(camera, quality).render(CardScene((PlacedCard(board, pose),)), rng)
+    image = render(camera, CardScene((PlacedCard(board, pose),)), rng, quality)
     rough = exp(torch.tensor([0.01, -0.008, 0.005], dtype=torch.float64)).numpy() @ pose[:3, :3]
-    start = BoardPose(rough, pose[:3, 3] + [1e-4, -1e-4, 1e-3], np.eye(6), 0.0, 0, False)
+    start = BoardPose(rough, pose[:3, 3] + [1e-4, -1e-4, 1e-3], np.eye(6), False)
     error = twist(refine_on_edges(image, camera, board, start), pose)
     assert np.abs(error[:2]).max() < 2e-5  # m
     assert abs(error[2]) < 3e-4
@@ -121,7 +124,7 @@ def test_edges_of_a_half_hidden_board_still_count(pose_of, rng, shade):
     camera, board, pose = PinholeCamera(), MarkerBoard(), pose_of(tilt_deg=30)
     finger = ConvexBody.capsule(np.array([-0.03, 0.012, 0.33]), np.array([0.04, 0.02, 0.33]), 0.007, shade)
     image = SimulatedCamera(camera).render(CardScene((PlacedCard(board, pose),), (finger,)), rng)
-    start = BoardPose(pose[:3, :3], pose[:3, 3], np.eye(6), 0.0, 0, False)
+    start = BoardPose(pose[:3, :3], pose[:3, 3], np.eye(6), False)
     refined = refine_on_edges(image, camera, board, start)
     assert refined is not start
     error = twist(refined, pose)
@@ -131,5 +134,5 @@ def test_edges_of_a_half_hidden_board_still_count(pose_of, rng, shade):
 
 def test_no_edges_leave_the_pose_alone(pose_of):
     blank = np.full((480, 640), 128, dtype=np.uint8)
-    start = BoardPose(pose_of()[:3, :3], pose_of()[:3, 3], np.eye(6), 0.0, 0, False)
+    start = BoardPose(pose_of()[:3, :3], pose_of()[:3, 3], np.eye(6), False)
     assert refine_on_edges(blank, PinholeCamera(), MarkerBoard(), start) is start

@@ -9,7 +9,7 @@ import torch
 
 from ..kinematics.se3 import hat
 from ..typing import Bool, Float, Tensor
-from .contact_model import ContactModel, contact_models, normal_rows, selected_rows
+from .contact_model import ContactModel, contact_models, selected_rows
 from .contact_set import ContactSet
 
 FLAT = 1.0
@@ -43,7 +43,7 @@ class ContactKinematics:
     @cached_property
     def normal_rows(self) -> list[int]:
         """Position of each contact's normal force in ``mu``."""
-        return normal_rows(self.models)
+        return [place for place, row in enumerate(self.rows) if row % 6 == 0]
 
     @cached_property
     def row_index(self) -> Tensor:

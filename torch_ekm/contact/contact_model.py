@@ -47,12 +47,3 @@ def selected_rows(models: Sequence[ContactModel]) -> list[int]:
     ``J_h = H J~_h`` and ``G = G~ H^T`` (Prattichizzo and Trinkle, Grasping, 2008).
     """
     return [6 * i + row for i, model in enumerate(models) for row in model.rows]
-
-
-def normal_rows(models: Sequence[ContactModel]) -> list[int]:
-    """Where each contact's normal force stands in ``mu``: ``n_c`` indices."""
-    starts, at = [], 0
-    for model in models:
-        starts.append(at)
-        at += len(model.rows)
-    return starts

@@ -22,6 +22,9 @@ from .contact_set import LINK_MARGIN, ContactSet, NearMiss
 from .link_contact import LinkShapes
 from .pad_contact import Pad, PadContact, Solid, pad_contact
 
+CROWN_RADIUS = 0.5
+"""R, of a pad along its axis [m]."""
+
 
 class ContactDetector:
     r"""One contact per (pad, object): ``s* = argmin_s d(c(s)) + s^2/(2 R)``, ``x = c(s*) - (rho + gap/2) n``.
@@ -44,12 +47,11 @@ class ContactDetector:
         hand: its pads make contacts; of its other links those that touch are reported as near misses.
         obj: the object.
         margin: pads farther away than this [m] are left out, and reported so; ``math.inf`` keeps them all.
-        crown_radius: R [m]; infinite: none.
         kinematics: of the same hand, to share one; made here if None.
 
     Raises:
         MissingExtraError: coal is not installed.
-        ParameterError: ``margin`` or ``crown_radius`` is out of range.
+        ParameterError: ``margin`` is negative.
         DescriptionError: the hand has no pads.
     """
 
@@ -58,17 +60,14 @@ class ContactDetector:
         hand: HandDescription,
         obj: ObjectDescription,
         margin: float = 0.002,
-        crown_radius: float = 0.5,
         kinematics: Kinematics | None = None,
     ) -> None:
         if not margin >= 0:
             raise ParameterError("margin", margin, "at least 0 [m]")
-        if not crown_radius > 0:
-            raise ParameterError("crown_radius", crown_radius, "positive [m]; infinite: no crown")
         if not hand.pads:
             problem = "the hand has no [[pads]], so nothing of it can touch an object"
             raise DescriptionError(hand.transmission_path, problem)
-        self.hand, self.obj, self.margin, self.crown_radius = hand, obj, margin, crown_radius
+        self.hand, self.obj, self.margin = hand, obj, margin
         self.kinematics = HandKinematics(hand) if kinematics is None else kinematics
         self._coal = require("coal")
         self._links = [hand.link_names.index(pad.link) for pad in hand.pads]
@@ -134,7 +133,7 @@ class ContactDetector:
                 least = min(least, coarse)
                 if coarse > self.margin:
                     continue
-            contact = pad_contact(pad, T_pad, solid, T_solid, self.crown_radius)
+            contact = pad_contact(pad, T_pad, solid, T_solid, CROWN_RADIUS)
             if contact.gap <= self.margin and (best is None or contact.gap < best.gap):
                 best = contact
         return least if best is None else best

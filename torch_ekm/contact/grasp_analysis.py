@@ -29,8 +29,6 @@ class GraspAnalysis:
     """n_h + n_a - rank [A; B]: combinations of contact and actuator forces that equilibrium leaves open."""
     indeterminate: bool
     """null G^T: some object motion does not show at the contacts."""
-    graspable: bool
-    """null G: there are internal forces."""
 
 
 def analyse(
@@ -68,7 +66,6 @@ def analyse(
         internal_forces=n_h - rank_G,
         undetermined_forces=n_h + len(actuation) - rank(torch.cat([A_s, B_s])),
         indeterminate=rank_G < n_p,
-        graspable=rank_G < n_h,
     )
 
 

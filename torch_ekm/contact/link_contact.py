@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..description import HandDescription, Shape
+from ..description import HandDescription
 from ..typing import Array
 from .contact_set import NearMiss
 from .pad_contact import Solid
@@ -28,14 +28,16 @@ class LinkShapes:
     def __init__(self, coal, hand: HandDescription, margin: float, distance: Callable[..., float]) -> None:
         carry_pads = {pad.link for pad in hand.pads}
         self.margin, self._distance = margin, distance
-        self._shapes: list[tuple[int, str, Solid, float]] = [
-            (hand.link_names.index(link.name), link.name, Solid(coal, shape), _bounding_radius(shape))
+        self._shapes: list[tuple[int, str, Solid]] = [
+            (hand.link_names.index(link.name), link.name, Solid(coal, shape))
             for link in hand.urdf.links
             if link.name not in carry_pads
             for shape in link.collisions
         ]
+        for _, _, solid in self._shapes:
+            solid.geometry.computeLocalAABB()
         self._links = [index for index, *_ in self._shapes]
-        self._centres = np.array([[*solid.shape.transform[:3, 3], 1.0] for _, _, solid, _ in self._shapes])
+        self._centres = np.array([[*solid.shape.transform[:3, 3], 1.0] for _, _, solid in self._shapes])
 
     def touching(self, frames: Array, solids: list[tuple[Solid, Array]]) -> list[NearMiss]:
         """The links that touch, one entry for each.
@@ -50,20 +52,10 @@ class LinkShapes:
         centres = (frames[self._links] @ self._centres[:, :, None])[:, :3, 0]
         for solid, T in solids:
             near = (centres - T[:3, 3]) @ T[:3, :3]
-            for (index, link, shape, radius), centre in zip(self._shapes, near.tolist(), strict=True):
-                if solid.distance(*centre)[0] > radius + self.margin:
+            for (index, link, shape), centre in zip(self._shapes, near.tolist(), strict=True):
+                if solid.distance(*centre)[0] > shape.geometry.aabb_radius + self.margin:
                     continue
                 gap = self._distance(shape, frames[index] @ shape.shape.transform, solid, T)
                 if gap <= min(self.margin, found.get(link, self.margin)):
                     found[link] = gap
         return [NearMiss(link, None, gap) for link, gap in found.items()]
-
-
-def _bounding_radius(shape: Shape) -> float:
-    """Of the ball about the shape's own origin that holds it [m]."""
-    if shape.kind == "box":
-        return float(np.linalg.norm(shape.size)) / 2
-    if shape.kind == "sphere":
-        return shape.size[0]
-    radius, half = shape.size[0], shape.size[1] / 2
-    return radius + half if shape.kind == "capsule" else float(np.hypot(radius, half))

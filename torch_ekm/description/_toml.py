@@ -143,13 +143,6 @@ class TomlTable:
             return tuple(math.radians(value) for value in self.vector(f"{key}_deg", size))
         return self.vector(key, size, default)
 
-    def notes(self) -> dict[str, str]:
-        """The free text of the table ``[notes]``, if there is one."""
-        value = self._get("notes", {})
-        if not isinstance(value, dict):
-            raise self.error(f"'notes' must be a table, got {_shown(value)}")
-        return {name: str(text) for name, text in value.items()}
-
     def weights(self, key: str) -> dict[str, float]:
         """A table of numbers, e.g. moment arms by joint name; not empty."""
         value = self._get(key, _NOTHING)

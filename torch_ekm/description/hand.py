@@ -109,7 +109,6 @@ class HandDescription:
     iCub's palm faces down: its fingers hang, and the line of a pinch is level."""
     pinch_force: float = 5.0
     """Normal force with which the thumb pinches an object in simulation [N]; soft springs bear less."""
-    notes: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.planar_normal is not None:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..exceptions import DescriptionError
 from ..typing import Array
-from ._toml import LARGEST_FIGURE
 
 _CLOSE = 1e-6  # of weights
 _RESTS = 1e-3  # [rad]: an angle written with few digits
@@ -32,38 +31,24 @@ class Mimic:
         return {self.joint: 1.0, self.other: -self.multiplier}
 
 
-def read_mimics(path: Path, root: ET.Element) -> tuple[Mimic, ...]:
-    """The ``<mimic>`` of all moving joints.
+def read_mimics(path: Path, joints: Sequence[Any]) -> tuple[Mimic, ...]:
+    """The ``<mimic>`` of all moving joints, of the ``yourdfpy.Joint`` of a file.
 
     Raises:
-        DescriptionError: one names no other moving joint, or has a figure that is none.
+        DescriptionError: one names no other moving joint, or has the multiplier 0.
     """
-    moving = {
-        joint.get("name", ""): joint
-        for joint in root.findall("joint")
-        if joint.get("type") in ("revolute", "continuous")
-    }
+    moving = [joint.name for joint in joints if joint.type != "fixed"]
     found = []
-    for name, joint in moving.items():
-        mimic = joint.find("mimic")
-        if mimic is None:
+    for joint in joints:
+        if joint.mimic is None:
             continue
-        place, other = f"joint '{name}': <mimic>", mimic.get("joint", "")
-        if other not in moving or other == name:
-            valid = ", ".join(one for one in moving if one != name)
+        place, other = f"joint '{joint.name}': <mimic>", joint.mimic.joint
+        if other not in moving or other == joint.name:
+            valid = ", ".join(one for one in moving if one != joint.name)
             raise DescriptionError(path, f"{place} names '{other}', which must be one of {valid}")
-        figures = []
-        for key, default in (("multiplier", "1"), ("offset", "0")):
-            try:
-                value = float(mimic.get(key, default))
-            except ValueError:
-                value = math.nan
-            if not abs(value) <= LARGEST_FIGURE:
-                raise DescriptionError(path, f"{place}: '{key}' must be a number, got '{mimic.get(key)}'")
-            figures.append(value)
-        if figures[0] == 0:
+        if joint.mimic.multiplier == 0:
             raise DescriptionError(path, f"{place}: 'multiplier' is 0; make it a fixed joint")
-        found.append(Mimic(name, other, *figures))
+        found.append(Mimic(joint.name, other, joint.mimic.multiplier, joint.mimic.offset))
     return tuple(found)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +42,6 @@ class ObjectDescription:
     """Unit direction along which the fingers press, ``(3,)``."""
     grasp_width: float
     """Thickness between the fingers at the origin, along ``grasp_axis`` [m]."""
-    notes: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         problem = inertia_problem(self.mass, self.inertia)
@@ -92,5 +91,4 @@ def read_object(path: Path, urdf: UrdfModel) -> ObjectDescription:
         marker_transform=pose(translate=xyz, angles=rpy),
         grasp_axis=axis / np.linalg.norm(axis),
         grasp_width=table.number("grasp_width", positive=True),
-        notes=top.notes(),
     )

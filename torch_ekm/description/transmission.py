@@ -57,6 +57,8 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
     data = read_toml(path, "transmission file")
     _check_filled_in(path, data)
     top = TomlTable(path, "top level", data, TABLES)
+    if not isinstance(data.get("notes", {}), dict):
+        raise top.error("'notes' must be a table, of text that is for people alone")
     joints = urdf.moving_joints
     names = tuple(joint.name for joint in joints)
     if not names:
@@ -100,7 +102,6 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
         planar_normal=None if normal is None else (normal[0], normal[1], normal[2]),
         gravity=(gravity[0], gravity[1], gravity[2]),
         pinch_force=hand.number("pinch_force", HandDescription.pinch_force, positive=True),
-        notes=top.notes(),
     )
 
 

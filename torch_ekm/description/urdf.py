@@ -35,7 +35,7 @@ _CHILDREN = {
     "inertial": ("origin", "mass", "inertia"),
     "collision": ("origin", "geometry"),
     "geometry": _SHAPES,
-    "joint": ("parent", "child", "origin", "axis", "limit"),
+    "joint": ("parent", "child", "origin", "axis", "limit", "mimic"),
 }
 _NEEDED = {"inertial": ("mass", "inertia"), "collision": ("geometry",), "joint": ("parent", "child")}
 # ... and the attributes that hold figures: those that it needs, and the others
@@ -45,6 +45,7 @@ _FIGURES = {
     "inertia": (("ixx", "iyy", "izz"), ("ixy", "ixz", "iyz")),
     "axis": (("xyz",), ()),
     "limit": ((), ("lower", "upper", "effort", "velocity")),
+    "mimic": ((), ("multiplier", "offset")),
     "box": (("size",), ()),
     "cylinder": (("radius", "length"), ()),
     "sphere": (("radius",), ()),
@@ -68,7 +69,7 @@ class UrdfLink:
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """``T_parent_child(q) = transform @ rot(axis, q)``; limits [rad], effort [N m], velocity [rad/s]."""
+    """``T_parent_child(q) = transform @ rot(axis, q)``; limits [rad]."""
 
     name: str
     kind: str
@@ -78,8 +79,6 @@ class UrdfJoint:
     axis: Array
     lower: float
     upper: float
-    effort: float
-    velocity: float
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,8 @@ def read_urdf(path: str | Path) -> UrdfModel:
     robot = require("yourdfpy").URDF.load(document, build_scene_graph=False, load_meshes=False).robot
     links = tuple(_link(path, link) for link in robot.links)
     joints = tuple(_joint(path, joint) for joint in robot.joints)
-    return UrdfModel(path, robot.name, links, joints, _root(path, links, joints), read_mimics(path, root))
+    base = _root(path, links, joints)
+    return UrdfModel(path, robot.name, links, joints, base, read_mimics(path, robot.joints))
 
 
 def _place(path: Path, element: ET.Element) -> str:
@@ -151,7 +151,7 @@ def _strict_joint(path: Path, element: ET.Element) -> ET.Element:
         raise DescriptionError(path, f"{place}: type '{kind}' is not supported; supported: {valid}")
     if kind == "revolute" and element.find("limit") is None:
         raise DescriptionError(path, f"{place}: <joint> needs a <limit>")
-    unread = {"revolute": (), "continuous": ("limit",), "fixed": ("axis", "limit")}
+    unread = {"revolute": (), "continuous": ("limit",), "fixed": ("axis", "limit", "mimic")}
     return _strict(path, element, place, unread[kind])
 
 
@@ -244,16 +244,15 @@ def _joint(path: Path, joint: Any) -> UrdfJoint:
     place, length = f"joint '{joint.name}'", float(np.linalg.norm(joint.axis))
     if length < 1e-9:
         raise DescriptionError(path, f"{place}: the axis must not be zero")
-    lower, upper, effort, velocity = -np.inf, np.inf, np.inf, np.inf
+    lower, upper = -np.inf, np.inf
     if joint.limit is not None:
         limit = joint.limit
         lower, upper = limit.lower or 0.0, limit.upper or 0.0
-        effort, velocity = (np.inf if x is None else x for x in (limit.effort, limit.velocity))
         if lower > upper:
             raise DescriptionError(path, f"{place}: limits reversed, lower {lower} > upper {upper}")
     ends = joint.parent or "", joint.child or ""
     frame, axis = _pose(joint.origin), joint.axis / length
-    return UrdfJoint(joint.name, joint.type, *ends, frame, axis, lower, upper, effort, velocity)
+    return UrdfJoint(joint.name, joint.type, *ends, frame, axis, lower, upper)
 
 
 def _pose(origin: Array | None) -> Array:

@@ -224,12 +224,12 @@ class Bench:
 
 def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting, keep_images: bool) -> Plant:
     from ..sensing import ContactAligned  # OpenCV is needed only here
-    from ..simulation import HallSensors, SensedPlant, Stuck
+    from ..simulation import HallSensors, SensedPlant
 
     hand, stuck = simulated.hand, setting.parameters.stuck_joints
     hall = HallSensors(hand) if hand.hall_sensors else None
     sensed = SensedPlant(plant, hand, simulated.object, hall=hall, keep_images=keep_images)
     if hall is not None:  # after the calibration: a channel that was dead by then would not be believed
-        hall.stuck = [Stuck.FROZEN if joint in stuck else Stuck.NO for joint in hall.joints]
+        hall.stuck = {k: math.nan for k, joint in enumerate(hall.joints) if joint in stuck}
     rested = FramesAtRest(sensed, setting.frames)
     return rested if hall is None else ContactAligned(rested, hand, simulated.object)

@@ -234,7 +234,7 @@ def _pinch(
     if picture is not None:
         try:
             yield Check("picture", "ok", str(_draw(hand, lin, picture).resolve()))
-        except (MissingExtraError, OSError, ValueError) as error:
+        except (EKMError, OSError) as error:
             yield Check("picture", "warning", f"not drawn: {error}")
 
 

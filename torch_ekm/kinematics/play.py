@@ -22,11 +22,6 @@ class PlayState(NamedTuple):
         """z, the middle of the bounds [rad]."""
         return 0.5 * (self.low + self.high)
 
-    @property
-    def uncertainty(self) -> Float[Tensor, "*batch n_a"]:
-        """Distance of the bounds [rad]: 0 once the motor has crossed the play, whatever the start."""
-        return self.high - self.low
-
 
 class Play:
     """``z+ = clip(z - da, -w/2, w/2)``,  transmitted ``dx = da + z+ - z``.

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
-from .._checks import check_finite, check_positive, check_shape
+from .._checks import check_finite, check_shape
 from .._recorded import Recorded
 from ..typing import Bool, Float, Tensor
 
@@ -58,30 +58,22 @@ class ServoModel(Recorded, nn.Module):
 
     Args:
         names: of the actuators.
-        encoder_std: standard deviation of an encoder [rad].
-        resolution: wanted motions up to this size are none [rad].
-        largest: no dead zone is larger [rad].
 
     Source: the factorisation of a Hammerstein system; adaptive inverses: Tao and Kokotovic, Adaptive Control
     of Systems with Actuator and Sensor Nonlinearities (1996).
     """
 
     learns = True
+    moved_from = 3 * (0.01 * _DEG)
+    """Readings of an encoder up to this size are its noise, three standard deviations [rad]."""
+    resolution = 0.02 * _DEG
+    """Wanted motions up to this size are none [rad]."""
+    largest = 6 * _DEG
+    """No dead zone is larger [rad]."""
 
-    def __init__(
-        self,
-        names: Sequence[str],
-        *,
-        encoder_std: float = 0.01 * _DEG,
-        resolution: float = 0.02 * _DEG,
-        largest: float = 6 * _DEG,
-    ) -> None:
+    def __init__(self, names: Sequence[str]) -> None:
         super().__init__()
-        figures = {"encoder_std": encoder_std, "resolution": resolution, "largest": largest}
-        for name, value in figures.items():
-            check_positive(name, value)
         self.names = tuple(names)
-        self.moved_from, self.resolution, self.largest = 3 * encoder_std, resolution, largest
         self._prior = torch.diag(torch.tensor(_PRIOR_STD, dtype=torch.float64).square()) / _NOISE_STD**2
         n = len(self.names)
         self.estimate = nn.Buffer(torch.zeros(n, 2).double())  # theta = (d, b) [rad]

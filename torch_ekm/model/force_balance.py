@@ -50,8 +50,6 @@ class KnownForces:
 
     normal: Float[Tensor, "*batch n_c"] | None = None
     """Measured normal forces [N], NaN where there is no sensor."""
-    actuator_load: Float[Tensor, "*batch n_a"] | None = None
-    """Measured force of each actuator along +a [N m], NaN where there is no sensor."""
     expected: ExpectedForces | None = None
     """Prediction from the state before."""
     last: GraspForces | None = None
@@ -120,8 +118,7 @@ class ForceBalance:
 
         states = zip(*(rows(x) for x in (q, at.A, at.V_s[..., :n_q], at.V_s[..., n_q:])), strict=True)
         measured = None if known.normal is None else rows(known.normal)
-        load = None if known.actuator_load is None else rows(known.actuator_load)
-        estimating = not (measured is None and load is None and known.expected is None)
+        estimating = measured is not None or known.expected is not None
         prior = ForcePrior(kin, known.expected, options) if estimating else None
         cones = friction_cones(
             kin.models, kin.contacts.friction.tolist(), kin.contacts.torsional_friction.tolist()
@@ -146,7 +143,6 @@ class ForceBalance:
                 bound_upper=upper,
                 weight=self.weight,
                 measured_normal=None if measured is None else measured[k],
-                measured_actuator=None if load is None else load[k],
             )
             if prior is not None:
                 eq = prior.into(eq, k)

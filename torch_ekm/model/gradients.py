@@ -56,11 +56,6 @@ def only_if_asked(method: Callable[..., Any]) -> Any:
     return wrapped
 
 
-def detached(state: GraspState) -> GraspState:
-    """The same state without a graph: no gradient flows back from it."""
-    return GraspState(state.q.detach(), state.position.detach(), state.rotation.detach())
-
-
 def following(
     contacts: ContactSet, detect: Callable[[GraspState], ContactSet], state: GraspState
 ) -> ContactSet:
@@ -69,7 +64,7 @@ def following(
     Of point, normal, gap and curvatures, along those parts of the state that require a gradient. Where a
     small step changes who touches, that direction has no derivative and counts as 0.
     """
-    here = detached(state)
+    here = GraspState(state.q.detach(), state.position.detach(), state.rotation.detach())
     n_q = here.q.shape[-1]
     asked = [j for j in range(here.n_s) if (state.q if j < n_q else state.position).requires_grad]
     if state.rotation.requires_grad and not state.position.requires_grad:
@@ -119,7 +114,7 @@ def differentiable_forces(
         object_matrix, object_load, hand_matrix, actuator_matrix, hand_load: as in ``eq``, with a graph.
     """
     cost = force_cost(eq, options)
-    problem, scale = force_problem(eq, options, cost, np.zeros((0, len(solution.mu)))), cost.scale
+    problem, scale = force_problem(eq, cost, np.zeros((0, len(solution.mu)))), cost.scale
     n_h, n_a, n = len(solution.mu), len(solution.lam), len(scale)
     x = np.concatenate([solution.mu, solution.lam, solution.bound]) / scale
     P, A = cost.P, cost.balance

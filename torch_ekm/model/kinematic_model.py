@@ -26,7 +26,6 @@ from .options import ModelOptions
 from .reduction import Reduction
 from .sensitivity import force_change, margin_sensitivity, normal_motion, normal_sensitivity
 from .stiffness.geometric import geometric_stiffness, precedence
-from .stiffness.link_weights import LinkWeights
 from .stiffness.potential import gravity_gradient, gravity_hessian, spring_torque
 from .validity import find_doubts
 
@@ -47,7 +46,7 @@ class KinematicModel(nn.Module):
     quasi-static equilibrium; ``docs/explanation/quasi_static_model.md`` has the derivation.
 
     Args:
-        hand: the hand; its gravity is the model's unless the options say otherwise.
+        hand: the hand; its gravity is the model's.
         obj: the object: its mass, centre of mass and surfaces.
         options: what to take into account.
         kinematics: in place of :class:`~torch_ekm.kinematics.HandKinematics`.
@@ -98,18 +97,13 @@ class KinematicModel(nn.Module):
 
         buffer("spring_stiffness", hand.spring_stiffness)
         buffer("spring_rest", hand.spring_rest)
-        self.gravity = hand.gravity if self.options.gravity is None else self.options.gravity
-        """g in the hand frame [m/s^2]."""
-        buffer("weight", float(obj.mass) * torch.tensor(self.gravity, dtype=torch.float64))
+        buffer("weight", float(obj.mass) * torch.tensor(hand.gravity, dtype=torch.float64))
         buffer("com", obj.com)
         normal = hand.planar_normal
         self.register_buffer(
             "plane", None if normal is None else torch.tensor(normal, dtype=dtype), persistent=False
         )
         self.register_buffer("precedes", precedence(self.kinematics.upstream), persistent=False)
-        self.link_weights: LinkWeights | None = None
-        if self.options.link_weights:
-            self.link_weights = LinkWeights(hand, self.kinematics, self.gravity, dtype)
 
     def extra_repr(self) -> str:
         return f"hand={self.hand.name}, n_q={self.hand.n_q}, n_a={self.hand.n_a}"
@@ -171,7 +165,6 @@ class KinematicModel(nn.Module):
         *,
         forces: GraspForces | None = None,
         fingertip_force: Float[Tensor, "*batch n_pads"] | None = None,
-        actuator_load: Float[Tensor, "*batch n_a"] | None = None,
         expected: ExpectedForces | None = None,
         previous: Linearization | None = None,
         locked: Sequence[str] = (),
@@ -191,7 +184,6 @@ class KinematicModel(nn.Module):
                 where nothing more is known.
             fingertip_force: measured normal forces [N] in the order of ``hand.pads``, NaN where unknown, to
                 be respected in that problem. Worth giving where joints are at their stops.
-            actuator_load: measured force of each actuator along +a [N m], NaN where unknown, likewise.
             expected: ``previous.forces_after(da)``, da what the encoders moved since: the forces then change
                 least from these, as far as balance and measurements leave them open.
             previous: the last linearization of this grasp whose forces were found. Where that problem has
@@ -213,7 +205,7 @@ class KinematicModel(nn.Module):
         check_contacts(state, contacts, self.link_names, self.options.max_overlap)
         kin = self.contact_kinematics(state, contacts, poses=poses)
         A = constraint_matrix(kin)
-        V_s, V_ss = self.potential(state, poses)
+        V_s, V_ss = self.potential(state)
         lock = [joint_index(self.hand, name) for name in locked]
         last, measured = None, None
         if fingertip_force is not None:
@@ -226,7 +218,7 @@ class KinematicModel(nn.Module):
             ):
                 last = previous.forces
             touch = None if measured is None else torch.stack([measured[f] for f in contacts.finger], dim=-1)
-            known = KnownForces(touch, actuator_load, expected, last)
+            known = KnownForces(touch, expected, last)
             forces = self.balance(Statics(state.q, kin, A, V_s, lock), known)
 
         o = self.options
@@ -272,19 +264,14 @@ class KinematicModel(nn.Module):
         return geometric_stiffness(kin, forces.force, forces.spin_moment, self.precedes)
 
     def potential(
-        self, state: GraspState, poses: LinkPoses | None = None
+        self, state: GraspState
     ) -> tuple[Float[Tensor, "*batch n_s"], Float[Tensor, "*batch n_s n_s"]]:
-        """``V_s`` [N m, N] and ``V_ss`` of springs, the object's weight and (as an option) the links'."""
+        """``V_s`` [N m, N] and ``V_ss`` of springs and the object's weight."""
         n_q = self.hand.n_q
         com_lever = (state.rotation @ self.com[:, None])[..., 0]
         V_q = spring_torque(state.q, self.spring_stiffness, self.spring_rest)
         V_ss = state.q.new_zeros(*state.q.shape[:-1], n_q + 6, n_q + 6)
         V_ss[..., :n_q, :n_q] = torch.diag(self.spring_stiffness)
         V_ss[..., n_q:, n_q:] = gravity_hessian(self.weight, com_lever)
-        if self.link_weights is not None:
-            poses = self.kinematics(state.q) if poses is None else poses
-            gradient, hessian = self.link_weights(poses)
-            V_q = V_q + gradient
-            V_ss[..., :n_q, :n_q] += hessian
         V_p = gravity_gradient(self.weight, com_lever)
         return torch.cat([V_q, V_p], dim=-1), V_ss

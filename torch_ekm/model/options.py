@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 from ..contact.forces.options import ForceOptions
@@ -17,10 +16,6 @@ class ModelOptions:
         ParameterError: a value outside its range.
     """
 
-    gravity: tuple[float, float, float] | None = None
-    """g in the **hand frame** [m/s^2], constant while the hand's pose is static. None: the hand's."""
-    link_weights: bool = False
-    """Count the weight of the hand's own links (masses of its URDF)."""
     rolling: bool = True
     """Contact points run over the surfaces. False treats them as pinned."""
     actuator_compliance: bool = True
@@ -45,5 +40,3 @@ class ModelOptions:
             raise ParameterError("contact_margin", self.contact_margin, "not negative")
         if self.slack_tension is not None and not self.slack_tension >= 0:
             raise ParameterError("slack_tension", self.slack_tension, "not negative, or None")
-        if self.gravity is not None and (len(self.gravity) != 3 or not all(map(math.isfinite, self.gravity))):
-            raise ParameterError("gravity", self.gravity, "three finite numbers [m/s^2]")

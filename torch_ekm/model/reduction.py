@@ -44,7 +44,7 @@ class Reduction(nn.Module):
 
     def __init__(self, hand: HandDescription, options: ModelOptions, dtype: torch.dtype) -> None:
         super().__init__()
-        self.options, self.actuators = options, hand.actuator_names
+        self.actuators = hand.actuator_names
         joint = joint_basis(hand).to(dtype)
         pose = torch.eye(6, dtype=dtype)
         if hand.planar_normal is not None:
@@ -78,7 +78,7 @@ class Reduction(nn.Module):
         rows: list[int],
         held: Bool[Tensor, "*batch n_q"],
         slack: Bool[Tensor, "*batch n_a"],
-        on_unstable: str | None = None,
+        on_unstable: str,
     ) -> GraspResponse:
         """J_m, dmu/da and dlam/da in full coordinates; states that differ in what is held are grouped.
 
@@ -92,21 +92,20 @@ class Reduction(nn.Module):
             rows: which of the 6 n_c contact components are the rows of A.
             held: joints that do not move.
             slack: tendons that pull nothing.
-            on_unstable: in place of the option of this name.
+            on_unstable: "raise" or "flag", as the option of this name.
         """
-        flag = self.options.on_unstable if on_unstable is None else on_unstable
         if held.dim() == 1:
-            return self._solve(D, A, rows, held, slack, flag)
+            return self._solve(D, A, rows, held, slack, on_unstable)
         n_q = held.shape[-1]
         pattern = torch.cat([held, slack], dim=-1).reshape(-1, n_q + slack.shape[-1])
         if len(pattern) == 1 or bool((pattern == pattern[0]).all()):
-            return self._solve(D, A, rows, pattern[0, :n_q], pattern[0, n_q:], flag)
+            return self._solve(D, A, rows, pattern[0, :n_q], pattern[0, n_q:], on_unstable)
         batch = held.shape[:-1]
         flat_D, flat_A = D.reshape(-1, *D.shape[-2:]), A.reshape(-1, *A.shape[-2:])
         parts: list[Tensor] = []
         for unique in torch.unique(pattern, dim=0):
             at = (pattern == unique).all(-1)
-            group = self._solve(flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], flag)
+            group = self._solve(flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable)
             parts = parts or [part.new_empty(len(pattern), *part.shape[1:]) for part in group]
             for whole, part in zip(parts, group, strict=True):
                 whole[at] = part
@@ -115,13 +114,8 @@ class Reduction(nn.Module):
     def _solve(
         self, D: Tensor, A: Tensor, rows: list[int], held: Tensor, slack: Tensor, on_unstable: str
     ) -> GraspResponse:
-        n_q, n_a, n_h, L = (
-            self.joint_basis.shape[0],
-            self.actuation.shape[0],
-            len(rows),
-            CHARACTERISTIC_LENGTH,
-        )
-        S = self.scaled_basis
+        n_a, n_q = self.actuation.shape
+        n_h, L, S = len(rows), CHARACTERISTIC_LENGTH, self.scaled_basis
         D = _left(S, D @ S)
         row_scale = torch.tensor(
             [1 / L if row % 6 < 3 else 1.0 for row in rows], dtype=D.dtype, device=D.device

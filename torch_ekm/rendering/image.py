@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._extras import require
+from ..exceptions import EKMError
 from ..typing import Array
 from .scene import Scene, shape_mesh
 
@@ -79,44 +80,19 @@ class Picture:
 def save_picture(scene: Scene, path: Path, frames: Sequence[int] = (-1,), size: int = 640) -> Path:
     """Draw some frames side by side, each ``size`` pixels wide.
 
-    An OpenGL that is broken or missing can abort the whole process, so PyVista draws in a process of its
-    own; if that fails, matplotlib draws a plainer picture.
+    An OpenGL that is broken can abort the whole process, so PyVista draws in a process of its own.
+
+    Raises:
+        MissingExtraError: pyvista or trimesh is not installed.
+        EKMError: PyVista cannot draw on this machine, or ``path`` cannot be written; the message ends with
+            what it says.
     """
+    require("pyvista")
     scene = replace(scene, transforms=scene.transforms[list(frames)])
     given = pickle.dumps((scene, path, (size, size * 3 // 4)))
-    try:
-        command = [sys.executable, "-c", _DRAW]
-        done = subprocess.run(command, input=given, capture_output=True, timeout=120, check=False)
-        drawn = done.returncode == 0 and path.exists()
-    except subprocess.TimeoutExpired:
-        drawn = False
-    if not drawn:
-        _draw_matplotlib(scene, path, size)
+    done = subprocess.run([sys.executable, "-c", _DRAW], input=given, capture_output=True, check=False)
+    if done.returncode != 0 or not path.exists():
+        said = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        remedy = "without a screen and OpenGL it needs VTK 9.5 or newer"
+        raise EKMError(f"PyVista could not draw {path} (exit status {done.returncode}); {remedy}: {said}")
     return path
-
-
-def _draw_matplotlib(scene: Scene, path: Path, size: int) -> None:
-    collection = require("mpl_toolkits.mplot3d.art3d").Poly3DCollection
-    n = len(scene.transforms)
-    figure = require("matplotlib.figure").Figure(figsize=(size / 100 * n, size / 100))
-    meshes = [(shape_mesh(shape), colour, scene.opacity(i)) for i, (shape, colour) in enumerate(scene.shapes)]
-    position, focus, up = scene.camera  # matplotlib's z is up in the picture: turn everything there
-    forward = np.eye(3)[int(abs(up[0]) > 0.99)]  # any direction that is not up
-    forward = forward - (forward @ up) * up
-    forward /= np.linalg.norm(forward)
-    turn = np.stack([forward, np.cross(up, forward), up])
-    sight = turn @ (position - focus)
-    azimuth = np.degrees(np.arctan2(sight[1], sight[0]))
-    elevation = np.degrees(np.arcsin(sight[2] / np.linalg.norm(sight)))
-    for k, transforms in enumerate(scene.transforms):
-        axis = figure.add_subplot(1, n, k + 1, projection="3d")
-        for (mesh, colour, opacity), T in zip(meshes, transforms, strict=True):
-            vertices = (mesh.vertices @ T[:3, :3].T + T[:3, 3]) @ turn.T
-            faces = collection(vertices[mesh.faces], facecolors=colour, shade=True, alpha=opacity)
-            axis.add_collection3d(faces)
-        for name, middle in zip("xyz", turn @ focus, strict=True):
-            getattr(axis, f"set_{name}lim")(middle - 0.06, middle + 0.06)
-        axis.set_axis_off()
-        axis.set_box_aspect((1, 1, 1), zoom=1.4)
-        axis.view_init(elev=elevation, azim=azimuth)
-    figure.savefig(path, dpi=100)

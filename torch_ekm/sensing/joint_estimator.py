@@ -8,10 +8,13 @@ import torch
 
 from .._checks import check_finite
 from ..description import HandDescription
-from ..exceptions import JointMismatchError, ParameterError, ShapeError
+from ..exceptions import JointMismatchError, ShapeError
 from ..typing import Float, Tensor
 from .hall.calibration import HallCalibration
 
+# s_a, by how much an encoder and J_a q + a_0 differ [rad]: at the motors of a loaded hand, behind cables that
+# stretch by degrees in a pinch of 5 N; encoders at the joints are good to half a degree
+ENCODER_STD = 0.0436
 COUPLING_STD = 5e-4  # s_c, play of a rigid coupling [rad]
 
 
@@ -39,23 +42,12 @@ class JointEstimator:
     Args:
         hand: joints, actuation Jacobian and couplings; ``C q = 0`` is taken to hold, not just ``C dq = 0``.
         calibration: of its Hall channels.
-        encoder_std: s_a, by how much an encoder and ``J_a q + a_0`` differ [rad]. The default is for
-            encoders at the motors of a loaded hand, behind cables that stretch by degrees in a pinch of
-            5 N; encoders at the joints are good to half a degree.
 
     Raises:
         JointMismatchError: the calibration names joints that the hand does not have.
-        ParameterError: ``encoder_std`` is not positive.
     """
 
-    def __init__(
-        self,
-        hand: HandDescription,
-        calibration: HallCalibration,
-        encoder_std: float = 0.0436,  # 2.5 deg
-    ) -> None:
-        if not encoder_std > 0:
-            raise ParameterError("encoder_std", encoder_std, "positive [rad]")
+    def __init__(self, hand: HandDescription, calibration: HallCalibration) -> None:
         unknown = [joint for joint in calibration.joints if joint not in hand.joint_names]
         if unknown:
             raise JointMismatchError(hand.name, (), unknown, hand.joint_names)
@@ -65,14 +57,13 @@ class JointEstimator:
             self._select[k, hand.joint_names.index(joint)] = 1.0
         self._J_a = torch.from_numpy(hand.actuation_jacobian.copy())
         self._offset = torch.from_numpy(hand.actuator_offset)
-        self._encoder_std = encoder_std
         C = torch.from_numpy(hand.coupling.copy())
         lower, upper = (torch.from_numpy(x.copy()) for x in (hand.joint_lower, hand.joint_upper))
         # a locked joint has no range: a small one keeps the information finite
         prior = 12 / (upper - lower).clamp(min=1e-3) ** 2
         self._middle = prior * (lower + upper) / 2
         self._fixed = (
-            torch.diag(prior) + self._J_a.mT @ self._J_a / encoder_std**2 + C.mT @ C / COUPLING_STD**2
+            torch.diag(prior) + self._J_a.mT @ self._J_a / ENCODER_STD**2 + C.mT @ C / COUPLING_STD**2
         )
 
     def __call__(
@@ -90,7 +81,7 @@ class JointEstimator:
         weight = hall.std**-2
         S = self._select
         information = self._fixed + S.mT @ (weight[..., None] * S)
-        encoder = (actuators.to(torch.float64) - self._offset) / self._encoder_std**2
+        encoder = (actuators.to(torch.float64) - self._offset) / ENCODER_STD**2
         right = self._middle + (weight * hall.q) @ S + encoder @ self._J_a
         factor = torch.linalg.cholesky(information)
         q = torch.cholesky_solve(right[..., None], factor)[..., 0]

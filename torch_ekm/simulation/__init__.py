@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from .config import PlantConfig
 from .disturbances import DisturbedPlant, PlantChange, Tug
-from .hall_sensors import HallSensors, Stuck
+from .hall_sensors import HallSensors
 from .imaging.simulated_camera import ImageQuality, SimulatedCamera
 from .parameters import PlantParameters
 from .presets import PRESETS, preset
@@ -22,7 +22,6 @@ __all__ = [
     "SensedPlant",
     "SimulatedCamera",
     "SimulatedHand",
-    "Stuck",
     "Tug",
     "preset",
 ]

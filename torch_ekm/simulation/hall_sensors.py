@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import Enum
+import math
 
 import numpy as np
 import torch
@@ -18,15 +18,6 @@ _ASYMMETRY_DEG = 6.0  # largest misalignment of a magnet
 # channels, and 491 to 505 of 510 (medians) for the sums of two; closed, medians are 0 to 22 of 255, and 127
 # of 765 for the little finger.
 _OPEN_OVERDRIVE, _CLOSED_OVERDRIVE = (-0.03, 0.06), (-0.16, 0.03)
-
-
-class Stuck(Enum):
-    """How a channel fails. The last is the commonest on real hands at either end of the range."""
-
-    NO = "no"
-    LOW = "low"  # at 0
-    HIGH = "high"  # at full scale
-    FROZEN = "frozen"  # at what it first read
 
 
 class HallSensors:
@@ -68,9 +59,8 @@ class HallSensors:
         )
         ends = torch.tensor([[s.open, s.closed] for s in sensors], dtype=torch.float64).T
         self._open, self._closed = ends
-        self.stuck = [Stuck.NO] * n
-        """Failure of each channel; may be changed at any time."""
-        self._frozen: dict[int, Tensor] = {}
+        self.stuck: dict[int, float] = {}
+        """Readings at which channels are stuck, by place; NaN: at what is read next. May be changed."""
 
     def field(self, q: Float[Tensor, "*batch n_q"]) -> Float[Tensor, "*batch n_channels"]:
         """Counts before noise, rounding and the ends of the scale.
@@ -110,11 +100,8 @@ class HallSensors:
         counts = self.field(q)
         noise = torch.randn(counts.shape, generator=generator, dtype=torch.float64)
         counts = (counts + self.noise * noise).clamp(0, 255).floor()
-        for k, failure in enumerate(self.stuck):
-            if failure is Stuck.NO:
-                self._frozen.pop(k, None)
-            elif failure is Stuck.FROZEN:
-                counts[..., k] = self._frozen.setdefault(k, counts[..., k].flatten()[0].clone())
-            else:
-                counts[..., k] = 0.0 if failure is Stuck.LOW else 255.0
+        for k, reading in self.stuck.items():
+            if math.isnan(reading):
+                self.stuck[k] = float(counts[..., k].flatten()[0])
+            counts[..., k] = self.stuck[k]
         return counts

@@ -46,9 +46,6 @@ class SensedPlant(PlantWrapper):
     Args:
         plant: for example a ``SimulatedHand``.
         hand, obj: what it consists of.
-        palm_mount: pose of the palm's board in the hand frame, ``(4, 4)``.
-        tracker: finds the boards; by default one that knows the lens and the mounts exactly. Give one
-            with a calibrated lens, or with mounts as measured, to include the errors of both.
         hall: the Hall channels, calibrated by a sweep of 181 postures; None keeps the inner plant's joint
             angles.
         keep_images: the last image of an observation stays in ``info["raw"]["image"]``.
@@ -62,21 +59,16 @@ class SensedPlant(PlantWrapper):
         plant: Plant,
         hand: HandDescription,
         obj: ObjectDescription,
-        palm_mount: np.ndarray = ICUB_PALM_MOUNT,
-        tracker: MarkerTracker | None = None,
         hall: HallSensors | None = None,
         keep_images: bool = False,
     ) -> None:
         super().__init__(plant)
         self.hand, self.object, self.keep_images = hand, obj, keep_images
         self.camera = SimulatedCamera()
-        palm = MarkerBoard(0) if tracker is None else tracker.palm_board
-        board = MarkerBoard(palm.n_markers) if tracker is None else tracker.object_board
-        self.boards = (
-            dataclasses.replace(palm, mount=palm_mount),
-            dataclasses.replace(board, mount=obj.marker_transform),
-        )
-        self.tracker = tracker or MarkerTracker(self.camera.camera, *self.boards)
+        palm = MarkerBoard(0, mount=ICUB_PALM_MOUNT)
+        self.boards = palm, MarkerBoard(palm.n_markers, mount=obj.marker_transform)
+        self.tracker = MarkerTracker(self.camera.camera, *self.boards)
+        """Finds the boards: it knows the lens and the mounts exactly."""
         self.hall, self.joints = hall, None
         if hall is not None:
             sweep = hall.sweep(181, torch.Generator().manual_seed(0))
@@ -120,8 +112,7 @@ class SensedPlant(PlantWrapper):
             self._last = *track.pose(), seen.taken.pose
         elif self._last is None:
             raise ObjectLostError(
-                f"none of {_LOOKS} frames shows both boards ({track.status.value}): another camera "
-                "distance or palm_mount may help"
+                f"none of {_LOOKS} frames shows both boards ({track.status.value}): grasp with another seed"
             )
         elif status is PlantStatus.HELD:
             status = PlantStatus.NOT_SEEN
@@ -142,15 +133,15 @@ class SensedPlant(PlantWrapper):
 
     def _look(self, scene: CardScene) -> tuple[Track, NDArray[np.uint8]]:
         """The first picture that shows both boards, or the last one tried."""
-        for k in range(_LOOKS):
+        for _ in range(_LOOKS):
             draw = np.random.default_rng([self._seed, self._frames])  # of this picture, whatever came before
             draw.random(2)  # not used: keeps the noise of earlier versions
             self._frames += 1
             image = self.camera.render(scene, draw)
             track = self.tracker.track(image)
-            if track.ok or k == _LOOKS - 1:
-                return track, image
-        raise AssertionError("there is at least one look")
+            if track.ok:
+                break
+        return track, image
 
     def _corners(self, track: Track) -> Float[Tensor, "n 4 2"]:
         """Of all markers of both boards [px], NaN where not found."""

@@ -60,8 +60,6 @@ class BalanceEquations:
     """(Z^T Z)^-1: whitens r where the permitted motions are not orthonormal."""
     measured_normal: Array | None = None
     """Measured normal forces [N], NaN where there is none."""
-    measured_actuator: Array | None = None
-    """Measured ``-lam``, force of each actuator along +a ``(n_a,)`` [N or N m], NaN where there is none."""
     expected: Array | None = None
     """Forces ``mu`` to stay near, ``(n_h,)``."""
     expected_covariance: Array | None = None

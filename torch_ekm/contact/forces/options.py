@@ -1,4 +1,4 @@
-"""What the force problem weighs and bounds."""
+"""How the force problem weighs what is known."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..._checks import check_positive
 
 @dataclass(frozen=True)
 class ForceOptions:
-    """Standard deviations and the bound of the force problem, all of them positive.
+    """Standard deviations of the force problem, all of them positive.
 
     Raises:
         ParameterError: a value outside its range.
@@ -19,12 +19,8 @@ class ForceOptions:
     """Standard deviation of unmodelled joint torque, Sigma_tau^(1/2) [N m]."""
     normal_std: float = 0.3
     """Standard deviation of a measured normal force [N]."""
-    actuator_std: float = 0.05
-    """Standard deviation of a measured actuator torque [N m] or tension [N]."""
     start_std: float = 1.5
     """Standard deviation of a contact force of which nothing is known yet, per axis [N]."""
-    max_normal: float = 1e3
-    """Upper bound of every normal force [N]; the lower one is 0."""
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -13,6 +13,8 @@ from .balance import BalanceEquations
 from .friction import outer_directions
 from .options import ForceOptions
 
+MAX_NORMAL = 1e3
+"""Upper bound of every normal force [N]; the lower one is 0."""
 _FORCE_WEIGHT = 1e-7
 """``eps``: weight of ``|mu|^2`` against the squared, whitened joint residual [1/N^2]."""
 
@@ -46,7 +48,7 @@ def force_cost(eq: BalanceEquations, options: ForceOptions) -> ForceCost:
 
     ```
     min  p(mu) + eps |lam r/L|^2 + |r|^2/sigma^2
-         + sum (f_n - measured)^2/sigma_n^2 + sum (lam + measured)^2/sigma_a^2
+         + sum (f_n - measured)^2/sigma_n^2
     s.t. G mu = V_p
     p(mu) = eps |mu|^2, or (mu - expected)^T Sigma^-1 (mu - expected) where forces are expected
     ```
@@ -75,23 +77,16 @@ def force_cost(eq: BalanceEquations, options: ForceOptions) -> ForceCost:
         W = np.linalg.inv(eq.expected_covariance) * scale[:n_h, None] * scale[:n_h]  # Sigma^-1 in x
         P[:n_h, :n_h] += W
         q[:n_h] -= W @ (eq.expected / scale[:n_h])
-    for columns, value, std in (
-        ([cone.start for cone in eq.cones], eq.measured_normal, options.normal_std),
-        (range(n_h, n_h + n_a), eq.measured_actuator, options.actuator_std),
-    ):
-        if value is not None:
-            known = np.isfinite(value)
-            at = np.array(columns)[known]
-            sign = np.where(at < n_h, 1.0, -1.0)  # lam is minus the force along +a
-            diagonal[at] += (scale[at] / std) ** 2
-            q[at] -= scale[at] * sign * value[known] / std**2
+    if eq.measured_normal is not None:
+        known = np.isfinite(eq.measured_normal)
+        at = np.array([cone.start for cone in eq.cones])[known]
+        diagonal[at] += (scale[at] / options.normal_std) ** 2
+        q[at] -= scale[at] * eq.measured_normal[known] / options.normal_std**2
     P[np.diag_indices(n)] += diagonal
     return ForceCost(P, q, balance, eq.object_load * eq.row_scale, scale)
 
 
-def force_problem(
-    eq: BalanceEquations, options: ForceOptions, cost: ForceCost, cuts: Array, *, soft: bool = False
-):
+def force_problem(eq: BalanceEquations, cost: ForceCost, cuts: Array, *, soft: bool = False):
     """Add the inequalities to the cost: a ``qpsolvers.Problem``.
 
     ```
@@ -102,7 +97,6 @@ def force_problem(
 
     Args:
         eq: the balance.
-        options: weights and bounds.
         cost: of :func:`force_cost`.
         cuts: more rows ``g mu <= 0``, ``(k, n_h)``.
         soft: put the object balance into the cost, to measure how far it is from possible.
@@ -118,7 +112,7 @@ def force_problem(
     inequality = np.zeros((len(rows), n))
     inequality[:, :n_h] = rows * scale[:n_h]
     lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
-    lower[normals], upper[normals] = 0.0, options.max_normal
+    lower[normals], upper[normals] = 0.0, MAX_NORMAL
     upper[n_h : n_h + n_a] = np.where(eq.tendon, 0.0, np.inf)
     L = CHARACTERISTIC_LENGTH
     lower[n_h + n_a :], upper[n_h + n_a :] = eq.bound_lower / L, eq.bound_upper / L

@@ -12,7 +12,7 @@ from ...typing import Array
 from .balance import BalanceEquations, ForceSolution, ForceStatus
 from .friction import cutting_planes
 from .options import ForceOptions
-from .problem import ForceCost, force_cost, force_problem
+from .problem import MAX_NORMAL, ForceCost, force_cost, force_problem
 
 _TOLERANCE = 2e-7  # [N] largest friction violation left by the cutting planes
 _MAX_CUTS = 30
@@ -30,17 +30,15 @@ def contact_forces(eq: BalanceEquations, options: ForceOptions | None = None) ->
     options = options or ForceOptions()
     n_h = eq.object_matrix.shape[1]
     cost, cuts = force_cost(eq, options), np.zeros((0, n_h))
-    covariance = None
-    if eq.expected_covariance is not None:
-        covariance = cost.covariance(n_h)
-    inside = _inside(eq, options, cost)
+    covariance = None if eq.expected_covariance is None else cost.covariance(n_h)
+    inside = _inside(eq, cost)
     if inside is not None:
         return _unpack(eq, inside, 0, covariance)
-    problem = force_problem(eq, options, cost, cuts)
+    problem = force_problem(eq, cost, cuts)
     for solves in range(1, _MAX_CUTS + 1):
         solution = _solve(problem)
         if not solution.found:
-            return _classify_failure(eq, options, cost, cuts, solves)
+            return _classify_failure(eq, cost, cuts, solves)
         unknowns = cost.scale * solution.x
         new = cutting_planes(eq.cones, unknowns[:n_h], _TOLERANCE)
         if not len(new):
@@ -52,7 +50,7 @@ def contact_forces(eq: BalanceEquations, options: ForceOptions | None = None) ->
     return _unpack(eq, unknowns, solves, covariance)
 
 
-def _inside(eq: BalanceEquations, options: ForceOptions, cost: ForceCost) -> Array | None:
+def _inside(eq: BalanceEquations, cost: ForceCost) -> Array | None:
     """The answer without inequalities where it keeps them all, as it mostly does; it is then the optimum."""
     n_h, n_a = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1]
     try:
@@ -65,7 +63,7 @@ def _inside(eq: BalanceEquations, options: ForceOptions, cost: ForceCost) -> Arr
     kept = (
         all(cone.slack(mu) >= 0 for cone in eq.cones)
         and (normal >= 0).all()
-        and (normal <= options.max_normal).all()
+        and (normal <= MAX_NORMAL).all()
         and not (lam[eq.tendon] > 0).any()
         and (bound >= eq.bound_lower).all()
         and (bound <= eq.bound_upper).all()
@@ -111,11 +109,9 @@ def _unpack(
     )
 
 
-def _classify_failure(
-    eq: BalanceEquations, options: ForceOptions, cost: ForceCost, cuts: Array, solves: int
-) -> ForceSolution:
+def _classify_failure(eq: BalanceEquations, cost: ForceCost, cuts: Array, solves: int) -> ForceSolution:
     """Find out whether the balance is impossible or the solver failed."""
-    solution = _solve(force_problem(eq, options, cost, cuts, soft=True))
+    solution = _solve(force_problem(eq, cost, cuts, soft=True))
     status, violation = ForceStatus.FAILED, math.nan
     if solution.found:
         violation = _unpack(eq, cost.scale * solution.x, solves).violation

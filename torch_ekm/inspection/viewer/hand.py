@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...description import HandDescription, load_hand
+from ...description import HandDescription
 from ...kinematics import ActuationMap
 from ...plant import PlantStatus
 from ...rendering import Scene, make_scene
 from ...rendering.visuals import visuals
-from ...simulation import PlantConfig, SimulatedHand
+from ...simulation import SimulatedHand
 from ...typing import Array
 from .words import as_html
 
@@ -74,12 +74,7 @@ class GraspShow:
     """
 
     def __init__(self, hand: str, object: str, seed: int = 0) -> None:
-        normal = load_hand(hand).planar_normal
-        config = PlantConfig()
-        if normal is not None:  # in the plane of a planar hand, since nothing bears its object off it
-            x, y, z = (9.81 * _in_plane(np.array(normal))).tolist()
-            config = PlantConfig(gravity=(x, y, z))
-        self.plant = SimulatedHand(hand, object, config)
+        self.plant = SimulatedHand(hand, object)
         self._seed = seed
         self._seen = self.plant.reset(seed)
         self._start = self._seen.a.numpy()
@@ -134,10 +129,3 @@ class GraspShow:
             shown = ", ".join(f"{pad.name} {force:.1f} N" for pad, force in forces if force > 0)
         status = "lost" if self._seen.status is PlantStatus.LOST else "held"
         return as_html([f"The object is {status}; fingertips: {shown or 'nothing'}."])
-
-
-def _in_plane(normal: Array) -> Array:
-    """Unit vector square to ``normal``: -y, or -z where the normal is y."""
-    down = -np.eye(3)[1 if abs(normal[1]) < 0.9 * np.linalg.norm(normal) else 2]
-    down = down - normal * (normal @ down) / (normal @ normal)
-    return down / np.linalg.norm(down)

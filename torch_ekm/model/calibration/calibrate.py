@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from itertools import pairwise
 
 import numpy as np
@@ -27,8 +27,6 @@ def calibrate(
     model: KinematicModel,
     recordings: Iterable[Recording],
     parameters: Iterable[str] = ("springs", "moment_arms", "stiffness", "offset"),
-    *,
-    priors: Mapping[str, float] | None = None,
 ) -> Calibration:
     """``min_x |W r(x)|^2 + |x|^2``: figures of the hand from measured motions, and how sure they are.
 
@@ -48,14 +46,14 @@ def calibrate(
         parameters: kinds ("springs", "rest", "moment_arms", "stiffness", "offset", "backlash",
             "object_position", "object_rotation"), or one of a kind: "springs:thumb_2",
             "moment_arms:thumb_distal".
-        priors: standard deviations by kind, in place of 0.5 (springs), 0.3 (moment arms), 0.7 (stiffness),
-            these of the logarithm, 10 deg (rest), 5 deg (offset), 1 deg (backlash), 2 mm and 2 deg (object).
+            Priors are standard deviations of 0.5 (springs), 0.3 (moment arms), 0.7 (stiffness), these of the
+            logarithm, 10 deg (rest), 5 deg (offset), 1 deg (backlash), 2 mm and 2 deg (object).
 
     Raises:
         UnknownNameError: no such kind of parameter, joint or actuator.
-        ParameterError: no motion can be used, or a prior is not positive.
+        ParameterError: no motion can be used.
     """
-    unknowns = Unknowns(model.hand, parameters, priors)
+    unknowns = Unknowns(model.hand, parameters)
     evidence = Evidence(model, rests(recordings), unknowns)
     nominal = np.zeros(len(unknowns))
     start = np.maximum(nominal, unknowns.bounds[0] + _INSIDE)  # no derivative leads off a bound

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -102,29 +102,20 @@ class Unknowns:
         hand: its figures are the start.
         chosen: kinds, or "kind:name" for one of them (all pulleys of an actuator: "moment_arms:actuator").
             Kinds leave out actuators that only shape the hand (``posture``): they rest while an object moves.
-        priors: in place of :data:`PRIORS`, by kind.
 
     Raises:
         UnknownNameError: no such kind or name.
-        ParameterError: nothing is chosen, or a prior is not positive.
+        ParameterError: nothing is chosen.
     """
 
-    def __init__(
-        self, hand: HandDescription, chosen: Iterable[str], priors: Mapping[str, float] | None = None
-    ) -> None:
+    def __init__(self, hand: HandDescription, chosen: Iterable[str]) -> None:
         self.hand, self.nominal = hand, Figures.of(hand)
-        for kind, prior in (priors or {}).items():
-            if kind not in PRIORS:
-                raise UnknownNameError("kind of parameter", kind, PRIORS)
-            if not prior > 0:
-                raise ParameterError(f"priors[{kind!r}]", prior, "positive")
-        scale = {**PRIORS, **(priors or {})}
         found: dict[tuple[str, tuple[int, ...]], Parameter] = {}
         for choice in chosen:
             kind, _, one = choice.partition(":")
             if kind not in PRIORS:
                 raise UnknownNameError("kind of parameter", kind, PRIORS)
-            candidates = self._all(kind, scale[kind], with_posture=bool(one))
+            candidates = self._all(kind, with_posture=bool(one))
             names = list(dict.fromkeys(part for p in candidates for part in p.name.split(" at ")[:1]))
             if one and one not in names:
                 raise UnknownNameError(f"one of the {kind}", one, names)
@@ -135,7 +126,7 @@ class Unknowns:
         if not self.parameters:
             raise ParameterError("parameters", list(chosen), f"some of {', '.join(PRIORS)}")
 
-    def _all(self, kind: str, prior: float, with_posture: bool) -> list[Parameter]:
+    def _all(self, kind: str, with_posture: bool) -> list[Parameter]:
         hand, values = self.hand, getattr(self.nominal, kind)
         motors = [k for k, a in enumerate(hand.actuators) if with_posture or not a.posture]
         if kind.startswith("object"):
@@ -148,7 +139,7 @@ class Unknowns:
             by_joint = kind in ("springs", "rest")
             of = hand.joint_names if by_joint else hand.actuator_names
             names = {(k,): name for k, name in enumerate(of) if by_joint or k in motors}
-        entries = [Parameter(kind, name, at, float(values[at]), prior) for at, name in names.items()]
+        entries = [Parameter(kind, name, at, float(values[at]), PRIORS[kind]) for at, name in names.items()]
         # a spring that is not there and an actuator that is rigid have no logarithm to search
         return [p for p in entries if not p.logarithmic or (p.nominal != 0 and math.isfinite(p.nominal))]
 

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 
 from ..._checks import check_finite
-from ..._files import write_whole
-from ...exceptions import DescriptionError, ParameterError, ShapeError
+from ...exceptions import ParameterError, ShapeError
 from ...typing import Bool, Float, Tensor
 from .channel import FULL_SCALE, HallChannel, fit_channel
 
@@ -35,7 +31,7 @@ class HallCalibration:
     an estimate is ``sigma^2 = (q'(r) sigma_n)^2 + sigma_m^2``: noise and rounding of the reading through
     the slope of the curve, and what a cubic misses. Both are read off the residuals of the sweep.
 
-    Build one with :meth:`fit` or :meth:`load`.
+    Build one with :meth:`fit`.
     """
 
     def __init__(self, channels: Sequence[HallChannel]) -> None:
@@ -63,10 +59,6 @@ class HallCalibration:
     @property
     def n_channels(self) -> int:
         return len(self.channels)
-
-    def __repr__(self) -> str:
-        lines = (f"  {channel.summary()}" for channel in self.channels)
-        return "HallCalibration(\n" + "\n".join(lines) + "\n)"
 
     @classmethod
     def fit(
@@ -126,25 +118,3 @@ class HallCalibration:
             # never surer than the last reading that is not saturated
             std = torch.where(pinned, torch.maximum(std, (spread**2 + self._misfit**2).sqrt()), std)
         return HallEstimate(q, std, ~(blind[0] | blind[1] | blind[2]))
-
-    def save(self, path: str | Path) -> None:
-        """Write the calibration as JSON; :meth:`load` gives it back to the last bit."""
-        channels = [asdict(channel) for channel in self.channels]
-        table = {"format": "torch_ekm.HallCalibration", "version": 1, "channels": channels}
-        write_whole(Path(path), json.dumps(table, indent=1) + "\n")
-
-    @classmethod
-    def load(cls, path: str | Path) -> HallCalibration:
-        """Read what :meth:`save` wrote.
-
-        Raises:
-            DescriptionError: the file is not such a calibration.
-        """
-        try:
-            table = json.loads(Path(path).read_text(encoding="utf-8"))
-            if table["format"] != "torch_ekm.HallCalibration" or table["version"] != 1:
-                raise DescriptionError(path, "no Hall calibration of version 1")
-            channels = [{**c, "coefficients": tuple(c["coefficients"])} for c in table["channels"]]
-            return cls([HallChannel(**channel) for channel in channels])
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
-            raise DescriptionError(path, f"no Hall calibration: {error}") from error

@@ -34,25 +34,8 @@ class HallChannel:
     """sigma_n: noise and rounding of a reading [counts]."""
     misfit: float
     """sigma_m: what the cubic misses [rad]."""
-    residual_rms: float
-    """Over the unsaturated samples of the sweep [rad]."""
-    residual_max: float
-    """Largest residual [rad]."""
-    n_samples: int
-    """Unsaturated samples of the sweep."""
     stuck: bool = False
     """The channel did not answer in the sweep; its estimates are never valid."""
-
-    def summary(self) -> str:
-        if self.stuck:
-            return f"{self.joint}: stuck"
-        rms, worst, start, end = torch.rad2deg(
-            torch.tensor([self.residual_rms, self.residual_max, *self.unsaturated])
-        ).tolist()
-        return (
-            f"{self.joint}: rms {rms:.2f} deg, max {worst:.2f} deg, "
-            f"readings {self.low:.0f}..{self.high:.0f}, angles {start:.1f}..{end:.1f} deg"
-        )
 
     def angle(self, reading: float) -> float:
         """Value of the cubic [rad] at a reading [counts], also outside ``[low, high]``."""
@@ -89,9 +72,7 @@ def fit_channel(joint: str, readings: Float[Tensor, " n"], angles: Float[Tensor,
             name, "the joint moved by less than 10 deg in the sweep; sweep its whole range"
         )
     if float(readings.max() - readings.min()) < _MIN_SPAN:
-        return HallChannel(
-            joint, (0.0, 0.0, 0.0, 0.0), 0.0, FULL_SCALE, start, end, 0.0, 0.0, 0.0, 0.0, 0, stuck=True
-        )
+        return HallChannel(joint, (0.0, 0.0, 0.0, 0.0), 0.0, FULL_SCALE, start, end, 0.0, 0.0, stuck=True)
     free = (readings > 0) & (readings < FULL_SCALE)
     n = int(free.sum())
     if n < _MIN_SAMPLES:
@@ -106,9 +87,8 @@ def fit_channel(joint: str, readings: Float[Tensor, " n"], angles: Float[Tensor,
     residual = y - V @ c
     slope = (c[1] + r * (2 * c[2] + 3 * r * c[3])) / FULL_SCALE
     noise, misfit = _split(residual, slope)
-    rms, worst = float((residual**2).mean().sqrt()), float(residual.abs().max())
     c0, c1, c2, c3 = (float(value) for value in c)
-    return HallChannel(joint, (c0, c1, c2, c3), low, high, start, end, noise, misfit, rms, worst, n)
+    return HallChannel(joint, (c0, c1, c2, c3), low, high, start, end, noise, misfit)
 
 
 def _check_monotone(name: str, c: Tensor, low: float, high: float) -> None:

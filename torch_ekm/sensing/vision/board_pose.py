@@ -5,10 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from ..._extras import require
+from ...kinematics.se3 import hat
 from ...typing import Array
 from .camera import PinholeCamera
+
+_CORNER_STD = 0.20  # of one coordinate of a detected corner [px]
+_MAX_RESIDUAL = 1.0  # a corner farther than this from the fitted board is left out [px]
+_MIN_CORNERS = 6  # fewer do not make a pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,10 +27,6 @@ class BoardPose:
     """Centre of the card ``(3,)`` [m]."""
     covariance: Array
     """Of the twist ``(v; w)`` of the card about its centre, camera axes, ``(6, 6)`` [m, rad]."""
-    rms: float
-    """Root mean square distance of the corners from where the pose puts them [px]."""
-    n_rejected: int
-    """Corners that disagreed with the others and were left out."""
     ambiguous: bool
     """Another pose explains the image as well; ``prior`` decided, if one was given."""
     mirror: tuple[Array, Array] | None = None
@@ -35,10 +37,7 @@ def estimate_board_pose(
     camera: PinholeCamera,
     object_points: Array,
     image_points: Array,
-    corner_std: float = 0.15,
-    max_residual: float = 1.0,
     prior: Array | None = None,
-    min_corners: int = 6,
 ) -> BoardPose | None:
     r"""``min_{R, t} sum_i |u_i - pi(R X_i + t)|^2`` over the corners that agree.
 
@@ -48,7 +47,7 @@ def estimate_board_pose(
     ``chi^2 = sum r^2 / corner_std^2``. Where it is worse by less than nine and the two differ by
     more than 10 deg the result is ``ambiguous``, and the one nearer to ``prior`` is taken.
 
-    Corners farther than ``max_residual`` from the fit, or than four robust deviations, are left
+    Corners farther than 1 px from the fit, or than four robust deviations, are left
     out, the worst first (a corner half hidden by a finger is found, but at a wrong place).
 
     The covariance is ``sigma^2 (J^T J)^-1`` with ``sigma`` the larger of ``corner_std`` and the
@@ -58,26 +57,22 @@ def estimate_board_pose(
         camera: the lens.
         object_points: corners in the board frame, ``(n, 3)`` with ``z = 0`` [m].
         image_points: where they were seen, ``(n, 2)`` [px].
-        corner_std: standard deviation of one coordinate of a corner [px].
-        max_residual: distance beyond which a corner is surely wrong [px].
         prior: rotation ``(3, 3)`` of the board that is to be expected.
-        min_corners: fewer do not make a pose.
 
     Returns:
         The pose, or None where too few corners agree.
     """
     X, u = np.asarray(object_points, dtype=np.float64), np.asarray(image_points, dtype=np.float64)
-    n = len(X)
-    while len(X) >= max(min_corners, 4):
+    while len(X) >= _MIN_CORNERS:
         candidates = _both_poses(camera, X, u)
         if not candidates:
             return None
         best = candidates[0]
         residual = np.linalg.norm(best[2], axis=1)
         worst = int(residual.argmax())
-        limit = min(max_residual, 4 * max(corner_std, float(np.median(residual))))
+        limit = min(_MAX_RESIDUAL, 4 * max(_CORNER_STD, float(np.median(residual))))
         if residual[worst] <= limit:
-            return _choose(camera, X, candidates, corner_std, prior, n - len(X))
+            return _choose(camera, X, candidates, prior)
         keep = np.arange(len(X)) != worst
         X, u = X[keep], u[keep]
     return None
@@ -106,14 +101,12 @@ def _choose(
     camera: PinholeCamera,
     X: Array,
     candidates: list[tuple[Array, Array, Array]],
-    corner_std: float,
     prior: Array | None,
-    n_rejected: int,
 ) -> BoardPose:
     chosen, ambiguous, mirror = candidates[0], False, None
     if len(candidates) > 1:
         other = candidates[1]
-        worse = (np.sum(other[2] ** 2) - np.sum(chosen[2] ** 2)) / corner_std**2
+        worse = (np.sum(other[2] ** 2) - np.sum(chosen[2] ** 2)) / _CORNER_STD**2
         if worse < 100 and angle_between(chosen[0], other[0]) > np.radians(2):
             mirror = other[:2]
         ambiguous = bool(worse < 9 and angle_between(chosen[0], other[0]) > np.radians(10))
@@ -123,10 +116,9 @@ def _choose(
     rotation, position, residual = chosen
     J = projection_jacobian(camera, X, rotation, position)
     freedom = max(2 * len(X) - 6, 1)
-    variance = max(corner_std**2, float(np.sum(residual**2)) / freedom)
+    variance = max(_CORNER_STD**2, float(np.sum(residual**2)) / freedom)
     covariance = np.asarray(variance * np.linalg.inv(J.T @ J), dtype=np.float64)
-    rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
-    return BoardPose(rotation, position, covariance, rms, n_rejected, ambiguous, mirror)
+    return BoardPose(rotation, position, covariance, ambiguous, mirror)
 
 
 def projection_jacobian(camera: PinholeCamera, X: Array, rotation: Array, position: Array) -> Array:
@@ -136,14 +128,9 @@ def projection_jacobian(camera: PinholeCamera, X: Array, rotation: Array, positi
     _, full = cv2.projectPoints(X, rvec, position, camera.matrix, camera.distortion_array)
     by_position = full[:, 3:6].reshape(-1, 2, 3)  # dpi/dx, since x = R X + t
     arm = X @ rotation.T
-    return np.concatenate([by_position, -by_position @ skew(arm)], axis=-1).reshape(-1, 6)
-
-
-def skew(v: Array) -> Array:
-    """Cross-product matrix ``[v]x``, ``(*batch, 3, 3)``, of each vector ``(*batch, 3)``."""
-    x, y, z = np.moveaxis(v, -1, 0)
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape, 3)
+    return np.concatenate([by_position, -by_position @ hat(torch.from_numpy(arm)).numpy()], axis=-1).reshape(
+        -1, 6
+    )
 
 
 def angle_between(a: Array, b: Array) -> float:

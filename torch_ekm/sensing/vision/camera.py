@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
-from ..._extras import require
-from ..._files import write_whole
-from ...exceptions import DescriptionError, ParameterError
+from ...exceptions import ParameterError
 from ...typing import Array
 
 
@@ -50,11 +46,6 @@ class PinholeCamera:
     def distortion_array(self) -> Array:
         return np.asarray(self.distortion, dtype=np.float64)
 
-    @property
-    def is_ideal(self) -> bool:
-        """True where straight lines stay straight in the image."""
-        return not any(self.distortion)
-
     def project(self, points: Array) -> Array:
         """Pixels ``(*batch, 2)`` of points ``(*batch, 3)`` in the camera frame [m], ``z > 0``."""
         points = np.asarray(points, dtype=np.float64)
@@ -65,32 +56,3 @@ class PinholeCamera:
         xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
         yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
         return np.stack([self.fx * xd + self.cx, self.fy * yd + self.cy], axis=-1)
-
-    def rays(self, pixels: Array) -> Array:
-        """Inverse of :meth:`project`: ``(x/z, y/z)`` of pixels, ``(*batch, 2) -> (*batch, 2)``."""
-        pixels = np.asarray(pixels, dtype=np.float64)
-        ideal = (pixels - [self.cx, self.cy]) / [self.fx, self.fy]
-        if self.is_ideal:
-            return ideal
-        cv2 = require("cv2")
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
-        flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2))
-        undistorted = cv2.undistortPoints(flat, self.matrix, self.distortion_array, criteria=criteria)
-        return undistorted.reshape(pixels.shape)
-
-    def save(self, path: str | Path) -> None:
-        """Write size, focal lengths, centre [px] and distortion as JSON."""
-        write_whole(Path(path), json.dumps(asdict(self), indent=2) + "\n")
-
-    @classmethod
-    def load(cls, path: str | Path) -> PinholeCamera:
-        """Read what :meth:`save` wrote.
-
-        Raises:
-            DescriptionError: the file is no JSON or names other parameters.
-        """
-        try:
-            values = json.loads(Path(path).read_text(encoding="utf-8"))
-            return cls(**{**values, "distortion": tuple(values["distortion"])})
-        except (json.JSONDecodeError, TypeError, KeyError) as error:
-            raise DescriptionError(path, f"no camera parameters: {error}") from error

@@ -8,15 +8,14 @@ from numpy.typing import NDArray
 
 from ..._extras import require
 from ...exceptions import ParameterError, ShapeError
+from ...kinematics.se3 import hat
 from ...typing import Array
 from .board import MarkerBoard, get_dictionary
-from .board_pose import BoardPose, angle_between, estimate_board_pose, skew
+from .board_pose import BoardPose, angle_between, estimate_board_pose
 from .camera import PinholeCamera
 from .edge_refinement import refine_on_edges
 from .track import Track, TrackStatus
 
-_CORNER_STD = 0.20  # of one coordinate of a detected corner [px]
-_MAX_RESIDUAL = 1.0  # a corner farther than this from the fitted board is left out [px]
 _MAX_STEP, _MAX_TURN = 0.020, float(np.radians(20.0))  # believable between two frames [m], [rad]
 _MIN_MARKERS = 2  # of a board that must be seen: one alone is prone to flips
 _JUMP_FRAMES = 3  # a jump is believed when that many frames in a row agree on it
@@ -124,8 +123,6 @@ class MarkerTracker:
             self.camera,
             np.concatenate([board.corners[k - board.first_id] for k in seen]),
             np.concatenate([markers[k] for k in seen]),
-            _CORNER_STD,
-            _MAX_RESIDUAL,
             self._prior.get(id(board)),
         )
         if pose is None or not self.edges:
@@ -145,8 +142,9 @@ class MarkerTracker:
         reach = obj.position + arm - palm.position
         position = M @ reach + t_hp
         zero = np.zeros((3, 3))
-        by_object = np.block([[M, -M @ skew(arm)], [zero, M]])
-        by_palm = -np.block([[M, -M @ skew(reach)], [zero, M]])
+        across, apart = hat(torch.from_numpy(np.stack([arm, reach]))).numpy()
+        by_object = np.block([[M, -M @ across], [zero, M]])
+        by_palm = -np.block([[M, -M @ apart], [zero, M]])
         covariance = by_object @ obj.covariance @ by_object.T + by_palm @ palm.covariance @ by_palm.T
         return position, M @ R_co, covariance
 

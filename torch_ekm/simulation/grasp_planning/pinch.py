@@ -128,7 +128,7 @@ def _descend(problem: PinchProblem, request: PinchRequest, guess: Array, ranges:
         gtol=1e-9,
     )
     g = problem.geometry(found.x[None])
-    violation = float(np.abs(problem.equations(found.x[None], request, g)[0]).max())
+    violation = float(np.abs(problem.equations(request, g)[0]).max())
     outside = float(problem.outside(g).max(initial=-np.inf))
     return _Solution(found.x, violation, outside, found.cost)
 

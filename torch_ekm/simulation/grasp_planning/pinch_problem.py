@@ -227,9 +227,8 @@ class PinchProblem:
 
     # -- residuals --------------------------------------------------------------------------------------
 
-    def equations(self, x: Array, request: PinchRequest, g: PinchGeometry | None = None) -> Array:
+    def equations(self, request: PinchRequest, g: PinchGeometry) -> Array:
         """What must vanish, in units of its tolerance."""
-        g = self.geometry(x) if g is None else g
         weight = self.obj.mass * np.array(self.hand.gravity)
         force = g.force.sum(axis=1) + weight
         centre = g.rotation @ self.obj.com
@@ -241,7 +240,7 @@ class PinchProblem:
             [g.gap / 1e-4, force / 0.01, moment / 2e-4, passive / 1e-3, press[:, None] / 0.1], axis=1
         )
 
-    def residuals(self, x: Array, request: PinchRequest, ranges: bool = False) -> Array:
+    def residuals(self, x: Array, request: PinchRequest, ranges: bool) -> Array:
         """Equations and wishes ``(b, n_r)``, to be squared and summed.
 
         Args:
@@ -268,7 +267,7 @@ class PinchProblem:
         clear = np.maximum(0.0, 0.002 - g.clearance) / 1e-3
         posture = (x[:, : len(self.moving)] - self.preferred()) / 0.3
         taut = np.maximum(0.0, 0.02 - self.tension(g)[:, self._pulling]) / 0.01
-        hard = 3 * self.equations(x, request, g)
+        hard = 3 * self.equations(request, g)
         wishes = [cone, share, cap, pad, np.stack(place, axis=1), tilt, opposed, clear, posture, taut]
         if ranges:
             wishes.append(np.maximum(0.0, self.outside(g) + _ROOM) / 0.01)
@@ -302,13 +301,14 @@ class PinchProblem:
         wish = self.along + request.tilt[0] * third + request.tilt[1] * self.towards
         return wish / np.linalg.norm(wish)
 
-    def jacobian(self, x: Array, request: PinchRequest, ranges: bool = False, step: float = 1e-6) -> Array:
+    def jacobian(self, x: Array, request: PinchRequest, ranges: bool) -> Array:
         """Of :meth:`residuals`, central differences, all columns in one batch."""
+        step = 1e-6
         shift = step * np.eye(len(x))
         values = self.residuals(np.concatenate([x + shift, x - shift]), request, ranges)
         return ((values[: len(x)] - values[len(x) :]) / (2 * step)).T
 
 
-def _null_space(matrix: Array, tolerance: float = 1e-9) -> Array:
+def _null_space(matrix: Array) -> Array:
     _, singular, vt = np.linalg.svd(matrix)
-    return np.asarray(vt[int((singular > tolerance).sum()) :].T, dtype=np.float64)
+    return np.asarray(vt[int((singular > 1e-9).sum()) :].T, dtype=np.float64)

@@ -61,18 +61,22 @@ class SimulatedCamera:
     by nearer cards; the scene knows the true poses, the picture is all that a tracker gets.
 
     Args:
-        camera: the lens.
+        camera: the lens, without distortion.
         quality: blur, noise, light.
+
+    Raises:
+        ParameterError: a lens that distorts.
     """
 
     def __init__(self, camera: PinholeCamera | None = None, quality: ImageQuality | None = None) -> None:
         self.camera = camera or PinholeCamera()
+        if any(self.camera.distortion):
+            raise ParameterError(
+                "camera.distortion", self.camera.distortion, "0: straight lines are drawn straight"
+            )
         self.quality = quality or ImageQuality()
         self._textures: dict[Card, NDArray[np.uint8]] = {}
         v, u = np.mgrid[: self.camera.height, : self.camera.width].astype(np.float32)
-        self._rays = None
-        if not self.camera.is_ideal:
-            self._rays = self.camera.rays(np.stack([u, v], axis=-1)).astype(np.float32)
         radius2 = (u - self.camera.cx) ** 2 + (v - self.camera.cy) ** 2
         self._light = 1 - self.quality.vignette * radius2 / radius2.max()
 
@@ -96,7 +100,7 @@ class SimulatedCamera:
     def _draw_card(
         self, image: NDArray, placed: PlacedCard, bodies: list[tuple[ConvexBody, NDArray | None]]
     ) -> None:
-        cv2, s = require("cv2"), _SAMPLES
+        cv2, s, camera = require("cv2"), _SAMPLES, self.camera
         outline = placed.outline
         cosine = abs(placed.pose[:3, 2] @ placed.pose[:3, 3]) / np.linalg.norm(placed.pose[:3, 3])
         if np.any(outline[:, 2] < 1e-3) or cosine < _EDGE_ON:
@@ -109,7 +113,9 @@ class SimulatedCamera:
         if u0 >= u1 or v0 >= v1:
             return
         u0, v0, u1, v1 = int(u0), int(v0), int(u1), int(v1)  # numpy's would make the samples float64
-        x, y = self._sample_rays(u0, v0, u1, v1)
+        u = u0 - 0.5 + (np.arange((u1 - u0) * s, dtype=np.float32) + 0.5) / s
+        v = v0 - 0.5 + (np.arange((v1 - v0) * s, dtype=np.float32) + 0.5) / s
+        x, y = (u - camera.cx) / camera.fx, ((v - camera.cy) / camera.fy)[:, None]  # x/z, y/z of the samples
         # plane of the card: (x, y, 1) ~ [r1 r2 t] (X, Y, 1)
         to_card = np.linalg.inv(placed.pose[:3, [0, 1, 3]]).astype(np.float32)
         X, Y, W = (row[0] * x + row[1] * y + row[2] for row in to_card)
@@ -142,24 +148,7 @@ class SimulatedCamera:
         patch *= 1 - alpha
         patch += colour
 
-    def _sample_rays(self, u0: int, v0: int, u1: int, v1: int) -> tuple[NDArray, NDArray]:
-        """``x/z, y/z`` of the samples of a window, float32."""
-        cv2, s, camera = require("cv2"), _SAMPLES, self.camera
-        n_u, n_v = (u1 - u0) * s, (v1 - v0) * s
-        if self._rays is None:
-            u = u0 - 0.5 + (np.arange(n_u, dtype=np.float32) + 0.5) / s
-            v = v0 - 0.5 + (np.arange(n_v, dtype=np.float32) + 0.5) / s
-            return (u[None, :] - camera.cx) / camera.fx, (v[:, None] - camera.cy) / camera.fy
-        # distortion is smooth: linear in between pixels; one more pixel keeps the rim of the window exact
-        a, b = max(u0 - 1, 0), max(v0 - 1, 0)
-        crop = self._rays[b : v1 + 1, a : u1 + 1]
-        fine = cv2.resize(crop, (crop.shape[1] * s, crop.shape[0] * s), interpolation=cv2.INTER_LINEAR)
-        fine = fine[(v0 - b) * s :, (u0 - a) * s :][:n_v, :n_u]
-        return np.ascontiguousarray(fine[..., 0]), np.ascontiguousarray(fine[..., 1])
-
     def _texture(self, card: Card) -> NDArray[np.uint8]:
         if card not in self._textures:
-            if len(self._textures) >= 16:
-                self._textures.clear()
             self._textures[card] = card.texture()
         return self._textures[card]

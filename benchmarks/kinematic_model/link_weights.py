@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import nn
 
-from ...description.hand import HandDescription
-from ...kinematics.link_poses import Kinematics, LinkPoses
-from ...typing import Float, Tensor
-from .geometric import precedence
-from .potential import posture_stiffness
+from torch_ekm.description.hand import HandDescription
+from torch_ekm.kinematics.link_poses import Kinematics, LinkPoses
+from torch_ekm.model.stiffness.geometric import precedence
+from torch_ekm.model.stiffness.potential import posture_stiffness
+from torch_ekm.typing import Float, Tensor
 
 
 class LinkWeights(nn.Module):
@@ -18,24 +18,17 @@ class LinkWeights(nn.Module):
     Args:
         hand: its URDF gives masses and centres of mass.
         kinematics: of the same hand.
-        gravity: g in the hand frame [m/s^2].
-        dtype: of the buffers.
     """
 
-    def __init__(
-        self,
-        hand: HandDescription,
-        kinematics: Kinematics,
-        gravity: tuple[float, float, float],
-        dtype: torch.dtype,
-    ) -> None:
+    def __init__(self, hand: HandDescription, kinematics: Kinematics) -> None:
         super().__init__()
+        dtype = kinematics.dtype
         upstream, names = kinematics.upstream, list(kinematics.link_names)
         links = [link for link in hand.urdf.links if link.mass > 0 and upstream[names.index(link.name)].any()]
         self._joint_axes, self._index = kinematics.joint_axes, [names.index(link.name) for link in links]
         mass = torch.tensor([link.mass for link in links], dtype=dtype)
         com = torch.stack([torch.as_tensor(link.com).to(dtype) for link in links])
-        g = torch.tensor(gravity, dtype=dtype)
+        g = torch.tensor(hand.gravity, dtype=dtype)
         self.weights = nn.Buffer(mass[:, None] * g, persistent=False)  # m_l g [N], (n_l, 3)
         self.com = nn.Buffer(com, persistent=False)  # in the links' frames [m], (n_l, 3)
         self.upstream = nn.Buffer(upstream[self._index], persistent=False)
