@@ -121,7 +121,7 @@ class Foresight(Protocol):
         if contender != "oracle":  # before anything more is learned
             dark = {"learn": False, "blind_deg": math.inf}
             records.append(turn("blind", _BLIND, self.blind_angle_deg, touch=True, **dark))
-            again = {"touch": True, "look_again_deg": self.look_again_deg}
+            again = {"touch": True, "look_again": self.look_again_deg * _DEG}
             records.append(turn("blind, looks again", _BLIND, self.blind_angle_deg, **again, **dark))
             records.append(turn("blind, no touch", _BLIND, self.blind_angle_deg, **dark))
         if self.far_deg:

@@ -126,9 +126,8 @@ class Bench:
         learn: bool = True,
         events: Sequence[Tug | PlantChange] = (),
         blind_deg: float = 0.0,
-        touch: bool = False,
-        look_again_deg: float = math.inf,
         poses: bool = False,
+        **blind: Any,
     ) -> TrialRecord:
         """Turn the object that is held.
 
@@ -137,9 +136,8 @@ class Bench:
             learn: train after every motion (an E-KM only).
             events: what happens on the way; ``at`` counts this trial's commands from 0.
             blind_deg: the camera is off for this last part of the turn [deg]; infinite: for all of it.
-            touch: without camera joints and fingertips correct the pose; else the prediction is all there is.
-            look_again_deg: of :class:`~torch_ekm.foresight.BlindPose` [deg].
             poses: keep the true poses, for pictures.
+            blind: options of :class:`~torch_ekm.foresight.BlindPose`; its ``touch`` is off.
         """
         self.disturbed.events = tuple(
             dataclasses.replace(event, at=event.at + self.disturbed.count) for event in events
@@ -152,10 +150,9 @@ class Bench:
                 plant,
                 self._predictor,
                 axis,
-                look_again=look_again_deg * _DEG,
                 # rotation off the axis does not keep the camera on: a model that tilts is not to be helped
                 switch_off=lambda seen: abs(float(axis @ target.error(seen.state)[3:])) <= blind_deg * _DEG,
-                touch=touch,
+                **{"touch": False, **blind},
             )
         setting = self.setting
         known = {"knowledge": self.knowledge, "safety": setting.safety}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,15 +15,9 @@ from ..exceptions import DescriptionError, ParameterError
 from ..kinematics import se3
 from ..plant import Trajectory, TrialLog
 
-if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-else:
-    AnyReader = require("rosbags.highlevel").AnyReader
-    _rosbag2, _typesys = require("rosbags.rosbag2"), require("rosbags.typesys")
-    StoragePlugin, Writer = _rosbag2.StoragePlugin, _rosbag2.Writer
-    Stores, get_typestore = _typesys.Stores, _typesys.get_typestore
+AnyReader, _typesys = require("rosbags.highlevel").AnyReader, require("rosbags.typesys")
+_rosbag2 = require("rosbags.rosbag2")
+_TYPES = _typesys.get_typestore(_typesys.Stores.ROS2_HUMBLE)
 
 _ABOUT, _POSE = "/about", "/object_pose"
 _JOINTS = ("q", "a", "commands")  # as JointState, which viewers know
@@ -36,17 +30,16 @@ def _write_trial(trajectory: Trajectory, folder: str | Path) -> Path:
     if folder.exists():
         raise ParameterError("folder", str(folder), "a folder that does not exist yet")
     arrays = trajectory.arrays()
-    types = get_typestore(Stores.ROS2_HUMBLE)
-    made = _Messages(types)
+    made = _Messages(_TYPES)
     stamps = [round(1e9 * time) for time in arrays["time"].tolist()]
     shapes = {place: [list(array.shape), array.dtype.str] for place, array in arrays.items()}
     about = {"seed": trajectory.seed, "about": trajectory.about, "arrays": shapes}
-    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    with _rosbag2.Writer(folder, version=9, storage_plugin=_rosbag2.StoragePlugin.MCAP) as writer:
 
         def topic(name: str, kind: str, rows: list[tuple[int, Any]]) -> None:
-            connection = writer.add_connection(name, kind, typestore=types)
+            connection = writer.add_connection(name, kind, typestore=_TYPES)
             for stamp, message in rows:
-                writer.write(connection, stamp, types.serialize_cdr(message, kind))
+                writer.write(connection, stamp, _TYPES.serialize_cdr(message, kind))
 
         kind = "std_msgs/msg/String"
         topic(_ABOUT, kind, [(min(stamps, default=0), made.text(json.dumps(about)))])
@@ -70,7 +63,7 @@ def _read_trial(folder: str | Path) -> Trajectory:
         raise DescriptionError(folder, "there is no such recording")
     rows: dict[str, list[Any]] = {}
     try:
-        with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        with AnyReader([folder], default_typestore=_TYPES) as reader:
             for connection, _, raw in reader.messages():
                 message: Any = reader.deserialize(raw, connection.msgtype)
                 if connection.topic != _POSE:
