@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,10 +13,7 @@ from ..residual import ResidualLearner
 from ..typing import Array
 from .online_regressor import LearnerLike, OnlineRegressor, make_learner
 
-if TYPE_CHECKING:
-    from river import base
-else:
-    base = require("river.base", "interop")
+base = require("river.base", "interop")
 
 
 class _Columns:
