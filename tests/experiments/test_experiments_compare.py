@@ -17,9 +17,10 @@ from torch_ekm.cli import app
 from torch_ekm.exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.experiments import compare
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
-from torch_ekm.experiments.learner_comparison.report import Comparison, overview_table, score_table
+from torch_ekm.experiments.learner_comparison.report import ComparisonReport, overview_table, score_table
 from torch_ekm.experiments.learner_comparison.run import run_one
 from torch_ekm.experiments.learner_comparison.scores import (
+    Comparison,
     Score,
     block_bootstrap,
 )
@@ -39,7 +40,7 @@ def linear(n: int = 120, seed: int = 0, name: str = "linear") -> Stream:
 
 
 @pytest.fixture(scope="module")
-def compared() -> Comparison:
+def compared() -> ComparisonReport:
     return compare([linear(), linear(seed=1, name="other")], ("model alone", "linear RLS", "SOGP plain"))
 
 
@@ -82,7 +83,7 @@ def test_medians_decide_where_few_samples_make_the_rms() -> None:
         for key, squared in errors.items()
     }
     scores = {key: Score(*key, *both, 0.0, 0.9, 1.0, 1.0) for key, both in of.items()}
-    comparison = Comparison((stream,), ("model alone", "bad", "good"), scores, errors)
+    comparison = ComparisonReport((stream,), ("model alone", "bad", "good"), scores, errors)
     assert comparison.measure("linear") == "median"
     assert comparison.best("linear").learner == "good"
     ratio = comparison.ratio("linear", "good", "bad")

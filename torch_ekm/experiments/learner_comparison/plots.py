@@ -10,11 +10,10 @@ import numpy as np
 from ..._extras import require
 from ..learners import OURS
 from ..reporting.plots import new_figure
+from .scores import Comparison
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from .report import Comparison
 
 _WINDOWS = 25  # of a learning curve
 _BLUE, _GREY = "#0072B2", "#7f7f7f"

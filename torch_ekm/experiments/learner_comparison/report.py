@@ -1,126 +1,21 @@
-"""What a comparison of learners says: in numbers, as tables, as text and as a report folder."""
+"""A comparison of learners as tables, as text and as a report folder."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from ..._extras import require
-from ...typing import Array
 from ..reporting.plots import save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from ..reporting.statistics import Estimate
 from .plots import plot_cost, plot_learning_curves, plot_ranks, plot_scores
-from .scores import DECIDED, Measure, Score, block_bootstrap, blocks_of, gives_away, rare_share
-from .stream import Stream
+from .scores import Comparison, Score
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Scores and errors of all learners on all streams: prints as a table, and can be written."""
-
-    streams: tuple[Stream, ...]
-    learners: tuple[str, ...]
-    scores: dict[tuple[str, str], Score]
-    """(stream, learner) -> score."""
-    errors: dict[tuple[str, str], Array]
-    """(stream, learner) -> squared error of each scored sample, mean over the outputs."""
-    calls: dict[str, str] = field(default_factory=dict)
-    """learner -> how a user makes it, of d inputs and m outputs, where that is known."""
-
-    def measure(self, stream: str) -> Measure:
-        """What the learners are ranked by: rms errors, or medians where few samples make the rms.
-
-        That is where a hundredth of the samples makes more than half of the squared error of the learner
-        with the smallest.
-        """
-        return self._measures[stream]
-
-    @functools.cached_property
-    def _measures(self) -> dict[str, Measure]:
-        found: dict[str, Measure] = {}
-        for stream in self.streams:
-            least = min((self.errors[stream.name, name] for name in self.learners), key=np.sum)
-            found[stream.name] = "median" if rare_share(least) > DECIDED else "rms"
-        return found
-
-    def error(self, stream: str, learner: str) -> Estimate:
-        """Over that of the model alone, by the stream's :meth:`measure`."""
-        score = self.scores[stream, learner]
-        return score.rms if self.measure(stream) == "rms" else score.median
-
-    def stream(self, name: str) -> Stream:
-        """The stream of that name, with its samples."""
-        return next(stream for stream in self.streams if stream.name == name)
-
-    def row(self, stream: str) -> list[Score]:
-        """Scores on one stream, in the order of the learners."""
-        return [self.scores[stream, name] for name in self.learners]
-
-    def best(self, stream: str) -> Score:
-        """The smallest error on a stream, by its :meth:`measure`."""
-        return min(self.row(stream), key=lambda score: self.error(stream, score.learner).mean)
-
-    def ratio(self, stream: str, ours: str, theirs: str) -> Estimate:
-        """Error of ``ours`` over that of ``theirs`` on the same samples, by the stream's :meth:`measure`.
-
-        Its interval is that of a paired block bootstrap, 95 %.
-        """
-        errors = self.errors[stream, ours], self.errors[stream, theirs]
-        return block_bootstrap(*errors, blocks_of(self.stream(stream)), measure=self.measure(stream))
-
-    def ranks(self) -> Array:
-        """``(n_streams, n_learners)``, 1 is best; ties share their mean rank."""
-        table = np.array(
-            [[self.error(stream.name, name).mean for name in self.learners] for stream in self.streams]
-        )
-        return require("scipy.stats").rankdata(table, axis=1)
-
-    def critical_difference(self) -> float:
-        """Mean ranks that differ by less are not distinguishable (Nemenyi, 5 %; Demsar, JMLR 7, 2006)::
-
-            CD = q sqrt(k (k + 1) / (6 N))
-
-        for k learners on N streams; infinite for one stream.
-        """
-        k, n = len(self.learners), len(self.streams)
-        if n < 2 or k < 2:
-            return float("inf")
-        q = require("scipy.stats").studentized_range.ppf(0.95, k, np.inf) / np.sqrt(2)
-        return float(q * np.sqrt(k * (k + 1) / (6 * n)))
-
-    def verdicts(self) -> list[str]:
-        """For each stream: which learner is best, which cannot be told from it, how far off the default is,
-        on how many of how many rows, and whether a few of them decide."""
-        sentences = []
-        for stream in self.streams:
-            best = self.best(stream.name).learner
-            ratios = {
-                name: self.ratio(stream.name, name, best)
-                for name in self.learners
-                if name not in (best, "model alone")
-            }
-            level = [name for name, ratio in ratios.items() if ratio.low <= 1]
-            found = f"{self.error(stream.name, best):.3f}"
-            text = f"{stream.name}: {best} is best, {found} of the model alone"
-            if level:
-                text += f"; this recording does not tell it from {', '.join(level)}"
-            behind = sorted((n for n in ratios if n not in level), key=lambda n: ratios[n].mean)
-            told = [name for k, name in enumerate(behind) if name == "default" or (k == 0 and not level)]
-            text += "".join(f"; {name} has {ratios[name]:.3f} times its error" for name in told)
-            text += f". On {stream.used}."
-            if self.measure(stream.name) == "median":
-                share = 100 * rare_share(self.errors[stream.name, best])
-                text += f" Medians: one row in a hundred makes {share:.0f} % of the squared error."
-            if gives_away(stream):
-                text += " The inputs give y exactly: is what was measured among them?"
-            sentences.append(text)
-        return sentences
+class ComparisonReport(Comparison):
+    """A comparison that prints as a table and can be written."""
 
     def tables(self) -> list[Table]:
         """One for each stream; of several streams an overview first, how the learners are made last."""

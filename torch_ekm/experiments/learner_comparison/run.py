@@ -20,7 +20,7 @@ from ..learners import COMPARED, Factory, constructor_call, learner_factory
 from .fingerprint import fingerprint
 from .prequential import run_prequential
 from .recordings import LIMIT, load_recording
-from .report import Comparison
+from .report import ComparisonReport
 from .scores import Score, block_bootstrap, blocks_of
 from .stream import LEAST, Stream
 
@@ -35,7 +35,7 @@ def compare(
     folder: str | Path | None = None,
     processes: int = 1,
     on_done: Callable[[str], None] | None = None,
-) -> Comparison:
+) -> ComparisonReport:
     """Every learner goes once through every stream: it predicts each sample, is scored, then learns it.
 
     ``print(report)`` shows the scores, ``report.scores`` and ``report.errors`` hold them as numbers, and
@@ -94,7 +94,7 @@ def compare(
         median = block_bootstrap(squared, alone, blocks, measure="median")
         scores[stream.name, name] = Score(stream.name, name, rms, median, **result)
     calls = {name: constructor_call(factory) for name, factory in factories.items()}
-    return Comparison(tuple(streams), tuple(factories), scores, errors, calls)
+    return ComparisonReport(tuple(streams), tuple(factories), scores, errors, calls)
 
 
 def run_one(stream: Stream, factory: Factory) -> dict[str, Any]:
