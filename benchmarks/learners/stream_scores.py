@@ -17,6 +17,16 @@ from torch_ekm.residual import ResidualLearner
 from torch_ekm.typing import Tensor
 
 
+def rms_ratio(run: Prequential, start: int = 0) -> float:
+    """rms of the error over rms of y: below 1 the learner helps."""
+    return float(run.error[start:].square().mean().sqrt() / run.y[start:].square().mean().sqrt())
+
+
+def median_ratio(run: Prequential, start: int = 0) -> float:
+    """The same of the median absolute values: blind to outliers."""
+    return float(run.error[start:].abs().median() / run.y[start:].abs().median())
+
+
 @dataclass(frozen=True)
 class ObjectScore:
     """Scores of one object; the second half is what counts after the learner has settled in.
@@ -47,10 +57,10 @@ def score_objects(
         scores.append(
             ObjectScore(
                 stream.name,
-                run.rms_ratio(),
-                run.rms_ratio(half),
-                run.median_ratio(),
-                run.median_ratio(half),
+                rms_ratio(run),
+                rms_ratio(run, half),
+                median_ratio(run),
+                median_ratio(run, half),
                 winsorised_ratio(run),
                 winsorised_ratio(run, half),
                 run.nll(),

@@ -19,7 +19,7 @@ from foresight_turn import ForesightTurn
 from oracle import OracleBench
 from run_study import run_study
 
-from torch_ekm.exceptions import ParameterError
+from torch_ekm.exceptions import GraspError, ParameterError
 from torch_ekm.experiments.config import Setting, digest, object_name
 from torch_ekm.experiments.protocols.generalize import OTHER_ANGLES, TABLE_I
 from torch_ekm.experiments.protocols.protocol import Protocol
@@ -27,7 +27,7 @@ from torch_ekm.experiments.records import NotGrasped, Record, Trial, TrialRecord
 from torch_ekm.experiments.reporting.report import Report
 from torch_ekm.experiments.reporting.statistics import DataFrame
 from torch_ekm.experiments.runner import Bench
-from torch_ekm.foresight import Reach
+from torch_ekm.foresight import Reach, reachable
 
 _DEG = math.pi / 180
 _FIRST_WARM_UP, _FAR, _BLIND = 1000, 3000, 4000  # numbers of the grasps
@@ -114,14 +114,14 @@ class Foresight(Protocol):
             about = Trial(bench.name, kind, controller, seed, trial, angle)
             if start is None:
                 return NotGrasped(**vars(about), message=bench.no_grasp)
-            reach = None if kind.startswith("blind") else bench.reach(angle)
+            reach = None if kind.startswith("blind") else reach_of(bench, angle)
             return self._record(bench, contender, bench.turn(about, start, **options), reach)
 
         records = []
         if contender != "oracle":  # before anything more is learned
             dark = {"learn": False, "blind_deg": math.inf}
             records.append(turn("blind", _BLIND, self.blind_angle_deg, touch=True, **dark))
-            again = {"touch": True, "look_again_deg": self.look_again_deg}
+            again = {"touch": True, "look_again": self.look_again_deg * _DEG}
             records.append(turn("blind, looks again", _BLIND, self.blind_angle_deg, **again, **dark))
             records.append(turn("blind, no touch", _BLIND, self.blind_angle_deg, **dark))
         if self.far_deg:
@@ -155,6 +155,15 @@ class Foresight(Protocol):
     def report(self, seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
         """Answer, tables, figures, and a turn next to what was predicted of it."""
         return foresight_report(self.setting, seeds, trials, folder)
+
+
+def reach_of(bench: Bench, angle_deg: float) -> Reach | None:
+    """How far the model says that the grasp turns, up to ``angle_deg``; None: it refuses the grasp."""
+    sign, limit = (1 if angle_deg > 0 else -1), abs(angle_deg) * _DEG
+    try:
+        return reachable(bench.look_and_move(), bench.plant.observe(), sign=sign, limit=limit)
+    except GraspError:
+        return None
 
 
 if __name__ == "__main__":

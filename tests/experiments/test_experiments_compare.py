@@ -88,7 +88,6 @@ def test_medians_decide_where_few_samples_make_the_rms() -> None:
     assert comparison.best("linear").learner == "good"
     ratio = comparison.ratio("linear", "good", "bad")
     assert (ratio.low, ratio.mean, ratio.high) == pytest.approx((0.5, 0.5, 0.5), rel=0.02)
-    assert comparison.ratio("linear", "good", "bad", measure="rms").mean > 0.99
     assert "one row in a hundred" in comparison.verdicts()[0]
     assert re.search(r"bad has (2.0|1.9)", comparison.verdicts()[0])
 

@@ -43,7 +43,6 @@ def test_controllers_differ_in_the_reference_of_their_increments() -> None:
         ({"capacity": 0}, ParameterError, "capacity"),
         ({"plant": {"spring": 2.0}}, ParameterError, "a PlantParameters"),
         ({"model": {"rolling": False}}, ParameterError, "a ModelOptions"),
-        ({"grasp": {"pinch_force": 1.0}}, ParameterError, "a PlantConfig"),
         ({"pace": LimitingFunction()}, ParameterError, "a PaceOptions"),
         ({"safety": Caution()}, ParameterError, "a Safety"),
     ],

@@ -49,15 +49,6 @@ def test_river_finds_nothing_wrong_with_features_that_come_and_go() -> None:
             check(model.clone())
 
 
-def test_river_finds_nothing_wrong_with_several_targets() -> None:
-    from river import checks
-
-    model = as_river(tiny, targets=3)
-    for check in checks.yield_checks(model):
-        if "memory" not in check.__name__:  # three thousand samples of SolarFlare: same buffers as above
-            check(model.clone())
-
-
 def test_river_example() -> None:
     from river import datasets, dummy, evaluate, metrics, stats
 

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 from as_published import sogp
+from stream_scores import rms_ratio
 from torch.distributions import StudentT
 
 from torch_ekm.exceptions import ParameterError
@@ -71,7 +72,7 @@ def test_what_cannot_be_learned_costs_next_to_nothing():
     ratios = []
     for wrap in (MixtureResidual, lambda learner: learner):
         learner = wrap(sogp(3, 1, capacity=40, noise_variance=0.1, parts=[ProcessNoise(0.003)]))
-        ratios.append(run_prequential(learner, x, y).rms_ratio(100))
+        ratios.append(rms_ratio(run_prequential(learner, x, y), 100))
     assert ratios[1] > 1.05
     assert ratios[0] < 1.02
 

@@ -10,7 +10,7 @@ from typing import Annotated, ParamSpec, TypeVar
 
 from .._terminal import say  # first: needs the extra
 from .._versions import versions_of
-from ..exceptions import MissingExtraError, OutputError, ParameterError
+from ..exceptions import MissingExtraError, ParameterError
 
 import typer  # isort: skip
 from typer import Option  # isort: skip
@@ -118,16 +118,3 @@ def parse_step(degrees: float) -> float:
 def names(text: str) -> tuple[str, ...]:
     """Names separated by commas, each once: ``"a, b, a"`` as ("a", "b")."""
     return tuple(dict.fromkeys(filter(None, map(str.strip, text.split(",")))))
-
-
-def check_file(path: Path, suffixes: tuple[str, ...] = ()) -> None:
-    """Before anything runs: a file can be written there.
-
-    Raises:
-        OutputError: the path is a folder, or in one that is not there.
-        ParameterError: another suffix.
-    """
-    if path.is_dir() or not path.resolve().parent.is_dir():
-        raise OutputError(path, "there is no such folder, or a folder of this name")
-    if suffixes and path.suffix.lower() not in suffixes:
-        raise ParameterError("file", str(path), f"a name that ends in {', '.join(suffixes)}")

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 from .._terminal import console, print_table, say
-from ._app import AN_OBJECT, app, check_file, needs
+from ..exceptions import OutputError, ParameterError
+from ._app import AN_OBJECT, app, needs
 
 import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
@@ -66,7 +67,10 @@ def check(
     """
     from ..inspection.check import Check, check_hand
 
-    check_file(picture, (".png", ".jpg", ".jpeg"))
+    if picture.is_dir() or not picture.resolve().parent.is_dir():
+        raise OutputError(picture, "there is no such folder, or a folder of this name")
+    if picture.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise ParameterError("file", str(picture), "a name that ends in .png, .jpg, .jpeg")
     with console.status("Checking: some seconds, a minute or two where the pinch fails"):
         rows = check_hand(hand, object, picture)
     print_table(Check._fields, rows, hand)

@@ -39,7 +39,6 @@ class Setting:
     preset: str = "nominal"
     plant: PlantParameters | None = None
     """In place of the preset's."""
-    grasp: PlantConfig = field(default_factory=PlantConfig)
     model: ModelOptions = field(default_factory=ModelOptions)
     tasks: tuple[Task, ...] = DEFAULT_TASKS
     limits: tuple[Limit, ...] = DEFAULT_LIMITS
@@ -63,7 +62,7 @@ class Setting:
         for name in ("capacity", "frames"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
-        kinds = {"plant": PlantParameters, "grasp": PlantConfig, "model": ModelOptions}
+        kinds = {"plant": PlantParameters, "model": ModelOptions}
         for name, kind in {**kinds, "pace": PaceOptions, "safety": Safety}.items():
             value = self.parameters if name == "plant" else getattr(self, name)
             if not isinstance(value, kind):
@@ -91,13 +90,13 @@ class Setting:
         if controller not in CONTROLLERS:
             raise UnknownNameError("controller", controller, CONTROLLERS)
         relative_to = "setpoint" if controller.endswith("+I") else "encoder"
-        return dataclasses.replace(self.grasp, relative_to=relative_to)
+        return PlantConfig(relative_to=relative_to)
 
     def figures(self) -> dict[str, Any]:
         """All figures of plant, model, controller and learner, defaults included."""
         return {
             "plant": dataclasses.asdict(self.parameters),
-            "plant_config": dataclasses.asdict(self.grasp),
+            "plant_config": dataclasses.asdict(PlantConfig()),
             "model": dataclasses.asdict(self.model),
             "controller": [repr(part) for part in (*self.tasks, *self.limits, self.pace, self.safety)],
             "learner": learner_figures(self.learner, self.capacity, **self.learner_options),

@@ -58,33 +58,25 @@ def run_jobs(
         OutputError: a result cannot be written.
         MissingExtraError: joblib is not installed.
     """
+    results, tell = {}, on_done or (lambda name: None)
     make_folder(folder)
     with WriterLock(folder):
-        return _run_all(function, jobs, folder, processes, on_done or (lambda name: None))
-
-
-def _run_all(
-    function: Callable[..., Any],
-    jobs: Jobs,
-    folder: Path,
-    processes: int,
-    tell: Callable[[str], None],
-) -> dict[str, Any]:
-    results = {}
-    for name in jobs:
-        path = folder / f"{name}.json"
-        if path.exists():
-            try:
-                results[name] = read_result(path, name)
-            except ValueError as error:
-                warnings.warn(f"{path}: {error}; the job is run again", stacklevel=3)
-    for name in results:
-        tell(name)
-    waiting = {name: arguments for name, arguments in jobs.items() if name not in results}
-    with closing(_in_processes(processes, function, waiting)) as outcomes:
-        for name, result in outcomes:
-            results[name] = _write(folder / f"{name}.json", name, result)
+        for name in jobs:
+            path = folder / f"{name}.json"
+            if path.exists():
+                try:
+                    results[name] = read_result(path, name)
+                except ValueError as error:
+                    warnings.warn(f"{path}: {error}; the job is run again", stacklevel=2)
+        for name in results:
             tell(name)
+        waiting = {name: arguments for name, arguments in jobs.items() if name not in results}
+        with closing(_in_processes(processes, function, waiting)) as outcomes:
+            for name, result in outcomes:
+                text = _text(name, result)
+                write_whole(folder / f"{name}.json", text)
+                results[name] = json.loads(text)["result"]  # in the types that a resumed run reads
+                tell(name)
     return {name: results[name] for name in jobs}
 
 
@@ -174,13 +166,6 @@ def read_result(path: Path, name: str) -> Any:
     if _text(name, kept["result"]).encode() != content:
         raise ValueError("damaged: its digest (SHA-256) is another")
     return kept["result"]
-
-
-def _write(path: Path, name: str, result: Any) -> Any:
-    """``result`` in the types that a resumed run reads."""
-    text = _text(name, result)
-    write_whole(path, text)
-    return json.loads(text)["result"]
 
 
 def _text(name: str, result: Any) -> str:

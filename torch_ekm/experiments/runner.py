@@ -22,7 +22,7 @@ from ..control import (
 from ..description import ObjectDescription
 from ..enhanced import EnhancedModel, GraspEncoding
 from ..exceptions import EquilibriumError, GraspError
-from ..foresight import BlindPose, Reach, reachable
+from ..foresight import BlindPose
 from ..kinematics import GraspState
 from ..model import KinematicModel
 from ..plant import FramesAtRest, Plant
@@ -126,9 +126,8 @@ class Bench:
         learn: bool = True,
         events: Sequence[Tug | PlantChange] = (),
         blind_deg: float = 0.0,
-        touch: bool = False,
-        look_again_deg: float = math.inf,
         poses: bool = False,
+        **blind: Any,
     ) -> TrialRecord:
         """Turn the object that is held.
 
@@ -137,9 +136,8 @@ class Bench:
             learn: train after every motion (an E-KM only).
             events: what happens on the way; ``at`` counts this trial's commands from 0.
             blind_deg: the camera is off for this last part of the turn [deg]; infinite: for all of it.
-            touch: without camera joints and fingertips correct the pose; else the prediction is all there is.
-            look_again_deg: of :class:`~torch_ekm.foresight.BlindPose` [deg].
             poses: keep the true poses, for pictures.
+            blind: options of :class:`~torch_ekm.foresight.BlindPose`; its ``touch`` is off.
         """
         self.disturbed.events = tuple(
             dataclasses.replace(event, at=event.at + self.disturbed.count) for event in events
@@ -152,26 +150,15 @@ class Bench:
                 plant,
                 self._predictor,
                 axis,
-                look_again=look_again_deg * _DEG,
                 # rotation off the axis does not keep the camera on: a model that tilts is not to be helped
                 switch_off=lambda seen: abs(float(axis @ target.error(seen.state)[3:])) <= blind_deg * _DEG,
-                touch=touch,
+                **{"touch": False, **blind},
             )
         setting = self.setting
         known = {"knowledge": self.knowledge, "safety": setting.safety}
-        loop = ClosedLoop(plant, self._controller(axis), **known, learn=learn)
+        loop = ClosedLoop(plant, self.look_and_move(), **known, learn=learn)
         self.last = loop.run(target)
         return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
-
-    def reach(self, angle_deg: float) -> Reach | None:
-        """How far the model says that the grasp turns, up to ``angle_deg``; None: it refuses the grasp."""
-        axis = self.hand.rotation_axis
-        sign, limit = (1 if angle_deg > 0 else -1), abs(angle_deg) * _DEG
-        try:
-            controller = self._controller(axis)
-            return reachable(controller, self.plant.observe(), sign=sign, limit=limit)
-        except GraspError:
-            return None
 
     def long_step(self, seed: int, trial: int, step_deg: float) -> Record:
         """One motion of ``step_deg`` from a fresh grasp: how far from it does the object come to rest?
@@ -208,8 +195,9 @@ class Bench:
     def _predictor(self) -> KinematicModel | EnhancedModel:
         return self.model if self.enhanced is None else self.enhanced
 
-    def _controller(self, axis: torch.Tensor) -> LookAndMoveController:
-        setting = self.setting
+    def look_and_move(self) -> LookAndMoveController:
+        """The controller of the next turn: about the hand's axis, by what is known now."""
+        setting, axis = self.setting, self.hand.rotation_axis
         return LookAndMoveController(self._predictor, axis, setting.tasks, setting.limits, self.pace)
 
     def _prepare_learner(self, start: GraspState) -> None:

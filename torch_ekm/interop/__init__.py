@@ -10,7 +10,6 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .acados_residual import AcadosResidual
 from .capymoa_regressor import CapyMOARegressor as as_capymoa  # noqa: N813  called like the others
 from .gpytorch_svgp import GPyTorchSVGP
 from .online_regressor import LearnerLike, OnlineRegressor
@@ -20,11 +19,11 @@ if TYPE_CHECKING:
     from .bags import read_bag
     from .casadi_residual import CasadiResidual as to_casadi  # noqa: N813
     from .mcap_log import log_from_mcap, log_to_mcap
-    from .river_regressor import as_river
+    from .river_regressor import RiverRegressor as as_river  # noqa: N813
     from .sklearn_regressor import SklearnRegressor as as_sklearn  # noqa: N813
 
 _ASKED_FOR = {
-    "as_river": ("river_regressor", "as_river"),
+    "as_river": ("river_regressor", "RiverRegressor"),
     "as_sklearn": ("sklearn_regressor", "SklearnRegressor"),
     "log_from_mcap": ("mcap_log", "log_from_mcap"),
     "log_to_mcap": ("mcap_log", "log_to_mcap"),
@@ -41,7 +40,6 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
-    "AcadosResidual",
     "GPyTorchSVGP",
     "LearnerLike",
     "OnlineRegressor",

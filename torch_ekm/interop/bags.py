@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,13 +13,7 @@ from .._extras import require
 from ..exceptions import DescriptionError, UnknownNameError
 from ..typing import Array
 
-if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-else:
-    AnyReader = require("rosbags.highlevel").AnyReader
-    _typesys = require("rosbags.typesys")
-    Stores, get_typestore = _typesys.Stores, _typesys.get_typestore
+AnyReader, _typesys = require("rosbags.highlevel").AnyReader, require("rosbags.typesys")
 
 _MOST = 64  # numbers of one field; more is an image or a cloud
 _LEFT_OUT = ("header", "layout")  # stamps and array shapes
@@ -56,7 +50,7 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
     heard: dict[str, float] = {}
     rows: list[tuple[int, dict[str, float]]] = []
     try:
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+        reader = AnyReader([path], default_typestore=_typesys.get_typestore(_typesys.Stores.LATEST))
         with reader:
             there = sorted({connection.topic for connection in reader.connections})
             for topic in (clock, *topics):

@@ -52,8 +52,11 @@ class Inputs:
         return np.concatenate([tensor.ravel(order="F") for tensor in tensors])
 
 
-class Covariance:
-    """A kernel and a basis: ``k(X, z)`` ``(M, 1)`` and ``k(z, z)`` of a column z.
+_Function = Callable[["ca.SX"], "ca.SX"]
+
+
+def covariance(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> tuple[_Function, _Function]:
+    """``k(X, z)`` ``(M, 1)`` and ``k(z, z)``, functions of a column z.
 
     Args:
         kernel: of one model.
@@ -63,15 +66,6 @@ class Covariance:
     Raises:
         ParameterError: a kernel of another kind.
     """
-
-    def __init__(self, kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> None:
-        self.column, self.diagonal = _expressions(kernel, basis, inputs)
-
-
-_Function = Callable[["ca.SX"], "ca.SX"]
-
-
-def _expressions(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> tuple[_Function, _Function]:
     if isinstance(kernel, ActionLinearKernel):
         return _action_linear(kernel, basis, inputs)
     if isinstance(kernel, DeepKernel):
@@ -115,7 +109,7 @@ def _action_linear(
     kernel: ActionLinearKernel, basis: Callable[[], Tensor], inputs: Inputs
 ) -> tuple[_Function, _Function]:
     n = kernel.state_features
-    state, of_state = _expressions(kernel.state_kernel, lambda: basis()[:, :n], inputs)
+    state, of_state = covariance(kernel.state_kernel, lambda: basis()[:, :n], inputs)
     actions = inputs.take("actions", lambda: basis()[:, n:])
     variance = inputs.take("action_variance", lambda: kernel.action_variance)
     return (

@@ -12,7 +12,7 @@ from ..exceptions import ParameterError
 from ..residual import LastResidual, MixtureResidual, ResidualLearner, SparseOnlineGP, Standardize
 from ..residual.sparse_gp.part import Units
 from ..typing import Array
-from .casadi_kernels import Covariance, Inputs
+from .casadi_kernels import Inputs, covariance
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -91,14 +91,14 @@ def _sparse(learner: SparseOnlineGP, inputs: Inputs, variance: bool) -> _Express
         shift, wide, scale, offset = 0.0, 1.0, ca.SX.ones(learner.out_features), 0.0
     else:
         raise ParameterError("units", type(units).__name__, "those of x and y, or Standardize")
-    covariance = Covariance(learner.kernel, lambda: posterior.basis, inputs)
+    column, diagonal = covariance(learner.kernel, lambda: posterior.basis, inputs)
     alpha = inputs.take("alpha", lambda: posterior.alpha)
     C = inputs.take("C", lambda: posterior.covariance) if variance else None
 
     def expression(x: ca.SX) -> tuple[ca.SX, ca.SX]:
         z = (x - shift) / wide
-        k = covariance.column(z)
-        latent = ca.SX(0) if C is None else covariance.diagonal(z) + k.T @ (C @ k)
+        k = column(z)
+        latent = ca.SX(0) if C is None else diagonal(z) + k.T @ (C @ k)
         return scale * (alpha.T @ k) + offset, scale * scale * latent
 
     return expression

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,15 +15,9 @@ from ..exceptions import DescriptionError, ParameterError
 from ..kinematics import se3
 from ..plant import Trajectory, TrialLog
 
-if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-else:
-    AnyReader = require("rosbags.highlevel").AnyReader
-    _rosbag2, _typesys = require("rosbags.rosbag2"), require("rosbags.typesys")
-    StoragePlugin, Writer = _rosbag2.StoragePlugin, _rosbag2.Writer
-    Stores, get_typestore = _typesys.Stores, _typesys.get_typestore
+AnyReader, _typesys = require("rosbags.highlevel").AnyReader, require("rosbags.typesys")
+_rosbag2 = require("rosbags.rosbag2")
+_TYPES = _typesys.get_typestore(_typesys.Stores.ROS2_HUMBLE)
 
 _ABOUT, _POSE = "/about", "/object_pose"
 _JOINTS = ("q", "a", "commands")  # as JointState, which viewers know
@@ -36,29 +30,27 @@ def _write_trial(trajectory: Trajectory, folder: str | Path) -> Path:
     if folder.exists():
         raise ParameterError("folder", str(folder), "a folder that does not exist yet")
     arrays = trajectory.arrays()
-    types = get_typestore(Stores.ROS2_HUMBLE)
-    made = _Messages(types)
     stamps = [round(1e9 * time) for time in arrays["time"].tolist()]
     shapes = {place: [list(array.shape), array.dtype.str] for place, array in arrays.items()}
     about = {"seed": trajectory.seed, "about": trajectory.about, "arrays": shapes}
-    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    with _rosbag2.Writer(folder, version=9, storage_plugin=_rosbag2.StoragePlugin.MCAP) as writer:
 
         def topic(name: str, kind: str, rows: list[tuple[int, Any]]) -> None:
-            connection = writer.add_connection(name, kind, typestore=types)
+            connection = writer.add_connection(name, kind, typestore=_TYPES)
             for stamp, message in rows:
-                writer.write(connection, stamp, types.serialize_cdr(message, kind))
+                writer.write(connection, stamp, _TYPES.serialize_cdr(message, kind))
 
         kind = "std_msgs/msg/String"
-        topic(_ABOUT, kind, [(min(stamps, default=0), made.text(json.dumps(about)))])
+        topic(_ABOUT, kind, [(min(stamps, default=0), _message(kind, data=json.dumps(about)))])
         for place, array in arrays.items():
-            kind, make = made.of(place, array)
+            kind, make = _of_rows(place, array)
             topic(
                 f"/{place}",
                 kind,
                 [(stamp, make(stamp, row)) for stamp, row in zip(stamps, array, strict=False)],
             )
         poses = zip(stamps, trajectory.observations, strict=True)
-        rows = [(stamp, made.pose(stamp, one.position, one.rotation)) for stamp, one in poses]
+        rows = [(stamp, _pose(stamp, one.position, one.rotation)) for stamp, one in poses]
         topic(_POSE, "geometry_msgs/msg/PoseStamped", rows)
     return folder
 
@@ -70,7 +62,7 @@ def _read_trial(folder: str | Path) -> Trajectory:
         raise DescriptionError(folder, "there is no such recording")
     rows: dict[str, list[Any]] = {}
     try:
-        with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        with AnyReader([folder], default_typestore=_TYPES) as reader:
             for connection, _, raw in reader.messages():
                 message: Any = reader.deserialize(raw, connection.msgtype)
                 if connection.topic != _POSE:
@@ -129,53 +121,50 @@ def log_from_mcap(folder: str | Path, target: str | Path) -> TrialLog:
         return log
 
 
-class _Messages:
-    """Makes the messages of one set of types."""
+def _message(kind: str, **fields: Any) -> Any:
+    return _TYPES.types[kind](**fields)
 
-    def __init__(self, types: Any) -> None:
-        self.types = types.types
 
-    def of(self, place: str, array: np.ndarray) -> tuple[str, Any]:
-        """Message type of an array's rows, and what makes one of (stamp, row)."""
-        if place in _JOINTS:
-            return "sensor_msgs/msg/JointState", self.joints
-        if array.dtype.kind == "S":
-            return "std_msgs/msg/String", lambda _, row: self.text(row.decode())
-        code = array.dtype.kind + str(array.dtype.itemsize)
-        code = code if code in _KINDS else {"f": "f8", "b": "u1"}.get(array.dtype.kind, "i8")
-        kind = f"std_msgs/msg/{_KINDS[code]}MultiArray"
-        return kind, lambda _, row: self.array(kind, np.asarray(row, dtype=code))
+def _of_rows(place: str, array: np.ndarray) -> tuple[str, Any]:
+    """Message type of an array's rows, and what makes one of (stamp, row)."""
+    if place in _JOINTS:
+        return "sensor_msgs/msg/JointState", _joints
+    if array.dtype.kind == "S":
+        return "std_msgs/msg/String", lambda _, row: _message("std_msgs/msg/String", data=row.decode())
+    code = array.dtype.kind + str(array.dtype.itemsize)
+    code = code if code in _KINDS else {"f": "f8", "b": "u1"}.get(array.dtype.kind, "i8")
+    kind = f"std_msgs/msg/{_KINDS[code]}MultiArray"
+    return kind, lambda _, row: _multi_array(kind, np.asarray(row, dtype=code))
 
-    def text(self, data: str) -> Any:
-        return self.types["std_msgs/msg/String"](data=data)
 
-    def array(self, kind: str, row: np.ndarray) -> Any:
-        dimension = self.types["std_msgs/msg/MultiArrayDimension"]
-        sizes = [dimension(label="", size=size, stride=size) for size in row.shape]
-        layout = self.types["std_msgs/msg/MultiArrayLayout"](dim=sizes, data_offset=0)
-        return self.types[kind](layout=layout, data=np.atleast_1d(row).ravel())
+def _multi_array(kind: str, row: np.ndarray) -> Any:
+    sizes = [
+        _message("std_msgs/msg/MultiArrayDimension", label="", size=size, stride=size) for size in row.shape
+    ]
+    layout = _message("std_msgs/msg/MultiArrayLayout", dim=sizes, data_offset=0)
+    return _message(kind, layout=layout, data=np.atleast_1d(row).ravel())
 
-    def joints(self, stamp: int, row: np.ndarray) -> Any:
-        empty = np.zeros(0)
-        position = np.asarray(row, dtype=np.float64)
-        return self.types["sensor_msgs/msg/JointState"](
-            header=self.header(stamp), name=[], position=position, velocity=empty, effort=empty
-        )
 
-    def pose(self, stamp: int, position: Any, rotation: Any) -> Any:
-        x, y, z = (float(one) for one in position)
-        phi = se3.log(rotation)
-        angle = float(phi.norm())
-        i, j, k = (float(one) * (math.sin(0.5 * angle) / angle if angle else 0.5) for one in phi)
-        w = math.cos(0.5 * angle)
-        point = self.types["geometry_msgs/msg/Point"](x=x, y=y, z=z)
-        turn = self.types["geometry_msgs/msg/Quaternion"](x=i, y=j, z=k, w=w)
-        pose = self.types["geometry_msgs/msg/Pose"](position=point, orientation=turn)
-        return self.types["geometry_msgs/msg/PoseStamped"](header=self.header(stamp), pose=pose)
+def _joints(stamp: int, row: np.ndarray) -> Any:
+    empty, position = np.zeros(0), np.asarray(row, dtype=np.float64)
+    figures = {"position": position, "velocity": empty, "effort": empty}
+    return _message("sensor_msgs/msg/JointState", header=_header(stamp), name=[], **figures)
 
-    def header(self, stamp: int) -> Any:
-        time = self.types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
-        return self.types["std_msgs/msg/Header"](stamp=time, frame_id="hand")
+
+def _pose(stamp: int, position: Any, rotation: Any) -> Any:
+    x, y, z = (float(one) for one in position)
+    phi = se3.log(rotation)
+    angle = float(phi.norm())
+    i, j, k = (float(one) * (math.sin(0.5 * angle) / angle if angle else 0.5) for one in phi)
+    point = _message("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    turn = _message("geometry_msgs/msg/Quaternion", x=i, y=j, z=k, w=math.cos(0.5 * angle))
+    pose = _message("geometry_msgs/msg/Pose", position=point, orientation=turn)
+    return _message("geometry_msgs/msg/PoseStamped", header=_header(stamp), pose=pose)
+
+
+def _header(stamp: int) -> Any:
+    time = _message("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
+    return _message("std_msgs/msg/Header", stamp=time, frame_id="hand")
 
 
 def _values(message: Any) -> Any:

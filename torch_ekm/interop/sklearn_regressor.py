@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -10,17 +10,10 @@ from .._extras import require
 from ..typing import Array
 from .online_regressor import LearnerLike, OnlineRegressor, make_learner
 
-if TYPE_CHECKING:
-    from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
-    from sklearn.utils.validation import check_is_fitted, validate_data
-else:
-    _base, _validation = require("sklearn.base", "interop"), require("sklearn.utils.validation", "interop")
-    BaseEstimator, MultiOutputMixin = _base.BaseEstimator, _base.MultiOutputMixin
-    RegressorMixin = _base.RegressorMixin
-    check_is_fitted, validate_data = _validation.check_is_fitted, _validation.validate_data
+_base, _validation = require("sklearn.base", "interop"), require("sklearn.utils.validation", "interop")
 
 
-class SklearnRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
+class SklearnRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.BaseEstimator):
     """``y = c + g(X)``, c the first target, g a learner: a regressor of scikit-learn.
 
     The rows of X ``(n, in)`` and y ``(n,)`` or ``(n, out)`` are learned one after the other, in their order:
@@ -44,15 +37,17 @@ class SklearnRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def predict(self, X: Any, return_std: bool = False) -> Array | tuple[Array, Array]:
         """Mean of y, ``(n,)`` or ``(n, out)``; with ``return_std`` also the standard deviation of y."""
-        check_is_fitted(self)
-        X = validate_data(self, X, reset=False, dtype=np.float64)
+        _validation.check_is_fitted(self)
+        X = _validation.validate_data(self, X, reset=False, dtype=np.float64)
         mean, deviation = self.regressor_.predict(X)
         if self.flat_:
             mean, deviation = mean[:, 0], deviation[:, 0]
         return (mean, deviation) if return_std else mean
 
     def _learn(self, X: Any, y: Any, reset: bool) -> Self:
-        X, y = validate_data(self, X, y, reset=reset, multi_output=True, y_numeric=True, dtype=np.float64)
+        X, y = _validation.validate_data(
+            self, X, y, reset=reset, multi_output=True, y_numeric=True, dtype=np.float64
+        )
         rows = np.asarray(y, dtype=np.float64).reshape(len(X), -1)
         if reset:
             self.flat_ = np.ndim(y) == 1

@@ -16,6 +16,7 @@ from ..plant import Observation, Plant, PlantStatus, PlantWrapper
 from ..typing import Tensor
 
 KINDS = ("late", "frozen", "frozen, with running stamps", "jumping", "missing", "out of range")
+_LONGEST = 12  # observations of a fault
 _SENSORS = ("encoders", "joints", "pose", "fingertips")
 _FIELDS = {"encoders": ("a",), "joints": ("q",), "pose": ("position", "rotation"),
            "fingertips": ("fingertip_force",)}  # fmt: skip
@@ -27,21 +28,20 @@ class FuzzedPlant(PlantWrapper):
     """Any plant whose readings are spoilt at random: what guards must live through.
 
     One fault at a time: it begins at an observation with probability ``chance``, strikes one sensor in one
-    of the ways of :data:`KINDS`, and lasts one observation, or in one of four cases up to ``longest``.
+    of the ways of :data:`KINDS`, and lasts one observation, or in one of four cases up to twelve.
     The same seed gives the same faults. ``info["events"]`` and ``faults`` name them.
 
     Args:
         plant: to be spoilt.
         chance: of a fault's begin, 0 to 1.
-        longest: observations of a long fault.
         seed: of the faults.
     """
 
-    def __init__(self, plant: Plant, chance: float = 0.15, longest: int = 12, seed: int = 0) -> None:
+    def __init__(self, plant: Plant, chance: float = 0.15, seed: int = 0) -> None:
         super().__init__(plant)
         if not 0 <= chance <= 1:
             raise ParameterError("chance", chance, "between 0 and 1")
-        self.chance, self.longest = chance, longest
+        self.chance = chance
         self.faults: Counter[str] = Counter()
         """Spoilt observations by kind."""
         self.observations = 0
@@ -60,7 +60,7 @@ class FuzzedPlant(PlantWrapper):
         draw = self._random
         if self._left == 0 and draw.random() < self.chance and len(self._past) > 1:
             self._kind, self._sensor = str(draw.choice(KINDS)), str(draw.choice(_SENSORS))
-            self._left = 1 if draw.random() < 0.75 else int(draw.integers(2, self.longest + 1))
+            self._left = 1 if draw.random() < 0.75 else int(draw.integers(2, _LONGEST + 1))
             self._held = self._past[-2]
         if self._left == 0:
             return seen

@@ -42,15 +42,12 @@ class OwnRecording:
         name: of the file.
         x: state and command ``(n, d)``, in the recording's units.
         y: what the model left over ``(n, m)``, in the units of the observation.
-        inputs, outputs: names of the columns of x and y.
         about: what it is, and what "the model alone" predicts.
     """
 
     name: str
     x: Float[Tensor, "n d"]
     y: Float[Tensor, "n m"]
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
     about: str
 
     def stream(self) -> Stream:
@@ -123,7 +120,7 @@ def load_own(
     alone = "nothing moves" if model is None else getattr(model, "__name__", type(model).__name__)
     about = f"increments of {len(outputs)} columns of {path.name}; alone: {alone}"
     x, y = torch.from_numpy(np.hstack([s, u])), torch.from_numpy(moved - nominal)
-    return OwnRecording(path.stem, x, y, (*state, *command), tuple(outputs), about)
+    return OwnRecording(path.stem, x, y, about)
 
 
 def _find(wanted: Sequence[str], names: Sequence[str]) -> list[str]:

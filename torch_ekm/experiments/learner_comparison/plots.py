@@ -15,6 +15,7 @@ from .scores import Comparison
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_WINDOWS = 25  # of a learning curve
 _BLUE, _GREY = "#0072B2", "#7f7f7f"
 _ALWAYS = {"model alone": _GREY, "default": _BLUE}
 _CYCLE = ("#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
@@ -61,13 +62,12 @@ def plot_learning_curves(
     stream: str,
     learners: Sequence[str] | None = None,
     mark: dict[int, str] | None = None,
-    windows: int = 25,
 ) -> Figure:
     """Error over the time of one stream, in windows; ``mark``: sample -> what happened there."""
     figure, (axis,) = new_figure(7.5, 3.4)
     one = comparison.stream(stream)
     n = len(one) - one.warm_up
-    edges = np.linspace(0, n, min(windows, n // 5) + 1).astype(int)
+    edges = np.linspace(0, n, min(_WINDOWS, n // 5) + 1).astype(int)
     middle = one.warm_up + 0.5 * (edges[1:] + edges[:-1])
     others, measure = iter(_CYCLE * 3), comparison.measure(stream)
     reduce = np.mean if measure == "rms" else np.median

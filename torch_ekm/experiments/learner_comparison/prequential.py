@@ -10,7 +10,7 @@ import torch
 from ...residual.base import ResidualLearner
 from ...typing import Float, Tensor
 
-Z90 = 1.6448536269514722  # half width of a central 90 % interval of the normal law
+_Z90 = 1.6448536269514722  # half width of a central 90 % interval of the normal law
 
 
 @dataclass(frozen=True)
@@ -32,14 +32,6 @@ class Prequential:
         """``y - mean`` ``(n, m)``, in the units of y."""
         return self.y - self.mean
 
-    def rms_ratio(self, start: int = 0) -> float:
-        """rms of the error over rms of y: below 1 the learner helps."""
-        return float(self.error[start:].square().mean().sqrt() / self.y[start:].square().mean().sqrt())
-
-    def median_ratio(self, start: int = 0) -> float:
-        """The same of the median absolute values: blind to outliers."""
-        return float(self.error[start:].abs().median() / self.y[start:].abs().median())
-
     def nll(self, start: int = 0) -> float:
         """Mean negative log density per output under a normal law [nats]."""
         law = torch.distributions.Normal(self.mean[start:], self.deviation[start:], validate_args=False)
@@ -47,7 +39,7 @@ class Prequential:
 
     def coverage(self, start: int = 0) -> Float[Tensor, "*out"]:
         """Share of samples inside the central 90 % interval, per output."""
-        return (self.error[start:].abs() <= Z90 * self.deviation[start:]).to(self.y.dtype).mean(0)
+        return (self.error[start:].abs() <= _Z90 * self.deviation[start:]).to(self.y.dtype).mean(0)
 
 
 def run_prequential(

@@ -18,7 +18,7 @@ from ...typing import Array
 from ..jobs import run_jobs
 from ..learners import COMPARED, Factory, constructor_call, learner_factory
 from .fingerprint import fingerprint
-from .prequential import Z90, run_prequential
+from .prequential import run_prequential
 from .recordings import LIMIT, load_recording
 from .report import ComparisonReport
 from .scores import Score, block_bootstrap, blocks_of
@@ -109,11 +109,10 @@ def run_one(stream: Stream, factory: Factory) -> dict[str, Any]:
     finally:
         torch.set_num_threads(threads)
     start = stream.warm_up
-    error, deviation = run.error[start:], run.deviation[start:]
     return {
-        "squared": [float(f"{value:.6g}") for value in _squared(error)],
+        "squared": [float(f"{value:.6g}") for value in _squared(run.error[start:])],
         "nll": run.nll(start),
-        "coverage": float((error.abs() <= Z90 * deviation).double().mean()),
+        "coverage": float(run.coverage(start).mean()),
         "microseconds": 1e6 * run.seconds / len(stream),
         "kilobytes": _kilobytes(model),
     }

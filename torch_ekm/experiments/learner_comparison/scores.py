@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -84,30 +83,24 @@ class Comparison:
         """Scores on one stream, in the order of the learners."""
         return [self.scores[stream, name] for name in self.learners]
 
-    def best(self, stream: str, among: Sequence[str] | None = None) -> Score:
+    def best(self, stream: str) -> Score:
         """The smallest error on a stream, by its :meth:`measure`."""
-        chosen = [score for score in self.row(stream) if among is None or score.learner in among]
-        return min(chosen, key=lambda score: self.error(stream, score.learner).mean)
+        return min(self.row(stream), key=lambda score: self.error(stream, score.learner).mean)
 
-    def ratio(
-        self, stream: str, ours: str, theirs: str, seed: int = 0, measure: Measure | None = None
-    ) -> Estimate:
-        """Error of ``ours`` over that of ``theirs`` on the same samples, 95 % paired block bootstrap.
+    def ratio(self, stream: str, ours: str, theirs: str) -> Estimate:
+        """Error of ``ours`` over that of ``theirs`` on the same samples, by the stream's :meth:`measure`.
 
-        Args:
-            measure: ``"rms"`` or ``"median"``; None: that of the stream.
+        Its interval is that of a paired block bootstrap, 95 %.
         """
-        blocks, measure = blocks_of(self.stream(stream)), measure or self.measure(stream)
         errors = self.errors[stream, ours], self.errors[stream, theirs]
-        return block_bootstrap(*errors, blocks, seed, measure=measure)
+        return block_bootstrap(*errors, blocks_of(self.stream(stream)), measure=self.measure(stream))
 
     def ranks(self) -> Array:
         """``(n_streams, n_learners)``, 1 is best; ties share their mean rank."""
         table = np.array(
             [[self.error(stream.name, name).mean for name in self.learners] for stream in self.streams]
         )
-        mine, others = table[:, :, None], table[:, None, :]
-        return (others < mine).sum(-1) + 0.5 * ((others == mine).sum(-1) + 1)
+        return require("scipy.stats").rankdata(table, axis=1)
 
     def critical_difference(self) -> float:
         """Mean ranks that differ by less are not distinguishable (Nemenyi, 5 %; Demsar, JMLR 7, 2006)::

@@ -55,6 +55,8 @@ _TEMPERATURE = 0.1
 _FIRST = 5
 #: Turns of each object before its assignment is judged.
 _LEARNING_TURNS = 3
+#: Largest number of models that the bank may keep.
+_MODELS = 8
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,6 @@ class ObjectMemory(Protocol):
     setting: Setting = field(default_factory=Setting)
     objects: tuple[str, ...] = field(default_factory=lambda: list_objects()[:6])
     turns_each: int = 8
-    models: int = 8
-    """Largest number of models that the bank may keep."""
     readings: int = 8
     """Sensor readings at rest that make up a grasp's signature; 0: residuals alone tell objects apart."""
 
@@ -193,7 +193,7 @@ class ObjectMemory(Protocol):
         factory = partial(
             make_learner, setting.learner, n_s, n_a, setting.capacity, **setting.learner_options
         )
-        return Memories(factory, self.models, **options)
+        return Memories(factory, _MODELS, **options)
 
 
 class Memories(ModelBank):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
@@ -24,6 +24,10 @@ from .protocol import Protocol
 
 _LEARNED = 16
 """Trials after which the paper's learner has learned."""
+_KNOCK = (0.0, 0.10, 0.0)
+"""Torque of a knock [N m], hand frame, for 50 ms: it turns the tube by 5 to 10 deg."""
+_NEW_TENDONS = {"moment_arm": 1.15, "servo_stiffness": 0.8}
+"""What the plant then is: tighter tendons, less stretch."""
 
 
 @dataclass(frozen=True)
@@ -44,14 +48,8 @@ class Online(Protocol):
     """Rotations are drawn from this interval."""
     dislocations: tuple[int, ...] = (20, 44)
     """In these trials the object is knocked after its third motion."""
-    knock: tuple[float, float, float] = (0.0, 0.10, 0.0)
-    """Torque of the knock [N m], hand frame, for 50 ms: it turns the tube by 5 to 10 deg."""
     tendons_replaced: int = 31
     """Before this trial the tendons are replaced (0: never)."""
-    new_tendons: Mapping[str, float] = field(
-        default_factory=lambda: {"moment_arm": 1.15, "servo_stiffness": 0.8}
-    )
-    """What the plant then is: tighter tendons, less stretch."""
 
     def __post_init__(self) -> None:
         low, high = self.angle_range_deg
@@ -83,8 +81,8 @@ class Online(Protocol):
         records = []
         for trial, angle in enumerate(angles.tolist(), start=1):
             if trial == self.tendons_replaced:
-                PlantChange(0, self.new_tendons).happen(bench.hand)
-            events = (Tug(at=3, torque=self.knock),) if trial in self.dislocations else ()
+                PlantChange(0, _NEW_TENDONS).happen(bench.hand)
+            events = (Tug(at=3, torque=_KNOCK),) if trial in self.dislocations else ()
             records.append(bench.trial(seed, trial, angle, events=events))
         bench.close()
         return records

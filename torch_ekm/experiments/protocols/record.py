@@ -70,29 +70,23 @@ def record(
         FolderInUseError: another process records there; the message names the process.
         OutputError: the log cannot be written.
     """
-    with TrialLog(folder, config.configuration) as log:
-        _fill(log, config, seeds, on_trial)
-    return log
-
-
-def _fill(
-    log: TrialLog, config: RecordConfig, seeds: tuple[int, ...], on_trial: Callable[[int], None] | None
-) -> None:
     n = len(config.angles_deg)
-    for seed in seeds:
-        trials = range(seed * n, seed * n + n)
-        missing = log.missing(trials)
-        bench = None
-        if missing:
-            bench = Bench(config.setting, config.object, config.controller, keep_images=config.images)
-            bench.plant = RecordingPlant(bench.plant)
-        for trial, angle in zip(trials, config.angles_deg, strict=True):
-            if bench is not None and (trial in missing or bench.learns):
-                _turn(bench, log, seed, trial, angle)
-            if on_trial is not None:
-                on_trial(trial)
-        if bench is not None:
-            bench.close()
+    with TrialLog(folder, config.configuration) as log:
+        for seed in seeds:
+            trials = range(seed * n, seed * n + n)
+            missing = log.missing(trials)
+            bench = None
+            if missing:
+                bench = Bench(config.setting, config.object, config.controller, keep_images=config.images)
+                bench.plant = RecordingPlant(bench.plant)
+            for trial, angle in zip(trials, config.angles_deg, strict=True):
+                if bench is not None and (trial in missing or bench.learns):
+                    _turn(bench, log, seed, trial, angle)
+                if on_trial is not None:
+                    on_trial(trial)
+            if bench is not None:
+                bench.close()
+    return log
 
 
 def _turn(bench: Bench, log: TrialLog, seed: int, trial: int, angle: float) -> None:

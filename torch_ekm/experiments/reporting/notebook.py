@@ -1,21 +1,16 @@
-"""What the notebooks share: smoke mode, the hand to turn and zoom, and copies of them."""
+"""What the notebooks share: smoke mode, pictures of the hand, and copies of them."""
 
 from __future__ import annotations
 
-import base64
-import html
 import os
 import shutil
-import sys
 import tempfile
-from contextlib import AbstractContextManager, nullcontext, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..._files import make_folder
-from ...exceptions import DescriptionError, MissingExtraError
-from ...rendering import Scene, save_animation, save_picture
+from ...exceptions import DescriptionError
+from ...rendering import Scene, save_picture
 
 
 def smoke_mode() -> bool:
@@ -23,40 +18,12 @@ def smoke_mode() -> bool:
     return os.environ.get("TORCH_EKM_SMOKE", "0") not in ("", "0")
 
 
-@dataclass
-class HandView:
-    """A scene as the last line of a notebook cell: a picture, or a page to turn and zoom."""
+def hand_picture(scene: Scene, frames: tuple[int, ...] = (0,)) -> Any:
+    """A scene as the last line of a notebook cell: these frames of it side by side, an image of IPython."""
+    from IPython.display import Image
 
-    scene: Scene
-    """See :func:`~torch_ekm.rendering.make_scene`."""
-    frames: tuple[int, ...] = (0,)
-    """Of the picture, side by side."""
-    interactive: bool = False
-    """Also offer the page with all frames (viser): megabytes in a notebook that is stored. Without viser:
-    the picture only."""
-
-    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
-        bundle = {"text/plain": "HandView"}
-        with tempfile.TemporaryDirectory() as folder:
-            picture = save_picture(self.scene, Path(folder) / "hand.png", frames=self.frames)
-            bundle["image/png"] = base64.b64encode(picture.read_bytes()).decode()
-            if self.interactive:
-                with suppress(MissingExtraError), _silence():
-                    page = save_animation(self.scene, Path(folder) / "hand.html").read_text(encoding="utf-8")
-                    bundle["text/html"] = (
-                        f'<iframe srcdoc="{html.escape(page)}" width="100%" height="420" '
-                        'style="border: 0"></iframe>'
-                    )
-        return bundle
-
-
-def _silence() -> AbstractContextManager:
-    """viser announces an address that nobody shall open, in a notebook through IPython's display."""
-    if "IPython" not in sys.modules:
-        return nullcontext()
-    from IPython.utils.capture import capture_output
-
-    return capture_output()
+    with tempfile.TemporaryDirectory() as folder:
+        return Image(save_picture(scene, Path(folder) / "hand.png", frames=frames).read_bytes())
 
 
 def notebook_folder() -> Path:
