@@ -25,7 +25,6 @@ GROUPS = {
     ),
     "Controller: size of a step": ("torch_ekm.control", ["LimitingFunction", "StepBound", "TrustRegion"]),
     "Closed loop": ("torch_ekm.control", ["StoppingRule", "Caution", "Guards"]),
-    "Foresight": ("torch_ekm.foresight", ["BlindOptions"]),
     "Simulation": ("torch_ekm.simulation", ["PlantConfig", "ImageQuality"]),
 }
 

@@ -119,7 +119,7 @@ def test_the_spin_moments_of_soft_fingers_hold_what_two_points_cannot() -> None:
 
 def test_what_lies_within_reach_ends_by_nothing(grasp) -> None:
     plant, seen, controller = grasp
-    reach = reachable(controller.kinematic, seen.state, plant.rotation_axis, limit=5 * DEG)
+    reach = reachable(controller.kinematic, seen, plant.rotation_axis, limit=5 * DEG)
     assert reach.end is ReachEnd.NOTHING
     assert reach.angle == pytest.approx(5 * DEG, abs=0.3 * DEG)
 
@@ -157,7 +157,7 @@ def test_what_cannot_be_asked_is_refused(grasp) -> None:
         reachable(controller, seen, friction=0.0)
     with pytest.raises(ParameterError, match="limit"):
         reachable(controller, seen, limit=4.0)
-    away = GraspState(seen.q, seen.position + 0.2, seen.rotation)
+    away = dataclasses.replace(seen, position=seen.position + 0.2)
     with pytest.raises(NoContactError):
         reachable(controller, away)
     whole = copy.copy(controller)

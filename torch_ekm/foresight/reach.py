@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from enum import Enum
@@ -11,6 +12,7 @@ import torch
 from ..control import (
     Caution,
     ClosedLoop,
+    FocusedPose,
     HandKnowledge,
     LookAndMoveController,
     PoseTarget,
@@ -26,7 +28,6 @@ from ..plant import Observation
 from ..typing import Float, Tensor
 from .friction_share import friction_share
 from .model_hand import ModelHand
-from .rehearsal import axis_of, hand_at, own_controller
 
 _DEG = math.pi / 180
 _BEARS = 0.01  # [N m] of a stop that ends a turn
@@ -78,7 +79,7 @@ class Reach:
 @torch.no_grad()
 def reachable(
     model: LookAndMoveController | KinematicModel | EnhancedModel,
-    seen: Observation | GraspState,
+    seen: Observation,
     axis: Float[Tensor, " 3"] | None = None,
     *,
     sign: int = 1,
@@ -94,7 +95,7 @@ def reachable(
 
     Args:
         model: a controller, or a model for one with default tasks and limits.
-        seen: the grasp. Of a bare state encoders and forces follow from the model.
+        seen: the grasp.
         axis: about which it is to be turned, hand frame; None: the controller's focus.
         sign: 1 or -1, which way.
         limit: farthest angle that is tried [rad].
@@ -114,9 +115,12 @@ def reachable(
         raise ParameterError("limit", limit, "above 0 and at most 170 deg [rad]")
     if not friction > 0:
         raise ParameterError("friction", friction, "greater than 0")
-    controller = own_controller(model, axis)
-    about = axis_of(controller.focus)
-    hand = hand_at(controller, seen)
+    controller = _own_controller(model, axis)
+    about, f = _axis_of(controller.focus), controller.kinematic
+    predictor = f if controller.enhanced is None else controller.enhanced
+    hand = ModelHand(predictor, seen.state, seen.a, seen.fingertip_force)
+    if hand.linearization is None:
+        f.linearize(seen.state)  # raises, and says why
     start = hand.observe()
     idle = set(hand.at_limits())
     path, angles = [start.state], [0.0]
@@ -133,7 +137,7 @@ def reachable(
             stop: Stop = over.value
             break
         lin = hand.linearization
-        share = 0.0 if hand.failure or lin is None else friction_share(controller.kinematic, lin)
+        share = 0.0 if hand.failure or lin is None else friction_share(f, lin)
         if share > friction:
             said = f"the object needs {100 * share:.0f} % of the friction, more than {100 * friction:.0f} %"
             stop = Stop(StopReason.GIVEN_UP, step.after, said)
@@ -179,7 +183,7 @@ class BeyondReach:
         Raises:
             ParameterError: the focus is no rotation about one axis.
         """
-        about = axis_of(self.controller.focus)
+        about = _axis_of(self.controller.focus)
         asked = float(about @ target.error(seen.state)[3:])
         sign, limit = (1 if asked >= 0 else -1), min(max(abs(asked), 1 * _DEG), 170 * _DEG)
         try:
@@ -207,6 +211,37 @@ class _Standing:
             return []
         left = sorted(zip(lin.forces.relative_margin.tolist(), lin.contacts.finger, strict=True))
         return [pad for share, pad in left if share < 0.05]
+
+
+def _own_controller(
+    model: LookAndMoveController | KinematicModel | EnhancedModel, axis: Tensor | None
+) -> LookAndMoveController:
+    """A controller apart from the given one, with a pace of its own.
+
+    Raises:
+        ParameterError: a model without an axis.
+    """
+    if isinstance(model, LookAndMoveController):
+        controller = copy.copy(model)
+        if axis is not None:
+            controller.focus = FocusedPose.rotation_about(axis)
+    elif axis is None:
+        raise ParameterError("axis", None, "given with a model; a controller has a focus of its own")
+    else:
+        controller = LookAndMoveController(model, axis)
+    controller.pace = copy.deepcopy(controller.pace)
+    return controller
+
+
+def _axis_of(focus: FocusedPose) -> Float[Tensor, " 3"]:
+    """Of a focus that is the rotation about it.
+
+    Raises:
+        ParameterError: the focus is something else.
+    """
+    if focus.matrix.shape[0] != 1 or bool((focus.matrix[:, :3].abs() > 1e-9).any()):
+        raise ParameterError("focus", focus.matrix.tolist(), "a rotation about one axis")
+    return focus.matrix[0, 3:]
 
 
 def _end(stop: Stop, hand: ModelHand, at: _Standing) -> tuple[ReachEnd, tuple[str, ...], str]:
