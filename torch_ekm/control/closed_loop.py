@@ -20,7 +20,9 @@ from .decision import Decision, Expectation, StopReason
 from .focus import FocusedPose, PoseTarget
 from .knowledge import HandKnowledge
 from .pace import contact_lever
-from .safety import Progress, Safety, Watch
+from .safety import Safety
+from .safety.progress import Progress
+from .safety.watch import Watch
 
 
 @dataclass(frozen=True)
@@ -89,8 +91,8 @@ class ClosedLoop:
             for step in loop.steps(target):
                 print(step.increment)
 
-    Whatever ends the manipulation early (an exception, Ctrl-C, a ``break``), the hand is told to hold its
-    position, and what was raised goes on. In a ``with`` block that is so for errors of the block, too.
+    Whatever ends the manipulation early (an exception, Ctrl-C, a ``break``), the hand is commanded to hold
+    its position, and what was raised goes on. In a ``with`` block that is so for errors of the block, too.
 
     Commands go through a :class:`~torch_ekm.plant.ServoInverse`, and the model learns from what the encoders
     did; with servos that are taken for ideal both are the increments that were decided.
@@ -140,7 +142,7 @@ class ClosedLoop:
         self._stop.set()
 
     def hold(self) -> None:
-        """Tell the hand to stay where it is; what the plant raises here is ignored."""
+        """Command the hand to stay where it is; what the plant raises here is ignored."""
         still = torch.zeros(self.controller.kinematic.hand.n_a, dtype=torch.float64)
         with contextlib.suppress(Exception):
             self.plant.command(still)

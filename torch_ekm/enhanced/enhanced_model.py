@@ -184,24 +184,21 @@ class EnhancedModel(Recorded, nn.Module):
         state: Any,
         action: Float[Tensor, "*batch n_a"],
         nominal_jacobian: Float[Tensor, "*batch n_s n_a"] | None = None,
-        encoded: Float[Tensor, "*batch d"] | None = None,
     ) -> tuple[Float[Tensor, "*batch n_s"], Float[Tensor, "*batch n_s n_a"]]:
         """``(f + g, d(f + g)/d da)`` at a state and action, or at each of a batch.
 
         Args:
             nominal_jacobian: J_m if it is known already (then ``f = J_m da``).
-            encoded: ``encode(state)`` if it is known already.
 
         Raises:
             NoDerivativeError: f carries no derivative (numpy, ``no_grad``, a detached output).
             ShapeError: ``jacobian`` gave another shape.
         """
         nominal, J = self._nominal_with_jacobian(state, action, nominal_jacobian)
-        seen = self.encode(state) if encoded is None else encoded
-        mean, dmean = self.learner.linearize(torch.cat([seen, self.action_scale * action], dim=-1))
-        n_a = action.shape[-1]
+        mean, dmean = self.learner.linearize(self.features(state, action))
         value = nominal + self._scatter(mean / self.output_scale, nominal)
-        slope = (dmean[..., -n_a:] * self.action_scale / self.output_scale.reshape(-1, 1)).to(J.dtype)
+        dmean = dmean[..., -action.shape[-1] :]
+        slope = (dmean * self.action_scale / self.output_scale.reshape(-1, 1)).to(J.dtype)
         if self.outputs is None:
             return value, J + slope
         jacobian = J.clone()

@@ -8,7 +8,7 @@ from ...plant import Observation, PlantStatus
 from ...typing import Tensor
 from ..decision import Decision, StopReason
 from ..focus import FocusedPose, PoseTarget
-from .safety import Halt, Safety
+from .safety import Objection, Safety
 
 
 class Progress:
@@ -21,7 +21,7 @@ class Progress:
         started: of a monotonic clock [s].
     """
 
-    halt: Halt | None = None
+    halt: Objection | None = None
     """What a guard says against going on."""
     limited = False
     """The last step was cut short by an actuator's limit."""
@@ -40,7 +40,7 @@ class Progress:
         self._off_allowed = safety.caution.off_rotation
         self._bearing: frozenset[str] | None = None
 
-    def over(self, seen: Observation, stopped: bool) -> Halt | None:
+    def over(self, seen: Observation, stopped: bool) -> Objection | None:
         """Why the manipulation ends before the next decision; None: it goes on.
 
         Args:
@@ -49,15 +49,15 @@ class Progress:
         if self.halt is not None:
             return self.halt
         if seen.status is PlantStatus.LOST:
-            return Halt(StopReason.OBJECT_LOST, "")
+            return Objection(StopReason.OBJECT_LOST)
         if self.lost(seen):
-            return Halt(StopReason.OBJECT_LOST, "dislocated off the focused axis")
+            return Objection(StopReason.OBJECT_LOST, "dislocated off the focused axis")
         if stopped:
-            return Halt(StopReason.STOPPED, "")
+            return Objection(StopReason.STOPPED)
         if time.monotonic() - self._started > self.safety.rule.max_seconds:
-            return Halt(StopReason.TIME_OUT, "")
+            return Objection(StopReason.TIME_OUT)
         reason = self.safety.rule.judge(self.errors, self.limited)
-        return None if reason is StopReason.RUNNING else Halt(reason, "")
+        return None if reason is StopReason.RUNNING else Objection(reason)
 
     def lost(self, seen: Observation) -> bool:
         """The plant reports it, or the object is dislocated."""

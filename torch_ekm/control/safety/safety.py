@@ -19,12 +19,16 @@ _DEG = math.pi / 180
 _MAX_AGE = Stamps(encoders=0.2, joints=0.2, pose=0.4, fingertips=0.4)
 
 
-class Halt(NamedTuple):
-    """Why a guard ends a manipulation."""
+class Objection(NamedTuple):
+    """What speaks against a reading, a command, or going on."""
 
     reason: StopReason
-    message: str
+    message: str = ""
     """Sensor, figure, limit, and what to do."""
+    blind: bool = False
+    """The pose is not known; the rest is."""
+    gated: bool = False
+    """Surprising, but possible."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,7 @@ class StoppingRule:
 
 @dataclass(frozen=True)
 class Caution:
-    """What tells of a loss before it comes, and what is done then; the same for every controller.
+    """What announces a loss before it comes, and what is done then; the same for every controller.
 
     Signs: the model refuses the state; the object has turned off the focus by ``off_rotation``; a link
     without a pad comes to bear on the object. One that ``looks`` further readings show as well is heeded:
@@ -163,7 +167,7 @@ class Guards:
     joint_noise: float = 1.5 * _DEG
     """[rad]"""
     encoder_jump: float = 8 * _DEG
-    """An encoder goes so much further than it was told, or so far back [rad]."""
+    """An encoder goes so much further than it was commanded to, or so far back [rad]."""
     joint_jump: float = 20 * _DEG
     """Of a joint, away from what was predicted of one motion [rad]."""
     rotation_jump: float = 60 * _DEG
