@@ -19,7 +19,6 @@ from .controller import LookAndMoveController
 from .decision import Decision, Expectation, StopReason
 from .focus import FocusedPose, PoseTarget
 from .knowledge import HandKnowledge
-from .pace import contact_lever
 from .safety import Safety
 from .safety.progress import Progress
 from .safety.watch import Watch
@@ -147,24 +146,18 @@ class ClosedLoop:
         with contextlib.suppress(Exception):
             self.plant.command(still)
 
-    def run(self, target: PoseTarget, on_step: Callable[[Step], object] | None = None) -> Manipulation:
+    def run(self, target: PoseTarget) -> Manipulation:
         """Drive the object to ``target``.
-
-        Args:
-            on_step: called with each motion when it is over.
 
         Raises:
             EKMError: see :meth:`LookAndMoveController.decide`, and what the plant raises.
         """
-        steps: list[Step] = []
-        with contextlib.closing(self.steps(target)) as motions:
-            while True:
-                try:
-                    steps.append(next(motions))
-                except StopIteration as end:
-                    return Manipulation(target, self.controller.focus, tuple(steps), end.value)
-                if on_step is not None:
-                    on_step(steps[-1])
+        steps, motions = [], self.steps(target)
+        while True:
+            try:
+                steps.append(next(motions))
+            except StopIteration as end:
+                return Manipulation(target, self.controller.focus, tuple(steps), end.value)
 
     def steps(self, target: PoseTarget) -> Generator[Step, None, Stop]:
         """The motions one by one; the generator's return value is the :class:`Stop`."""
@@ -275,7 +268,7 @@ class ClosedLoop:
             return None
         if not self.knowledge.servo.learns:  # then the dead zones are g's to learn
             expected = self.controller.expect(lin, decision.delta_a)
-        lever = contact_lever(lin.contacts.point - seen.position)
+        lever = float((lin.contacts.point - seen.position).square().sum(-1).mean().sqrt())
         surprise = self._force_surprise(lin, seen, expected.moved, after)
         trust = self.controller.pace.options.trust
         rho = trust.disagreement(expected.increment[-6:], ds[-6:], lever, surprise)

@@ -93,25 +93,19 @@ class ControlProblem:
         """(lower, upper) of u in degrees."""
         return self.qp.lb[: self.n_u], self.qp.ub[: self.n_u]
 
-    def solve(self, solver: str = "piqp") -> ControlSolution:
-        """The best u.
-
-        Args:
-            solver: any solver that qpsolvers finds installed; the open-source "piqp" by default.
+    def solve(self) -> ControlSolution:
+        """The best u, by the open-source solver PIQP.
 
         Raises:
-            ParameterError: the solver is not installed (the message lists those that are).
-            SolverError: the solver did not find a solution.
+            SolverError: the solver did not find a solution, or is not installed.
         """
         qpsolvers, qp, n_u = require("qpsolvers"), self.qp, self.n_u
-        if solver not in qpsolvers.available_solvers:
-            raise ParameterError("solver", solver, f"one of {', '.join(qpsolvers.available_solvers)}")
         try:
-            solution = qpsolvers.solve_problem(qp, solver=solver)
+            solution = qpsolvers.solve_problem(qp, solver="piqp")
         except Exception as error:  # back ends raise types of their own
-            raise SolverError(solver, f"{type(error).__name__}: {error}") from error
+            raise SolverError("piqp", f"{type(error).__name__}: {error}") from error
         if not solution.found or solution.x is None:
-            raise SolverError(solver, "no solution found", "bounds may be far out of scale")
+            raise SolverError("piqp", "no solution found", "bounds may be far out of scale")
         u = np.clip(solution.x[:n_u], *self.bounds)
         slack = np.zeros(0) if qp.A is None else (qp.b - qp.A[:, :n_u] @ u) * DEGREE
         broken = np.zeros(0) if qp.G is None else qp.G[:, :n_u] @ u - qp.h

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import nn
 
-from .._checks import check_finite
+from .._checks import check_finite, check_shape
 from .._recorded import Recorded, check_state, describe
-from ..exceptions import ParameterError, ShapeError
+from ..exceptions import ParameterError
 from ..kinematics import GraspState
 from ..residual.base import ResidualLearner, UpdateReport
 from ..residual.kernels.action_linear import ActionLinearKernel
 from ..typing import Float, Tensor
 from .encoding import GraspEncoding
 from .grasp_learner import grasp_learner
-from .model_jacobian import checked_jacobian, differentiated, finite_differences
+from .model_jacobian import differentiated, finite_differences
 
 if TYPE_CHECKING:
     from ..model import KinematicModel
@@ -167,10 +167,7 @@ class EnhancedModel(Recorded, nn.Module):
                 "increment", type(increment).__name__, "a tensor: torch.as_tensor(increment)"
             )
         predicted = self.nominal(state, action) if nominal is None else nominal
-        if increment.shape != predicted.shape:
-            raise ShapeError(
-                "increment", f"{tuple(predicted.shape)}, that of the prediction", increment.shape
-            )
+        check_shape("increment", increment, predicted.shape, "as the prediction has")
         if self.learner.on_invalid == "raise":  # else the learner leaves such a sample out, and counts it
             for name, value in (
                 ("action", action), ("increment", increment), ("f(state, action)", predicted)
@@ -217,7 +214,9 @@ class EnhancedModel(Recorded, nn.Module):
         nominal = self.nominal(state, action)
         if self.jacobian == "finite-difference":
             return nominal, finite_differences(self.nominal, state, action)
-        return nominal, checked_jacobian(self.jacobian(state, action), nominal, action)
+        J = torch.as_tensor(self.jacobian(state, action)).to(action)
+        check_shape("jacobian", J, (*nominal.shape, action.shape[-1]))
+        return nominal, J
 
     def correction(
         self, state: Any, action: Float[Tensor, "*batch n_a"], n_s: int

@@ -20,16 +20,16 @@ from ..control import (
     Stop,
     StopReason,
 )
-from ..enhanced import EnhancedModel
 from ..exceptions import GraspError, ParameterError
 from ..kinematics import GraspState
-from ..model import KinematicModel, Linearization
+from ..model import Linearization
 from ..plant import Observation
 from ..typing import Float, Tensor
 from .friction_share import friction_share
 from .model_hand import ModelHand
 
 _DEG = math.pi / 180
+_FRICTION = 0.7  # largest share of its friction that a grasp may need to hold the object
 _BEARS = 0.01  # [N m] of a stop that ends a turn
 _PRESSED = -0.3e-3
 """Gap of a link that bears on the object [m]: links sink in here, where real ones push; noise hides less."""
@@ -78,13 +78,11 @@ class Reach:
 
 @torch.no_grad()
 def reachable(
-    model: LookAndMoveController | KinematicModel | EnhancedModel,
+    controller: LookAndMoveController,
     seen: Observation,
-    axis: Float[Tensor, " 3"] | None = None,
     *,
     sign: int = 1,
     limit: float = 90 * _DEG,
-    friction: float = 0.7,
     safety: Safety | None = None,
 ) -> Reach:
     """``max |angle|`` of the closed loop on a :class:`ModelHand`: the controller's own programs, limits and
@@ -94,28 +92,27 @@ def reachable(
     and this grasp; it is no better than the model's contacts and forces, and knows nothing of noise.
 
     Args:
-        model: a controller, or a model for one with default tasks and limits.
+        controller: with the axis about which the object is to be turned as its focus.
         seen: the grasp.
-        axis: about which it is to be turned, hand frame; None: the controller's focus.
         sign: 1 or -1, which way.
         limit: farthest angle that is tried [rad].
-        friction: largest share of its friction that the grasp may need to hold the object
-            (:func:`~torch_ekm.foresight.friction_share`); infinite: any.
         safety: as in :class:`~torch_ekm.control.ClosedLoop`; None: the usual one, but a link bears only where
             it would lie 0.3 mm deep, which is when noisy readings show it.
 
+    A turn also ends where the grasp needs more than 70 % of its friction to hold the object
+    (:func:`~torch_ekm.foresight.friction_share`).
+
     Raises:
-        ParameterError: no axis, a focus that is no single rotation, a sign that is none, an angle outside 0
-            to 170 deg, or a share that is not positive.
+        ParameterError: a focus that is no single rotation, a sign that is none, or an angle outside 0 to
+            170 deg.
         GraspError: the model refuses the grasp as it is.
     """
     if sign not in (1, -1):
         raise ParameterError("sign", sign, "1 or -1")
     if not 0 < limit <= 170 * _DEG:
         raise ParameterError("limit", limit, "above 0 and at most 170 deg [rad]")
-    if not friction > 0:
-        raise ParameterError("friction", friction, "greater than 0")
-    controller = _own_controller(model, axis)
+    controller = copy.copy(controller)
+    controller.pace = copy.deepcopy(controller.pace)
     about, f = _axis_of(controller.focus), controller.kinematic
     predictor = f if controller.enhanced is None else controller.enhanced
     hand = ModelHand(predictor, seen.state, seen.a, seen.fingertip_force)
@@ -138,8 +135,8 @@ def reachable(
             break
         lin = hand.linearization
         share = 0.0 if hand.failure or lin is None else friction_share(f, lin)
-        if share > friction:
-            said = f"the object needs {100 * share:.0f} % of the friction, more than {100 * friction:.0f} %"
+        if share > _FRICTION:
+            said = f"the object needs {100 * share:.0f} % of the friction, more than {100 * _FRICTION:.0f} %"
             stop = Stop(StopReason.GIVEN_UP, step.after, said)
             break
         turned = float(about @ step.after.state.minus(start.state)[-3:])
@@ -211,26 +208,6 @@ class _Standing:
             return []
         left = sorted(zip(lin.forces.relative_margin.tolist(), lin.contacts.finger, strict=True))
         return [pad for share, pad in left if share < 0.05]
-
-
-def _own_controller(
-    model: LookAndMoveController | KinematicModel | EnhancedModel, axis: Tensor | None
-) -> LookAndMoveController:
-    """A controller apart from the given one, with a pace of its own.
-
-    Raises:
-        ParameterError: a model without an axis.
-    """
-    if isinstance(model, LookAndMoveController):
-        controller = copy.copy(model)
-        if axis is not None:
-            controller.focus = FocusedPose.rotation_about(axis)
-    elif axis is None:
-        raise ParameterError("axis", None, "given with a model; a controller has a focus of its own")
-    else:
-        controller = LookAndMoveController(model, axis)
-    controller.pace = copy.deepcopy(controller.pace)
-    return controller
 
 
 def _axis_of(focus: FocusedPose) -> Float[Tensor, " 3"]:

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from ...exceptions import ParameterError
-from ...model import ModelStatus
 from ...plant import Stamps
 from ..decision import StopReason
-
-if TYPE_CHECKING:
-    from ...model import Linearization
 
 _DEG = math.pi / 180
 _MAX_AGE = Stamps(encoders=0.2, joints=0.2, pose=0.4, fingertips=0.4)
@@ -109,23 +104,6 @@ class Caution:
             if not getattr(self, name) >= 0:
                 raise ParameterError(name, getattr(self, name), "0 or more")
 
-    def bearing_links(self, lin: Linearization | None) -> frozenset[str]:
-        """Links without a pad that bear on the object."""
-        doubts: Iterable = () if lin is None else lin.doubts
-        near = (doubt for doubt in doubts if doubt.kind is ModelStatus.LINK_TOUCHES)
-        return frozenset(doubt.what for doubt in near if doubt.value < self.link_gap)
-
-    def sign(self, off_rotation: float, allowed: float, bearing: frozenset[str]) -> str:
-        """What speaks for a loss to come; empty: nothing.
-
-        Args:
-            off_rotation, allowed: of the object since the start [rad].
-            bearing: links without a pad that bear on the object and did not at the start.
-        """
-        if off_rotation > allowed:
-            return f"the object has turned {off_rotation / _DEG:.1f} deg off the focus"
-        return f"link '{min(bearing)}', which has no pad, bears on the object" if bearing else ""
-
 
 @dataclass(frozen=True)
 class Guards:
@@ -201,19 +179,12 @@ class Guards:
 @dataclass(frozen=True)
 class Safety:
     """Which readings count, when the hand looks again, goes back, stops and gives up; the same for every
-    controller that is compared.
-
-    ============================================================ ==========================
-    reasons to end                                               figures
-    ============================================================ ==========================
-    reached, stalled, step limit, actuator limits, time-out,     :class:`StoppingRule`
-    object lost
-    given up                                                     :class:`Caution`
-    stale sensor and all that follow it in :class:`StopReason`   :class:`Guards`
-    unstable grasp                                               none: the model has no step
-    ============================================================ ==========================
+    controller that is compared. A grasp that is unstable has no figure: the model has no step.
     """
 
     rule: StoppingRule = StoppingRule()
+    """Reached, stalled, step limit, actuator limits, time-out, object lost."""
     caution: Caution = Caution()
+    """Given up."""
     guards: Guards = Guards()
+    """Stale sensor, and all reasons that follow it in :class:`StopReason`."""
