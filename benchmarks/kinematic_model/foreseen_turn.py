@@ -56,7 +56,11 @@ def turn(name: str, seed: int) -> tuple[float, float, float, int | None, float]:
     felt = torch.stack([t.fingertip_force[pads] for t in truth])
     wrong = (foreseen.normal_force - felt)[: foreseen.first_slip]
     rms = [float(x.square().mean().sqrt()) for x in (off / DEG, wrong)]
-    return *rms, float(wrong.abs().max()), foreseen.first_slip, 1e3 * float(foreseen.gap().max())
+    end = foreseen.at(-1)
+    found = model.contacts(end.state)
+    off = end.contacts.point - found.point[[found.finger.index(pad) for pad in end.contacts.finger]]
+    gap = 1e3 * float(torch.linalg.vector_norm(off, dim=-1).max())
+    return *rms, float(wrong.abs().max()), foreseen.first_slip, gap
 
 
 def main() -> None:

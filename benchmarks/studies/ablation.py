@@ -20,7 +20,6 @@ from run_study import run_study
 from torch_ekm.control import (
     ActuatorLimit,
     Caution,
-    FrictionMarginLimit,
     GripForceTask,
     JointLimit,
     LimitingFunction,
@@ -127,7 +126,6 @@ _OPTIONS: list[tuple[str, str, Callable[[Setting], dict[str, Any]], tuple[str, .
         _part(LimitingFunction, step=6 * _DEG, contact_travel=2e-3), _ALL,
     ),
     ("controller", "actuators cut at 6 deg", _short_actuator_steps, _ALL),
-    ("controller", "rows for the friction margin", _part(FrictionMarginLimit, minimum=0.5), _ALL),
     ("care", "a grip of 5 N for every object", _part(GripForceTask, force=5.0), _ALL),
     ("care", "the pace fixed", _part(TrustRegion, start=1.0, smallest=1.0, largest=1.0), _LEARNING),
     ("care", "steps never cut", _part(StepBound, least=math.inf), _ALL),

@@ -19,8 +19,8 @@ _ALSO = [
     "torch_ekm.exceptions",
     "torch_ekm.typing",
 ]  # public modules that are no packages
-# their names are listed where they come from, not where they are offered again
-_LAST = ["torch_ekm.control.guards", "torch_ekm"]
+# its names are listed where they come from, not where they are offered again
+_LAST = "torch_ekm"
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def places() -> dict[int, str]:
 @functools.cache
 def _places() -> dict[int, str]:
     found: dict[int, str] = {}
-    for package in sorted(packages(), key=lambda one: _LAST.index(one) + 1 if one in _LAST else 0):
+    for package in sorted(packages(), key=lambda one: one == _LAST):
         module = importlib.import_module(package)
         for name in module.__all__:
             found.setdefault(id(getattr(module, name)), f"{package}.{name}")

@@ -21,11 +21,10 @@ GROUPS = {
     ),
     "Controller: limits": (
         "torch_ekm.control",
-        ["ActuatorLimit", "JointLimit", "NormalForceLimit", "FrictionMarginLimit"],
+        ["ActuatorLimit", "JointLimit", "NormalForceLimit"],
     ),
     "Controller: size of a step": ("torch_ekm.control", ["LimitingFunction", "StepBound", "TrustRegion"]),
     "Closed loop": ("torch_ekm.control", ["StoppingRule", "Caution", "Guards"]),
-    "Foresight": ("torch_ekm.foresight", ["BlindOptions"]),
     "Simulation": ("torch_ekm.simulation", ["PlantConfig", "ImageQuality"]),
 }
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 
 import torch
 from fakes import FakePlant
 
+from torch_ekm.control import ClosedLoop, Manipulation, PoseTarget, Step
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation
@@ -82,3 +84,15 @@ class Obedient(FakePlant):
 def turned(seen: Observation, axis: torch.Tensor, angle: float) -> Observation:
     """``seen`` with its object turned further by ``angle`` [rad]."""
     return dataclasses.replace(seen, rotation=exp(angle * axis) @ seen.rotation)
+
+
+def watched(loop: ClosedLoop, target: PoseTarget, on_step: Callable[[Step], object]) -> Manipulation:
+    """As ``loop.run(target)``, with a look at each motion when it is over."""
+    steps = []
+    with contextlib.closing(loop.steps(target)) as motions:
+        while True:
+            try:
+                steps.append(next(motions))
+            except StopIteration as end:
+                return Manipulation(target, loop.controller.focus, tuple(steps), end.value)
+            on_step(steps[-1])

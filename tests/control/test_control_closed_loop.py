@@ -9,6 +9,7 @@ import threading
 import pytest
 import torch
 from fakes import FakePlant
+from obedient_plant import watched
 
 from torch_ekm.control import (
     ClosedLoop,
@@ -100,11 +101,11 @@ def test_a_program_that_no_solver_solves_gives_up_holding(held, monkeypatch, sol
     """Next to buckling a Jacobian is out of all scale: the loop goes back and ends, and raises nothing."""
     solve, calls = ControlProblem.solve, []
 
-    def no_longer(problem: ControlProblem, solver: str = "piqp"):
-        calls.append(solver)
+    def no_longer(problem: ControlProblem):
+        calls.append(problem)
         if len(calls) > solved:
-            raise SolverError(solver, "no solution found")
-        return solve(problem, solver)
+            raise SolverError("piqp", "no solution found")
+        return solve(problem)
 
     monkeypatch.setattr(ControlProblem, "solve", no_longer)
     done, _ = drive(held)
@@ -251,7 +252,7 @@ def test_the_hand_holds_after_an_error_of_the_caller_and_after_a_break(held) -> 
 
     plant = Noted(seen)
     with pytest.raises(ZeroDivisionError):
-        ClosedLoop(plant, controller, safety=SAFETY).run(target, fail)
+        watched(ClosedLoop(plant, controller, safety=SAFETY), target, fail)
     assert [bool(da.any()) for da in plant.given] == [True, False]
     plant = Noted(seen)
     motions = []  # alive when the block fails: it is the block that holds the hand
@@ -281,7 +282,7 @@ def test_another_thread_stops_it_after_the_motion_under_way(held) -> None:
     plant = Noted(seen)
     loop = ClosedLoop(plant, controller, safety=SAFETY)
     worker = threading.Thread(target=loop.stop)
-    done = loop.run(PoseTarget.turned(seen.state, axis, degrees=80), lambda step: worker.start())
+    done = watched(loop, PoseTarget.turned(seen.state, axis, degrees=80), lambda step: worker.start())
     worker.join()
     assert done.reason is Reason.STOPPED
     assert len(done.steps) <= 2

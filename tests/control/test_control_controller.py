@@ -15,7 +15,6 @@ from torch_ekm.control import (
     EffortTask,
     FocusedPose,
     FocusTask,
-    FrictionMarginLimit,
     Inequality,
     JointLimit,
     LimitingFunction,
@@ -269,25 +268,3 @@ def test_bad_observations_are_refused(grasp) -> None:
         loop.decide(state, seen.a, target, seen.fingertip_force + np.inf)
     with pytest.raises(NonFiniteError, match="position"):
         GraspState(state.q, state.position * torch.nan, state.rotation)
-
-
-def test_margin_rows_keep_away_from_the_friction_cone(grasp) -> None:
-    plant, _, seen, state = grasp
-    target = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG)
-    free = controller(grasp).decide(state, seen.a, target, seen.fingertip_force)
-    lin = free.linearization
-
-    def after(decision) -> torch.Tensor:
-        return lin.margins + lin.margin_sensitivity @ decision.delta_a
-
-    bound = float(after(free).min()) + 0.2
-    limits = (*DEFAULT_LIMITS, FrictionMarginLimit(bound))
-    kept = controller(grasp, limits=limits).decide(state, seen.a, target, seen.fingertip_force)
-    assert float(after(kept).min()) > bound - 1e-4
-    assert float(plant.rotation_axis @ kept.predicted[-3:]) == pytest.approx(STEP, rel=1e-4)
-    # far more than can be had: as much as one step may ask for, and the turn is still made
-    much = (*DEFAULT_LIMITS, FrictionMarginLimit(50.0))
-    decision = controller(grasp, limits=much).decide(state, seen.a, target, seen.fingertip_force)
-    assert decision.status is StopReason.RUNNING
-    assert decision.solution is not None
-    assert float((after(decision) - lin.margins).min()) > float((after(free) - lin.margins).min())

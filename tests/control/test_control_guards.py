@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from obedient_plant import Obedient, turned
+from obedient_plant import Obedient, turned, watched
 
 from torch_ekm.control import ClosedLoop, Guards, LookAndMoveController, PoseTarget, Safety, StoppingRule
 from torch_ekm.control import StopReason as Reason
@@ -42,9 +42,8 @@ class Run:
             self.plant if around is None else around(self.plant), controller, safety=safety
         )
         self.learned = [self.state()]
-        self.done = self.loop.run(
-            PoseTarget.turned(seen.state, axis, degrees=angle), lambda step: self.learned.append(self.state())
-        )
+        target = PoseTarget.turned(seen.state, axis, degrees=angle)
+        self.done = watched(self.loop, target, lambda step: self.learned.append(self.state()))
         self.reason, self.message = self.done.reason, self.done.stop.message
         self.taught = [step.report is not None for step in self.done.steps]
 

@@ -101,7 +101,7 @@ def test_an_enhanced_model_with_its_encoding(tmp_path: Path) -> None:
 
     double = {"dtype": torch.float64}
     reference = GraspState(torch.ones(4, **double), torch.ones(3, **double), torch.eye(3, **double))
-    encode = GraspEncoding(reference, [1, 3], q_scale=0.5)
+    encode = GraspEncoding(reference, [1, 3])
     learner = SparseOnlineGP(encode.n_features + 2, 2, capacity=8)
     ekm = EnhancedModel(f, learner, encode=encode, action_scale=3.0, output_scale=torch.tensor([2.0, 5.0]))
     action, motion = torch.ones(2, **double), torch.ones(10, **double)

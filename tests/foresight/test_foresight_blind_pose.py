@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import ParameterError
-from torch_ekm.foresight import BlindOptions, BlindPose
+from torch_ekm.foresight import BlindPose, pose_filter
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, Plant, PlantStatus, PlantWrapper
@@ -78,10 +78,11 @@ def missed(plant: BlindPose, seen: Observation) -> torch.Tensor:
     return seen.state.minus(seen.truth.state)[-6:]
 
 
-def test_joints_and_touch_find_what_the_prediction_misses(turned) -> None:
+def test_joints_and_touch_find_what_the_prediction_misses(turned, monkeypatch) -> None:
     hand, made = turned
     assert float(hand.rotation_axis @ made[-1].truth.state.minus(made[0].truth.state)[-3:]) > 6 * DEG
-    plant, seen = blind(turned, scale=0.0, options=BlindOptions(joint=1e-3 * DEG))
+    monkeypatch.setattr(pose_filter, "_JOINT", 1e-3 * DEG)
+    plant, seen = blind(turned, scale=0.0)
     alone, predicted = blind(turned, scale=0.0, touch=False)
     error, of_prediction = (
         float(p.axis @ missed(p, s[-1])[3:]) for p, s in ((plant, seen), (alone, predicted))
@@ -149,8 +150,6 @@ def test_it_goes_dark_when_told_and_sees_after_a_reset(turned) -> None:
 def test_figures_that_make_no_sense_are_refused(turned) -> None:
     hand, _ = turned
     model = KinematicModel(hand.hand, hand.object)
-    with pytest.raises(ParameterError, match="slip"):
-        BlindOptions(slip=0.0)
     with pytest.raises(ParameterError, match="look_again"):
         BlindPose(hand, model, hand.rotation_axis, look_again=0.0)
     with pytest.raises(ParameterError, match="axis"):

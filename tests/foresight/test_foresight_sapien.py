@@ -48,7 +48,10 @@ def test_a_turn_of_twenty_degrees_is_foreseen_until_the_first_slip(name, seed):
         assert errors.square().mean().sqrt() < 0.1 * DEG
         sticks = foreseen.first_slip
         assert sticks is not None
-        assert foreseen.gap().max() < 1e-4
+        end = foreseen.at(-1)
+        found = model.contacts(end.state)
+        assert found.finger == end.contacts.finger
+        assert (found.point - end.contacts.point).norm(dim=-1).max() < 1e-4
         pads = plant.hand.pad_indices(foreseen.contacts.finger)
         felt = torch.stack([t.fingertip_force[pads] for t in truth])
         assert (foreseen.normal_force - felt)[:sticks].square().mean().sqrt() < 0.1  # at most .15

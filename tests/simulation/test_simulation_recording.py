@@ -78,7 +78,6 @@ def test_a_saved_recording_replays_like_the_original(tmp_path):
         assert now.info["raw"]["hall"].dtype == torch.uint8
     assert [o.info.get("events", ()) for o in seen] == [(), (), (str(Tug(at=1, force=(0.0, 0.0, 5.0))),), ()]
     assert [o.status for o in seen] == [PlantStatus.HELD] * 4
-    assert torch.equal(seen[-1].info["recorded_command"], original.commands[-1])
     with pytest.raises(ParameterError, match="ends there"):
         replayed.command(torch.zeros(3))
     assert torch.equal(replayed.reset(0).q, original.observations[0].q)

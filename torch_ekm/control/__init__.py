@@ -7,7 +7,7 @@ from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
 from .decision import Decision, StopReason
 from .focus import FocusedPose, PoseTarget
 from .knowledge import HandKnowledge
-from .limits import ActuatorLimit, FrictionMarginLimit, JointLimit, Limit, NormalForceLimit
+from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
 from .pace import LimitingFunction, Pace, PaceOptions, StepBound, TrustRegion
 from .qp import Bounds, ControlProblem, ControlSolution, Equality, Inequality, Squares, build_qp
 from .safety import Caution, Guards, Safety, StoppingRule
@@ -28,7 +28,6 @@ __all__ = [
     "Equality",
     "FocusTask",
     "FocusedPose",
-    "FrictionMarginLimit",
     "GripForceTask",
     "Guards",
     "HandKnowledge",

@@ -19,8 +19,9 @@ from .controller import LookAndMoveController
 from .decision import Decision, Expectation, StopReason
 from .focus import FocusedPose, PoseTarget
 from .knowledge import HandKnowledge
-from .pace import contact_lever
-from .safety import Progress, Safety, Watch
+from .safety import Safety
+from .safety.progress import Progress
+from .safety.watch import Watch
 
 
 @dataclass(frozen=True)
@@ -89,8 +90,8 @@ class ClosedLoop:
             for step in loop.steps(target):
                 print(step.increment)
 
-    Whatever ends the manipulation early (an exception, Ctrl-C, a ``break``), the hand is told to hold its
-    position, and what was raised goes on. In a ``with`` block that is so for errors of the block, too.
+    Whatever ends the manipulation early (an exception, Ctrl-C, a ``break``), the hand is commanded to hold
+    its position, and what was raised goes on. In a ``with`` block that is so for errors of the block, too.
 
     Commands go through a :class:`~torch_ekm.plant.ServoInverse`, and the model learns from what the encoders
     did; with servos that are taken for ideal both are the increments that were decided.
@@ -140,29 +141,23 @@ class ClosedLoop:
         self._stop.set()
 
     def hold(self) -> None:
-        """Tell the hand to stay where it is; what the plant raises here is ignored."""
+        """Command the hand to stay where it is; what the plant raises here is ignored."""
         still = torch.zeros(self.controller.kinematic.hand.n_a, dtype=torch.float64)
         with contextlib.suppress(Exception):
             self.plant.command(still)
 
-    def run(self, target: PoseTarget, on_step: Callable[[Step], object] | None = None) -> Manipulation:
+    def run(self, target: PoseTarget) -> Manipulation:
         """Drive the object to ``target``.
-
-        Args:
-            on_step: called with each motion when it is over.
 
         Raises:
             EKMError: see :meth:`LookAndMoveController.decide`, and what the plant raises.
         """
-        steps: list[Step] = []
-        with contextlib.closing(self.steps(target)) as motions:
-            while True:
-                try:
-                    steps.append(next(motions))
-                except StopIteration as end:
-                    return Manipulation(target, self.controller.focus, tuple(steps), end.value)
-                if on_step is not None:
-                    on_step(steps[-1])
+        steps, motions = [], self.steps(target)
+        while True:
+            try:
+                steps.append(next(motions))
+            except StopIteration as end:
+                return Manipulation(target, self.controller.focus, tuple(steps), end.value)
 
     def steps(self, target: PoseTarget) -> Generator[Step, None, Stop]:
         """The motions one by one; the generator's return value is the :class:`Stop`."""
@@ -273,7 +268,7 @@ class ClosedLoop:
             return None
         if not self.knowledge.servo.learns:  # then the dead zones are g's to learn
             expected = self.controller.expect(lin, decision.delta_a)
-        lever = contact_lever(lin.contacts.point - seen.position)
+        lever = float((lin.contacts.point - seen.position).square().sum(-1).mean().sqrt())
         surprise = self._force_surprise(lin, seen, expected.moved, after)
         trust = self.controller.pace.options.trust
         rho = trust.disagreement(expected.increment[-6:], ds[-6:], lever, surprise)

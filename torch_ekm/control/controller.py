@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from .._checks import check_finite
+from .._checks import check_finite, check_shape
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
-from ..exceptions import EKMError, GraspError, NoContactError, ShapeError, SolverError
+from ..exceptions import EKMError, GraspError, NoContactError, SolverError
 from ..kinematics import GraspState
 from ..model import ModelStatus
 from ..typing import Float, Tensor
@@ -27,10 +27,10 @@ from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
 if TYPE_CHECKING:
     from ..model import KinematicModel, Linearization
 
-#: What a step should do unless told otherwise: effort, off-axis motion, grip force, focus. The figures suit
-#: the iCub hand.
+#: What a step should do by default: effort, off-axis motion, grip force, focus. The figures suit the iCub
+#: hand.
 DEFAULT_TASKS: tuple[Task, ...] = (EffortTask(), OffAxisTask(), GripForceTask(), FocusTask())
-#: What a step must not do unless told otherwise: limits of actuators, normal forces and joints.
+#: What a step must not do by default: limits of actuators, normal forces and joints.
 DEFAULT_LIMITS: tuple[Limit, ...] = (ActuatorLimit(), NormalForceLimit(), JointLimit())
 
 # of the SQP for a model that is not linear in the action
@@ -60,7 +60,6 @@ class LookAndMoveController:
         tasks: what a step should do (:class:`Task`); None: :data:`DEFAULT_TASKS`.
         limits: what it must not do (:class:`Limit`); None: :data:`DEFAULT_LIMITS`.
         pace: how far a step goes; None: a new :class:`Pace`, which adapts if the model is an enhanced one.
-        solver: any that qpsolvers finds installed.
     """
 
     def __init__(
@@ -70,15 +69,12 @@ class LookAndMoveController:
         tasks: Sequence[Task] | None = None,
         limits: Sequence[Limit] | None = None,
         pace: Pace | None = None,
-        *,
-        solver: str = "piqp",
     ) -> None:
         self.kinematic, self.enhanced = kinematic_and_enhanced(model)
         self.focus = focus if isinstance(focus, FocusedPose) else FocusedPose.rotation_about(focus)
         self.tasks = DEFAULT_TASKS if tasks is None else tuple(tasks)
         self.limits = DEFAULT_LIMITS if limits is None else tuple(limits)
         self.pace = Pace(adapts=self.enhanced is not None) if pace is None else pace
-        self.solver = solver
         self.tighter = 0.0
         """Grip force on top of the one that suits the object [N]."""
         self._weight = float(torch.linalg.vector_norm(self.kinematic.weight))
@@ -124,10 +120,9 @@ class LookAndMoveController:
         """The decision to undo a motion, instead of the one that was taken ``at`` the state."""
         lin, still = at.linearization, at.predicted.new_zeros(at.predicted.shape)
         expected = Expectation(delta_a, still, still, still) if lin is None else self.expect(lin, delta_a)
-        predicted, nominal = expected.increment, expected.nominal
-        desired = self.focus.matrix @ predicted[-6:]
+        predicted, desired = expected.increment, self.focus.matrix @ expected.increment[-6:]
         return Decision(
-            delta_a, StopReason.RUNNING, desired, predicted, nominal, share=0.0, linearization=lin
+            delta_a, StopReason.RUNNING, desired, predicted, expected.nominal, share=0.0, linearization=lin
         )
 
     def decide(
@@ -156,22 +151,24 @@ class LookAndMoveController:
             EKMError: what the tasks and limits raise.
         """
         hand = self.kinematic.hand
-        _check("a", a, hand.n_a)
+        check_shape("a", a, (hand.n_a,))
+        check_finite("a", a)
         if fingertip_force is not None:
-            _check("fingertip_force", fingertip_force, len(hand.pads))
+            check_shape("fingertip_force", fingertip_force, (len(hand.pads),))
+            check_finite("fingertip_force", fingertip_force)
             least = self.kinematic.options.forces.normal_std
             fingertip_force = fingertip_force.where(fingertip_force.abs() >= least, torch.nan)
             if bool(fingertip_force.isnan().all()):
                 fingertip_force = None
         error = target.error(state)
-        _check("target", error, 6)
+        check_shape("target", error, (6,))
+        check_finite("target", error)
         focused = self.focus.matrix @ error
         try:
             lin = self._linearize(state, a, fingertip_force)
         except GraspError as failure:
             lost = isinstance(failure, NoContactError)
-            status = StopReason.OBJECT_LOST if lost else StopReason.UNSTABLE_GRASP
-            return self._none(status, failure, focused)
+            return self._none(StopReason.OBJECT_LOST if lost else StopReason.UNSTABLE_GRASP, failure, focused)
 
         travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
         desired, share = self.pace.ask(focused, travel)
@@ -181,7 +178,8 @@ class LookAndMoveController:
         )
         try:
             da, predicted, problem, solution = self._solve(lin, seen)
-            phi = self.pace.cut(lin, da, predicted, seen, self._wanted_grip(lin, seen), share)
+            grips = (task.wanted(lin, seen) for task in self.tasks if isinstance(task, GripForceTask))
+            phi = self.pace.cut(lin, da, predicted, seen, next(grips, None), share)
             if phi < 1:
                 desired, share = phi * desired, phi * share
                 seen = dataclasses.replace(seen, desired=desired)
@@ -191,9 +189,7 @@ class LookAndMoveController:
         nominal = lin.manipulation_jacobian @ da
         slack = float(np.abs(solution.slack).max(initial=0.0))
         limited = slack > 0.05 * float(desired.abs().max()) and self._at_limit(a, da, problem)
-        return Decision(
-            da, StopReason.RUNNING, desired, predicted, nominal, share, limited, slack, lin, solution
-        )
+        return Decision(da, StopReason.RUNNING, desired, predicted, nominal, share, limited, slack, lin)
 
     def _none(self, status: StopReason, failure: EKMError, focused: Tensor) -> Decision:
         """No motion, and why."""
@@ -206,12 +202,11 @@ class LookAndMoveController:
     ) -> tuple[Tensor, Tensor, ControlProblem, ControlSolution]:
         """The best increment, what the model predicts of it, and the last program with its solution."""
         enhanced, da = self.enhanced, seen.a.new_zeros(len(seen.a))
-        encoded = None if enhanced is None else enhanced.encode(seen.state)
         linear = enhanced is None or enhanced.affine
         for _ in range(1 if linear else _ITERATIONS):
-            model = LinearizedModel.about(da, lin, enhanced, encoded)
-            problem = self.program(model, seen)
-            solution = problem.solve(self.solver)
+            model = LinearizedModel.about(da, lin, enhanced)
+            problem = build_qp(len(da), [part.rows(model, seen) for part in (*self.tasks, *self.limits)])
+            solution = problem.solve()
             best = torch.as_tensor(solution.u, dtype=da.dtype)
             change = best - da
             done = linear or float(change.abs().max()) <= _TOLERANCE
@@ -220,16 +215,8 @@ class LookAndMoveController:
                 break
         predicted = model.offset + model.jacobian @ da
         if enhanced is not None and not linear:
-            predicted = enhanced.linearize(seen.state, da, lin.manipulation_jacobian, encoded)[0]
+            predicted = enhanced.linearize(seen.state, da, lin.manipulation_jacobian)[0]
         return da, predicted, problem, solution
-
-    def _wanted_grip(self, lin: Linearization, seen: Situation) -> float | None:
-        grips = (task for task in self.tasks if isinstance(task, GripForceTask))
-        return next((task.wanted(lin, seen) for task in grips), None)
-
-    def program(self, model: LinearizedModel, seen: Situation) -> ControlProblem:
-        """The quadratic program of one iteration: the sum of all tasks and limits."""
-        return build_qp(len(seen.a), [part.rows(model, seen) for part in (*self.tasks, *self.limits)])
 
     def _at_limit(self, a: Tensor, da: Tensor, problem: ControlProblem) -> bool:
         """An actuator that may move ends at the end of its range."""
@@ -237,9 +224,3 @@ class LookAndMoveController:
         lower, upper = problem.bounds
         at_end = (after <= hand.actuator_lower + margin) | (after >= hand.actuator_upper - margin)
         return bool((at_end & ((lower != 0) | (upper != 0))).any())
-
-
-def _check(name: str, value: Tensor, size: int) -> None:
-    if tuple(value.shape) != (size,):
-        raise ShapeError(name, f"({size},)", value.shape)
-    check_finite(name, value)

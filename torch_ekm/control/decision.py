@@ -7,7 +7,6 @@ from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..typing import Float, Tensor
-from .qp import ControlSolution
 
 if TYPE_CHECKING:
     from ..model import Linearization
@@ -66,8 +65,6 @@ class Decision:
     """Largest focused error that the step leaves unmet [unit of the focus]."""
     linearization: Linearization | None = None
     """The kinematic model at the state; None where it has none."""
-    solution: ControlSolution | None = None
-    """Of the last quadratic program, with its residuals."""
     message: str = ""
     """Why there is no increment."""
 

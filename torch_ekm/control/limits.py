@@ -112,17 +112,3 @@ class NormalForceLimit:
         low = np.minimum(np.minimum(self.minimum - f_n, self.step), high)
         S = as_array(model.kinematic.normal_force_sensitivity)
         return Inequality(np.concatenate([-S, S]), np.concatenate([-low, high]))
-
-
-@dataclass(frozen=True)
-class FrictionMarginLimit:
-    """``m + (dm/da) u >= minimum`` of each contact, ``m = mu f_n - |f_t|`` as the kinematic model has it."""
-
-    minimum: float = 0.5
-    """[N]"""
-    step: float = 0.7
-    """At most this much of what is missing is asked for in one step [N]: a wrong model may miss a lot."""
-
-    def rows(self, model: LinearizedModel, seen: Situation) -> Inequality:
-        low = (self.minimum - model.kinematic.margins).clamp(max=self.step)
-        return Inequality(-model.kinematic.margin_sensitivity, -low)

@@ -18,6 +18,17 @@ if TYPE_CHECKING:
     from ..model import Linearization
 
 _DEG = math.pi / 180
+# of the trust region
+_AGREE = 1.0  # rho up to which the pace grows
+_DISAGREE = 1.6  # rho from which it shrinks
+_GROW, _SHRINK = 1.2, 0.7
+_RELATIVE = (
+    0.12  # error that is no surprise, as a share of the motion; of a translation the contacts' way counts
+)
+_TRANSLATION_NOISE = 0.3e-3  # [m] standard deviation of a measured motion
+_ROTATION_NOISE = 0.3 * _DEG  # [rad]
+_FORCE_NOISE = 0.5  # [N]
+_USED = 0.7  # a motion below this share of what was allowed says nothing for a larger one
 
 
 @dataclass(frozen=True)
@@ -62,11 +73,6 @@ def contact_travel(twist: Float[Tensor, " 6"], lever: Float[Tensor, "n_c 3"]) ->
     v, w = twist.split(3)
     carried = v + torch.linalg.cross(w.expand_as(lever), lever)
     return float(torch.linalg.vector_norm(carried, dim=-1).max())
-
-
-def contact_lever(lever: Float[Tensor, "n_c 3"]) -> float:
-    """Root mean square distance of the contacts from the object's point [m]."""
-    return float(lever.square().sum(-1).mean().sqrt())
 
 
 @dataclass(frozen=True)
@@ -143,12 +149,12 @@ class StepBound:
 
 @dataclass(frozen=True)
 class TrustRegion:
-    """``p <- grow p`` where ``rho < agree``, ``shrink p`` where ``rho > disagree``, with::
+    """``p <- 1.2 p`` where ``rho < 1``, ``0.7 p`` where ``rho > 1.6``, with::
 
-        rho^2 = mean_i (dx_i - predicted_i)^2 / (noise_i^2 + (relative_i |predicted|)^2)
+        rho^2 = mean_i (dx_i - predicted_i)^2 / (noise_i^2 + (0.12 |predicted|)^2)
 
     over the object's twist in all six directions and the normal forces: 1 is an error that the sensors' noise
-    and ``relative`` of the motion explain.
+    (0.3 mm, 0.3 deg, 0.5 N) and 12 % of the motion explain.
 
     Source: trust regions of nonlinear optimisation, Conn, Gould and Toint, Trust-Region Methods (2000), with
     the measured motion in the place of the cost.
@@ -158,34 +164,11 @@ class TrustRegion:
     """Pace with an object that is new."""
     smallest: float = 0.5
     largest: float = 2.0
-    agree: float = 1.0
-    """rho up to which the pace grows."""
-    disagree: float = 1.6
-    """rho from which it shrinks."""
-    grow: float = 1.2
-    shrink: float = 0.7
-    relative: float = 0.12
-    """Error that is no surprise, as a share of the motion; of a translation the contacts' way counts."""
-    translation_noise: float = 0.3e-3
-    """Standard deviation of a measured motion [m]."""
-    rotation_noise: float = 0.3 * _DEG
-    """[rad]"""
-    force_noise: float = 0.5
-    """[N]"""
-    used: float = 0.7
-    """A motion below this share of what was allowed says nothing for a larger one."""
 
     def __post_init__(self) -> None:
         if not 0 < self.smallest <= self.start <= self.largest:
             valid = f"between smallest and largest, {self.smallest:g} to {self.largest:g}"
             raise ParameterError("start", self.start, valid)
-        if not (0 < self.agree < self.disagree and 0 < self.shrink < 1 <= self.grow):
-            figures = (self.agree, self.disagree, self.shrink, self.grow)
-            valid = "0 < agree < disagree, 0 < shrink < 1 <= grow"
-            raise ParameterError("agree, disagree, shrink, grow", figures, valid)
-        for name in ("relative", "translation_noise", "rotation_noise", "force_noise"):
-            if not getattr(self, name) > 0:
-                raise ParameterError(name, getattr(self, name), "greater than 0")
 
     def disagreement(
         self,
@@ -199,15 +182,15 @@ class TrustRegion:
         Args:
             predicted: twist of the object that the model predicts for what the encoders did [m, rad].
             came: as measured.
-            lever: of the contacts about the object's point [m].
+            lever: of the contacts about the object's point, root mean square [m].
             surprise: normal forces at the contacts, as measured less predicted [N]; None: unknown.
         """
         unit = predicted.new_tensor([lever] * 3 + [1.0] * 3)
         size = torch.linalg.vector_norm(predicted / unit)
-        noise = predicted.new_tensor([self.translation_noise] * 3 + [self.rotation_noise] * 3)
-        terms = (came - predicted).square() / (noise.square() + (self.relative * size * unit).square())
+        noise = predicted.new_tensor([_TRANSLATION_NOISE] * 3 + [_ROTATION_NOISE] * 3)
+        terms = (came - predicted).square() / (noise.square() + (_RELATIVE * size * unit).square())
         if surprise is not None:
-            terms = torch.cat([terms, (surprise / self.force_noise).square()])
+            terms = torch.cat([terms, (surprise / _FORCE_NOISE).square()])
         return float(terms.mean().sqrt())
 
 
@@ -286,11 +269,11 @@ class Pace(nn.Module):
         trust = self.options.trust
         if not self.adapts:
             return
-        if disagreement > trust.disagree:
+        if disagreement > _DISAGREE:
             least = min(self.factor, trust.smallest)
-            self.value.mul_(trust.shrink).clamp_(min=least)
-        elif disagreement < trust.agree and share >= trust.used:
-            self.value.mul_(trust.grow).clamp_(max=trust.largest)
+            self.value.mul_(_SHRINK).clamp_(min=least)
+        elif disagreement < _AGREE and share >= _USED:
+            self.value.mul_(_GROW).clamp_(max=trust.largest)
 
     def restart(self) -> None:
         """Begin again with half the smallest steps: something went wrong, and is near."""

@@ -93,25 +93,19 @@ class ControlProblem:
         """(lower, upper) of u in degrees."""
         return self.qp.lb[: self.n_u], self.qp.ub[: self.n_u]
 
-    def solve(self, solver: str = "piqp") -> ControlSolution:
-        """The best u.
-
-        Args:
-            solver: any solver that qpsolvers finds installed; the open-source "piqp" by default.
+    def solve(self) -> ControlSolution:
+        """The best u, by the open-source solver PIQP.
 
         Raises:
-            ParameterError: the solver is not installed (the message lists those that are).
-            SolverError: the solver did not find a solution.
+            SolverError: the solver did not find a solution, or is not installed.
         """
         qpsolvers, qp, n_u = require("qpsolvers"), self.qp, self.n_u
-        if solver not in qpsolvers.available_solvers:
-            raise ParameterError("solver", solver, f"one of {', '.join(qpsolvers.available_solvers)}")
         try:
-            solution = qpsolvers.solve_problem(qp, solver=solver)
+            solution = qpsolvers.solve_problem(qp, solver="piqp")
         except Exception as error:  # back ends raise types of their own
-            raise SolverError(solver, f"{type(error).__name__}: {error}") from error
+            raise SolverError("piqp", f"{type(error).__name__}: {error}") from error
         if not solution.found or solution.x is None:
-            raise SolverError(solver, "no solution found", "bounds may be far out of scale")
+            raise SolverError("piqp", "no solution found", "bounds may be far out of scale")
         u = np.clip(solution.x[:n_u], *self.bounds)
         slack = np.zeros(0) if qp.A is None else (qp.b - qp.A[:, :n_u] @ u) * DEGREE
         broken = np.zeros(0) if qp.G is None else qp.G[:, :n_u] @ u - qp.h
@@ -119,27 +113,12 @@ class ControlProblem:
         return ControlSolution(u * DEGREE, slack, float(np.max(broken, initial=0.0)), *residuals)
 
 
-@dataclass(frozen=True)
-class RowSum:
-    """``1/2 u^T P u + q.u + rho |E u - d|_1 + rho_t max(0, C u - h)`` and bounds of u, in degrees."""
-
-    P: Array
-    q: Array
-    E: Array
-    d: Array
-    rho: Array
-    C: Array
-    h: Array
-    rho_t: Array
-    lower: Array
-    upper: Array
-
-
-def sum_rows(n_u: int, rows: Iterable[Rows | None]) -> RowSum:
-    """The sum of what tasks and limits ask for; None asks for nothing.
+def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
+    """The program of one step: the sum of what tasks and limits ask for.
 
     Args:
         n_u: number of actuators.
+        rows: of each task and limit; None asks for nothing.
 
     Raises:
         ParameterError: bounds that cross, or a figure that is not finite.
@@ -174,33 +153,17 @@ def sum_rows(n_u: int, rows: Iterable[Rows | None]) -> RowSum:
     for name, value in (("cost", P), ("cost", q), ("equality", E), ("equality", d), ("rows", C), ("rows", h)):
         if not np.isfinite(value).all():
             raise ParameterError(name, "NaN or infinity", "finite")
-    return RowSum(P, q, E, d, rho, C, h, rho_t, lower, upper)
-
-
-def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
-    """The program of one step: the sum of what tasks and limits ask for.
-
-    Args:
-        n_u: number of actuators.
-        rows: of each task and limit; None asks for nothing.
-
-    Raises:
-        ParameterError: bounds that cross, or a figure that is not finite.
-    """
-    qpsolvers, s = require("qpsolvers"), sum_rows(n_u, rows)
-    n_e, n_t = len(s.d), len(s.h)
-    n = n_u + 2 * n_e + n_t
-    P_z = np.zeros((n, n))
-    P_z[:n_u, :n_u] = s.P
-    A = np.hstack([s.E, np.eye(n_e), -np.eye(n_e), np.zeros((n_e, n_t))])
-    G = np.hstack([s.C, np.zeros((n_t, 2 * n_e)), -np.eye(n_t)])
-    qp = qpsolvers.Problem(
-        P_z,
-        np.concatenate([s.q, s.rho, s.rho, s.rho_t]),
-        *((G, s.h) if n_t else (None, None)),
-        *((A, s.d) if n_e else (None, None)),
-        np.concatenate([s.lower, np.zeros(2 * n_e + n_t)]),
-        np.concatenate([s.upper, np.full(2 * n_e + n_t, np.inf)]),
+    n_e, n_t = len(d), len(h)
+    slacks = 2 * n_e + n_t
+    A = np.hstack([E, np.eye(n_e), -np.eye(n_e), np.zeros((n_e, n_t))])
+    G = np.hstack([C, np.zeros((n_t, 2 * n_e)), -np.eye(n_t)])
+    qp = require("qpsolvers").Problem(
+        np.pad(P, (0, slacks)),
+        np.concatenate([q, rho, rho, rho_t]),
+        *((G, h) if n_t else (None, None)),
+        *((A, d) if n_e else (None, None)),
+        np.pad(lower, (0, slacks)),
+        np.pad(upper, (0, slacks), constant_values=np.inf),
     )
     return ControlProblem(qp, n_u)
 

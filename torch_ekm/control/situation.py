@@ -54,11 +54,10 @@ class Situation:
 
 @dataclass(frozen=True)
 class LinearizedModel:
-    """``(f + g)(s, u) ~ offset + jacobian u`` near ``u = action``."""
+    """``(f + g)(s, u) ~ offset + jacobian u`` near one action."""
 
     kinematic: Linearization
     """f alone, with its contacts and forces and how they answer to the actuators."""
-    action: Float[Tensor, " n_a"]
     offset: Float[Tensor, " n_s"]
     jacobian: Float[Tensor, "n_s n_a"]
     """Rows: joints [rad/rad], object point [m/rad], object rotation [rad/rad]."""
@@ -69,15 +68,10 @@ class LinearizedModel:
         action: Float[Tensor, " n_a"],
         kinematic: Linearization,
         enhanced: EnhancedModel | None = None,
-        encoded: Float[Tensor, " d"] | None = None,
     ) -> LinearizedModel:
-        """``(f + g)(a + d) ~ value + J d = (value - J a) + J (a + d)`` about one action a.
-
-        Args:
-            encoded: the state as the learner sees it, if that is known already.
-        """
-        state, J = kinematic.state, kinematic.manipulation_jacobian
+        """``(f + g)(a + d) ~ value + J d = (value - J a) + J (a + d)`` about one action a."""
+        J = kinematic.manipulation_jacobian
         if enhanced is None:
-            return cls(kinematic, action, J.new_zeros(len(J)), J)
-        value, J = enhanced.linearize(state, action, J, encoded)
-        return cls(kinematic, action, value - J @ action, J)
+            return cls(kinematic, J.new_zeros(len(J)), J)
+        value, J = enhanced.linearize(kinematic.state, action, J)
+        return cls(kinematic, value - J @ action, J)

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from .._checks import check_positive
 from .._recorded import Recorded
 from ..exceptions import UnknownNameError
 from ..kinematics.grasp_state import GraspState
@@ -15,37 +14,28 @@ from ..typing import Float, Tensor
 if TYPE_CHECKING:
     from ..model import KinematicModel
 
+_Q_SCALE = 0.3  # [rad]
+_POSITION_SCALE = 0.01  # [m]
+_ROTATION_SCALE = 0.3  # [rad]
+
 
 class GraspEncoding(Recorded):
     """``x_s = [(q_sel - q_ref) / q_scale; (o - o_ref) / o_scale; Log(R R_ref^T) / r_scale]``.
 
-    Scaled so that the workspace of a pinch is of the order of 1 in each input.
+    Scaled by 0.3 rad, 0.01 m and 0.3 rad, so that the workspace of a pinch is of the order of 1 in each
+    input.
 
     Args:
         reference: the state at the origin of the coordinates (e.g. the first grasp).
         joints: indices of the joints to use (those of the grasping fingers); none if empty.
-        q_scale: [rad].
-        position_scale: [m].
-        rotation_scale: [rad].
     """
 
-    def __init__(
-        self,
-        reference: GraspState,
-        joints: list[int],
-        *,
-        q_scale: float = 0.3,
-        position_scale: float = 0.01,
-        rotation_scale: float = 0.3,
-    ) -> None:
+    def __init__(self, reference: GraspState, joints: list[int]) -> None:
         n_q = reference.q.shape[-1]
         for joint in joints:
             if not 0 <= joint < n_q:
                 raise UnknownNameError("joint index", str(joint), [f"0..{n_q - 1}"])
         self.reference, self.joints = reference, joints
-        self.q_scale = check_positive("q_scale", q_scale)
-        self.position_scale = check_positive("position_scale", position_scale)
-        self.rotation_scale = check_positive("rotation_scale", rotation_scale)
 
     @classmethod
     def of(cls, model: KinematicModel, state: GraspState) -> GraspEncoding:
@@ -70,4 +60,4 @@ class GraspEncoding(Recorded):
         n_q = state.q.shape[-1]
         dq = x[..., self.joints] - self.reference.q[..., self.joints]
         do, dphi = x[..., n_q : n_q + 3], x[..., n_q + 3 :]
-        return torch.cat([dq / self.q_scale, do / self.position_scale, dphi / self.rotation_scale], dim=-1)
+        return torch.cat([dq / _Q_SCALE, do / _POSITION_SCALE, dphi / _ROTATION_SCALE], dim=-1)

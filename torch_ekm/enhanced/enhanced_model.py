@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import nn
 
-from .._checks import check_finite
+from .._checks import check_finite, check_shape
 from .._recorded import Recorded, check_state, describe
-from ..exceptions import ParameterError, ShapeError
+from ..exceptions import ParameterError
 from ..kinematics import GraspState
 from ..residual.base import ResidualLearner, UpdateReport
 from ..residual.kernels.action_linear import ActionLinearKernel
 from ..typing import Float, Tensor
 from .encoding import GraspEncoding
 from .grasp_learner import grasp_learner
-from .model_jacobian import checked_jacobian, differentiated, finite_differences
+from .model_jacobian import differentiated, finite_differences
 
 if TYPE_CHECKING:
     from ..model import KinematicModel
@@ -167,10 +167,7 @@ class EnhancedModel(Recorded, nn.Module):
                 "increment", type(increment).__name__, "a tensor: torch.as_tensor(increment)"
             )
         predicted = self.nominal(state, action) if nominal is None else nominal
-        if increment.shape != predicted.shape:
-            raise ShapeError(
-                "increment", f"{tuple(predicted.shape)}, that of the prediction", increment.shape
-            )
+        check_shape("increment", increment, predicted.shape, "as the prediction has")
         if self.learner.on_invalid == "raise":  # else the learner leaves such a sample out, and counts it
             for name, value in (
                 ("action", action), ("increment", increment), ("f(state, action)", predicted)
@@ -184,24 +181,21 @@ class EnhancedModel(Recorded, nn.Module):
         state: Any,
         action: Float[Tensor, "*batch n_a"],
         nominal_jacobian: Float[Tensor, "*batch n_s n_a"] | None = None,
-        encoded: Float[Tensor, "*batch d"] | None = None,
     ) -> tuple[Float[Tensor, "*batch n_s"], Float[Tensor, "*batch n_s n_a"]]:
         """``(f + g, d(f + g)/d da)`` at a state and action, or at each of a batch.
 
         Args:
             nominal_jacobian: J_m if it is known already (then ``f = J_m da``).
-            encoded: ``encode(state)`` if it is known already.
 
         Raises:
             NoDerivativeError: f carries no derivative (numpy, ``no_grad``, a detached output).
             ShapeError: ``jacobian`` gave another shape.
         """
         nominal, J = self._nominal_with_jacobian(state, action, nominal_jacobian)
-        seen = self.encode(state) if encoded is None else encoded
-        mean, dmean = self.learner.linearize(torch.cat([seen, self.action_scale * action], dim=-1))
-        n_a = action.shape[-1]
+        mean, dmean = self.learner.linearize(self.features(state, action))
         value = nominal + self._scatter(mean / self.output_scale, nominal)
-        slope = (dmean[..., -n_a:] * self.action_scale / self.output_scale.reshape(-1, 1)).to(J.dtype)
+        dmean = dmean[..., -action.shape[-1] :]
+        slope = (dmean * self.action_scale / self.output_scale.reshape(-1, 1)).to(J.dtype)
         if self.outputs is None:
             return value, J + slope
         jacobian = J.clone()
@@ -220,7 +214,9 @@ class EnhancedModel(Recorded, nn.Module):
         nominal = self.nominal(state, action)
         if self.jacobian == "finite-difference":
             return nominal, finite_differences(self.nominal, state, action)
-        return nominal, checked_jacobian(self.jacobian(state, action), nominal, action)
+        J = torch.as_tensor(self.jacobian(state, action)).to(action)
+        check_shape("jacobian", J, (*nominal.shape, action.shape[-1]))
+        return nominal, J
 
     def correction(
         self, state: Any, action: Float[Tensor, "*batch n_a"], n_s: int

@@ -1,4 +1,4 @@
-"""How a user's model changes with the action: differentiated, by finite differences, or as it says."""
+"""How a user's model changes with the action: differentiated, or by finite differences."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from ..exceptions import NoDerivativeError, ShapeError
+from ..exceptions import NoDerivativeError
 from ..typing import Float, Tensor
 
 Model = Callable[[Any, Tensor], Tensor]
@@ -58,18 +58,3 @@ def finite_differences(
         width = (up[..., j] - down[..., j]).unsqueeze(-1)  # as rounded
         columns.append((f(state, up) - f(state, down)) / width)
     return torch.stack(columns, dim=-1)
-
-
-def checked_jacobian(
-    J: Any, value: Float[Tensor, "*batch n_s"], action: Float[Tensor, "*batch n_a"]
-) -> Float[Tensor, "*batch n_s n_a"]:
-    """What a model says of itself, as a tensor.
-
-    Raises:
-        ShapeError: it has another shape.
-    """
-    J = torch.as_tensor(J).to(action)
-    expected = (*value.shape, action.shape[-1])
-    if J.shape != expected:
-        raise ShapeError("jacobian", str(tuple(expected)), J.shape)
-    return J

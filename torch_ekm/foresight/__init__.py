@@ -5,14 +5,13 @@ from __future__ import annotations
 from .blind_pose import BlindPose
 from .friction_share import friction_share
 from .model_hand import ModelHand
-from .pose_filter import BlindOptions, PoseFilter
+from .pose_filter import PoseFilter
 from .prediction import Prediction
 from .reach import BeyondReach, Reach, ReachEnd, reachable
 from .rollout import Rollout
 
 __all__ = [
     "BeyondReach",
-    "BlindOptions",
     "BlindPose",
     "ModelHand",
     "PoseFilter",

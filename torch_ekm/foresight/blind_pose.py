@@ -13,7 +13,7 @@ from ..exceptions import ParameterError
 from ..model import KinematicModel
 from ..plant import Observation, Plant, PlantStatus, PlantWrapper
 from ..typing import Float, Tensor
-from .pose_filter import BlindOptions, PoseFilter
+from .pose_filter import PoseFilter
 
 
 class BlindPose(PlantWrapper):
@@ -37,7 +37,6 @@ class BlindPose(PlantWrapper):
             first one.
         touch: False leaves the pose to the prediction alone (the test that the paper leaves for the future,
             section VI).
-        options: standard deviations.
 
     Raises:
         ParameterError: ``axis`` has no direction, or ``look_again`` is not positive.
@@ -52,14 +51,13 @@ class BlindPose(PlantWrapper):
         look_again: float = math.inf,
         switch_off: Callable[[Observation], bool] | None = None,
         touch: bool = True,
-        options: BlindOptions | None = None,
     ) -> None:
         if not float(torch.linalg.vector_norm(axis)) > 1e-9:
             raise ParameterError("axis", axis.tolist(), "a vector of non-zero length")
         if not look_again > 0:
             raise ParameterError("look_again", look_again, "greater than 0 [rad]; infinite: never")
         super().__init__(plant)
-        self.filter = PoseFilter(model, options, touch=touch)
+        self.filter = PoseFilter(model, touch=touch)
         self.axis = axis / torch.linalg.vector_norm(axis)
         self.look_again = look_again
         self._switch_off = switch_off
@@ -93,7 +91,7 @@ class BlindPose(PlantWrapper):
             if self.dark:
                 self.filter.start(seen.state, seen.fingertip_force, _covariance(seen))
             return seen
-        self.filter.feel(seen.q, seen.fingertip_force)
+        self.filter.measure(seen.q, seen.fingertip_force)
         looked = self.axis_std > self.look_again and seen.status is PlantStatus.HELD
         if looked:
             self.looks += 1

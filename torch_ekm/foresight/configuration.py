@@ -21,10 +21,15 @@ from ..typing import Float, Tensor
 if TYPE_CHECKING:
     from ..model import KinematicModel, Linearization
 
-_FORCES = (
-    "mu", "lam", "force", "spin_moment", "normal", "residual", "stop_torque", "margin", "relative_margin",
-    "violation",
-)  # fmt: skip
+#: What varies over a batch, with the number of its dimensions for one grasp.
+_TAILS: dict[str, dict[str, int]] = {
+    "state": {"q": 1, "position": 1, "rotation": 2},
+    "contacts": VARYING,
+    "forces": {
+        "mu": 1, "lam": 1, "force": 2, "spin_moment": 1, "normal": 1, "residual": 1, "stop_torque": 1,
+        "margin": 1, "relative_margin": 1, "violation": 0,
+    },
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -42,36 +47,29 @@ class Configuration:
 
     def expand(self, *batch: int) -> Configuration:
         """The same for each of a batch; contacts and forces may lack it."""
-        return self._each(lambda x, tail: x.expand((*batch, *x.shape[x.dim() - tail :])))
+        return _combined([self], lambda x, tail: x[0].expand((*batch, *x[0].shape[x[0].dim() - tail :])))
 
     def select(self, k: int) -> Configuration:
         """Number k of the last batch dimension."""
-        return self._each(lambda x, tail: x.select(x.dim() - tail - 1, k))
-
-    def _each(self, change: Callable[[Tensor, int], Tensor]) -> Configuration:
-        s = self.state
-        state = GraspState(change(s.q, 1), change(s.position, 1), change(s.rotation, 2))
-        contacts = self.contacts.replace(
-            **{name: change(getattr(self.contacts, name), tail) for name, tail in VARYING.items()}
-        )
-        tail = {"force": 2, "violation": 0}
-        parts = {name: change(getattr(self.forces, name), tail.get(name, 1)) for name in _FORCES}
-        return Configuration(state, contacts, _with(self.forces, state.q.shape[:-1], parts))
+        return _combined([self], lambda x, tail: x[0].select(-tail - 1, k))
 
 
 def stack(parts: Sequence[Configuration]) -> Configuration:
     """Configurations of one batch one after the other: ``(*batch, len(parts), ...)``."""
-    first = parts[0]
-    batch = first.state.q.dim() - 1
+    return _combined(parts, lambda x, tail: torch.stack(x, dim=-tail - 1))
 
-    def join(pick) -> Tensor:
-        return torch.stack([pick(part) for part in parts], dim=batch)
 
-    state = GraspState(*(join(lambda z, n=n: getattr(z.state, n)) for n in ("q", "position", "rotation")))
-    varying = {n: join(lambda z, n=n: getattr(z.contacts, n)) for n in VARYING}
-    forces = {n: join(lambda z, n=n: getattr(z.forces, n)) for n in _FORCES}
+def _combined(
+    parts: Sequence[Configuration], combine: Callable[[list[Tensor], int], Tensor]
+) -> Configuration:
+    """``combine`` of all that varies over a batch."""
+    pose, contacts, forces = (
+        {name: combine([getattr(getattr(z, group), name) for z in parts], n) for name, n in tails.items()}
+        for group, tails in _TAILS.items()
+    )
+    state, first = GraspState(**pose), parts[0]
     return Configuration(
-        state, first.contacts.replace(**varying), _with(first.forces, state.q.shape[:-1], forces)
+        state, first.contacts.replace(**contacts), _with(first.forces, state.q.shape[:-1], forces)
     )
 
 
@@ -95,7 +93,7 @@ def change(
     rates: Linearization,
     kin: ContactKinematics,
     action: Float[Tensor, "*batch n_a"],
-    correction: Float[Tensor, "*batch n_s"] | None = None,
+    correction: Float[Tensor, "*batch n_s"],
 ) -> Change:
     """``dz = (dz/da) da``, contacts rolling along.
 
@@ -115,9 +113,7 @@ def change(
         action: da [rad].
         correction: g(s, da).
     """
-    ds = rates.step(action)
-    if correction is not None:
-        ds = ds + correction
+    ds = rates.step(action) + correction
     dq, do, w_o = ds.split([ds.shape[-1] - 6, 3, 3], dim=-1)
     dq = dq[..., None, :, None]
     v_f, w_f = (kin.point_jacobian @ dq)[..., 0], (kin.spin_jacobian @ dq)[..., 0]
@@ -138,25 +134,14 @@ def change(
     return Change(ds, 0.5 * (v_f + v_o) + run[..., 0], turns[0], turns[1], force, spin, lam)
 
 
-def held_force(
-    contacts: ContactSet, normal: Float[Tensor, "*batch n_c 3"], force: Float[Tensor, "*batch n_c 3"]
-) -> Float[Tensor, "*batch n_c 3"]:
-    """``f_n >= 0, |f_t| <= mu_s f_n``: what is left of a force when the contact has slid or opened [N].
-
-    Args:
-        normal: outward normals of the object.
-    """
-    n_in = -normal
-    f_n = (force * n_in).sum(-1, keepdim=True).clamp_min(0.0)
-    f_t = force - (force * n_in).sum(-1, keepdim=True) * n_in
-    size = torch.linalg.vector_norm(f_t, dim=-1, keepdim=True)
-    share = (contacts.friction[:, None] * f_n / size.clamp_min(1e-9)).clamp(max=1.0)
-    return f_n * n_in + share * f_t
-
-
 def settled(z: Configuration) -> Configuration:
-    """The configuration with the forces that its contacts hold."""
-    force = held_force(z.contacts, z.contacts.normal, z.forces.force)
+    """``f_n >= 0, |f_t| <= mu_s f_n``: with what is left of forces when contacts have slid or opened [N]."""
+    n_in = -z.contacts.normal
+    pressing = (z.forces.force * n_in).sum(-1, keepdim=True)
+    f_n, f_t = pressing.clamp_min(0.0), z.forces.force - pressing * n_in
+    size = torch.linalg.vector_norm(f_t, dim=-1, keepdim=True)
+    share = (z.contacts.friction[:, None] * f_n / size.clamp_min(1e-9)).clamp(max=1.0)
+    force = f_n * n_in + share * f_t
     normal, margin, _ = friction_use(z.contacts, force, z.forces.spin_moment, z.contacts.normal)
     forces = dataclasses.replace(z.forces, force=force, normal=normal, margin=margin)
     return dataclasses.replace(z, forces=forces)

@@ -13,7 +13,7 @@ from ..model import KinematicModel, Linearization
 from ..model.force_balance import STOP_TOLERANCE
 from ..plant import Observation, PlantStatus
 from ..typing import Float, Tensor
-from .pose_filter import BlindOptions, PoseFilter
+from .pose_filter import PoseFilter
 
 _STEP = 0.1  # [rad] largest motion of an actuator between two linearizations
 
@@ -24,12 +24,11 @@ class ModelHand:
 
     The motion is that of a :class:`PoseFilter`. A joint that would pass its stop is brought to it, and is
     locked while it pushes against it. Forces change as the model says, and balance the object and the joints
-    after each motion; fingertips report the normal ones. Encoders go where they are told.
+    after each motion; fingertips report the normal ones. Encoders go where they are commanded to.
 
     Args:
         model: predicts the motions.
         state, a, fingertip_force: where it begins, as measured [rad, m, N].
-        options: of the filter.
     """
 
     failure: str
@@ -43,12 +42,10 @@ class ModelHand:
         state: GraspState,
         a: Float[Tensor, " n_a"],
         fingertip_force: Float[Tensor, " n_pads"] | None = None,
-        options: BlindOptions | None = None,
     ) -> None:
-        self.filter = PoseFilter(model, options)
-        self.hand = self.filter.kinematic.hand
+        self.filter = PoseFilter(model)
+        self.hand = hand = self.filter.kinematic.hand
         self._start = state, a, fingertip_force
-        hand = self.hand
         limits = hand.joint_lower, hand.joint_upper, hand.actuator_lower, hand.actuator_upper
         self._q_min, self._q_max, self._a_min, self._a_max = (torch.from_numpy(x).to(a) for x in limits)
         self.reset(0)
@@ -84,8 +81,7 @@ class ModelHand:
     def at_stops(self, push: float = 0.0) -> list[str]:
         """Joints of the fingers that touch, at a stop that bears more than ``push`` [N m]."""
         lin = self.linearization
-        q, near = self.filter.state.q, STOP_TOLERANCE
-        touching = (self._q_max > self._q_min) & ((q <= self._q_min + near) | (q >= self._q_max - near))
+        touching = (self._q_max > self._q_min) & ~self._inside(self.filter.state.q)
         if lin is not None:
             kinematics = self.filter.kinematic.kinematics
             links = [self.filter.kinematic.link_names.index(link) for link in lin.contacts.link]
@@ -108,12 +104,14 @@ class ModelHand:
             f.move(w, lin=lin)
             f.close_gaps()
             beyond = self._beyond()
-            again = {j for j in beyond if not self._inside(before[0].q, j)} - locked
+            inside = self._inside(before[0].q)
+            again = {j for j in beyond if not inside[j]} - locked
             if not again:
                 break
             locked |= again
+            names = [self.hand.joint_names[j] for j in sorted(locked)]
             try:
-                lin = self._linearize(lin, sorted(locked))
+                lin = f.kinematic.linearize(lin.state, lin.contacts, forces=lin.forces, locked=names)
             except GraspError as error:
                 self.failure = str(error)
                 return
@@ -131,24 +129,17 @@ class ModelHand:
         out = (self._q_max > self._q_min) & ((q < self._q_min) | (q > self._q_max))
         return torch.nonzero(out).flatten().tolist()
 
-    def _inside(self, q: Tensor, joint: int) -> bool:
-        near = STOP_TOLERANCE
-        return bool(self._q_min[joint] + near < q[joint] < self._q_max[joint] - near)
-
-    def _linearize(self, lin: Linearization, locked: list[int]) -> Linearization:
-        """``lin`` with more joints held."""
-        names = [self.hand.joint_names[j] for j in locked]
-        return self.filter.kinematic.linearize(lin.state, lin.contacts, forces=lin.forces, locked=names)
+    def _inside(self, q: Tensor) -> Tensor:
+        """Joints that stand at no stop."""
+        return (self._q_min + STOP_TOLERANCE < q) & (q < self._q_max - STOP_TOLERANCE)
 
     def _balance(self, known: dict) -> None:
         """The model at the present state, with forces that balance it."""
-        model = self.filter.kinematic
         try:
-            lin = model.linearize(self.filter.state, **known)
+            self.linearization = lin = self.filter.kinematic.linearize(self.filter.state, **known)
         except GraspError as error:
             self.linearization, self.failure = None, str(error)
             return
-        self.linearization = lin
         if not lin.forces.solved:
             self.failure = str(lin.doubts[0])
             return

@@ -6,7 +6,6 @@ import contextlib
 import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -16,13 +15,25 @@ from ..contact.contact_set import CHARACTERISTIC_LENGTH
 from ..contact.detector import ContactDetector
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
-from ..exceptions import GraspError, NoContactError, ParameterError
+from ..exceptions import GraspError, NoContactError
 from ..kinematics import GraspState
 from ..model import KinematicModel, Linearization
 from ..typing import Float, Tensor
 
 _DEG = math.pi / 180
 _ITERATIONS = 3  # of an update: gaps are not linear in the state
+# standard deviations
+_JOINT = 0.3 * _DEG  # [rad] of a measured joint angle
+_POSITION = 0.2e-3  # [m] of the object's point as the camera sees it, where the plant states no covariance
+_ROTATION = 0.15 * _DEG  # [rad] of its orientation, likewise
+_GAP = 0.05e-3  # [m] of the gap of a pad that measures a force
+# of a joint's predicted motion, as a share of the largest of an actuator: a kinematic model with tendons of
+# another radius predicts joints badly
+_JOINT_DRIFT = 0.5
+_POSE_DRIFT = 0.02  # of the object's predicted motion, as a share of it, on top of what the learner states
+_MODEL_DRIFT = 0.3  # the same of a kinematic model alone, which states nothing
+_SLIP = 0.05  # of the slide of a contact, as a share of its way
+_LEAST_FORCE = 0.3  # [N] a pad that measures less touches nothing, or is dead
 
 
 class Measurement(NamedTuple):
@@ -35,56 +46,22 @@ class Measurement(NamedTuple):
     """Covariance."""
 
 
-@dataclass(frozen=True)
-class BlindOptions:
-    """Standard deviations of what a :class:`PoseFilter` is told and predicts.
-
-    Raises:
-        ParameterError: one is not positive.
-    """
-
-    joint: float = 0.3 * _DEG
-    """Of a measured joint angle [rad]."""
-    position: float = 0.2e-3
-    """Of the object's point as the camera sees it, where the plant states no covariance [m]."""
-    rotation: float = 0.15 * _DEG
-    """Of its orientation, likewise [rad]."""
-    gap: float = 0.05e-3
-    """Of the gap of a pad that feels a force [m]."""
-    joint_drift: float = 0.5
-    """Of a joint's predicted motion, as a share of the largest motion of an actuator: a kinematic model with
-    tendons of another radius predicts joints badly."""
-    pose_drift: float = 0.02
-    """Of the object's predicted motion, as a share of it, on top of what the learner states."""
-    model_drift: float = 0.3
-    """The same of a kinematic model alone, which states nothing."""
-    slip: float = 0.05
-    """Of the slide of a contact, as a share of its way."""
-    least_force: float = 0.3
-    """A pad that feels less touches nothing, or is dead [N]."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (math.isfinite(value) and value > 0):
-                raise ParameterError(name, value, "finite and greater than 0")
-
-
 class PoseFilter:
     """Extended Kalman filter of ``s = (q, o, R)`` with the covariance P of its error ``[dq; do; dphi]``::
 
         motion    s <- s (+) ds,  P <- P + Q         ds = (f + g)(s, w),  w what the encoders did
-        rolling   A ds = 0 +- slip |way|             at the middle of the motion; conditions ds and Q
-        joints    q_measured = q +- joint
-        touch     gap_i(s) = 0 +- gap                pads i that feel a force
+        rolling   A ds = 0 +- 5 % of the way         at the middle of the motion; conditions ds and Q
+        joints    q_measured = q +- 0.3 deg
+        touch     gap_i(s) = 0 +- 0.05 mm            pads i that measure a force
         camera    (o, R) as seen                     when it is asked
 
-    Q is diagonal: ``joint_drift``, ``pose_drift``, and the variance that the learner states. Contacts that
-    roll tie the object's motion to that of the fingers, so measured joints and closed gaps correct the pose,
-    too. The update is iterated, since gaps are not linear (Bell and Cathey, IEEE TAC 38(2), 1993).
+    Q is diagonal: of joints 50 % of the largest motion of an actuator, of the pose 2 % of its motion (30 %
+    where nothing is learned), and the variance that the learner states. Contacts that roll tie the object's
+    motion to that of the fingers, so measured joints and closed gaps correct the pose, too. The update is
+    iterated, since gaps are not linear (Bell and Cathey, IEEE TAC 38(2), 1993).
 
     Args:
         model: predicts the motions; of an enhanced model the learner tells how unsure it is.
-        options: standard deviations.
         touch: False leaves the pose to the prediction alone, without rolling and gaps.
     """
 
@@ -96,12 +73,11 @@ class PoseFilter:
     def __init__(
         self,
         model: KinematicModel | EnhancedModel,
-        options: BlindOptions | None = None,
         *,
         touch: bool = True,
     ) -> None:
         self.kinematic, self.enhanced = kinematic_and_enhanced(model)
-        self.options, self.touch = BlindOptions() if options is None else options, touch
+        self.touch = touch
         self._detector = copy.copy(self.kinematic.detector)
         if isinstance(self._detector, ContactDetector):  # a pad that presses touches, however far off
             self._detector.margin = math.inf
@@ -123,11 +99,11 @@ class PoseFilter:
         Args:
             seen: joints and pose as measured.
             fingertip_force: normal force of each pad [N]; None: the pads near the object touch it.
-            pose_covariance: of the pose's error twist [m, rad]; None or NaN: that of the options.
+            pose_covariance: of the pose's error twist [m, rad]; None or NaN: 0.2 mm and 0.15 deg.
         """
         n_q = seen.q.shape[-1]
         P = seen.q.new_zeros(n_q + 6, n_q + 6)
-        P[:n_q, :n_q] = self.options.joint**2 * torch.eye(n_q, dtype=P.dtype)
+        P[:n_q, :n_q] = _JOINT**2 * torch.eye(n_q, dtype=P.dtype)
         P[n_q:, n_q:] = self._seen_covariance(pose_covariance, P)
         self.state, self.covariance, self._last = seen, self._permitted(P), None
         self._update(None, fingertip_force)
@@ -148,12 +124,13 @@ class PoseFilter:
         """
         held = None if lin is None else lin.held_joints
         lin = self._linearize(moved, fingertip_force) if lin is None else lin
-        ds = torch.zeros_like(self.covariance[0])
+        ds = unsure = torch.zeros_like(self.covariance[0])
         if lin is not None:
             ds = lin.step(moved)
             if self.enhanced is not None:
-                ds = self.enhanced.linearize(self.state, moved, lin.manipulation_jacobian)[0]
-        Q = self._motion_covariance(moved, ds if lin is not None else None)
+                g, unsure = self.enhanced.correction(self.state, moved, len(ds))
+                ds = ds + g
+        Q = self._motion_covariance(moved, None if lin is None else ds, unsure)
         if held is not None:
             moves = torch.cat([~held, held.new_ones(6)]).to(Q)
             Q = Q * moves * moves[:, None]
@@ -163,21 +140,21 @@ class PoseFilter:
             kin = self.kinematic.contact_kinematics(middle, contacts)
             A, v, w = constraint_matrix(kin), *ds[-6:].split(3)
             way = torch.linalg.vector_norm(v + torch.linalg.cross(w.expand_as(kin.lever), kin.lever), dim=-1)
-            slide = (self.options.slip * way + 1e-5)[[row // 6 for row in kin.rows]]
+            slide = (_SLIP * way + 1e-5)[[row // 6 for row in kin.rows]]
             gain = torch.linalg.solve(A @ Q @ A.mT + torch.diag(slide.square()), A @ Q).mT
             ds, Q = ds - gain @ (A @ ds), Q - gain @ A @ Q
         self.state = self.state.plus(ds)
         self.covariance = self.covariance + 0.5 * (Q + Q.mT)
 
-    def feel(self, q: Float[Tensor, " n_q"], fingertip_force: Float[Tensor, " n_pads"] | None = None) -> None:
+    def measure(self, q: Float[Tensor, " n_q"], fingertip_force: Float[Tensor, " n_pads"] | None) -> None:
         """What measured joints [rad] and fingertips [N] say at rest."""
         joints = torch.eye(len(q), len(self.covariance), dtype=q.dtype)
-        variance = self.options.joint**2 * torch.eye(len(q), dtype=q.dtype)
+        variance = _JOINT**2 * torch.eye(len(q), dtype=q.dtype)
         self._update(Measurement(joints, lambda at: q - at.q, variance), fingertip_force)
 
-    def close_gaps(self, fingertip_force: Float[Tensor, " n_pads"] | None = None) -> None:
-        """Close the gaps of pads that press."""
-        self._update(None, fingertip_force)
+    def close_gaps(self) -> None:
+        """Close the gaps of the pads that are next to the object."""
+        self._update(None, None)
 
     def hold(self, joints: Sequence[int], q: Float[Tensor, " n_joints"]) -> None:
         """Some joints stand at known angles [rad], such as stops."""
@@ -192,10 +169,9 @@ class PoseFilter:
         self._update(Measurement(pose, lambda at: seen.minus(at)[-6:], variance), None, gaps=False)
 
     def _seen_covariance(self, stated: Tensor | None, like: Tensor) -> Tensor:
-        o = self.options
         if stated is not None and bool(torch.isfinite(stated).all()):
             return stated.to(like)
-        return torch.diag(like.new_tensor([o.position] * 3 + [o.rotation] * 3).square())
+        return torch.diag(like.new_tensor([_POSITION] * 3 + [_ROTATION] * 3).square())
 
     def _linearize(self, moved: Tensor, fingertip_force: Tensor | None) -> Linearization | None:
         """The model at the state, with forces carried along from motion to motion; None: it refuses."""
@@ -211,23 +187,16 @@ class PoseFilter:
         self._last = (lin, moved) if lin.forces.solved else None
         return lin
 
-    def _motion_covariance(self, moved: Tensor, ds: Tensor | None) -> Tensor:
-        """Q before the contacts have their say."""
-        o, n_q = self.options, self.state.q.shape[-1]
-        largest = moved.abs().max()
+    def _motion_covariance(self, moved: Tensor, ds: Tensor | None, unsure: Tensor) -> Tensor:
+        """Q before the contacts have their say; ``unsure`` is the learner's variance."""
+        n_q, largest = self.state.q.shape[-1], moved.abs().max()
         unit = moved.new_tensor([CHARACTERISTIC_LENGTH] * 3 + [1.0] * 3)
         share, size = 1.0, largest
         if ds is not None:
-            share = o.model_drift if self.enhanced is None else o.pose_drift
+            share = _MODEL_DRIFT if self.enhanced is None else _POSE_DRIFT
             size = torch.linalg.vector_norm(ds[n_q:] / unit)
-        std = torch.cat([o.joint_drift * largest.expand(n_q), share * size * unit])
-        variance = std.square() + 1e-14
-        if self.enhanced is not None and ds is not None:
-            outputs = self.enhanced.outputs
-            rows = list(range(len(ds))) if outputs is None else outputs
-            stated = self.enhanced.learner.predict(self.enhanced.features(self.state, moved)).stddev
-            variance[rows] += (stated / self.enhanced.output_scale).square().to(variance)
-        return self._permitted(torch.diag(variance))
+        std = torch.cat([_JOINT_DRIFT * largest.expand(n_q), share * size * unit])
+        return self._permitted(torch.diag(std.square() + 1e-14 + unsure))
 
     def _permitted(self, covariance: Tensor) -> Tensor:
         """Conditioned on couplings, joints that do not move, and the plane of a planar hand:
@@ -248,10 +217,10 @@ class PoseFilter:
             pressing = contacts.gap <= self.kinematic.options.contact_margin
         else:
             pads = self.kinematic.hand.pad_indices(contacts.finger)
-            pressing = fingertip_force[pads] >= self.options.least_force
+            pressing = fingertip_force[pads] >= _LEAST_FORCE
         rows = torch.nonzero(pressing).flatten().tolist()
         if not rows:
-            raise NoContactError("no pad feels a force")
+            raise NoContactError("no pad measures a force")
         return contacts.select(rows)
 
     def _update(
@@ -271,7 +240,7 @@ class PoseFilter:
                     kin = self.kinematic.contact_kinematics(at, contacts)
                     closing = constraint_matrix(kin)[kin.normal_rows]  # gap(s + ds) = gap - closing ds
                     H, miss = torch.cat([H, closing]), torch.cat([miss, contacts.gap])
-                    gap = P.new_full((len(closing),), self.options.gap).square()
+                    gap = P.new_full((len(closing),), _GAP).square()
                     noise = torch.block_diag(noise, torch.diag(gap))
             gain = torch.linalg.solve(H @ P @ H.mT + noise, H @ P).mT
             ds = gain @ (miss + H @ ds)

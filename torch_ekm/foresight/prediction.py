@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-import torch
-
-from ..exceptions import NoContactError
 from ..kinematics.grasp_state import GraspState
 from ..typing import Float, Tensor
 from .configuration import Configuration
 
 if TYPE_CHECKING:
     from ..contact.contact_set import ContactSet
-    from ..model import KinematicModel, Linearization
+    from ..model import Linearization
     from ..model.grasp_forces import GraspForces
 
 SLIP = 1e-3
@@ -26,14 +22,13 @@ SLIP = 1e-3
 class Prediction:
     """``z_0, z_1 .. z_K``: the grasp before and after each of K motions, hand frame."""
 
-    model: KinematicModel = field(repr=False)
     actions: Float[Tensor, "*batch K n_a"]
     """Increments of the encoders [rad]."""
     linearization: Linearization = field(repr=False)
     """Of f at all ``K + 1`` configurations, ``(*batch, K + 1, ...)``."""
-    motion_variance: Float[Tensor, "*batch nodes n_s"]
-    """``Var[g]`` of the motion that ends here [rad^2, m^2, rad^2]: what the learner does not know; 0 at the
-    start, and throughout without a learner."""
+    variance: Float[Tensor, "*batch nodes n_s"]
+    """``(sum_k sd_k)^2`` of the state [rad^2, m^2, rad^2], ``sd_k^2 = Var[g]`` of motion k: g is wrong alike
+    in motions that follow each other, and their deviations add up. 0 without a learner."""
 
     @property
     def states(self) -> GraspState:
@@ -51,11 +46,6 @@ class Prediction:
         return self.linearization.forces
 
     @property
-    def force(self) -> Float[Tensor, "*batch nodes n_c 3"]:
-        """f_i of finger on object, hand axes [N]."""
-        return self.forces.force
-
-    @property
     def normal_force(self) -> Float[Tensor, "*batch nodes n_c"]:
         """f_n [N]; below 0 the contact would have to pull."""
         return self.forces.normal
@@ -71,27 +61,14 @@ class Prediction:
         return self.linearization.stability
 
     @property
-    def variance(self) -> Float[Tensor, "*batch nodes n_s"]:
-        """``(sum_k sd_k)^2`` of the state [rad^2, m^2, rad^2], sd_k of motion k: g is wrong alike in
-        motions that follow each other, and their deviations add up."""
-        return self.motion_variance.sqrt().cumsum(-2).square()
-
-    @property
-    def slip_step(self) -> Float[Tensor, "*batch"]:
-        """Index of the first configuration with a margin below 0; -1: none."""
-        slips = (self.margin.detach() < -SLIP).any(-1)
-        return torch.where(slips.any(-1), slips.to(torch.int64).argmax(-1), -1)
-
-    @property
     def first_slip(self) -> int | None:
-        """The earliest :attr:`slip_step` of all sequences; None: no contact slips."""
-        steps = self.slip_step
-        steps = steps[steps >= 0]
-        return int(steps.min()) if steps.numel() else None
+        """Index of the first configuration, of all sequences, with a margin below 0; None: nothing slips."""
+        slips = (self.margin < -SLIP).any(-1).nonzero()[:, -1]
+        return int(slips.min()) if len(slips) else None
 
     def at(self, k: int) -> Configuration:
         """State, contacts and forces after k motions; -1: after the last."""
-        return Configuration.of(self.linearization).select(-1 if k < 0 else k)
+        return Configuration.of(self.linearization).select(k)
 
     @property
     def end(self) -> GraspState:
@@ -103,22 +80,3 @@ class Prediction:
         s = self.states
         start = GraspState(s.q[..., :1, :], s.position[..., :1, :], s.rotation[..., :1, :, :])
         return s.minus(start)[..., -6:] @ matrix.mT
-
-    @torch.no_grad()
-    def gap(self) -> Float[Tensor, "*batch n_c"]:
-        """Distance of each rolled contact point at the end from where the detector finds it [m].
-
-        NaN: the detector finds no contact of that pad.
-        """
-        z = self.at(-1)
-        found = torch.full_like(z.contacts.point, torch.nan)
-        for index in itertools.product(*map(range, z.state.q.shape[:-1])):
-            state = GraspState(z.state.q[index], z.state.position[index], z.state.rotation[index])
-            try:
-                contacts = self.model.contacts(state)
-            except NoContactError:
-                continue
-            for i, name in enumerate(z.contacts.finger):
-                if name in contacts.finger:
-                    found[(*index, i)] = contacts.point[contacts.finger.index(name)]
-        return torch.linalg.vector_norm(z.contacts.point - found, dim=-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from enum import Enum
@@ -11,6 +12,7 @@ import torch
 from ..control import (
     Caution,
     ClosedLoop,
+    FocusedPose,
     HandKnowledge,
     LookAndMoveController,
     PoseTarget,
@@ -18,17 +20,16 @@ from ..control import (
     Stop,
     StopReason,
 )
-from ..enhanced import EnhancedModel
 from ..exceptions import GraspError, ParameterError
 from ..kinematics import GraspState
-from ..model import KinematicModel, Linearization
+from ..model import Linearization
 from ..plant import Observation
 from ..typing import Float, Tensor
 from .friction_share import friction_share
 from .model_hand import ModelHand
-from .rehearsal import axis_of, hand_at, own_controller
 
 _DEG = math.pi / 180
+_FRICTION = 0.7  # largest share of its friction that a grasp may need to hold the object
 _BEARS = 0.01  # [N m] of a stop that ends a turn
 _PRESSED = -0.3e-3
 """Gap of a link that bears on the object [m]: links sink in here, where real ones push; noise hides less."""
@@ -77,13 +78,11 @@ class Reach:
 
 @torch.no_grad()
 def reachable(
-    model: LookAndMoveController | KinematicModel | EnhancedModel,
-    seen: Observation | GraspState,
-    axis: Float[Tensor, " 3"] | None = None,
+    controller: LookAndMoveController,
+    seen: Observation,
     *,
     sign: int = 1,
     limit: float = 90 * _DEG,
-    friction: float = 0.7,
     safety: Safety | None = None,
 ) -> Reach:
     """``max |angle|`` of the closed loop on a :class:`ModelHand`: the controller's own programs, limits and
@@ -93,30 +92,32 @@ def reachable(
     and this grasp; it is no better than the model's contacts and forces, and knows nothing of noise.
 
     Args:
-        model: a controller, or a model for one with default tasks and limits.
-        seen: the grasp. Of a bare state encoders and forces follow from the model.
-        axis: about which it is to be turned, hand frame; None: the controller's focus.
+        controller: with the axis about which the object is to be turned as its focus.
+        seen: the grasp.
         sign: 1 or -1, which way.
         limit: farthest angle that is tried [rad].
-        friction: largest share of its friction that the grasp may need to hold the object
-            (:func:`~torch_ekm.foresight.friction_share`); infinite: any.
         safety: as in :class:`~torch_ekm.control.ClosedLoop`; None: the usual one, but a link bears only where
             it would lie 0.3 mm deep, which is when noisy readings show it.
 
+    A turn also ends where the grasp needs more than 70 % of its friction to hold the object
+    (:func:`~torch_ekm.foresight.friction_share`).
+
     Raises:
-        ParameterError: no axis, a focus that is no single rotation, a sign that is none, an angle outside 0
-            to 170 deg, or a share that is not positive.
+        ParameterError: a focus that is no single rotation, a sign that is none, or an angle outside 0 to
+            170 deg.
         GraspError: the model refuses the grasp as it is.
     """
     if sign not in (1, -1):
         raise ParameterError("sign", sign, "1 or -1")
     if not 0 < limit <= 170 * _DEG:
         raise ParameterError("limit", limit, "above 0 and at most 170 deg [rad]")
-    if not friction > 0:
-        raise ParameterError("friction", friction, "greater than 0")
-    controller = own_controller(model, axis)
-    about = axis_of(controller.focus)
-    hand = hand_at(controller, seen)
+    controller = copy.copy(controller)
+    controller.pace = copy.deepcopy(controller.pace)
+    about, f = _axis_of(controller.focus), controller.kinematic
+    predictor = f if controller.enhanced is None else controller.enhanced
+    hand = ModelHand(predictor, seen.state, seen.a, seen.fingertip_force)
+    if hand.linearization is None:
+        f.linearize(seen.state)  # raises, and says why
     start = hand.observe()
     idle = set(hand.at_limits())
     path, angles = [start.state], [0.0]
@@ -133,9 +134,9 @@ def reachable(
             stop: Stop = over.value
             break
         lin = hand.linearization
-        share = 0.0 if hand.failure or lin is None else friction_share(controller.kinematic, lin)
-        if share > friction:
-            said = f"the object needs {100 * share:.0f} % of the friction, more than {100 * friction:.0f} %"
+        share = 0.0 if hand.failure or lin is None else friction_share(f, lin)
+        if share > _FRICTION:
+            said = f"the object needs {100 * share:.0f} % of the friction, more than {100 * _FRICTION:.0f} %"
             stop = Stop(StopReason.GIVEN_UP, step.after, said)
             break
         turned = float(about @ step.after.state.minus(start.state)[-3:])
@@ -179,7 +180,7 @@ class BeyondReach:
         Raises:
             ParameterError: the focus is no rotation about one axis.
         """
-        about = axis_of(self.controller.focus)
+        about = _axis_of(self.controller.focus)
         asked = float(about @ target.error(seen.state)[3:])
         sign, limit = (1 if asked >= 0 else -1), min(max(abs(asked), 1 * _DEG), 170 * _DEG)
         try:
@@ -207,6 +208,17 @@ class _Standing:
             return []
         left = sorted(zip(lin.forces.relative_margin.tolist(), lin.contacts.finger, strict=True))
         return [pad for share, pad in left if share < 0.05]
+
+
+def _axis_of(focus: FocusedPose) -> Float[Tensor, " 3"]:
+    """Of a focus that is the rotation about it.
+
+    Raises:
+        ParameterError: the focus is something else.
+    """
+    if focus.matrix.shape[0] != 1 or bool((focus.matrix[:, :3].abs() > 1e-9).any()):
+        raise ParameterError("focus", focus.matrix.tolist(), "a rotation about one axis")
+    return focus.matrix[0, 3:]
 
 
 def _end(stop: Stop, hand: ModelHand, at: _Standing) -> tuple[ReachEnd, tuple[str, ...], str]:

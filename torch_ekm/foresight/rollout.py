@@ -27,9 +27,8 @@ class Rollout:
 
     z is state, contacts and forces. f is taken half a motion later; g, which was learned of whole motions, at
     their beginnings: ``ds = J_m(s_m) w + g(s, w)``. Contacts roll along; no collision query is made on the
-    way. Forces are
-    those of contacts that stick throughout a motion; a contact that was asked for more than its cone begins
-    the next motion on it.
+    way. Forces are those of contacts that stick throughout a motion; a contact that was asked for more than
+    its cone begins the next motion on it.
 
     Args:
         model: a kinematic model, or an enhanced one around it.
@@ -87,14 +86,14 @@ class Rollout:
             variance.append(unsure)
         every = stack(way)
         lin = dataclasses.replace(self._linearize(settled(every)), forces=every.forces)
-        return Prediction(self.kinematic, actions, lin, torch.stack(variance, dim=-2))
+        deviation = torch.stack(variance, dim=-2).sqrt().cumsum(-2)
+        return Prediction(actions, lin, deviation.square())
 
     def _motion(self, z: Configuration, action: Tensor) -> tuple[Configuration, Tensor]:
         """One motion by the midpoint rule, and the learner's variance of it."""
         g, variance = self._correction(z.state, action)
-        half = None if g is None else g / 2
         z = settled(z)
-        dz = change(self._linearize(z), self._contacts(z), action / 2, half)
+        dz = change(self._linearize(z), self._contacts(z), action / 2, g / 2)
         middle = settled(moved(self.kinematic, z, dz))
         dz = change(self._linearize(middle), self._contacts(middle), action, g)
         return moved(self.kinematic, z, dz), variance
@@ -105,8 +104,9 @@ class Rollout:
     def _contacts(self, z: Configuration):
         return self.kinematic.contact_kinematics(z.state, z.contacts)
 
-    def _correction(self, state: GraspState, action: Tensor) -> tuple[Tensor | None, Tensor]:
+    def _correction(self, state: GraspState, action: Tensor) -> tuple[Tensor, Tensor]:
         """``g(s, w)`` and its variance, as increments of the state."""
         if self.enhanced is None:
-            return None, action.new_zeros(*action.shape[:-1], state.n_s)
+            still = action.new_zeros(*action.shape[:-1], state.n_s)
+            return still, still
         return self.enhanced.correction(state, action, state.n_s)

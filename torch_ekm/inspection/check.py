@@ -14,6 +14,7 @@ import torch
 from ..contact import ContactSet
 from ..contact.contact_kinematics import contact_frames
 from ..contact.signed_distance import signed_distance
+from ..control import LookAndMoveController
 from ..description import HandDescription, ObjectDescription, Shape, load_hand, load_object
 from ..exceptions import EKMError, MissingExtraError
 from ..foresight import reachable
@@ -181,7 +182,8 @@ def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
         plant = SimulatedHand(hand, obj)
         seen = plant.reset(0)
         model = KinematicModel(plant.hand, obj)
-        ends = [reachable(model, seen, plant.rotation_axis, sign=sign) for sign in (-1, 1)]
+        controller = LookAndMoveController(model, plant.rotation_axis)
+        ends = [reachable(controller, seen, sign=sign) for sign in (-1, 1)]
     except MissingExtraError:
         return
     except EKMError as error:

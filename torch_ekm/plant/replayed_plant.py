@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .observation import Observation
@@ -13,8 +11,7 @@ from .trajectory import Trajectory
 class ReplayedPlant:
     """Gives the recorded observations one by one, whatever is commanded; implements :class:`Plant`.
 
-    ``info["recorded_command"]`` says what was commanded then. A driver of a real hand has the same
-    five lines: send the increment, wait until it is done, read the sensors.
+    A driver of a real hand has the same methods: send the increment, wait until it is done, read the sensors.
 
     Raises:
         ParameterError: the trajectory is empty.
@@ -45,10 +42,8 @@ class ReplayedPlant:
             raise ParameterError(
                 "command", self._place, f"at most {len(self.trajectory.commands)}: it ends there"
             )
-        command = self.trajectory.commands[self._place]
         self._place += 1
-        observation = self.observe()
-        return dataclasses.replace(observation, info={**observation.info, "recorded_command": command})
+        return self.observe()
 
     def close(self) -> None:
         """Does nothing: a recording holds no device."""

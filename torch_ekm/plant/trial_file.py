@@ -19,8 +19,7 @@ from ..exceptions import DescriptionError
 FORMAT = "torch_ekm trial 2"
 _LARGEST = 4 << 30  # bytes of all arrays of a trial: a small file can tell of any size
 _HEAD = 512  # bytes: the block that HDF5 leaves to its user (its smallest size)
-_LINE = re.compile(rb"torch_ekm trial (\d+)\nsha256 ([0-9a-f]{64})\n")
-_UNREAD = "a recording starts with a line 'torch_ekm trial 2', which this file does not"
+_LINE = re.compile(f"{FORMAT}\nsha256 ([0-9a-f]{{64}})\n".encode())
 
 
 def write_trial(path: Path, seed: int, about: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
@@ -58,9 +57,10 @@ def read_trial(
     except OSError as error:
         raise DescriptionError(path, f"cannot be read: {error.strerror}") from None
     head = _LINE.match(content)
-    if head is None or head[1] != FORMAT.rpartition(" ")[2].encode():
-        raise DescriptionError(path, f"damaged, or not a recording of this version of torch_ekm: {_UNREAD}")
-    written_digest = head[2].decode()
+    if head is None:
+        first = f"a recording starts with a line '{FORMAT}', which this file does not"
+        raise DescriptionError(path, f"damaged, or not a recording of this version of torch_ekm: {first}")
+    written_digest = head[1].decode()
     whole = content[:_HEAD] == _head(written_digest)
     content[:_HEAD] = _head("0" * 64)
     if not whole or hashlib.sha256(content).hexdigest() != written_digest:

@@ -125,7 +125,7 @@ class TrialLog:
         return [trial for trial in trials if trial not in self]
 
     def path(self, trial: int) -> Path:
-        """Where a trial is, or will be."""
+        """Path of the HDF5 file in which a trial is, or will be."""
         return trial_path(self.folder, trial)
 
     def read(self, trial: int) -> Trajectory:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from .progress import Progress
-from .safety import Caution, Guards, Halt, Safety, StoppingRule
-from .watch import Verdict, Watch
-
-__all__ = ["Caution", "Guards", "Halt", "Progress", "Safety", "StoppingRule", "Verdict", "Watch"]
+from .safety import Caution as Caution
+from .safety import Guards as Guards
+from .safety import Safety as Safety
+from .safety import StoppingRule as StoppingRule

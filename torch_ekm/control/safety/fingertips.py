@@ -11,7 +11,7 @@ from ...exceptions import GraspError
 from ...plant import Observation
 from ...typing import Float, Tensor
 from ..decision import Decision, StopReason
-from .safety import Guards, Halt
+from .safety import Guards, Objection
 
 if TYPE_CHECKING:
     from ...model import KinematicModel, Linearization
@@ -29,11 +29,11 @@ class Fingertips(NamedTuple):
     force: Float[Tensor, " n_pads"] | None
     """[N]; 0 where a pad is not believed, and the model's estimate stands in."""
     note: str = ""
-    halt: Halt | None = None
+    halt: Objection | None = None
 
 
 def hold(seen: Observation) -> bool:
-    """The fingertips feel an object between them."""
+    """Two fingertips at least measure a force: an object is between them."""
     return seen.fingertip_force is not None and int((seen.fingertip_force > _HOLDS).sum()) > 1
 
 
@@ -53,18 +53,18 @@ class FingertipWatch:
         force = seen.fingertip_force
         return force is not None and bool((force > self.guards.force_ceiling).any())
 
-    def before(self, decision: Decision, seen: Observation) -> Halt | None:
+    def before(self, decision: Decision, seen: Observation) -> Objection | None:
         """Pads that do not measure press too hard, by the model's estimate."""
         lin = decision.linearization
         if lin is None or not lin.forces.solved or decision.share == 0.0:  # the way back is no new motion
             return None
         estimate = lin.forces.normal
-        if float(estimate.max()) <= self.guards.force_ceiling:
-            return None
         if seen.fingertip_force is not None:
             pads = self.model.hand.pad_indices(lin.contacts.finger)
             estimate = estimate.where(seen.fingertip_force[pads] < self.least, 0.0)
         i = int(estimate.argmax())
+        if estimate[i] <= self.guards.force_ceiling:
+            return None
         return self._too_hard(lin.contacts.finger[i], float(estimate[i]), "by the model's estimate")
 
     def judge(self, before: Observation, decision: Decision, seen: Observation) -> Fingertips:
@@ -77,15 +77,19 @@ class FingertipWatch:
             note = f"the fingertips were read at {taken:.3f} s: the model's estimate stands in"
             return Fingertips(None, note)
         repeats = self._frozen(force, float((seen.a - before.a).abs().max()))
-        expected = self._by_model(decision)
+        lin = decision.linearization
+        expected = {} if lin is None else self._normal(lin)
         faults = {i: f"reads {float(force[i]):.2f} N again and again" for i in repeats if i in expected}
-        high = [i for i in range(len(self.pads)) if i not in faults and self._surprising(i, force, expected)]
+        # above the ceiling, or far above what the model had before the motion
+        ceiling = self.guards.force_ceiling
+        usual = [min(ceiling, expected.get(i, math.inf) + _SURPRISE) for i in range(len(force))]
+        high = [i for i, most in enumerate(usual) if i not in faults and force[i] > most]
         alone = self._by_joints(seen) if high else {}
         for i in high:
             other = alone.get(i)
             if other is not None and self._contradicts(float(force[i]), other):
                 faults[i] = f"reads {float(force[i]):.2f} N where joints and springs speak for {other:.2f} N"
-            elif force[i] > self.guards.force_ceiling:
+            elif force[i] > ceiling:
                 return Fingertips(force, halt=self._too_hard(self.pads[i], float(force[i]), "as measured"))
         notes = [f"fingertip '{self.pads[i]}' {problem}" for i, problem in sorted(faults.items())]
         if len(faults) > self.guards.faulty_pads:
@@ -93,7 +97,7 @@ class FingertipWatch:
                 f"{'; '.join(notes)} (Guards.faulty_pads is {self.guards.faulty_pads}): look after range and "
                 "cable of the fingertips, or of the joints' sensors if several fingertips disagree with them"
             )
-            return Fingertips(force, halt=Halt(StopReason.FINGERTIP_FAULT, message))
+            return Fingertips(force, halt=Objection(StopReason.FINGERTIP_FAULT, message))
         notes += [
             f"fingertip '{self.pads[i]}' reads {float(force[i]):.2f} N where the model has {other:.2f} N"
             for i, other in expected.items()
@@ -120,27 +124,17 @@ class FingertipWatch:
         except GraspError:
             return {}
 
-    def _by_model(self, decision: Decision) -> dict[int, float]:
-        """That of the last decision, by all that is known [N]."""
-        return {} if decision.linearization is None else self._normal(decision.linearization)
-
     def _normal(self, lin: Linearization) -> dict[int, float]:
         pads = self.model.hand.pad_indices(lin.contacts.finger)
         return dict(zip(pads, lin.forces.normal.tolist(), strict=True)) if lin.forces.solved else {}
-
-    def _surprising(self, i: int, force: Tensor, expected: dict[int, float]) -> bool:
-        """Above the ceiling, or far above what the model had before the motion."""
-        return float(force[i]) > min(self.guards.force_ceiling, expected.get(i, math.inf) + _SURPRISE)
 
     def _contradicts(self, force: float, expected: float) -> bool:
         variance = self.least**2 + _JOINT_STD**2 + (_JOINT_SHARE * expected) ** 2
         return (force - expected) ** 2 > self.guards.gate**2 * variance
 
-    def _too_hard(self, pad: str, force: float, how: str) -> Halt | None:
-        if force <= self.guards.force_ceiling:
-            return None
+    def _too_hard(self, pad: str, force: float, how: str) -> Objection:
         message = (
             f"fingertip '{pad}' presses with {force:.1f} N {how}, Guards.force_ceiling is "
             f"{self.guards.force_ceiling:g} N: free the object, or lower GripForceTask.force"
         )
-        return Halt(StopReason.FORCE_CEILING, message)
+        return Objection(StopReason.FORCE_CEILING, message)

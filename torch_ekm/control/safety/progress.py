@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import time
 
+from ...model import ModelStatus
 from ...plant import Observation, PlantStatus
 from ...typing import Tensor
 from ..decision import Decision, StopReason
 from ..focus import FocusedPose, PoseTarget
-from .safety import Halt, Safety
+from .safety import Objection, Safety
 
 
 class Progress:
@@ -21,7 +23,7 @@ class Progress:
         started: of a monotonic clock [s].
     """
 
-    halt: Halt | None = None
+    halt: Objection | None = None
     """What a guard says against going on."""
     limited = False
     """The last step was cut short by an actuator's limit."""
@@ -38,9 +40,10 @@ class Progress:
         """What the encoders did [rad], motion by motion, without what was undone."""
         self._start, self._started = seen.state, started
         self._off_allowed = safety.caution.off_rotation
-        self._bearing: frozenset[str] | None = None
+        # links without a pad that bear on the object at the start
+        self._bearing: set[str] | None = None
 
-    def over(self, seen: Observation, stopped: bool) -> Halt | None:
+    def over(self, seen: Observation, stopped: bool) -> Objection | None:
         """Why the manipulation ends before the next decision; None: it goes on.
 
         Args:
@@ -49,15 +52,15 @@ class Progress:
         if self.halt is not None:
             return self.halt
         if seen.status is PlantStatus.LOST:
-            return Halt(StopReason.OBJECT_LOST, "")
+            return Objection(StopReason.OBJECT_LOST)
         if self.lost(seen):
-            return Halt(StopReason.OBJECT_LOST, "dislocated off the focused axis")
+            return Objection(StopReason.OBJECT_LOST, "dislocated off the focused axis")
         if stopped:
-            return Halt(StopReason.STOPPED, "")
+            return Objection(StopReason.STOPPED)
         if time.monotonic() - self._started > self.safety.rule.max_seconds:
-            return Halt(StopReason.TIME_OUT, "")
+            return Objection(StopReason.TIME_OUT)
         reason = self.safety.rule.judge(self.errors, self.limited)
-        return None if reason is StopReason.RUNNING else Halt(reason, "")
+        return None if reason is StopReason.RUNNING else Objection(reason)
 
     def lost(self, seen: Observation) -> bool:
         """The plant reports it, or the object is dislocated."""
@@ -67,9 +70,15 @@ class Progress:
         """What speaks for a loss to come; empty: nothing."""
         if decision.status is not StopReason.RUNNING:
             return decision.message
-        links = self.safety.caution.bearing_links(decision.linearization)
-        self._bearing = links if self._bearing is None else self._bearing
-        return self.safety.caution.sign(self._off_rotation(seen), self._off_allowed, links - self._bearing)
+        lin, turned = decision.linearization, self._off_rotation(seen)
+        near = () if lin is None else (d for d in lin.doubts if d.kind is ModelStatus.LINK_TOUCHES)
+        bearing = {doubt.what for doubt in near if doubt.value < self.safety.caution.link_gap}
+        self._bearing = bearing if self._bearing is None else self._bearing
+        if turned > self._off_allowed:
+            return f"the object has turned {math.degrees(turned):.1f} deg off the focus"
+        if bearing <= self._bearing:
+            return ""
+        return f"link '{min(bearing - self._bearing)}', which has no pad, bears on the object"
 
     def alarm(self, seen: Observation) -> None:
         """A sign is heeded: an object that has slid off the focus may stay there, and turn a little more."""

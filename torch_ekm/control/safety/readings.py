@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -11,7 +11,7 @@ from ...plant import Observation, PlantStatus
 from ...typing import Float, Tensor
 from ..decision import Decision, Expectation, StopReason
 from .fingertips import hold
-from .safety import Guards
+from .safety import Guards, Objection
 
 if TYPE_CHECKING:
     from ...description import HandDescription
@@ -19,17 +19,6 @@ if TYPE_CHECKING:
 _DEG = math.pi / 180
 _NAMES = ("the encoders' reading", "the joints' reading", "the object's pose")
 _LEVER = 0.03  # [m] a rotation that is predicted wrong carries the object's point so much
-
-
-class Objection(NamedTuple):
-    """What speaks against a reading."""
-
-    reason: StopReason
-    message: str
-    blind: bool = False
-    """The pose is not known; the rest is."""
-    gated: bool = False
-    """Surprising, but possible."""
 
 
 class ReadingTests:
@@ -45,8 +34,8 @@ class ReadingTests:
         self._raw: Observation | None = None
         self._path = {"joints": 0.0, "pose": 0.0}
         self._limits = [
-            ("encoder", self.hand.actuator_names, self.hand.actuator_lower, self.hand.actuator_upper),
-            ("joint", self.hand.joint_names, self.hand.joint_lower, self.hand.joint_upper),
+            ("encoder", hand.actuator_names, hand.actuator_lower, hand.actuator_upper),
+            ("joint", hand.joint_names, hand.joint_lower, hand.joint_upper),
         ]
 
     def at_rest(self, seen: Observation, before: Observation | None = None) -> Objection | None:
@@ -68,9 +57,7 @@ class ReadingTests:
         """Of a reading after a motion, the worst first; ``blind`` motions without a pose came before."""
         doubt = self._age(seen, before) or self._range(seen) or self._encoders(before, decision.delta_a, seen)
         doubt = self._speed(before, seen) if doubt is None else doubt
-        if doubt is not None and not doubt.blind:
-            return doubt
-        if expected is None:
+        if expected is None or (doubt is not None and not doubt.blind):
             return doubt
         ds, predicted = seen.state.minus(before.state), expected.increment
         if doubt is not None:  # blind: the joints are still looked at
@@ -128,14 +115,14 @@ class ReadingTests:
                 return Objection(StopReason.OUT_OF_RANGE, message)
         return None
 
-    def _encoders(self, before: Observation, told: Tensor, seen: Observation) -> Objection | None:
-        """Jumps and speeds."""
-        moved, none = seen.a - before.a, torch.zeros_like(told)
-        away = torch.maximum(torch.minimum(told, none) - moved, moved - torch.maximum(told, none))
+    def _encoders(self, before: Observation, command: Tensor, seen: Observation) -> Objection | None:
+        """An encoder that went further than it was commanded to, or back."""
+        moved = seen.a - before.a
+        away = torch.maximum(command.clamp(max=0) - moved, moved - command.clamp(min=0))
         i, names = int(away.argmax()), self.hand.actuator_names
         if away[i] > self.guards.encoder_jump:
             message = (
-                f"encoder '{names[i]}' went {deg(moved[i])} where {deg(told[i])} were commanded "
+                f"encoder '{names[i]}' went {deg(moved[i])} where {deg(command[i])} were commanded "
                 f"(Guards.encoder_jump is {deg(self.guards.encoder_jump)}): look after its cable and zero"
             )
             return Objection(StopReason.ENCODER_JUMP, message)
@@ -177,9 +164,9 @@ class ReadingTests:
         self, before: Observation, ds: Tensor, expected: Expectation, seen: Observation, blind: int
     ) -> Objection | None:
         """The innovation against its covariance."""
-        sigma, predicted = self.deviation(before, expected, seen, blind), expected.increment
-        z = (ds - predicted).abs() / sigma
-        i, n_q = int(z.argmax()), self.hand.n_q
+        sigma, predicted = self._deviation(before, expected, seen, blind), expected.increment
+        z, n_q = (ds - predicted).abs() / sigma, self.hand.n_q
+        i = int(z.argmax())
         if z[i] <= self.guards.gate:
             return None
         if i < n_q:
@@ -194,8 +181,8 @@ class ReadingTests:
         )
         return Objection(StopReason.BLIND, message, gated=True)
 
-    def deviation(
-        self, before: Observation, expected: Expectation, seen: Observation, blind: int = 0
+    def _deviation(
+        self, before: Observation, expected: Expectation, seen: Observation, blind: int
     ) -> Float[Tensor, " n_s"]:
         """sigma of each entry of an increment, see :class:`~torch_ekm.control.Guards`."""
         guards, n_q, predicted = self.guards, self.hand.n_q, expected.increment

@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from ...exceptions import ParameterError
-from ...model import ModelStatus
 from ...plant import Stamps
 from ..decision import StopReason
-
-if TYPE_CHECKING:
-    from ...model import Linearization
 
 _DEG = math.pi / 180
 _MAX_AGE = Stamps(encoders=0.2, joints=0.2, pose=0.4, fingertips=0.4)
 
 
-class Halt(NamedTuple):
-    """Why a guard ends a manipulation."""
+class Objection(NamedTuple):
+    """What speaks against a reading, a command, or going on."""
 
     reason: StopReason
-    message: str
+    message: str = ""
     """Sensor, figure, limit, and what to do."""
+    blind: bool = False
+    """The pose is not known; the rest is."""
+    gated: bool = False
+    """Surprising, but possible."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ class StoppingRule:
 
 @dataclass(frozen=True)
 class Caution:
-    """What tells of a loss before it comes, and what is done then; the same for every controller.
+    """What announces a loss before it comes, and what is done then; the same for every controller.
 
     Signs: the model refuses the state; the object has turned off the focus by ``off_rotation``; a link
     without a pad comes to bear on the object. One that ``looks`` further readings show as well is heeded:
@@ -104,23 +103,6 @@ class Caution:
         for name in ("looks", "off_rotation", "off_further", "retreats", "way_back", "tighten"):
             if not getattr(self, name) >= 0:
                 raise ParameterError(name, getattr(self, name), "0 or more")
-
-    def bearing_links(self, lin: Linearization | None) -> frozenset[str]:
-        """Links without a pad that bear on the object."""
-        doubts: Iterable = () if lin is None else lin.doubts
-        near = (doubt for doubt in doubts if doubt.kind is ModelStatus.LINK_TOUCHES)
-        return frozenset(doubt.what for doubt in near if doubt.value < self.link_gap)
-
-    def sign(self, off_rotation: float, allowed: float, bearing: frozenset[str]) -> str:
-        """What speaks for a loss to come; empty: nothing.
-
-        Args:
-            off_rotation, allowed: of the object since the start [rad].
-            bearing: links without a pad that bear on the object and did not at the start.
-        """
-        if off_rotation > allowed:
-            return f"the object has turned {off_rotation / _DEG:.1f} deg off the focus"
-        return f"link '{min(bearing)}', which has no pad, bears on the object" if bearing else ""
 
 
 @dataclass(frozen=True)
@@ -163,7 +145,7 @@ class Guards:
     joint_noise: float = 1.5 * _DEG
     """[rad]"""
     encoder_jump: float = 8 * _DEG
-    """An encoder goes so much further than it was told, or so far back [rad]."""
+    """An encoder goes so much further than it was commanded to, or so far back [rad]."""
     joint_jump: float = 20 * _DEG
     """Of a joint, away from what was predicted of one motion [rad]."""
     rotation_jump: float = 60 * _DEG
@@ -197,19 +179,12 @@ class Guards:
 @dataclass(frozen=True)
 class Safety:
     """Which readings count, when the hand looks again, goes back, stops and gives up; the same for every
-    controller that is compared.
-
-    ============================================================ ==========================
-    reasons to end                                               figures
-    ============================================================ ==========================
-    reached, stalled, step limit, actuator limits, time-out,     :class:`StoppingRule`
-    object lost
-    given up                                                     :class:`Caution`
-    stale sensor and all that follow it in :class:`StopReason`   :class:`Guards`
-    unstable grasp                                               none: the model has no step
-    ============================================================ ==========================
+    controller that is compared. A grasp that is unstable has no figure: the model has no step.
     """
 
     rule: StoppingRule = StoppingRule()
+    """Reached, stalled, step limit, actuator limits, time-out, object lost."""
     caution: Caution = Caution()
+    """Given up."""
     guards: Guards = Guards()
+    """Stale sensor, and all reasons that follow it in :class:`StopReason`."""

@@ -14,7 +14,7 @@ from ...typing import Tensor
 from ..decision import Decision, Expectation, StopReason
 from .fingertips import FingertipWatch
 from .readings import ReadingTests, agree, deg
-from .safety import Guards, Halt
+from .safety import Guards, Objection
 
 if TYPE_CHECKING:
     from ...model import KinematicModel, Linearization
@@ -31,7 +31,7 @@ class Verdict(NamedTuple):
     """The reading to go on with; of a blind motion with the pose that the model predicted."""
     teaches: bool
     """Both ends of the motion were measured, and nothing speaks against them."""
-    halt: Halt | None = None
+    halt: Objection | None = None
     """Why the manipulation must end here."""
     note: str = ""
     """What a guard objects to where the loop goes on."""
@@ -69,9 +69,9 @@ class Watch:
             seen = look()
         self.readings.follow(None, seen)
         self.blind = int(seen.status is PlantStatus.NOT_SEEN)
-        return Verdict(seen, doubt is None, None if doubt is None else Halt(doubt.reason, doubt.message))
+        return Verdict(seen, doubt is None, doubt)
 
-    def command(self, decision: Decision, seen: Observation) -> Halt | None:
+    def command(self, decision: Decision, seen: Observation) -> Objection | None:
         """What speaks against a motion before it is made; None: nothing."""
         size = decision.delta_a.abs()
         i = int(size.argmax())
@@ -81,7 +81,7 @@ class Watch:
             f"a command of {deg(size[i])} to actuator '{self.hand.actuator_names[i]}', Guards.increment is "
             f"{deg(self.guards.increment)}: mend the controller, or allow more"
         )
-        return Halt(StopReason.COMMAND_CEILING, message)
+        return Objection(StopReason.COMMAND_CEILING, message)
 
     def motion(
         self,
@@ -107,7 +107,7 @@ class Watch:
                 break
             last, seen = seen, look()
         if doubt is not None and not (doubt.blind or doubt.gated):
-            return Verdict(seen, False, Halt(doubt.reason, doubt.message), "", expected)
+            return Verdict(seen, False, doubt, "", expected)
         if doubt is not None and doubt.gated and (last is None or not agree(last, seen, self.guards)):
             doubt = doubt._replace(blind=True)
         tips = self.fingertips.judge(before, decision, seen)
@@ -121,7 +121,7 @@ class Watch:
             seen, most = self._predicted(before, expected, seen), self.guards.blind_motions
             if self.blind > most:
                 more = f"{doubt.message} ({self.blind} motions running, Guards.blind_motions is {most})"
-                halt = halt or Halt(doubt.reason, more)
+                halt = halt or Objection(doubt.reason, more)
             return Verdict(seen, False, halt, doubt.message, expected)
         self.blind = 0
         if doubt is None:
@@ -140,7 +140,7 @@ class Watch:
 
     def _stuck(
         self, before: Observation, decision: Decision, seen: Observation, stuck: tuple[str, ...]
-    ) -> Halt | None:
+    ) -> Objection | None:
         """Actuators that do not move, however they are commanded."""
         size, still = decision.delta_a.abs(), (seen.a - before.a).abs() < _STILL
         again = still & (size > self.guards.stuck_command)
@@ -151,7 +151,7 @@ class Watch:
             return None
         names = ", ".join(f"'{self.hand.actuator_names[i]}'" for i in found.nonzero().flatten().tolist())
         message = f"actuator {names} does not move however it is commanded: look after motor and tendon"
-        return Halt(StopReason.ACTUATOR_STUCK, message)
+        return Objection(StopReason.ACTUATOR_STUCK, message)
 
     @staticmethod
     def _predicted(before: Observation, expected: Expectation | None, seen: Observation) -> Observation:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ...control import LookAndMoveController
 from ...foresight import Reach, reachable
 from ...kinematics import GraspState
 from ...model import KinematicModel
@@ -25,9 +26,10 @@ class ReachShow:
     def __init__(self, hand: str, object: str, seed: int = 0) -> None:
         self._grasp = GraspShow(hand, object, seed)
         plant = self._grasp.plant
-        model, seen = KinematicModel(plant.hand, plant.object), plant.observe()
+        controller = LookAndMoveController(KinematicModel(plant.hand, plant.object), plant.rotation_axis)
+        seen = plant.observe()
         self.reaches: tuple[Reach, Reach] = tuple(  # type: ignore[assignment]
-            reachable(model, seen, plant.rotation_axis, sign=sign) for sign in (-1, 1)
+            reachable(controller, seen, sign=sign) for sign in (-1, 1)
         )
         back, forth = self.reaches
         self.path: tuple[GraspState, ...] = (*reversed(back.path), *forth.path[1:])
