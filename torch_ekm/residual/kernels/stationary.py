@@ -97,9 +97,6 @@ class StationaryKernel(Kernel):
         v = self.log_variance.exp().unsqueeze(-1)
         return v * phi, (v * psi).unsqueeze(-1) * (u * w)
 
-    def diagonal_gradient(self, x: Tensor) -> Tensor:
-        return torch.zeros_like(x)
-
     def shift_invariant(self, in_features: int) -> list[bool]:
         return [True] * in_features
 

@@ -140,7 +140,7 @@ class LearnHyperparameters(Part):
             x, y = torch.cat([x, x_past], dim=-2), torch.cat([y, y_past], dim=-2)
             weight = torch.cat([weight, weight_past], dim=-1)
             absorbed, age = torch.cat([absorbed, torch.ones_like(age_past)]), torch.cat([age, age_past])
-        return Queries(*learner.units.of_sets(x, y), weight, absorbed, age, self.past is not None)
+        return Queries(*learner.units.of_sets(x, y), weight, absorbed, age)
 
     def descend(self, learner: Host) -> None:
         """Adam on the loss, model by model; a model without samples or finite gradient stays as it is."""
