@@ -308,8 +308,6 @@ def test_what_does_not_go_together_is_told(parts, message):
         (ProcessNoise, {"share": 1.0}, "share"),
         (ProcessNoise, {"share": -0.1}, "share"),
         (RobustWeight, {"threshold": 0.0}, "threshold"),
-        (Standardize, {"samples": 0}, "samples"),
-        (CalibrateNoise, {"rate": 0.0}, "rate"),
         (LearnHyperparameters, {"rate": -1.0}, "rate"),
         (LearnHyperparameters, {"steps": 0}, "steps"),
         (LearnHyperparameters, {"memory": -1}, "memory"),
