@@ -123,7 +123,7 @@ def compare(samples: int, capacity: int, only: str | None) -> None:
             for gp, targets in zip(trio, (y, y, torch.nextafter(y, y + 1.0)), strict=True):
                 gp.update(x, targets)
             for query in x[::97]:
-                exact, *others = (torch.cat([gp(query), gp.variance(query)]) for gp in trio)
+                exact, *others = (torch.cat([gp(query), gp.predict(query).variance]) for gp in trio)
                 worst = [max(w, float((exact - o).abs().max())) for w, o in zip(worst, others, strict=True)]
         loops, rounding = (value / largest for value in worst)
         seconds = time.perf_counter() - begin
@@ -143,14 +143,14 @@ def soak(gp: SparseOnlineGP, samples: int) -> None:
         query = x[::53]
         assert bool(gp(query).isfinite().all()), f"not finite after {start} samples"
         drift = max(drift, float((gp(query) - rebuilt(query)).abs().max()))
-        smallest = min(smallest, float(gp.variance(query).min()))
+        smallest = min(smallest, float(gp.predict(query).variance.min()))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     quarter = max(len(errors) // 4, 1)
     first, last = (sum(part) / quarter for part in (errors[:quarter], errors[-quarter:]))
     print(
         f"{type(gp.kernel).__name__}, {samples} samples, {gp.dtype}, {gp.capacity} points: finite, "
         f"smallest variance {smallest:.2e}, largest drift {drift:.1e}, "
-        f"condition {float(gp.condition_number):.1e}, {memory:.0f} MB, "
+        f"condition {float(torch.linalg.cond(gp.posterior.gram(gp.kernel))):.1e}, {memory:.0f} MB, "
         f"{(time.perf_counter() - begin) / samples * 1e6:.0f} us per sample, rms of the next "
         f"{block} samples {first:.4f} in the first quarter, {last:.4f} in the last",
         flush=True,

@@ -225,7 +225,7 @@ def test_bank_serves_as_the_learner_of_an_enhanced_model() -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [{"models": 0}, {"window": 0}, {"new_prior": 0.0}, {"temperature": 1.5}, {"common_weights": (2.0,)}],
+    [{"models": 0}, {"window": 0}, {"temperature": 1.5}],
 )
 def test_wrong_figures_are_refused(options: dict) -> None:
     with pytest.raises(ParameterError, match=next(iter(options))):

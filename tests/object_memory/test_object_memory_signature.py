@@ -14,7 +14,7 @@ from torch.distributions import MultivariateNormal, StudentT
 from torch_ekm.description import load_hand
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.kinematics import HandKinematics
-from torch_ekm.object_memory import GraspSignature, ModelBank, SignatureModel
+from torch_ekm.object_memory import GraspSignature, ModelBank, SignatureModel, model_bank
 from torch_ekm.residual import ActionLinearKernel, SparseOnlineGP, SquaredExponential
 
 N_A, D = 2, 3
@@ -43,7 +43,8 @@ def test_predictive_density_in_a_group_is_students() -> None:
     """One feature, one group: p(z_n+1 | z_1..n, same group) is Student's t, scatter integrated out."""
     generator = torch.Generator().manual_seed(0)
     z = torch.randn(5, 1, generator=generator, dtype=torch.float64)
-    model = SignatureModel(spread=1e6, strength=7.0)  # so wide that the mean is known from the data alone
+    model = SignatureModel()
+    model.spread, model.strength = 1e6, 7.0  # so wide that the mean is known from the data alone
 
     def log_density(value: float) -> float:
         more = torch.cat([z, torch.tensor([[value]], dtype=torch.float64)])
@@ -62,7 +63,8 @@ def test_predictive_density_in_a_group_is_students() -> None:
 def test_log_joint_agrees_with_its_formula_written_out() -> None:
     z, _ = signatures(2, seed=1)
     label = torch.tensor([0, 2, 2, 0, 3, 3, 3, 0])
-    model = SignatureModel(spread=5.0, strength=9.0, concentration=0.7)
+    model = SignatureModel()
+    model.spread, model.strength, model.concentration = 5.0, 9.0, 0.7
     groups = [z[label == k] for k in (0, 2, 3)]
     n, K = len(z), len(groups)
     means = torch.stack([group.mean(0) for group in groups])
@@ -180,10 +182,12 @@ def test_leader_is_known_before_the_first_motion() -> None:
         assert float(signed.posterior[signed.leader]) > 0.95
 
 
-def test_confused_grasps_are_learned_again_where_they_belong() -> None:
+def test_confused_grasps_are_learned_again_where_they_belong(monkeypatch) -> None:
     """Confused until the last grasp, the models then hold what labelled ones hold, in the order of time."""
     z, truth = signatures(6, seed=4)
-    signed = bank(common_weights=(0.0,), signatures=SignatureModel(concentration=1e-30))
+    monkeypatch.setattr(model_bank, "_COMMON_WEIGHTS", (0.0,))
+    signed = bank()
+    signed.signatures.concentration = 1e-30
     session(signed, z, truth)
     assert signed.memory is not None
     assert signed.n_models < 4
@@ -205,10 +209,11 @@ def test_confused_grasps_are_learned_again_where_they_belong() -> None:
         assert int(signed.episodes[slot]) == 6
 
 
-def test_full_memory_gives_up_the_oldest_of_the_most_frequent() -> None:
+def test_full_memory_gives_up_the_oldest_of_the_most_frequent(monkeypatch) -> None:
     z, _ = signatures(6, seed=4)
     order = torch.tensor([3, 0, 0, 0, 0, 0, 0, 0])
-    small = bank(models=3, remember=4)
+    monkeypatch.setattr(model_bank, "_REMEMBERED", 4)
+    small = bank(models=3)
     centre = torch.stack([z[0], z[0] + 40.0])
     session(small, torch.stack([centre[int(k == 3)] for k in order]), order)
     assert small.memory is not None
@@ -249,10 +254,6 @@ def test_wrong_signatures_are_refused_and_nothing_changes() -> None:
         assert torch.equal(signed.state_dict()[name], value), name
     with pytest.raises(ParameterError, match="signature_features"):
         ModelBank(learner, 2).begin(torch.zeros(D))
-    with pytest.raises(ParameterError, match="remember"):
-        bank(remember=6)
-    with pytest.raises(ParameterError, match="spread"):
-        SignatureModel(spread=0.0)
 
 
 # -- the features of a hand ----------------------------------------------------------------------------

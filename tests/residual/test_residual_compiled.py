@@ -80,7 +80,7 @@ def pair(name: str, shape: tuple[int, ...] = ()) -> list[SparseOnlineGP]:
 def assert_alike(a: SparseOnlineGP, b: SparseOnlineGP, x: torch.Tensor, largest: float) -> None:
     tolerance = 1e-11 * largest  # of the targets: outliers are a thousand times what noise is
     for query in (x[0], x[-1]):  # one query per model: compiled
-        for ask in ("forward", "variance", "linearize", "predict_with_jacobians"):
+        for ask in ("forward", "linearize", "predict_with_jacobians"):
             torch.testing.assert_close(
                 getattr(b, ask)(query), getattr(a, ask)(query), atol=tolerance, rtol=tolerance
             )
@@ -101,9 +101,6 @@ def test_compiled_loops_do_what_torch_does(name, shape):
         for figure in ("novelty", "nis", "weight"):
             torch.testing.assert_close(getattr(b, figure), getattr(a, figure), atol=1e-8, rtol=1e-8)
     assert_alike(reference, fast, x, float(y.abs().max()))
-    fast.posterior.alpha[..., 0, :] *= 1.0 + 1e-5  # a fault that both must see alike
-    assert fast.engine.drift(fast) == pytest.approx(reference.engine.drift(fast), rel=1e-4)
-    fast.posterior.alpha[..., 0, :] /= 1.0 + 1e-5
     if shape:
         mask = torch.rand(60, *shape, generator=torch.Generator().manual_seed(1)) < 0.7
         a, b = reference.update(x[:60], y[:60], mask), fast.update(x[:60], y[:60], mask)
@@ -179,9 +176,9 @@ def test_without_numba_torch_does_it_all(monkeypatch):
     reference = pair("all")[0]
     reference.update(x, y)
     monkeypatch.setitem(sys.modules, "numba", None)
-    for name in ("numba_checks", "numba_kernels"):
-        monkeypatch.delitem(sys.modules, f"torch_ekm.residual.sparse_gp.engine.{name}", raising=False)
-        monkeypatch.delattr(sys.modules["torch_ekm.residual.sparse_gp.engine"], name, raising=False)
+    engine = "torch_ekm.residual.sparse_gp.engine"
+    monkeypatch.delitem(sys.modules, f"{engine}.numba_kernels", raising=False)
+    monkeypatch.delattr(sys.modules[engine], "numba_kernels", raising=False)
     compiled.load_kernels.cache_clear()
     try:
         assert compiled.load_kernels() is None

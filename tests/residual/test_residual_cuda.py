@@ -23,7 +23,7 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA d
 def make(name: str, device: str):
     options = {"batch_shape": (16,), "on_invalid": "skip", "device": device}
     if name == "rls":
-        return RecursiveLeastSquares(4, 2, forgetting_factor=0.99, robust=3.0, refresh_every=8, **options)
+        return RecursiveLeastSquares(4, 2, forgetting_factor=0.99, robust=3.0, **options)
     options |= {"capacity": 12, "refresh_every": 8}
     parts = [RobustWeight(3.0), ForgettingFactor(0.99)]
     if name == "plain":

@@ -136,7 +136,8 @@ def test_a_slow_change_of_scale_is_followed():
     n = 3000
     growth = torch.logspace(0, 1, n, dtype=torch.float64).unsqueeze(-1)
     x = stream(n)[0] * growth
-    scale = RunningScale(3, [True] * 3, memory=300)
+    scale = RunningScale(3, [True] * 3)
+    scale.memory = 300
     for t in range(n):
         scale.observe(t, x[t], None)
     scale.settle()
@@ -144,7 +145,8 @@ def test_a_slow_change_of_scale_is_followed():
 
 
 def test_what_rests_keeps_its_units():
-    scale = RunningScale(1, [True], memory=300)
+    scale = RunningScale(1, [True])
+    scale.memory = 300
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(4000, 1, generator=generator, dtype=torch.float64)
     x[1000:] *= 1e-6

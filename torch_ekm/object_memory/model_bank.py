@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import torch
 from torch import nn
 from torch.distributions import Normal, StudentT
 
-from .._checks import check_count, check_finite, check_fraction, check_positive
+from .._checks import check_count, check_finite, check_fraction
 from ..exceptions import ParameterError, ShapeError
 from ..residual import ResidualLearner, SparseOnlineGP, UpdateReport
 from ..residual.base import SingleLearner
@@ -24,6 +24,9 @@ _PRUNE = math.log(1e-4)  # hypotheses less probable than this are dropped for th
 _SCALE_RATE = 0.02
 _TRUST, _FADE = 0.1, 0.9  # what one sample says of leader and common learner, and how fast that fades
 _SAMPLES = 64  # remembered of an episode
+_REMEMBERED = 96  # grasps, with their signatures and samples
+_NEW_PRIOR = 0.3  # nu, the weight of "new" in episodes
+_COMMON_WEIGHTS = (0.1, 0.01, 0.0)  # shares of the common learner's information that a new model starts with
 
 
 class ModelBank(SingleLearner):
@@ -57,7 +60,7 @@ class ModelBank(SingleLearner):
     "New" starts from what is common: a learner of all objects whose information is multiplied by a
     weight. It predicts the same and is less sure of it: for a familiar object it loses to the model
     that was sure and right, for an unfamiliar one it wins against all that are sure and wrong. How much
-    objects have in common nobody knows beforehand, so each of ``common_weights`` is a hypothesis, down
+    objects have in common nobody knows beforehand, so each of three weights is a hypothesis, down
     to 0, the empty learner. No threshold decides, only the evidence.
 
     To a controller it is a learner like any other. Residuals have heavier tails than a Gaussian, and
@@ -68,12 +71,8 @@ class ModelBank(SingleLearner):
         factory: makes an empty learner; all hypotheses are copies of what it returns.
         models: largest number of objects. Once they are there, nothing is new any more.
         window: samples in which an object is recognised.
-        new_prior: nu, the weight of "new" in episodes.
         temperature: tau in (0, 1]; below 1 since the samples of one grasp are not independent.
-        common_weights: shares of the common learner's information that a new model may start with.
         signature_features: width of z; 0: grasps have no signature.
-        signatures: how signatures scatter; by default a :class:`SignatureModel` with its own figures.
-        remember: grasps that are remembered with their signatures and samples.
 
     Raises:
         ParameterError: a figure outside its range, or the factory's learners are a fleet.
@@ -88,27 +87,18 @@ class ModelBank(SingleLearner):
         models: int = 8,
         *,
         window: int = 16,
-        new_prior: float = 0.3,
         temperature: float = 0.5,
-        common_weights: Sequence[float] = (0.1, 0.01, 0.0),
         signature_features: int = 0,
-        signatures: SignatureModel | None = None,
-        remember: int = 96,
     ) -> None:
         first = factory()
         like: dict[str, Any] = {"dtype": first.dtype, "device": first.device}
         super().__init__(first.in_features, first.out_features, batch_shape=first.batch_shape, **like)
         self.models, self.window = check_count("models", models), check_count("window", window)
-        # with fewer a model might lose the last grasp by which it is known
-        check_count("remember", remember, least=self.models + 1)
         check_count("signature_features", signature_features, least=0)
-        if not common_weights or not all(0 <= weight <= 1 for weight in common_weights):
-            raise ParameterError("common_weights", common_weights, "one or more shares in [0, 1]")
-        self.new_prior = check_positive("new_prior", new_prior)
         self.temperature = check_fraction("temperature", temperature)
-        self.common_weights, self.common = tuple(common_weights), first
+        self.common = first
         self.kept: Any = nn.ModuleList(copy.deepcopy(first) for _ in range(models))
-        hypotheses = models + len(self.common_weights)  # the last ones: "new"
+        hypotheses = models + len(_COMMON_WEIGHTS)  # the last ones: "new"
         self.trial: Any = nn.ModuleList(copy.deepcopy(first) for _ in range(hypotheses))
         zeros = self._like.new_zeros
         self.episodes = nn.Buffer(zeros(models, dtype=torch.int64))
@@ -118,10 +108,12 @@ class ModelBank(SingleLearner):
         self.leader = nn.Buffer(zeros((), dtype=torch.int64))
         self.scale = nn.Buffer(self._like.new_ones(self.out_features))
         self.lead = nn.Buffer(zeros((), dtype=torch.float64))  # logit p
-        self.signatures = SignatureModel() if signatures is None else signatures
+        self.signatures = SignatureModel()
         self.memory: EpisodeMemory | None = None
         if signature_features:
-            self.memory = EpisodeMemory(first, models, signature_features, remember, _SAMPLES)
+            # with fewer a model might lose the last grasp by which it is known
+            grasps = max(_REMEMBERED, models + 1)
+            self.memory = EpisodeMemory(first, models, signature_features, grasps, _SAMPLES)
         self.signed = nn.Buffer(zeros((), dtype=torch.bool))
         self._open(None)
 
@@ -187,20 +179,20 @@ class ModelBank(SingleLearner):
             p = self.signatures.log_posterior(signature.to(past), past, label, new)
             self.log_prior[:new][known] = p[known]
             free = p[~known].logsumexp(0) if not bool(known.all()) else p.new_tensor(-math.inf)
-            self.log_prior[new:] = free - math.log(len(self.common_weights))
+            self.log_prior[new:] = free - math.log(len(_COMMON_WEIGHTS))
         else:
             n = self.n_models
-            share = self.new_prior / (self.new_prior + float(self.episodes.sum()))
+            share = _NEW_PRIOR / (_NEW_PRIOR + float(self.episodes.sum()))
             share = 1.0 if n == 0 else 0.0 if n == self.models else share
             if n:
                 self.log_prior[:new][known] = math.log((1 - share) / n)
             if share:
-                self.log_prior[new:] = math.log(share / len(self.common_weights))
+                self.log_prior[new:] = math.log(share / len(_COMMON_WEIGHTS))
         self.log_evidence.zero_()
         self.seen.zero_()
         for i in torch.nonzero(known).flatten().tolist():
             self.trial[i].load_state_dict(self.kept[i].state_dict())
-        for i, weight in enumerate(self.common_weights, start=new):
+        for i, weight in enumerate(_COMMON_WEIGHTS, start=new):
             self._begin_new(self.trial[i], weight)
         self.leader.copy_(self.log_prior.argmax())
 
@@ -222,7 +214,7 @@ class ModelBank(SingleLearner):
         if self.memory is None:
             return slot
         evidence = self.log_evidence[: self.models].clone()
-        weights = math.log(len(self.common_weights))
+        weights = math.log(len(_COMMON_WEIGHTS))
         evidence[self.episodes == 0] = self.log_evidence[self.models :].logsumexp(0) - weights
         evidence[slot] = self.log_evidence[best]
         row = self.memory.keep(slot, evidence)
@@ -238,7 +230,7 @@ class ModelBank(SingleLearner):
         memory.label[rows] = after
         for slot in set(before[moved].tolist()) | set(after[moved].tolist()):
             self.episodes[slot] += int((after == slot).sum() - (before == slot).sum())
-            self._begin_new(self.kept[slot], min(self.common_weights))
+            self._begin_new(self.kept[slot], min(_COMMON_WEIGHTS))
             memory.replay(slot, self.kept[slot])
 
     # -- a learner like any other ---------------------------------------------------------------------

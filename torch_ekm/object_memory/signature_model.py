@@ -6,7 +6,6 @@ import math
 
 import torch
 
-from .._checks import check_positive
 from ..typing import Float, Int, Tensor
 
 _MOST_MOVES = 64
@@ -31,18 +30,11 @@ class SignatureModel:
     scatter's prior. W is learned from all objects together: a few grasps of each are too few for
     covariances of their own.
 
-    Args:
-        spread: how far apart objects are thought to be, in units of that scatter.
-        strength: nu_0, in samples: how firmly the expected scatter is believed.
-        concentration: alpha, the weight of "new".
-
-    Raises:
-        ParameterError: a figure is not positive.
     """
 
-    def __init__(self, spread: float = 4.0, strength: float = 30.0, concentration: float = 1.0) -> None:
-        self.spread, self.strength = check_positive("spread", spread), check_positive("strength", strength)
-        self.concentration = check_positive("concentration", concentration)
+    spread = 4.0  #: how far apart objects are thought to be, in units of that scatter
+    strength = 30.0  #: nu_0, in samples: how firmly the expected scatter is believed
+    concentration = 1.0  #: alpha, the weight of "new"
 
     def log_joint(
         self, z: Float[Tensor, "n d"], label: Int[Tensor, "*batch n"], groups: int

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pathlib
+import threading
 from abc import ABC, abstractmethod
 from typing import Any, Literal
 
@@ -15,7 +16,6 @@ from .._checks import check_count, check_counts, check_finite
 from .._recorded import Recorded, check_state, describe
 from ..exceptions import ParameterError, ShapeError
 from ..typing import Bool, Float, Tensor
-from .lock import UpdateLock
 from .report import UpdateReport
 
 
@@ -66,7 +66,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
             raise ParameterError("on_invalid", on_invalid, "'raise' or 'skip'")
         self.on_invalid = on_invalid
         self.n_refused = nn.Buffer(torch.zeros(self.batch_shape, dtype=torch.int64, device=device))
-        self.lock = UpdateLock()
+        self.lock = threading.RLock()
         # An empty float tensor follows .to() and so remembers dtype and device for all subclasses.
         self._like = nn.Buffer(torch.empty(0, dtype=dtype, device=device), persistent=False)
 
@@ -184,6 +184,14 @@ class ResidualLearner(Recorded, nn.Module, ABC):
 
     # -- state ----------------------------------------------------------------------------------
 
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy has a lock of its own, and a pickled learner a new one."""
+        return {name: value for name, value in vars(self).items() if name != "lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self.lock = threading.RLock()
+
     def get_extra_state(self) -> dict[str, Any]:
         """What it was made with, so that no other learner takes its state. Subclasses add to it."""
         return {"made_with": describe(self)}
@@ -285,6 +293,9 @@ class DoubleStateLearner(ResidualLearner):
             return tensor.to(moved.device)
 
         return super()._apply(keep_double, recurse)
+
+    def _cast(self, x: Tensor) -> Tensor:
+        return torch.as_tensor(x, dtype=torch.float64, device=self.device)
 
 
 class SingleLearner(ResidualLearner):

@@ -15,11 +15,10 @@ from ..typing import Float, Tensor
 from .base import ResidualLearner
 from .last_residual import LastResidual
 from .report import MomentsWithJacobians, UpdateReport
-from .tails import ScaleMixture
+from .tails import MEMORY, ScaleMixture
 
 _CARRIES = (-0.3, 0.0, 0.2, 0.4, 0.6, 0.8)  # values of kappa to choose from
 _CAPS = (3.0, 30.0)  # and of c
-_MEMORY = 0.99  # forgetting factor of the evidence
 _PRIOR = 0.8  # belief that a learner is to be taken at its word
 _FREEDOM = 10.0  # of the t law that judges the experts: an outlier must not decide alone
 _LEVEL_DECAY, _TREND_DECAY = 0.995, 0.98
@@ -90,9 +89,10 @@ class MixtureResidual(ResidualLearner):
         factory = {"dtype": self.dtype, "device": self.device}
         self._experts = nn.Buffer(torch.tensor(values, **factory), persistent=False)
         members_of = torch.nn.functional.one_hot(torch.tensor(owner), len(members))
-        self._owner = nn.Buffer(members_of.to(self._like), persistent=False)
+        self.owner = nn.Buffer(members_of.to(self._like), persistent=False)
+        """1 where an expert takes its mean from that learner, ``(experts, learners)``."""
         # the belief of `shares` is split over what is not a share of 1, if 1 is among them
-        plain = self._experts[0] == max(shares)
+        plain = self.shares == max(shares)
         others = max(len(set(shares)) - 1, 1)
         prior = torch.where(plain, _PRIOR, (1 - _PRIOR) / others).log()
         self.prior = nn.Buffer(prior, persistent=False)
@@ -107,7 +107,7 @@ class MixtureResidual(ResidualLearner):
         self.inflation = nn.Buffer(torch.ones(wide[:-1], **factory))
         self.count = nn.Buffer(torch.zeros(self.batch_shape, **factory))
         fleet = {"batch_shape": self.batch_shape, **factory}
-        self.tails = ScaleMixture(self.out_features, memory=_MEMORY, **fleet)
+        self.tails = ScaleMixture(self.out_features, **fleet)
         self._settle()
 
     # -- predictions ----------------------------------------------------------------------------
@@ -127,9 +127,9 @@ class MixtureResidual(ResidualLearner):
             return Normal(mean, deviation, validate_args=False)
         laws = [learner.predict(x) for learner in self.members]
         variances = torch.stack([law.variance for law in laws], dim=-1).to(x.dtype)
-        inside = self._experts[0].square() * (variances @ self._owner.mT)
+        inside = self.shares.square() * (variances @ self.owner.mT)
         between = (self._means(means) - mean.unsqueeze(-1)).square()
-        variance = (self._weights() * (inside + between)).sum(-1)
+        variance = (self.beliefs * (inside + between)).sum(-1)
         # y is measured: experts that disagree by more than y scatters do not know less of g than of y
         return Normal(mean, torch.minimum(variance.sqrt(), deviation), validate_args=False)
 
@@ -162,10 +162,10 @@ class MixtureResidual(ResidualLearner):
         m, v, dm, dv = (torch.stack(part, dim=-1).to(x.dtype) for part in zip(*each, strict=True))
         noisy = [learner.predict(x, observation=True).variance for learner in self.members]
         mean = (self.gain * m).sum(-1) + self.offset
-        p, h, inflation = self._weights(), self._experts[0], self.inflation
+        p, h, inflation = self.beliefs, self.shares, self.inflation
         apart = self._means(m) - mean.unsqueeze(-1)
-        variance = (p * (h.square() * (v @ self._owner.mT) + apart.square())).sum(-1)
-        of_v, of_m = (p * h.square()) @ self._owner, (2.0 * p * h * apart) @ self._owner
+        variance = (p * (h.square() * (v @ self.owner.mT) + apart.square())).sum(-1)
+        of_v, of_m = (p * h.square()) @ self.owner, (2.0 * p * h * apart) @ self.owner
         slope = (of_v.unsqueeze(-2) * dv).sum(-1) + (of_m.unsqueeze(-2) * dm).sum(-1)
         share = self.weights
         most = inflation * (share * torch.stack(noisy, dim=-1).to(x.dtype)).sum(-1)
@@ -185,12 +185,7 @@ class MixtureResidual(ResidualLearner):
     @property
     def weights(self) -> Float[Tensor, "*batch out learners"]:
         """Posterior probability of each learner, at whatever share."""
-        return self._weights() @ self._owner
-
-    @property
-    def carry(self) -> Float[Tensor, "*batch out"]:
-        """Expected kappa: which part of an innovation comes back with the opposite sign."""
-        return (self._weights() * self._experts[1]).sum(-1)
+        return self.beliefs @ self.owner
 
     @property
     def shares(self) -> Float[Tensor, " experts"]:
@@ -198,19 +193,14 @@ class MixtureResidual(ResidualLearner):
         return self._experts[0]
 
     @property
-    def owner(self) -> Float[Tensor, "experts learners"]:
-        """1 where an expert takes its mean from that learner."""
-        return self._owner
-
-    @property
     def beliefs(self) -> Float[Tensor, "*batch out experts"]:
         """Posterior probability p of each expert, by output."""
-        return self._weights()
+        return (self.prior + self.evidence).softmax(-1)
 
     @property
     def carried(self) -> Float[Tensor, "*batch out experts"]:
         """What each expert adds to its learner's mean: ``l - kappa w``."""
-        return self._carried()
+        return self.level - self._experts[1] * self.innovation
 
     # -- learning -------------------------------------------------------------------------------
 
@@ -246,7 +236,7 @@ class MixtureResidual(ResidualLearner):
         scale = (deviation * typical).unsqueeze(-1)
         far = _bounded(innovation / scale)
         r = (far * (typical / judged_by).unsqueeze(-1)).square()
-        evidence = _MEMORY * self.evidence - 0.5 * (_FREEDOM + 1.0) * torch.log1p(r / _FREEDOM)
+        evidence = MEMORY * self.evidence - 0.5 * (_FREEDOM + 1.0) * torch.log1p(r / _FREEDOM)
         evidence = (evidence - evidence.amax(-1, keepdim=True)).clamp_min(_LEAST)
         innovation = scale * far / (1.0 + (far / self._experts[4]).square())
         trend = _TREND_DECAY * self.trend + self._experts[3] * innovation
@@ -277,20 +267,14 @@ class MixtureResidual(ResidualLearner):
 
     # -- pieces ---------------------------------------------------------------------------------
 
-    def _weights(self) -> Tensor:
-        return (self.prior + self.evidence).softmax(-1)
-
-    def _carried(self) -> Tensor:
-        return self.level - self._experts[1] * self.innovation
-
     def _means(self, means: Float[Tensor, "*any out learners"]) -> Float[Tensor, "*any out experts"]:
-        return self._experts[0] * (means @ self._owner.mT) + self._carried()
+        return self.shares * (means @ self.owner.mT) + self.carried
 
     def _settle(self) -> None:
         """Gain and offset from the weights."""
-        p = self._weights()
-        self.gain.copy_((p * self._experts[0]) @ self._owner)
-        self.offset.copy_((p * self._carried()).sum(-1))
+        p = self.beliefs
+        self.gain.copy_((p * self.shares) @ self.owner)
+        self.offset.copy_((p * self.carried).sum(-1))
 
     def _standard(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean, the deviation by which innovations are standardised (the learners' own), their means."""

@@ -39,22 +39,21 @@ class RunningScale(nn.Module):
     Args:
         features: width of x.
         shifted: columns that are centred (none by default).
-        memory: samples over which mean and spread are pooled.
         batch_shape: shape of the fleet.
     """
+
+    memory = 2000  #: samples over which mean and spread are pooled
 
     def __init__(
         self,
         features: int,
         shifted: list[bool] | None = None,
         *,
-        memory: int = 2000,
         batch_shape: tuple[int, ...] = (),
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__()
-        self.memory = memory
         shape, factory = (*batch_shape, features), {"dtype": dtype, "device": device}
         self.shift = nn.Buffer(torch.zeros(shape, **factory))
         self.scale = nn.Buffer(torch.ones(shape, **factory))

@@ -10,6 +10,7 @@ from torch.distributions import Categorical, MixtureSameFamily, StudentT
 
 from ..typing import Float, Tensor
 
+MEMORY = 0.99  #: forgetting factor of the evidence
 _RATES, _FREEDOMS = (0.02, 0.06, 0.2), (2.0, 4.0, 30.0)
 _LARGEST = 14.0  # of the logarithm of a scale: a noise-free stream must not end in 0/0
 
@@ -26,7 +27,6 @@ class ScaleMixture(nn.Module):
 
     Args:
         out_features: number of outputs, each with experts of its own.
-        memory: forgetting factor of the evidence.
         batch_shape: shape of the fleet.
     """
 
@@ -34,13 +34,11 @@ class ScaleMixture(nn.Module):
         self,
         out_features: int,
         *,
-        memory: float = 0.99,
         batch_shape: tuple[int, ...] = (),
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__()
-        self.memory = memory
         factory = {"dtype": dtype, "device": device}
         rates, freedoms = zip(*itertools.product(_RATES, _FREEDOMS), strict=True)
         self.rates = nn.Buffer(torch.tensor(rates, **factory), persistent=False)
@@ -70,7 +68,7 @@ class ScaleMixture(nn.Module):
         r = (z / scale).square()
         score = (self.freedoms + 1.0) * r / (self.freedoms + r) - 1.0
         step = torch.maximum(self.rates, (0.5 / (1.0 + count / 4.0))[..., None, None]) * score
-        evidence = self.memory * self.evidence + density
+        evidence = MEMORY * self.evidence + density
         evidence = evidence - evidence.amax(-1, keepdim=True)
         log_scale = (self.log_scale + step).clamp(-_LARGEST, _LARGEST)
         if mask is not None:

@@ -30,9 +30,10 @@ class KRLSTracker(ScaledLearner, SingleLearner, DoubleStateLearner):
         kernel: default Matern 3/2 with lengthscale sqrt(in_features).
         noise_variance: s2.
         forgetting_factor: lam in (0, 1].
-        jitter: nugget relative to k**, also the tolerance below which a sample is not novel.
         options: see ScaledLearner; ``batch_shape`` must be (): several are a ``LearnerFleet``.
     """
+
+    jitter = 1e-6  #: nugget relative to k**, also the tolerance below which a sample is not novel
 
     def __init__(
         self,
@@ -43,14 +44,12 @@ class KRLSTracker(ScaledLearner, SingleLearner, DoubleStateLearner):
         kernel: Kernel | None = None,
         noise_variance: float = 0.1,
         forgetting_factor: float = 1.0,
-        jitter: float = 1e-6,
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
         self.capacity = check_count("capacity", capacity)
         self.noise_variance = check_positive("noise_variance", noise_variance)
         self.forgetting_factor = check_fraction("forgetting_factor", forgetting_factor)
-        self.jitter = check_positive("jitter", jitter)
         factory = {"dtype": torch.float64, "device": self.device}
         self.kernel = Matern32(in_features, **factory) if kernel is None else kernel.double()
         M = self.capacity + 1
@@ -133,9 +132,6 @@ class KRLSTracker(ScaledLearner, SingleLearner, DoubleStateLearner):
             matrix[i] = 0.0
             matrix[:, i] = 0.0
         self.mu[i] = 0.0
-
-    def _cast(self, x: Tensor) -> Tensor:
-        return torch.as_tensor(x, dtype=torch.float64, device=self.device)
 
     def _cross(self, z: Tensor) -> Tensor:
         return self.kernel.vector(z, self.basis) * self.active

@@ -30,10 +30,11 @@ class LinearInFeatures(ScaledLearner):
         n_phi: number of features f.
         noise_variance, weight_variance: s2 and v.
         forgetting_factor: lam in (0, 1], see ForgettingFactor.
-        refresh_every: samples between two rebuilds.
         robust: c of the weight ``1 / (1 + z2/c^2)`` on a sample's noise; None: weight 1.
         options: see ScaledLearner and ResidualLearner.
     """
+
+    refresh_every = 16  #: samples between two rebuilds
 
     def __init__(
         self,
@@ -45,7 +46,6 @@ class LinearInFeatures(ScaledLearner):
         weight_variance: float = 1.0,
         forgetting_factor: float = 1.0,
         robust: float | None = None,
-        refresh_every: int = 16,
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
@@ -53,7 +53,6 @@ class LinearInFeatures(ScaledLearner):
         self.weight_variance = check_positive("weight_variance", weight_variance)
         self.forgetting_factor = check_fraction("forgetting_factor", forgetting_factor)
         self.robust = None if robust is None else check_positive("robust", robust)
-        self.refresh_every = check_count("refresh_every", refresh_every)
         f, zeros = n_phi, self._like.new_zeros
         self.information = nn.Buffer(zeros(*self.batch_shape, f, f))
         self.target = nn.Buffer(zeros(*self.batch_shape, f, self.out_features))
@@ -61,11 +60,7 @@ class LinearInFeatures(ScaledLearner):
         self.covariance = nn.Buffer(prior.expand(*self.batch_shape, f, f).clone())
         self.weights = nn.Buffer(zeros(*self.batch_shape, f, self.out_features))
         self.pending = nn.Buffer(zeros(self.batch_shape))
-        self._make_units(self._shifted(), self.dtype)
-
-    def _shifted(self) -> list[bool]:
-        """Columns of x whose origin does not matter."""
-        return [True] * self.in_features
+        self._make_units([True] * self.in_features, self.dtype)
 
     @abstractmethod
     def features(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any f"]:
@@ -132,24 +127,14 @@ class RecursiveLeastSquares(LinearInFeatures):
     """``g(x) = W' [x, 1]``: Bayesian recursive least squares with forgetting.
 
     Args:
-        bias: append the constant 1.
         options: see LinearInFeatures.
     """
 
-    def __init__(self, in_features: int, out_features: int, *, bias: bool = True, **options: Any) -> None:
-        self._bias = bool(bias)  # the units ask for it
-        super().__init__(in_features, out_features, in_features + bias, **options)
-
-    @property
-    def bias(self) -> bool:
-        """Whether the constant 1 is among the features."""
-        return self._bias
-
-    def _shifted(self) -> list[bool]:
-        return [self.bias] * self.in_features
+    def __init__(self, in_features: int, out_features: int, **options: Any) -> None:
+        super().__init__(in_features, out_features, in_features + 1, **options)
 
     def features(self, x: Tensor) -> Tensor:
-        return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1) if self.bias else x
+        return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1)
 
     def _slopes(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """The slope is W itself, everywhere."""
@@ -159,10 +144,9 @@ class RecursiveLeastSquares(LinearInFeatures):
     def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
         """``new phi = T phi``: ``A <- T A T'``, ``b <- T (b + A 1 o) r``, 1 being the bias' place."""
         (offset, ratio), (offset_t, ratio_t) = change, change_t
-        T = torch.diag_embed(torch.cat([ratio, torch.ones_like(ratio[..., :1])], -1) if self.bias else ratio)
-        if self.bias:
-            T[..., :-1, -1] = offset * ratio
-            self.target += self.information[..., -1:] * offset_t.unsqueeze(-2)
+        T = torch.diag_embed(torch.cat([ratio, torch.ones_like(ratio[..., :1])], -1))
+        T[..., :-1, -1] = offset * ratio
+        self.target += self.information[..., -1:] * offset_t.unsqueeze(-2)
         self.information.copy_(T @ self.information @ T.mT)
         self.target.copy_(T @ self.target * ratio_t.unsqueeze(-2))
         self._rebuild()

@@ -66,6 +66,11 @@ class ReplayMLP(ScaledLearner, SingleLearner):
         self._clear()
         self._make_units([True] * self.in_features, self.dtype)
 
+    @property
+    def _start(self) -> list[Tensor]:
+        """The weights theta_0 that every member began with."""
+        return [self.get_buffer(f"start_{i}") for i in range(len(self.theta))]
+
     def _mean(self, z: Tensor) -> Tensor:
         """Mean of the members."""
         return self._members(z).mean(-2)
@@ -103,8 +108,7 @@ class ReplayMLP(ScaledLearner, SingleLearner):
         self.inputs[:n].add_(offset).mul_(ratio)
         self.targets[:n].add_(offset_t).mul_(ratio_t)
         self.noise.mul_(ratio_t.square())
-        start = [self.get_buffer(f"start_{i}") for i in range(len(self.theta))]
-        for theta, shift in (([p.data for p in self.theta], offset_t), (start, 0.0)):
+        for theta, shift in (([p.data for p in self.theta], offset_t), (self._start, 0.0)):
             theta[1].sub_(offset.unsqueeze(-2) @ theta[0])
             theta[0].div_(ratio.unsqueeze(-1))
             theta[-2].mul_(ratio_t)
@@ -118,8 +122,7 @@ class ReplayMLP(ScaledLearner, SingleLearner):
 
     def _members(self, x: Tensor) -> Tensor:
         x = x.unsqueeze(-2).unsqueeze(-2)
-        start = [self.get_buffer(f"start_{i}") for i in range(len(self.theta))]
-        return (self._net(x, list(self.theta)) - self._net(x, start)).squeeze(-2)
+        return (self._net(x, list(self.theta)) - self._net(x, self._start)).squeeze(-2)
 
     def _learn(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         mean, variance = self._law(x, True)
@@ -128,7 +131,6 @@ class ReplayMLP(ScaledLearner, SingleLearner):
         self.noise.lerp_((y - mean).square(), max(0.02, 1.0 / (n + 2)))
         self.inputs[n % self.memory], self.targets[n % self.memory] = x, y
         self.count += 1
-        start = [self.get_buffer(f"start_{i}") for i in range(len(self.theta))]
         # the sample's number seeds its minibatches, so that a reloaded learner draws the same
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + n)
         for step in range(_STEPS):
@@ -136,7 +138,7 @@ class ReplayMLP(ScaledLearner, SingleLearner):
             index = torch.randint(min(n + 1, self.memory), size, generator=generator)
             index[:, 0] = n % self.memory
             index = index.to(self.device)
-            bx, by = self.inputs[index], self.targets[index] + self._net(self.inputs[index], start)
+            bx, by = self.inputs[index], self.targets[index] + self._net(self.inputs[index], self._start)
             with torch.enable_grad():
                 theta = [p.detach().requires_grad_(True) for p in self.theta]
                 loss = (self._net(bx, theta) - by).square().sum((0, 2)).mean()

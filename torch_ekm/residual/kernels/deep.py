@@ -14,6 +14,8 @@ from ...typing import Float, Tensor
 from .kernel import Kernel
 from .stationary import StationaryKernel, squared_distances
 
+_INITIAL_SCALE = 0.3  # of the features at the start, relative to an ordinary initialisation
+
 
 class DeepKernel(Kernel):
     """``k(x, z) = v phi(|x - z|^2_L + |net(x) - net(z)|^2)``.
@@ -28,7 +30,6 @@ class DeepKernel(Kernel):
         base: stationary kernel that gives v, L and phi.
         hidden: widths of the hidden layers.
         features: width of net(x).
-        initial_scale: size of the features at the start, relative to an ordinary initialisation.
         seed: of the weights.
 
     Raises:
@@ -43,7 +44,6 @@ class DeepKernel(Kernel):
         *,
         hidden: Sequence[int] = (64, 64),
         features: int = 16,
-        initial_scale: float = 0.3,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -56,7 +56,7 @@ class DeepKernel(Kernel):
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         self._remembered: tuple[tuple[Tensor, ...], list, Tensor] | None = None
         for layer, (n_in, n_out) in enumerate(itertools.pairwise(widths)):
-            scale = (initial_scale if layer == len(widths) - 2 else 1.0) / n_in**0.5
+            scale = (_INITIAL_SCALE if layer == len(widths) - 2 else 1.0) / n_in**0.5
             # every model of a fleet starts with the same weights, as a single model would
             weight = scale * torch.randn(n_in, n_out, generator=generator, dtype=torch.float64)
             weight = weight.to(like).expand(*fleet, n_in, n_out).contiguous()
@@ -123,9 +123,6 @@ class DeepKernel(Kernel):
         phi, psi = self.base.phi_psi(near.square().sum(-1) + far.square().sum(-1))
         v = self.base.log_variance.exp().unsqueeze(-1)
         return v * phi, (v * psi).unsqueeze(-1) * (near * w + far @ slope.mT)
-
-    def diagonal_gradient(self, x: Tensor) -> Tensor:
-        return torch.zeros_like(x)
 
     def shift_invariant(self, in_features: int) -> list[bool]:
         # not invariant, but the network learns any shift: centred inputs keep tanh in its range

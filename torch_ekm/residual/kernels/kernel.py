@@ -36,9 +36,9 @@ class Kernel(Recorded, nn.Module, ABC):
     ) -> tuple[Tensor, Tensor]:
         """``(k(x, z_j), d k(x, z_j)/dx)``: shapes ``(*batch, m)`` and ``(*batch, m, d)``."""
 
-    @abstractmethod
     def diagonal_gradient(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
-        """d k(x, x)/dx of one point per model, 0 if the kernel is stationary."""
+        """d k(x, x)/dx of one point per model; 0 here, where the same prior variance holds everywhere."""
+        return torch.zeros_like(x)
 
     def vector(self, x: Float[Tensor, "*batch d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
         """k(x, z_j) for one query per model, ``(*batch, m)``."""

@@ -61,13 +61,13 @@ class StationaryKernel(Kernel):
 
     @staticmethod
     @abstractmethod
-    def phi(d2: Tensor) -> Tensor:
-        """Correlation phi at the squared scaled distance ``d2``, 1 at 0."""
-
-    @staticmethod
-    @abstractmethod
     def phi_psi(d2: Tensor) -> tuple[Tensor, Tensor]:
         """Correlation phi and ``psi = -2 dphi/d(d2)`` at the squared scaled distance."""
+
+    @classmethod
+    def phi(cls, d2: Tensor) -> Tensor:
+        """Correlation phi at the squared scaled distance ``d2``, 1 at 0."""
+        return cls.phi_psi(d2)[0]
 
     def forward(self, x: Tensor, z: Tensor) -> Tensor:
         w = self.log_lengthscale.neg().exp().unsqueeze(-2)
@@ -97,9 +97,6 @@ class StationaryKernel(Kernel):
         v = self.log_variance.exp().unsqueeze(-1)
         return v * phi, (v * psi).unsqueeze(-1) * (u * w)
 
-    def diagonal_gradient(self, x: Tensor) -> Tensor:
-        return torch.zeros_like(x)
-
     def shift_invariant(self, in_features: int) -> list[bool]:
         return [True] * in_features
 
@@ -109,10 +106,6 @@ class StationaryKernel(Kernel):
 
 class SquaredExponential(StationaryKernel):
     """``k = v exp(-1/2 |x - z|^2_L)``."""
-
-    @staticmethod
-    def phi(d2: Tensor) -> Tensor:
-        return torch.exp(-0.5 * d2)
 
     @staticmethod
     def phi_psi(d2: Tensor) -> tuple[Tensor, Tensor]:
@@ -128,13 +121,8 @@ class Matern32(StationaryKernel):
     """``k = v (1 + sqrt(3) r) exp(-sqrt(3) r)``, ``r = |x - z|_L``."""
 
     @staticmethod
-    def phi(d2: Tensor) -> Tensor:
-        r = (3.0 * d2.clamp_min(_TINY)).sqrt()
-        return (1.0 + r) * torch.exp(-r)
-
-    @staticmethod
     def phi_psi(d2: Tensor) -> tuple[Tensor, Tensor]:
-        r = (3.0 * d2).sqrt()
+        r = (3.0 * d2.clamp_min(_TINY)).sqrt()
         decay = torch.exp(-r)
         return (1.0 + r) * decay, 3.0 * decay
 
@@ -143,12 +131,7 @@ class Matern52(StationaryKernel):
     """``k = v (1 + sqrt(5) r + 5/3 r^2) exp(-sqrt(5) r)``, ``r = |x - z|_L``."""
 
     @staticmethod
-    def phi(d2: Tensor) -> Tensor:
-        r = (5.0 * d2.clamp_min(_TINY)).sqrt()
-        return (1.0 + r + r * r / 3.0) * torch.exp(-r)
-
-    @staticmethod
     def phi_psi(d2: Tensor) -> tuple[Tensor, Tensor]:
-        r = (5.0 * d2).sqrt()
+        r = (5.0 * d2.clamp_min(_TINY)).sqrt()
         decay = torch.exp(-r)
         return (1.0 + r + r * r / 3.0) * decay, (5.0 / 3.0) * (1.0 + r) * decay

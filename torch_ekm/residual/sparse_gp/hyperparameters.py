@@ -20,6 +20,11 @@ from .prequential_loss import PrequentialLoss, Queries
 from .replay import ReplayMemory
 
 _REPLAYED = 4  # samples of the memory per sample of the window, in each step; at least as many as points
+# Adam's first step on parameters that are no logarithms: a deep kernel's weights
+_NETWORK_RATE = 0.015
+# the part of these that goes with each step, times the noise's share of y (and shrinking as steps do):
+# features of noise do not stay (decoupled as in Loshchilov & Hutter, ICLR 2019)
+_NETWORK_DECAY = 0.25
 
 
 class LearnHyperparameters(Part):
@@ -47,9 +52,6 @@ class LearnHyperparameters(Part):
         steps: gradient steps per rebuild.
         memory: samples of the past to learn from, too (ReplayMemory); 0: the last k only. Not with
             :class:`ProcessNoise`: where g wanders the past is another g.
-        network_rate: Adam's first step on parameters that are no logarithms (a deep kernel's weights).
-        network_decay: the part of these that goes with each step, times the noise's share of y (and shrinking
-            as steps do): features of noise do not stay (decoupled as in Loshchilov & Hutter, ICLR 2019).
 
     Raises:
         ParameterError: a figure is outside its range.
@@ -57,21 +59,9 @@ class LearnHyperparameters(Part):
 
     stands_last = True
 
-    def __init__(
-        self,
-        *,
-        rate: float = 0.03,
-        steps: int = 1,
-        memory: int = 0,
-        network_rate: float = 0.015,
-        network_decay: float = 0.25,
-    ) -> None:
+    def __init__(self, *, rate: float = 0.03, steps: int = 1, memory: int = 0) -> None:
         super().__init__()
         self.rate = check_positive("rate", rate)
-        self.network_rate = check_positive("network_rate", network_rate)
-        if not 0 <= network_decay < 1:
-            raise ParameterError("network_decay", network_decay, "in [0, 1)")
-        self.network_decay = float(network_decay)
         self.steps, self.memory = check_count("steps", steps), check_count("memory", memory, least=0)
 
     def bind(self, learner: Host) -> None:
@@ -140,7 +130,7 @@ class LearnHyperparameters(Part):
             x, y = torch.cat([x, x_past], dim=-2), torch.cat([y, y_past], dim=-2)
             weight = torch.cat([weight, weight_past], dim=-1)
             absorbed, age = torch.cat([absorbed, torch.ones_like(age_past)]), torch.cat([age, age_past])
-        return Queries(*learner.units.of_sets(x, y), weight, absorbed, age, self.past is not None)
+        return Queries(*learner.units.of_sets(x, y), weight, absorbed, age)
 
     def descend(self, learner: Host) -> None:
         """Adam on the loss, model by model; a model without samples or finite gradient stays as it is."""
@@ -163,9 +153,9 @@ class LearnHyperparameters(Part):
             logarithm = name.split(".")[-1].startswith("log_")
             shared = self.shared_kernel and name != "log_noise"
             good = gradient.isfinite() & (_spread(on, p, shared) > 0)
-            rate = (self.rate if logarithm else self.network_rate) * _spread(correction, p, shared)
-            if not logarithm and self.network_decay:
-                p.mul_(1.0 - self.network_decay * _spread(noise * _shrink(n), p, shared))
+            rate = (self.rate if logarithm else _NETWORK_RATE) * _spread(correction, p, shared)
+            if not logarithm:
+                p.mul_(1.0 - _NETWORK_DECAY * _spread(noise * _shrink(n), p, shared))
             self.adam.move(i, p, gradient.where(good, 0.0), rate, good)
             if logarithm:  # far beyond what standardised data can mean
                 p.clamp_(-14.0 if name == "log_noise" else -7.0, 7.0)

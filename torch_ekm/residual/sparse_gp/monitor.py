@@ -6,9 +6,10 @@ import torch
 from torch import nn
 
 from ..._checks import check_positive
-from ...typing import Bool, Float, Tensor
+from ...typing import Float, Tensor
 from .part import Host, Part, Sample
 
+_CALIBRATION_RATE = 0.2  # of the logarithm of a factor on the noise
 _Z90_SQUARED = 1.6448536269514722**2
 RATE = 1 / 8  #: of the shares of samples that do not fit
 _MEMORY = 24  # samples kept, of which those since the change are replayed
@@ -56,21 +57,11 @@ class RobustWeight(Part):
 class CalibrateNoise(Part):
     """Factors c_j on the observation noise that make 90 % intervals hold 90 % of the samples::
 
-        log c_j += rate ([|i_j| > 1.645 sqrt(v + c_j s2_j)] - 0.1)
+        log c_j += 0.2 ([|i_j| > 1.645 sqrt(v + c_j s2_j)] - 0.1)
 
     Adaptive conformal inference (Gibbs & Candes, NeurIPS 2021): the long-run share of misses is 10 %
     whatever the law of the noise, per output, without touching the mean or the gain.
-
-    Args:
-        rate: of the logarithm.
-
-    Raises:
-        ParameterError: not positive.
     """
-
-    def __init__(self, rate: float = 0.2) -> None:
-        super().__init__()
-        self.rate = check_positive("rate", rate)
 
     def bind(self, learner: Host) -> None:
         """Factors c = 1 on the noise of all outputs."""
@@ -81,7 +72,7 @@ class CalibrateNoise(Part):
         noise = learner.log_noise_variance.exp()
         variance = sample.variance.unsqueeze(-1) + noise * self.log_factor.exp()
         missed = sample.innovation.square() > _Z90_SQUARED * variance
-        step = self.rate * (missed.to(noise.dtype) - 0.1)
+        step = _CALIBRATION_RATE * (missed.to(noise.dtype) - 0.1)
         self.log_factor += step if sample.mask is None else step * sample.mask.unsqueeze(-1)
         self.log_factor.clamp_(-5.0, 10.0)
         return False
@@ -122,11 +113,6 @@ class DetectChanges(Part):
         changed = self.level > _ALARM
         self.level.masked_fill_(changed, _COOL)
         if bool(changed.any()):
-            learner.start_anew(changed, self.inputs, self.targets, self.since_change)
+            later = (self.levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0) > 0
+            learner.start_anew(changed, self.inputs, self.targets, later & self.levels.isfinite())
         return False
-
-    @property
-    def since_change(self) -> Bool[Tensor, "*memory_and_batch"]:
-        """Which of the kept samples belong to the new system, at an alarm."""
-        later = (self.levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0)
-        return (later > 0) & self.levels.isfinite()

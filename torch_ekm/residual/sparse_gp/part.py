@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator
-from typing import ClassVar, NamedTuple, Protocol, TypeVar, runtime_checkable
+from collections.abc import Iterable
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
 from torch import nn
@@ -12,6 +12,7 @@ from torch import nn
 from ..._recorded import Recorded
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
+from ..base import DoubleStateLearner
 from ..kernels.kernel import Kernel
 from ..report import UpdateReport
 from .posterior import SparsePosterior
@@ -70,17 +71,14 @@ class Sample(NamedTuple):
     report: UpdateReport
 
 
-@runtime_checkable
-class Host(Protocol):
-    """What a part finds in its learner."""
+class Host(DoubleStateLearner):
+    """What a part finds in its learner: the state, and how it is forgotten and learned again."""
 
-    in_features: int
-    out_features: int
-    batch_shape: torch.Size
     kernel: Kernel
     log_noise_variance: nn.Parameter
     posterior: SparsePosterior
     units: Units
+    engine: Any
     refresh_every: int
     n_samples: int
     """Samples before the present one."""
@@ -88,39 +86,56 @@ class Host(Protocol):
     """Samples of each model since the caches were made, ``(*batch_shape)``."""
     weighing: tuple[Part, ...]
     """Parts that weigh samples."""
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Precision of x and y; the state's is float64."""
-        ...
-
-    def modules(self) -> Iterator[nn.Module]:
-        """The learner and all modules in it."""
-        ...
-
-    def check_query(self, x: Tensor) -> Tensor:
-        """x in the learner's dtype, with all the fleet's axes, or ShapeError."""
-        ...
-
-    def shared_noise(self) -> Tensor:
-        """Noise variance by which the gain is computed, ``(*batch_shape)``."""
-        ...
+    _parts: tuple[Part, ...]
 
     def part(self, kind: type[P]) -> P | None:
-        """The part of that kind, if there is one (in :meth:`Part.bind`: among those before)."""
-        ...
+        """The part of that kind, e.g. ``learner.part(Standardize)``; None if it has none.
 
+        In :meth:`Part.bind` it is looked for among those before.
+        """
+        return next((part for part in self._parts if isinstance(part, kind)), None)
+
+    def shared_noise(self) -> Float[Tensor, "*batch"]:
+        """Noise by which the gain is computed: geometric mean over the (standardised) outputs."""
+        return self.log_noise_variance.mean(-1).exp()
+
+    @torch.no_grad()
     def refresh(self) -> None:
-        """Let the parts change the natural form, and rebuild the caches."""
-        ...
+        """Let the parts change the natural form, and rebuild the caches from it.
 
-    def learn_anew(self, x: Tensor, y: Tensor, on: Tensor) -> None:
-        """Empty basis; then the samples ``x (*batch, n, in)``, ``y (*batch, n, out)`` where ``on``."""
-        ...
+        Call it after a change of the kernel's or the noise's parameters.
+        """
+        for part in self._parts:
+            part.on_rebuild(self)
+        self.pending.zero_()
+        self.posterior.rebuild(self.kernel, self.shared_noise())
+        for part in self._parts:
+            part.after_rebuild(self)
 
-    def start_anew(self, models: Tensor, x: Tensor, y: Tensor, used: Tensor) -> None:
-        """These models forget all and learn the n samples ``used`` ``(n, *batch_shape)``."""
-        ...
+    def learn_anew(
+        self, x: Float[Tensor, "*batch n in"], y: Float[Tensor, "*batch n out"], on: Float[Tensor, "*batch n"]
+    ) -> None:
+        """Empty basis; then these samples, where ``on``."""
+        if x.shape[-2]:
+            self.posterior.reset()
+            for x_t, y_t, on_t in zip(x.unbind(-2), y.unbind(-2), on.unbind(-1), strict=True):
+                self.engine.absorb(self, x_t, y_t, on_t)
+            self.refresh()
+
+    def start_anew(
+        self,
+        models: Bool[Tensor, "*batch"],
+        x: Float[Tensor, "n *batch in"],
+        y: Float[Tensor, "n *batch out"],
+        used: Bool[Tensor, "*n_and_batch"],
+    ) -> None:
+        """These models forget all but units, kernel and noise, and learn the samples ``used``."""
+        self.posterior.forget(models)
+        for part in self._parts:
+            part.forget(models)
+        self.pending.masked_fill_(models, 0.0)
+        for x_t, y_t, used_t in zip(x, y, used, strict=True):
+            self.engine.absorb(self, x_t, y_t, (used_t & models).to(x.dtype))
 
 
 class Part(Recorded, nn.Module):

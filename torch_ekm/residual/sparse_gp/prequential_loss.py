@@ -24,7 +24,6 @@ class Queries(NamedTuple):
     weight: Float[Tensor, "*batch n"]
     absorbed: Float[Tensor, " n"]  # 1: part of the state, to be left out of it
     age: Float[Tensor, " n"]  # samples since then
-    replayed: bool = True  # whether some may be part of the state
 
 
 class _Slopes(NamedTuple):
@@ -133,8 +132,6 @@ class PrequentialLoss(nn.Module):
 
     def _left_out(self, p: Tensor, u: Tensor, s2: Tensor, queries: Queries) -> Tensor:
         """c: what residual and p of each query grow by once it is left out of the state."""
-        if not queries.replayed:
-            return torch.ones_like(p)
         most = (u / p.clamp_min(torch.finfo(p.dtype).tiny)).clamp_min(1.0)
         weight = queries.absorbed * queries.weight * self.forgetting_factor**queries.age
         return torch.minimum(1.0 / (1.0 - weight * p / s2).clamp_min(torch.finfo(p.dtype).eps), most)

@@ -10,15 +10,14 @@ from torch import nn
 from torch.distributions import Normal
 
 from ..._checks import check_count
-from ...typing import Bool, Float, Tensor
-from ..base import DoubleStateLearner
+from ...typing import Float, Tensor
 from ..kernels.kernel import Kernel, check_kernel, log_parameter
 from ..kernels.stationary import Matern32
 from ..report import MomentsWithJacobians, UpdateReport
 from .defaults import chosen_parts
 from .engine.compiled import CompiledEngine
 from .engine.reference import ReferenceEngine
-from .part import Host, P, Part, Sample, Units
+from .part import Host, Part, Sample, Units
 from .posterior import SparsePosterior
 from .units import Standardize
 
@@ -26,7 +25,7 @@ _LATEST = 8  # rounds of ``refresh_every`` after which the caches are rebuilt in
 _DRIFT = 1e-8  # beyond which they are rebuilt at once, see SparsePosterior.drift
 
 
-class SparseOnlineGP(DoubleStateLearner, Host):
+class SparseOnlineGP(Host):
     """``g ~ GP(0, k)``, ``y = g(x) + noise``, on at most ``capacity`` basis vectors::
 
         mean(x) = alpha' k(X, x),   var(x) = k(x, x) + k(X, x)' C k(X, x)
@@ -76,7 +75,6 @@ class SparseOnlineGP(DoubleStateLearner, Host):
     """
 
     starts = ("noise_variance",)
-    units: Units
 
     def __init__(
         self,
@@ -116,7 +114,7 @@ class SparseOnlineGP(DoubleStateLearner, Host):
         self.engine: ReferenceEngine = CompiledEngine()
         self.drifts = False  # the last look at the caches found them less exact than rounding would have it
         self.n_samples = 0  # on the host, so that the rhythm of rebuilds never asks the GPU
-        self._parts: tuple[Part, ...] = ()
+        self._parts = ()
         for part in chosen_parts(parts, standardize):
             part.bind(self)
             self._parts += (part,)
@@ -134,10 +132,6 @@ class SparseOnlineGP(DoubleStateLearner, Host):
     def forward(self, x: Tensor) -> Tensor:
         """Posterior mean ``alpha' k(X, x)`` in the outputs' units, differentiable in x."""
         return self.engine.mean(self, x)
-
-    def variance(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*all out"]:
-        """Latent variance ``k** + k'Ck`` of each output, differentiable in x."""
-        return self.engine.moments(self, x)[1]
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """N(mean, var), with the observation noise added on request."""
@@ -161,10 +155,6 @@ class SparseOnlineGP(DoubleStateLearner, Host):
 
     # -- what is known --------------------------------------------------------------------------
 
-    def part(self, kind: type[P]) -> P | None:
-        """The part of that kind, e.g. ``learner.part(Standardize)``; None if it has none."""
-        return next((part for part in self._parts if isinstance(part, kind)), None)
-
     @property
     def noise_variance(self) -> Float[Tensor, "*batch out"]:
         """Observation noise variance, in the outputs' own squared units."""
@@ -178,11 +168,6 @@ class SparseOnlineGP(DoubleStateLearner, Host):
         """Basis points in the inputs' own units; only slots with ``posterior.active == 1`` count."""
         return self.units.sets_as_given(self.posterior.basis).to(self.dtype)
 
-    @property
-    def condition_number(self) -> Float[Tensor, "*batch"]:
-        """Condition of the basis' kernel matrix (2-norm)."""
-        return torch.linalg.cond(self.posterior.gram(self.kernel))
-
     # -- learning -------------------------------------------------------------------------------
 
     def reset(self) -> None:
@@ -193,19 +178,6 @@ class SparseOnlineGP(DoubleStateLearner, Host):
         self.pending.zero_()
         self.n_refused.zero_()
         self.n_samples, self.drifts = 0, False
-
-    @torch.no_grad()
-    def refresh(self) -> None:
-        """Let the parts change the natural form, and rebuild the caches from it.
-
-        Call it after a change of the kernel's or the noise's parameters.
-        """
-        for part in self._parts:
-            part.on_rebuild(self)
-        self.pending.zero_()
-        self.posterior.rebuild(self.kernel, self.shared_noise())
-        for part in self._parts:
-            part.after_rebuild(self)
 
     def update(self, x: Tensor, y: Tensor, mask: Tensor | None = None) -> UpdateReport:
         """See :meth:`ResidualLearner.update`; single samples that the engine accepts skip its checks."""
@@ -243,43 +215,9 @@ class SparseOnlineGP(DoubleStateLearner, Host):
         """Whether the caches must be made again after n samples although no part changed the state."""
         if n % (_LATEST * self.refresh_every) == 0:
             return True
-        drift = self.engine.drift(self)
+        drift = self.posterior.drift(self.kernel, self.shared_noise())
         self.drifts = drift > 0.01 * _DRIFT
         return drift > _DRIFT
-
-    def learn_anew(
-        self, x: Float[Tensor, "*batch n in"], y: Float[Tensor, "*batch n out"], on: Float[Tensor, "*batch n"]
-    ) -> None:
-        """Empty basis; then these samples, where ``on``."""
-        if x.shape[-2]:
-            self.posterior.reset()
-            for x_t, y_t, on_t in zip(x.unbind(-2), y.unbind(-2), on.unbind(-1), strict=True):
-                self.engine.absorb(self, x_t, y_t, on_t)
-            self.refresh()
-
-    def start_anew(
-        self,
-        models: Bool[Tensor, "*batch"],
-        x: Float[Tensor, "n *batch in"],
-        y: Float[Tensor, "n *batch out"],
-        used: Bool[Tensor, "*n_and_batch"],
-    ) -> None:
-        """These models forget all but units, kernel and noise, and learn the samples ``used``."""
-        self.posterior.forget(models)
-        for part in self._parts:
-            part.forget(models)
-        self.pending.masked_fill_(models, 0.0)
-        for x_t, y_t, used_t in zip(x, y, used, strict=True):
-            self.engine.absorb(self, x_t, y_t, (used_t & models).to(x.dtype))
-
-    # -- pieces ---------------------------------------------------------------------------------
-
-    def shared_noise(self) -> Tensor:
-        """Noise by which the gain is computed: geometric mean over the (standardised) outputs."""
-        return self.log_noise_variance.mean(-1).exp()
-
-    def _cast(self, x: Tensor) -> Tensor:
-        return torch.as_tensor(x, dtype=torch.float64, device=self.device)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Number of samples seen: the rhythm of rebuilds continues after a reload."""

@@ -6,7 +6,6 @@ from typing import Literal
 
 import torch
 
-from ..._checks import check_count
 from ...exceptions import ParameterError
 from ...typing import Tensor
 from ..running_scale import ALIEN, BLOCK, RunningScale
@@ -27,17 +26,15 @@ class Standardize(Part, Units):
     of the first that lies far out is judged by those that follow.
 
     Args:
-        samples: over so many of the last the moments reach.
         output_offset: ``"zero"``: g is 0 far from all samples, as a model's residual wants it;
             ``"learned"``: the mean of y.
 
     Raises:
-        ParameterError: not a positive integer, or an unknown offset.
+        ParameterError: an unknown offset.
     """
 
-    def __init__(self, samples: int = 2000, output_offset: Literal["zero", "learned"] = "zero") -> None:
+    def __init__(self, output_offset: Literal["zero", "learned"] = "zero") -> None:
         super().__init__()
-        self.samples = check_count("samples", samples)
         if output_offset not in ("zero", "learned"):
             raise ParameterError("output_offset", output_offset, "'zero' or 'learned'")
         self.output_offset = output_offset
@@ -48,8 +45,8 @@ class Standardize(Part, Units):
         fleet = {"batch_shape": learner.posterior.batch_shape, "dtype": like.dtype, "device": like.device}
         shifted = learner.kernel.shift_invariant(learner.in_features)
         centred = [self.output_offset == "learned"] * learner.out_features
-        self.input = RunningScale(learner.in_features, shifted, memory=self.samples, **fleet)
-        self.output = RunningScale(learner.out_features, centred, memory=self.samples, **fleet)
+        self.input = RunningScale(learner.in_features, shifted, **fleet)
+        self.output = RunningScale(learner.out_features, centred, **fleet)
 
     def inputs(self, x: Tensor) -> Tensor:
         return self.input(x)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cache
 from types import ModuleType
@@ -25,13 +26,13 @@ from .reference import ReferenceEngine
 
 
 @cache
-def load_kernels() -> tuple[ModuleType, ModuleType] | None:
+def load_kernels() -> ModuleType | None:
     """The compiled loops; None where numba is missing, does not fit numpy, or cannot write its cache."""
     try:
-        from . import numba_checks, numba_kernels
+        from . import numba_kernels
     except (ImportError, RuntimeError):
         return None
-    return numba_kernels, numba_checks
+    return numba_kernels
 
 
 class CompiledEngine(ReferenceEngine):
@@ -74,7 +75,8 @@ class CompiledEngine(ReferenceEngine):
     def accepts(self, gp: Host, x: Tensor, y: Tensor) -> bool:
         if not self._takes(gp, x) or not _is_plain(y, (*self._batch, self._m)):
             return False
-        return self._have_squares(x.numpy().reshape(-1), y.numpy().reshape(-1))
+        x_, y_ = x.numpy().reshape(-1), y.numpy().reshape(-1)
+        return math.isfinite(x_.dot(x_) + y_.dot(y_))
 
     def absorb(self, gp: Host, x: Tensor, y: Tensor, on: Tensor | None) -> Absorbed:
         if not self._takes(gp, x) or not _is_plain(y, (*self._batch, self._m)):
@@ -102,13 +104,6 @@ class CompiledEngine(ReferenceEngine):
         report = UpdateReport(torch.from_numpy(event.reshape(batch)), novelty, nis, weight)
         return Absorbed(report, torch.from_numpy(errors.reshape(*batch, m)), variance)
 
-    def drift(self, gp: Host) -> float:
-        if torch.compiler.is_compiling() or not self._is_bound(gp) or self._given:
-            return super().drift(gp)
-        basis, active, _, _, moments, vectors = self._state
-        jitter = self._posterior.jitter
-        return self._drift(self._flags, basis, active, moments, vectors, *self._hyper, self._noise, jitter)
-
     def _ask(
         self, gp: Host, x: Tensor, *, variance: bool = False, slopes: bool = False
     ) -> MomentsWithJacobians | None:
@@ -134,15 +129,11 @@ class CompiledEngine(ReferenceEngine):
         """Whether this call is one for compiled loops; prepares the arrays."""
         if torch.compiler.is_compiling() or not _is_plain(x, (*gp.batch_shape, gp.in_features)):
             return False
-        if not self._is_bound(gp):
-            return False
-        return not (torch.is_grad_enabled() and any(p.requires_grad for p in self._parameters))
-
-    def _is_bound(self, gp: Host) -> bool:
-        """Whether the arrays, made again if need be, are of use."""
         if gp.kernel is not self._kernel or not self._is_current():
             self._bind(gp)
-        return self._usable
+        if not self._usable:
+            return False
+        return not (torch.is_grad_enabled() and any(p.requires_grad for p in self._parameters))
 
     def _is_current(self) -> bool:
         """Whether all tensors are those that were bound, at the same place in memory."""
@@ -167,10 +158,9 @@ class CompiledEngine(ReferenceEngine):
         tensors = (*state, gp.log_noise_variance, *self._parameters, *(units or ()), *levels)
         self._sources = _sources(gp, tensors)
         on_host = all(t.is_cpu and t.is_contiguous() for t in tensors) and gp.dtype == torch.float64
-        modules = load_kernels() if on_host else None
-        if modules is None or len(robust) < len(gp.weighing):
+        kernels = load_kernels() if on_host else None
+        if kernels is None or len(robust) < len(gp.weighing):
             return
-        kernels, checks = modules
         self._given = own is None or units is None
         kind, n_actions = (kernels.GIVEN, 0) if self._given or own is None else own[0]
         self._flags = np.array([kind, n_actions])
@@ -192,8 +182,6 @@ class CompiledEngine(ReferenceEngine):
                 self._units = tuple(t.numpy().reshape(n, -1) for t in units)
         self._absorb: Callable = kernels.absorb_fleet
         self._query: Callable = kernels.query_fleet
-        self._drift: Callable = checks.drift_fleet
-        self._have_squares: Callable = checks.have_squares
         self._usable = True
 
 

@@ -64,10 +64,6 @@ class ReferenceEngine:
         z, t = gp.units.inputs(x), gp.units.targets(y)
         return absorb(gp.posterior, z, t, gp.kernel, gp.shared_noise(), on, gp.weighing)
 
-    def drift(self, gp: Host) -> float:
-        """How far the caches are from exact ones, see ``SparsePosterior.drift``."""
-        return gp.posterior.drift(gp.kernel, gp.shared_noise())
-
 
 def _cross(gp: Host, z: Tensor) -> Tensor:
     """k(X, z) of the slots in use."""
