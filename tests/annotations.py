@@ -15,7 +15,7 @@ import jaxtyping
 from beartype import BeartypeConf, beartype
 
 #: Packages whose annotations are checked.
-CHECKED: tuple[str, ...] = ()
+CHECKED: tuple[str, ...] = ("kinematics", "contact", "model", "residual", "enhanced", "control")
 
 
 def check(function: Callable[..., Any]) -> Callable[..., Any]:

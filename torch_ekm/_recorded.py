@@ -109,7 +109,10 @@ def make(described: Any, known: Mapping[str, Any]) -> Any:
         raise ParameterError("class", name, f"one of {', '.join(sorted(known))}; pass others as `classes`")
     if "named" in described:
         return known[name]
-    return known[name](**{key: make(value, known) for key, value in described["arguments"].items()})
+    arguments = {key: make(value, known) for key, value in described["arguments"].items()}
+    if isinstance(arguments.get("batch_shape"), list):
+        arguments["batch_shape"] = tuple(arguments["batch_shape"])  # JSON has no tuples
+    return known[name](**arguments)
 
 
 def opaque_arguments(described: Any, place: str = "") -> list[str]:

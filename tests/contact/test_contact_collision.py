@@ -234,7 +234,7 @@ def test_normals_are_gradients_and_curvature_their_derivative(kind: str) -> None
             continue  # inside there are ridges
         np.testing.assert_allclose(numeric, n, atol=1e-5)
         on = p - (d - 1e-7) * np.array(n)  # hardly outside the surface
-        principal, sharp = surface_curvature(shape, tuple(on), n)
+        principal, sharp = surface_curvature(shape, tuple(on.tolist()), n)
         if sharp:
             continue
         K = sum((k * np.outer(e, e) for k, e in principal), np.zeros((3, 3)))

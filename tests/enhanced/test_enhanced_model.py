@@ -215,6 +215,7 @@ def test_batches_and_dtypes(jacobian, generator: torch.Generator) -> None:
         {"jacobian": "exact"},
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_arguments_are_checked(wrong: dict) -> None:
     given = {"model": model, "learner": SparseOnlineGP(N_S + N_A, 3, capacity=4), **wrong}
     with pytest.raises(ParameterError, match=next(iter(wrong))):

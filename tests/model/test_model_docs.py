@@ -15,23 +15,28 @@ from torch_ekm.model import KinematicModel
 from torch_ekm.model.stiffness.geometric import geometric_stiffness
 
 PAGE = Path(__file__).parents[2] / "docs" / "explanation" / "quasi_static_model.md"
+F64 = torch.float64
 H = 0.04 + 0.03 * math.cos(math.pi / 6)  # [m] height of the tips
 
 
 @pytest.fixture(scope="module")
 def grasp():
-    ball, flat = torch.diag(torch.tensor([0, 1, 1]) / 0.006).double(), torch.zeros(2, 3, 3)
-    state = GraspState(q=[0, math.pi / 6] * 2, position=[0, H, 0], rotation=torch.eye(3))
+    ball, flat = torch.diag(torch.tensor([0, 1, 1], dtype=F64) / 0.006), torch.zeros(2, 3, 3, dtype=F64)
+    state = GraspState(
+        q=torch.tensor([0, math.pi / 6] * 2, dtype=F64),
+        position=torch.tensor([0, H, 0], dtype=F64),
+        rotation=torch.eye(3, dtype=F64),
+    )
     contacts = ContactSet(
         finger=("left", "right"),
         link=("left_1", "right_1"),
-        gap=[0, 0],
-        point=[[-0.009, H, 0], [0.009, H, 0]],
-        normal=[[-1, 0, 0], [1, 0, 0]],
+        gap=torch.zeros(2, dtype=F64),
+        point=torch.tensor([[-0.009, H, 0], [0.009, H, 0]], dtype=F64),
+        normal=torch.tensor([[-1, 0, 0], [1, 0, 0]], dtype=F64),
         finger_curvature=ball.expand(2, 3, 3),
         object_curvature=flat,
-        friction=[0.9] * 2,
-        torsional_friction=[0, 0],
+        friction=torch.full((2,), 0.9, dtype=F64),
+        torsional_friction=torch.zeros(2, dtype=F64),
     )
     model = KinematicModel(load_hand("planar_two_finger"), load_object("box"))
     return model, model.linearize(state, contacts)

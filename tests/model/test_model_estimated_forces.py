@@ -114,7 +114,10 @@ def test_a_contact_that_was_not_expected_joins_in():
         finger=fewer.finger,
         force=expected.force[[0, 2]],
         spin_moment=expected.spin_moment[[0, 2]],
+        normal=expected.normal[[0, 2]],
+        margin=expected.margin[[0, 2]],
         covariance=expected.covariance[:8, :8],
+        margin_std=expected.margin_std[[0, 2]],
     )
     forces = toy.model.linearize(toy.state, expected=two).forces
     assert float((forces.force - lin.forces.force).norm()) < 0.2 * float(lin.forces.force.norm())

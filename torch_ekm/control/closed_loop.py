@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import torch
 
@@ -129,7 +129,7 @@ class ClosedLoop:
         self.safety = Safety() if safety is None else safety
         self._stop = threading.Event()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> ClosedLoop:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:

@@ -7,7 +7,7 @@ so the program always has a solution.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from .qp import DEGREE, Bounds, Inequality, as_array
 from .situation import LinearizedModel, Situation
 
 
+@runtime_checkable
 class Limit(Protocol):
     """What a step must not do. One of your own needs no more than this method."""
 

@@ -38,7 +38,7 @@ class KKTSolution:
 def two_stage(
     D: Float[Tensor, "*batch n n"],
     E: Float[Tensor, "*batch m n"],
-    R: Float[Tensor, "m n_a"],
+    R: Float[Tensor, "... m n_a"],
     F: Float[Tensor, "... n n_a"] | None = None,
     *,
     on_unstable: str = "raise",
@@ -52,7 +52,7 @@ def two_stage(
     Args:
         D: stiffness, in coordinates scaled so that its entries compare.
         E: rows that hold exactly.
-        R: how fast each row is driven by each actuator.
+        R: how fast each row is driven by each actuator; one for all states, or one for each.
         F: generalised forces of compliant actuators, per unit of da; one for all states, or one for each.
         on_unstable: "raise", or "flag" (return the formal answer; read ``stability``).
         actuators: their names, for messages.
