@@ -38,6 +38,7 @@ def test_focus_and_rest_span_all_directions() -> None:
     assert focus.off_translation.tolist() == [True] * 3 + [False] * 2
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_bad_focus_is_refused() -> None:
     with pytest.raises(ShapeError):
         FocusedPose(torch.eye(5, dtype=torch.float64))
