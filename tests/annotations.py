@@ -1,4 +1,4 @@
-"""Shape annotations are checked in every call that the tests make.
+"""Shape annotations are checked in the first thousand calls of each test.
 
 :mod:`jaxtyping` binds the sizes of a call to each other; :mod:`beartype` checks types. ``int`` is taken where
 ``float`` is annotated, as type checkers do (PEP 484).
@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -14,13 +15,35 @@ from typing import Any
 import jaxtyping
 from beartype import BeartypeConf, beartype
 
+#: Checks of one test; the rest of its calls, most of them in long streams, repeat the same shapes.
+BUDGET = 1000
 #: Packages whose annotations are checked.
 CHECKED: tuple[str, ...] = ("kinematics", "contact", "model", "residual", "enhanced", "control")
 
 
+_count = [0]
+
+
 def check(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The type checker of the import hook."""
-    return beartype(function, conf=BeartypeConf(is_pep484_tower=True))
+    """The type checker of the import hook, which also counts."""
+    checked = beartype(function, conf=BeartypeConf(is_pep484_tower=True))
+    if isinstance(checked, type):
+        return checked
+
+    @functools.wraps(checked)
+    def counted(*args: Any, **options: Any) -> Any:
+        _count[0] += 1
+        if _count[0] == BUDGET:
+            jaxtyping.config.update("jaxtyping_disable", True)
+        return checked(*args, **options)
+
+    return counted
+
+
+def begin_test() -> None:
+    """The next test has its own thousand checks."""
+    _count[0] = 0
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def install() -> None:

@@ -31,8 +31,13 @@ def generator() -> torch.Generator:
     return torch.Generator().manual_seed(7)
 
 
+@pytest.fixture(autouse=True)
+def _checks_begin_again() -> None:
+    shapes.begin_test()
+
+
 @pytest.fixture
-def unchecked():
+def unchecked(_checks_begin_again):
     """Annotations are not checked: the test passes what they forbid, to see the package's own error."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield

@@ -191,7 +191,6 @@ def test_every_optional_module_has_an_extra_that_brings_it() -> None:
     extras = tomllib.loads(project.read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     packages = {
         "cv2": "opencv-python",
-        "mpl_toolkits": "matplotlib",
         "IPython": "ipykernel",
         "sklearn": "scikit-learn",
     }

@@ -10,7 +10,7 @@ from .exceptions import MissingExtraError
 _BRINGS = {
     "robot": ("pytorch_kinematics", "yourdfpy", "trimesh", "coal", "qpsolvers", "clarabel", "scipy"),
     "sim": ("sapien", "cv2", "gymnasium", "h5py", "filelock"),
-    "plots": ("matplotlib", "mpl_toolkits", "jinja2", "typer", "rich"),
+    "plots": ("matplotlib", "jinja2", "typer", "rich"),
     "experiments": ("joblib", "pandas", "pyvista", "viser", "websockets"),
     "notebooks": ("IPython", "pyarrow"),
     "peers": ("gpytorch", "river"),

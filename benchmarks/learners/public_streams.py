@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch_ekm.interop._default import default_learner
 
-from torch_ekm import LearnHyperparameters, RobustWeight, SparseOnlineGP, Standardize
+from torch_ekm import default_learner
 from torch_ekm.interop import as_capymoa, as_river
+from torch_ekm.residual import LearnHyperparameters, RobustWeight, SparseOnlineGP, Standardize
 from torch_ekm.typing import Array
 
 SEED = 1000

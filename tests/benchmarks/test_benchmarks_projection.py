@@ -18,6 +18,7 @@ from torch_ekm.exceptions import EKMError, NoContactError, ParameterError, Shape
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel
 
+pytestmark = pytest.mark.usefixtures("unchecked")  # states of lists
 F64, DEG = torch.float64, math.pi / 180
 NOISE = {"q_std": 2 * DEG, "position_std": 1e-3, "rotation_std": 2 * DEG}
 PINCH = {  # [deg]

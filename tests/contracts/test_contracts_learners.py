@@ -39,6 +39,8 @@ from torch_ekm.residual import (
 )
 from torch_ekm.testing import check_residual_learner
 
+pytestmark = pytest.mark.usefixtures("unchecked")  # the contract gives input that annotations forbid
+
 
 def deep(dtype=torch.float64, **options):
     base = SquaredExponential(3, batch_shape=options.get("batch_shape", ()))
@@ -169,7 +171,7 @@ def test_the_decision_table_names_learners_that_can_be_made():
     calls = re.findall(r"^\| [^|]* \| `([A-Za-z_]\w*\(d, m.*?\))`", _page("choose_a_learner"), re.MULTILINE)
     assert len(calls) >= 8
     for call in calls:
-        names = {**vars(torch_ekm), "d": 4, "m": 2, "n_actions": 2, "n": 3}
+        names = {**vars(torch_ekm.residual), **vars(torch_ekm), "d": 4, "m": 2, "n_actions": 2, "n": 3}
         made = eval(call, names)
         assert (made.in_features, made.out_features) == (4, 2), call
 

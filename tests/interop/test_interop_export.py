@@ -102,6 +102,7 @@ def test_an_exported_learner_says_the_same(name: str, format: str, tmp_path: Pat
             close(field, ours, getattr(truth, field))
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match="SparseOnlineGP or a MixtureResidual"):
         KRLSTracker(3, 2, capacity=5).export(tmp_path / "a.pt2")

@@ -76,7 +76,9 @@ def test_the_derivative_of_the_residuals(toy, kind, monkeypatch):
     hand = toy.wrong()
     actuators = tuple(dataclasses.replace(actuator, backlash=1e-4) for actuator in hand.actuators)
     hand = dataclasses.replace(hand, actuators=actuators)
-    unknowns = Unknowns(hand, [kind], {"offset": 1e-3, "backlash": 1e-4})
+    monkeypatch.setitem(PRIORS, "offset", 1e-3)
+    monkeypatch.setitem(PRIORS, "backlash", 1e-4)
+    unknowns = Unknowns(hand, [kind])
     evidence = Evidence(toy.model(hand), rests(toy.recordings(steps=3)), unknowns)
     x = np.full(len(unknowns), 0.02)
     slope = evidence(x).jacobian

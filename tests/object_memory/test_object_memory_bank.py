@@ -77,6 +77,7 @@ def run(
     return bank, placed, errors
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_is_a_residual_learner() -> None:
     check_residual_learner(lambda **options: ModelBank(lambda: learner(**options), 3))
 

@@ -267,7 +267,7 @@ def test_deep_kernel_gradient_is_autograds():
     torch.testing.assert_close(
         p.mean_jacobian, torch.func.vmap(torch.func.jacrev(gp))(x[:5]), atol=1e-10, rtol=0
     )
-    slope = torch.func.vmap(torch.func.jacrev(gp.variance))(x[:5])
+    slope = torch.func.vmap(torch.func.jacrev(lambda at: gp.predict(at).variance))(x[:5])
     torch.testing.assert_close(p.variance_jacobian, slope, atol=1e-9, rtol=0)
 
 

@@ -119,7 +119,7 @@ class HandKinematics(nn.Module):
         self,
         q: LinkPoses | Float[Tensor, "*batch n_q"],
         link: str | int,
-        point: Float[Tensor, "*batch 3"] | None = None,
+        point: Float[Tensor, "*points 3"] | None = None,
     ) -> Float[Tensor, "*batch 6 n_q"]:
         """``J[:, j] = (z_j x (x - o_j); z_j)`` for joints that move the link, 0 for the others.
 
