@@ -76,7 +76,8 @@ class CompiledEngine(ReferenceEngine):
         if not self._takes(gp, x) or not _is_plain(y, (*self._batch, self._m)):
             return False
         x_, y_ = x.numpy().reshape(-1), y.numpy().reshape(-1)
-        return math.isfinite(x_.dot(x_) + y_.dot(y_))
+        with np.errstate(over="ignore"):  # a number without a square is refused, not warned of
+            return math.isfinite(x_.dot(x_) + y_.dot(y_))
 
     def absorb(self, gp: Host, x: Tensor, y: Tensor, on: Tensor | None) -> Absorbed:
         if not self._takes(gp, x) or not _is_plain(y, (*self._batch, self._m)):
