@@ -245,7 +245,7 @@ class ClosedLoop:
         """Command, observe, learn."""
         first = self.plant.command(decision.delta_a)
         began = time.perf_counter()
-        verdict = watch.motion(seen, decision, first, self.plant.observe, self.plant.stuck)
+        verdict = watch.motion(seen, decision, first, self.plant.observe, self.knowledge.servo.stuck)
         after, progress.halt = verdict.seen, verdict.halt
         if progress.halt is not None:
             if progress.halt.reason is not StopReason.ACTUATOR_STUCK:  # the servo model itself finds this one

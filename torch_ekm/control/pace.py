@@ -22,9 +22,8 @@ _DEG = math.pi / 180
 _AGREE = 1.0  # rho up to which the pace grows
 _DISAGREE = 1.6  # rho from which it shrinks
 _GROW, _SHRINK = 1.2, 0.7
-_RELATIVE = (
-    0.12  # error that is no surprise, as a share of the motion; of a translation the contacts' way counts
-)
+# error that is no surprise, as a share of the motion; of a translation the contacts' way counts
+_RELATIVE = 0.12
 _TRANSLATION_NOISE = 0.3e-3  # [m] standard deviation of a measured motion
 _ROTATION_NOISE = 0.3 * _DEG  # [rad]
 _FORCE_NOISE = 0.5  # [N]

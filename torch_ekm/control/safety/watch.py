@@ -89,12 +89,12 @@ class Watch:
         decision: Decision,
         after: Observation,
         look: Callable[[], Observation],
-        stuck: tuple[str, ...] = (),
+        stuck: Tensor,
     ) -> Verdict:
         """Judge a motion; where its reading is in doubt, ``look`` gives another.
 
         Args:
-            stuck: actuators that the servo model calls so.
+            stuck: which actuators the servo model calls so.
         """
         seen, last, doubt, expected = after, None, None, None
         for left in range(self.guards.looks, -1, -1):
@@ -139,14 +139,13 @@ class Watch:
         return before if doubtful else seen
 
     def _stuck(
-        self, before: Observation, decision: Decision, seen: Observation, stuck: tuple[str, ...]
+        self, before: Observation, decision: Decision, seen: Observation, stuck: Tensor
     ) -> Objection | None:
         """Actuators that do not move, however they are commanded."""
         size, still = decision.delta_a.abs(), (seen.a - before.a).abs() < _STILL
         again = still & (size > self.guards.stuck_command)
         self._still = torch.where(again, self._still + 1, 0 * self._still)
-        known = torch.tensor([name in stuck for name in self.hand.actuator_names])
-        found = (self._still > 1) | (known & still & (size > _ASKED))
+        found = (self._still > 1) | (stuck & still & (size > _ASKED))
         if not bool(found.any()):
             return None
         names = ", ".join(f"'{self.hand.actuator_names[i]}'" for i in found.nonzero().flatten().tolist())
