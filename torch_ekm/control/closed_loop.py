@@ -127,6 +127,8 @@ class ClosedLoop:
         self.plant, self.knowledge = ServoInverse(plant, hand, knowledge.servo), knowledge
         self.controller, self.learn, self.decline = controller, learn, decline
         self.safety = Safety() if safety is None else safety
+        if controller.enhanced is not None:
+            controller.force_correction = knowledge.forces.correction
         self._stop = threading.Event()
 
     def __enter__(self) -> ClosedLoop:
@@ -270,10 +272,26 @@ class ClosedLoop:
             expected = self.controller.expect(lin, decision.delta_a)
         lever = float((lin.contacts.point - seen.position).square().sum(-1).mean().sqrt())
         surprise = self._force_surprise(lin, seen, expected.moved, after)
+        self._learn_forces(lin, seen, expected.moved, after)
         trust = self.controller.pace.options.trust
         rho = trust.disagreement(expected.increment[-6:], ds[-6:], lever, surprise)
         self.controller.pace.judge(rho, decision.share)
         return enhanced.update(seen.state, expected.moved, ds, expected.nominal)
+
+    def _learn_forces(self, lin: Linearization, seen: Observation, moved: Tensor, after: Observation) -> None:
+        """Pads that touched and measured before and after teach how their forces answer."""
+        if seen.fingertip_force is None or after.fingertip_force is None:
+            return
+        forces = self.knowledge.forces
+        pads = self.controller.kinematic.hand.pad_indices(lin.contacts.finger)
+        change = torch.full((len(forces.correction),), torch.nan, dtype=torch.float64)
+        before, now = seen.fingertip_force[pads], after.fingertip_force[pads]
+        least = self.controller.kinematic.options.forces.normal_std
+        measured = torch.minimum(before, now) >= least
+        change[pads] = (now - before).where(measured, torch.nan)
+        described = torch.zeros_like(forces.correction)
+        described[pads] = lin.normal_force_sensitivity - forces.correction[pads]
+        forces.update(moved, change, described)
 
     def _force_surprise(
         self, lin: Linearization, seen: Observation, moved: Tensor, after: Observation

@@ -75,6 +75,8 @@ class LookAndMoveController:
         self.tasks = DEFAULT_TASKS if tasks is None else tuple(tasks)
         self.limits = DEFAULT_LIMITS if limits is None else tuple(limits)
         self.pace = Pace(adapts=self.enhanced is not None) if pace is None else pace
+        self.force_correction: Float[Tensor, "n_pads n_a"] | None = None
+        """B, what was learned of ``df_n/da`` of each pad [N/rad]; a :class:`ClosedLoop` sets it."""
         self.tighter = 0.0
         """Grip force on top of the one that suits the object [N]."""
         self._weight = float(torch.linalg.vector_norm(self.kinematic.weight))
@@ -102,6 +104,9 @@ class LookAndMoveController:
         lin = self.kinematic.linearize(
             state, fingertip_force=fingertip_force, expected=expected, previous=last
         )
+        if self.force_correction is not None:
+            pads = self.kinematic.hand.pad_indices(lin.contacts.finger)
+            lin = lin.with_normal_sensitivity(self.force_correction[pads])
         if lin.forces.solved:
             self._previous = lin, a
         return lin

@@ -11,6 +11,7 @@ from ..description import HandDescription
 from ..exceptions import FileFormatError, ParameterError
 from ..kinematics import IdealServos, ServoModel
 from ..residual.files import known_classes, read, rebuild, write
+from .force_sensitivity import ForceSensitivity
 
 
 class HandKnowledge(Recorded, nn.Module):
@@ -25,11 +26,12 @@ class HandKnowledge(Recorded, nn.Module):
 
     Args:
         servo: of the actuators.
+        forces: how the pads' normal forces answer to the actuators.
     """
 
-    def __init__(self, servo: ServoModel | IdealServos) -> None:
+    def __init__(self, servo: ServoModel | IdealServos, forces: ForceSensitivity) -> None:
         super().__init__()
-        self.servo = servo
+        self.servo, self.forces = servo, forces
 
     @classmethod
     def of(cls, hand: HandDescription, *, learns: bool = True) -> HandKnowledge:
@@ -38,7 +40,8 @@ class HandKnowledge(Recorded, nn.Module):
         Args:
             learns: False takes servos for ideal, and learns nothing of them.
         """
-        return cls((ServoModel if learns else IdealServos)(hand.actuator_names))
+        servo = (ServoModel if learns else IdealServos)(hand.actuator_names)
+        return cls(servo, ForceSensitivity(len(hand.pads), hand.n_a))
 
     def check(self, hand: HandDescription) -> None:
         """That it is of this hand.

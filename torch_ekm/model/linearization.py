@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -75,6 +76,20 @@ class Linearization:
     def margins(self) -> Float[Tensor, "*batch n_c"]:
         """``mu_s f_n - |f_t|`` of each contact [N]."""
         return self.forces.margin
+
+    def with_normal_sensitivity(self, correction: Float[Tensor, "n_c n_a"]) -> Linearization:
+        """The same with ``df_n/da + correction`` [N/rad]; margins and force vectors follow."""
+        mu_s, inward = self.contacts.friction[..., None], -self.contacts.normal[..., None]
+        dmu = self.contact_force_sensitivity.index_add(
+            -2, torch.tensor(self.normal_rows), correction.to(self.contact_force_sensitivity)
+        )
+        return dataclasses.replace(
+            self,
+            contact_force_sensitivity=dmu,
+            normal_force_sensitivity=self.normal_force_sensitivity + correction,
+            margin_sensitivity=self.margin_sensitivity + mu_s * correction,
+            force_vector_sensitivity=self.force_vector_sensitivity + inward * correction[..., None, :],
+        )
 
     def step(self, delta_a: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_s"]:
         """``ds = J_m da``.

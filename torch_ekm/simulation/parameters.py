@@ -36,9 +36,32 @@ class PlantParameters:
     link_weight: bool = False
     """Gravity pulls at the fingers too (the kinematic model leaves their weight out)."""
 
+    # -- the mechanism is of another kind than its description
+    arm_variation: float = 0.0
+    """v: moment arms vary with the joint angle, ``J_a (1 + v sin(2 q + phase))``, as those of pulleys that are
+    not round; joints of rigid couplings keep theirs. Between -1 and 1."""
+    arm_phase: float = 0.0
+    """Bound of the phase of each joint [rad]; drawn once, from ``hardware_seed``."""
+    spring_stiffening: float = 0.0
+    """s: joint springs stiffen, ``k x (1 + s x^2)``, x from their rest [rad]; negative: they sag."""
+    cable_friction: float = 0.0
+    """Share of the cables' torque at a joint that friction holds, ``1 - exp(-mu w)`` of a cable that is wound
+    by w round its pulleys (capstan)."""
+    hysteresis: float = 0.0
+    """Full width of the transmissions' hysteresis, as a share of their torque."""
+    tendon_coupling: float = 0.0
+    """The pull of one tendon lengthens the others: their share of its own stretch, below 1."""
+    joint_play: float = 0.0
+    """Full width of the play of one joint of each finger [rad]; which one is drawn from ``hardware_seed``."""
+    contact_stiffness: float = 0.0
+    """Of each contact [N/m]: pads give way; 0: they do not."""
+
     # -- the object
     friction: float = 1.0
     """Factor on the friction coefficient."""
+    friction_unevenness: float = 0.0
+    """One side of the object has so much less friction, as a share, 0.5 at most: that of the finger which
+    opposes the others, or theirs, as ``hardware_seed`` has it."""
     mass: float = 1.0
     """Factor on the object's mass and inertia."""
     com_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -69,6 +92,11 @@ class PlantParameters:
     """Standard deviation of the force of a fingertip that touches [N]."""
     force_offset: float = 0.0
     """Bound of a constant error of each fingertip [N]; drawn once, from ``hardware_seed``."""
+    force_scale: float = 1.0
+    """Each fingertip reads its force times a factor between 1/x and x; drawn once, from ``hardware_seed``."""
+    force_drift: float = 0.0
+    """Bound of how fast the reading of each fingertip drifts, from no error at the start of a grasp [N/s];
+    drawn once, from ``hardware_seed``."""
     force_hysteresis: float = 0.0
     """Full width of the play between force and reading [N]."""
     force_range: float = 0.0
@@ -93,8 +121,13 @@ class PlantParameters:
                 raise ParameterError(field.name, value, "finite")
             if field.name in _POSITIVE and not all(entry > 0 for entry in entries):
                 raise ParameterError(field.name, value, "greater than 0")
-            if field.name not in _POSITIVE | {"com_shift"} and not all(entry >= 0 for entry in entries):
+            if field.name not in _POSITIVE | _SIGNED and not all(entry >= 0 for entry in entries):
                 raise ParameterError(field.name, value, "0 or more")
+        for name, (valid, most) in _BELOW.items():
+            if abs(getattr(self, name)) > most:
+                raise ParameterError(name, getattr(self, name), valid)
+        if self.force_scale < 1:
+            raise ParameterError("force_scale", self.force_scale, "1 or more")
         if self.frame_loss > 1:
             raise ParameterError("frame_loss", self.frame_loss, "a chance between 0 and 1")
 
@@ -108,3 +141,11 @@ class PlantParameters:
 
 
 _POSITIVE = {"moment_arm", "spring", "servo_stiffness", "friction", "mass", "object_scale"}
+_SIGNED = {"com_shift", "spring_stiffening", "arm_variation"}
+_BELOW = {
+    "arm_variation": ("between -0.9 and 0.9", 0.9),
+    "cable_friction": ("between 0 and 0.9", 0.9),
+    "hysteresis": ("between 0 and 1", 1.0),
+    "tendon_coupling": ("between 0 and 0.9", 0.9),
+    "friction_unevenness": ("between 0 and 0.5", 0.5),
+}

@@ -46,16 +46,34 @@ _FIGURES: dict[str, tuple[Any, Any, Any]] = {  # nominal, worn, hostile
     "frame_loss": (0.0, 0.02, 0.1),
     "stuck_joints": ((), (), ("index_3",)),
 }
-#: Name -> parameters: "none", "nominal", "worn" and "hostile".
-PRESETS = {"none": PlantParameters()} | {
-    name: PlantParameters(**{key: levels[k] for key, levels in _FIGURES.items()})
-    for k, name in enumerate(("nominal", "worn", "hostile"))
-}
+_NOMINAL = PlantParameters(**{key: levels[0] for key, levels in _FIGURES.items()})
+# "odd_1" to "odd_5": used hands that are of another kind than their description, mixtures of what others
+# than ours may be. Strengths are those of the families in docs/benchmarks/any_hand.md.
+_ODD: tuple[dict[str, Any], ...] = (
+    {"arm_variation": 0.25, "arm_phase": math.pi, "spring_stiffening": 0.5},
+    {"arm_variation": 0.2, "arm_phase": math.pi, "spring_stiffening": -0.3, "hysteresis": 0.1},
+    {"cable_friction": 0.1, "tendon_coupling": 0.1, "friction_unevenness": 0.4},
+    {"contact_stiffness": 5e3, "joint_play": 1.5 * _DEG, "force_scale": 1.5},
+    {
+        "arm_variation": 0.12, "arm_phase": math.pi, "spring_stiffening": 0.25, "cable_friction": 0.05,
+        "hysteresis": 0.05, "tendon_coupling": 0.05, "joint_play": 0.8 * _DEG, "contact_stiffness": 1e4,
+        "friction_unevenness": 0.2, "force_scale": 1.3, "force_drift": 0.02,
+    },
+)  # fmt: skip
+#: Name -> parameters: "none", "nominal", "worn", "hostile" and "odd_1" to "odd_5".
+PRESETS = (
+    {"none": PlantParameters(), "nominal": _NOMINAL}
+    | {
+        name: PlantParameters(**{key: levels[k] for key, levels in _FIGURES.items()})
+        for k, name in ((1, "worn"), (2, "hostile"))
+    }
+    | {f"odd_{k}": _NOMINAL.replace(**figures) for k, figures in enumerate(_ODD, 1)}
+)
 
 
 def preset(name: str) -> PlantParameters:
     """The parameters called "none" (as described, perfect sensors), "nominal" (a used hand, which the
-    residual learners are for), "worn" or "hostile".
+    residual learners are for), "worn", "hostile", or "odd_1" to "odd_5" (of another kind than described).
 
     Raises:
         UnknownNameError: there is no such preset; the message lists them.

@@ -34,7 +34,7 @@ class Sensors:
 
         q^ = q + noise, except on stuck channels, which keep their first reading
         o^ = o(t - latency) + noise,  R^ = exp([noise]x) R(t - latency),  or the last frame if lost
-        F^ = quantise(play(F) + offset + noise)     8 bit over ``force_range``
+        F^ = quantise(scale play(F) + offset + drift t + noise)     8 bit over ``force_range``
 
     ``play`` is hysteresis: the reading follows the force only once it has moved by half the width.
     The offset is drawn once for each hardware instance; a fingertip that touches nothing reads
@@ -50,6 +50,8 @@ class Sensors:
         self._p = parameters
         hardware_instance = np.random.default_rng([parameters.hardware_seed, 1])
         self._offset = parameters.force_offset * hardware_instance.uniform(-1.0, 1.0, size=self.n_pads)
+        self._scale = parameters.force_scale ** hardware_instance.uniform(-1.0, 1.0, size=self.n_pads)
+        self._drift = parameters.force_drift * hardware_instance.uniform(-1.0, 1.0, size=self.n_pads)
         self._stuck = np.array([name in parameters.stuck_joints for name in self._joints], dtype=bool)
 
     def forget(self) -> None:
@@ -91,12 +93,13 @@ class Sensors:
         self._seen = (picture.position + p.position_noise * noise, shaken, picture.time)
         return *self._seen, True
 
-    def forces(self, normal: Array, generator: np.random.Generator) -> Array:
-        """Estimated normal force of each pad ``(n_pads,)`` [N]."""
+    def forces(self, normal: Array, time: float, generator: np.random.Generator) -> Array:
+        """Estimated normal force of each pad ``(n_pads,)`` [N], ``time`` after the grasp [s]."""
         p = self._p
         noise = p.force_noise * generator.standard_normal(self.n_pads)
         self._felt = np.clip(self._felt, normal - p.force_hysteresis / 2, normal + p.force_hysteresis / 2)
-        reading = np.maximum(0.0, self._felt + self._offset + np.where(normal > 0, noise, 0.0))
+        off = self._offset + self._drift * max(time, 0.0)
+        reading = np.maximum(0.0, self._scale * self._felt + off + np.where(normal > 0, noise, 0.0))
         if p.force_range > 0:  # an 8-bit converter
             unit = p.force_range / 255
             reading = unit * np.round(np.minimum(reading, p.force_range) / unit)

@@ -142,7 +142,7 @@ class SimulatedHand:
         joints = self._sensors.joints(q, draw)
         picture = self._sensors.pictured(TimedState(rig.time, q, position, rotation))
         seen_position, seen_rotation, taken, seen = self._sensors.pose(picture, draw)
-        force = self._sensors.forces(rig.normal, draw)
+        force = self._sensors.forces(rig.normal, rig.time, draw)
         if not seen and status is PlantStatus.HELD:
             status = PlantStatus.NOT_SEEN
         torque = rig.transmission.actuator_torque(q, rig.servo.output)

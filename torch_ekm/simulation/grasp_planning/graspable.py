@@ -9,17 +9,6 @@ from ...description.shape import Shape
 from ...typing import Array
 
 
-def chain(hand: HandDescription, link: str) -> list[int]:
-    """Joints that move a link, the nearest first."""
-    above = {joint.child: joint for joint in hand.urdf.joints}
-    chain = []
-    while link in above:
-        if above[link].name in hand.joint_names:
-            chain.append(hand.joint_names.index(above[link].name))
-        link = above[link].parent
-    return chain
-
-
 def obstacles(hand: HandDescription, pads: tuple[ContactPad, ...]) -> tuple[list[str], Array, Array]:
     """Balls that stand for the solid parts of the hand, the pads' rounded ends left out.
 

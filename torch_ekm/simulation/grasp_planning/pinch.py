@@ -206,18 +206,24 @@ def pinch_problem(
         ParameterError: a time step that rigid actuators do not bear.
     """
     require_two_pads_and_limits(hand)
-    names = [pad.name for pad in hand.pads]
-    thumb = config.thumb or next((name for name in names if name.startswith("thumb")), names[0])
-    fingers = config.fingers
-    if fingers is None:
-        chosen = tuple(name for name in names if name.startswith(("index", "middle")))
-        fingers = chosen or tuple(name for name in names if name != thumb)
+    thumb, fingers = opposing_pads(hand, config)
     transmission = make_transmission(hand, parameters)
     if transmission.stiff and config.time_step > _STIFF_STEP:
         valid = f"at most {_STIFF_STEP} s: '{hand.name}' has rigid or very stiff actuators"
         raise ParameterError("time_step", config.time_step, valid)
     along = turning_axis(hand, config)
     return PinchProblem(hand, true_object(obj, parameters), transmission, thumb, fingers, along)
+
+
+def opposing_pads(hand: HandDescription, config: PlantConfig) -> tuple[str, tuple[str, ...]]:
+    """Names of the pad that opposes the others, and of these."""
+    names = [pad.name for pad in hand.pads]
+    thumb = config.thumb or next((name for name in names if name.startswith("thumb")), names[0])
+    fingers = config.fingers
+    if fingers is None:
+        chosen = tuple(name for name in names if name.startswith(("index", "middle")))
+        fingers = chosen or tuple(name for name in names if name != thumb)
+    return thumb, fingers
 
 
 def turning_axis(hand: HandDescription, config: PlantConfig) -> Array:

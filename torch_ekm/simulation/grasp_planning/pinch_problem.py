@@ -13,8 +13,9 @@ from ...exceptions import UnknownNameError
 from ...kinematics import HandKinematics, LinkPoses
 from ...kinematics.se3 import exp
 from ...typing import Array
+from ..mechanism.assembly import chain
 from ..mechanism.transmission import Transmission
-from .graspable import chain, object_axes, obstacles
+from .graspable import object_axes, obstacles
 
 # Preferred joint angles as parts of their range, last joint first: the thumb bent and the fingers
 # nearly straight, since turning the object towards the fingers' flexion straightens the thumb.
@@ -233,8 +234,7 @@ class PinchProblem:
         force = g.force.sum(axis=1) + weight
         centre = g.rotation @ self.obj.com
         moment = np.cross(g.point - g.position[:, None], g.force).sum(axis=1) + np.cross(centre, weight)
-        spring = self.transmission.spring_stiffness * (g.q - self.transmission.spring_rest)
-        passive = (spring + g.torque)[:, self.moving] @ self._passive
+        passive = self._joint_load(g)[:, self.moving] @ self._passive
         press = -np.einsum("bi,bi->b", g.force[:, 0], g.normal[:, 0]) - request.force
         return np.concatenate(
             [g.gap / 1e-4, force / 0.01, moment / 2e-4, passive / 1e-3, press[:, None] / 0.1], axis=1
@@ -283,8 +283,9 @@ class PinchProblem:
     def motors(self, g: PinchGeometry) -> Array:
         """Motor positions that hold the candidates ``(b, n_a)`` [rad]; idle ones rest."""
         T = self.transmission
-        stretch = np.where(self.in_use, self.tension(g) / T.stiffness, 0.0)
-        return T.offset + g.q @ T.J_a.T + stretch
+        stretch = T.stretched(np.where(self.in_use, self.tension(g), 0.0))
+        inner = g.q + T.lean(g.torque)
+        return T.offset + T.shape.excursion(inner) @ T.J_a.T + np.where(self.in_use, stretch, 0.0)
 
     def outside(self, g: PinchGeometry) -> Array:
         """How far each motor in use is beyond its range ``(b, n)`` [rad]; negative: inside."""
@@ -293,8 +294,13 @@ class PinchProblem:
 
     def tension(self, g: PinchGeometry) -> Array:
         """Torque of each actuator along ``+a`` that balances the joints, ``(batch, n_a)`` [N m]."""
-        spring = self.transmission.spring_stiffness * (g.q - self.transmission.spring_rest)
-        return (spring + g.torque) @ self._to_tension.T
+        return self._joint_load(g) @ self._to_tension.T
+
+    def _joint_load(self, g: PinchGeometry) -> Array:
+        """What springs and contacts ask of the tendons, for moment arms J_a, ``(batch, n_q)`` [N m]."""
+        T = self.transmission
+        inner = g.q + T.lean(g.torque)
+        return (T.spring_torque(inner) + g.torque) / T.shape.arm(inner)
 
     def _tilted(self, request: PinchRequest) -> Array:
         third = np.cross(self.along, self.towards)

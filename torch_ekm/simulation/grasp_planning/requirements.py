@@ -11,7 +11,7 @@ from ...description import ContactPad, HandDescription
 from ...exceptions import DescriptionError
 from ...kinematics import HandKinematics
 from ...typing import Array
-from .graspable import chain
+from ..mechanism.assembly import chain
 from .pinch_problem import PinchProblem
 
 _FACING = 0.3  # least cosine between a pad's direction and where it is to press; the planner wishes the same

@@ -9,6 +9,7 @@ import numpy as np
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import ParameterError
 from ..parameters import PlantParameters
+from .departures import CableLosses, JointShape
 from .transmission import Transmission
 
 _RIGID = 100.0  # [N m/rad] at a joint: 0.3 to 0.4 % of a motion from rigid; stiffer settles worse at 1 ms
@@ -55,8 +56,32 @@ def true_object(obj: ObjectDescription, parameters: PlantParameters) -> ObjectDe
     )
 
 
+def chain(hand: HandDescription, link: str) -> list[int]:
+    """Joints that move a link, the nearest first."""
+    above = {joint.child: joint for joint in hand.urdf.joints}
+    chain = []
+    while link in above:
+        if above[link].name in hand.joint_names:
+            chain.append(hand.joint_names.index(above[link].name))
+        link = above[link].parent
+    return chain
+
+
 def make_transmission(hand: HandDescription, parameters: PlantParameters) -> Transmission:
     """Tendons, springs and joint friction as they are at the start of a grasp."""
-    transmission = Transmission(true_hand(hand, parameters), parameters.tendon_creep)
-    transmission.lengthen(parameters.tendon_elongation)
+    p = parameters
+    coupled = (hand.coupling.reshape(-1, hand.n_q) != 0).any(axis=0)
+    draw = np.random.default_rng([p.hardware_seed, 2])
+    shape = JointShape(
+        np.where(coupled, 0.0, p.arm_variation),
+        p.arm_phase * draw.uniform(-1.0, 1.0, size=hand.n_q),
+        p.spring_stiffening,
+    )
+    play = np.zeros(hand.n_q)
+    for pad in hand.pads:  # one joint of each finger
+        play[draw.choice(chain(hand, pad.link))] = p.joint_play
+    play[coupled] = 0.0
+    losses = CableLosses(p.cable_friction, p.hysteresis, p.tendon_coupling, play)
+    transmission = Transmission(true_hand(hand, p), p.tendon_creep, shape, losses)
+    transmission.lengthen(p.tendon_elongation)
     return transmission

@@ -6,6 +6,7 @@ import numpy as np
 
 from ...description.hand import HandDescription
 from ...typing import Array
+from .departures import CableLosses, JointShape
 
 _COUPLING_STIFFNESS = 8.0  # k_c [N m/rad]
 _BRISTLE_STIFFNESS = 3.0  # k_f [N m/rad]
@@ -35,12 +36,24 @@ class Transmission:
     joint to an anchor that slips when the bristle carries the friction torque. It belongs to the
     same drive. PhysX's own joint friction is a fraction of the momentum, not a torque: not used.
 
+    Pulleys that are not round and springs that are not linear (``shape``) put ``h(q)`` in the place of q at
+    the tendons, ``h'(q)`` on their arms, and ``x (1 + s x^2)`` in the place of ``q - q0``. Friction of the
+    cables, hysteresis, coupled tendons and play of joints are ``losses``.
+
     Args:
         hand: as it really is; the model's may be another.
         creep: how fast a loaded tendon lengthens for good [rad/(N m s)].
+        shape: of pulleys and springs; None: as described.
+        losses: None: there are none.
     """
 
-    def __init__(self, hand: HandDescription, creep: float = 0.0) -> None:
+    def __init__(
+        self,
+        hand: HandDescription,
+        creep: float = 0.0,
+        shape: JointShape | None = None,
+        losses: CableLosses | None = None,
+    ) -> None:
         stiffness = np.array([actuator.stiffness for actuator in hand.actuators])
         self.n_a, self.n_q = hand.n_a, hand.n_q
         self.J_a = hand.actuation_jacobian
@@ -59,18 +72,24 @@ class Transmission:
         self._any_tendon = bool(self._pulls_only.any())
         self.spring_stiffness, self.spring_rest = hand.spring_stiffness, hand.spring_rest
         self.friction = hand.joint_friction
-        self._k_f = np.where(self.friction > 0, _BRISTLE_STIFFNESS, 0.0)
-        self._reach = np.divide(
-            self.friction, self._k_f, out=np.zeros_like(self.friction), where=self._k_f > 0
-        )
-        self._anchor = self.spring_rest
-        self._spring_torque = self.spring_stiffness * self.spring_rest
+        self.shape = JointShape.round(hand.n_q) if shape is None else shape
+        self.losses = CableLosses.none(hand.n_q) if losses is None else losses
+        rubs = (self.friction > 0) | ((self.losses.capstan > 0) & self._lead.any(axis=0))
+        self._k_f = np.where(rubs, _BRISTLE_STIFFNESS, 0.0)
         self.stiff = bool((stiffness[:, None] * self.J_a**2).max() > _STIFF)
         """Some actuator is: :meth:`drive_targets` takes the joints as they will be after the step."""
+        self._compliance = self.losses.compliance(stiffness)
+        self._K = np.linalg.inv(self._compliance) if self.losses.coupling > 0 else None
+        steep = self._k.copy()
+        steep[: self.n_a] *= self.losses.steepening
         size = np.abs(self._M)
-        carried = (self._k * size.sum(axis=1)) @ size if self.stiff else self._k @ size**2
-        self.drive_stiffness = self.spring_stiffness + carried + self._k_f
+        carried = (steep * size.sum(axis=1)) @ size if self.stiff else steep @ size**2
+        farthest = np.maximum(hand.joint_upper - self.spring_rest, self.spring_rest - hand.joint_lower)
+        springs = self.spring_stiffness * self.shape.largest_spring_factor(farthest)
+        self._turned = springs + carried * self.shape.largest_arm**2
+        self.drive_stiffness = self._turned + self._k_f
         """Stiffness of each joint's drive ``(n_q,)`` [N m/rad], while all tendons are taut."""
+        self.relax(self.spring_rest)
 
     @property
     def stiffness(self) -> Array:
@@ -78,32 +97,69 @@ class Transmission:
         return self._k[: self.n_a]
 
     def relax(self, q: Array) -> None:
-        """Put the friction's anchors at ``q``: no friction torque now."""
+        """Put the friction's anchors at ``q``: no friction torque now, no hysteresis, joints amid their play."""
         self._anchor = np.array(q, dtype=np.float64)
+        self._lean = np.zeros(self.n_q)
+        self._bent: tuple[Array, Array] | None = None
 
     def stretch(self, q: Array, motor: Array) -> Array:
         """``m - a0 - J_a q``: elastic stretch of each transmission [rad]; negative: a tendon is slack."""
-        return motor - self.offset - self._lead @ q
+        return motor - self.offset - self._lead @ self.shape.excursion(q)
 
     def actuator_torque(self, q: Array, motor: Array) -> Array:
         """``-lam``: torque of each actuator along ``+a`` [N m]; never negative for a tendon."""
-        torque = self.stiffness * self.stretch(q, motor)
+        torque = self._pull(self.stretch(q, motor))
         return np.where(self._pulls_only[: self.n_a], np.maximum(torque, 0.0), torque)
+
+    def _pull(self, stretch: Array) -> Array:
+        return self.stiffness * stretch if self._K is None else self._K @ stretch
+
+    def stretched(self, torque: Array) -> Array:
+        """Stretch at which the actuators give such torques ``(*batch, n_a)`` [rad], without hysteresis."""
+        return torque @ self._compliance
+
+    def lean(self, load: Array) -> Array:
+        """How far transmissions are ahead of joints that give ``load`` to the fingers ``(*batch, n_q)`` [rad]."""
+        return np.clip(load / self._turned, -self.losses.play / 2, self.losses.play / 2)
+
+    def spring_torque(self, q: Array) -> Array:
+        """``k x (1 + s x^2)``, ``x = q - q0``: what the springs oppose ``(*batch, n_q)`` [N m]."""
+        return self.spring_stiffness * self.shape.spring(q - self.spring_rest)
 
     def drive_targets(self, q: Array, motor: Array) -> Array:
         """Targets that make the drives give the torque above at ``q`` ``(n_q,)`` [rad].
 
         A slack tendon takes its stiffness with it: the target then undoes the drive's share.
         """
-        slip = q - self._anchor
-        np.clip(slip, -self._reach, self._reach, out=slip)
-        self._anchor = q - slip  # the anchor follows where the bristle would carry more than friction
-        stretch = np.concatenate([motor - self.offset, np.zeros(len(self._k) - self.n_a)]) - self._M @ q
-        force = self._k * stretch
+        inner = q + self._lean
+        stretch = motor - self.offset - self._lead @ self.shape.excursion(inner)
+        pull = self._pull(stretch)
+        if self.losses.hysteresis > 0:
+            pull = pull + self._hysteresis(stretch)
+        apart = self._M[self.n_a :] @ inner
+        force = np.concatenate([pull, -self._k[self.n_a :] * apart])
         if self._any_tendon:
             force[self._pulls_only & (force < 0)] = 0.0
-        torque = self._spring_torque - self.spring_stiffness * q + force @ self._M - self._k_f * slip
-        return q + torque / self.drive_stiffness
+        cables = self.shape.arm(inner) * (force @ self._M)
+        torque = cables - self.spring_torque(inner)
+        if self.losses.any_play:
+            whole = torque + self._turned * self._lean
+            self._lean = self.lean(whole)
+            torque = whole - self._turned * self._lean
+        # the anchor follows where the bristle would carry more than friction
+        most = self.friction + self.losses.capstan * np.abs(cables)
+        reach = np.divide(most, self._k_f, out=np.zeros_like(most), where=self._k_f > 0)
+        slip = np.clip(q - self._anchor, -reach, reach)
+        self._anchor = q - slip
+        return q + (torque - self._k_f * slip) / self.drive_stiffness
+
+    def _hysteresis(self, stretch: Array) -> Array:
+        """What the transmissions hold against their motion ``(n_a,)`` [N m]."""
+        last, held = (stretch, np.zeros(self.n_a)) if self._bent is None else self._bent
+        most = 0.5 * self.losses.hysteresis * np.abs(self.stiffness * stretch)
+        held = np.clip(held + self.stiffness * (stretch - last), -most, most)
+        self._bent = stretch, held
+        return held
 
     def lengthen(self, amount: float) -> None:
         """Make every tendon longer for good [rad at the actuator]; looped cables keep their length."""
@@ -120,8 +176,8 @@ class Transmission:
         before, ``J^T k s = J_o^T k_o s_o``, which says how much the new tendon is stretched."""
         along = np.einsum("aq,aq->a", self._lead, other._lead) / np.einsum("aq,aq->a", self._lead, self._lead)
         stretch = other.stretch(q, motor) * along * other.stiffness / self.stiffness
-        self.offset = motor - self._lead @ q - stretch
-        self._anchor = other._anchor
+        self.offset = motor - self._lead @ self.shape.excursion(q) - stretch
+        self._anchor, self._lean, self._bent = other._anchor, other._lean, None
 
 
 def coupled_posture(coupling: Array) -> Array:

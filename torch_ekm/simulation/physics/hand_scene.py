@@ -29,7 +29,9 @@ class HandScene:
         self.time_step = time_step
         self._scene: Any = new_scene(hand.gravity, time_step)
         self._system: Any = self._scene.physx_system
-        self._material = sapien().physx.PhysxMaterial(obj.friction, obj.friction, 0.0)
+        material = sapien().physx.PhysxMaterial
+        self._material, self._opposed = (material(obj.friction, obj.friction, 0.0) for _ in range(2))
+        """Of the object and all links but those of the finger that opposes the others, and of these."""
         self._hand = build_hand(self._scene, hand, self._material)
         self._object = build_object(self._scene, obj, self._material)
         self.set_object(obj)
@@ -56,8 +58,19 @@ class HandScene:
         """Mass, centre of mass and inertia; the shapes stay."""
         set_inertia(self._object, obj.mass, obj.com, obj.inertia)
 
-    def set_friction(self, coefficient: float) -> None:
-        self._material.static_friction = self._material.dynamic_friction = coefficient
+    def oppose(self, links: set[str]) -> None:
+        """These links are of the finger that opposes the others."""
+        for shape, link in self._hand.link_of.items():
+            if link in links:
+                shape.set_physical_material(self._opposed)
+
+    def set_contact(self, friction: float, opposed: float, stiffness: float) -> None:
+        """Friction coefficients of the object's two sides, the second at the finger that opposes the others,
+        and stiffness of a contact [N/m], 0: rigid. PhysX takes the mean of the two bodies' coefficients, and
+        a negative restitution for a stiffness."""
+        for material, value in ((self._material, friction), (self._opposed, 2 * opposed - friction)):
+            material.static_friction = material.dynamic_friction = value
+            material.restitution = -stiffness
 
     def set_link_weight(self, pulls: bool) -> None:
         """Whether gravity pulls at the links too; without, only at the object."""

@@ -11,9 +11,8 @@ import numpy as np
 from ...description import HandDescription, ObjectDescription
 from ...typing import Array
 from ..config import PlantConfig
-from ..grasp_planning.graspable import chain
-from ..grasp_planning.pinch import PinchPlan
-from ..mechanism.assembly import make_transmission, true_object
+from ..grasp_planning.pinch import PinchPlan, opposing_pads
+from ..mechanism.assembly import chain, make_transmission, true_object
 from ..mechanism.servo import Servo
 from ..mechanism.transmission import Transmission
 from ..parameters import PlantParameters
@@ -81,6 +80,10 @@ class Rig:
     def _build(self) -> None:
         p = self.parameters
         self.scene = HandScene(self.hand, true_object(self.obj, p), self.config.time_step)
+        thumb, _ = opposing_pads(self.hand, self.config)
+        finger = self._finger_of[next(pad.link for pad in self.hand.pads if pad.name == thumb)]
+        self.scene.oppose({link for link, root in self._finger_of.items() if root == finger})
+        self._set_contact()
         self.scene.set_link_weight(p.link_weight)
         self._built_scale = p.object_scale
         self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
@@ -97,7 +100,7 @@ class Rig:
         scene.object_pose = (plan.position, plan.rotation)
         scene.hold_object(True)
         transmission.relax(plan.q)
-        slack = transmission.offset + transmission.J_a @ plan.q
+        slack = transmission.offset + transmission.J_a @ transmission.shape.excursion(plan.q)
         self.servo.place(slack)
         self.time = -_CLOSING  # time runs on while the object is grasped: a late camera looks back into it
         self.run(round(_CLOSING / step), lambda part: slack + part * (plan.motor - slack))
@@ -164,7 +167,7 @@ class Rig:
         """
         old, self.parameters = self.parameters, new
         self.servo.set_parameters(new)
-        if _differ(old, new, "moment_arm", "spring", "servo_stiffness", "joint_friction", "tendon_creep"):
+        if _differ(old, new, *_TRANSMISSION):
             previous, self.transmission = self.transmission, make_transmission(self.hand, new)
             self.transmission.take_over(previous, self.scene.q, self.servo.output)
             self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
@@ -174,8 +177,17 @@ class Rig:
             self.scene.set_object(obj)
         if _differ(old, new, "link_weight"):
             self.scene.set_link_weight(new.link_weight)
-        if _differ(old, new, "friction"):
-            self.scene.set_friction(obj.friction)
+        if _differ(old, new, "friction", "friction_unevenness", "contact_stiffness", "hardware_seed"):
+            self._set_contact()
+
+    def _set_contact(self) -> None:
+        """Friction of the object's two sides, and the pads' stiffness."""
+        p = self.parameters
+        friction = true_object(self.obj, p).friction
+        sides = [friction, (1 - p.friction_unevenness) * friction]
+        if np.random.default_rng([p.hardware_seed, 3]).random() < 0.5:
+            sides.reverse()
+        self.scene.set_contact(*sides, p.contact_stiffness)
 
     def snapshot(self) -> RigState:
         return RigState(
@@ -195,6 +207,12 @@ class Rig:
         self.scene.restore(state.physics)
         self.transmission, self.servo = copy.deepcopy((state.transmission, state.servo))
         self.normal, self.fingers, self.time = state.normal.copy(), state.fingers, state.time
+
+
+_TRANSMISSION = (
+    *("moment_arm", "spring", "servo_stiffness", "joint_friction", "tendon_creep", "arm_variation", "arm_phase"),
+    *("spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling", "joint_play", "hardware_seed"),
+)
 
 
 def _differ(old: PlantParameters, new: PlantParameters, *names: str) -> bool:

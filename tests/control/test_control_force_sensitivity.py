@@ -1,0 +1,85 @@
+"""The learned correction of how normal forces answer to the actuators."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torch_ekm.control.force_sensitivity import ForceSensitivity
+from torch_ekm.exceptions import NonFiniteError, ShapeError
+
+NAN = math.nan
+F64 = torch.float64
+
+
+def moves(n: int, n_a: int = 3, seed: int = 0) -> torch.Tensor:
+    """Motions of 0.1 rad."""
+    return 0.1 * torch.randn(n, n_a, dtype=F64, generator=torch.Generator().manual_seed(seed))
+
+
+def taught(
+    true: torch.Tensor, described: torch.Tensor, w: torch.Tensor, noise: float = 0.0
+) -> ForceSensitivity:
+    learner = ForceSensitivity(*true.shape)
+    draw = torch.Generator().manual_seed(1)
+    for one in w:
+        error = noise * torch.randn(len(true), dtype=F64, generator=draw)
+        learner.update(one, true @ one + error, described)
+    return learner
+
+
+def test_it_finds_what_the_description_gets_wrong() -> None:
+    described, off = torch.full((2, 3), 10.0, dtype=F64), torch.tensor([[-15.0, 4.0, 0.0], [3.0, 0.0, -8.0]])
+    learner = taught(described + off.double(), described, moves(60), noise=0.1)
+    torch.testing.assert_close(learner.correction, off.double(), atol=1.5, rtol=0)
+
+
+def test_without_forgetting_it_is_regularised_least_squares(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch_ekm.control.force_sensitivity._FORGETTING", 1.0)
+    true, w = torch.tensor([[5.0, -3.0, 2.0]], dtype=F64), moves(8)
+    learner = taught(true, torch.zeros_like(true), w)
+    y, s, p = w @ true[0], 0.25, 20.0
+    exact = torch.linalg.solve(w.mT @ w / s**2 + torch.eye(3, dtype=F64) / p**2, w.mT @ y / s**2)
+    torch.testing.assert_close(learner.correction[0], exact)
+
+
+def test_motions_in_one_direction_do_not_fade_what_others_said() -> None:
+    true, described = torch.tensor([[5.0, -3.0, 2.0]], dtype=F64), torch.zeros(1, 3, dtype=F64)
+    learner = taught(true, described, moves(30))
+    one = torch.tensor([0.1, 0.0, 0.0], dtype=F64)
+    before = learner.evidence.clone()
+    for _ in range(300):
+        learner.update(one, true @ one, described)
+    assert float(learner.evidence[1, 1]) > 0.5 * float(before[1, 1])
+    torch.testing.assert_close(learner.correction, true, atol=0.5, rtol=0)
+
+
+def test_a_pad_that_does_not_measure_learns_nothing_and_a_slip_little() -> None:
+    true, described = torch.full((2, 3), 5.0, dtype=F64), torch.zeros(2, 3, dtype=F64)
+    learner = taught(true, described, moves(30))
+    before = learner.correction.clone()
+    w = moves(1, seed=5)[0]
+    r = learner.update(w, torch.tensor([NAN, float(true[1] @ w)], dtype=F64), described)
+    assert math.isnan(float(r[0]))
+    assert torch.equal(learner.correction[0], before[0])
+    learner.update(w, true @ w - 50.0, described)  # it lets go
+    assert float((learner.correction - before).abs().max()) < 10.0
+
+
+def test_bad_input_changes_nothing_and_the_state_dict_carries_all() -> None:
+    true, described = torch.full((2, 3), 5.0, dtype=F64), torch.zeros(2, 3, dtype=F64)
+    learner = taught(true, described, moves(5))
+    kept = {name: value.clone() for name, value in learner.state_dict().items()}
+    with pytest.raises(ShapeError, match="change"):
+        learner.update(moves(1)[0], torch.zeros(3, dtype=F64), described)
+    with pytest.raises(NonFiniteError, match="moved"):
+        learner.update(torch.full((3,), NAN, dtype=F64), torch.zeros(2, dtype=F64), described)
+    learner.update(torch.zeros(3, dtype=F64), torch.zeros(2, dtype=F64), described)  # nothing moved
+    assert all(torch.equal(value, kept[name]) for name, value in learner.state_dict().items())
+    other = ForceSensitivity(2, 3)
+    other.load_state_dict(kept)
+    for each in (learner, other):
+        each.update(moves(1, seed=9)[0], torch.ones(2, dtype=F64), described)
+    assert torch.equal(other.correction, learner.correction)

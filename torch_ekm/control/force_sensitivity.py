@@ -1,0 +1,87 @@
+"""How the normal forces of the pads answer to the actuators, corrected by what was measured."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from .._checks import check_finite, check_shape
+from .._recorded import Recorded
+from ..typing import Float, Tensor
+
+_PRIOR_STD = 20.0  # [N/rad] of an entry of B
+_NOISE_STD = 0.25  # [N] of a change of force that B does not explain
+_FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
+_CLIP = 4.0  # standard deviations; a contact that slips says nothing of the rest
+
+
+class ForceSensitivity(Recorded, nn.Module):
+    """``f_n+ - f_n = (df_n/da + B) w + noise``: B ``(n_pads, n_a)``, by recursive least squares::
+
+        r = (f_n+ - f_n) - (df_n/da + B) w                   of each pad that measures
+        D <- D - (1 - .97) D w w' D / (w' D w) + w w' / s^2  what motions say, forgotten in the direction of w
+        B <- B + r k',   k = (D + I / 20^2)^-1 w / s^2
+
+    All pads share D. B belongs to the hand: it is kept from grasp to grasp.
+
+    Args:
+        n_pads, n_a: contact pads and actuators of the hand.
+
+    Source: least squares with directional forgetting, Kulhavy and Karny, IFAC World Congress (1984).
+    """
+
+    def __init__(self, n_pads: int, n_a: int) -> None:
+        super().__init__()
+        self.correction = nn.Buffer(torch.zeros(n_pads, n_a, dtype=torch.float64))
+        """B [N/rad]."""
+        self.evidence = nn.Buffer(torch.zeros(n_a, n_a, dtype=torch.float64))
+        """D [rad^2/N^2 of B], information of the motions."""
+
+    @property
+    def _covariance(self) -> Tensor:
+        prior = torch.eye(len(self.evidence), dtype=torch.float64) / _PRIOR_STD**2
+        return torch.linalg.inv(self.evidence + prior)
+
+    @torch.no_grad()
+    def update(
+        self,
+        moved: Float[Tensor, " n_a"],
+        change: Float[Tensor, " n_pads"],
+        described: Float[Tensor, "n_pads n_a"],
+    ) -> Float[Tensor, " n_pads"]:
+        """Learn from one motion.
+
+        Args:
+            moved: w, of the encoders [rad].
+            change: ``f_n+ - f_n`` of each pad [N]; NaN: it does not measure, or does not touch.
+            described: ``df_n/da`` of each pad by the model [N/rad].
+
+        Returns:
+            r [N], NaN where nothing was measured.
+
+        Raises:
+            ShapeError, NonFiniteError: nothing is changed.
+        """
+        n_pads, n_a = self.correction.shape
+        for name, value, shape in (
+            ("moved", moved, (n_a,)), ("change", change, (n_pads,)), ("described", described, (n_pads, n_a))
+        ):  # fmt: skip
+            check_shape(name, value, shape)
+        check_finite("moved", moved)
+        w = moved.to(self.correction)
+        r = change.to(w) - (described.to(w) + self.correction) @ w
+        known = ~r.isnan()
+        if not bool(known.any()) or not bool(w.any()):
+            return r
+        spread = (_NOISE_STD**2 + w @ self._covariance @ w).sqrt()
+        Dw = self.evidence @ w
+        if float(w @ Dw) > 0:
+            self.evidence -= (1 - _FORGETTING) * torch.outer(Dw, Dw) / (w @ Dw)
+        self.evidence += torch.outer(w, w) / _NOISE_STD**2
+        gain = self._covariance @ w / _NOISE_STD**2
+        bounded = r.clamp(-_CLIP * spread, _CLIP * spread)
+        self.correction[known] += torch.outer(bounded[known], gain)
+        return r
+
+    def extra_repr(self) -> str:
+        return f"pads={len(self.correction)}, largest={float(self.correction.abs().max()):.3g} N/rad"

@@ -1,0 +1,96 @@
+"""How a transmission departs from round pulleys, linear springs and cables without losses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...typing import Array
+
+
+@dataclass(frozen=True)
+class JointShape:
+    """How far pulleys are from round, and springs from linear::
+
+        h_j(q) = q - (v/2) (cos(2 q + phase_j) - cos phase_j)      excursion J_a h(q), arms J_a h'(q)
+        k x (1 + s x^2)                                            x from the spring's rest
+
+    Source: the arm of a tendon is the derivative of its excursion, An et al., J. Biomech. Eng. 105 (1983);
+    the cubic spring is that of Duffing (1918).
+    """
+
+    variation: Array
+    """v of each joint ``(n_q,)``."""
+    phase: Array
+    """Of each joint ``(n_q,)`` [rad]."""
+    stiffening: float = 0.0
+    """s [1/rad^2]."""
+
+    @classmethod
+    def round(cls, n_q: int) -> JointShape:
+        """Round pulleys and linear springs."""
+        return cls(np.zeros(n_q), np.zeros(n_q))
+
+    @property
+    def largest_arm(self) -> Array:
+        """Largest factor on each joint's moment arms ``(n_q,)``."""
+        return 1 + np.abs(self.variation)
+
+    def largest_spring_factor(self, farthest: Array) -> Array:
+        """Largest ``d(x + s x^3)/dx`` up to ``farthest`` from the rest ``(n_q,)``."""
+        return np.maximum(1.0, 1 + 3 * self.stiffening * farthest**2)
+
+    def excursion(self, q: Array) -> Array:
+        """h(q) ``(*batch, n_q)`` [rad]."""
+        return q - 0.5 * self.variation * (np.cos(2 * q + self.phase) - np.cos(self.phase))
+
+    def arm(self, q: Array) -> Array:
+        """h'(q) ``(*batch, n_q)``."""
+        return 1 + self.variation * np.sin(2 * q + self.phase)
+
+    def spring(self, x: Array) -> Array:
+        """``x (1 + s x^2)`` ``(*batch, n_q)`` [rad]."""
+        return x * (1 + self.stiffening * x**2)
+
+
+@dataclass(frozen=True)
+class CableLosses:
+    """Friction, hysteresis and coupling of the transmissions, and play of the joints::
+
+        |tau_f| <= friction + capstan |arm^T T|             Coulomb friction of the joint and of its cables
+        T  = K s + z,  |z| <= (hysteresis/2) k |s|,  dz = k ds while it may grow
+        K^-1 = D (I + coupling (1 1^T - I)) D,  D = diag(k)^(-1/2)
+        no torque goes through a joint while it is within its play
+
+    Source: a cable round a pulley over the angle w loses the share ``1 - exp(-mu w)`` of its tension (Euler
+    and Eytelwein): capstan; the elastic hysteresis is that of Masing (1926) with one element; actuators on one
+    frame that gives way are springs in series with a common one: coupling.
+    """
+
+    capstan: float
+    hysteresis: float
+    coupling: float
+    play: Array
+    """Full width of each joint ``(n_q,)`` [rad]."""
+
+    @classmethod
+    def none(cls, n_q: int) -> CableLosses:
+        """No losses."""
+        return cls(0.0, 0.0, 0.0, np.zeros(n_q))
+
+    @property
+    def any_play(self) -> bool:
+        """Some joint has play."""
+        return bool(self.play.any())
+
+    @property
+    def steepening(self) -> float:
+        """Bound of ``dT/ds`` in units of k."""
+        return 1 / (1 - self.coupling) + (self.hysteresis > 0)
+
+    def compliance(self, stiffness: Array) -> Array:
+        """``K^-1`` ``(n_a, n_a)`` [rad/(N m)] of actuators with stiffness k ``(n_a,)`` [N m/rad]."""
+        root = 1 / np.sqrt(stiffness)
+        shared = self.coupling + (1 - self.coupling) * np.eye(len(stiffness))
+        return root[:, None] * shared * root
