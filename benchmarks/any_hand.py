@@ -3,8 +3,9 @@
     python benchmarks/any_hand.py --families all --objects box,bottle --seeds 1000:1003
 
 Each family is one way in which a plant departs from its description, at three strengths, on the preset
-"nominal"; the mixtures are the presets "odd_1" to "odd_5". Turns of 9, 19 and 27 deg; the E-KM has three turns
-of warm-up with the object. Finished sessions stay in ``--out``: an interrupted run goes on where it stopped.
+"nominal"; the mixtures are the presets "odd_1" to "odd_5". Turns of 9, 19 and 27 deg; the E-KM has three
+turns of warm-up with the object. Finished sessions stay in ``--out``: an interrupted run goes on where it
+stopped.
 """
 
 from __future__ import annotations
@@ -113,14 +114,18 @@ class Row:
         """The figures of some turns."""
         reached = [one for one in records if not (one.lost or one.not_reached)]
         motions = float(np.mean([one.steps for one in reached])) if reached else math.nan
-        ends = Counter("object lost" if one.lost else one.reason for one in records if one.lost or one.not_reached)
+        ends = Counter(
+            "object lost" if one.lost else one.reason for one in records if one.lost or one.not_reached
+        )
         text = ", ".join(f"{n} {reason}" for reason, n in ends.most_common())
         lost = sum(one.lost for one in records)
         return cls(family, strength, controller, len(records), lost, len(reached), motions, text)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     names = ", ".join((*FAMILIES, *OTHERS))
     parser.add_argument("--families", default="all", help=f"of {names}; FAMILY:strong for one strength")
     parser.add_argument("--objects", default="box,bottle", help="names or paths")
@@ -153,7 +158,9 @@ def main() -> None:
         figures = f"{row.turns} | {row.lost} | {row.reached} | {row.motions:.1f} | {row.ends}"
         print(f"| {row.family} | {row.strength} | {row.controller} | {figures} |")
     totals = {
-        name: Row.of("all", "", name, [one for key, turns in records.items() if key[2] == name for one in turns])
+        name: Row.of(
+            "all", "", name, [one for key, turns in records.items() if key[2] == name for one in turns]
+        )
         for name in CONTROLLERS
     }
     ours, theirs = totals["E-KM"], totals["KM+I"]

@@ -18,7 +18,8 @@ Fault = Callable[["Obedient", Observation], Observation]
 
 
 class Obedient(FakePlant):
-    """``ds = gain J_m da``; encoders obey but for ``dead`` actuators; a motion takes a second.
+    """``ds = gain J_m da, df_n = (df_n/da) da``; encoders obey but for ``dead`` actuators;
+    a motion takes 1 s.
 
     From command ``since`` on each reading is what ``fault`` makes of it. ``given`` are the commands.
     ``noise`` is that of angles [rad], and of positions [0.1 m].
@@ -42,11 +43,11 @@ class Obedient(FakePlant):
         self.given: list[torch.Tensor] = []
         self.last: list[Observation] = []
         """As passed on."""
-        self.state, self.a = seen.state, seen.a
+        self.state, self.a, self.force = seen.state, seen.a, seen.fingertip_force
         self.draw = torch.Generator().manual_seed(3)
 
     def reset(self, seed: int) -> Observation:
-        self.state, self.a = self.start.state, self.start.a
+        self.state, self.a, self.force = self.start.state, self.start.a, self.start.fingertip_force
         self.draw.manual_seed(seed)
         return self.observe()
 
@@ -55,7 +56,7 @@ class Obedient(FakePlant):
         state = self.state.plus(
             self.noise * noise * torch.tensor([1.0] * len(self.start.q) + [0.1] * 3 + [1.0] * 3)
         )
-        force = self.start.fingertip_force
+        force = self.force
         felt = None if force is None else force * (1 + 0.01 * noise[: len(force)])
         seen = dataclasses.replace(
             self.start,
@@ -77,7 +78,12 @@ class Obedient(FakePlant):
         moved = delta_a.clone()
         moved[self.dead] = 0.0
         if bool(moved.any()):
-            self.state = self.state.plus(self.gain * self.model.linearize(self.state).step(moved))
+            lin = self.model.linearize(self.state)
+            self.state = self.state.plus(self.gain * lin.step(moved))
+            if self.force is not None:
+                pads = torch.tensor(self.model.hand.pad_indices(lin.contacts.finger))
+                change = lin.normal_force_sensitivity @ moved
+                self.force = self.force.index_add(0, pads, change).clamp(min=0.0)
         self.a = self.a + moved
 
 

@@ -25,6 +25,7 @@ from torch_ekm.control import (
     TrustRegion,
 )
 from torch_ekm.control import StopReason as Reason
+from torch_ekm.control.pace import ForceSurprise
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
@@ -151,32 +152,35 @@ def test_a_step_is_cut_in_proportion_to_what_is_predicted_to_go_wrong(held) -> N
     at = Situation(plant.hand, focus, seen.state, seen.a, None, torch.zeros(6), torch.zeros(1), weight=0.8)
     still, bound = torch.zeros(plant.hand.n_a, dtype=torch.float64), StepBound()
     predicted = torch.zeros(plant.hand.n_q + 6, dtype=torch.float64)
-    assert bound.share(lin, still, predicted, at, None) == 1.0
+    assert bound.share(lin, still, predicted, at) == 1.0
     off = focus.off_matrix[~focus.off_translation][0]
     turned = predicted.clone()
     turned[-6:] = 3 * DEG * off
-    assert bound.share(lin, still, turned, at, None) == pytest.approx(0.5)
+    assert bound.share(lin, still, turned, at) == pytest.approx(0.5)
     carried = predicted.clone()
     carried[-6:] = 10e-3 * focus.off_matrix[focus.off_translation][0]
-    assert bound.share(lin, still, carried, at, None) == pytest.approx(0.25)
+    assert bound.share(lin, still, carried, at) == pytest.approx(0.25)
     force = float(at.normal_force(lin).max())  # type: ignore[union-attr]
-    assert bound.share(lin, still, predicted, at, 2 * force) == pytest.approx(0.25)
+    at = dataclasses.replace(at, grip=2 * force)
+    assert bound.share(lin, still, predicted, at) == pytest.approx(0.25)
+    at = dataclasses.replace(at, grip=6.0)
     # the sum of three fingers is right, but one of the two that share a side bears half of its part
     felt = torch.tensor([6.0, 4.5, 1.5], dtype=torch.float64)
     uneven = dataclasses.replace(at, fingertip_force=torch.cat([felt, torch.full((2,), torch.nan)]))
     part = (1.5 / (bound.even * 3.0)) ** 2
-    shares = [bound.share(lin, still, predicted, uneven, 6.0, asked) for asked in (0.3, 1.0, 2.0, 4.0)]
+    shares = [bound.share(lin, still, predicted, uneven, asked) for asked in (0.3, 1.0, 2.0, 4.0)]
     assert shares == pytest.approx([1.0, 1.0, 0.5, part])  # steps of pace 1 are not cut
-    assert StepBound(even=0.5).share(lin, still, predicted, uneven, 6.0, 4.0) == 1.0
+    assert StepBound(even=0.5).share(lin, still, predicted, uneven, 4.0) == 1.0
     felt = torch.tensor([6.0, 4.5, -1.5, torch.nan, torch.nan], dtype=torch.float64)  # of a pad that drifts
     off = dataclasses.replace(at, fingertip_force=felt)
-    assert bound.share(lin, still, predicted, off, 6.0, 4.0) == pytest.approx(0.25)
+    assert bound.share(lin, still, predicted, off, 4.0) == pytest.approx(0.25)
     felt = torch.tensor([6.0, -0.5, -0.5, torch.nan, torch.nan], dtype=torch.float64)  # nobody opposes
     alone = dataclasses.replace(at, fingertip_force=felt)
-    assert bound.share(lin, still, predicted, alone, 6.0, 4.0) == pytest.approx(0.25)
+    assert bound.share(lin, still, predicted, alone, 4.0) == pytest.approx(0.25)
     # a motion that takes the margins away: the heavier the object, the less of it is made
     delta = 4 * DEG * torch.from_numpy(np.sign(lin.margin_sensitivity.sum(0).numpy())) * -1.0
-    shares = [bound.share(lin, delta, predicted, dataclasses.replace(at, weight=w), None) for w in (0.3, 3.0)]
+    heavier = [dataclasses.replace(at, grip=None, weight=weight) for weight in (0.3, 3.0)]
+    shares = [bound.share(lin, delta, predicted, one) for one in heavier]
     assert 0 < shares[1] < shares[0] < 1
 
 
@@ -202,15 +206,21 @@ def test_the_pace_grows_where_the_model_is_right_and_shrinks_where_it_is_not() -
     assert trust.disagreement(predicted, predicted, 0.015) == 0.0
     pace.judge(0.0)
     assert pace.factor == pytest.approx(trust.start * grow)
-    # one direction of six is wrong by 3 deg: rho^2 = 9 / 6 / (0.3^2 + (0.12 * 2.5)^2)
+    # one direction of three is wrong by 3 deg: rho^2 = 9 / 3 / (0.3^2 + (0.12 * 2.5)^2)
     rho = trust.disagreement(predicted, wrong, 0.015)
-    assert rho == pytest.approx(math.sqrt(9 / 6 / 0.18), rel=1e-6)
+    assert rho == pytest.approx(math.sqrt(9 / 3 / 0.18), rel=1e-6)
     pace.judge(rho)
     assert pace.factor == pytest.approx(trust.start * grow * shrink)
     before = pace.factor
     pace.judge(0.0, share=0.5)  # half a step says nothing for a larger one
     assert pace.factor == before
-    pace.judge(trust.disagreement(predicted, predicted, 0.015, torch.full((3,), 5.0)))  # forces went wrong
+    # the worst finger counts, for the share of its own force: 2 N of 1.5 N are wrong, 2 N of 8 N are not
+    for bears, rho in ((1.5, 2 / math.hypot(0.5, 0.25 * 1.5)), (8.0, 2 / math.hypot(0.5, 2.0))):
+        forces = torch.tensor([6.0, bears, 4.0], dtype=torch.float64)
+        off = torch.tensor([0.0, -2.0, torch.nan], dtype=torch.float64)
+        felt = ForceSurprise((0, 1, 2), forces, forces + off, off)
+        assert trust.disagreement(predicted, predicted, 0.015, felt) == pytest.approx(rho)
+    pace.judge(2.0)
     assert pace.factor < before
     for _ in range(50):
         pace.judge(0.0)

@@ -68,7 +68,7 @@ def test_a_pad_that_does_not_measure_learns_nothing_and_a_slip_little() -> None:
     assert float((learner.correction - before).abs().max()) < 10.0
 
 
-def test_bad_input_changes_nothing_and_the_state_dict_carries_all() -> None:
+def test_bad_input_changes_nothing_and_the_state_dict_carries_all(unchecked) -> None:
     true, described = torch.full((2, 3), 5.0, dtype=F64), torch.zeros(2, 3, dtype=F64)
     learner = taught(true, described, moves(5))
     kept = {name: value.clone() for name, value in learner.state_dict().items()}

@@ -9,6 +9,7 @@ import torch
 from obedient_plant import Obedient
 
 from torch_ekm.control import ClosedLoop, HandKnowledge, LookAndMoveController, PoseTarget
+from torch_ekm.control.force_sensitivity import ForceSensitivity
 from torch_ekm.enhanced import EnhancedModel, save
 from torch_ekm.exceptions import FileFormatError, ParameterError
 from torch_ekm.kinematics import IdealServos, ServoModel
@@ -69,7 +70,7 @@ def test_knowledge_of_another_hand_and_another_file_are_refused(held, driven, tm
         ClosedLoop(
             Obedient(model, seen),
             LookAndMoveController(model, axis),
-            knowledge=HandKnowledge(ServoModel(["one", "two"])),
+            knowledge=HandKnowledge(ServoModel(["one", "two"]), ForceSensitivity(5, 2)),
         )
     save(SparseOnlineGP(2, 1), tmp_path / "learner.ekm")
     with pytest.raises(FileFormatError, match="holds a SparseOnlineGP, no HandKnowledge"):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import math
 import threading
 import time
 from collections.abc import Callable, Generator
@@ -19,9 +21,12 @@ from .controller import LookAndMoveController
 from .decision import Decision, Expectation, StopReason
 from .focus import FocusedPose, PoseTarget
 from .knowledge import HandKnowledge
+from .pace import ForceSurprise
 from .safety import Safety
 from .safety.progress import Progress
 from .safety.watch import Watch
+
+_GRIP_SHARE = 0.5  # of a motion that only grips: too little for the pace to grow
 
 
 @dataclass(frozen=True)
@@ -128,7 +133,7 @@ class ClosedLoop:
         self.controller, self.learn, self.decline = controller, learn, decline
         self.safety = Safety() if safety is None else safety
         if controller.enhanced is not None:
-            controller.force_correction = knowledge.forces.correction
+            controller.forces = knowledge.forces
         self._stop = threading.Event()
 
     def __enter__(self) -> ClosedLoop:
@@ -182,6 +187,10 @@ class ClosedLoop:
             against = self.decline(seen, target)
             if against:
                 return Stop(StopReason.OUT_OF_REACH, seen, against)
+        if progress.halt is None and seen.status is PlantStatus.HELD:
+            seen, weak = yield from self._grip_first(seen, progress, watch)
+            if weak and progress.halt is None and not progress.lost(seen):
+                return Stop(StopReason.WEAK_GRASP, seen, weak)
         while True:
             over = progress.over(seen, self._stop.is_set())
             if over is not None:
@@ -191,6 +200,7 @@ class ClosedLoop:
             seen, decision, sign, seconds = self._decide(seen, progress, watch)
             if sign and progress.way and decision.status is not StopReason.OBJECT_LOST:
                 progress.alarm(seen)
+                watch.forget()
                 seen, clear = yield from self._go_back(seen, decision, progress, watch)
                 if progress.halt is not None:
                     continue
@@ -211,6 +221,27 @@ class ClosedLoop:
             yield step
             seen, progress.limited = step.after, decision.limited
 
+    def _grip_first(
+        self, seen: Observation, progress: Progress, watch: Watch
+    ) -> Generator[Step, None, tuple[Observation, str]]:
+        """Tighten a grip in which a finger bears less than the object needs; what still does, in words."""
+        for left in range(self.safety.caution.grips, -1, -1):
+            here = PoseTarget(seen.position, seen.rotation)
+            decision = self.controller.decide(seen.state, seen.a, here, seen.fingertip_force)
+            weak = watch.grip.weak(decision) if decision.status is StopReason.RUNNING else ""
+            if not weak or left == 0:
+                return seen, weak
+            decision = dataclasses.replace(decision, share=_GRIP_SHARE)
+            progress.halt = watch.command(decision, seen)
+            if progress.halt is not None:
+                return seen, weak
+            step = self._move(seen, decision, progress, watch, turns=False)
+            yield step
+            seen = step.after
+            if seen.status is not PlantStatus.HELD or progress.halt is not None:
+                return seen, weak
+        return seen, ""
+
     def _decide(
         self, seen: Observation, progress: Progress, watch: Watch
     ) -> tuple[Observation, Decision, str, float]:
@@ -220,7 +251,7 @@ class ClosedLoop:
             began = time.perf_counter()
             decision = self.controller.decide(seen.state, seen.a, progress.target, seen.fingertip_force)
             seconds = time.perf_counter() - began
-            sign = progress.sign(seen, decision)
+            sign = progress.sign(seen, decision) or watch.slid or watch.grip.sign
             if not sign or looks == 0 or seen.status is not PlantStatus.HELD:
                 return seen, decision, sign, seconds
             seen, looks = watch.rest(seen, self.plant.observe()), looks - 1
@@ -242,7 +273,13 @@ class ClosedLoop:
         return seen, False
 
     def _move(
-        self, seen: Observation, decision: Decision, progress: Progress, watch: Watch, seconds: float = 0.0
+        self,
+        seen: Observation,
+        decision: Decision,
+        progress: Progress,
+        watch: Watch,
+        seconds: float = 0.0,
+        turns: bool = True,
     ) -> Step:
         """Command, observe, learn."""
         first = self.plant.command(decision.delta_a)
@@ -255,52 +292,47 @@ class ClosedLoop:
         elif after is not first:
             self.plant.correct(after)
         increment = after.state.minus(seen.state)
-        report = None
-        if verdict.teaches and self.learn and verdict.expected is not None:
-            report = self._learn(seen, decision, after, increment, verdict.expected)
+        report, lin, expected = None, decision.linearization, verdict.expected
+        if lin is not None and expected is not None and after.status is PlantStatus.HELD:
+            felt = watch.grip.surprise(lin, seen, expected.moved, after)
+            if decision.share > 0:
+                watch.grip.follow(decision, felt)
+            if verdict.teaches and self.learn:
+                report = self._learn(seen, decision, lin, increment, expected, felt)
+            if watch.grip.slows:
+                self.controller.pace.judge(math.inf)
         seconds += time.perf_counter() - began
-        progress.add(after, blind=watch.blind > 0)
+        if turns:
+            progress.add(after, blind=watch.blind > 0)
         return Step(seen, decision, after, increment, report, seconds, verdict.note)
 
     def _learn(
-        self, seen: Observation, decision: Decision, after: Observation, ds: Tensor, expected: Expectation
+        self,
+        seen: Observation,
+        decision: Decision,
+        lin: Linearization,
+        ds: Tensor,
+        expected: Expectation,
+        felt: ForceSurprise | None,
     ) -> UpdateReport | None:
-        enhanced, lin = self.controller.enhanced, decision.linearization
-        if enhanced is None or after.status is not PlantStatus.HELD or lin is None:
+        enhanced = self.controller.enhanced
+        if enhanced is None:
             return None
         if not self.knowledge.servo.learns:  # then the dead zones are g's to learn
             expected = self.controller.expect(lin, decision.delta_a)
         lever = float((lin.contacts.point - seen.position).square().sum(-1).mean().sqrt())
-        surprise = self._force_surprise(lin, seen, expected.moved, after)
-        self._learn_forces(lin, seen, expected.moved, after)
+        if felt is not None:
+            self._learn_forces(lin, expected.moved, felt)
         trust = self.controller.pace.options.trust
-        rho = trust.disagreement(expected.increment[-6:], ds[-6:], lever, surprise)
+        rho = trust.disagreement(expected.increment[-6:], ds[-6:], lever, felt)
         self.controller.pace.judge(rho, decision.share)
         return enhanced.update(seen.state, expected.moved, ds, expected.nominal)
 
-    def _learn_forces(self, lin: Linearization, seen: Observation, moved: Tensor, after: Observation) -> None:
+    def _learn_forces(self, lin: Linearization, moved: Tensor, felt: ForceSurprise) -> None:
         """Pads that touched and measured before and after teach how their forces answer."""
-        if seen.fingertip_force is None or after.fingertip_force is None:
-            return
-        forces = self.knowledge.forces
-        pads = self.controller.kinematic.hand.pad_indices(lin.contacts.finger)
+        forces, pads = self.knowledge.forces, list(felt.pads)
         change = torch.full((len(forces.correction),), torch.nan, dtype=torch.float64)
-        before, now = seen.fingertip_force[pads], after.fingertip_force[pads]
-        least = self.controller.kinematic.options.forces.normal_std
-        measured = torch.minimum(before, now) >= least
-        change[pads] = (now - before).where(measured, torch.nan)
+        change[pads] = (felt.after - felt.before).where(~felt.surprise.isnan(), torch.nan)
         described = torch.zeros_like(forces.correction)
         described[pads] = lin.normal_force_sensitivity - forces.correction[pads]
         forces.update(moved, change, described)
-
-    def _force_surprise(
-        self, lin: Linearization, seen: Observation, moved: Tensor, after: Observation
-    ) -> Float[Tensor, " n_c"] | None:
-        """How far each contact's normal force is from what was predicted [N]; None: not all pads measure."""
-        if seen.fingertip_force is None or after.fingertip_force is None:
-            return None
-        pads = self.controller.kinematic.hand.pad_indices(lin.contacts.finger)
-        before, now = seen.fingertip_force[pads], after.fingertip_force[pads]
-        if bool((torch.minimum(before, now) < self.controller.kinematic.options.forces.normal_std).any()):
-            return None  # a pad that reads so little may be dead, or has let go
-        return now - before - lin.normal_force_sensitivity @ moved

@@ -16,7 +16,7 @@ from ..exceptions import EKMError, GraspError, NoContactError, SolverError
 from ..kinematics import GraspState
 from ..model import ModelStatus
 from ..typing import Float, Tensor
-from .decision import Decision, Expectation, StopReason
+from .decision import Decision, Expectation, Grip, StopReason
 from .focus import FocusedPose, PoseTarget
 from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
 from .pace import Pace, contact_travel
@@ -26,6 +26,7 @@ from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
 
 if TYPE_CHECKING:
     from ..model import KinematicModel, Linearization
+    from .force_sensitivity import ForceSensitivity
 
 #: What a step should do by default: effort, off-axis motion, grip force, focus. The figures suit the iCub
 #: hand.
@@ -75,8 +76,8 @@ class LookAndMoveController:
         self.tasks = DEFAULT_TASKS if tasks is None else tuple(tasks)
         self.limits = DEFAULT_LIMITS if limits is None else tuple(limits)
         self.pace = Pace(adapts=self.enhanced is not None) if pace is None else pace
-        self.force_correction: Float[Tensor, "n_pads n_a"] | None = None
-        """B, what was learned of ``df_n/da`` of each pad [N/rad]; a :class:`ClosedLoop` sets it."""
+        self.forces: ForceSensitivity | None = None
+        """What was learned of how the pads' forces answer; a :class:`ClosedLoop` sets it."""
         self.tighter = 0.0
         """Grip force on top of the one that suits the object [N]."""
         self._weight = float(torch.linalg.vector_norm(self.kinematic.weight))
@@ -104,9 +105,9 @@ class LookAndMoveController:
         lin = self.kinematic.linearize(
             state, fingertip_force=fingertip_force, expected=expected, previous=last
         )
-        if self.force_correction is not None:
+        if self.forces is not None:
             pads = self.kinematic.hand.pad_indices(lin.contacts.finger)
-            lin = lin.with_normal_sensitivity(self.force_correction[pads])
+            lin = lin.with_normal_sensitivity(self.forces.correction[pads])
         if lin.forces.solved:
             self._previous = lin, a
         return lin
@@ -178,13 +179,16 @@ class LookAndMoveController:
         travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
         desired, share = self.pace.ask(focused, travel)
         alone = None if fingertip_force is None else self._joint_force(lin)
+        deviation = None if self.forces is None else self.forces.variance.sqrt()
         seen = Situation(
-            hand, self.focus, state, a, fingertip_force, error, desired, alone, self._weight, self.tighter
-        )
+            hand, self.focus, state, a, fingertip_force, error, desired, alone, self._weight, self.tighter,
+            force_std=deviation,
+        )  # fmt: skip
+        grips = (task.wanted(lin, seen) for task in self.tasks if isinstance(task, GripForceTask))
+        seen = dataclasses.replace(seen, grip=next(grips, None))
         try:
             da, predicted, problem, solution = self._solve(lin, seen)
-            grips = (task.wanted(lin, seen) for task in self.tasks if isinstance(task, GripForceTask))
-            phi = self.pace.cut(lin, da, predicted, seen, next(grips, None), share)
+            phi = self.pace.cut(lin, da, predicted, seen, share)
             if phi < 1:
                 desired, share = phi * desired, phi * share
                 seen = dataclasses.replace(seen, desired=desired)
@@ -194,7 +198,19 @@ class LookAndMoveController:
         nominal = lin.manipulation_jacobian @ da
         slack = float(np.abs(solution.slack).max(initial=0.0))
         limited = slack > 0.05 * float(desired.abs().max()) and self._at_limit(a, da, problem)
-        return Decision(da, StopReason.RUNNING, desired, predicted, nominal, share, limited, slack, lin)
+        grip = self._grip(lin, seen)
+        return Decision(
+            da, StopReason.RUNNING, desired, predicted, nominal, share, limited, slack, lin, grip=grip
+        )
+
+    def _grip(self, lin: Linearization, seen: Situation) -> Grip | None:
+        """What the fingers bear and should bear; None where nothing is known or asked of it."""
+        f_n = seen.normal_force(lin)
+        least = next((limit for limit in self.limits if isinstance(limit, NormalForceLimit)), None)
+        if f_n is None or least is None:
+            return None
+        sure = dataclasses.replace(seen, force_std=None)
+        return Grip(torch.from_numpy(f_n), torch.from_numpy(least.least(f_n, lin, sure)))
 
     def _none(self, status: StopReason, failure: EKMError, focused: Tensor) -> Decision:
         """No motion, and why."""

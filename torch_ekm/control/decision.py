@@ -23,6 +23,8 @@ class StopReason(Enum):
     UNSTABLE_GRASP = "unstable grasp"
     GIVEN_UP = "given up"
     """With the object in the hand, see :class:`~torch_ekm.control.Caution`."""
+    WEAK_GRASP = "weak grasp"
+    """Declined before anything turned: a finger bears less than the object needs, and grips no better."""
     OUT_OF_REACH = "out of reach"
     """Declined before anything moved, see ``decline`` of :class:`~torch_ekm.control.ClosedLoop`."""
     OBJECT_LOST = "object lost"
@@ -41,6 +43,15 @@ class StopReason(Enum):
     COMMAND_CEILING = "command ceiling"
     SPEED_CEILING = "speed ceiling"
     FORCE_CEILING = "force ceiling"
+
+
+class Grip(NamedTuple):
+    """What the fingers in contact bear before a motion."""
+
+    force: Float[Tensor, " n_c"]
+    """f_n, as measured, or as estimated where a pad does not measure [N]."""
+    least: Float[Tensor, " n_c"]
+    """What each should bear at least, see :class:`~torch_ekm.control.NormalForceLimit` [N]."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +78,8 @@ class Decision:
     """The kinematic model at the state; None where it has none."""
     message: str = ""
     """Why there is no increment."""
+    grip: Grip | None = None
+    """None: no forces are known, or no :class:`~torch_ekm.control.NormalForceLimit` asks for any."""
 
 
 class Expectation(NamedTuple):

@@ -12,6 +12,7 @@ from ..typing import Float, Tensor
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
 _NOISE_STD = 0.25  # [N] of a change of force that B does not explain
 _FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
+_RECENT = 0.1  # weight of the last motion in the variance of r
 _CLIP = 4.0  # standard deviations; a contact that slips says nothing of the rest
 
 
@@ -36,6 +37,8 @@ class ForceSensitivity(Recorded, nn.Module):
         """B [N/rad]."""
         self.evidence = nn.Buffer(torch.zeros(n_a, n_a, dtype=torch.float64))
         """D [rad^2/N^2 of B], information of the motions."""
+        self.variance = nn.Buffer(torch.full((n_pads,), _NOISE_STD**2, dtype=torch.float64))
+        """Of r, of each pad's last motions [N^2]."""
 
     @property
     def _covariance(self) -> Tensor:
@@ -81,6 +84,7 @@ class ForceSensitivity(Recorded, nn.Module):
         gain = self._covariance @ w / _NOISE_STD**2
         bounded = r.clamp(-_CLIP * spread, _CLIP * spread)
         self.correction[known] += torch.outer(bounded[known], gain)
+        self.variance[known] += _RECENT * (bounded[known].square() - self.variance[known])
         return r
 
     def extra_repr(self) -> str:

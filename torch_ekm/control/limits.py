@@ -7,13 +7,16 @@ so the program always has a solution.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
 from ..exceptions import ParameterError, UnknownNameError
-from .qp import DEGREE, Bounds, Inequality, as_array
-from .situation import LinearizedModel, Situation
+from .qp import DEGREE, Array, Bounds, Inequality, as_array
+from .situation import LinearizedModel, Situation, grip_shares
+
+if TYPE_CHECKING:
+    from ..model import Linearization
 
 
 @runtime_checkable
@@ -82,7 +85,12 @@ class JointLimit:
 
 @dataclass(frozen=True)
 class NormalForceLimit:
-    """``minimum <= f_n + (df_n/da) u <= maximum`` of each finger, f_n as measured.
+    """``least_i <= f_n + (df_n/da) u <= maximum`` of each finger, f_n as measured, with::
+
+        least_i = max(minimum, share f*_i) + std_i        at most f*_i
+
+    f*_i is what :class:`GripForceTask` wants of the finger, which follows from load and friction, and std_i
+    how far predictions of its force are off: no finger fades.
 
     For the upper limit the largest of measured and estimated force counts, with the estimate of joints and
     springs alone where it contradicts the pads: sensors that read too little must not make the hand squeeze.
@@ -94,6 +102,7 @@ class NormalForceLimit:
 
     minimum: float = 0.8
     """[N]"""
+    share: float = 0.4
     step: float = 0.7
     """At most this much of what is missing, or too much, is asked for in one step [N]."""
     maximum: float = 10.0
@@ -110,6 +119,16 @@ class NormalForceLimit:
         most = np.maximum(f_n, as_array(forces.normal)) if forces.solved else f_n
         most = most if seen.joint_force is None else np.maximum(most, as_array(seen.joint_force))
         high = np.maximum(self.maximum - most, -self.step)
-        low = np.minimum(np.minimum(self.minimum - f_n, self.step), high)
+        low = np.minimum(np.minimum(self.least(f_n, model.kinematic, seen) - f_n, self.step), high)
         S = as_array(model.kinematic.normal_force_sensitivity)
         return Inequality(np.concatenate([-S, S]), np.concatenate([-low, high]))
+
+    def least(self, f_n: Array, kinematic: Linearization, seen: Situation) -> Array:
+        """least_i of each contact ``(n_c,)`` [N]."""
+        if seen.grip is None:
+            return np.full(len(f_n), self.minimum)
+        wanted = grip_shares(f_n, seen.grip)
+        least = np.maximum(self.minimum, self.share * wanted)
+        if seen.force_std is not None:
+            least += as_array(seen.force_std)[seen.hand.pad_indices(kinematic.contacts.finger)]
+        return np.minimum(least, np.maximum(wanted, self.minimum))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ _RELATIVE = 0.12
 _TRANSLATION_NOISE = 0.3e-3  # [m] standard deviation of a measured motion
 _ROTATION_NOISE = 0.3 * _DEG  # [rad]
 _FORCE_NOISE = 0.5  # [N]
+_FORCE_SHARE = 0.25  # of the force that a finger bears: an error that leaves it its grip
 _USED = 0.7  # a motion below this share of what was allowed says nothing for a larger one
 
 
@@ -111,14 +112,12 @@ class StepBound:
         delta_a: Float[Tensor, " n_a"],
         predicted: Float[Tensor, " n_s"],
         seen: Situation,
-        wanted: float | None,
         asked: float = 1.0,
     ) -> float:
         """phi of a step.
 
         Args:
             predicted: increment that the corrected model predicts for ``delta_a``.
-            wanted: grip force of the finger that opposes the others [N]; None: no such wish.
             asked: p, size of the step in units of the largest at pace 1.
         """
         focus = seen.focus
@@ -130,9 +129,9 @@ class StepBound:
         if f_n is None or not lin.forces.solved:
             return phi
         force = float(f_n.max())
-        if wanted:
+        if seen.grip:
             others = np.delete(f_n, f_n.argmax())
-            phi = min(phi, max(force / wanted, 0.0) ** 2)
+            phi = min(phi, max(force / seen.grip, 0.0) ** 2)
             if len(others):
                 even = max(float(others.min()), 0.0) / max(self.even * float(others.mean()), 1e-9)
                 phi = min(phi, max(1 / max(asked, 1.0), even**2))
@@ -146,14 +145,38 @@ class StepBound:
         return phi
 
 
+class ForceSurprise(NamedTuple):
+    """What the pads in contact measured in a motion, against the prediction ``f_n + (df_n/da) w``."""
+
+    pads: tuple[int, ...]
+    before: Float[Tensor, " n_c"]
+    """f_n before the motion [N]."""
+    after: Float[Tensor, " n_c"]
+    """[N]"""
+    surprise: Float[Tensor, " n_c"]
+    """Measured less predicted [N]; NaN where a pad does not measure, or has let go."""
+
+    @property
+    def z(self) -> Tensor:
+        """Surprises in units of their noise and of a share of what the finger bears ``(n_c,)``."""
+        return self.surprise / (_FORCE_NOISE**2 + (_FORCE_SHARE * self.before).square()).sqrt()
+
+    @property
+    def wrong(self) -> bool:
+        """Some pad measured what was not predicted, or has let go."""
+        return bool((self.z.abs() > _DISAGREE).any() or self.surprise.isnan().any())
+
+
 @dataclass(frozen=True)
 class TrustRegion:
     """``p <- 1.2 p`` where ``rho < 1``, ``0.7 p`` where ``rho > 1.6``, with::
 
-        rho^2 = mean_i (dx_i - predicted_i)^2 / (noise_i^2 + (0.12 |predicted|)^2)
+        rho = max(rms_i z_i over translation, over rotation, |z_i| of each finger's normal force)
+        z_i = (dx_i - predicted_i) / sqrt(noise_i^2 + (0.12 |predicted|)^2)
 
-    over the object's twist in all six directions and the normal forces: 1 is an error that the sensors' noise
-    (0.3 mm, 0.3 deg, 0.5 N) and 12 % of the motion explain.
+    with a quarter of what the finger bears in the place of 12 % of the motion. 1 is an error that the
+    sensors' noise (0.3 mm, 0.3 deg, 0.5 N) and these shares explain. The worst part counts: the mean would
+    let one finger fade while the rest is predicted well.
 
     Source: trust regions of nonlinear optimisation, Conn, Gould and Toint, Trust-Region Methods (2000), with
     the measured motion in the place of the cost.
@@ -174,7 +197,7 @@ class TrustRegion:
         predicted: Float[Tensor, " 6"],
         came: Float[Tensor, " 6"],
         lever: float,
-        surprise: Float[Tensor, " n_c"] | None = None,
+        forces: ForceSurprise | None = None,
     ) -> float:
         """rho of one motion.
 
@@ -182,15 +205,16 @@ class TrustRegion:
             predicted: twist of the object that the model predicts for what the encoders did [m, rad].
             came: as measured.
             lever: of the contacts about the object's point, root mean square [m].
-            surprise: normal forces at the contacts, as measured less predicted [N]; None: unknown.
+            forces: of the contacts; None: unknown.
         """
         unit = predicted.new_tensor([lever] * 3 + [1.0] * 3)
         size = torch.linalg.vector_norm(predicted / unit)
         noise = predicted.new_tensor([_TRANSLATION_NOISE] * 3 + [_ROTATION_NOISE] * 3)
-        terms = (came - predicted).square() / (noise.square() + (_RELATIVE * size * unit).square())
-        if surprise is not None:
-            terms = torch.cat([terms, (surprise / _FORCE_NOISE).square()])
-        return float(terms.mean().sqrt())
+        z = (came - predicted).square() / (noise.square() + (_RELATIVE * size * unit).square())
+        parts = [z[:3].mean(), z[3:].mean()]
+        if forces is not None:
+            parts += list(forces.z[~forces.z.isnan()].square())
+        return float(torch.stack(parts).max().sqrt())
 
 
 @dataclass(frozen=True)
@@ -244,18 +268,16 @@ class Pace(nn.Module):
         delta_a: Float[Tensor, " n_a"],
         predicted: Float[Tensor, " n_s"],
         seen: Situation,
-        wanted: float | None,
         share: float,
     ) -> float:
         """phi, see :class:`StepBound`: which part of the step that was asked for is made.
 
         Args:
             predicted: increment that the corrected model predicts for ``delta_a``.
-            wanted: grip force of the finger that opposes the others [N]; None: no such wish.
             share: of the largest step that was asked for.
         """
         bound, asked = self.options.bound, share * self.factor
-        phi = bound.share(lin, delta_a, predicted, seen, wanted, asked)
+        phi = bound.share(lin, delta_a, predicted, seen, asked)
         return max(phi, min(1.0, bound.least / max(asked, 1e-9)))
 
     def judge(self, disagreement: float, share: float = 1.0) -> None:

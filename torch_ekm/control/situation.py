@@ -39,6 +39,10 @@ class Situation:
     """Of the object [N]."""
     tighter: float = 0.0
     """Wanted on top of the grip that suits the object [N]."""
+    grip: float | None = None
+    """Wanted of the finger that opposes the others, see :class:`GripForceTask` [N]; None: nothing."""
+    force_std: Float[Tensor, " n_pads"] | None = None
+    """How far the prediction of each pad's force is off [N]; None: unknown."""
 
     def normal_force(self, kinematic: Linearization) -> Array | None:
         """``f_n`` of each contact [N]: as its pad measures it, or else as the model estimates it.
@@ -50,6 +54,18 @@ class Situation:
             return estimated
         measured = as_array(self.fingertip_force)[self.hand.pad_indices(kinematic.contacts.finger)]
         return np.where(np.isnan(measured), 0.0 if estimated is None else estimated, measured)
+
+
+def grip_shares(f_n: Array, grip: float) -> Array:
+    """What is wanted of each finger ``(n_c,)`` [N]: the one that presses most opposes all that share.
+
+    Args:
+        f_n: normal forces [N].
+        grip: of the finger that opposes the others [N].
+    """
+    wanted = np.full(len(f_n), grip / max(len(f_n) - 1, 1))
+    wanted[f_n.argmax()] = grip
+    return wanted
 
 
 @dataclass(frozen=True)

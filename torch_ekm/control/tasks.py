@@ -10,7 +10,7 @@ import torch
 
 from .pace import contact_travel
 from .qp import DEGREE, Equality, Squares, as_array
-from .situation import LinearizedModel, Situation
+from .situation import LinearizedModel, Situation, grip_shares
 
 if TYPE_CHECKING:
     from ..model import Linearization
@@ -93,9 +93,7 @@ class GripForceTask:
         f_n = seen.normal_force(model.kinematic)
         if f_n is None:
             return None
-        force = self.wanted(model.kinematic, seen)
-        wanted = np.full(len(f_n), force / max(len(f_n) - 1, 1))
-        wanted[f_n.argmax()] = force
+        wanted = grip_shares(f_n, self.wanted(model.kinematic, seen))
         change = np.clip(wanted - f_n, -self.step, self.step)
         return Squares(as_array(model.kinematic.normal_force_sensitivity), change, self.weight)
 

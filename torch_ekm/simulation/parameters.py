@@ -38,8 +38,8 @@ class PlantParameters:
 
     # -- the mechanism is of another kind than its description
     arm_variation: float = 0.0
-    """v: moment arms vary with the joint angle, ``J_a (1 + v sin(2 q + phase))``, as those of pulleys that are
-    not round; joints of rigid couplings keep theirs. Between -1 and 1."""
+    """v: moment arms vary with the joint angle, ``J_a (1 + v sin(2 q + phase))``, as those of pulleys that
+    are not round; joints of rigid couplings keep theirs."""
     arm_phase: float = 0.0
     """Bound of the phase of each joint [rad]; drawn once, from ``hardware_seed``."""
     spring_stiffening: float = 0.0
@@ -54,7 +54,7 @@ class PlantParameters:
     joint_play: float = 0.0
     """Full width of the play of one joint of each finger [rad]; which one is drawn from ``hardware_seed``."""
     contact_stiffness: float = 0.0
-    """Of each contact [N/m]: pads give way; 0: they do not."""
+    """Of each contact [N/m]: pads give way; 0: they do not. A change holds from the next grasp on."""
 
     # -- the object
     friction: float = 1.0

@@ -78,7 +78,8 @@ class Caution:
     """What announces a loss before it comes, and what is done then; the same for every controller.
 
     Signs: the model refuses the state; the object has turned off the focus by ``off_rotation``; a link
-    without a pad comes to bear on the object. One that ``looks`` further readings show as well is heeded:
+    without a pad comes to bear on the object; a finger loses its force against the prediction in three
+    motions running. One that ``looks`` further readings show as well is heeded:
     the hand goes back along the way that was come, motion by motion, until the signs are gone, for these
     states are known to hold. It grips by ``tighten`` more and tries again at a smaller pace, ``retreats``
     times; at the next sign it goes back once more and gives up. Where going back does not help, it gives up
@@ -98,9 +99,12 @@ class Caution:
     """Motions of one retreat at most."""
     tighten: float = 1.0
     """[N]"""
+    grips: int = 5
+    """Motions at most that only grip, where a finger bears less than the object needs before the first turn;
+    a grasp that stays weak is declined."""
 
     def __post_init__(self) -> None:
-        for name in ("looks", "off_rotation", "off_further", "retreats", "way_back", "tighten"):
+        for name in ("looks", "off_rotation", "off_further", "retreats", "way_back", "tighten", "grips"):
             if not getattr(self, name) >= 0:
                 raise ParameterError(name, getattr(self, name), "0 or more")
 

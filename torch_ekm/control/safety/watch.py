@@ -13,6 +13,7 @@ from ...plant import Observation, PlantStatus
 from ...typing import Tensor
 from ..decision import Decision, Expectation, StopReason
 from .fingertips import FingertipWatch
+from .grip import GripWatch
 from .readings import ReadingTests, agree, deg
 from .safety import Guards, Objection
 
@@ -57,6 +58,9 @@ class Watch:
         """Motions in succession without a pose."""
         self.gated = 0
         """Motions in succession that nothing but the gate objects to."""
+        self.grip = GripWatch(model)
+        self.slid = ""
+        """How the object has slid in the last motion, farther than the guards let a pose jump; or empty."""
         self._still = torch.zeros(self.hand.n_a, dtype=torch.long)
 
     def first(self, seen: Observation, look: Callable[[], Observation]) -> Verdict:
@@ -107,7 +111,11 @@ class Watch:
                 break
             last, seen = seen, look()
         if doubt is not None and not (doubt.blind or doubt.gated):
-            return Verdict(seen, False, doubt, "", expected)
+            if doubt.reason is StopReason.POSE_JUMP:
+                self.slid = self._slid(decision, before, expected, last, seen)
+            if not self.slid:
+                return Verdict(seen, False, doubt, "", expected)
+            doubt = doubt._replace(gated=True, message=self.slid)
         if doubt is not None and doubt.gated and (last is None or not agree(last, seen, self.guards)):
             doubt = doubt._replace(blind=True)
         tips = self.fingertips.judge(before, decision, seen)
@@ -128,8 +136,32 @@ class Watch:
             self.gated = 0
             return Verdict(seen, measured and halt is None, halt, tips.note, expected)
         self.gated += 1  # what is seen again and again is the truth, and the model is wrong
-        again = self.gated > self.guards.blind_motions
+        again = self.gated > self.guards.blind_motions and not self.slid
         return Verdict(seen, measured and again and halt is None, halt, doubt.message, expected)
+
+    def _slid(
+        self,
+        decision: Decision,
+        before: Observation,
+        expected: Expectation | None,
+        last: Observation | None,
+        seen: Observation,
+    ) -> str:
+        """A pose that jumps is the object's where two looks agree and the grip has changed, too."""
+        lin = decision.linearization
+        if lin is None or expected is None or last is None or not agree(last, seen, self.guards):
+            return ""
+        felt = self.grip.surprise(lin, before, expected.moved, seen)
+        if felt is None or not felt.wrong:
+            return ""
+        ds = (seen.state.minus(before.state) - expected.increment)[-6:]
+        way, turn = (float(torch.linalg.vector_norm(part)) for part in ds.split(3))
+        return f"the object has slid {1e3 * way:.1f} mm and {deg(turn)} farther than predicted"
+
+    def forget(self) -> None:
+        """Signs of a loss are heeded: the hand goes back."""
+        self.slid = ""
+        self.grip.forget()
 
     def rest(self, before: Observation, seen: Observation) -> Observation:
         """A further reading of a hand at rest, or ``before`` where it cannot be one."""

@@ -79,8 +79,8 @@ def make_transmission(hand: HandDescription, parameters: PlantParameters) -> Tra
     )
     play = np.zeros(hand.n_q)
     for pad in hand.pads:  # one joint of each finger
-        play[draw.choice(chain(hand, pad.link))] = p.joint_play
-    play[coupled] = 0.0
+        free = [joint for joint in chain(hand, pad.link) if not coupled[joint]]
+        play[draw.choice(free or [0])] = p.joint_play if free else 0.0
     losses = CableLosses(p.cable_friction, p.hysteresis, p.tendon_coupling, play)
     transmission = Transmission(true_hand(hand, p), p.tendon_creep, shape, losses)
     transmission.lengthen(p.tendon_elongation)

@@ -64,8 +64,8 @@ class CableLosses:
         no torque goes through a joint while it is within its play
 
     Source: a cable round a pulley over the angle w loses the share ``1 - exp(-mu w)`` of its tension (Euler
-    and Eytelwein): capstan; the elastic hysteresis is that of Masing (1926) with one element; actuators on one
-    frame that gives way are springs in series with a common one: coupling.
+    and Eytelwein): capstan; the elastic hysteresis is that of Masing (1926) with one element; actuators on
+    one frame that gives way are springs in series with a common one: coupling.
     """
 
     capstan: float

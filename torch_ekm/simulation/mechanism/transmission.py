@@ -97,7 +97,7 @@ class Transmission:
         return self._k[: self.n_a]
 
     def relax(self, q: Array) -> None:
-        """Put the friction's anchors at ``q``: no friction torque now, no hysteresis, joints amid their play."""
+        """Put the friction's anchors at ``q``: no friction torque, no hysteresis, joints amid their play."""
         self._anchor = np.array(q, dtype=np.float64)
         self._lean = np.zeros(self.n_q)
         self._bent: tuple[Array, Array] | None = None
@@ -119,7 +119,7 @@ class Transmission:
         return torque @ self._compliance
 
     def lean(self, load: Array) -> Array:
-        """How far transmissions are ahead of joints that give ``load`` to the fingers ``(*batch, n_q)`` [rad]."""
+        """How far transmissions are ahead of joints that bear ``load`` [N m], ``(*batch, n_q)`` [rad]."""
         return np.clip(load / self._turned, -self.losses.play / 2, self.losses.play / 2)
 
     def spring_torque(self, q: Array) -> Array:

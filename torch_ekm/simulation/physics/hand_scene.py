@@ -23,14 +23,18 @@ class HandScene:
         hand: the hand; its URDF gives links, inertias and shapes. Hand frame = world frame.
         obj: the object, as it really is.
         time_step: [s].
+        contact_stiffness: of each contact [N/m]; 0: rigid. PhysX takes a negative restitution for it.
     """
 
-    def __init__(self, hand: HandDescription, obj: ObjectDescription, time_step: float) -> None:
+    def __init__(
+        self, hand: HandDescription, obj: ObjectDescription, time_step: float, contact_stiffness: float = 0.0
+    ) -> None:
         self.time_step = time_step
         self._scene: Any = new_scene(hand.gravity, time_step)
         self._system: Any = self._scene.physx_system
         material = sapien().physx.PhysxMaterial
-        self._material, self._opposed = (material(obj.friction, obj.friction, 0.0) for _ in range(2))
+        mu, restitution = obj.friction, -contact_stiffness
+        self._material, self._opposed = (material(mu, mu, restitution) for _ in range(2))
         """Of the object and all links but those of the finger that opposes the others, and of these."""
         self._hand = build_hand(self._scene, hand, self._material)
         self._object = build_object(self._scene, obj, self._material)
@@ -64,13 +68,12 @@ class HandScene:
             if link in links:
                 shape.set_physical_material(self._opposed)
 
-    def set_contact(self, friction: float, opposed: float, stiffness: float) -> None:
-        """Friction coefficients of the object's two sides, the second at the finger that opposes the others,
-        and stiffness of a contact [N/m], 0: rigid. PhysX takes the mean of the two bodies' coefficients, and
-        a negative restitution for a stiffness."""
+    def set_friction(self, friction: float, opposed: float) -> None:
+        """Coefficients of the object's two sides, the second at the finger that opposes the others.
+
+        PhysX takes the mean of the two bodies' coefficients."""
         for material, value in ((self._material, friction), (self._opposed, 2 * opposed - friction)):
             material.static_friction = material.dynamic_friction = value
-            material.restitution = -stiffness
 
     def set_link_weight(self, pulls: bool) -> None:
         """Whether gravity pulls at the links too; without, only at the object."""

@@ -79,11 +79,12 @@ class Rig:
 
     def _build(self) -> None:
         p = self.parameters
-        self.scene = HandScene(self.hand, true_object(self.obj, p), self.config.time_step)
+        obj, step = true_object(self.obj, p), self.config.time_step
+        self.scene = HandScene(self.hand, obj, step, p.contact_stiffness)
         thumb, _ = opposing_pads(self.hand, self.config)
         finger = self._finger_of[next(pad.link for pad in self.hand.pads if pad.name == thumb)]
         self.scene.oppose({link for link, root in self._finger_of.items() if root == finger})
-        self._set_contact()
+        self._set_friction()
         self.scene.set_link_weight(p.link_weight)
         self._built_scale = p.object_scale
         self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
@@ -177,17 +178,17 @@ class Rig:
             self.scene.set_object(obj)
         if _differ(old, new, "link_weight"):
             self.scene.set_link_weight(new.link_weight)
-        if _differ(old, new, "friction", "friction_unevenness", "contact_stiffness", "hardware_seed"):
-            self._set_contact()
+        if _differ(old, new, "friction", "friction_unevenness", "hardware_seed"):
+            self._set_friction()
 
-    def _set_contact(self) -> None:
-        """Friction of the object's two sides, and the pads' stiffness."""
+    def _set_friction(self) -> None:
+        """Of the object's two sides."""
         p = self.parameters
         friction = true_object(self.obj, p).friction
         sides = [friction, (1 - p.friction_unevenness) * friction]
         if np.random.default_rng([p.hardware_seed, 3]).random() < 0.5:
             sides.reverse()
-        self.scene.set_contact(*sides, p.contact_stiffness)
+        self.scene.set_friction(sides[0], sides[1])
 
     def snapshot(self) -> RigState:
         return RigState(
@@ -210,7 +211,15 @@ class Rig:
 
 
 _TRANSMISSION = (
-    *("moment_arm", "spring", "servo_stiffness", "joint_friction", "tendon_creep", "arm_variation", "arm_phase"),
+    *(
+        "moment_arm",
+        "spring",
+        "servo_stiffness",
+        "joint_friction",
+        "tendon_creep",
+        "arm_variation",
+        "arm_phase",
+    ),
     *("spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling", "joint_play", "hardware_seed"),
 )
 

@@ -1,0 +1,213 @@
+"""Pulleys that are not round, springs that are not linear, cables with losses, pads that give way."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from torch_ekm.description import load_hand
+from torch_ekm.exceptions import ParameterError
+from torch_ekm.simulation import PlantParameters, SimulatedHand, preset
+from torch_ekm.simulation.mechanism.assembly import make_transmission
+from torch_ekm.simulation.mechanism.departures import CableLosses, JointShape
+from torch_ekm.simulation.mechanism.transmission import Transmission, coupled_posture
+from torch_ekm.simulation.sensors import Sensors
+
+HAND = load_hand("icub_right")
+N_Q, STIFFNESS = HAND.n_q, 4.0
+ARMED = np.flatnonzero(HAND.actuation_jacobian.any(axis=0))
+
+
+def make(shape: JointShape | None = None, losses: CableLosses | None = None) -> Transmission:
+    actuators = tuple(dataclasses.replace(actuator, stiffness=STIFFNESS) for actuator in HAND.actuators)
+    real = dataclasses.replace(HAND, actuators=actuators, joint_friction=np.zeros(N_Q))
+    return Transmission(real, 0.0, shape, losses)
+
+
+def flexed(seed: int = 0) -> np.ndarray:
+    part = np.random.default_rng(seed).uniform(0.2, 0.6, N_Q)
+    return coupled_posture(HAND.coupling) @ (HAND.joint_lower + part * (HAND.joint_upper - HAND.joint_lower))
+
+
+def torque(transmission: Transmission, q: np.ndarray, motor: np.ndarray) -> np.ndarray:
+    """What the drives give at ``q``."""
+    return transmission.drive_stiffness * (transmission.drive_targets(q, motor) - q)
+
+
+def taut(transmission: Transmission, q: np.ndarray, by: float = 0.1) -> np.ndarray:
+    """Motors that stretch all tendons by so much."""
+    return transmission.offset + transmission.J_a @ transmission.shape.excursion(q) + by
+
+
+def test_the_drives_give_the_gradient_of_the_energy_of_odd_pulleys_springs_and_coupled_tendons() -> None:
+    free = HAND.coupling.reshape(-1, N_Q).any(axis=0)
+    draw = np.random.default_rng(1)
+    shape = JointShape(np.where(free, 0.0, 0.25), draw.uniform(-3, 3, N_Q), 0.5)
+    coupling = 0.2
+    transmission = make(shape, dataclasses.replace(CableLosses.none(N_Q), coupling=coupling))
+    S, q = coupled_posture(HAND.coupling), flexed()
+    motor = taut(transmission, q)
+    compliance = (np.eye(HAND.n_a) * (1 - coupling) + coupling) / STIFFNESS
+
+    def excursion(x: np.ndarray) -> np.ndarray:  # the arms, integrated numerically
+        t = (np.arange(400) + 0.5) / 400
+        arms = 1 + shape.variation * np.sin(2 * t[:, None] * x + shape.phase)
+        return x * arms.mean(axis=0)
+
+    def energy(x: np.ndarray) -> float:
+        stretch = motor - HAND.actuator_offset - HAND.actuation_jacobian @ S @ excursion(x)
+        y, away = x - HAND.spring_rest, x - S @ x
+        spring = HAND.spring_stiffness @ (y**2 / 2 + 0.5 * y**4 / 4)
+        return spring + (stretch @ np.linalg.solve(compliance, stretch) + 8.0 * away @ away) / 2
+
+    step = 1e-5
+    gradient = [(energy(q + step * e) - energy(q - step * e)) / (2 * step) for e in np.eye(N_Q)]
+    np.testing.assert_allclose(torque(transmission, q, motor), -np.array(gradient), atol=1e-6)
+    pulls = transmission.actuator_torque(q, motor)
+    np.testing.assert_allclose(transmission.stretched(pulls), transmission.stretch(q, motor), atol=1e-12)
+
+
+def test_hysteresis_holds_a_share_of_the_pull_against_either_direction() -> None:
+    transmission = make(losses=dataclasses.replace(CableLosses.none(N_Q), hysteresis=0.1))
+    q, plain = flexed(), make()
+    held = []
+    for by in (0.05, 0.2, 0.2):  # from below, then from above
+        torque(transmission, q, taut(transmission, q, by))
+    for by in (0.1, 0.1):
+        held.append(torque(transmission, q, taut(transmission, q, by)) - torque(plain, q, taut(plain, q, by)))
+    cables = 0.1 * STIFFNESS * HAND.actuation_jacobian.sum(axis=0)
+    np.testing.assert_allclose(held[-1][ARMED], -0.05 * (cables @ coupled_posture(HAND.coupling))[ARMED])
+
+
+def test_cable_friction_is_a_share_of_what_the_cables_turn_a_joint_with() -> None:
+    transmission = make(losses=dataclasses.replace(CableLosses.none(N_Q), capstan=0.1))
+    q = flexed()
+    motor = taut(transmission, q)
+    cables = STIFFNESS * 0.1 * (HAND.actuation_jacobian.sum(axis=0) @ coupled_posture(HAND.coupling))
+    ends = []
+    for direction in (1.0, -1.0):
+        transmission.relax(q - 0.2 * direction)
+        ends.append(torque(transmission, q, motor))
+    np.testing.assert_allclose((ends[1] - ends[0])[ARMED], 2 * 0.1 * np.abs(cables)[ARMED], rtol=1e-9)
+
+
+def test_no_torque_goes_through_a_joint_within_its_play() -> None:
+    play = np.zeros(N_Q)
+    joint = HAND.joint_names.index("index_2")
+    play[joint] = 0.06
+    transmission, plain = make(losses=CableLosses(0.0, 0.0, 0.0, play)), make()
+    q = flexed()
+    motor = taut(plain, q, 0.0)
+    balanced = q.copy()
+    for _ in range(200):  # where the joint rests without play
+        balanced[joint] = plain.drive_targets(balanced, motor)[joint]
+    for off, through in ((0.02, 0.0), (-0.02, 0.0), (0.05, 0.02), (-0.05, -0.02)):
+        at = balanced.copy()
+        at[joint] += off
+        transmission.relax(at)
+        for _ in range(3):
+            found = torque(transmission, at, motor)[joint]
+        beyond = balanced.copy()
+        beyond[joint] += through
+        assert found == pytest.approx(torque(plain, beyond, motor)[joint], abs=1e-9)
+
+
+def test_each_hardware_instance_has_its_own_shapes_and_play() -> None:
+    figures = {"arm_variation": 0.25, "arm_phase": math.pi, "joint_play": 0.02, "spring_stiffening": 0.5}
+    one, same, other = (
+        make_transmission(HAND, PlantParameters(hardware_seed=seed, **figures)) for seed in (3, 3, 4)
+    )
+    np.testing.assert_array_equal(one.shape.phase, same.shape.phase)
+    assert (one.shape.phase != other.shape.phase).all()
+    coupled = HAND.coupling.reshape(-1, N_Q).any(axis=0)
+    assert (one.losses.play > 0).sum() == 3  # ring and little finger have couplings only
+    assert not one.losses.play[coupled].any()
+    assert (one.shape.variation[coupled] == 0).all()
+    assert (one.shape.variation[~coupled] == 0.25).all()
+
+
+def test_fingertips_scale_and_drift() -> None:
+    figures = PlantParameters(force_scale=2.0, force_drift=0.1, hardware_seed=5)
+    sensors = Sensors(figures, N_Q, 5, HAND.joint_names)
+    normal, draw = np.full(5, 4.0), np.random.default_rng(0)
+    begin, later = sensors.forces(normal, 0.0, draw), sensors.forces(normal, 10.0, draw)
+    assert ((begin > 2.0) & (begin < 8.0)).all()
+    assert np.unique(begin).size == 5
+    rate = (later - begin) / 10
+    assert (np.abs(rate) <= 0.1).all()
+    assert np.abs(rate).max() > 0.02
+
+
+def at_rest(**figures: float) -> tuple[float, float, int]:
+    """A grasp of the box: force of the thumb [N], depth of its pad in the box [mm], fingers that touch."""
+    plant = SimulatedHand("icub_right", "box", parameters=PlantParameters(**figures))
+    seen = plant.reset(seed=0)
+    assert seen.truth is not None
+    from torch_ekm.model import KinematicModel
+
+    contacts = KinematicModel(plant.hand, plant.object).linearize(seen.truth.state).contacts
+    k = contacts.finger.index(plant.hand.pads[0].name)
+    return float(seen.truth.fingertip_force[0]), -1e3 * float(contacts.gap[k]), len(contacts.finger)
+
+
+@pytest.mark.parametrize(
+    "figures",
+    [
+        {"arm_variation": 0.25, "spring_stiffening": 0.5},
+        {"arm_variation": -0.25, "spring_stiffening": -0.3},
+        {"joint_play": 0.03},
+        {"tendon_coupling": 0.1},
+    ],
+)
+def test_the_planner_knows_the_plant(figures) -> None:
+    force, _, fingers = at_rest(**figures)
+    assert fingers == 3
+    assert force == pytest.approx(5.0, abs=0.6)
+
+
+def test_pads_give_way_by_force_over_stiffness() -> None:
+    force, depth, _ = at_rest(contact_stiffness=5e3)
+    assert depth == pytest.approx(1e3 * force / 5e3, rel=0.15)
+    assert abs(at_rest()[1]) < 0.1
+
+
+def test_one_side_of_the_object_has_less_friction() -> None:
+    sides = set()
+    for seed in range(6):
+        plant = SimulatedHand(
+            "icub_right", "box", parameters=PlantParameters(friction_unevenness=0.4, hardware_seed=seed)
+        )
+        plant.reset(seed=0)
+        scene = plant._grasped().scene
+        mean = (scene._opposed.static_friction + scene._material.static_friction) / 2
+        sides.add((round(scene._material.static_friction, 6), round(mean, 6)))
+        plant.close()
+    mu = plant.object.friction
+    assert sides == {(mu, round(0.6 * mu, 6)), (round(0.6 * mu, 6), mu)}
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("arm_variation", 1.0),
+        ("friction_unevenness", 0.6),
+        ("tendon_coupling", 1.0),
+        ("cable_friction", -0.1),
+        ("hysteresis", 1.5),
+        ("force_scale", 0.5),
+    ],
+)
+def test_figures_outside_their_range_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ParameterError, match=name):
+        preset("nominal").replace(**{name: value})
+
+
+def test_odd_presets_are_the_nominal_hand_of_another_kind() -> None:
+    nominal = preset("nominal")
+    for k in range(1, 6):
+        odd = preset(f"odd_{k}")
+        assert odd != nominal
+        assert odd.moment_arm == nominal.moment_arm
