@@ -36,7 +36,7 @@ class Truth:
     fingertip_force: Float[Tensor, " n_pads"] | None = None
     """Normal force of each contact pad [N]."""
     actuator_torque: Float[Tensor, " n_a"] | None = None
-    """Torque of each actuator at its output [N m]."""
+    """Torque of each actuator along ``+a`` [N m]."""
     pictured: GraspState | None = None
     """The state when the newest picture was taken; None: the present one."""
 

@@ -78,8 +78,8 @@ def _index(folder: Path, entries: Mapping[int, TrialEntry], n_trials: int) -> Fi
     if written == right:
         return Finding(INDEX, "ok", f"lists {len(entries)} trials")
     listed = {line.partition(b",")[0] for line in written.splitlines()[1:]}
-    there = {*right.splitlines()} <= {*written.splitlines()}
-    if there and len(entries) < n_trials == len(listed):
+    complete = len(listed) == n_trials and {*right.splitlines()} <= {*written.splitlines()}
+    if complete and len(entries) < n_trials:
         return Finding(INDEX, "ok", f"lists {n_trials} trials, the damaged ones too")
     return Finding(INDEX, "wrong", "does not say what the files say; the next run makes it from them")
 
@@ -96,6 +96,8 @@ def _sources(configuration: Mapping[str, Any]) -> list[Finding]:
         return [Finding("(sources)", "wrong", f"not here: {error}")]
     found = []
     for name in sorted({*recorded, *here}):
-        state, word = ("ok", "") if recorded.get(name) == here.get(name) else ("wrong", "not ")
-        found.append(Finding(name, state, f"the file here is {word}the one that the log was made from"))
+        if recorded.get(name) == here.get(name):
+            found.append(Finding(name, "ok", "the file here is the one that the log was made from"))
+        else:
+            found.append(Finding(name, "wrong", "the file here is not the one that the log was made from"))
     return found

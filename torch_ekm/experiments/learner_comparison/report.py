@@ -48,23 +48,16 @@ class ComparisonReport(Comparison):
             caption += f"is learned{some}."
             figure = plot_learning_curves(self, stream, shown)
             figures.append(save(figure, name=f"curve_{stream}", caption=caption))
+        streams = {}
+        for s in self.streams:
+            samples = {"samples": len(s), "available": max(s.available, len(s)), "warm_up": s.warm_up}
+            streams[s.name] = {**samples, "about": s.about}
         report = Report(
             title="Residual learners compared",
             summary=" ".join(self.verdicts()),
             tables=self.tables(),
             figures=figures,
-            configuration={
-                "learners": list(self.learners),
-                "streams": {
-                    s.name: {
-                        "samples": len(s),
-                        "available": max(s.available, len(s)),
-                        "warm_up": s.warm_up,
-                        "about": s.about,
-                    }
-                    for s in self.streams
-                },
-            },
+            configuration={"learners": list(self.learners), "streams": streams},
         )
         report.write(Path(folder))
         return report

@@ -100,7 +100,7 @@ def absorb(
     grown = novel ^ excess
     posterior.count.add_(grown)
     posterior.slot.add_(grown)
-    if excess.is_cuda or bool(excess.any()):  # looking is free on the CPU alone
+    if _any(excess):
         _add_and_prune(posterior, scaled, left, excess, s2)
     else:
         _add_products(posterior.moments, scaled.unsqueeze(-1), left.unsqueeze(-1))
@@ -186,3 +186,8 @@ def _add_products(target: Tensor, left: Tensor, right: Tensor) -> None:
     """target += left right', in place, over all leading axes in one call."""
     flat = target.view(-1, *target.shape[-2:])
     flat.baddbmm_(left.reshape(-1, *left.shape[-2:]), right.reshape(-1, *right.shape[-2:]).mT)
+
+
+def _any(flag: Tensor) -> bool:
+    """Skip work that no model needs where looking is free: on the CPU."""
+    return flag.is_cuda or bool(flag.any())
