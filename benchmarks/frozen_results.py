@@ -115,10 +115,10 @@ def main() -> None:
         results[name] = json.loads(json.dumps(compute()))
         found = list(differences(results[name], before[name], name)) if name in before else []
         differ += len(found)
-        told = (
+        message = (
             "" if not chosen.against else "not there before" if name not in before else f"{len(found)} differ"
         )
-        print(f"{name}: {told}", *found[:5], sep="\n  ", flush=True)
+        print(f"{name}: {message}", *found[:5], sep="\n  ", flush=True)
     if chosen.write:
         chosen.write.write_text(json.dumps(results))
     if chosen.against:

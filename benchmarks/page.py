@@ -10,7 +10,7 @@ from pathlib import Path
 from torch_ekm._versions import versions_of
 
 ROOT = Path(__file__).resolve().parents[1]
-#: What decides the figures, and the peers that are measured beside.
+#: What decides the figures, and the peers that are measured, too.
 PACKAGES = (
     "torch_ekm", "torch", "numpy", "scipy", "sapien", "coal", "qpsolvers", "piqp", "numba",
     "gpytorch", "scikit-learn", "river", "capymoa",
@@ -43,9 +43,9 @@ def provenance(command: str) -> list[str]:
 
 
 def _processor() -> str:
-    """Its model, where Linux tells it."""
-    told = Path("/proc/cpuinfo")
-    lines = told.read_text(encoding="utf-8").splitlines() if told.exists() else []
+    """Its model, where Linux states it."""
+    source = Path("/proc/cpuinfo")
+    lines = source.read_text(encoding="utf-8").splitlines() if source.exists() else []
     return next(
         (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")),
         "unknown processor",

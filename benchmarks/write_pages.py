@@ -125,7 +125,7 @@ def report_body(folder: Path, name: str, pictures: tuple[str, ...]) -> str:
 
 
 def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:
-    """A page, and the pictures that it shows beside it."""
+    """A page, and the pictures that it shows."""
     lines = []
     for k, part in enumerate(parts_of(name)):
         folder = out / name / str(k)

@@ -127,9 +127,9 @@ def servo_inverse() -> Figure:
     servo = ServoModel(["motor"])
     servo.estimate[:] = torch.deg2rad(torch.tensor([[d, b]]))
     wanted = torch.linspace(-3, 3, 601, dtype=torch.float64)
-    told = torch.stack([servo.command(torch.deg2rad(one)[None])[0] for one in wanted]).rad2deg()
+    commanded = torch.stack([servo.command(torch.deg2rad(one)[None])[0] for one in wanted]).rad2deg()
     for part in (wanted < -0.02, wanted > 0.02):
-        inverse.plot(wanted[part], told[part], color=GREEN)
+        inverse.plot(wanted[part], commanded[part], color=GREEN)
     inverse.plot([0], [0], "o", color=GREEN, ms=4)
     inverse.set_xlabel("wanted $w$ [deg]")
     inverse.set_ylabel("commanded $v$ [deg]")

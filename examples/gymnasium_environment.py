@@ -12,7 +12,7 @@ from torch_ekm.model import KinematicModel
 
 env = gymnasium.make("torch_ekm.simulation.env:torch_ekm/InHandRotation-v0", object="can", parameters="none")
 observation, info = env.reset(seed=0, options={"angle": np.radians(8)})
-hand = env.unwrapped  # its plant tells the model what is held, and the axis of the pinch
+hand = env.unwrapped  # its plant gives the model what is held, and the axis of the pinch
 model = KinematicModel(hand.plant.hand, hand.plant.object)
 total = 0.0
 while True:

@@ -1,6 +1,6 @@
 """From a URDF and its transmission file to a turn: python examples/own_hand.py [HAND [OBJECT [DEGREES]]]
 
-HAND is a name or a path to a URDF beside which its transmission file lies; by default the planar hand.
+HAND is a name or a path to a URDF next to which its transmission file lies; by default the planar hand.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""A learner of one's own beside those of the package, on a stream.
+"""A learner of one's own compared with those of the package, on a stream.
 
     python examples/own_learner_in_compare.py
 

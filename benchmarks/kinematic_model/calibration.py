@@ -45,7 +45,7 @@ class Outcome(NamedTuple):
     """Of one seed."""
 
     figures: dict[str, np.ndarray]
-    """Relative errors of the figures that are told, by kind."""
+    """Relative errors of the identifiable figures, by kind."""
     sure: dict[str, np.ndarray]
     """Those with a standard error below 2.5 %."""
     before: float
@@ -55,7 +55,7 @@ class Outcome(NamedTuple):
     """Of rotation and position errors together (30 mm count as 1 rad)."""
     least: float
     """The same ratio of a model that knows the figures: what is left is not linear, or slips."""
-    told: int
+    identifiable: int
     seconds: float
 
 
@@ -125,7 +125,7 @@ def size(errors: np.ndarray) -> float:
 
 
 def found(calibration: Calibration, truth: HandDescription, sure: float = np.inf) -> dict[str, np.ndarray]:
-    """Relative errors of the figures that the calibration says are told, by kind.
+    """Relative errors of the figures that the calibration calls identifiable, by kind.
 
     ``sure``: only those with a relative standard error below.
     """
@@ -157,10 +157,10 @@ def trial(seed: int, sensors: str = "exact", count: int = 30) -> tuple[Outcome, 
     after = step_errors(KinematicModel(calibration.hand, box), unseen)
     known = step_errors(KinematicModel(truth, box), unseen)
     rotations = [float(np.sqrt(np.mean(np.sum(e[:, 3:] ** 2, axis=1)))) / DEG for e in (before, after)]
-    told = sum(row.identifiable for row in calibration.parameters)
+    identifiable = sum(row.identifiable for row in calibration.parameters)
     ratios = size(after) / size(before), size(known) / size(before)
     figures = found(calibration, truth), found(calibration, truth, 0.025)
-    return Outcome(*figures, *rotations, *ratios, told, seconds), calibration
+    return Outcome(*figures, *rotations, *ratios, identifiable, seconds), calibration
 
 
 def main() -> None:
@@ -179,7 +179,7 @@ def main() -> None:
     print(
         f"{'seed':>6}"
         + "".join(f"{kind:>18}" for kind in KINDS)
-        + "   step [deg]         ratio  least  told    s"
+        + "   step [deg]         ratio  least ident    s"
     )
     for seed in range(first, end):
         outcome, _ = trial(seed, options.sensors, count)
@@ -189,9 +189,12 @@ def main() -> None:
             for e in outcome.figures.values()
         )
         steps = f"{outcome.before:6.3f} {outcome.after:6.3f} {outcome.ratio:10.2f} {outcome.least:6.2f}"
-        print(f"{seed:6d} {' '.join(medians)} {steps} {outcome.told:5d} {outcome.seconds:5.1f}", flush=True)
+        print(
+            f"{seed:6d} {' '.join(medians)} {steps} {outcome.identifiable:5d} {outcome.seconds:5.1f}",
+            flush=True,
+        )
     for kind in KINDS:
-        for name, of in (("all that are told", "figures"), ("standard error below 2.5 %", "sure")):
+        for name, of in (("all identifiable", "figures"), ("standard error below 2.5 %", "sure")):
             every = np.concatenate([getattr(outcome, of)[kind] for outcome in outcomes])
             if every.size:
                 within = f"{100 * np.mean(every <= 0.05):.0f} % of {every.size} within 5 %"

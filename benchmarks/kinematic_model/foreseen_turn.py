@@ -53,8 +53,8 @@ def turn(name: str, seed: int) -> tuple[float, float, float, int | None, float]:
     foreseen = rollout.predict(start, torch.stack(moved), start=lin)
     off = torch.stack([foreseen.at(k).state.minus(t.state)[-3:] @ axis for k, t in enumerate(truth)])
     pads = plant.hand.pad_indices(foreseen.contacts.finger)
-    felt = torch.stack([t.fingertip_force[pads] for t in truth])
-    wrong = (foreseen.normal_force - felt)[: foreseen.first_slip]
+    measured = torch.stack([t.fingertip_force[pads] for t in truth])
+    wrong = (foreseen.normal_force - measured)[: foreseen.first_slip]
     rms = [float(x.square().mean().sqrt()) for x in (off / DEG, wrong)]
     end = foreseen.at(-1)
     found = model.contacts(end.state)

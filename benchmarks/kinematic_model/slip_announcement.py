@@ -10,7 +10,7 @@ none). Below 0.01 mm nothing slid; in between a contact creeps at its friction l
 the simulator's joint torques, normal forces and friction.
 
 Plants: "sensed" is the mechanism as described with the sensors of "nominal"; "nominal" is a used hand whose
-servos stop short of what they are told by up to 1.3 deg, so its second rows take da as the encoders then read
+servos stop short of their commands by up to 1.3 deg, so its second rows take da as the encoders then read
 it. Forces: "smallest" ones, or "estimated" from fingertips and from those expected after the step before.
 """
 
@@ -250,13 +250,13 @@ class Score:
         previous, slipped = None, False
         for motion in motions:
             seen = motion.seen
-            told = {}
+            known = {}
             if estimate:
-                told["fingertip_force"] = seen.fingertip_force
+                known["fingertip_force"] = seen.fingertip_force
                 if previous is not None:
-                    told["expected"] = previous[0].forces_after(seen.a - previous[1])
+                    known["expected"] = previous[0].forces_after(seen.a - previous[1])
             try:
-                lin = model.linearize(seen.state, previous=None if previous is None else previous[0], **told)
+                lin = model.linearize(seen.state, previous=None if previous is None else previous[0], **known)
             except GraspError:  # says so itself: an alarm
                 alarm, previous = True, None
             else:

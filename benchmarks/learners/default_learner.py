@@ -119,7 +119,7 @@ def _without_outliers(samples: Samples) -> Tensor:
 
 
 def overfitting(n: int, seed: int, capacity: int) -> None:
-    """The product of two of 32 inputs: the deep learner beside the plain one."""
+    """The product of two of 32 inputs: the deep learner compared with the plain one."""
     samples = product_of_two(n, seed)
     print(
         f"\n| product of two of 32 inputs, {capacity} points | error of y | coverage of 90 % |\n|---|---|---|"

@@ -99,7 +99,7 @@ def from_rest(n: int, seed: int) -> Samples:
 def arm(n: int, seed: int, rate: float = 100.0) -> Samples:
     """Torques of a two-link arm at 100 Hz that a model with other masses and no friction leaves over.
 
-    x holds joint angles and speeds [rad, rad/s]; accelerations are not told. Masses 1.2 and 0.9 kg, in the
+    x holds joint angles and speeds [rad, rad/s]; accelerations are not given. Masses 1.2 and 0.9 kg, in the
     model 1.0 and 0.7; links of 1 and 0.8 m with their masses at the ends; Coulomb and viscous friction.
     """
     g = torch.Generator().manual_seed(seed)

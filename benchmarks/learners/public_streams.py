@@ -1,4 +1,4 @@
-"""Public records of streaming regression: ours beside what was published, and the peers run again.
+"""Public records of streaming regression: ours compared with what was published, and the peers run again.
 
     TORCH_EKM_DATA=../shared/data python benchmarks/learners/public_streams.py
 
@@ -173,7 +173,7 @@ def measure(data: Path | None, limit: int | None) -> Iterator[Row]:
 
 
 def tables(rows: list[Row]) -> str:
-    """A table for each stream, ours beside what was published, as Markdown."""
+    """A table for each stream, ours next to what was published, as Markdown."""
     lines = [
         "Errors are those of each sample before it is learned; seed "
         f"{SEED}. \"95 %\": share of samples in the interval, and its mean width over the range of y. "

@@ -75,7 +75,7 @@ def winsorised_ratio(run: Prequential, start: int = 0, level: float = 0.99) -> f
     """The rms ratio with |error| and |y| cut at this quantile of |y|, per output.
 
     Residuals of real hands hold a few glitches (an angle that jumps by a quarter turn) which would
-    otherwise be all that the rms tells of.
+    otherwise be all that the rms shows.
     """
     error, y = run.error[start:].abs(), run.y[start:].abs()
     most = torch.quantile(y, level, dim=0)

@@ -146,7 +146,7 @@ def _run(
 ) -> RecordedHandResult:
     hand, apart = load_hand(HAND), paths[APART]
     diameter = known_diameter(APART)
-    assert diameter is not None  # its name tells
+    assert diameter is not None  # its name states it
     markers = identify_markers(
         hand,
         np.concatenate([path.markers for path in apart]),

@@ -1,7 +1,7 @@
 """Where the markers of a planar hand of two-joint fingers sit, and where its camera is: in closed form.
 
 A proximal marker runs on a circle about the base joint, a distal one on a circle about the second joint, and
-a finger that touches a cylinder of known diameter tells the angle at which its distal marker sits.
+a finger that touches a cylinder of known diameter determines the angle at which its distal marker sits.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def identify_markers(hand: HandDescription, markers: Array, pose: Array, diamete
 def register_camera(markers: FingerMarkers, seen: Array) -> FingerMarkers:
     """The same markers, the camera where it was in another recording, from its frames ``(n, 4, 2)``.
 
-    Distances of markers from their joints are what tells; where the camera was before is a prior, since
+    Distances of markers from their joints are what is measured; where the camera was before is a prior, since
     the fingers of a few frames point about the same way.
     """
     fingers, before = PlanarFingers(markers.hand), camera_of(markers)

@@ -63,7 +63,7 @@ def project_onto_contacts(
         q_std, position_std, rotation_std: its standard deviations [rad, m, rad], hand axes; all positive.
         touching: the pads that touch, by name. By default those that bear at least ``least_force``, or
             without ``fingertip_force`` those whose gap is within four of its standard deviations.
-        fingertip_force: normal force at each pad [N], NaN where nothing is felt.
+        fingertip_force: normal force at each pad [N], NaN where nothing is measured.
         least_force: what counts as touching [N].
 
     Raises:
@@ -88,8 +88,8 @@ def project_onto_contacts(
     first = contacts.gap
     if touching is None and fingertip_force is not None:
         (force,) = as_tensors(fingertip_force=fingertip_force)
-        felt = zip(model.hand.pads, force.tolist(), strict=True)
-        touching = [pad.name for pad, newtons in felt if newtons >= least_force]
+        measured = zip(model.hand.pads, force.tolist(), strict=True)
+        touching = [pad.name for pad, newtons in measured if newtons >= least_force]
     if touching is None:
         near = first <= 4 * (A_n @ Sigma * A_n).sum(-1).sqrt()
         touching = [name for name, close in zip(contacts.finger, near.tolist(), strict=True) if close]

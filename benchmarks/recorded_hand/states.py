@@ -28,7 +28,7 @@ from .recordings import RecordedPath, known_diameter
 STRIDE = 10
 """Steps from one state to the next."""
 OPTIONS = ModelOptions(slack_tension=None, on_unstable="flag", max_overlap=0.02)
-"""Servos keep both tendons taut all the time; markers are too coarse to tell a grasp's stability."""
+"""Servos keep both tendons taut all the time; markers are too coarse to identify a grasp's stability."""
 _WINDOW = 5  # frames up to now whose median is the measurement: single frames jump by up to 15 mm
 _MOVED = 2e-3  # [m] by which a proximal marker has moved before a frame is worth another look
 _GROWTH = 1.3  # of the frames worth a look, until camera and diameter are fitted again
@@ -115,7 +115,7 @@ def estimate_states(
 
     Camera and, where it is not published, the diameter of the object (taken for a cylinder) come from the
     frames up to now: the first one of the path, and again whenever the fingers have moved enough. Angles come
-    from the median of the last five frames; the projection onto the contacts closes the gaps, and tells
+    from the median of the last five frames; the projection onto the contacts closes the gaps, and shows
     the angle of a distal joint whose marker is not seen.
     """
     rows: list[tuple] = []
@@ -134,7 +134,7 @@ def estimate_states(
             std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
             for k, step in enumerate(steps):
                 angles, spread = q[k], std[k]
-                if last is not None:  # an angle that no marker tells is about what it was
+                if last is not None:  # an angle that no marker shows is about what it was
                     angles = torch.where(spread > _UNSEEN, last[0].q, angles)
                     spread = spread.clamp(max=_UNSEEN)
                 measured = GraspState(angles, place[k], turn[k])
@@ -185,8 +185,8 @@ def _diameter(markers: FingerMarkers, seen: Array, pose: Array) -> float:
     q = markers.joints(torch.from_numpy(seen)).q.numpy()
     position = (pose[:, :2] - camera[1:]) @ _rotation(camera[0])
     distance = PlanarFingers(markers.hand).distance(q, position)
-    told = distance[np.isfinite(seen[:, 2:]).all(-1)]  # by a finger whose distal marker is seen
-    return float(np.clip(2 * np.median(told), *_DIAMETERS)) if told.size else _USUAL
+    measured = distance[np.isfinite(seen[:, 2:]).all(-1)]  # by a finger whose distal marker is seen
+    return float(np.clip(2 * np.median(measured), *_DIAMETERS)) if measured.size else _USUAL
 
 
 def _looks(path: RecordedPath) -> list[tuple[int, Array, Array]]:

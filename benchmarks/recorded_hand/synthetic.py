@@ -19,7 +19,7 @@ from .recordings import APART, FILE, UNIT, RecordedPath
 from .states import OPTIONS, STRIDE, cylinder, upright
 
 OBJECTS = {APART: 0.045, "cyl30_d_v0": 0.030, "cyl35_red_d_v0": 0.035, "poly6_d_v0": 0.040}
-"""Name -> diameter [m]; of the last one the name does not tell."""
+"""Name -> diameter [m]; the name of the last one does not state it."""
 _MARKERS = ((0.058, -0.05), (0.057, 0.03), (0.0175, -0.04), (0.0180, 0.13))  # [m], [rad] in their links
 _CAMERA = {"blue": (0.037, 0.024, 0.016), "red": (0.050, 0.027, 0.023)}  # phi [rad], t [m]
 _NOISE = 2e-4  # [m] of a coordinate

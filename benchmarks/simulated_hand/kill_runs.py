@@ -182,8 +182,8 @@ def main() -> None:
             report, again = root / "report", root / "report_again"
             seconds = timed(reproduce_command(report))
             print(f"reproduce: {seconds:.0f} s unbroken")
-            told = kill_often(reproduce_command(again), again, results, report, kills, seconds)
-            print("reproduce:", told, flush=True)
+            outcome = kill_often(reproduce_command(again), again, results, report, kills, seconds)
+            print("reproduce:", outcome, flush=True)
         if options.only in (None, "bits"):
             print("bits: {} of {} found".format(*flipped_bits(log, flips)), flush=True)
 

@@ -69,7 +69,7 @@ def measure_tracking(
     """Track two boards at 0.35 to 0.45 m, each tilted up to ``max_tilt_deg``, in any direction and spin.
 
     Each frame is a new scene (generator ``seed + k``), and the tracker is reset before it: nothing
-    but the image tells one pose from its mirror image.
+    but the image distinguishes one pose from its mirror image.
 
     Args:
         n_frames: scenes.

@@ -1,4 +1,4 @@
-"""What Sphinx is told of this package: where a name is documented, and how docstrings are written."""
+"""What Sphinx knows about this package: where a name is documented, and how docstrings are written."""
 
 from __future__ import annotations
 

@@ -35,18 +35,18 @@ def _row(parameter: Any) -> str:
     shown = names if is_option else f"`{_metavar(parameter)}`".replace("|", r"\|")
     default = parameter.default() if callable(parameter.default) else parameter.default
     if parameter.required:
-        told = "required"
+        default_text = "required"
     elif default is None or default == "":
-        told = "–"
+        default_text = "–"
     elif isinstance(default, bool):
-        told = next(
+        default_text = next(
             (f"`{one[0]}`" for one in ((parameter.opts, parameter.secondary_opts)[not default],) if one),
             "off",
         )
     else:
-        told = f"`{default}`"
+        default_text = f"`{default}`"
     meaning = _plain(getattr(parameter, "help", "") or "").replace("\n", " ")
-    return f"| {shown} | {told} | {meaning} |"
+    return f"| {shown} | {default_text} | {meaning} |"
 
 
 def _metavar(parameter: Any) -> str:

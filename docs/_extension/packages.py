@@ -30,7 +30,7 @@ class Entry:
     name: str
     directive: str
     bases: bool
-    """Whether it tells what it is derived from."""
+    """Whether it states what it is derived from."""
     choices: bool
     """Whether it is an enumeration, which shows all members."""
     summary: str

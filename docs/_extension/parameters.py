@@ -68,7 +68,7 @@ def default_of(one: dataclasses.Field) -> Any:
 
 
 def shown(value: Any, text: str) -> str:
-    """A default for readers: angles in degrees beside radians."""
+    """A default for readers: angles in degrees as well as in radians."""
     if value is dataclasses.MISSING:
         return "required"
     if isinstance(value, tuple) and value:

@@ -19,8 +19,8 @@ _ClickException: type[Exception] = typer.BadParameter.__mro__[2]  # newer versio
 
 
 def main() -> None:
-    """Entry point: what torch_ekm refuses on purpose, and what the system refuses (a full disk, say), is told
-    in one line, without a traceback. The process ends with 1 then, with 2 if it was an option."""
+    """Entry point: what torch_ekm refuses on purpose, and what the system refuses (a full disk, say), is
+    reported in one line, without a traceback. The process ends with 1 then, with 2 if it was an option."""
     try:
         code = app(standalone_mode=False)
     except _ClickException as error:

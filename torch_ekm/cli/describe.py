@@ -24,8 +24,8 @@ def hands(
     """List the hands of the package, or begin your own.
 
     With --new: all joints of the URDF with their limits, a coupling for each <mimic>, and examples of
-    actuators and pads. Fill in what is marked with TODO; 'torch-ekm check NAME.urdf' tells what lacks. A file
-    that is there is not overwritten.
+    actuators and pads. Fill in what is marked with TODO; 'torch-ekm check NAME.urdf' lists what is missing.
+    A file that is there is not overwritten.
     """
     from ..description import list_hands, load_hand, write_template
 
@@ -42,7 +42,7 @@ def hands(
 @app.command()
 @needs("robot")
 def objects() -> None:
-    """List the objects of the package."""
+    """List the objects of the package: mass [g], friction, grasp width [mm] and shapes."""
     from ..description import list_cylinders, list_objects, load_object
 
     rows = []

@@ -99,14 +99,8 @@ def reproduce(
     pace = PaceOptions(limiting=limiting)
     setting = Setting(hand=hand, preset=preset, learner=learner, sensing=sensing, pace=pace)
     turns = parse_angles(angles) if angles else None
-    planned = plan(
-        experiment,
-        parse_seeds(seeds),
-        setting=setting,
-        objects=objects or None,
-        angles_deg=turns,
-        quick=quick,
-    )
+    chosen, things = parse_seeds(seeds), objects or None
+    planned = plan(experiment, chosen, setting=setting, objects=things, angles_deg=turns, quick=quick)
     _run(experiment, planned, out or Path(f"reproduce_{experiment}"), jobs)
 
 

@@ -14,7 +14,6 @@ from typer import Argument, Option  # isort: skip
 
 if TYPE_CHECKING:
     from ..inspection.viewer.serve import Show
-    from ..plant.trial_log import TrialEntry
 
 
 @app.command()
@@ -44,14 +43,10 @@ def record(
     chosen = parse_seeds(seeds)
     with progress("recording", len(chosen) * len(config.angles_deg)) as advance:
         made = run(config, chosen, log, on_trial=advance)
-    ends = Counter(_end(entry) for entry in made.index)
+    ends = Counter(e.status if e.status == "not grasped" else e.reason or e.status for e in made.index)
     say(f"{made.folder.resolve()}: {', '.join(f'{n} {end}' for end, n in ends.items())}")
     if set(ends) == {"not grasped"}:
         raise typer.Exit(1)
-
-
-def _end(entry: TrialEntry) -> str:
-    return entry.status if entry.status == "not grasped" else entry.reason or entry.status
 
 
 @app.command()

@@ -27,7 +27,7 @@ class ContactKinematics:
     lever: Float[Tensor, "*batch n_c 3"]
     """r_i = x_i - o [m]."""
     axis: Float[Tensor, "*batch n_q 3"]
-    """z_j, joint axes."""
+    """z_j, unit vectors along the joint axes, hand frame."""
     point_jacobian: Float[Tensor, "*batch n_c 3 n_q"]
     """Velocity of the finger's material point at x_i [m/rad]."""
     spin_jacobian: Float[Tensor, "*batch n_c 3 n_q"]

@@ -70,9 +70,9 @@ class ContactSet:
     gap: Float[Tensor, "*batch n_c"]
     """Signed distance between the surfaces [m]; negative: they overlap."""
     finger_curvature: Float[Tensor, "*batch n_c 3 3"]
-    """K_f [1/m]."""
+    """K_f, curvature of the finger pad at the contact [1/m]."""
     object_curvature: Float[Tensor, "*batch n_c 3 3"]
-    """K_o [1/m]."""
+    """K_o, curvature of the object's surface there [1/m]."""
     friction: Float[Tensor, " n_c"]
     """Coulomb coefficient mu_s of each contact."""
     torsional_friction: Float[Tensor, " n_c"]

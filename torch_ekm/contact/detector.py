@@ -140,16 +140,10 @@ class ContactDetector:
 
     def _coarse_distance(self, pad: Pad | Solid, T_pad: Array, solid: Solid, T_solid: Array) -> float:
         """coal's signed distance [m]: the gap without the crown, to its tolerance of 1e-6."""
-        place = self._coal.Transform3s
+        here, there = (self._coal.Transform3s(T[:3, :3], T[:3, 3]) for T in (T_pad, T_solid))
         self._result.clear()
-        return self._coal.distance(
-            pad.geometry,
-            place(T_pad[:3, :3], T_pad[:3, 3]),
-            solid.geometry,
-            place(T_solid[:3, :3], T_solid[:3, 3]),
-            self._request,
-            self._result,
-        )
+        shapes = pad.geometry, here, solid.geometry, there
+        return self._coal.distance(*shapes, self._request, self._result)
 
     def _contact_set(
         self,
@@ -160,6 +154,8 @@ class ContactDetector:
     ) -> ContactSet:
         pads = [self.hand.pads[k] for k, _ in found]
         contacts = [contact for _, contact in found]
+        # the softer of the two surfaces makes the patch that resists spinning
+        torsional = [max(pad.torsional_friction, self.obj.torsional_friction) for pad in pads]
 
         def tensor(values: list, *shape: int) -> Tensor:
             array = np.array(values, dtype=np.float64).reshape(len(found), *shape)
@@ -174,10 +170,7 @@ class ContactDetector:
             finger_curvature=tensor([c.finger_curvature for c in contacts], 3, 3),
             object_curvature=tensor([c.object_curvature for c in contacts], 3, 3),
             friction=tensor([self.obj.friction for _ in contacts]),
-            # the softer of the two surfaces makes the patch that resists spinning
-            torsional_friction=tensor(
-                [max(pad.torsional_friction, self.obj.torsional_friction) for pad in pads]
-            ),
+            torsional_friction=tensor(torsional),
             pinned=tuple(c.pinned for c in contacts),
             near_misses=tuple(missed),
         )

@@ -31,23 +31,21 @@ class GraspAnalysis:
     """null G^T: some object motion does not show at the contacts."""
 
 
-def analyse(
-    kin: ContactKinematics,
-    actuation: Float[Tensor, "n_a n_q"],
-) -> GraspAnalysis:
+def analyse(kin: ContactKinematics, actuation: Float[Tensor, "n_a n_q"]) -> GraspAnalysis:
     """Ranks and classes of one grasp (no batch); of a planar hand: of forces and motions in the plane.
 
     Args:
         kin: its contacts.
         actuation: J_a.
     """
-    A, n_q = constraint_matrix(kin), actuation.shape[-1]
+    A, n_q, L = constraint_matrix(kin), actuation.shape[-1], CHARACTERISTIC_LENGTH
     scale = A.new_ones(n_q + 6)
-    scale[n_q : n_q + 3] = CHARACTERISTIC_LENGTH
-    L = CHARACTERISTIC_LENGTH
+    scale[n_q : n_q + 3] = L
     row = torch.tensor([1 / L if r % 6 < 3 else 1.0 for r in kin.rows], dtype=A.dtype, device=A.device)
     A_s = row[:, None] * A * scale
-    if _planar(kin):  # the plane's normal is each contact's second tangent
+    if {*kin.models} == {
+        ContactModel.PLANAR_POINT_WITH_FRICTION
+    }:  # the plane's normal is each contact's second tangent
         n, t, normal = kin.frame[0].unbind(-1)
         plane = A.new_zeros(6, 3)
         plane[:3, 0], plane[:3, 1], plane[3:, 2] = n, t, normal
@@ -67,7 +65,3 @@ def analyse(
         undetermined_forces=n_h + len(actuation) - rank(torch.cat([A_s, B_s])),
         indeterminate=rank_G < n_p,
     )
-
-
-def _planar(kin: ContactKinematics) -> bool:
-    return bool(kin.models) and all(m is ContactModel.PLANAR_POINT_WITH_FRICTION for m in kin.models)

@@ -91,9 +91,8 @@ def _along(solid: Solid, m: tuple, t: tuple, half: float, most: float) -> tuple[
     if abs(s) >= half:  # at a round end, crown or not
         return s, most
     step = 1e-6
-    ahead, behind = (
-        solid.distance(m[0] + x * t[0], m[1] + x * t[1], m[2] + x * t[2])[1] for x in (s + step, s - step)
-    )
+    points = ((m[0] + x * t[0], m[1] + x * t[1], m[2] + x * t[2]) for x in (s + step, s - step))
+    ahead, behind = (solid.distance(*point)[1] for point in points)
     curved = sum((a - b) * axis for a, b, axis in zip(ahead, behind, t, strict=True)) / (2 * step)
     crown = min(most, max(0.0, most - curved))
     return (_closest(solid, m, t, half, crown) if crown < most else s), crown

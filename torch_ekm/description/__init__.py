@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from .hand import Actuator, ContactPad, HandDescription
 from .objects import ObjectDescription
-from .registry import (
-    file_digests,
-    list_cylinders,
-    list_hands,
-    list_objects,
-    load_hand,
-    load_object,
-)
+from .registry import file_digests, list_cylinders, list_hands, list_objects, load_hand, load_object
 from .shape import Shape
 from .template import write_template
 from .transmission_file import write_transmission

@@ -120,9 +120,8 @@ class TomlTable:
             return float(default)
         value = self._finite(key, value)
         if value < minimum or (positive and value <= 0):
-            raise self.error(
-                f"'{key}' must be {'positive' if positive else f'at least {minimum:g}'}, got {value:g}"
-            )
+            valid = "positive" if positive else f"at least {minimum:g}"
+            raise self.error(f"'{key}' must be {valid}, got {value:g}")
         return value
 
     def angle(self, key: str, default: Any = _NOTHING) -> float:

@@ -1,8 +1,4 @@
-"""What a hand is, as data: joints, actuators, springs, pads, sensors.
-
-Nothing here computes. A :class:`HandDescription` is read from a URDF and the
-transmission file next to it by :func:`torch_ekm.description.load_hand`.
-"""
+"""What a hand is, as data: joints, actuators, springs, pads, sensors."""
 
 from __future__ import annotations
 
@@ -70,7 +66,7 @@ class HallSensor:
 
 @dataclass(frozen=True)
 class HandDescription:
-    """A hand: its URDF and everything that a URDF cannot say.
+    """A hand: its URDF and everything that a URDF cannot say, as ``load_hand`` reads it.
 
     Shapes: ``n_q`` joints, ``n_a`` actuators, ``n_k`` rigid couplings. Angles [rad],
     lengths [m], torques [N m]. Vectors over joints are in the order of ``joint_names``.
@@ -97,7 +93,7 @@ class HandDescription:
     spring_stiffness: Array
     """Diagonal of K_s, ``(n_q,)`` [N m/rad]."""
     spring_rest: Array
-    """q0, ``(n_q,)`` [rad]."""
+    """q0, angles at which the springs are slack, ``(n_q,)`` [rad]."""
     joint_friction: Array
     """Coulomb friction torque of each joint, ``(n_q,)`` [N m]."""
     pads: tuple[ContactPad, ...]
@@ -115,26 +111,20 @@ class HandDescription:
             self._check_plane(np.array(self.planar_normal, dtype=float))
 
     def _check_plane(self, normal: Array) -> None:
-        """Joints that turn about the normal turn no axis away from it: one posture tells."""
+        """Joints that turn about the normal turn no axis away from it: one posture is enough."""
         size = float(np.linalg.norm(normal))
         if not 1e-9 < size < np.inf:
             problem = f"planar_normal must not be zero, and finite, got {self.planar_normal}"
             raise DescriptionError(self.transmission_path, problem)
-        carried_by = {joint.child: joint for joint in self.urdf.joints}
-
-        def rotation(link: str) -> Array:
-            joint = carried_by.get(link)
-            return np.eye(3) if joint is None else rotation(joint.parent) @ joint.transform[:3, :3]
-
-        normal = rotation(self.base_link) @ normal / size
+        normal = self.urdf.pose(self.base_link)[:3, :3] @ normal / size
         for joint in self.urdf.moving_joints:
-            lean = float(np.linalg.norm(np.cross(rotation(joint.child) @ joint.axis, normal)))
+            axis = self.urdf.pose(joint.child)[:3, :3] @ joint.axis
+            lean = float(np.linalg.norm(np.cross(axis, normal)))
             if lean > 1e-3:
                 degrees = np.degrees(np.arcsin(min(lean, 1.0)))
                 problem = f"the axis of joint '{joint.name}' is {degrees:.3g} deg off planar_normal"
-                raise DescriptionError(
-                    self.transmission_path, f"{problem}; a planar hand turns about it alone"
-                )
+                problem += "; a planar hand turns about it alone"
+                raise DescriptionError(self.transmission_path, problem)
 
     @property
     def urdf_path(self) -> Path:

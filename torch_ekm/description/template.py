@@ -1,4 +1,4 @@
-"""A transmission file to be filled in: all that a URDF tells of a hand, and marks where it does not."""
+"""A transmission file to be filled in: all that a URDF states about a hand, and marks where it does not."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from .._files import write_whole
 from ..exceptions import DescriptionError, UnknownNameError
-from .shape import Shape
 from .transmission import TODO
 from .transmission_file import toml_key
 from .urdf import UrdfModel, read_urdf
@@ -20,7 +19,7 @@ _ROUND = ("capsule", "sphere")
 _ONE_PLANE = 1e-3  # [m]
 _HEAD = """\
 # What {urdf} cannot say about this hand. Begun by 'torch-ekm hands --new'.
-# Put a figure wherever "TODO" stands; 'torch-ekm check {urdf}' tells what lacks.
+# Put a figure wherever "TODO" stands; 'torch-ekm check {urdf}' lists what is missing.
 # Angles in rad, or in deg where the key ends in _deg; lengths in m; torques in N m.
 # A joint that closes its finger with negative angles has a negative moment arm.
 # All keys: docs/reference/file_formats.md;
@@ -54,7 +53,7 @@ _PADS = """
 def write_template(urdf: str | Path) -> Path:
     """Write ``<stem>.transmission.toml`` next to a URDF: all joints, and couplings for ``<mimic>``.
 
-    Figures that the URDF does not tell are ``"TODO"``; as long as one is left, ``load_hand`` names them all.
+    Figures that the URDF does not state are ``"TODO"``; as long as one is left, ``load_hand`` names them all.
 
     Args:
         urdf: a path that ends in ".urdf".
@@ -86,7 +85,7 @@ def template(model: UrdfModel) -> str:
     if normal is not None:
         lines.append(f"planar_normal = {_vector(normal)}  # all joints turn in one plane: a planar hand")
     lines += [_JOINTS.rstrip("\n"), *_joints(model), *_couplings(model), _ACTUATORS.rstrip("\n")]
-    fingers = _fingers(model, base)
+    fingers = _fingers(model)
     for k, finger in enumerate(fingers, start=1):
         lines += _actuator(model, finger, f"finger_{k}")
     lines.append(_PADS.rstrip("\n"))
@@ -141,18 +140,14 @@ def _pad(model: UrdfModel, link: str, name: str) -> Iterator[str]:
     round_shapes = [s for s in model.link(link).collisions if s.kind in _ROUND]
     if round_shapes:
         shape = round_shapes[-1]
-        start, end = _ends(shape)
+        half = 0.5 * shape.size[1] * shape.transform[:3, 2] if shape.kind == "capsule" else np.zeros(3)
+        start, end = shape.transform[:3, 3] - half, shape.transform[:3, 3] + half
         yield f"start = {_vector(start)}\nend = {_vector(end)}"
         yield f"radius = {shape.size[0]:.9g}  # as <collision>"
     else:
         todo = f"[{', '.join([_text(TODO)] * 3)}]"
         yield f"start = {todo}\nend = {todo}\nradius = {_text(TODO)}"
     yield f"direction = [{', '.join([_text(TODO)] * 3)}]  # outward, e.g. [0.0, 1.0, 0.0]"
-
-
-def _ends(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
-    half = 0.5 * shape.size[1] * shape.transform[:3, 2] if shape.kind == "capsule" else np.zeros(3)
-    return shape.transform[:3, 3] - half, shape.transform[:3, 3] + half
 
 
 def _base(model: UrdfModel) -> str:
@@ -165,22 +160,12 @@ def _base(model: UrdfModel) -> str:
         base = joints[0].child
 
 
-def _fingers(model: UrdfModel, base: str) -> list[list[str]]:
+def _fingers(model: UrdfModel) -> list[list[str]]:
     """Links of each chain from the base to a link that moves and carries no other that does."""
-    parent = {joint.child: joint for joint in model.joints}
-    moving = {joint.child for joint in model.moving_joints}
-
-    def chain(link: str) -> list[str]:
-        links = []
-        while link in parent:
-            links.append(link)
-            link = parent[link].parent
-        return [one for one in reversed(links) if one in moving]
-
-    chains = [chain(link) for link in moving]
+    moving = [joint.child for joint in model.moving_joints]
+    chains = [[joint.child for joint in model.joints_to(link) if joint.child in moving] for link in moving]
     inner = {link for links in chains for link in links[:-1]}
-    ends = [joint.child for joint in model.moving_joints if joint.child not in inner]
-    return [chain(link) for link in ends]
+    return [links for links in chains if links[-1] not in inner]
 
 
 def _fingertip(model: UrdfModel, link: str) -> str:
@@ -198,12 +183,8 @@ def _planar_normal(model: UrdfModel, base: str) -> np.ndarray | None:
 
     Nor is there one where joints lie in several parallel planes: their fingers hold an object in space.
     """
-    placed = {model.root: np.eye(4)}
-    for _ in model.joints:
-        for joint in model.joints:
-            if joint.parent in placed:
-                placed[joint.child] = placed[joint.parent] @ joint.transform
-    frames = [np.linalg.inv(placed[base]) @ placed[joint.child] for joint in model.moving_joints]
+    base_pose = model.pose(base)
+    frames = [np.linalg.inv(base_pose) @ model.pose(joint.child) for joint in model.moving_joints]
     axes = [T[:3, :3] @ joint.axis for T, joint in zip(frames, model.moving_joints, strict=True)]
     normal = axes[0] * np.sign(axes[0][np.abs(axes[0]).argmax()])
     heights = [float(normal @ T[:3, 3]) for T in frames]

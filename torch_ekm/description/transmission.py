@@ -24,18 +24,9 @@ TABLES = ("hand", "joints", "actuators", "couplings", "pads", "hall_sensors", "n
 HAND = ("name", "base_link", "planar_normal", "gravity", "pinch_force")
 JOINT = ("spring", "rest", "rest_deg", "friction")
 ACTUATOR = (
-    "name",
-    "range",
-    "range_deg",
-    "offset",
-    "offset_deg",
-    "moment_arms",
-    "tendon",
-    "stiffness",
-    "backlash",
-    "backlash_deg",
-    "posture",
-)
+    "name", "range", "range_deg", "offset", "offset_deg", "moment_arms", "tendon", "stiffness",
+    "backlash", "backlash_deg", "posture",
+)  # fmt: skip
 COUPLING = ("name", "joints")
 PAD = ("name", "link", "start", "end", "radius", "direction", "torsional_friction")
 HALL = ("joint", "channel", "open", "closed")
@@ -109,11 +100,8 @@ def _check_filled_in(path: Path, data: dict[str, Any]) -> None:
     """Figures of a template that nobody has filled in yet, all of them in one message."""
 
     def places(value: Any, name: str) -> Iterator[str]:
-        parts = (
-            list(value.values() if isinstance(value, dict) else value)
-            if isinstance(value, dict | list)
-            else []
-        )
+        parts = list(value.values()) if isinstance(value, dict) else value
+        parts = parts if isinstance(parts, list) else []
         if value == TODO or (parts and all(part == TODO for part in parts)):
             yield name
         elif isinstance(value, dict):
@@ -235,27 +223,21 @@ def _check_mechanism(
         stiffness, modes = np.linalg.eigh(N.T @ (K_s[:, None] * N))
         if stiffness[0] <= 1e-9 * max(1.0, stiffness[-1]):
             loose = np.abs(N @ modes[:, 0])
-            joints = ", ".join(
-                name for name, part in zip(names, loose, strict=True) if part > 0.3 * loose.max()
-            )
+            pairs = zip(names, loose, strict=True)
+            joints = ", ".join(name for name, part in pairs if part > 0.3 * loose.max())
             problem = "no spring, actuator or coupling holds the joints"
             raise DescriptionError(path, f"{problem} {joints}: give them a positive 'spring' in [joints]")
 
 
 def _check_base(path: Path, base: str, urdf: UrdfModel) -> None:
     """The hand frame must not move: only fixed joints between the root and it."""
-    parents = {joint.child: joint for joint in urdf.joints}
     links = [link.name for link in urdf.links]
     if base not in links:
         raise DescriptionError(path, f"[hand]: unknown base_link '{base}'; links are: {', '.join(links)}")
-    link = base
-    while link in parents:
-        if parents[link].kind != "fixed":
-            joint = parents[link].name
-            raise DescriptionError(
-                path, f"[hand]: base_link '{base}' moves with joint '{joint}'; choose a fixed link"
-            )
-        link = parents[link].parent
+    moving = [joint.name for joint in urdf.joints_to(base) if joint.kind != "fixed"]
+    if moving:
+        problem = f"base_link '{base}' moves with joint '{moving[-1]}'; choose a fixed link"
+        raise DescriptionError(path, f"[hand]: {problem}")
 
 
 def _check_unique(path: Path, kind: str, names: Iterable[str]) -> None:

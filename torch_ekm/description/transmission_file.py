@@ -40,9 +40,8 @@ def write_transmission(hand: HandDescription, path: str | Path) -> Path:
             "friction": float(hand.joint_friction[j]),
         }
     for actuator, table, arms in zip(hand.actuators, data["actuators"], hand.actuation_jacobian, strict=True):
-        table["moment_arms"] = {
-            name: float(arm) for name, arm in zip(hand.joint_names, arms, strict=True) if arm != 0
-        }
+        named = zip(hand.joint_names, arms, strict=True)
+        table["moment_arms"] = {name: float(arm) for name, arm in named if arm != 0}
         for key in ("stiffness", "offset", "offset_deg", "backlash", "backlash_deg"):
             table.pop(key, None)
         if math.isfinite(actuator.stiffness):

@@ -101,6 +101,21 @@ class UrdfModel:
     def link(self, name: str) -> UrdfLink:
         return next(link for link in self.links if link.name == name)
 
+    def joints_to(self, link: str) -> list[UrdfJoint]:
+        """The joints between the root and a link, that of the root first."""
+        carried_by, joints = {joint.child: joint for joint in self.joints}, []
+        while link in carried_by:
+            joints.append(carried_by[link])
+            link = carried_by[link].parent
+        return joints[::-1]
+
+    def pose(self, link: str) -> Array:
+        """``T_root_link`` at zero angles, ``(4, 4)`` [m]."""
+        T = np.eye(4)
+        for joint in self.joints_to(link):
+            T = T @ joint.transform
+        return T
+
 
 def read_urdf(path: str | Path) -> UrdfModel:
     """Parse the URDF at ``path``.
@@ -174,7 +189,7 @@ def _strict(path: Path, element: ET.Element, place: str, unread: tuple[str, ...]
             strict.append(_strict(path, child, f"{place}, {child.tag}"))
     if tag == "geometry" and len(strict) != 1:
         raise DescriptionError(path, f"{place}: <geometry> needs one of {', '.join(_SHAPES)}")
-    if tag == "collision":  # yourdfpy knows no capsule: it travels as a cylinder whose name tells
+    if tag == "collision":  # yourdfpy knows no capsule: it is passed as a cylinder whose name states the kind
         shape = next(strict.iter("geometry"))[0]
         strict.set("name", shape.tag)
         shape.tag = "cylinder" if shape.tag == "capsule" else shape.tag
@@ -271,16 +286,13 @@ def _root(path: Path, links: tuple[UrdfLink, ...], joints: tuple[UrdfJoint, ...]
     for joint in joints:
         for end in (joint.parent, joint.child):
             if end not in names:
-                raise DescriptionError(
-                    path,
-                    f"joint '{joint.name}' names the unknown link '{end}'; links are: {', '.join(names)}",
-                )
+                problem = f"names the unknown link '{end}'; links are: {', '.join(names)}"
+                raise DescriptionError(path, f"joint '{joint.name}' {problem}")
     children = [joint.child for joint in joints]
     roots = [name for name in names if name not in children]
     if len(roots) != 1 or len(set(children)) != len(children):
-        raise DescriptionError(
-            path, f"the links must form one tree; links without a parent: {roots or 'none'}"
-        )
+        problem = f"the links must form one tree; links without a parent: {roots or 'none'}"
+        raise DescriptionError(path, problem)
     reached = {roots[0]}
     for _ in joints:  # as many sweeps as joints reach the deepest link
         reached |= {joint.child for joint in joints if joint.parent in reached}

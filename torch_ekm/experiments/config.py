@@ -62,8 +62,8 @@ class Setting:
         for name in ("capacity", "frames"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
-        kinds = {"plant": PlantParameters, "model": ModelOptions}
-        for name, kind in {**kinds, "pace": PaceOptions, "safety": Safety}.items():
+        kinds = {"plant": PlantParameters, "model": ModelOptions, "pace": PaceOptions, "safety": Safety}
+        for name, kind in kinds.items():
             value = self.parameters if name == "plant" else getattr(self, name)
             if not isinstance(value, kind):
                 raise ParameterError(name, value, f"a {kind.__name__}")
@@ -74,7 +74,7 @@ class Setting:
 
     @property
     def parameters(self) -> PlantParameters:
-        """The plant's."""
+        """Figures of the simulated plant: ``plant``, or else those of the preset."""
         return preset(self.preset) if self.plant is None else self.plant
 
     def hardware_instance(self, seed: int) -> Setting:
@@ -103,7 +103,7 @@ class Setting:
         }
 
     def replace(self, **changes: Any) -> Setting:
-        """A copy with some figures changed."""
+        """A copy in which the named fields have other values, checked like a new setting."""
         return dataclasses.replace(self, **changes)
 
 

@@ -58,7 +58,7 @@ def run_jobs(
         OutputError: a result cannot be written.
         MissingExtraError: joblib is not installed.
     """
-    results, tell = {}, on_done or (lambda name: None)
+    results, report = {}, on_done or (lambda name: None)
     make_folder(folder)
     with WriterLock(folder):
         for name in jobs:
@@ -69,14 +69,14 @@ def run_jobs(
                 except ValueError as error:
                     warnings.warn(f"{path}: {error}; the job is run again", stacklevel=2)
         for name in results:
-            tell(name)
+            report(name)
         waiting = {name: arguments for name, arguments in jobs.items() if name not in results}
         with closing(_in_processes(processes, function, waiting)) as outcomes:
             for name, result in outcomes:
                 text = _text(name, result)
                 write_whole(folder / f"{name}.json", text)
                 results[name] = json.loads(text)["result"]  # in the types that a resumed run reads
-                tell(name)
+                report(name)
     return {name: results[name] for name in jobs}
 
 
@@ -137,7 +137,7 @@ def _in_processes(processes: int, function: Callable[..., Any], jobs: Jobs) -> O
 
 
 def _end_with(parent: int) -> None:
-    """End this process when its parent has: killed, a parent tells nobody."""
+    """End this process when its parent has: killed, a parent gives no notice."""
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -83,11 +83,6 @@ def _parts(robust: float | None, forgetting_factor: float, parts: Any) -> list[A
     return [*weight, *fading, *parts]
 
 
-def constructor_call(factory: Factory) -> str:
-    """How a user makes the learner of this factory, of d inputs and m outputs; "" where it does not tell."""
-    return getattr(factory, "call", "")
-
-
 class Mixture:
     """One learner that stands still and learns features, one that wanders: evidence decides."""
 

@@ -20,7 +20,7 @@ from ..typing import Float, Tensor
 
 _DEG = np.pi / 180
 _DISLOCATED = math.degrees(StoppingRule().off_limit)
-_MOVING = 0.5 * _DEG  # commands that ask for less tell nothing about the shortfall of a step
+_MOVING = 0.5 * _DEG  # commands that ask for less say nothing about the shortfall of a step
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Trial:
     """What was to be done: object, controller, grasp and rotation."""
 
     object: str
-    """Short name."""
+    """Its name, or the stem of its file."""
     kind: str
     """"turn", "warm-up", "long step" (one motion without feedback) or "camera off" (at the end)."""
     controller: str
@@ -147,9 +147,8 @@ class TrialRecord(Trial):
         turned = [axis @ after.minus(before)[-3:] for before, after in pairwise(truth)]
 
         def errors(name: str) -> tuple[float, ...]:
-            wrong = (
-                prediction_error(step.increment, getattr(step.decision, name), focus.matrix) for step in steps
-            )
+            pairs = ((step.increment, getattr(step.decision, name)) for step in steps)
+            wrong = (prediction_error(*pair, focus.matrix) for pair in pairs)
             return tuple(float(torch.linalg.vector_norm(error)) / _DEG for error in wrong)
 
         def true_errors(name: str) -> tuple[float, ...]:
@@ -193,5 +192,5 @@ def prediction_error(
 
 def true_state(seen: Observation) -> GraspState:
     """Joint angles and pose as they are; for reports only."""
-    assert seen.truth is not None  # a simulated hand tells
+    assert seen.truth is not None  # a simulated hand knows
     return seen.truth.state

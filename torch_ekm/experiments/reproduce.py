@@ -19,11 +19,7 @@ from .protocols.protocol import Protocol
 from .reporting.report import Report
 from .reporting.trials import trial_frame
 
-PROTOCOLS: dict[str, type[Protocol]] = {
-    "online": Online,
-    "generalize": Generalize,
-    "adapt": ObjectMemory,
-}
+PROTOCOLS: dict[str, type[Protocol]] = {"online": Online, "generalize": Generalize, "adapt": ObjectMemory}
 #: Seeds that nobody tuned on, at least twenty for each case.
 REPORTED_SEEDS = tuple(range(FIRST_REPORTED, FIRST_REPORTED + 20))
 
@@ -86,10 +82,7 @@ def plan(
 
 
 def reproduce(
-    experiment: Experiment,
-    folder: Path,
-    processes: int = 1,
-    on_done: Callable[[str], None] | None = None,
+    experiment: Experiment, folder: Path, processes: int = 1, on_done: Callable[[str], None] | None = None
 ) -> Report:
     """Run what has not been run yet, and write the report into ``folder``.
 
@@ -134,9 +127,8 @@ def objects_of(names: str | Path) -> tuple[str, ...]:
         return chosen
     found = tuple(str(path) for path in sorted(folder.glob("*.urdf")))
     if not found:
-        raise ParameterError(
-            "objects", str(folder), "a folder with *.urdf files, each with its *.object.toml"
-        )
+        valid = "a folder with *.urdf files, each with its *.object.toml"
+        raise ParameterError("objects", str(folder), valid)
     for path in found:  # what is wrong with one is said before anything runs
         load_object(path)
     return found

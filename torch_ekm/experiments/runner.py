@@ -47,12 +47,7 @@ class Bench:
     """
 
     def __init__(
-        self,
-        setting: Setting,
-        object: str | ObjectDescription,
-        controller: str,
-        *,
-        keep_images: bool = False,
+        self, setting: Setting, object: str | ObjectDescription, controller: str, *, keep_images: bool = False
     ) -> None:
         torch.set_num_threads(1)  # small matrices: more threads only wait for each other
         self.setting, self.controller = setting, controller
@@ -81,7 +76,7 @@ class Bench:
 
     @property
     def learns(self) -> bool:
-        """The controller is an E-KM."""
+        """Whether the controller is an E-KM, which trains a learner after each motion."""
         return self.controller.startswith("E-KM")
 
     def grasp(self, seed: int, trial: int) -> GraspState | None:
@@ -139,9 +134,8 @@ class Bench:
             poses: keep the true poses, for pictures.
             blind: options of :class:`~torch_ekm.foresight.BlindPose`; its ``touch`` is off.
         """
-        self.disturbed.events = tuple(
-            dataclasses.replace(event, at=event.at + self.disturbed.count) for event in events
-        )
+        now = self.disturbed.count
+        self.disturbed.events = tuple(dataclasses.replace(event, at=event.at + now) for event in events)
         axis = self.hand.rotation_axis
         target = PoseTarget.turned(start, axis, about.angle_deg * _DEG)
         plant = self.plant
@@ -154,8 +148,7 @@ class Bench:
                 switch_off=lambda seen: abs(float(axis @ target.error(seen.state)[3:])) <= blind_deg * _DEG,
                 **{"touch": False, **blind},
             )
-        setting = self.setting
-        known = {"knowledge": self.knowledge, "safety": setting.safety}
+        known = {"knowledge": self.knowledge, "safety": self.setting.safety}
         loop = ClosedLoop(plant, self.look_and_move(), **known, learn=learn)
         self.last = loop.run(target)
         return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
@@ -188,7 +181,7 @@ class Bench:
         return dataclasses.replace(record, true_error_deg=abs(float(turned) / _DEG - step_deg))
 
     def close(self) -> None:
-        """Give back what the plant holds."""
+        """Close the plant: its simulation and rendering end; the bench is not used afterwards."""
         self.plant.close()
 
     @property

@@ -1,5 +1,3 @@
-"""A plant whose camera is off: the pose is predicted, corrected by touch, and looked at when it must be."""
-
 from __future__ import annotations
 
 import dataclasses
@@ -72,7 +70,7 @@ class BlindPose(PlantWrapper):
         return math.sqrt(max(float(self.axis @ self.filter.pose_covariance[3:, 3:] @ self.axis), 0.0))
 
     def reset(self, seed: int) -> Observation:
-        """Grasp again, camera on."""
+        """Grasp again with the camera on; the observation after it is that of the plant."""
         self.dark, self.looks, self._before = False, 0, None
         return super().reset(seed)
 

@@ -42,7 +42,7 @@ class Configuration:
 
     @classmethod
     def of(cls, lin: Linearization) -> Configuration:
-        """Where a linearization stands."""
+        """State, contacts and forces at which the model was linearized, hand frame."""
         return cls(lin.state, lin.contacts, lin.forces)
 
     def expand(self, *batch: int) -> Configuration:
@@ -68,9 +68,8 @@ def _combined(
         for group, tails in _TAILS.items()
     )
     state, first = GraspState(**pose), parts[0]
-    return Configuration(
-        state, first.contacts.replace(**contacts), _with(first.forces, state.q.shape[:-1], forces)
-    )
+    combined = _with(first.forces, state.q.shape[:-1], forces)
+    return Configuration(state, first.contacts.replace(**contacts), combined)
 
 
 class Change(NamedTuple):
@@ -84,7 +83,7 @@ class Change(NamedTuple):
     """Of the object's surface, and of its normal, at the contact point."""
     finger_turn: Float[Tensor, "*batch n_c 3 3"]
     force: Float[Tensor, "*batch n_c 3"]
-    """[N]"""
+    """Change of each contact force, hand frame [N]."""
     spin_moment: Float[Tensor, "*batch n_c"]
     lam: Float[Tensor, "*batch n_a"]
 

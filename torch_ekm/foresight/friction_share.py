@@ -1,5 +1,3 @@
-"""How much of its friction a grasp needs to hold the object."""
-
 from __future__ import annotations
 
 import itertools
@@ -24,7 +22,7 @@ def friction_share(model: KinematicModel, lin: Linearization) -> float:
     balanced. Above 1 no force within the cones holds the object, whatever the fingers do; infinite: none at
     all. A linear program, with a pyramid of 12 sides (soft fingers: 24) inside each cone.
 
-    A contact that creeps at its friction limit has a margin of 0 for as long as it creeps. This figure tells
+    A contact that creeps at its friction limit has a margin of 0 for as long as it creeps. This figure shows
     whether the others still hold what it lets go of.
 
     Args:
@@ -50,20 +48,13 @@ def friction_share(model: KinematicModel, lin: Linearization) -> float:
         tangents = [column for column, at in enumerate(parts) if at in ((i, 1), (i, 2))]
         spin = [column for column, at in enumerate(parts) if at == (i, 3)]
         friction, torsional = float(contacts.friction[i]), float(contacts.torsional_friction[i])
-        for angle, sign in itertools.product(
-            np.arange(_SIDES) * (2 * math.pi / _SIDES), (1, -1)[: 1 + len(spin)]
-        ):
+        angles = np.arange(_SIDES) * (2 * math.pi / _SIDES)
+        for angle, sign in itertools.product(angles, (1, -1)[: 1 + len(spin)]):
             side = np.zeros(len(parts) + 1)
             side[tangents] = [math.cos(angle), math.sin(angle)][: len(tangents)]
             side[spin] = sign * friction / torsional if spin else 0.0
             side[-1] = -friction * normal[i] * math.cos(math.pi / _SIDES)
             inside.append(side)
-    found = optimize.linprog(
-        cost,
-        np.array(inside),
-        np.zeros(len(inside)),
-        np.column_stack([G, np.zeros(len(G))]),
-        load,
-        bounds=[*bounds, (0, None)],
-    )
+    balance, bounds = np.column_stack([G, np.zeros(len(G))]), [*bounds, (0, None)]
+    found = optimize.linprog(cost, np.array(inside), np.zeros(len(inside)), balance, load, bounds=bounds)
     return float(found.x[-1]) if found.status == 0 else math.inf

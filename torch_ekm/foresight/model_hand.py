@@ -60,7 +60,7 @@ class ModelHand:
         return self.observe()
 
     def observe(self) -> Observation:
-        """What the model believes."""
+        """The predicted state [rad, m], encoders [rad] and normal forces [N]; LOST after a failure."""
         s = self.filter.state
         status = PlantStatus.LOST if self.failure else PlantStatus.HELD
         return Observation(s.q, self.a, s.position, s.rotation, self.force, self.time, status)
@@ -76,7 +76,7 @@ class ModelHand:
         return self.observe()
 
     def close(self) -> None:
-        """There is nothing to give back."""
+        """Does nothing: the model holds no device."""
 
     def at_stops(self, push: float = 0.0) -> list[str]:
         """Joints of the fingers that touch, at a stop that bears more than ``push`` [N m]."""

@@ -6,7 +6,7 @@ import contextlib
 import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -37,13 +37,13 @@ _LEAST_FORCE = 0.3  # [N] a pad that measures less touches nothing, or is dead
 
 
 class Measurement(NamedTuple):
-    """``H ds = miss(s) +- noise``."""
+    """``H ds = miss(s) +- noise``: n_m linear measurements of an increment ds [rad, m, rad] of the state."""
 
     H: Float[Tensor, "n_m n_s"]
     miss: Callable[[GraspState], Float[Tensor, " n_m"]]
     """What was measured less what a state says."""
     noise: Float[Tensor, "n_m n_m"]
-    """Covariance."""
+    """Covariance of the measurements, in the squares of their units."""
 
 
 class PoseFilter:
@@ -61,7 +61,7 @@ class PoseFilter:
     iterated, since gaps are not linear (Bell and Cathey, IEEE TAC 38(2), 1993).
 
     Args:
-        model: predicts the motions; of an enhanced model the learner tells how unsure it is.
+        model: predicts the motions; of an enhanced model the learner states its variance.
         touch: False leaves the pose to the prediction alone, without rolling and gaps.
     """
 
@@ -70,12 +70,7 @@ class PoseFilter:
     covariance: Float[Tensor, "n_s n_s"]
     """P [rad, m, rad], hand axes."""
 
-    def __init__(
-        self,
-        model: KinematicModel | EnhancedModel,
-        *,
-        touch: bool = True,
-    ) -> None:
+    def __init__(self, model: KinematicModel | EnhancedModel, *, touch: bool = True) -> None:
         self.kinematic, self.enhanced = kinematic_and_enhanced(model)
         self.touch = touch
         self._detector = copy.copy(self.kinematic.detector)
@@ -175,13 +170,11 @@ class PoseFilter:
 
     def _linearize(self, moved: Tensor, fingertip_force: Tensor | None) -> Linearization | None:
         """The model at the state, with forces carried along from motion to motion; None: it refuses."""
-        last, expected = None, None
+        known: dict[str, Any] = {"fingertip_force": fingertip_force}
         if self._last is not None:
-            last, expected = self._last[0], self._last[0].forces_after(self._last[1])
+            known |= {"previous": self._last[0], "expected": self._last[0].forces_after(self._last[1])}
         try:
-            lin = self.kinematic.linearize(
-                self.state, fingertip_force=fingertip_force, expected=expected, previous=last
-            )
+            lin = self.kinematic.linearize(self.state, **known)
         except GraspError:
             return None
         self._last = (lin, moved) if lin.forces.solved else None

@@ -1,5 +1,3 @@
-"""What a sequence of motions is predicted to do."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -32,7 +30,7 @@ class Prediction:
 
     @property
     def states(self) -> GraspState:
-        """``(*batch, K + 1, ...)``."""
+        """Joint angles [rad] and object poses [m] before and after each motion, ``(*batch, K + 1, ...)``."""
         return self.linearization.state
 
     @property
@@ -72,7 +70,7 @@ class Prediction:
 
     @property
     def end(self) -> GraspState:
-        """After the last motion."""
+        """Joint angles [rad] and object pose [m] after the last motion, hand frame."""
         return self.at(-1).state
 
     def turned(self, matrix: Float[Tensor, "n_x 6"]) -> Float[Tensor, "*batch nodes n_x"]:

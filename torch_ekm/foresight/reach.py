@@ -36,7 +36,7 @@ _PRESSED = -0.3e-3
 
 
 class ReachEnd(Enum):
-    """What ends a turn."""
+    """What ends a turn of the object, as the model predicts it."""
 
     NOTHING = "nothing"
     """It goes on beyond the angle that was asked about."""
@@ -124,9 +124,8 @@ def reachable(
     standing = _Standing([], [], hand.linearization)
     safety = Safety(caution=Caution(link_gap=_PRESSED)) if safety is None else safety
     ideal = HandKnowledge.of(hand.hand, learns=False)
-    motions = ClosedLoop(hand, controller, knowledge=ideal, safety=safety, learn=False).steps(
-        PoseTarget.turned(start.state, about, sign * limit)
-    )
+    loop = ClosedLoop(hand, controller, knowledge=ideal, safety=safety, learn=False)
+    motions = loop.steps(PoseTarget.turned(start.state, about, sign * limit))
     while True:
         try:
             step = next(motions)
@@ -164,11 +163,7 @@ class BeyondReach:
     """
 
     def __init__(
-        self,
-        controller: LookAndMoveController,
-        beyond: float = 2 * _DEG,
-        *,
-        safety: Safety | None = None,
+        self, controller: LookAndMoveController, beyond: float = 2 * _DEG, *, safety: Safety | None = None
     ) -> None:
         self.controller, self.beyond, self.safety = controller, beyond, safety
         self.reach: Reach | None = None

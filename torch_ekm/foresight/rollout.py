@@ -1,5 +1,3 @@
-"""From a grasp and a sequence of motions to all grasps on the way."""
-
 from __future__ import annotations
 
 import dataclasses

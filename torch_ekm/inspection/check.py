@@ -255,9 +255,8 @@ def _grasp(hand: HandDescription, lin: Linearization) -> Iterator[Check]:
     found = f"{stability:.2g} N m/rad with locked actuators; the model's status: {lin.status.value}"
     few = len(lin.contacts.finger) < 2  # the simulation lets any link hold, the model pads alone
     state: State = "error" if few or stability < _STABLE else "ok" if good else "warning"
-    yield Check(
-        "stability", state, found, "" if state == "ok" else "stiffer springs, less force, pads that touch"
-    )
+    mend = "" if state == "ok" else "stiffer springs, less force, pads that touch"
+    yield Check("stability", state, found, mend)
     answer = float(lin.normal_force_sensitivity.abs().max())
     if answer > _CONTRADICT:
         found = f"rigid actuators contradict each other: {answer:.1g} N/rad"
@@ -269,9 +268,8 @@ def _grasp(hand: HandDescription, lin: Linearization) -> Iterator[Check]:
     yield Check("friction margins", "warning" if low else "ok", f"{found} (1: no tangential load)", mend)
     stopped = [name for name, held in zip(hand.joint_names, lin.held_joints, strict=True) if held]
     if stopped:
-        yield Check(
-            "stops", "warning", f"a stop holds: {', '.join(stopped)}", "wider limits, stiffer springs"
-        )
+        found = f"a stop holds: {', '.join(stopped)}"
+        yield Check("stops", "warning", found, "wider limits, stiffer springs")
     upstream = HandKinematics(hand).upstream.numpy()
     used = upstream[[hand.link_names.index(link) for link in lin.contacts.link]].any(axis=0)
     slack = [

@@ -93,10 +93,8 @@ def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
             if field.name in _LEFT_OUT or field.name.startswith("__"):
                 continue
             if labels and isinstance(part, np.ndarray) and len(part) == len(labels):
-                yield from (
-                    (f"{place}.{field.name}.{label}", float(one))
-                    for label, one in zip(labels, part, strict=True)
-                )
+                for label, one in zip(labels, part, strict=True):
+                    yield f"{place}.{field.name}.{label}", float(one)
             else:
                 yield from _numbers(part, f"{place}.{field.name}")
     elif isinstance(value, bool | int | float | np.number):

@@ -10,14 +10,7 @@ import numpy as np
 
 from .._extras import require
 from ..exceptions import ParameterError
-from ..residual import (
-    ActionLinearKernel,
-    DeepKernel,
-    Kernel,
-    Matern32,
-    Matern52,
-    SquaredExponential,
-)
+from ..residual import ActionLinearKernel, DeepKernel, Kernel, Matern32, Matern52, SquaredExponential
 from ..typing import Array, Tensor
 
 if TYPE_CHECKING:

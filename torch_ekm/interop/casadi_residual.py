@@ -107,9 +107,8 @@ def _sparse(learner: SparseOnlineGP, inputs: Inputs, variance: bool) -> _Express
 def _mixture(learner: MixtureResidual, inputs: Inputs, variance: bool) -> _Expression:
     """The moments of :meth:`MixtureResidual.predict`; gain, offset and weights are inputs."""
     members = [_build(one, inputs, variance) for one in learner.members]
-    noises = (
-        [inputs.take("noise", lambda one=one: _noise(one)) for one in learner.members] if variance else []
-    )
+    noisy = learner.members if variance else []
+    noises = [inputs.take("noise", lambda one=one: _noise(one)) for one in noisy]
     gain = inputs.take("gain", lambda: learner.gain)
     offset = inputs.take("offset", lambda: learner.offset)
     if not variance:
@@ -144,7 +143,6 @@ def _noise(learner: ResidualLearner) -> Any:
     if isinstance(learner, LastResidual):
         return _noise(learner.learner)
     if not isinstance(learner, SparseOnlineGP):
-        raise ParameterError(
-            "learners", type(learner).__name__, "SparseOnlineGPs, where the variance is wanted"
-        )
+        valid = "SparseOnlineGPs, where the variance is wanted"
+        raise ParameterError("learners", type(learner).__name__, valid)
     return learner.noise_variance

@@ -44,11 +44,8 @@ def _write_trial(trajectory: Trajectory, folder: str | Path) -> Path:
         topic(_ABOUT, kind, [(min(stamps, default=0), _message(kind, data=json.dumps(about)))])
         for place, array in arrays.items():
             kind, make = _of_rows(place, array)
-            topic(
-                f"/{place}",
-                kind,
-                [(stamp, make(stamp, row)) for stamp, row in zip(stamps, array, strict=False)],
-            )
+            rows = [(stamp, make(stamp, row)) for stamp, row in zip(stamps, array, strict=False)]
+            topic(f"/{place}", kind, rows)
         poses = zip(stamps, trajectory.observations, strict=True)
         rows = [(stamp, _pose(stamp, one.position, one.rotation)) for stamp, one in poses]
         topic(_POSE, "geometry_msgs/msg/PoseStamped", rows)
@@ -105,9 +102,8 @@ def log_from_mcap(folder: str | Path, target: str | Path) -> TrialLog:
     """
     found = sorted(Path(folder).glob("trial_[0-9]*"))
     if not found:
-        raise DescriptionError(
-            folder, "no recording: there is no folder named trial_000000 or the like in it"
-        )
+        problem = "no recording: there is no folder named trial_000000 or the like in it"
+        raise DescriptionError(folder, problem)
     target = Path(target)
     make_folder(target)
     with WriterLock(target):
@@ -138,9 +134,8 @@ def _of_rows(place: str, array: np.ndarray) -> tuple[str, Any]:
 
 
 def _multi_array(kind: str, row: np.ndarray) -> Any:
-    sizes = [
-        _message("std_msgs/msg/MultiArrayDimension", label="", size=size, stride=size) for size in row.shape
-    ]
+    dimension = "std_msgs/msg/MultiArrayDimension"
+    sizes = [_message(dimension, label="", size=size, stride=size) for size in row.shape]
     layout = _message("std_msgs/msg/MultiArrayLayout", dim=sizes, data_offset=0)
     return _message(kind, layout=layout, data=np.atleast_1d(row).ravel())
 

@@ -29,14 +29,7 @@ class RiverResidual(SingleLearner):
         options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
     """
 
-    def __init__(
-        self,
-        in_features: int,
-        out_features: int,
-        *,
-        model: Any = None,
-        **options: Any,
-    ) -> None:
+    def __init__(self, in_features: int, out_features: int, *, model: Any = None, **options: Any) -> None:
         super().__init__(in_features, out_features, **options)
         require("river")
         if model is None:
@@ -90,6 +83,5 @@ class RiverResidual(SingleLearner):
         Raises:
             NoStateError: always.
         """
-        raise NoStateError(
-            type(self).__name__, "river's regressors are objects; pickle it if you trust the file"
-        )
+        reason = "river's regressors are objects; pickle it if you trust the file"
+        raise NoStateError(type(self).__name__, reason)

@@ -45,9 +45,8 @@ class SklearnRegressor(_base.MultiOutputMixin, _base.RegressorMixin, _base.BaseE
         return (mean, deviation) if return_std else mean
 
     def _learn(self, X: Any, y: Any, reset: bool) -> Self:
-        X, y = _validation.validate_data(
-            self, X, y, reset=reset, multi_output=True, y_numeric=True, dtype=np.float64
-        )
+        kind = {"multi_output": True, "y_numeric": True, "dtype": np.float64}
+        X, y = _validation.validate_data(self, X, y, reset=reset, **kind)
         rows = np.asarray(y, dtype=np.float64).reshape(len(X), -1)
         if reset:
             self.flat_ = np.ndim(y) == 1

@@ -1,5 +1,3 @@
-"""Joint angles to actuator positions, and back when nothing is touched."""
-
 from __future__ import annotations
 
 import torch

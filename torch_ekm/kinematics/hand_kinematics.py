@@ -1,5 +1,3 @@
-"""Forward kinematics and geometric Jacobians of a whole hand: a tree, batched, differentiable."""
-
 from __future__ import annotations
 
 from typing import Any
@@ -165,17 +163,12 @@ def _build_chain(hand: HandDescription, dtype: torch.dtype, device: torch.device
 
     urdf = hand.urdf
     frames = {link.name: pk.Frame(link.name, pk.Link(link.name)) for link in urdf.links}
-    carried_by = {joint.child: joint for joint in urdf.joints}
     for joint in urdf.joints:
-        kind = "revolute" if joint.name in hand.joint_names else "fixed"
-        frames[joint.child].joint = pk.Joint(
-            joint.name, offset(joint.transform), kind, joint.axis.tolist(), **to
-        )
+        kind, origin = "revolute" if joint.name in hand.joint_names else "fixed", offset(joint.transform)
+        frames[joint.child].joint = pk.Joint(joint.name, origin, kind, joint.axis.tolist(), **to)
         frames[joint.parent].add_child(frames[joint.child])
-    link, T = hand.base_link, np.eye(4)  # T_root_base: the hand frame may sit behind fixed joints
-    while link != urdf.root:
-        T, link = carried_by[link].transform @ T, carried_by[link].parent
-    frames[urdf.root].link.offset = offset(np.linalg.inv(T))
+    # the hand frame may sit behind fixed joints
+    frames[urdf.root].link.offset = offset(np.linalg.inv(urdf.pose(hand.base_link)))
     chain = pk.Chain(frames[urdf.root], **to)
     # The frames of a level are neighbours: slices read and write them without a gather, a tenth faster. The
     # library has no other place where levels could be given: it makes index tensors of them.

@@ -1,5 +1,3 @@
-"""What a set of linear constraints leaves free."""
-
 from __future__ import annotations
 
 import torch

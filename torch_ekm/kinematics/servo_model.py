@@ -34,11 +34,11 @@ class IdealServos(Recorded, nn.Module):
         self.stuck = nn.Buffer(torch.zeros(len(self.names)).bool())
 
     def command(self, wanted: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
-        """v = w [rad]."""
+        """v = w: the increments that are wanted, unchanged [rad]."""
         return wanted
 
     def update(self, command: Tensor, moved: Tensor, free: Tensor | None = None) -> None:
-        """Nothing is learned."""
+        """Does nothing: ideal servos have neither dead zone nor bias to be learned."""
 
 
 class ServoModel(Recorded, nn.Module):
@@ -88,7 +88,7 @@ class ServoModel(Recorded, nn.Module):
 
     @property
     def dead_zone(self) -> Float[Tensor, " n_a"]:
-        """d [rad]."""
+        """d, the half width of each servo's dead zone, at least 0 [rad]."""
         return self.estimate[:, 0].clamp(min=0.0)
 
     @property
@@ -104,7 +104,7 @@ class ServoModel(Recorded, nn.Module):
 
     @property
     def standard_errors(self) -> Float[Tensor, "2 n_a"]:
-        """Of d and of b [rad]."""
+        """Standard errors of the estimates d (first row) and b (second row) [rad]."""
         return self.noise_std * self.covariance.diagonal(dim1=-2, dim2=-1).T.sqrt()
 
     def command(self, wanted: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:

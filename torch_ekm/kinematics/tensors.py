@@ -1,5 +1,3 @@
-"""Whatever holds numbers, as tensors of one precision."""
-
 from __future__ import annotations
 
 import functools

@@ -1,5 +1,3 @@
-"""Past grasps: what was measured in each, what was learned from, and to which model it went."""
-
 from __future__ import annotations
 
 from typing import ClassVar

@@ -1,5 +1,3 @@
-"""What a hand measures of the object that it holds, before it moves it."""
-
 from __future__ import annotations
 
 from collections.abc import Sequence

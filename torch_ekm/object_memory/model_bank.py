@@ -51,7 +51,7 @@ class ModelBank(SingleLearner):
     so where objects differ little it is as good as one model of all, and where they differ much about
     as good as a model of each.
 
-    Different objects may answer alike, and then residuals cannot tell them apart. With a *signature* z,
+    Different objects may answer alike, and then residuals do not distinguish them. With a *signature* z,
     the readings of the grasp before the first motion (:class:`GraspSignature`), recognition begins with
     ``p(m | z)`` of a mixture (:class:`SignatureModel`). The first grasps say little of how far apart objects
     are; so the grasps of the past are remembered, and whenever an episode ends they are sorted again in the

@@ -29,7 +29,6 @@ class SignatureModel:
     Everything is in units of the scatter that is expected of one object's signatures, so that I is the
     scatter's prior. W is learned from all objects together: a few grasps of each are too few for
     covariances of their own.
-
     """
 
     spread = 4.0  #: how far apart objects are thought to be, in units of that scatter

@@ -1,5 +1,3 @@
-"""The mean of several readings while the hand rests."""
-
 from __future__ import annotations
 
 import dataclasses

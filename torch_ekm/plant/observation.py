@@ -32,11 +32,11 @@ class Truth:
     position: Float[Tensor, " 3"]
     """Object point o [m]."""
     rotation: Float[Tensor, "3 3"]
-    """Object orientation R."""
+    """Object orientation R, object frame to hand frame."""
     fingertip_force: Float[Tensor, " n_pads"] | None = None
     """Normal force of each contact pad [N]."""
     actuator_torque: Float[Tensor, " n_a"] | None = None
-    """[N m]"""
+    """Torque of each actuator along ``+a`` [N m]."""
     pictured: GraspState | None = None
     """The state when the newest picture was taken; None: the present one."""
 
@@ -78,7 +78,7 @@ class Observation:
     position: Float[Tensor, " 3"]
     """Object point o [m] (markers)."""
     rotation: Float[Tensor, "3 3"]
-    """Object orientation R."""
+    """Object orientation R, object frame to hand frame."""
     fingertip_force: Float[Tensor, " n_pads"] | None = None
     """Normal force of each contact pad [N], in the order of ``HandDescription.pads``; None: no sensors."""
     time: float = 0.0

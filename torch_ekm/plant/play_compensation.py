@@ -1,5 +1,3 @@
-"""Commands that a known play of the drives does not swallow."""
-
 from __future__ import annotations
 
 import dataclasses

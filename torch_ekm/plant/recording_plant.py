@@ -1,5 +1,3 @@
-"""A plant that takes notes."""
-
 from __future__ import annotations
 
 import dataclasses

@@ -1,5 +1,3 @@
-"""A plant that replays what another one did: an example of a driver."""
-
 from __future__ import annotations
 
 from ..exceptions import ParameterError
@@ -39,9 +37,8 @@ class ReplayedPlant:
             ParameterError: the trajectory ends here.
         """
         if self._place >= len(self.trajectory.commands):
-            raise ParameterError(
-                "command", self._place, f"at most {len(self.trajectory.commands)}: it ends there"
-            )
+            valid = f"at most {len(self.trajectory.commands)}: it ends there"
+            raise ParameterError("command", self._place, valid)
         self._place += 1
         return self.observe()
 

@@ -1,5 +1,3 @@
-"""Commands through the inverse of the servos."""
-
 from __future__ import annotations
 
 import copy

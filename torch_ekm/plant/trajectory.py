@@ -89,12 +89,9 @@ class Trajectory:
             if happened := json.loads(events[k]):
                 info["events"] = tuple(happened)
             known = None if truth is None else Truth(**_row(truth, k))
-            status = PlantStatus(words[k].decode())
             taken = None if stamps is None else Stamps(*stamps[k].tolist())
-            seen = Observation(
-                **_row(sensors, k), time=time, status=status, info=info, truth=known, stamps=taken
-            )
-            observations.append(seen)
+            other = {"status": PlantStatus(words[k].decode()), "info": info, "truth": known, "stamps": taken}
+            observations.append(Observation(**_row(sensors, k), time=time, **other))
         return cls(seed, commands, observations, about)
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -104,14 +101,12 @@ class Trajectory:
             ParameterError: the forces or an array of ``info`` change their shape or come and go.
         """
         seen = self.observations
+        events = [json.dumps([str(event) for event in o.info.get("events", ())]).encode() for o in seen]
         arrays = {
             "commands": _stack("commands", self.commands),
             "time": np.array([o.time for o in seen], dtype=np.float64),
             "status": np.array([o.status.value for o in seen], dtype="S8"),
-            "events": np.array(
-                [json.dumps([str(event) for event in o.info.get("events", ())]).encode() for o in seen],
-                dtype=bytes,
-            ),
+            "events": np.array(events, dtype=bytes),
         }
         arrays |= {name: _stack(name, [getattr(o, name) for o in seen]) for name in _FIELDS}
         if any(o.stamps is not None for o in seen):

@@ -17,7 +17,7 @@ from .._files import write_whole
 from ..exceptions import DescriptionError
 
 FORMAT = "torch_ekm trial 2"
-_LARGEST = 4 << 30  # bytes of all arrays of a trial: a small file can tell of any size
+_LARGEST = 4 << 30  # bytes of all arrays of a trial: a small file can claim any size
 _HEAD = 512  # bytes: the block that HDF5 leaves to its user (its smallest size)
 _LINE = re.compile(f"{FORMAT}\nsha256 ([0-9a-f]{{64}})\n".encode())
 

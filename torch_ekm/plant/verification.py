@@ -34,7 +34,7 @@ def verify_log(folder: str | Path) -> list[Finding]:
     """Check every byte of a log: each trial, the index, and the hand's and object's files it was made from.
 
     A trial is right if its SHA-256 is, it can be read, it is the one that its name says, and its
-    configuration is that of the others. The digests tell of damage, not of somebody who changes a file
+    configuration is that of the others. The digests detect damage, not somebody who changes a file
     and its digest.
 
     Returns:
@@ -43,9 +43,8 @@ def verify_log(folder: str | Path) -> list[Finding]:
     folder = Path(folder)
     trials = trials_in(folder) if folder.is_dir() else ()
     if not trials:
-        return [
-            Finding(str(folder), "wrong", "no log: there is no file named trial_000000.h5 or the like in it")
-        ]
+        problem = "no log: there is no file named trial_000000.h5 or the like in it"
+        return [Finding(str(folder), "wrong", problem)]
     entries: dict[int, TrialEntry] = {}
     shared: dict[str, Any] | None = None
     found = []
@@ -60,17 +59,14 @@ def verify_log(folder: str | Path) -> list[Finding]:
                 sizes = f"{len(recording.commands)} commands and {len(recording.observations)} observations"
                 raise ParameterError("recording", sizes, "one observation more than commands")
             entries[trial] = entry
-            found.append(
-                Finding(path.name, "ok", f"{entry.commands} commands, {entry.reason or entry.status}")
-            )
+            what = f"{entry.commands} commands, {entry.reason or entry.status}"
+            found.append(Finding(path.name, "ok", what))
         except EKMError as error:
             found.append(Finding(path.name, "wrong", str(error).removeprefix(f"{path}: ")))
     found += [_index(folder, entries, len(trials)), *_sources(shared or {})]
-    for path in sorted([*folder.glob("*.part"), *folder.glob(f"*{DAMAGED}")]):
-        found.append(
-            Finding(path.name, "left over", "no part of the log; the next run clears up unfinished files")
-        )
-    return found
+    left_over = sorted([*folder.glob("*.part"), *folder.glob(f"*{DAMAGED}")])
+    what = "no part of the log; the next run clears up unfinished files"
+    return found + [Finding(path.name, "left over", what) for path in left_over]
 
 
 def _index(folder: Path, entries: Mapping[int, TrialEntry], n_trials: int) -> Finding:
@@ -82,11 +78,8 @@ def _index(folder: Path, entries: Mapping[int, TrialEntry], n_trials: int) -> Fi
     if written == right:
         return Finding(INDEX, "ok", f"lists {len(entries)} trials")
     listed = {line.partition(b",")[0] for line in written.splitlines()[1:]}
-    if (
-        len(entries) < n_trials
-        and {*right.splitlines()} <= {*written.splitlines()}
-        and len(listed) == n_trials
-    ):
+    complete = len(listed) == n_trials and {*right.splitlines()} <= {*written.splitlines()}
+    if complete and len(entries) < n_trials:
         return Finding(INDEX, "ok", f"lists {n_trials} trials, the damaged ones too")
     return Finding(INDEX, "wrong", "does not say what the files say; the next run makes it from them")
 

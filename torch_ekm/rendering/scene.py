@@ -21,7 +21,7 @@ Colour = tuple[float, float, float]
 _PALM, _PHALANX, _TIP, _OBJECT = (0.45, 0.47, 0.50), (0.72, 0.74, 0.77), (0.00, 0.45, 0.70), (0.90, 0.62, 0.0)
 _GHOST = (0.0, 0.62, 0.45)
 _DISTANCE = 0.34  # [m] of the camera
-_TURNED = 0.05  # [rad]: a smaller rotation does not tell its axis
+_TURNED = 0.05  # [rad]: a smaller rotation does not determine its axis
 
 
 @dataclass(frozen=True)
@@ -95,12 +95,8 @@ def make_scene(
         raise DescriptionError(hand.urdf_path, problem)
     if axis is None and rotation is not None:
         axis = _axis(np.asarray(rotation))
-    return Scene(
-        shapes,
-        np.stack(transforms, axis=1),
-        *_view(hand, gravity, axis),
-        ghosts=0 if ghost is None else len(solids),
-    )
+    ghosts = 0 if ghost is None else len(solids)
+    return Scene(shapes, np.stack(transforms, axis=1), *_view(hand, gravity, axis), ghosts=ghosts)
 
 
 def _axis(rotation: Array) -> Array | None:

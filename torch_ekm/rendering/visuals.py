@@ -28,7 +28,7 @@ class Mesh:
     """A surface in the frame of its link; lengths [m]."""
 
     vertices: Array
-    """``(n, 3)``"""
+    """Corners of the faces, ``(n, 3)`` [m]."""
     faces: Array
     """``(m, 3)``, indices of vertices."""
     transform: Array
@@ -133,9 +133,8 @@ def _find(urdf: Path, name: str) -> Path | None:
     places = [urdf.parent / rest]
     if name.startswith("package://"):
         package, _, inside = name.removeprefix("package://").partition("/")
-        places = [
-            above / part for above in urdf.parents for part in (f"{package}/{inside}", inside) if inside
-        ]
+        parts = (f"{package}/{inside}", inside) if inside else ()
+        places = [above / part for above in urdf.parents for part in parts]
     return next((place for place in places if place.is_file()), None)
 
 

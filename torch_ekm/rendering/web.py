@@ -56,17 +56,11 @@ def draw(server: Any, scene: Scene) -> list[Any]:
     server.scene.set_up_direction(tuple(-scene.down))
     nodes = []
     for i, (shape, colour) in enumerate(scene.shapes):
-        mesh = shape_mesh(shape)
-        nodes.append(
-            server.scene.add_mesh_simple(
-                f"/shape_{i}",
-                np.asarray(mesh.vertices, dtype=np.float32),
-                np.asarray(mesh.faces, dtype=np.uint32),
-                color=tuple(int(255 * c) for c in colour),
-                flat_shading=isinstance(shape, Mesh) or shape.kind == "box",
-                opacity=scene.opacity(i),
-            )
-        )
+        mesh, flat = shape_mesh(shape), isinstance(shape, Mesh) or shape.kind == "box"
+        vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
+        look = {"color": tuple(int(255 * c) for c in colour), "opacity": scene.opacity(i)}
+        node = server.scene.add_mesh_simple(f"/shape_{i}", vertices, faces, flat_shading=flat, **look)
+        nodes.append(node)
     position, focus, up = scene.camera
     server.initial_camera.position = tuple(position)
     server.initial_camera.look_at = tuple(focus)

@@ -1,5 +1,3 @@
-"""Who may talk to a viewer's server: whoever was given its address, and no page of another origin."""
-
 from __future__ import annotations
 
 import dataclasses

@@ -1,5 +1,3 @@
-"""Adam in a module's buffers."""
-
 from __future__ import annotations
 
 from collections.abc import Iterable

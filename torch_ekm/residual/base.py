@@ -173,9 +173,8 @@ class ResidualLearner(Recorded, nn.Module, ABC):
             x, y = x.where(mask[..., None], 0.0), y.where(mask[..., None], 0.0)
         if not time:
             return self._step(x, y, mask)
-        return UpdateReport.stack(
-            [self._step(x[t], y[t], None if mask is None else mask[t]) for t in range(time[0])]
-        )
+        masks = [None] * len(x) if mask is None else mask.unbind()
+        return UpdateReport.stack([self._step(*sample) for sample in zip(x, y, masks, strict=True)])
 
     def _step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         if mask is not None and not mask.is_cuda and not bool(mask.any()):

@@ -1,5 +1,3 @@
-"""The learner to take where nothing is known but the sizes."""
-
 from __future__ import annotations
 
 import math

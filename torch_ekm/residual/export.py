@@ -58,7 +58,7 @@ class _Predictions(nn.Module):
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """The exporter tells of packages and functions of its own that have nothing to do with a learner."""
+    """The exporter logs packages and functions of its own that have nothing to do with a learner."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

@@ -105,10 +105,8 @@ def rebuild(
 
 def known_classes(classes: Iterable[type] = ()) -> dict[str, Any]:
     """Classes of this package that record what they were made with, and those given, by name."""
-    found = {
-        kind.__name__: kind for kind in _subclasses(Recorded) if kind.__module__.startswith("torch_ekm.")
-    }
-    return found | {kind.__name__: kind for kind in classes}
+    own = [kind for kind in _subclasses(Recorded) if kind.__module__.startswith("torch_ekm.")]
+    return {kind.__name__: kind for kind in (*own, *classes)}
 
 
 def _subclasses(kind: type) -> Iterator[type]:

@@ -1,5 +1,3 @@
-"""Any learner as a fleet: independent ones side by side, behind one contract."""
-
 from __future__ import annotations
 
 import copy

@@ -1,5 +1,3 @@
-"""A learner that has the last residual among its inputs."""
-
 from __future__ import annotations
 
 from typing import Any, cast
@@ -60,9 +58,8 @@ class LastResidual(ResidualLearner):
             raise ParameterError("learner", type(self.learner).__name__, valid)
         n, f = self.in_features, cast("Any", self.learner)
         p: MomentsWithJacobians = f.predict_with_jacobians(self._with_last(self.check_query(x)))
-        return p._replace(
-            mean_jacobian=p.mean_jacobian[..., :n], variance_jacobian=p.variance_jacobian[..., :n]
-        )
+        by_x = {"mean_jacobian": p.mean_jacobian[..., :n], "variance_jacobian": p.variance_jacobian[..., :n]}
+        return p._replace(**by_x)
 
     def reset(self) -> None:
         """f back to its prior, no last sample."""

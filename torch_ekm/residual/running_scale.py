@@ -1,5 +1,3 @@
-"""Shift and scale of a stream's columns, robust and in constant memory."""
-
 from __future__ import annotations
 
 import torch
@@ -9,9 +7,8 @@ from ..typing import Float, Tensor
 
 BLOCK = 32  #: samples of a block; those before the first one is full count from the first on
 _TRIMMED = (8.0, 4.0)  # an eighth, or a fourth of a block
-_SPIKES = (
-    0.03  # below this share of what the eighth leaves in, the rest stands still and these are no outliers
-)
+# below this share of what the eighth leaves in, the rest stands still and these are no outliers
+_SPIKES = 0.03
 _CLIP = 5.5  # of the trimmed rms, 3.3 deviations of a normal law
 _BURST_CLIP = 10.0  # times as much for columns whose large samples come in company
 _COMPANY = 0.5  # of what chance would leave alone

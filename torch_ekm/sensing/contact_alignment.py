@@ -1,5 +1,3 @@
-"""A pad that measures a force touches the object: what that says about joints without a sensor."""
-
 from __future__ import annotations
 
 import dataclasses
@@ -40,16 +38,10 @@ class ContactAligned(PlantWrapper):
         self._detector = ContactDetector(hand, obj, margin=math.inf)
         kinematics = HandKinematics(hand)
         sensed = {sensor.joint for sensor in hand.hall_sensors}
-        self._joints: list[list[int]] = []
-        for pad in hand.pads:
-            upstream = kinematics.upstream[kinematics.link_index(pad.link)]
-            self._joints.append(
-                [
-                    j
-                    for j in torch.nonzero(upstream).flatten().tolist()
-                    if hand.joint_names[j] not in sensed and hand.joint_upper[j] > hand.joint_lower[j]
-                ]
-            )
+        free = torch.tensor([name not in sensed for name in hand.joint_names])
+        free &= torch.from_numpy(hand.joint_upper > hand.joint_lower)
+        upstream = kinematics.upstream[[kinematics.link_index(pad.link) for pad in hand.pads]]
+        self._joints: list[list[int]] = [torch.nonzero(row & free).flatten().tolist() for row in upstream]
         self._delta = torch.zeros(hand.n_q, dtype=torch.float64)
 
     def reset(self, seed: int) -> Observation:
@@ -59,9 +51,7 @@ class ContactAligned(PlantWrapper):
 
     def observation(self, seen: Observation) -> Observation:
         """``seen`` with joints that agree with the contacts."""
-        forces = (
-            [0.0] * len(self.hand.pads) if seen.fingertip_force is None else seen.fingertip_force.tolist()
-        )
+        forces = [] if seen.fingertip_force is None else seen.fingertip_force.tolist()
         for i, force in enumerate(forces):
             if force >= _LEAST_FORCE:
                 for j in self._joints[i]:

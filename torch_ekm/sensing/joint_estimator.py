@@ -1,5 +1,3 @@
-"""All joint angles from Hall readings, encoders and couplings together."""
-
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -22,9 +20,9 @@ class JointEstimate(NamedTuple):
     """Joint angles of a hand with their covariance."""
 
     q: Float[Tensor, "*batch n_q"]
-    """[rad]"""
+    """Estimated joint angles, in the order of ``hand.joint_names`` [rad]."""
     covariance: Float[Tensor, "*batch n_q n_q"]
-    """[rad^2]"""
+    """Covariance of their errors [rad^2]."""
 
     @property
     def std(self) -> Float[Tensor, "*batch n_q"]:
@@ -62,9 +60,8 @@ class JointEstimator:
         # a locked joint has no range: a small one keeps the information finite
         prior = 12 / (upper - lower).clamp(min=1e-3) ** 2
         self._middle = prior * (lower + upper) / 2
-        self._fixed = (
-            torch.diag(prior) + self._J_a.mT @ self._J_a / ENCODER_STD**2 + C.mT @ C / COUPLING_STD**2
-        )
+        encoders, couplings = self._J_a.mT @ self._J_a / ENCODER_STD**2, C.mT @ C / COUPLING_STD**2
+        self._fixed = torch.diag(prior) + encoders + couplings
 
     def __call__(
         self, readings: Float[Tensor, "*batch n_channels"], actuators: Float[Tensor, "*batch n_a"]

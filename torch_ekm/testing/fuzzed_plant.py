@@ -1,5 +1,3 @@
-"""Sensors that are late, frozen, jumping, missing or out of range, at random."""
-
 from __future__ import annotations
 
 import dataclasses

@@ -1,8 +1,4 @@
-"""The contract of a learner as one call: ``check_residual_learner(factory)``.
-
-For learners of this package and of others: needs torch alone, raises AssertionError with the broken
-clause. A factory takes ``dtype=`` and returns a fresh learner.
-"""
+"""The contract of a learner as one call: ``check_residual_learner(factory)``."""
 
 from __future__ import annotations
 
@@ -145,10 +141,8 @@ def _check_gradients(learner: ResidualLearner, x: Tensor, vmap: bool) -> None:
     value = learner(query)
     for j in range(learner.out_features):
         (row,) = torch.autograd.grad(value[..., j].sum(), query, retain_graph=True)
-        error = (row - jacobian[..., j, :]).abs().max()
-        assert float(error) <= tolerance, (
-            f"linearize is not the gradient of forward: off by {float(error):.1e}"
-        )
+        error = float((row - jacobian[..., j, :]).abs().max())
+        assert error <= tolerance, f"linearize is not the gradient of forward: off by {error:.1e}"
     if vmap and not learner.batch_shape:
         full = torch.func.vmap(torch.func.jacrev(learner))(x[:3])
         error = (full - learner.linearize(x[:3])[1]).abs().max()
@@ -238,9 +232,8 @@ def _check_persistence(
     assert single(x.float()).dtype == torch.float32, ".to(float32) does not change predictions' dtype"
     _close(single(x.float()).to(x), learner(x), single, ".to(float32) changed the prediction", factor=100)
     single.update(x.float(), y.float())
-    _close(
-        single(x.float()).to(x), original(x), single, "after .to(float32) it learns differently", factor=1000
-    )
+    message = "after .to(float32) it learns differently"
+    _close(single(x.float()).to(x), original(x), single, message, factor=1000)
 
 
 def _check_damaged_state(learner: ResidualLearner, fresh: ResidualLearner) -> None:

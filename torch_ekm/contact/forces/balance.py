@@ -36,15 +36,15 @@ class BalanceEquations:
     """
 
     object_matrix: Array
-    """G, ``(n_w, n_h)``."""
+    """G, contact forces to the wrench on the object, ``(n_w, n_h)``."""
     object_load: Array
-    """V_p, ``(n_w,)``."""
+    """V_p, gradient of the potential energy by the object's pose [N, N m], ``(n_w,)``."""
     hand_matrix: Array
     """(J_h Z)^T, ``(n_z, n_h)``."""
     actuator_matrix: Array
     """(J_a Z)^T, ``(n_z, n_a)``."""
     hand_load: Array
-    """Z^T V_q, ``(n_z,)``."""
+    """Z^T V_q, torques of the springs in the permitted motions [N m], ``(n_z,)``."""
     cones: tuple[FrictionCone, ...]
     moment_rows: Mask
     """Rows of ``object_load`` that are moments, bool ``(n_w,)``."""

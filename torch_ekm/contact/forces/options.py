@@ -1,5 +1,3 @@
-"""How the force problem weighs what is known."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass, fields

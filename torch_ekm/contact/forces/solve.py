@@ -1,5 +1,3 @@
-"""Solve the force problem: exact friction cones by cutting planes, and a certificate of the answer."""
-
 from __future__ import annotations
 
 import math
@@ -80,9 +78,8 @@ def _solve(problem):
     into its limit of iterations). Should it give up nevertheless, Clarabel has the last word.
     """
     qpsolvers, csc = require("qpsolvers"), require("scipy.sparse").csc_matrix
-    solution = qpsolvers.solve_problem(
-        problem, "piqp", eps_abs=1e-10, eps_rel=1e-11, iterative_refinement_always_enabled=True
-    )
+    options = {"eps_abs": 1e-10, "eps_rel": 1e-11, "iterative_refinement_always_enabled": True}
+    solution = qpsolvers.solve_problem(problem, "piqp", **options)
     status = str(getattr(solution.extras.get("info"), "status", ""))
     if solution.found or "PRIMAL_INFEASIBLE" in status:
         return solution
@@ -103,10 +100,8 @@ def _unpack(
     residual = eq.hand_load + eq.hand_matrix @ mu + eq.actuator_matrix @ lam
     if len(bound):
         residual = residual + eq.bound_matrix @ bound
-    unbalanced = (eq.object_matrix @ mu - eq.object_load) * eq.row_scale
-    return ForceSolution(
-        ForceStatus.SOLVED, mu, lam, bound, residual, float(np.linalg.norm(unbalanced)), solves, covariance
-    )
+    violation = float(np.linalg.norm((eq.object_matrix @ mu - eq.object_load) * eq.row_scale))
+    return ForceSolution(ForceStatus.SOLVED, mu, lam, bound, residual, violation, solves, covariance)
 
 
 def _classify_failure(eq: BalanceEquations, cost: ForceCost, cuts: Array, solves: int) -> ForceSolution:

@@ -1,5 +1,3 @@
-"""A digest of all that decides what a learner does: what it holds, and the code of its class."""
-
 from __future__ import annotations
 
 import hashlib

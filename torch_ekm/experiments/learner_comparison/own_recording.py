@@ -10,10 +10,10 @@ import numpy as np
 import torch
 
 from ... import interop
-from ...exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
+from ...exceptions import DescriptionError, ParameterError, ShapeError
 from ...typing import Array, Float, Tensor
-from .stream import LEAST, Stream
-from .table_file import open_table
+from .stream import LEAST, Stream, in_own_units
+from .table_file import find_columns, open_table
 
 #: ``f(state, command) -> increment of the observation`` of all motions at once, ``(n, .)`` each.
 Model = Callable[[Array, Array], Array]
@@ -55,15 +55,7 @@ class OwnRecording:
 
         Only x is centred: 0 is what the model says.
         """
-        warm_up = min(max(len(self.y) // 10, 20), 200)
-
-        def deviation(values: Tensor) -> Tensor:
-            first, whole = values[:warm_up].std(0), values.std(0)
-            scale = torch.where(first > 1e-9 * values.abs().amax(0), first, whole)
-            return torch.where(scale > 0, scale, 1.0)
-
-        x = (self.x - self.x[:warm_up].mean(0)) / deviation(self.x)
-        return Stream(self.name, x, self.y / deviation(self.y), warm_up, about=self.about)
+        return in_own_units(self.name, self.x.numpy(), self.y.numpy(), self.about, centre_y=False, ddof=1)
 
 
 def load_own(
@@ -102,9 +94,8 @@ def load_own(
         def read(wanted: Sequence[str], /) -> Array:
             return values[:, [names.index(name) for name in wanted]]
 
-    state, command, outputs = (
-        _find(wanted, names) for wanted in (columns.state, columns.command, columns.observation)
-    )
+    roles = columns.state, columns.command, columns.observation
+    state, command, outputs = (find_columns(wanted, names) for wanted in roles)
     known, commanded, seen = read(state), read(command), read(outputs)
     starts = np.arange(0, len(seen) - every, every)
     if len(starts) < LEAST:
@@ -121,15 +112,3 @@ def load_own(
     about = f"increments of {len(outputs)} columns of {path.name}; alone: {alone}"
     x, y = torch.from_numpy(np.hstack([s, u])), torch.from_numpy(moved - nominal)
     return OwnRecording(path.stem, x, y, about)
-
-
-def _find(wanted: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Names of the columns, in the order in which they are asked for."""
-    found: list[str] = []
-    for pattern in wanted:
-        begin = pattern.removesuffix("*")
-        fits = [name for name in names if name == pattern or (begin != pattern and name.startswith(begin))]
-        if not fits:
-            raise UnknownNameError("column", pattern, names)
-        found += [name for name in fits if name not in found]
-    return found

@@ -86,7 +86,7 @@ def plot_learning_curves(
 
 
 def plot_ranks(comparison: Comparison) -> Figure:
-    """Mean rank on the streams, +- half the critical difference: what overlaps cannot be told apart."""
+    """Mean rank on the streams, +- half the critical difference: what overlaps is not distinguishable."""
     ranks, difference = comparison.ranks().mean(0), comparison.critical_difference()
     order = np.argsort(ranks)
     figure, (axis,) = new_figure(6.5, 0.26 * len(ranks) + 1.0)
@@ -114,11 +114,11 @@ def plot_cost(comparison: Comparison) -> Figure:
         ratio = float(np.exp(np.mean(np.log(np.maximum(errors, 1e-6)))))
         if name != "model alone":
             points.append((ratio, time, name))
-    beside = {"textcoords": "axes fraction", "fontsize": 8, "va": "center"}
+    style = {"textcoords": "axes fraction", "fontsize": 8, "va": "center"}
     for place, (ratio, time, name) in enumerate(sorted(points)):  # names in a column: they would overlap
         colour, height = colour_of(name), (place + 0.5) / len(points)
         arrow = {"arrowstyle": "-", "color": colour, "alpha": 0.35, "linewidth": 0.7}
-        axis.annotate(name, (time, ratio), (1.03, height), color=colour, arrowprops=arrow, **beside)
+        axis.annotate(name, (time, ratio), (1.03, height), color=colour, arrowprops=arrow, **style)
         axis.plot(time, ratio, "o", color=colour)
     axis.set_xscale("log")
     ticker = require("matplotlib.ticker")

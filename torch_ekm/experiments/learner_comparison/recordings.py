@@ -78,12 +78,9 @@ def load_t42() -> list[Stream]:
         pose = np.column_stack([states[:, :2], np.unwrap(states[:, 2])])
         starts = np.arange(0, len(states) - _T42_HORIZON, _T42_HORIZON)
         action = np.array([actions[t : t + _T42_HORIZON].mean(0) for t in starts])
-        samples.setdefault(key.split("/")[0], []).append(
-            (states[starts], action.reshape(-1, actions.shape[1]), pose[starts + _T42_HORIZON] - pose[starts])
-        )
-    joined = {
-        name: [np.concatenate(part) for part in zip(*paths, strict=True)] for name, paths in samples.items()
-    }
+        action, change = action.reshape(-1, actions.shape[1]), pose[starts + _T42_HORIZON] - pose[starts]
+        samples.setdefault(key.split("/")[0], []).append((states[starts], action, change))
+    joined = {name: list(map(np.concatenate, zip(*paths, strict=True))) for name, paths in samples.items()}
     _, action, change = joined[_T42_NOMINAL]
     jacobian = np.linalg.lstsq(action, change, rcond=None)[0]
     pairs = {name: (np.hstack([s, a]), change - a @ jacobian) for name, (s, a, change) in joined.items()}
@@ -140,9 +137,8 @@ def _icub_grasp(limit: int | None) -> Stream:
         if path.name.startswith("full_coke"):  # its authors say not to trust it
             continue
         lines = [line.split() for line in path.read_text(encoding="latin-1").splitlines()[1:] if line.strip()]
-        slices = [
-            (a, b) for a, b in zip(lines[0::7], lines[1::7], strict=False) if (len(a), len(b)) == (9, 5)
-        ]
+        pairs = zip(lines[0::7], lines[1::7], strict=False)
+        slices = [(a, b) for a, b in pairs if (len(a), len(b)) == (9, 5)]
         if len(slices) < 4:
             continue
         encoders = np.array([a for a, _ in slices], dtype=float)

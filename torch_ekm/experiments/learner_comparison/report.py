@@ -36,39 +36,28 @@ class ComparisonReport(Comparison):
         figures = [save(plot_scores(self), name="scores", caption=caption)]
         if len(self.streams) > 1:
             caption = (
-                "Mean rank over the streams, 1 is best; learners whose bars overlap cannot be told apart."
+                "Mean rank over the streams, 1 is best; learners whose bars overlap are not distinguishable."
             )
             figures.append(save(plot_ranks(self), name="ranks", caption=caption))
         caption = "Error against the time of one prediction and one update: best at the lower left."
         figures.append(save(plot_cost(self), name="cost", caption=caption))
         for stream in (s.name for s in self.streams):
-            shown = curve_learners(self, stream)
-            measure = self.measure(stream)
-            caption = f"{measure} error on {stream} over time, each sample predicted before it is learned"
-            caption += (
-                f": {len(shown)} of {len(self.learners)} learners."
-                if len(shown) < len(self.learners)
-                else "."
-            )
+            shown, n = curve_learners(self, stream), len(self.learners)
+            some = f": {len(shown)} of {n} learners" if len(shown) < n else ""
+            caption = f"{self.measure(stream)} error on {stream} over time, each sample predicted before it "
+            caption += f"is learned{some}."
             figure = plot_learning_curves(self, stream, shown)
             figures.append(save(figure, name=f"curve_{stream}", caption=caption))
+        streams = {}
+        for s in self.streams:
+            samples = {"samples": len(s), "available": max(s.available, len(s)), "warm_up": s.warm_up}
+            streams[s.name] = {**samples, "about": s.about}
         report = Report(
             title="Residual learners compared",
             summary=" ".join(self.verdicts()),
             tables=self.tables(),
             figures=figures,
-            configuration={
-                "learners": list(self.learners),
-                "streams": {
-                    s.name: {
-                        "samples": len(s),
-                        "available": max(s.available, len(s)),
-                        "warm_up": s.warm_up,
-                        "about": s.about,
-                    }
-                    for s in self.streams
-                },
-            },
+            configuration={"learners": list(self.learners), "streams": streams},
         )
         report.write(Path(folder))
         return report
@@ -108,13 +97,12 @@ def overview_table(comparison: Comparison) -> Table:
     rows: list[list[Cell]] = []
     for learner, rank in sorted(zip(comparison.learners, ranks, strict=True), key=lambda pair: pair[1]):
         figures = ((comparison.error(name, learner).mean, best[name] == learner) for name in names)
-        rows.append(
-            [learner, *(f"{mean:.3f}{' *' if first else ''}" for mean, first in figures), float(rank)]
-        )
+        cells = (f"{mean:.3f}{' *' if first else ''}" for mean, first in figures)
+        rows.append([learner, *cells, float(rank)])
     difference = comparison.critical_difference()
     note = "* best of its column."
     if np.isfinite(difference):
-        note += f" Mean ranks closer than {difference:.1f} cannot be told apart (Nemenyi, 5 %)."
+        note += f" Mean ranks closer than {difference:.1f} are not distinguishable (Nemenyi, 5 %)."
     heads = [name + (", median" if comparison.measure(name) == "median" else "") for name in names]
     columns = ["learner", *heads, Column("mean rank", ".1f")]
     return Table("overview", "rms error / that of the model alone", columns, rows, note)
@@ -122,9 +110,8 @@ def overview_table(comparison: Comparison) -> Table:
 
 def constructor_table(comparison: Comparison) -> Table:
     """The constructor call with which a user makes each learner."""
-    rows: list[list[Cell]] = [
-        [name, call] for name in comparison.learners if (call := comparison.calls.get(name, ""))
-    ]
+    calls = {name: comparison.calls.get(name, "") for name in comparison.learners}
+    rows: list[list[Cell]] = [[name, call] for name, call in calls.items() if call]
     note = (
         "d inputs, m outputs. The streams above are in units of their own first samples; in the units of "
         "your own data omit standardize=False."

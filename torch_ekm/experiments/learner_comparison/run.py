@@ -16,7 +16,7 @@ from ...exceptions import MissingExtraError, NoStateError, ParameterError, Shape
 from ...residual import ResidualLearner
 from ...typing import Array
 from ..jobs import run_jobs
-from ..learners import COMPARED, Factory, constructor_call, learner_factory
+from ..learners import COMPARED, Factory, learner_factory
 from .fingerprint import fingerprint
 from .prequential import run_prequential
 from .recordings import LIMIT, load_recording
@@ -61,7 +61,7 @@ def compare(
         UnknownNameError: no such learner or recording; the message lists them.
         ParameterError: nothing to compare, two streams of one name, or a factory that does not make a
             learner of the stream's sizes; the message names it. Nothing has run.
-        ShapeError: a stream is too short to tell learners apart.
+        ShapeError: a stream is too short to distinguish learners.
         DescriptionError: a file cannot be used; the message names line and column.
     """
     factories = _factories(learners)
@@ -93,7 +93,7 @@ def compare(
         rms = block_bootstrap(squared, alone, blocks)
         median = block_bootstrap(squared, alone, blocks, measure="median")
         scores[stream.name, name] = Score(stream.name, name, rms, median, **result)
-    calls = {name: constructor_call(factory) for name, factory in factories.items()}
+    calls = {name: getattr(factory, "call", "") for name, factory in factories.items()}
     return ComparisonReport(tuple(streams), tuple(factories), scores, errors, calls)
 
 

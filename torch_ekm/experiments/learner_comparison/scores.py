@@ -97,9 +97,7 @@ class Comparison:
 
     def ranks(self) -> Array:
         """``(n_streams, n_learners)``, 1 is best; ties share their mean rank."""
-        table = np.array(
-            [[self.error(stream.name, name).mean for name in self.learners] for stream in self.streams]
-        )
+        table = [[self.error(stream.name, name).mean for name in self.learners] for stream in self.streams]
         return require("scipy.stats").rankdata(table, axis=1)
 
     def critical_difference(self) -> float:
@@ -116,8 +114,8 @@ class Comparison:
         return float(q * np.sqrt(k * (k + 1) / (6 * n)))
 
     def verdicts(self) -> list[str]:
-        """For each stream: which learner is best, which cannot be told from it, how far off the default is,
-        on how many of how many rows, and whether a few of them decide."""
+        """For each stream: which learner is best, which others are not distinguishable from it, how far off
+        the default is, on how many of how many rows, and whether a few of them decide."""
         sentences = []
         for stream in self.streams:
             best = self.best(stream.name).learner
@@ -130,10 +128,10 @@ class Comparison:
             found = f"{self.error(stream.name, best):.3f}"
             text = f"{stream.name}: {best} is best, {found} of the model alone"
             if level:
-                text += f"; this recording does not tell it from {', '.join(level)}"
+                text += f"; this recording does not distinguish it from {', '.join(level)}"
             behind = sorted((n for n in ratios if n not in level), key=lambda n: ratios[n].mean)
-            told = [name for k, name in enumerate(behind) if name == "default" or (k == 0 and not level)]
-            text += "".join(f"; {name} has {ratios[name]:.3f} times its error" for name in told)
+            named = [name for k, name in enumerate(behind) if name == "default" or (k == 0 and not level)]
+            text += "".join(f"; {name} has {ratios[name]:.3f} times its error" for name in named)
             text += f". On {stream.used}."
             if self.measure(stream.name) == "median":
                 share = 100 * rare_share(self.errors[stream.name, best])

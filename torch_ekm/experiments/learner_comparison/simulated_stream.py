@@ -1,5 +1,3 @@
-"""The residual of the kinematic model while the simulated hand turns an object, with new tendons half-way."""
-
 from __future__ import annotations
 
 import math

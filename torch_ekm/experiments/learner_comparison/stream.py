@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ...exceptions import DescriptionError, ShapeError, UnknownNameError
+from ...exceptions import DescriptionError, ShapeError
 from ...typing import Array, Float, Tensor
-from .table_file import open_table
+from .table_file import find_columns, open_table
 
-LEAST = 40  #: samples; fewer cannot tell learners apart
+LEAST = 40  #: samples; fewer do not distinguish learners
 
 
 @dataclass(frozen=True)
@@ -85,14 +85,12 @@ def load_table(
         UnknownNameError: there is no such column; the message lists the columns.
     """
     names, read = open_table(Path(path))
-    for name in (*inputs, *targets):
-        if name not in names:
-            raise UnknownNameError("column", name, names)
-    outputs = targets or [name for name in names if name == "y" or (name[:1] == "y" and name[1:].isdigit())]
+    chosen, outputs = (find_columns(wanted, names) for wanted in (inputs, targets))
+    outputs = outputs or [name for name in names if name == "y" or (name[:1] == "y" and name[1:].isdigit())]
     if not outputs:
         problem = "no column is called 'y' (or y1, y2, ...); name the targets: targets=, or --targets"
         raise DescriptionError(path, f"{problem}. The columns are {', '.join(names)}")
-    chosen = inputs or [name for name in names if name not in outputs]
+    chosen = chosen or [name for name in names if name not in outputs]
     if not chosen:
         raise DescriptionError(path, "all columns are targets; at least one must be an input")
     both = [name for name in chosen if name in outputs]
@@ -105,21 +103,33 @@ def load_table(
     return in_own_units(Path(path).stem, x, y, about, limit)
 
 
-def in_own_units(name: str, x: Array, y: Array, about: str = "", limit: int | None = None) -> Stream:
+def in_own_units(
+    name: str,
+    x: Array,
+    y: Array,
+    about: str = "",
+    limit: int | None = None,
+    *,
+    centre_y: bool = True,
+    ddof: int = 0,
+) -> Stream:
     """Standardize by the first tenth of the stream (20 to 200 samples), which is then not scored.
 
     Nothing of what is scored is seen beforehand. A constant input stays 0.
 
     Args:
         limit: only the first so many samples.
+        centre_y: False: y is only scaled, so that 0 is still what the model says.
+        ddof: of the standard deviations, as numpy has it.
     """
     available, x, y = len(x), x[:limit], y[:limit]
     warm_up = min(max(len(x) // 10, 20), 200)
 
-    def units(values: Array) -> Tensor:
+    def units(values: Array, centre: bool = True) -> Tensor:
         start = values[:warm_up]
-        deviation = start.std(0)
-        deviation = np.where(deviation > 1e-9 * np.abs(values).max(0), deviation, values.std(0))
-        return torch.from_numpy((values - start.mean(0)) / np.where(deviation > 0, deviation, 1.0))
+        deviation = start.std(0, ddof=ddof)
+        deviation = np.where(deviation > 1e-9 * np.abs(values).max(0), deviation, values.std(0, ddof=ddof))
+        away = values - start.mean(0) if centre else values
+        return torch.from_numpy(away / np.where(deviation > 0, deviation, 1.0))
 
-    return Stream(name, units(x), units(y), warm_up, about=about, available=available)
+    return Stream(name, units(x), units(y, centre_y), warm_up, about=about, available=available)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..._extras import require
-from ...exceptions import DescriptionError
+from ...exceptions import DescriptionError, UnknownNameError
 from ...typing import Array
 
 Names = tuple[str, ...]
@@ -34,9 +34,8 @@ def open_table(path: Path) -> tuple[Names, Read]:
     if not path.is_file():
         raise DescriptionError(path, "there is no such file")
     if path.suffix.lower() not in readers:
-        raise DescriptionError(
-            path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet (a ROS bag: load_own)"
-        )
+        problem = "are not read; use .csv or .parquet (a ROS bag: load_own)"
+        raise DescriptionError(path, f"files of kind '{path.suffix}' {problem}")
     names, read = readers[path.suffix.lower()](path)
     for i, name in enumerate(names):
         if not name:
@@ -44,6 +43,22 @@ def open_table(path: Path) -> tuple[Names, Read]:
         if name in names[:i]:
             raise DescriptionError(path, f"two columns are called '{name}'")
     return names, read
+
+
+def find_columns(wanted: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Names of the columns, in the order in which they are asked for; ``begin*``: all that begin so.
+
+    Raises:
+        UnknownNameError: there is no such column; the message lists the columns.
+    """
+    found: list[str] = []
+    for pattern in wanted:
+        begin = pattern.removesuffix("*")
+        fits = [name for name in names if name == pattern or (begin != pattern and name.startswith(begin))]
+        if not fits:
+            raise UnknownNameError("column", pattern, names)
+        found += [name for name in fits if name not in found]
+    return found
 
 
 def _csv(path: Path) -> tuple[Names, Read]:

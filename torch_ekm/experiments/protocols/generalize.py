@@ -126,10 +126,8 @@ class Generalize(Protocol):
         figures = []
         for name, mine in select(trials, kind="turn").groupby("object", sort=False):
             what = str(name).replace("_", " ")
-            caption = (
-                f"Steady-state error with the {what} for each target: every turn, and the mean (as in the "
-            )
-            caption += f"paper's Fig. 6).{crosses_caption(mine)}"
+            caption = f"Steady-state error with the {what} for each target: every turn, and the mean "
+            caption += f"(as in the paper's Fig. 6).{crosses_caption(mine)}"
             plot = plot_steady_state_error(mine, what)
             figures.append(save_figure(plot, folder, f"steady_state_error_{name}", caption))
         shown = [
@@ -223,10 +221,8 @@ def probe_table(trials: DataFrame) -> Table:
     }
     columns: dict[Column, Callable[[DataFrame], Cell]] = {}
     for kind, (error, lost) in kinds.items():
-        columns[Column(error)] = lambda mine, kind=kind: stats.estimate(
-            mine[mine["kind"] == kind], "error_deg"
-        )
-        columns[Column(lost)] = lambda mine, kind=kind: stats.rate(mine[mine["kind"] == kind]["lost"])
+        columns[Column(error)] = lambda mine, kind=kind: stats.estimate(select(mine, kind=kind), "error_deg")
+        columns[Column(lost)] = lambda mine, kind=kind: stats.rate(select(mine, kind=kind)["lost"])
     probes = select(trials)[select(trials)["kind"].isin(list(kinds))]
     items = {name: mine for name in CONTROLLERS if len(mine := select(probes, controller=name))}
     return Table.of("probes", "True error without feedback", "controller", items, columns)

@@ -74,7 +74,7 @@ class MemoryTurn(TrialRecord):
 
 @dataclass(frozen=True)
 class ObjectMemory(Protocol):
-    """A random sequence of objects, one grasp and one turn each; nobody tells which object it is.
+    """A random sequence of objects, one grasp and one turn each; the object is not given.
 
     Raises:
         ParameterError: no object, or fewer than one turn each.
@@ -84,7 +84,7 @@ class ObjectMemory(Protocol):
     objects: tuple[str, ...] = field(default_factory=lambda: list_objects()[:6])
     turns_each: int = 8
     readings: int = 8
-    """Sensor readings at rest that make up a grasp's signature; 0: residuals alone tell objects apart."""
+    """Sensor readings at rest that make up a grasp's signature; 0: residuals alone distinguish objects."""
 
     record: ClassVar[type[TrialRecord]] = MemoryTurn
     quick_seeds: ClassVar[int] = 1
@@ -132,9 +132,9 @@ class ObjectMemory(Protocol):
             start = bench.grasp(seed, trial)
             if start is None:
                 continue
-            # the object is at rest: feel it, and ask the bank what it is
-            felt = None if signature is None else _feel(bench, signature, self.readings)
-            slot = memories.grasp(item, felt)
+            # the object is at rest: measure its signature, and ask the bank which it is
+            measured = None if signature is None else _measure(bench, signature, self.readings)
+            slot = memories.grasp(item, measured)
             if records:
                 records[-1] = dataclasses.replace(records[-1], model=slot)
             memories.axis.copy_(bench.hand.rotation_axis)
@@ -170,12 +170,11 @@ class ObjectMemory(Protocol):
             f"reach the target: {missed}. {len(self.objects)} objects in random order, {self.turns_each} "
             f"turns each. {which_seeds(seeds)}"
         )
-        return Report(
-            "Object memory: familiar objects and new ones", summary, tables, figures, legend=_LEGEND
-        )
+        title = "Object memory: familiar objects and new ones"
+        return Report(title, summary, tables, figures, legend=_LEGEND)
 
     def make_signature(self, bench: Bench) -> GraspSignature:
-        """What tells grasps apart, without the object's label."""
+        """What distinguishes grasps, without the object's label."""
         hand = bench.model.hand
         thumb, *fingers = bench.hand.plan.pads  # the pads that the hand closes
         blind: list[str] = []
@@ -190,9 +189,8 @@ class ObjectMemory(Protocol):
         setting, options = self.setting, {}
         if signature is not None:
             options = {"temperature": _TEMPERATURE, "signature_features": signature.n_features}
-        factory = partial(
-            make_learner, setting.learner, n_s, n_a, setting.capacity, **setting.learner_options
-        )
+        sizes = n_s, n_a, setting.capacity
+        factory = partial(make_learner, setting.learner, *sizes, **setting.learner_options)
         return Memories(factory, _MODELS, **options)
 
 
@@ -232,7 +230,7 @@ class Memories(ModelBank):
 
 
 class Assignment(NamedTuple):
-    """How well a bank told objects apart, over one sequence."""
+    """How well a bank distinguished objects, over one sequence."""
 
     right: int
     """Turns, after the first three of their object, that went to the model that is their object's."""
@@ -252,7 +250,7 @@ def judge_assignment(turns: DataFrame) -> Assignment:
     return Assignment(int(right.sum()), len(judged), placed["model"].nunique())
 
 
-def _feel(bench: Bench, signature: GraspSignature, readings: int) -> Tensor:
+def _measure(bench: Bench, signature: GraspSignature, readings: int) -> Tensor:
     """Mean signature of several readings at rest."""
     seen = [bench.plant.observe() for _ in range(readings)]
     return torch.stack([signature(o.q, o.a, o.fingertip_force) for o in seen]).mean(0)
@@ -304,13 +302,12 @@ def recognition(turns: DataFrame) -> str:
 def _assignment_table(turns: DataFrame) -> Table:
     rows = [[str(seed), *found] for seed, found in _assignments(turns).items()]
     note = "Turns after the first three of their object; a model belongs to the object of most of its turns."
-    return Table(
-        "assignments", "Recognised objects", ["seed", "right [turns]", "of [turns]", "models"], rows, note
-    )
+    columns = ["seed", "right [turns]", "of [turns]", "models"]
+    return Table("assignments", "Recognised objects", columns, rows, note)
 
 
 def _assignments(turns: DataFrame) -> dict[int, Assignment]:
-    """How well objects were told apart with each seed."""
+    """How well objects were distinguished with each seed."""
     return {seed: judge_assignment(mine) for seed, mine in turns.groupby("seed", sort=False)}
 
 

@@ -1,5 +1,3 @@
-"""What an experiment is made of: its configuration, its jobs, a session, and a report of the trials."""
-
 from __future__ import annotations
 
 from abc import ABC, abstractmethod

@@ -52,10 +52,7 @@ class RecordConfig:
 
 
 def record(
-    config: RecordConfig,
-    seeds: tuple[int, ...],
-    folder: Path,
-    on_trial: Callable[[int], None] | None = None,
+    config: RecordConfig, seeds: tuple[int, ...], folder: Path, on_trial: Callable[[int], None] | None = None
 ) -> TrialLog:
     """Turn the object by each angle, for each seed, and log it; what is there already is not run again.
 

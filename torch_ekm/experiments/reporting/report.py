@@ -84,9 +84,8 @@ class Table:
 
     def text(self) -> list[list[str]]:
         """All cells as they are written, row by row."""
-        return [
-            [column.text(cell) for column, cell in zip(self._columns, row, strict=True)] for row in self.rows
-        ]
+        rows = (zip(self._columns, row, strict=True) for row in self.rows)
+        return [[column.text(cell) for column, cell in row] for row in rows]
 
     def __repr__(self) -> str:
         rows = [self.header, *self.text()]

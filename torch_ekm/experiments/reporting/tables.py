@@ -24,15 +24,16 @@ LEGEND = {
     "E-KM": "the kinematic model and what was learned of its errors, on the same servo inverse",
 }
 _MEANINGS = {
-    StopReason.REACHED: "the measured error stays within the tolerance",
-    StopReason.STALLED: "the error falls no further",
-    StopReason.STEP_LIMIT: "all motions are used up",
-    StopReason.ACTUATOR_LIMITS: "the motors that are needed are at the ends of their ranges",
-    StopReason.UNSTABLE_GRASP: "the model says that the grasp is about to buckle",
-    StopReason.GIVEN_UP: "the grasp came too near to a loss, and the way back did not help",
-    StopReason.OUT_OF_REACH: "declined before anything moved",
-    StopReason.OBJECT_LOST: "the object was dropped, or turned off the axis beyond help",
-    StopReason.FORCE_CEILING: "a fingertip pressed harder than the guard allows",
+    StopReason.REACHED.value: "the measured error stays within the tolerance",
+    StopReason.STALLED.value: "the error falls no further",
+    StopReason.STEP_LIMIT.value: "all motions are used up",
+    StopReason.ACTUATOR_LIMITS.value: "the motors that are needed are at the ends of their ranges",
+    StopReason.UNSTABLE_GRASP.value: "the model says that the grasp is about to buckle",
+    StopReason.GIVEN_UP.value: "the grasp came too near to a loss, and the way back did not help",
+    StopReason.OUT_OF_REACH.value: "declined before anything moved",
+    StopReason.OBJECT_LOST.value: "the object was dropped, or turned off the axis beyond help",
+    StopReason.FORCE_CEILING.value: "a fingertip pressed harder than the guard allows",
+    NotGrasped.reason: "no pinch held the object",
 }
 
 
@@ -103,16 +104,9 @@ def reason_table(trials: DataFrame) -> Table:
         if not len(mine):
             continue
         count, mean = mine.size(), mine.mean()
-        cells: list[Cell] = [
-            "-"
-            if name not in count
-            else f"{count[name]}" + ("" if np.isnan(mean[name]) else f" ({mean[name]:.2f})")
-            for name in names
-        ]
-        meaning = "no pinch held the object"
-        if reason != NotGrasped.reason:
-            meaning = _MEANINGS.get(StopReason(reason), "a guard stopped it")
-        rows.append([reason, *cells, meaning])
+        errors = {name: "" if np.isnan(mean[name]) else f" ({mean[name]:.2f})" for name in count.index}
+        cells = [f"{count[name]}{errors[name]}" if name in errors else "-" for name in names]
+        rows.append([reason, *cells, _MEANINGS.get(reason, "a guard stopped it")])
     columns = ["reason", *(f"{name}: turns (error [deg])" for name in names), "what it means"]
     note = "Turns, and in brackets the mean true error at their end; none of lost objects."
     return Table("stop_reasons", "Why the turns ended", columns, rows, note)

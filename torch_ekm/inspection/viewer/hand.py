@@ -82,10 +82,12 @@ class GraspShow:
 
     def scene(self) -> Scene:
         """One frame: the true state of the grasp as it is now, hand frame."""
-        q, position, rotation = (part[None] for part in self.plant.hand_state())
-        gravity = np.array(self.plant.hand.gravity)
-        axis = self.plant.rotation_axis.numpy()
-        return make_scene(self.plant.hand, self.plant.object, q, position, rotation, gravity, axis=axis)
+        return self.scene_of(*(part[None] for part in self.plant.hand_state()))
+
+    def scene_of(self, q: Array, position: Array, rotation: Array) -> Scene:
+        """A frame for each posture and pose, seen along the axis about which the object turns."""
+        hand, axis = self.plant.hand, self.plant.rotation_axis.numpy()
+        return make_scene(hand, self.plant.object, q, position, rotation, np.array(hand.gravity), axis=axis)
 
     def add_controls(self, gui: Any) -> None:
         """A slider for each actuator, increments since the grasp [deg], and a button to grasp again."""

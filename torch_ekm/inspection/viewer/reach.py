@@ -1,5 +1,3 @@
-"""How far a grasp can be turned: the turn as the model predicts it, with what ends it on either side."""
-
 from __future__ import annotations
 
 import math
@@ -11,7 +9,7 @@ from ...control import LookAndMoveController
 from ...foresight import Reach, reachable
 from ...kinematics import GraspState
 from ...model import KinematicModel
-from ...rendering.scene import Scene, make_scene
+from ...rendering.scene import Scene
 from ...typing import Array
 from .hand import GraspShow
 
@@ -53,9 +51,8 @@ class ReachShow:
     def add_controls(self, gui: Any) -> None:
         """A slider for the angle [deg], and what ends the turn."""
         low, high = float(self.angles_deg[0]), float(self.angles_deg[-1])
-        self._slider = gui.add_slider(
-            "angle [deg]", min=low, max=max(high, low + 1), step=0.5, initial_value=0.0
-        )
+        high = max(high, low + 1)
+        self._slider = gui.add_slider("angle [deg]", min=low, max=high, step=0.5, initial_value=0.0)
         gui.add_markdown("\n\n".join(f"**{angle} deg**: {end}" for _, angle, end in self.rows()))
 
     def update(self) -> Array | None:
@@ -67,10 +64,5 @@ class ReachShow:
         return self._scene([self.path[wanted]]).transforms[0]
 
     def _scene(self, states: list[GraspState]) -> Scene:
-        plant = self._grasp.plant
-        q, position, rotation = (
-            np.stack([getattr(state, name).numpy() for state in states])
-            for name in ("q", "position", "rotation")
-        )
-        gravity, axis = np.array(plant.hand.gravity), plant.rotation_axis.numpy()
-        return make_scene(plant.hand, plant.object, q, position, rotation, gravity, axis=axis)
+        parts = ([getattr(state, name).numpy() for state in states] for name in ("q", "position", "rotation"))
+        return self._grasp.scene_of(*map(np.stack, parts))

@@ -1,5 +1,3 @@
-"""A recorded trial to look at."""
-
 from __future__ import annotations
 
 import math

@@ -1,5 +1,3 @@
-"""Text next to a scene, as HTML."""
-
 from __future__ import annotations
 
 import html

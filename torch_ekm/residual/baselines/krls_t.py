@@ -116,10 +116,9 @@ class KRLSTracker(ScaledLearner, SingleLearner, DoubleStateLearner):
         full = int(self.active.sum()) > self.capacity
         if full or not novel:
             self._prune(None if novel else new)
-        event = UpdateEvent.ABSORBED if not novel else UpdateEvent.REPLACED if full else UpdateEvent.ADDED
-        return UpdateReport(
-            torch.tensor(int(event), device=self.device), gamma / prior, nis, torch.ones_like(gamma)
-        )
+        kind = UpdateEvent.ABSORBED if not novel else UpdateEvent.REPLACED if full else UpdateEvent.ADDED
+        event = torch.tensor(int(kind), device=self.device)
+        return UpdateReport(event, gamma / prior, nis, torch.ones_like(gamma))
 
     def _prune(self, i: int | None) -> None:
         if i is None:

@@ -175,9 +175,8 @@ class RandomFeatureRLS(LinearInFeatures):
         seed: int = 0,
         **options: Any,
     ) -> None:
-        super().__init__(
-            in_features, out_features, 2 * check_count("n_frequencies", n_frequencies), **options
-        )
+        n_phi = 2 * check_count("n_frequencies", n_frequencies)
+        super().__init__(in_features, out_features, n_phi, **options)
         generator = torch.Generator().manual_seed(seed)
         draws = torch.randn(n_frequencies, in_features, generator=generator, dtype=torch.float64)
         lengthscale = math.sqrt(in_features) if lengthscale is None else lengthscale

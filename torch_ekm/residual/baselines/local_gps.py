@@ -1,5 +1,3 @@
-"""Many small Gaussian processes, each responsible for a region."""
-
 from __future__ import annotations
 
 from typing import Any

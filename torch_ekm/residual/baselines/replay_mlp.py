@@ -1,5 +1,3 @@
-"""Small networks trained on the stream with a replay memory; several of them give uncertainty."""
-
 from __future__ import annotations
 
 import itertools

@@ -1,5 +1,3 @@
-"""A learner in units of its own: what baselines share."""
-
 from __future__ import annotations
 
 from abc import abstractmethod

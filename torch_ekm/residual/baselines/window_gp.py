@@ -1,5 +1,3 @@
-"""An exact GP on the last samples."""
-
 from __future__ import annotations
 
 from typing import Any

@@ -1,5 +1,3 @@
-"""The learner that learns nothing: what every other is measured against."""
-
 from __future__ import annotations
 
 import torch

@@ -54,9 +54,8 @@ class ActionLinearKernel(Kernel):
         if state_kernel is None:
             state_kernel = SquaredExponential(self.state_features, batch_shape=batch_shape, **factory)
         self.state_kernel = state_kernel
-        self.log_action_variance = log_parameter(
-            "action_variance", action_variance, (*batch_shape, self.action_features), **factory
-        )
+        shape = *batch_shape, self.action_features
+        self.log_action_variance = log_parameter("action_variance", action_variance, shape, **factory)
 
     @property
     def action_variance(self) -> Tensor:
@@ -91,9 +90,8 @@ class ActionLinearKernel(Kernel):
         s, a = self.split(x)
         ks = self.state_kernel.diagonal(s).unsqueeze(-1)
         norm = (a * a * self.action_variance).sum(-1, keepdim=True)
-        return torch.cat(
-            [self.state_kernel.diagonal_gradient(s) * norm, 2.0 * ks * a * self.action_variance], dim=-1
-        )
+        by_state = self.state_kernel.diagonal_gradient(s) * norm
+        return torch.cat([by_state, 2.0 * ks * a * self.action_variance], dim=-1)
 
     def shift_invariant(self, in_features: int) -> list[bool]:
         state = self.state_kernel.shift_invariant(self.state_features)

@@ -1,5 +1,3 @@
-"""A kernel on inputs and learned features of them."""
-
 from __future__ import annotations
 
 import itertools
@@ -39,12 +37,7 @@ class DeepKernel(Kernel):
     starts = ("seed",)
 
     def __init__(
-        self,
-        base: StationaryKernel,
-        *,
-        hidden: Sequence[int] = (64, 64),
-        features: int = 16,
-        seed: int = 0,
+        self, base: StationaryKernel, *, hidden: Sequence[int] = (64, 64), features: int = 16, seed: int = 0
     ) -> None:
         super().__init__()
         if not isinstance(base, StationaryKernel):

@@ -1,5 +1,3 @@
-"""The sparse online GP with learned features."""
-
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence

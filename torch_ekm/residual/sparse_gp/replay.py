@@ -1,5 +1,3 @@
-"""Samples of the past that a learner keeps to learn its kernel from, in constant memory."""
-
 from __future__ import annotations
 
 import math

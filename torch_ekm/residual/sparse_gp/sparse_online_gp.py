@@ -1,5 +1,3 @@
-"""The sparse online Gaussian process of Csato & Opper, kept in its natural form."""
-
 from __future__ import annotations
 
 from collections.abc import Iterable
@@ -100,15 +98,9 @@ class SparseOnlineGP(Host):
         self.kernel = check_kernel(kernel, self.in_features, shape).to(**double)
         noise_shape = (*shape, self.out_features)
         self.log_noise_variance = log_parameter("noise_variance", noise_variance, noise_shape, **double)
-        self.posterior = SparsePosterior(
-            self.in_features,
-            self.out_features,
-            self.capacity,
-            novelty_threshold=novelty_threshold,
-            jitter=jitter,
-            batch_shape=shape,
-            device=self.device,
-        )
+        sizes = self.in_features, self.out_features, self.capacity
+        figures = {"novelty_threshold": novelty_threshold, "jitter": jitter}
+        self.posterior = SparsePosterior(*sizes, **figures, batch_shape=shape, device=self.device)
         # samples of each model since the caches were made
         self.pending = nn.Buffer(torch.zeros(shape, **double))
         self.engine: ReferenceEngine = CompiledEngine()

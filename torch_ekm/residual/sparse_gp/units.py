@@ -1,5 +1,3 @@
-"""The units in which a learner works, learned from the stream."""
-
 from __future__ import annotations
 
 from typing import Literal
@@ -88,7 +86,8 @@ class Standardize(Part, Units):
         if n & (n + 1) == 0 and n < _DOUBLING:
             if n + 1 < BLOCK:
                 self._adopt(learner, young=True)
-                learner.learn_anew(self.input.block[..., :n, :], self.output.block[..., :n, :], self._on(n))
+                x, y, on = self.input.block, self.output.block, self.input.block_on
+                learner.learn_anew(x[..., :n, :], y[..., :n, :], on[..., :n, 0])
             elif (n + 1) % learner.refresh_every:  # else it comes of itself
                 learner.refresh()
 
@@ -108,9 +107,6 @@ class Standardize(Part, Units):
         if self.output_offset == "learned":
             posterior.information.add_(posterior.precision.sum(-1, keepdim=True) * offset_t.unsqueeze(-2))
         posterior.information.mul_(ratio_t.unsqueeze(-2))
-
-    def _on(self, n: int) -> Tensor:
-        return self.input.block_on[..., :n, 0]
 
     def reset(self) -> None:
         """Back to z = x, t = y."""

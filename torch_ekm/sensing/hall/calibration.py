@@ -17,7 +17,7 @@ class HallEstimate(NamedTuple):
     """Joint angles from one set of readings."""
 
     q: Float[Tensor, "*batch n_channels"]
-    """Angles [rad]; of a saturated channel the middle of the range that it cannot tell apart."""
+    """Angles [rad]; of a saturated channel the middle of the range that it cannot resolve."""
     std: Float[Tensor, "*batch n_channels"]
     """Standard deviations [rad]; of a channel that says nothing, that of a uniform spread over its sweep."""
     valid: Bool[Tensor, "*batch n_channels"]

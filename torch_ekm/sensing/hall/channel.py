@@ -44,12 +44,12 @@ class HallChannel:
 
     @property
     def unsaturated(self) -> tuple[float, float]:
-        """Angles between which the channel tells one from another [rad], the smaller first."""
+        """Angles between which the channel resolves angles [rad], the smaller first."""
         ends = sorted((self.angle(self.low), self.angle(self.high)))
         return ends[0], ends[1]
 
     def beyond(self, upper: bool) -> tuple[float, float]:
-        """The angles past the last that can be told, up to the end of the sweep [rad]."""
+        """The angles past the last that is resolved, up to the end of the sweep [rad]."""
         return (self.unsaturated[1], self.angle_max) if upper else (self.angle_min, self.unsaturated[0])
 
     @property
@@ -68,9 +68,8 @@ def fit_channel(joint: str, readings: Float[Tensor, " n"], angles: Float[Tensor,
     name = f"Hall channel of {joint}"
     start, end = float(angles.min()), float(angles.max())
     if end - start < _MIN_TRAVEL:
-        raise CalibrationError(
-            name, "the joint moved by less than 10 deg in the sweep; sweep its whole range"
-        )
+        problem = "the joint moved by less than 10 deg in the sweep; sweep its whole range"
+        raise CalibrationError(name, problem)
     if float(readings.max() - readings.min()) < _MIN_SPAN:
         return HallChannel(joint, (0.0, 0.0, 0.0, 0.0), 0.0, FULL_SCALE, start, end, 0.0, 0.0, stuck=True)
     free = (readings > 0) & (readings < FULL_SCALE)

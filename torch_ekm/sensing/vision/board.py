@@ -62,9 +62,8 @@ class MarkerBoard:
             raise ShapeError("MarkerBoard.mount", "(4, 4)", self.mount.shape)
         available = len(get_dictionary(self.dictionary).bytesList)
         if self.first_id < 0 or self.first_id + self.n_markers > available:
-            raise ParameterError(
-                "MarkerBoard.first_id", self.first_id, f"within 0..{available - self.n_markers}"
-            )
+            valid = f"within 0..{available - self.n_markers}"
+            raise ParameterError("MarkerBoard.first_id", self.first_id, valid)
 
     @property
     def n_markers(self) -> int:
@@ -93,10 +92,7 @@ class MarkerBoard:
         corners = np.zeros((self.n_markers, 4, 3))
         for k in range(self.n_markers):
             row, column = divmod(k, self.columns)
-            upper_left = [
-                -width / 2 + self.margin + column * pitch,
-                height / 2 - self.margin - row * pitch,
-            ]
+            upper_left = [-width / 2 + self.margin + column * pitch, height / 2 - self.margin - row * pitch]
             corners[k, :, :2] = upper_left + square
         return corners
 

@@ -22,7 +22,7 @@ class BoardPose:
     """Pose of a board in the camera frame, and how well the corners determine it."""
 
     rotation: Array
-    """``(3, 3)``"""
+    """Board frame to camera frame, ``(3, 3)``."""
     position: Array
     """Centre of the card ``(3,)`` [m]."""
     covariance: Array
@@ -34,10 +34,7 @@ class BoardPose:
 
 
 def estimate_board_pose(
-    camera: PinholeCamera,
-    object_points: Array,
-    image_points: Array,
-    prior: Array | None = None,
+    camera: PinholeCamera, object_points: Array, image_points: Array, prior: Array | None = None
 ) -> BoardPose | None:
     r"""``min_{R, t} sum_i |u_i - pi(R X_i + t)|^2`` over the corners that agree.
 
@@ -98,10 +95,7 @@ def _both_poses(camera: PinholeCamera, X: Array, u: Array) -> list[tuple[Array, 
 
 
 def _choose(
-    camera: PinholeCamera,
-    X: Array,
-    candidates: list[tuple[Array, Array, Array]],
-    prior: Array | None,
+    camera: PinholeCamera, X: Array, candidates: list[tuple[Array, Array, Array]], prior: Array | None
 ) -> BoardPose:
     chosen, ambiguous, mirror = candidates[0], False, None
     if len(candidates) > 1:
@@ -127,10 +121,8 @@ def projection_jacobian(camera: PinholeCamera, X: Array, rotation: Array, positi
     rvec = cv2.Rodrigues(rotation)[0]
     _, full = cv2.projectPoints(X, rvec, position, camera.matrix, camera.distortion_array)
     by_position = full[:, 3:6].reshape(-1, 2, 3)  # dpi/dx, since x = R X + t
-    arm = X @ rotation.T
-    return np.concatenate([by_position, -by_position @ hat(torch.from_numpy(arm)).numpy()], axis=-1).reshape(
-        -1, 6
-    )
+    by_rotation = -by_position @ hat(torch.from_numpy(X @ rotation.T)).numpy()
+    return np.concatenate([by_position, by_rotation], axis=-1).reshape(-1, 6)
 
 
 def angle_between(a: Array, b: Array) -> float:

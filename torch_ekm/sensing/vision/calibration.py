@@ -39,7 +39,7 @@ def calibrate_camera(images: Iterable[NDArray[np.uint8] | None], board: Any) -> 
     Corners of a ChArUco target (OpenCV's detector), then Zhang's method (``cv2.calibrateCamera``).
     Views whose own error exceeds 1 px are left out and the rest solved again, once.
     The target should fill different parts of the image, at tilts up to about 45 deg: frontal views
-    alone do not tell focal length from distance.
+    alone do not separate focal length from distance.
 
     Args:
         images: grey or BGR pictures of one size; None (dropped frames) are skipped.
@@ -63,11 +63,9 @@ def calibrate_camera(images: Iterable[NDArray[np.uint8] | None], board: Any) -> 
         if ids is not None and len(ids) >= _MIN_CORNERS:
             views.append((k, points[ids.ravel()].reshape(-1, 3), corners.reshape(-1, 2)))
     if shape is None or len(views) < _MIN_VIEWS:
-        raise CalibrationError(
-            "camera",
-            f"only {len(views)} pictures show {_MIN_CORNERS} or more corners of the target, at least "
-            f"{_MIN_VIEWS} are needed; move the target about, closer, in good light",
-        )
+        problem = f"only {len(views)} pictures show {_MIN_CORNERS} or more corners of the target, at least "
+        problem += f"{_MIN_VIEWS} are needed; move the target about, closer, in good light"
+        raise CalibrationError("camera", problem)
 
     def solve(chosen: list[tuple[int, NDArray, NDArray]]):
         size = (shape[1], shape[0])
@@ -83,9 +81,5 @@ def calibrate_camera(images: Iterable[NDArray[np.uint8] | None], board: Any) -> 
     lens = tuple(float(c) for c in k.ravel()[:5])
     camera = PinholeCamera(shape[1], shape[0], fx, fy, cx, cy, lens)
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-    return CameraCalibration(
-        camera,
-        float(rms),
-        {name: float(s) for name, s in zip(names, std.ravel(), strict=False)},
-        tuple(view[0] for view in views),
-    )
+    deviations = {name: float(s) for name, s in zip(names, std.ravel(), strict=False)}
+    return CameraCalibration(camera, float(rms), deviations, tuple(view[0] for view in views))

@@ -1,5 +1,3 @@
-"""The pinhole camera: where a point of space appears in the image."""
-
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -1,8 +1,5 @@
-"""A board's pose made finer on the edges of its markers."""
-
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -78,14 +75,7 @@ def refine_on_edges(
             found.sort(key=lambda fit: angle_between(fit.rotation, prior))
     best = found[0]
     mirror = (found[1].rotation, found[1].position) if ambiguous else None
-    return replace(
-        pose,
-        rotation=best.rotation,
-        position=best.position,
-        covariance=best.covariance,
-        ambiguous=ambiguous,
-        mirror=mirror,
-    )
+    return BoardPose(best.rotation, best.position, best.covariance, ambiguous, mirror)
 
 
 def _fit(

@@ -21,7 +21,7 @@ class TrackStatus(Enum):
     NO_IMAGE = "no_image"  # the frame was dropped
     PALM_HIDDEN = "palm_hidden"  # too few markers of the palm's board were found
     OBJECT_HIDDEN = "object_hidden"  # too few markers of the object's board were found
-    AMBIGUOUS = "ambiguous"  # two mirrored poses fit, and no earlier frame tells which
+    AMBIGUOUS = "ambiguous"  # two mirrored poses fit, and no earlier frame decides which
     JUMP = "jump"  # the pose is too far from the last one; believed when seen repeatedly
 
 
@@ -56,7 +56,6 @@ class Track:
             ObjectLostError: there is none in this frame.
         """
         if self.position is None or self.rotation is None:
-            raise ObjectLostError(
-                f"no pose in this frame: {self.status.value}; take the next frame, or clear the line of sight"
-            )
+            remedy = "take the next frame, or clear the line of sight"
+            raise ObjectLostError(f"no pose in this frame: {self.status.value}; {remedy}")
         return self.position, self.rotation

@@ -1,5 +1,3 @@
-"""The object's pose in the hand, from markers on both."""
-
 from __future__ import annotations
 
 import numpy as np
@@ -26,7 +24,7 @@ class MarkerTracker:
 
     Each image is searched for the markers of two boards (section III.C of the paper: one on the palm,
     one on the object). What comes out is the object's frame in the hand frame, its covariance, or the
-    reason why there is none. Only the last accepted pose is remembered, to tell flips and jumps.
+    reason why there is none. Only the last accepted pose is remembered, to detect flips and jumps.
 
     The covariance follows from both boards' by ``do_h = M (do_c - dt_p - dphi_p x (o_c - t_p))``,
     ``dphi_h = M (dphi_b - dphi_p)``, with ``M`` the rotation from camera to hand axes.
@@ -43,16 +41,11 @@ class MarkerTracker:
     """
 
     def __init__(
-        self,
-        camera: PinholeCamera,
-        palm_board: MarkerBoard,
-        object_board: MarkerBoard,
-        edges: bool = True,
+        self, camera: PinholeCamera, palm_board: MarkerBoard, object_board: MarkerBoard, edges: bool = True
     ) -> None:
         if set(palm_board.ids) & set(object_board.ids):
-            raise ParameterError(
-                "object_board.first_id", object_board.first_id, f"beyond the palm's {palm_board.ids}"
-            )
+            valid = f"beyond the palm's {palm_board.ids}"
+            raise ParameterError("object_board.first_id", object_board.first_id, valid)
         if palm_board.dictionary != object_board.dictionary:
             raise ParameterError("object_board.dictionary", object_board.dictionary, palm_board.dictionary)
         self.camera, self.palm_board, self.object_board = camera, palm_board, object_board
@@ -111,9 +104,8 @@ class MarkerTracker:
         if ids is None:
             return {}
         flat = ids.ravel().tolist()
-        return {
-            k: corners[i].reshape(4, 2).astype(np.float64) for i, k in enumerate(flat) if flat.count(k) == 1
-        }
+        once = [(i, k) for i, k in enumerate(flat) if flat.count(k) == 1]
+        return {k: corners[i].reshape(4, 2).astype(np.float64) for i, k in once}
 
     def _board_pose(self, board: MarkerBoard, markers: dict[int, Array], grey: NDArray) -> BoardPose | None:
         seen = [k for k in board.ids if k in markers]

@@ -66,11 +66,11 @@ def absorb(
     gamma, v = (prior - ke).clamp_min(0.0), prior + kCk
     innovation = y - (column.mT @ posterior.alpha).squeeze(-2)
 
-    noise = s2
     nis = innovation.square().mean(-1) / (s2 + v)
-    weight = _weight(weighing, nis, mask)
-    if weighing:
-        noise = (s2 + v) / weight - v
+    weight = torch.ones_like(nis)
+    for part in weighing:
+        weight = weight * part.weigh(nis, mask)
+    noise = (s2 + v) / weight - v if weighing else s2
     full = posterior.count == posterior.capacity
     novel = gamma > posterior.novelty_threshold * prior
     dropped = gamma * ~novel  # novelty that a projection ignores
@@ -129,7 +129,8 @@ def _add_and_prune(
     c_diag, q_diag, w_diag = diagonal.unbind(-2)
     loss = pruning_loss(posterior, c_diag, q_diag, w_diag / s2.unsqueeze(-1))
     loss = loss.where(posterior.active > 0, torch.inf)
-    i = (loss <= _with_ties(loss.amin(-1, keepdim=True), posterior)).to(torch.uint8).argmax(-1, keepdim=True)
+    least = loss.amin(-1, keepdim=True)  # up to it and a tie losses differ by rounding: the first one goes
+    i = (loss <= least + TIE * least.abs() + TIE_KL * m).to(torch.uint8).argmax(-1, keepdim=True)
     # rows, which lie together in memory, stand for columns
     columns = posterior.moments.gather(-2, i[..., None, None].expand(*fleet, 3, 1, M)).squeeze(-2)
     columns = columns + scaled * added.gather(-1, i.unsqueeze(-2).expand(*fleet, 3, 1))
@@ -176,11 +177,6 @@ def pruning_loss(
     return loss + posterior.out_features * (w / q + (rest / q).log())
 
 
-def _with_ties(least: Tensor, posterior: SparsePosterior) -> Tensor:
-    """Losses up to this differ from the least one by rounding at most: the first of them goes."""
-    return least + TIE * least.abs() + TIE_KL * posterior.out_features
-
-
 def _remaining(c: Tensor, q: Tensor) -> Tensor:
     """c + q >= 0, a point's remaining uncertainty; rounding must not turn it negative."""
     return torch.maximum(c + q, 100 * torch.finfo(q.dtype).eps * q)
@@ -190,15 +186,6 @@ def _add_products(target: Tensor, left: Tensor, right: Tensor) -> None:
     """target += left right', in place, over all leading axes in one call."""
     flat = target.view(-1, *target.shape[-2:])
     flat.baddbmm_(left.reshape(-1, *left.shape[-2:]), right.reshape(-1, *right.shape[-2:]).mT)
-
-
-def _weight(weighing: Sequence[Part], nis: Tensor, mask: Tensor | None) -> Tensor:
-    if not weighing:
-        return torch.ones_like(nis)
-    weight = weighing[0].weigh(nis, mask)
-    for part in weighing[1:]:
-        weight = weight * part.weigh(nis, mask)
-    return weight
 
 
 def _any(flag: Tensor) -> bool:
