@@ -38,6 +38,7 @@ def test_it_finds_what_the_description_gets_wrong() -> None:
 
 def test_without_forgetting_it_is_regularised_least_squares(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch_ekm.control.force_sensitivity._FORGETTING", 1.0)
+    monkeypatch.setattr("torch_ekm.control.force_sensitivity._RECENT", 0.0)
     true, w = torch.tensor([[5.0, -3.0, 2.0]], dtype=F64), moves(8)
     learner = taught(true, torch.zeros_like(true), w)
     y, s, p = w @ true[0], 0.25, 20.0

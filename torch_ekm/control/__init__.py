@@ -6,6 +6,7 @@ from .closed_loop import ClosedLoop, Manipulation, Step, Stop
 from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
 from .decision import Decision, StopReason
 from .focus import FocusedPose, PoseTarget
+from .force_sensitivity import ForceSensitivity
 from .knowledge import HandKnowledge
 from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
 from .pace import LimitingFunction, Pace, PaceOptions, StepBound, TrustRegion
@@ -28,6 +29,7 @@ __all__ = [
     "Equality",
     "FocusTask",
     "FocusedPose",
+    "ForceSensitivity",
     "GripForceTask",
     "Guards",
     "HandKnowledge",

@@ -21,7 +21,7 @@ from .controller import LookAndMoveController
 from .decision import Decision, Expectation, StopReason
 from .focus import FocusedPose, PoseTarget
 from .knowledge import HandKnowledge
-from .pace import ForceSurprise
+from .pace import DISAGREE, ForceSurprise
 from .safety import Safety
 from .safety.progress import Progress
 from .safety.watch import Watch
@@ -326,6 +326,8 @@ class ClosedLoop:
         trust = self.controller.pace.options.trust
         rho = trust.disagreement(expected.increment[-6:], ds[-6:], lever, felt)
         self.controller.pace.judge(rho, decision.share)
+        if decision.share > 0 and trust.disagreement(expected.increment[-6:], ds[-6:], lever) > DISAGREE:
+            self.controller.tighter += self.safety.caution.slip  # it slides, or turns out of the grip
         return enhanced.update(seen.state, expected.moved, ds, expected.nominal)
 
     def _learn_forces(self, lin: Linearization, moved: Tensor, felt: ForceSurprise) -> None:

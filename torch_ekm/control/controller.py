@@ -209,8 +209,7 @@ class LookAndMoveController:
         least = next((limit for limit in self.limits if isinstance(limit, NormalForceLimit)), None)
         if f_n is None or least is None:
             return None
-        sure = dataclasses.replace(seen, force_std=None)
-        return Grip(torch.from_numpy(f_n), torch.from_numpy(least.least(f_n, lin, sure)))
+        return Grip(torch.from_numpy(f_n), torch.from_numpy(least.least(f_n, seen)))
 
     def _none(self, status: StopReason, failure: EKMError, focused: Tensor) -> Decision:
         """No motion, and why."""

@@ -10,7 +10,7 @@ from .._recorded import Recorded
 from ..typing import Float, Tensor
 
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
-_NOISE_STD = 0.25  # [N] of a change of force that B does not explain
+_NOISE_STD = 0.25  # [N] of a change of force that B does not explain, at least
 _FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
 _RECENT = 0.1  # weight of the last motion in the variance of r
 _CLIP = 4.0  # standard deviations; a contact that slips says nothing of the rest
@@ -19,9 +19,10 @@ _CLIP = 4.0  # standard deviations; a contact that slips says nothing of the res
 class ForceSensitivity(Recorded, nn.Module):
     """``f_n+ - f_n = (df_n/da + B) w + noise``: B ``(n_pads, n_a)``, by recursive least squares::
 
-        r = (f_n+ - f_n) - (df_n/da + B) w                   of each pad that measures
-        D <- D - (1 - .97) D w w' D / (w' D w) + w w' / s^2  what motions say, forgotten in the direction of w
-        B <- B + r k',   k = (D + I / 20^2)^-1 w / s^2
+        r = (f_n+ - f_n) - (df_n/da + B) w               of each pad that measures
+        D <- D - (1 - .97) D w w' D / (w' D w) + w w'    motions, forgotten in the direction of a new one
+        B <- B + r k',  k = P w / s^2,  P = (D / s^2 + I / 20^2)^-1
+        s^2 <- .9 s^2 + .1 max(r^2 - w' P w, .25^2)      what B does not explain: a pad that rubs teaches less
 
     All pads share D. B belongs to the hand: it is kept from grasp to grasp.
 
@@ -36,14 +37,15 @@ class ForceSensitivity(Recorded, nn.Module):
         self.correction = nn.Buffer(torch.zeros(n_pads, n_a, dtype=torch.float64))
         """B [N/rad]."""
         self.evidence = nn.Buffer(torch.zeros(n_a, n_a, dtype=torch.float64))
-        """D [rad^2/N^2 of B], information of the motions."""
+        """D, of the motions [rad^2]."""
         self.variance = nn.Buffer(torch.full((n_pads,), _NOISE_STD**2, dtype=torch.float64))
-        """Of r, of each pad's last motions [N^2]."""
+        """s^2 of each pad [N^2]."""
 
     @property
     def _covariance(self) -> Tensor:
+        """P of each pad ``(n_pads, n_a, n_a)``."""
         prior = torch.eye(len(self.evidence), dtype=torch.float64) / _PRIOR_STD**2
-        return torch.linalg.inv(self.evidence + prior)
+        return torch.linalg.inv(self.evidence / self.variance[:, None, None] + prior)
 
     @torch.no_grad()
     def update(
@@ -76,15 +78,17 @@ class ForceSensitivity(Recorded, nn.Module):
         known = ~r.isnan()
         if not bool(known.any()) or not bool(w.any()):
             return r
-        spread = (_NOISE_STD**2 + w @ self._covariance @ w).sqrt()
+        doubt = (self._covariance @ w) @ w  # w' P w
+        spread = (self.variance + doubt).sqrt()
         Dw = self.evidence @ w
         if float(w @ Dw) > 0:
             self.evidence -= (1 - _FORGETTING) * torch.outer(Dw, Dw) / (w @ Dw)
-        self.evidence += torch.outer(w, w) / _NOISE_STD**2
-        gain = self._covariance @ w / _NOISE_STD**2
+        self.evidence += torch.outer(w, w)
+        gain = self._covariance @ w / self.variance[:, None]
         bounded = r.clamp(-_CLIP * spread, _CLIP * spread)
-        self.correction[known] += torch.outer(bounded[known], gain)
-        self.variance[known] += _RECENT * (bounded[known].square() - self.variance[known])
+        self.correction[known] += bounded[known, None] * gain[known]
+        unexplained = (bounded.square() - doubt).clamp(min=_NOISE_STD**2)
+        self.variance[known] += _RECENT * (unexplained - self.variance)[known]
         return r
 
     def extra_repr(self) -> str:

@@ -7,16 +7,13 @@ so the program always has a solution.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from ..exceptions import ParameterError, UnknownNameError
 from .qp import DEGREE, Array, Bounds, Inequality, as_array
 from .situation import LinearizedModel, Situation, grip_shares
-
-if TYPE_CHECKING:
-    from ..model import Linearization
 
 
 @runtime_checkable
@@ -87,10 +84,10 @@ class JointLimit:
 class NormalForceLimit:
     """``least_i <= f_n + (df_n/da) u <= maximum`` of each finger, f_n as measured, with::
 
-        least_i = max(minimum, share f*_i) + std_i        at most f*_i
+        least_i = max(minimum, share f*_i)
 
-    f*_i is what :class:`GripForceTask` wants of the finger, which follows from load and friction, and std_i
-    how far predictions of its force are off: no finger fades.
+    f*_i is what :class:`GripForceTask` wants of the finger, which follows from load and friction: no finger
+    fades.
 
     For the upper limit the largest of measured and estimated force counts, with the estimate of joints and
     springs alone where it contradicts the pads: sensors that read too little must not make the hand squeeze.
@@ -119,16 +116,12 @@ class NormalForceLimit:
         most = np.maximum(f_n, as_array(forces.normal)) if forces.solved else f_n
         most = most if seen.joint_force is None else np.maximum(most, as_array(seen.joint_force))
         high = np.maximum(self.maximum - most, -self.step)
-        low = np.minimum(np.minimum(self.least(f_n, model.kinematic, seen) - f_n, self.step), high)
+        low = np.minimum(np.minimum(self.least(f_n, seen) - f_n, self.step), high)
         S = as_array(model.kinematic.normal_force_sensitivity)
         return Inequality(np.concatenate([-S, S]), np.concatenate([-low, high]))
 
-    def least(self, f_n: Array, kinematic: Linearization, seen: Situation) -> Array:
+    def least(self, f_n: Array, seen: Situation) -> Array:
         """least_i of each contact ``(n_c,)`` [N]."""
         if seen.grip is None:
             return np.full(len(f_n), self.minimum)
-        wanted = grip_shares(f_n, seen.grip)
-        least = np.maximum(self.minimum, self.share * wanted)
-        if seen.force_std is not None:
-            least += as_array(seen.force_std)[seen.hand.pad_indices(kinematic.contacts.finger)]
-        return np.minimum(least, np.maximum(wanted, self.minimum))
+        return np.maximum(self.minimum, self.share * grip_shares(f_n, seen.grip))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _DEG = math.pi / 180
 # of the trust region
 _AGREE = 1.0  # rho up to which the pace grows
-_DISAGREE = 1.6  # rho from which it shrinks
+DISAGREE = 1.6  # rho from which it shrinks
 _GROW, _SHRINK = 1.2, 0.7
 # error that is no surprise, as a share of the motion; of a translation the contacts' way counts
 _RELATIVE = 0.12
@@ -164,7 +164,7 @@ class ForceSurprise(NamedTuple):
     @property
     def wrong(self) -> bool:
         """Some pad measured what was not predicted, or has let go."""
-        return bool((self.z.abs() > _DISAGREE).any() or self.surprise.isnan().any())
+        return bool((self.z.abs() > DISAGREE).any() or self.surprise.isnan().any())
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,7 @@ class Pace(nn.Module):
         trust = self.options.trust
         if not self.adapts:
             return
-        if disagreement > _DISAGREE:
+        if disagreement > DISAGREE:
             least = min(self.factor, trust.smallest)
             self.value.mul_(_SHRINK).clamp_(min=least)
         elif disagreement < _AGREE and share >= _USED:

@@ -55,6 +55,12 @@ class Situation:
         measured = as_array(self.fingertip_force)[self.hand.pad_indices(kinematic.contacts.finger)]
         return np.where(np.isnan(measured), 0.0 if estimated is None else estimated, measured)
 
+    def contact_force_std(self, kinematic: Linearization) -> Array:
+        """How far the prediction of each contact's force is off ``(n_c,)`` [N]; 0 where nobody knows."""
+        if self.force_std is None:
+            return np.zeros(kinematic.contacts.n_c)
+        return as_array(self.force_std)[self.hand.pad_indices(kinematic.contacts.finger)]
+
 
 def grip_shares(f_n: Array, grip: float) -> Array:
     """What is wanted of each finger ``(n_c,)`` [N]: the one that presses most opposes all that share.

@@ -99,14 +99,16 @@ class Caution:
     """Motions of one retreat at most."""
     tighten: float = 1.0
     """[N]"""
+    slip: float = 0.5
+    """Where an object moves otherwise than an E-KM predicts, the grip is tightened by so much [N]."""
     grips: int = 5
     """Motions at most that only grip, where a finger bears less than the object needs before the first turn;
     a grasp that stays weak is declined."""
 
     def __post_init__(self) -> None:
-        for name in ("looks", "off_rotation", "off_further", "retreats", "way_back", "tighten", "grips"):
-            if not getattr(self, name) >= 0:
-                raise ParameterError(name, getattr(self, name), "0 or more")
+        for name, value in vars(self).items():
+            if not value >= 0:
+                raise ParameterError(name, value, "0 or more")
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ class JointShape:
         h_j(q) = q - (v/2) (cos(2 q + phase_j) - cos phase_j)      excursion J_a h(q), arms J_a h'(q)
         k x (1 + s x^2)                                            x from the spring's rest
 
-    Source: the arm of a tendon is the derivative of its excursion, An et al., J. Biomech. Eng. 105 (1983);
-    the cubic spring is that of Duffing (1918).
+    Source: the arm of a tendon is the derivative of its excursion, An et al., J. Biomech. 16 (1983); the
+    cubic spring is that of Duffing (1918).
     """
 
     variation: Array
