@@ -176,7 +176,7 @@ def coal_distance(obj: ObjectDescription, position: torch.Tensor, rotation: torc
 
 
 @pytest.mark.parametrize("kind", list(SHAPES))
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=150)
 @given(pose=poses)
 def test_gap_is_coals_distance(kind: str, pose: tuple[float, ...]) -> None:
     """Outside, and while only the surfaces overlap; the crown adds at most half^2/(2 R) = 0.05 mm."""
@@ -195,7 +195,7 @@ def test_gap_is_coals_distance(kind: str, pose: tuple[float, ...]) -> None:
 
 
 @pytest.mark.parametrize("kind", list(SHAPES))
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=100)
 @given(pose=poses)
 def test_invariants(kind: str, pose: tuple[float, ...]) -> None:
     """Unit normal, tangent symmetric curvatures >= 0, the point on both surfaces shifted by half the gap."""
@@ -269,7 +269,7 @@ def test_the_contact_point_moves_continuously_as_the_finger_tilts(kind: str) -> 
 
 
 @pytest.mark.parametrize("kind", list(SHAPES))
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=100)
 @given(pose=poses, along=st.tuples(*[st.floats(-1, 1)] * 6))
 @example(pose=(0.047, 0.031, 0.0, 0.0, 0.0, 0.0), along=(0.0, 0.0, 0.0, 0.0, 0.0, 1.0))  # over an edge
 def test_no_jumps_anywhere_outside(kind: str, pose: tuple[float, ...], along: tuple[float, ...]) -> None:
