@@ -20,12 +20,13 @@ $(VENV)/installed: pyproject.toml constraints.txt
 demo: install
 	$(BIN)/torch-ekm demo --out demo_output
 
+# files in their order: files of few tests, which may be the longest, would come last
 test: install
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 # which lines the tests run: a summary here, htmlcov/index.html line by line
 coverage: install
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --cov=torch_ekm --cov-report=term:skip-covered --cov-report=html
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --cov=torch_ekm --cov-report=term:skip-covered --cov-report=html
 
 # what most changes break first: description, kinematics, learners, f + g, QP, drivers and logs
 FAST := description kinematics enhanced plant residual/test_residual_sogp_identities.py \

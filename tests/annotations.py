@@ -25,7 +25,12 @@ _count = [0]
 
 
 def check(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The type checker of the import hook, which also counts."""
+    """The type checker of the import hook, which also counts.
+
+    A function within another is made, and would be compiled anew, in each call of it: it stays unchecked.
+    """
+    if "<locals>" in function.__qualname__:
+        return function
     checked = beartype(function, conf=BeartypeConf(is_pep484_tower=True))
     if isinstance(checked, type):
         return checked

@@ -7,12 +7,21 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import annotations as shapes  # beside this file
+import hypothesis
 import jaxtyping
 import pytest
 import torch
 
 shapes.install()  # before anything imports the package
 torch.set_num_threads(1)  # many small matrices: threads only get into each other's way
+# examples are drawn from a fixed seed, and no clock decides on a slow machine
+hypothesis.settings.register_profile(
+    "repeatable",
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)
+hypothesis.settings.load_profile("repeatable")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from torch_ekm.contact.signed_distance import point_distance, surface_curvature, tangents
@@ -30,6 +30,7 @@ from torch_ekm.contact.detector import ContactDetector  # noqa: E402
 
 F64 = torch.float64
 EYE = torch.eye(3, dtype=F64)
+HAND, BOX = load_hand("planar_two_finger"), load_object("box")
 RADIUS, HALF = 0.0065, 0.00718
 SHAPES = {
     "box": (0.09, 0.03, 0.04),
@@ -41,7 +42,7 @@ SHAPES = {
 
 def thing(kind: str, size: tuple[float, ...] | None = None) -> ObjectDescription:
     shape = Shape(kind, size or SHAPES[kind], np.eye(4))  # type: ignore[arg-type]
-    return dataclasses.replace(load_object("box"), name=kind, shapes=(shape,))
+    return dataclasses.replace(BOX, name=kind, shapes=(shape,))
 
 
 def probe(obj: ObjectDescription, ball: bool = False, **options) -> ContactDetector:
@@ -51,7 +52,7 @@ def probe(obj: ObjectDescription, ball: bool = False, **options) -> ContactDetec
     """
     end = 0.0 if ball else HALF
     pad = ContactPad("pad", "hand", (-end, 0.0, 0.0), (end, 0.0, 0.0), RADIUS)
-    hand = dataclasses.replace(load_hand("planar_two_finger"), pads=(pad,))
+    hand = dataclasses.replace(HAND, pads=(pad,))
     return ContactDetector(hand, obj, **{"margin": math.inf, **options})
 
 
@@ -175,7 +176,7 @@ def coal_distance(obj: ObjectDescription, position: torch.Tensor, rotation: torc
 
 
 @pytest.mark.parametrize("kind", list(SHAPES))
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=150)
 @given(pose=poses)
 def test_gap_is_coals_distance(kind: str, pose: tuple[float, ...]) -> None:
     """Outside, and while only the surfaces overlap; the crown adds at most half^2/(2 R) = 0.05 mm."""
@@ -194,7 +195,7 @@ def test_gap_is_coals_distance(kind: str, pose: tuple[float, ...]) -> None:
 
 
 @pytest.mark.parametrize("kind", list(SHAPES))
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=100)
 @given(pose=poses)
 def test_invariants(kind: str, pose: tuple[float, ...]) -> None:
     """Unit normal, tangent symmetric curvatures >= 0, the point on both surfaces shifted by half the gap."""
@@ -268,8 +269,9 @@ def test_the_contact_point_moves_continuously_as_the_finger_tilts(kind: str) -> 
 
 
 @pytest.mark.parametrize("kind", list(SHAPES))
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=100)
 @given(pose=poses, along=st.tuples(*[st.floats(-1, 1)] * 6))
+@example(pose=(0.047, 0.031, 0.0, 0.0, 0.0, 0.0), along=(0.0, 0.0, 0.0, 0.0, 0.0, 1.0))  # over an edge
 def test_no_jumps_anywhere_outside(kind: str, pose: tuple[float, ...], along: tuple[float, ...]) -> None:
     """A change of the pose by 1e-7 (m, rad) moves the contact point by at most R/(0.2 rho) that."""
     position, rotation = torch.tensor(pose[:3], dtype=F64), turned(*pose[3:])

@@ -121,12 +121,16 @@ SINGLE = {
 }
 
 
-@pytest.mark.parametrize("shape", [(1,), (5,), (2, 3)])
+@pytest.mark.parametrize(  # each model of such a fleet learns by itself: few models, and one dtype for most
+    ("shape", "dtypes"),
+    [((1,), (torch.float64,)), ((3,), (torch.float64, torch.float32)), ((1, 2), (torch.float64,))],
+)
 @pytest.mark.parametrize("name", SINGLE)
-def test_contract_of_fleets_of_single_learners(name, shape):
+def test_contract_of_fleets_of_single_learners(name, shape, dtypes):
     kind, options = SINGLE[name]
     check_residual_learner(
         lambda **o: LearnerFleet(kind, 3, 2, batch_shape=shape, **options, **o),
+        dtypes=dtypes,
         n_samples=12,
         separates_noise=name != "mlp",
     )

@@ -209,7 +209,7 @@ def test_a_hall_channel_is_read_once(tmp_path: Path) -> None:
 JUNK = ["", "nan", "-1", "0", "1e999", "[]", "{}", '"x"', "<", "&", "true", "[[pads]]", "\x00", "é", "left_0"]
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=150)
 @given(which=st.booleans(), at=st.floats(0, 1, exclude_max=True), junk=st.sampled_from(JUNK))
 def test_damaged_files_never_raise_anything_else(which: bool, at: float, junk: str) -> None:
     """One word of either file replaced by junk: the hand loads, or the error is ours."""

@@ -11,7 +11,7 @@ from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import DescriptionError
 
 HAND, BOX = load_hand("planar_two_finger"), load_object("box")
-_PATIENCE = 5.0  # [s] of CPU: the machine may be busy
+_PATIENCE = 20.0  # [s] of CPU, of which a busy machine takes more
 
 TOML = {
     "nested arrays": "x = " + "[" * 100_000,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import shutil
 
 import pytest
 import torch
@@ -34,7 +35,7 @@ def test_what_a_learner_did_is_the_same_after_an_interruption(tmp_path):
     log = record(LEARNS, (1,), tmp_path / "one")
     assert log.trials == (2, 3)
     seen = []
-    record(LEARNS, (1,), tmp_path / "two")
+    shutil.copytree(tmp_path / "one", tmp_path / "two")
     (tmp_path / "two" / "trial_000003.h5").unlink()
     record(LEARNS, (1,), tmp_path / "two", seen.append)
     assert seen == [2, 3]

@@ -13,8 +13,10 @@ from typer.testing import CliRunner
 from torch_ekm.cli import app
 from torch_ekm.description import list_hands, load_hand, load_object
 from torch_ekm.exceptions import DescriptionError, EquilibriumError, GraspError
+from torch_ekm.inspection import check as module
 from torch_ekm.inspection.check import check_hand
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
+from torch_ekm.simulation.grasp_planning import pinch
 from torch_ekm.simulation.grasp_planning.pinch import pinch_problem
 from torch_ekm.simulation.grasp_planning.requirements import unmet
 
@@ -29,6 +31,14 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
     urdf.write_text(HAND.urdf_path.read_text())
     transmission.write_text(HAND.transmission_path.read_text())
     return urdf, transmission
+
+
+@pytest.fixture
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One first guess of the planner, one pinch with faults, one gentler pinch: most rows need no more."""
+    monkeypatch.setattr(pinch, "_GUESSES", 1)
+    monkeypatch.setattr(module, "_DISTURBED", 1)
+    monkeypatch.setattr(module, "_GENTLER", (2.0,))
 
 
 @pytest.mark.parametrize("name", list_hands())
@@ -63,6 +73,7 @@ FAULTS = {  # what is changed (0: URDF, 1: transmission file); name, state and t
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("brief")
 @pytest.mark.parametrize("fault", list(FAULTS))
 def test_each_fault_has_its_row(fault, files):
     which, old, new, name, state, text = FAULTS[fault]
@@ -78,6 +89,7 @@ def test_each_fault_has_its_row(fault, files):
     assert bool(rows[0].mend) == (state != "ok")
 
 
+@pytest.mark.usefixtures("brief")
 def test_a_planner_that_fails_names_the_joint_and_not_the_object():
     narrow = HAND.joint_upper.copy()
     narrow[HAND.joint_names.index("left_0")] = narrow[HAND.joint_names.index("right_0")] = -0.3
@@ -99,6 +111,7 @@ def test_the_joint_in_the_way_is_the_one_that_was_narrowed():
     assert all(["thumb_0" in lack.part for lack in found])
 
 
+@pytest.mark.usefixtures("brief")
 def test_a_pad_that_holds_with_its_back_is_told(monkeypatch):
     lower, upper = HAND.joint_lower.copy(), HAND.joint_upper.copy()
     lower[0], upper[0], upper[1] = -0.5, 0.0, 0.4
@@ -106,16 +119,18 @@ def test_a_pad_that_holds_with_its_back_is_told(monkeypatch):
     hand = dataclasses.replace(
         HAND, joint_lower=lower, joint_upper=upper, actuators=(left, *HAND.actuators[1:])
     )
-    monkeypatch.setattr("torch_ekm.inspection.check.load_hand", lambda _: hand)
+    monkeypatch.setattr(module, "load_hand", lambda _: hand)
     rows = {row.name: row for row in check_hand("mine")}
     assert rows["contact sides"].state == rows["model"].state == "error"
     assert "'right'" in rows["contact sides"].found
 
 
 def test_a_pinch_that_turns_little_is_told(monkeypatch):
+    can = load_object("can")
+
     def turn(least_deg: float) -> tuple[str, list[int]]:
-        monkeypatch.setattr("torch_ekm.inspection.check._LITTLE_TURN", math.radians(least_deg))
-        row = {row.name: row for row in check_hand("planar_two_finger", "can")}["turn"]
+        monkeypatch.setattr(module, "_LITTLE_TURN", math.radians(least_deg))
+        (row,) = module._turn(HAND, can)
         return row.state, [int(angle) for angle in re.findall(r"([+-]\d+) deg", row.found)]
 
     state, (back, forth) = turn(3.0)
@@ -124,13 +139,14 @@ def test_a_pinch_that_turns_little_is_told(monkeypatch):
     assert turn(min(-back, forth) - 2.0)[0] == "ok"
 
 
+@pytest.mark.usefixtures("brief")
 def test_limits_that_leave_no_pinch_are_told_with_the_angle_that_it_takes(monkeypatch):
     """Postures face to face exist, so that the row on limits is ok; none is in balance."""
     lower, upper = HAND.joint_lower.copy(), HAND.joint_upper.copy()
     lower[0], upper[0], upper[1] = -0.5, 0.0, 0.2
     hand = dataclasses.replace(HAND, joint_lower=lower, joint_upper=upper)
-    monkeypatch.setattr("torch_ekm.inspection.check.load_hand", lambda _: hand)
-    monkeypatch.setattr("torch_ekm.inspection.check._GENTLER", (4.0,))
+    monkeypatch.setattr(module, "load_hand", lambda _: hand)
+    monkeypatch.setattr(module, "_GENTLER", (4.0,))
     left = dataclasses.replace(hand.actuators[0], lower=-0.5)
     hand = dataclasses.replace(hand, actuators=(left, *hand.actuators[1:]))
     rows = {row.name: row for row in check_hand("mine")}
@@ -141,40 +157,44 @@ def test_limits_that_leave_no_pinch_are_told_with_the_angle_that_it_takes(monkey
     assert "no sound pinch with 4 N" in rows["pinch force"].found
 
 
+@pytest.mark.usefixtures("brief")
 def test_springs_too_soft_for_the_usual_force_are_told_which_one_they_bear(monkeypatch):
     hand = dataclasses.replace(HAND, spring_stiffness=HAND.spring_stiffness / 4)
-    monkeypatch.setattr("torch_ekm.inspection.check.load_hand", lambda _: hand)
+    monkeypatch.setattr(module, "load_hand", lambda _: hand)
     rows = {row.name: row for row in check_hand("mine", "can")}
     assert rows["pinch"].state == "error"
     assert "sound at 2 N" in rows["pinch force"].found
     assert "'pinch_force = 2'" in rows["pinch force"].mend
     gentle = dataclasses.replace(hand, pinch_force=2.0)
-    monkeypatch.setattr("torch_ekm.inspection.check.load_hand", lambda _: gentle)
+    monkeypatch.setattr(module, "load_hand", lambda _: gentle)
     assert {row.name: row for row in check_hand("mine", "can")}["pinch"].state == "ok"
 
 
+@pytest.mark.usefixtures("brief")
 def test_a_pinch_that_the_usual_faults_break_is_told(monkeypatch):
     def hand(*args, preset="none", **options):
         if preset == "nominal":
             raise GraspError("it slips")
         return SimulatedHand(*args, preset=preset, **options)
 
-    monkeypatch.setattr("torch_ekm.inspection.check.SimulatedHand", hand)
+    monkeypatch.setattr(module, "SimulatedHand", hand)
     rows = {row.name: row for row in check_hand("planar_two_finger", "can")}
     assert (rows["pinch"].state, rows["pinch, preset nominal"].state) == ("ok", "warning")
     assert "it slips" in rows["pinch, preset nominal"].found
 
 
+@pytest.mark.usefixtures("brief")
 def test_rigid_actuators_that_contradict_each_other_are_told(monkeypatch):
     hand = load_hand("icub_right")
     rigid = tuple(dataclasses.replace(actuator, stiffness=float("inf")) for actuator in hand.actuators)
     hand = dataclasses.replace(hand, actuators=rigid)
-    monkeypatch.setattr("torch_ekm.inspection.check.load_hand", lambda _: hand)
+    monkeypatch.setattr(module, "load_hand", lambda _: hand)
     rows = {row.name: row for row in check_hand("mine")}
     assert "thumb_distal 100" in rows["actuators"].found
     assert rows["actuators in the pinch"].state == "warning"
 
 
+@pytest.mark.usefixtures("brief")
 def test_command_line(files, tmp_path):
     runner = CliRunner()
     picture = ["--picture", str(tmp_path / "check.png")]

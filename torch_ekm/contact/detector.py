@@ -35,8 +35,9 @@ class ContactDetector:
     slight crown (radius ``R`` along its axis): without it a capsule lying on a flat face has no single
     contact point, and the point would jump from one end to the other as the finger tilts. With it, ``s*`` is
     a continuous function of the state, ``|ds*/dtilt| <= R``. Where the object is curved along the pad by k,
-    the crown is ``max(0, 1/R - k)``: none where it is curved at all. Where the pad touches with a round end,
-    and for balls, the crown plays no part.
+    the crown is ``max(0, 1/R - k)``: none where it is curved at all, but all of it at an edge, beyond which
+    a flat face may lie along the pad. Where the pad touches with a round end, and for balls, the crown
+    plays no part.
 
     The contact point lies midway between the two surfaces. Curvatures: pad ``1/rho`` across and
     the crown along its axis on the side, ``1/rho`` all around on a round end; object from the feature

@@ -90,6 +90,9 @@ def _along(solid: Solid, m: tuple, t: tuple, half: float, most: float) -> tuple[
     s = _closest(solid, m, t, half, most)
     if abs(s) >= half:  # at a round end, crown or not
         return s, most
+    c = (m[0] + s * t[0], m[1] + s * t[1], m[2] + s * t[2])
+    if surface_curvature(solid.shape, c, solid.distance(*c)[1])[1]:
+        return s, most  # without crown a pad along the face beyond the edge would jump to its end
     step = 1e-6
     points = ((m[0] + x * t[0], m[1] + x * t[1], m[2] + x * t[2]) for x in (s + step, s - step))
     ahead, behind = (solid.distance(*point)[1] for point in points)

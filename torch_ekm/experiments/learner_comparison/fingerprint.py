@@ -9,7 +9,14 @@ from typing import Any
 import torch
 
 _PLAIN = (bool, int, float, complex, str, bytes, type(None), torch.dtype, torch.device)
-_BY_NAME = {*sys.stdlib_module_names, "torch", "numpy", "scipy"}  # packages whose code does not count
+_BY_NAME = {
+    *sys.stdlib_module_names,
+    "torch",
+    "numpy",
+    "scipy",
+    "jaxtyping",
+    "beartype",
+}  # packages whose code does not count
 
 
 def fingerprint(*values: Any) -> str:
@@ -17,7 +24,8 @@ def fingerprint(*values: Any) -> str:
 
     Tensors and arrays count with their contents, objects with their class and their state. Classes and
     functions count with their bytecode, and with that of the functions, classes and plain constants that it
-    names in its module; those of Python, torch, numpy and scipy count with their names.
+    names in its module; those of Python, torch, numpy, scipy and of checkers of annotations count with their
+    names.
     """
     known: dict[int, tuple[Any, str]] = {}  # holds the value too: its id must not come again
 
