@@ -68,7 +68,9 @@ OTHERS: dict[str, PlantParameters] = {
 def plants(names: list[str]) -> dict[tuple[str, str], PlantParameters]:
     """The plants of some families, by name and strength."""
     found: dict[tuple[str, str], PlantParameters] = {}
-    for name in names:
+    strong = [f"{family}:strong" for family in FAMILIES]
+    groups = {"all": [*FAMILIES, *OTHERS], "strong": [*strong, *OTHERS]}
+    for name in itertools.chain.from_iterable(groups.get(name, [name]) for name in names):
         if name in OTHERS:
             found[name, ""] = OTHERS[name]
             continue
@@ -236,7 +238,9 @@ def main() -> None:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     names = ", ".join((*FAMILIES, *OTHERS))
-    parser.add_argument("--families", default="all", help=f"of {names}; FAMILY:strong for one strength")
+    parser.add_argument(
+        "--families", default="all", help=f"all, strong, or of {names}; FAMILY:weak for one strength"
+    )
     parser.add_argument("--objects", default="box,bottle", help="names or paths")
     parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1002"), help="FIRST:END")
     parser.add_argument("--controllers", default=",".join(CONTROLLERS))
@@ -246,7 +250,7 @@ def main() -> None:
         "--quick", action="store_true", help="one plant, object and seed: to see that it works"
     )
     given = parser.parse_args()
-    wanted = [*FAMILIES, *OTHERS] if given.families == "all" else given.families.split(",")
+    wanted = given.families.split(",")
     objects, seeds = given.objects.split(","), given.seeds
     if given.quick:
         wanted, objects, seeds = ["odd_1"], objects[:1], seeds[:1]

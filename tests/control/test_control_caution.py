@@ -206,9 +206,9 @@ def test_the_pace_grows_where_the_model_is_right_and_shrinks_where_it_is_not() -
     assert trust.disagreement(predicted, predicted, 0.015) == 0.0
     pace.judge(0.0)
     assert pace.factor == pytest.approx(trust.start * grow)
-    # one direction of three is wrong by 3 deg: rho^2 = 9 / 3 / (0.3^2 + (0.12 * 2.5)^2)
+    # one direction of six is wrong by 3 deg: rho^2 = 9 / 6 / (0.3^2 + (0.12 * 2.5)^2)
     rho = trust.disagreement(predicted, wrong, 0.015)
-    assert rho == pytest.approx(math.sqrt(9 / 3 / 0.18), rel=1e-6)
+    assert rho == pytest.approx(math.sqrt(9 / 6 / 0.18), rel=1e-6)
     pace.judge(rho)
     assert pace.factor == pytest.approx(trust.start * grow * shrink)
     before = pace.factor

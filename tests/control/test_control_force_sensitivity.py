@@ -84,3 +84,13 @@ def test_bad_input_changes_nothing_and_the_state_dict_carries_all(unchecked) -> 
     for each in (learner, other):
         each.update(moves(1, seed=9)[0], torch.ones(2, dtype=F64), described)
     assert torch.equal(other.correction, learner.correction)
+
+
+def test_a_correction_counts_less_where_the_pads_are_noisy() -> None:
+    true, described = torch.tensor([[5.0, -3.0, 2.0]], dtype=F64), torch.zeros(1, 3, dtype=F64)
+    quiet, noisy = (taught(true, described, moves(80), noise=noise) for noise in (0.05, 0.8))
+    assert torch.equal(quiet.used, quiet.correction)
+    assert float(noisy.variance.sqrt()) == pytest.approx(0.8, rel=0.4)
+    share = float((noisy.used / noisy.correction).mean())
+    assert share == pytest.approx((0.3**2 / float(noisy.variance)) ** 2)
+    assert share < 0.2

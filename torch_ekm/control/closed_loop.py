@@ -21,7 +21,7 @@ from .controller import LookAndMoveController
 from .decision import Decision, Expectation, StopReason
 from .focus import FocusedPose, PoseTarget
 from .knowledge import HandKnowledge
-from .pace import DISAGREE, ForceSurprise
+from .pace import SLIDES, ForceSurprise
 from .safety import Safety
 from .safety.progress import Progress
 from .safety.watch import Watch
@@ -326,7 +326,7 @@ class ClosedLoop:
         trust = self.controller.pace.options.trust
         rho = trust.disagreement(expected.increment[-6:], ds[-6:], lever, felt)
         self.controller.pace.judge(rho, decision.share)
-        if decision.share > 0 and trust.disagreement(expected.increment[-6:], ds[-6:], lever) > DISAGREE:
+        if decision.share > 0 and trust.disagreement(expected.increment[-6:], ds[-6:], lever) > SLIDES:
             self.controller.tighter += self.safety.caution.slip  # it slides, or turns out of the grip
         return enhanced.update(seen.state, expected.moved, ds, expected.nominal)
 
@@ -336,5 +336,5 @@ class ClosedLoop:
         change = torch.full((len(forces.correction),), torch.nan, dtype=torch.float64)
         change[pads] = (felt.after - felt.before).where(~felt.surprise.isnan(), torch.nan)
         described = torch.zeros_like(forces.correction)
-        described[pads] = lin.normal_force_sensitivity - forces.correction[pads]
+        described[pads] = lin.normal_force_sensitivity - forces.used[pads]
         forces.update(moved, change, described)

@@ -107,7 +107,7 @@ class LookAndMoveController:
         )
         if self.forces is not None:
             pads = self.kinematic.hand.pad_indices(lin.contacts.finger)
-            lin = lin.with_normal_sensitivity(self.forces.correction[pads])
+            lin = lin.with_normal_sensitivity(self.forces.used[pads])
         if lin.forces.solved:
             self._previous = lin, a
         return lin
@@ -209,7 +209,8 @@ class LookAndMoveController:
         least = next((limit for limit in self.limits if isinstance(limit, NormalForceLimit)), None)
         if f_n is None or least is None:
             return None
-        return Grip(torch.from_numpy(f_n), torch.from_numpy(least.least(f_n, seen)))
+        figures = f_n, least.least(f_n, seen), seen.contact_force_std(lin)
+        return Grip(*(torch.from_numpy(figure) for figure in figures))
 
     def _none(self, status: StopReason, failure: EKMError, focused: Tensor) -> Decision:
         """No motion, and why."""

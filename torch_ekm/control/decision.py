@@ -52,6 +52,8 @@ class Grip(NamedTuple):
     """f_n, as measured, or as estimated where a pad does not measure [N]."""
     least: Float[Tensor, " n_c"]
     """What each should bear at least, see :class:`~torch_ekm.control.NormalForceLimit` [N]."""
+    std: Float[Tensor, " n_c"]
+    """How far predictions of it are off [N]; 0 where nobody knows."""
 
 
 @dataclass(frozen=True)

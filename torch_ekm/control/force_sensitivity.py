@@ -11,6 +11,7 @@ from ..typing import Float, Tensor
 
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
 _NOISE_STD = 0.25  # [N] of a change of force that B does not explain, at least
+_TRUSTED_STD = 0.3  # [N] of what B does not explain; B counts less above it
 _FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
 _RECENT = 0.1  # weight of the last motion in the variance of r
 _CLIP = 4.0  # standard deviations; a contact that slips says nothing of the rest
@@ -40,6 +41,12 @@ class ForceSensitivity(Recorded, nn.Module):
         """D, of the motions [rad^2]."""
         self.variance = nn.Buffer(torch.full((n_pads,), _NOISE_STD**2, dtype=torch.float64))
         """s^2 of each pad [N^2]."""
+
+    @property
+    def used(self) -> Float[Tensor, "n_pads n_a"]:
+        """``min(1, (0.3 N / s)^4) B`` [N/rad]: small motions that follow the noise of a pad look as if its
+        force did not answer."""
+        return self.correction * (_TRUSTED_STD**4 / self.variance.square()).clamp(max=1.0)[:, None]
 
     @property
     def _covariance(self) -> Tensor:

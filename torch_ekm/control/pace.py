@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _DEG = math.pi / 180
 # of the trust region
 _AGREE = 1.0  # rho up to which the pace grows
-DISAGREE = 1.6  # rho from which it shrinks
+_DISAGREE = 1.6  # rho from which it shrinks
 _GROW, _SHRINK = 1.2, 0.7
 # error that is no surprise, as a share of the motion; of a translation the contacts' way counts
 _RELATIVE = 0.12
@@ -28,6 +28,7 @@ _TRANSLATION_NOISE = 0.3e-3  # [m] standard deviation of a measured motion
 _ROTATION_NOISE = 0.3 * _DEG  # [rad]
 _FORCE_NOISE = 0.5  # [N]
 _FORCE_SHARE = 0.25  # of the force that a finger bears: an error that leaves it its grip
+SLIDES = 2.0  # rho of the twist alone from which the object is thought to slide
 _USED = 0.7  # a motion below this share of what was allowed says nothing for a larger one
 
 
@@ -164,19 +165,19 @@ class ForceSurprise(NamedTuple):
     @property
     def wrong(self) -> bool:
         """Some pad measured what was not predicted, or has let go."""
-        return bool((self.z.abs() > DISAGREE).any() or self.surprise.isnan().any())
+        return bool((self.z.abs() > _DISAGREE).any() or self.surprise.isnan().any())
 
 
 @dataclass(frozen=True)
 class TrustRegion:
     """``p <- 1.2 p`` where ``rho < 1``, ``0.7 p`` where ``rho > 1.6``, with::
 
-        rho = max(rms_i z_i over translation, over rotation, |z_i| of each finger's normal force)
+        rho = max(rms_i z_i over twist and normal forces, |z_i| of each finger)
         z_i = (dx_i - predicted_i) / sqrt(noise_i^2 + (0.12 |predicted|)^2)
 
-    with a quarter of what the finger bears in the place of 12 % of the motion. 1 is an error that the
-    sensors' noise (0.3 mm, 0.3 deg, 0.5 N) and these shares explain. The worst part counts: the mean would
-    let one finger fade while the rest is predicted well.
+    with a quarter of what a finger bears in the place of 12 % of the motion. 1 is an error that the sensors'
+    noise (0.3 mm, 0.3 deg, 0.5 N) and these shares explain. Each finger counts alone, too: the mean would let
+    one fade while the rest is predicted well.
 
     Source: trust regions of nonlinear optimisation, Conn, Gould and Toint, Trust-Region Methods (2000), with
     the measured motion in the place of the cost.
@@ -211,10 +212,8 @@ class TrustRegion:
         size = torch.linalg.vector_norm(predicted / unit)
         noise = predicted.new_tensor([_TRANSLATION_NOISE] * 3 + [_ROTATION_NOISE] * 3)
         z = (came - predicted).square() / (noise.square() + (_RELATIVE * size * unit).square())
-        parts = [z[:3].mean(), z[3:].mean()]
-        if forces is not None:
-            parts += list(forces.z[~forces.z.isnan()].square())
-        return float(torch.stack(parts).max().sqrt())
+        fingers = z.new_zeros(0) if forces is None else forces.z[~forces.z.isnan()].square()
+        return float(torch.cat([torch.cat([z, fingers]).mean()[None], fingers]).max().sqrt())
 
 
 @dataclass(frozen=True)
@@ -290,7 +289,7 @@ class Pace(nn.Module):
         trust = self.options.trust
         if not self.adapts:
             return
-        if disagreement > DISAGREE:
+        if disagreement > _DISAGREE:
             least = min(self.factor, trust.smallest)
             self.value.mul_(_SHRINK).clamp_(min=least)
         elif disagreement < _AGREE and share >= _USED:

@@ -85,22 +85,17 @@ class GripForceTask:
     most: float = 8.5
     """[N]; also of a grip that was tightened."""
     weight: float = 4.0
-    """Per N^2, of forces that are predicted to ``std``; of others less, by the inverse of their variance."""
-    std: float = 0.25
-    """[N]"""
+    """Per N^2."""
     step: float = 0.7
-    """At most this much of an error is corrected in one step [N]. Of each error so much is left alone as
-    predictions of the force are off: a motion that follows noise moves the object."""
+    """At most this much of an error is corrected in one step [N]."""
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Squares | None:
         f_n = seen.normal_force(model.kinematic)
         if f_n is None:
             return None
         wanted = grip_shares(f_n, self.wanted(model.kinematic, seen))
-        error, std = wanted - f_n, seen.contact_force_std(model.kinematic)
-        change = np.sign(error) * np.clip(np.abs(error) - std, 0.0, self.step)
-        weight = self.weight * (self.std / np.maximum(std, self.std)) ** 2
-        return Squares(as_array(model.kinematic.normal_force_sensitivity), change, weight)
+        change = np.clip(wanted - f_n, -self.step, self.step)
+        return Squares(as_array(model.kinematic.normal_force_sensitivity), change, self.weight)
 
     def wanted(self, kinematic: Linearization, seen: Situation) -> float:
         """f, of the finger that opposes the others [N]."""

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from ...model import KinematicModel, Linearization
     from ...typing import Tensor
 
-_FADES = 0.3  # [N] below the prediction, in one motion
+_FADES = 0.3  # [N] below the prediction, in one motion, and
+_DOUBT = 1.2  # standard deviations of such predictions
 _SLOWS = 2  # such motions running, after which the pace shrinks
 _ALARMS = 3  # and after which the hand goes back
 
@@ -66,7 +67,8 @@ class GripWatch:
             return
         pads = list(forces.pads)
         gone = (forces.before >= self._least) & (forces.after < self._least)
-        fades = gone | ((forces.surprise < -_FADES) & (forces.after < decision.grip.least))
+        least, std = decision.grip.least, decision.grip.std
+        fades = gone | ((forces.surprise < -torch.clamp(_DOUBT * std, min=_FADES)) & (forces.after < least))
         self._faded[pads] = torch.where(fades, self._faded[pads] + 1, 0)
 
     def forget(self) -> None:
