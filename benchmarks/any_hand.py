@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 _DEG = math.pi / 180
 CONTROLLERS = ("KM+I", "KM+S", "E-KM")
 ANGLES = (9.0, 19.0, 27.0)
+WARM_UP = 3
 STRENGTHS = ("weak", "medium", "strong")
 #: Family -> the plant's figures at the three strengths.
 FAMILIES: dict[str, tuple[dict[str, Any], ...]] = {
@@ -91,7 +92,7 @@ def setting_of(plant: PlantParameters) -> Setting:
 def session(plant: PlantParameters, item: str, controller: str, seed: int) -> list[dict[str, Any]]:
     """Warm-up (E-KM only), then the turns: how each ended."""
     setting = setting_of(plant)
-    protocol = Generalize(setting, (item,), ANGLES, 3, 0.0, 0.0)
+    protocol = Generalize(setting, (item,), ANGLES, WARM_UP, 0.0, 0.0)
     return [one.to_json() for one in protocol.session(item, controller, seed) if one.kind == "turn"]
 
 

@@ -72,6 +72,9 @@ def test_knowledge_of_another_hand_and_another_file_are_refused(held, driven, tm
             LookAndMoveController(model, axis),
             knowledge=HandKnowledge(ServoModel(["one", "two"]), ForceSensitivity(5, 2)),
         )
+    other = HandKnowledge(ServoModel(model.hand.actuator_names), ForceSensitivity(2, model.hand.n_a))
+    with pytest.raises(ParameterError, match="a hand with 5 pads and 9 actuators"):
+        other.check(model.hand)
     save(SparseOnlineGP(2, 1), tmp_path / "learner.ekm")
     with pytest.raises(FileFormatError, match="holds a SparseOnlineGP, no HandKnowledge"):
         HandKnowledge.load(tmp_path / "learner.ekm")

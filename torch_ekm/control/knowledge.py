@@ -47,12 +47,16 @@ class HandKnowledge(Recorded, nn.Module):
         """That it is of this hand.
 
         Raises:
-            ParameterError: the actuators have other names.
+            ParameterError: the actuators have other names, or there are more or fewer pads.
         """
         if tuple(self.servo.names) != tuple(hand.actuator_names):
             names = ", ".join(self.servo.names)
             valid = f"that of a hand with the actuators {', '.join(hand.actuator_names)}"
             raise ParameterError("knowledge", f"of a hand with the actuators {names}", valid)
+        shape = tuple(self.forces.correction.shape)
+        if shape != (len(hand.pads), hand.n_a):
+            valid = f"that of a hand with {len(hand.pads)} pads and {hand.n_a} actuators"
+            raise ParameterError("knowledge", f"of {shape[0]} pads and {shape[1]} actuators", valid)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write all of it; the file appears whole or not at all.
