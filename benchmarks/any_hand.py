@@ -57,7 +57,7 @@ FAMILIES: dict[str, tuple[dict[str, Any], ...]] = {
 OTHERS: dict[str, PlantParameters] = {
     "nominal": preset("nominal"),
     "worn": preset("worn"),
-    # the plant that showed what was wrong: round pulleys and linear springs are taken for granted
+    # no mixture, and the same for every hardware instance
     "odd_hand": preset("nominal").replace(arm_variation=0.25, spring_stiffening=0.5),
     "odd_other": preset("nominal").replace(arm_variation=-0.25, spring_stiffening=-0.3),
     **{name: preset(name) for name in ("odd_1", "odd_2", "odd_3", "odd_4", "odd_5", "hostile")},
@@ -109,7 +109,7 @@ def jobs(
                 *filter(None, (family, strength)),
                 object_name(item),
                 controller,
-                digest(setting_of(plant), (item,), ANGLES),
+                digest(setting_of(plant), (item,), ANGLES, WARM_UP),
                 str(seed),
             ]
         ): (plant, item, controller, seed)

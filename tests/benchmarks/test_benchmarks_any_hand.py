@@ -48,7 +48,12 @@ def _changes(plant) -> set[str]:
 
 
 def test_lost_missed_and_motions_are_counted(tmp_path: Path) -> None:
-    ours = [record("reached", 6), record("reached", 8), record("stalled", 20), record("given up", 9, off=31.0)]
+    ours = [
+        record("reached", 6),
+        record("reached", 8),
+        record("stalled", 20),
+        record("given up", 9, off=31.0),
+    ]
     theirs = [record("reached", 14)] * 3 + [record("object lost", 3)]
     turns = Turns(tuple(ours))
     assert (turns.lost, turns.missed, turns.reached, turns.motions) == (1, 1, 2, 7.0)

@@ -218,7 +218,7 @@ def test_the_pace_grows_where_the_model_is_right_and_shrinks_where_it_is_not() -
     for bears, rho in ((1.5, 2 / math.hypot(0.5, 0.25 * 1.5)), (8.0, 2 / math.hypot(0.5, 2.0))):
         forces = torch.tensor([6.0, bears, 4.0], dtype=torch.float64)
         off = torch.tensor([0.0, -2.0, torch.nan], dtype=torch.float64)
-        felt = ForceSurprise((0, 1, 2), forces, forces + off, off)
+        felt = ForceSurprise((0, 1, 2), forces, forces + off, off, off.isnan())
         assert trust.disagreement(predicted, predicted, 0.015, felt) == pytest.approx(rho)
     pace.judge(2.0)
     assert pace.factor < before

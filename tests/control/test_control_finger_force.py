@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -95,6 +97,26 @@ def test_a_finger_that_fades_three_times_running_sends_the_hand_back(held) -> No
     assert loop.controller.tighter == Caution().tighten
 
 
+def test_a_finger_that_lets_go_sends_the_hand_back(held) -> None:
+    done, _, _ = turned(held, lambda n: [5.0, 2.5, [1.6, 0.9, 0.1, 0.0, 2.0][min(n, 4)]])
+    assert [step.retreat for step in done.steps][:4] == [False, False, False, True]
+
+
+def test_without_fingertips_nothing_is_declined(held) -> None:
+    plant, model, seen = held
+    blind = dataclasses.replace(seen, fingertip_force=None)
+    weak = LookAndMoveController(model, plant.rotation_axis, limits=[NormalForceLimit(minimum=9.0)])
+
+    class Still(FakePlant):
+        def observe(self) -> Observation:
+            return blind
+
+    done = ClosedLoop(Still(), weak, safety=SAFETY).run(
+        PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0)
+    )
+    assert done.reason is not Reason.WEAK_GRASP
+
+
 def test_a_finger_that_bears_enough_may_lose_force(held) -> None:
     done, _, _ = turned(held, lambda n: [5.0, 2.5, 4.0 - 0.4 * min(n, 6)])
     assert not any(step.retreat for step in done.steps)
@@ -110,13 +132,14 @@ def test_a_finger_that_fades_twice_slows_the_pace(held) -> None:
         loop = ClosedLoop(Pads(seen, model, lambda n, f=force: [5.0, 2.5, f[min(n, 2)]]), controller)
         steps = loop.steps(PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0))
         next(steps)
-        before = controller.pace.factor
+        judge = controller.pace.judge
+        controller.pace.judge = MagicMock(wraps=judge)  # type: ignore[method-assign]
         next(steps)
-        paces.append(controller.pace.factor / before)
-    assert paces[1] < 0.71 * paces[0]
+        paces.append(controller.pace.judge.call_args.args[0])
+    assert paces[0] < paces[1] == math.inf
 
 
-def test_the_least_force_of_a_finger_follows_from_grip_and_doubt(held) -> None:
+def test_the_least_force_of_a_finger_follows_from_the_grip(held) -> None:
     plant, model, seen = held
     controller = LookAndMoveController(model, plant.rotation_axis)
     target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=5.0)

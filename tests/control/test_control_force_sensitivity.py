@@ -53,7 +53,7 @@ def test_motions_in_one_direction_do_not_fade_what_others_said() -> None:
     before = learner.evidence.clone()
     for _ in range(300):
         learner.update(one, true @ one, described)
-    assert float(learner.evidence[1, 1]) > 0.5 * float(before[1, 1])
+    assert float(learner.evidence[0, 1, 1]) > 0.5 * float(before[0, 1, 1])
     torch.testing.assert_close(learner.correction, true, atol=0.5, rtol=0)
 
 
@@ -94,3 +94,13 @@ def test_a_correction_counts_less_where_the_pads_are_noisy() -> None:
     share = float((noisy.used / noisy.correction).mean())
     assert share == pytest.approx((0.3**2 / float(noisy.variance)) ** 2)
     assert share < 0.2
+
+
+def test_a_pad_that_joins_later_learns_as_fast_as_the_first() -> None:
+    true, described = torch.full((2, 3), 5.0, dtype=F64), torch.zeros(2, 3, dtype=F64)
+    learner, w = ForceSensitivity(2, 3), moves(112)
+    for k, one in enumerate(w):
+        change = true @ one
+        change[1] = NAN if k < 100 else change[1]
+        learner.update(one, change, described)
+    torch.testing.assert_close(learner.correction, true, atol=1.0, rtol=0)

@@ -113,7 +113,7 @@ def test_a_frame_that_is_missed_is_waited_for(held) -> None:
 def test_a_surprise_that_stands_is_believed_but_does_not_teach(held) -> None:
     """The object slides by 12 deg: it is where it is seen, and the model is not taught to turn so far."""
     axis = held[1]
-    run = Run(held, lambda plant, seen: turned(seen, axis, -12 * DEG))
+    run = Run(held, lambda plant, seen: turned(seen, axis, -12 * DEG), angle=15.0)
     assert run.taught[1] is False
     assert "predicted" in run.done.steps[1].note
     assert run.taught[2] is True

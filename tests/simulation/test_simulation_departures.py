@@ -70,6 +70,20 @@ def test_the_drives_give_the_gradient_of_the_energy_of_odd_pulleys_springs_and_c
     np.testing.assert_allclose(transmission.stretched(pulls), transmission.stretch(q, motor), atol=1e-12)
 
 
+def test_a_slack_tendon_neither_pushes_nor_shares_its_slack() -> None:
+    transmission = make(losses=dataclasses.replace(CableLosses.none(N_Q), coupling=0.2))
+    q = flexed()
+    motor = taut(transmission, q, 0.05)
+    pulling = np.flatnonzero([actuator.tendon for actuator in HAND.actuators])
+    assert len(pulling) > 1
+    motor[pulling[0]] -= 1.0
+    pulls = transmission.actuator_torque(q, motor)
+    assert pulls[pulling[0]] == 0.0
+    rest = np.delete(np.arange(HAND.n_a), pulling[0])
+    compliance = (np.eye(HAND.n_a - 1) * 0.8 + 0.2) / STIFFNESS
+    np.testing.assert_allclose(compliance @ pulls[rest], 0.05, atol=1e-12)
+
+
 def test_hysteresis_holds_a_share_of_the_pull_against_either_direction() -> None:
     transmission = make(losses=dataclasses.replace(CableLosses.none(N_Q), hysteresis=0.1))
     q, plain = flexed(), make()

@@ -132,8 +132,6 @@ class ClosedLoop:
         self.plant, self.knowledge = ServoInverse(plant, hand, knowledge.servo), knowledge
         self.controller, self.learn, self.decline = controller, learn, decline
         self.safety = Safety() if safety is None else safety
-        if controller.enhanced is not None:
-            controller.forces = knowledge.forces
         self._stop = threading.Event()
 
     def __enter__(self) -> ClosedLoop:
@@ -181,6 +179,7 @@ class ClosedLoop:
         first = watch.first(self.plant.observe(), self.plant.observe)
         seen = first.seen
         self.controller.reset()
+        self.controller.forces = None if self.controller.enhanced is None else self.knowledge.forces
         progress = Progress(self.safety, target, self.controller.focus, seen, started)
         progress.halt = first.halt
         if self.decline is not None and progress.halt is None and seen.status is not PlantStatus.LOST:
@@ -189,6 +188,7 @@ class ClosedLoop:
                 return Stop(StopReason.OUT_OF_REACH, seen, against)
         if progress.halt is None and seen.status is PlantStatus.HELD:
             seen, weak = yield from self._grip_first(seen, progress, watch)
+            watch.grip.forget()
             if weak and progress.halt is None and not progress.lost(seen):
                 return Stop(StopReason.WEAK_GRASP, seen, weak)
         while True:
@@ -225,20 +225,21 @@ class ClosedLoop:
         self, seen: Observation, progress: Progress, watch: Watch
     ) -> Generator[Step, None, tuple[Observation, str]]:
         """Tighten a grip in which a finger bears less than the object needs; what still does, in words."""
-        for left in range(self.safety.caution.grips, -1, -1):
+        left = self.safety.caution.grips
+        while not self._stop.is_set():
             here = PoseTarget(seen.position, seen.rotation)
             decision = self.controller.decide(seen.state, seen.a, here, seen.fingertip_force)
             weak = watch.grip.weak(decision) if decision.status is StopReason.RUNNING else ""
-            if not weak or left == 0:
-                return seen, weak
+            if not weak or left == 0:  # an estimate is no reason to decline
+                return seen, weak if seen.fingertip_force is not None else ""
             decision = dataclasses.replace(decision, share=_GRIP_SHARE)
             progress.halt = watch.command(decision, seen)
             if progress.halt is not None:
                 return seen, weak
             step = self._move(seen, decision, progress, watch, turns=False)
             yield step
-            seen = step.after
-            if seen.status is not PlantStatus.HELD or progress.halt is not None:
+            seen, left = step.after, left - 1
+            if seen.status is PlantStatus.LOST or progress.halt is not None:
                 return seen, weak
         return seen, ""
 
@@ -251,9 +252,9 @@ class ClosedLoop:
             began = time.perf_counter()
             decision = self.controller.decide(seen.state, seen.a, progress.target, seen.fingertip_force)
             seconds = time.perf_counter() - began
-            sign = progress.sign(seen, decision) or watch.slid or watch.grip.sign
+            sign = progress.sign(seen, decision)
             if not sign or looks == 0 or seen.status is not PlantStatus.HELD:
-                return seen, decision, sign, seconds
+                return seen, decision, sign or watch.slid or watch.grip.sign, seconds
             seen, looks = watch.rest(seen, self.plant.observe()), looks - 1
 
     def _go_back(
@@ -295,12 +296,12 @@ class ClosedLoop:
         report, lin, expected = None, decision.linearization, verdict.expected
         if lin is not None and expected is not None and after.status is PlantStatus.HELD:
             felt = watch.grip.surprise(lin, seen, expected.moved, after)
-            if decision.share > 0:
-                watch.grip.follow(decision, felt)
+            # what a guard objects to may be a faulty pad
+            fades = decision.share > 0 and not verdict.note and watch.grip.follow(decision, felt)
             if verdict.teaches and self.learn:
-                report = self._learn(seen, decision, lin, increment, expected, felt)
-            if watch.grip.slows:
-                self.controller.pace.judge(math.inf)
+                report = self._learn(seen, decision, lin, increment, expected, felt, fades)
+            if turns and decision.share > 0 and self._slides(lin, seen, increment, expected):
+                self.controller.tighter += self.safety.caution.slip
         seconds += time.perf_counter() - began
         if turns:
             progress.add(after, blind=watch.blind > 0)
@@ -314,21 +315,36 @@ class ClosedLoop:
         ds: Tensor,
         expected: Expectation,
         felt: ForceSurprise | None,
+        fades: bool,
     ) -> UpdateReport | None:
         enhanced = self.controller.enhanced
         if enhanced is None:
             return None
         if not self.knowledge.servo.learns:  # then the dead zones are g's to learn
             expected = self.controller.expect(lin, decision.delta_a)
-        lever = float((lin.contacts.point - seen.position).square().sum(-1).mean().sqrt())
         if felt is not None:
             self._learn_forces(lin, expected.moved, felt)
-        trust = self.controller.pace.options.trust
-        rho = trust.disagreement(expected.increment[-6:], ds[-6:], lever, felt)
+        rho = math.inf if fades else self._disagreement(lin, seen, ds, expected, felt)
         self.controller.pace.judge(rho, decision.share)
-        if decision.share > 0 and trust.disagreement(expected.increment[-6:], ds[-6:], lever) > SLIDES:
-            self.controller.tighter += self.safety.caution.slip  # it slides, or turns out of the grip
         return enhanced.update(seen.state, expected.moved, ds, expected.nominal)
+
+    def _disagreement(
+        self,
+        lin: Linearization,
+        seen: Observation,
+        ds: Tensor,
+        expected: Expectation,
+        felt: ForceSurprise | None = None,
+    ) -> float:
+        """rho of a motion, see :class:`~torch_ekm.control.TrustRegion`."""
+        lever = float((lin.contacts.point - seen.position).square().sum(-1).mean().sqrt())
+        trust = self.controller.pace.options.trust
+        return trust.disagreement(expected.increment[-6:], ds[-6:], lever, felt)
+
+    def _slides(self, lin: Linearization, seen: Observation, ds: Tensor, expected: Expectation) -> bool:
+        """The object moved otherwise than an E-KM predicted: it slides, or turns out of the grip."""
+        learns = self.controller.enhanced is not None
+        return learns and self._disagreement(lin, seen, ds, expected) > SLIDES
 
     def _learn_forces(self, lin: Linearization, moved: Tensor, felt: ForceSurprise) -> None:
         """Pads that touched and measured before and after teach how their forces answer."""

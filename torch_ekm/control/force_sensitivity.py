@@ -25,7 +25,7 @@ class ForceSensitivity(Recorded, nn.Module):
         B <- B + r k',  k = P w / s^2,  P = (D / s^2 + I / 20^2)^-1
         s^2 <- .9 s^2 + .1 max(r^2 - w' P w, .25^2)      what B does not explain: a pad that rubs teaches less
 
-    All pads share D. B belongs to the hand: it is kept from grasp to grasp.
+    B belongs to the hand: it is kept from grasp to grasp.
 
     Args:
         n_pads, n_a: contact pads and actuators of the hand.
@@ -37,8 +37,8 @@ class ForceSensitivity(Recorded, nn.Module):
         super().__init__()
         self.correction = nn.Buffer(torch.zeros(n_pads, n_a, dtype=torch.float64))
         """B [N/rad]."""
-        self.evidence = nn.Buffer(torch.zeros(n_a, n_a, dtype=torch.float64))
-        """D, of the motions [rad^2]."""
+        self.evidence = nn.Buffer(torch.zeros(n_pads, n_a, n_a, dtype=torch.float64))
+        """D, of the motions that each pad measured [rad^2]."""
         self.variance = nn.Buffer(torch.full((n_pads,), _NOISE_STD**2, dtype=torch.float64))
         """s^2 of each pad [N^2]."""
 
@@ -51,7 +51,7 @@ class ForceSensitivity(Recorded, nn.Module):
     @property
     def _covariance(self) -> Tensor:
         """P of each pad ``(n_pads, n_a, n_a)``."""
-        prior = torch.eye(len(self.evidence), dtype=torch.float64) / _PRIOR_STD**2
+        prior = torch.eye(self.correction.shape[-1], dtype=torch.float64) / _PRIOR_STD**2
         return torch.linalg.inv(self.evidence / self.variance[:, None, None] + prior)
 
     @torch.no_grad()
@@ -88,9 +88,9 @@ class ForceSensitivity(Recorded, nn.Module):
         doubt = (self._covariance @ w) @ w  # w' P w
         spread = (self.variance + doubt).sqrt()
         Dw = self.evidence @ w
-        if float(w @ Dw) > 0:
-            self.evidence -= (1 - _FORGETTING) * torch.outer(Dw, Dw) / (w @ Dw)
-        self.evidence += torch.outer(w, w)
+        seen = (Dw @ w).clamp(min=torch.finfo(w.dtype).tiny)[:, None, None]
+        forgotten = (1 - _FORGETTING) * Dw[:, :, None] * Dw[:, None, :] / seen
+        self.evidence[known] += (torch.outer(w, w) - forgotten)[known]
         gain = self._covariance @ w / self.variance[:, None]
         bounded = r.clamp(-_CLIP * spread, _CLIP * spread)
         self.correction[known] += bounded[known, None] * gain[known]

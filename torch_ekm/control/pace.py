@@ -156,6 +156,8 @@ class ForceSurprise(NamedTuple):
     """[N]"""
     surprise: Float[Tensor, " n_c"]
     """Measured less predicted [N]; NaN where a pad does not measure, or has let go."""
+    gone: Tensor
+    """Which pads measured before the motion, and do not now ``(n_c,)``."""
 
     @property
     def z(self) -> Tensor:
@@ -165,7 +167,7 @@ class ForceSurprise(NamedTuple):
     @property
     def wrong(self) -> bool:
         """Some pad measured what was not predicted, or has let go."""
-        return bool((self.z.abs() > _DISAGREE).any() or self.surprise.isnan().any())
+        return bool((self.z.abs() > _DISAGREE).any() or self.gone.any())
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ class GripForceTask:
     def wanted(self, kinematic: Linearization, seen: Situation) -> float:
         """f, of the finger that opposes the others [N]."""
         if self.force is not None:
-            return self.force + seen.tighter
+            return min(self.force + seen.tighter, max(self.force, self.most))
         contacts = kinematic.contacts
         mu = max(float(contacts.friction.mean()), 1e-3)
         turning = seen.focus.matrix[seen.focus.matrix[:, 3:].abs().sum(-1) > 0]

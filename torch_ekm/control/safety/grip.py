@@ -39,10 +39,10 @@ class GripWatch:
             return None
         pads = self.model.hand.pad_indices(lin.contacts.finger)
         before, now = seen.fingertip_force[pads], after.fingertip_force[pads]
-        # a pad that reads so little may be dead, or has let go
-        measured = torch.minimum(before, now) >= self._least
+        touched, touches = before >= self._least, now >= self._least  # one that reads less may be dead
         surprise = now - before - lin.normal_force_sensitivity @ moved
-        return ForceSurprise(tuple(pads), before, now, surprise.where(measured, torch.nan))
+        surprise = surprise.where(touched & touches, torch.nan)
+        return ForceSurprise(tuple(pads), before, now, surprise, touched & ~touches)
 
     def weak(self, decision: Decision) -> str:
         """Fingers that bear less than the object needs; empty: none."""
@@ -61,24 +61,21 @@ class GripWatch:
         ]
         return ", ".join(weak)
 
-    def follow(self, decision: Decision, forces: ForceSurprise | None) -> None:
-        """Remember a motion."""
+    def follow(self, decision: Decision, forces: ForceSurprise | None) -> bool:
+        """Remember a motion; whether a finger has faded for two motions."""
         if forces is None or decision.grip is None:
-            return
-        pads = list(forces.pads)
-        gone = (forces.before >= self._least) & (forces.after < self._least)
+            return False
         least, std = decision.grip.least, decision.grip.std
-        fades = gone | ((forces.surprise < -torch.clamp(_DOUBT * std, min=_FADES)) & (forces.after < least))
-        self._faded[pads] = torch.where(fades, self._faded[pads] + 1, 0)
+        fades = (forces.surprise < -torch.clamp(_DOUBT * std, min=_FADES)) & (forces.after < least)
+        faded, pads = torch.zeros_like(self._faded), list(forces.pads)
+        silent = forces.surprise.isnan() & ~forces.gone & (self._faded[pads] > 0)  # it has let go before
+        faded[pads] = torch.where(fades | forces.gone | silent, self._faded[pads] + 1, 0)
+        self._faded = faded
+        return bool((faded >= _SLOWS).any())
 
     def forget(self) -> None:
-        """The hand has gone back."""
+        """The hand has gone back, or begins."""
         self._faded.zero_()
-
-    @property
-    def slows(self) -> bool:
-        """A finger has faded for two motions."""
-        return bool((self._faded >= _SLOWS).any())
 
     @property
     def sign(self) -> str:

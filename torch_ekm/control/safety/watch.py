@@ -100,6 +100,7 @@ class Watch:
         Args:
             stuck: which actuators the servo model calls so.
         """
+        self.slid = ""
         seen, last, doubt, expected = after, None, None, None
         for left in range(self.guards.looks, -1, -1):
             if seen.status is PlantStatus.LOST:
@@ -113,7 +114,7 @@ class Watch:
         if doubt is not None and not (doubt.blind or doubt.gated):
             if doubt.reason is StopReason.POSE_JUMP:
                 self.slid = self._slid(decision, before, expected, last, seen)
-            if not self.slid:
+            if not self.slid:  # empty but for a pose that jumps
                 return Verdict(seen, False, doubt, "", expected)
             doubt = doubt._replace(gated=True, message=self.slid)
         if doubt is not None and doubt.gated and (last is None or not agree(last, seen, self.guards)):

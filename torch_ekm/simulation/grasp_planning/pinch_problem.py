@@ -285,7 +285,7 @@ class PinchProblem:
         T = self.transmission
         stretch = T.stretched(np.where(self.in_use, self.tension(g), 0.0))
         inner = g.q + T.lean(g.torque)
-        return T.offset + T.shape.excursion(inner) @ T.J_a.T + np.where(self.in_use, stretch, 0.0)
+        return T.offset + T.shape.excursion(inner) @ T.J_a.T + stretch
 
     def outside(self, g: PinchGeometry) -> Array:
         """How far each motor in use is beyond its range ``(b, n)`` [rad]; negative: inside."""

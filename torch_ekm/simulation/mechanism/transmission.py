@@ -10,6 +10,7 @@ from .departures import CableLosses, JointShape
 
 _COUPLING_STIFFNESS = 8.0  # k_c [N m/rad]
 _BRISTLE_STIFFNESS = 3.0  # k_f [N m/rad]
+_LEANS = 5e-3  # [N m] from which a joint with play is at its end; smooth, as a planner needs it
 _STIFF = 20.0  # [N m/rad] at a joint; up to here the late part damps little
 
 
@@ -79,7 +80,6 @@ class Transmission:
         self.stiff = bool((stiffness[:, None] * self.J_a**2).max() > _STIFF)
         """Some actuator is: :meth:`drive_targets` takes the joints as they will be after the step."""
         self._compliance = self.losses.compliance(stiffness)
-        self._K = np.linalg.inv(self._compliance) if self.losses.coupling > 0 else None
         steep = self._k.copy()
         steep[: self.n_a] *= self.losses.steepening
         size = np.abs(self._M)
@@ -112,15 +112,25 @@ class Transmission:
         return np.where(self._pulls_only[: self.n_a], np.maximum(torque, 0.0), torque)
 
     def _pull(self, stretch: Array) -> Array:
-        return self.stiffness * stretch if self._K is None else self._K @ stretch
+        """Torque of each actuator; of coupled ones, of those that are taut."""
+        if self.losses.coupling == 0:
+            return self.stiffness * stretch
+        taut = np.ones(self.n_a, dtype=bool)
+        while True:
+            torque = np.zeros(self.n_a)
+            torque[taut] = np.linalg.solve(self._compliance[np.ix_(taut, taut)], stretch[taut])
+            slack = taut & self._pulls_only[: self.n_a] & (torque < 0)
+            if not slack.any():
+                return torque
+            taut &= ~slack
 
     def stretched(self, torque: Array) -> Array:
         """Stretch at which the actuators give such torques ``(*batch, n_a)`` [rad], without hysteresis."""
         return torque @ self._compliance
 
     def lean(self, load: Array) -> Array:
-        """How far transmissions are ahead of joints that bear ``load`` [N m], ``(*batch, n_q)`` [rad]."""
-        return np.clip(load / self._turned, -self.losses.play / 2, self.losses.play / 2)
+        """How far transmissions at rest are ahead of joints under ``load`` [N m], ``(*batch, n_q)`` [rad]."""
+        return self.losses.play / 2 * np.clip(load / _LEANS, -1.0, 1.0)
 
     def spring_torque(self, q: Array) -> Array:
         """``k x (1 + s x^2)``, ``x = q - q0``: what the springs oppose ``(*batch, n_q)`` [N m]."""
@@ -144,7 +154,8 @@ class Transmission:
         torque = cables - self.spring_torque(inner)
         if self.losses.any_play:
             whole = torque + self._turned * self._lean
-            self._lean = self.lean(whole)
+            half = self.losses.play / 2
+            self._lean = np.clip(whole / self._turned, -half, half)
             torque = whole - self._turned * self._lean
         # the anchor follows where the bristle would carry more than friction
         most = self.friction + self.losses.capstan * np.abs(cables)
@@ -175,9 +186,10 @@ class Transmission:
         """Go on from another transmission without a jolt: each actuator turns its joints as hard as
         before, ``J^T k s = J_o^T k_o s_o``, which says how much the new tendon is stretched."""
         along = np.einsum("aq,aq->a", self._lead, other._lead) / np.einsum("aq,aq->a", self._lead, self._lead)
-        stretch = other.stretch(q, motor) * along * other.stiffness / self.stiffness
+        stretch = self.stretched(along * other._pull(other.stretch(q, motor)))
         self.offset = motor - self._lead @ self.shape.excursion(q) - stretch
-        self._anchor, self._lean, self._bent = other._anchor, other._lean, None
+        half = self.losses.play / 2
+        self._anchor, self._lean, self._bent = other._anchor, np.clip(other._lean, -half, half), None
 
 
 def coupled_posture(coupling: Array) -> Array:

@@ -82,8 +82,9 @@ class Rig:
         obj, step = true_object(self.obj, p), self.config.time_step
         self.scene = HandScene(self.hand, obj, step, p.contact_stiffness)
         thumb, _ = opposing_pads(self.hand, self.config)
-        finger = self._finger_of[next(pad.link for pad in self.hand.pads if pad.name == thumb)]
-        self.scene.oppose({link for link, root in self._finger_of.items() if root == finger})
+        pad = next(pad.link for pad in self.hand.pads if pad.name == thumb)
+        finger = self._finger_of.get(pad)  # None: a part of the palm
+        self.scene.oppose({pad} | {link for link, root in self._finger_of.items() if root == finger})
         self._set_friction()
         self.scene.set_link_weight(p.link_weight)
         self._built_scale = p.object_scale
@@ -211,17 +212,9 @@ class Rig:
 
 
 _TRANSMISSION = (
-    *(
-        "moment_arm",
-        "spring",
-        "servo_stiffness",
-        "joint_friction",
-        "tendon_creep",
-        "arm_variation",
-        "arm_phase",
-    ),
-    *("spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling", "joint_play", "hardware_seed"),
-)
+    "moment_arm", "spring", "servo_stiffness", "joint_friction", "tendon_creep", "arm_variation", "arm_phase",
+    "spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling", "joint_play", "hardware_seed",
+)  # fmt: skip
 
 
 def _differ(old: PlantParameters, new: PlantParameters, *names: str) -> bool:
