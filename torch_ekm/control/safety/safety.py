@@ -107,7 +107,7 @@ class Caution:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not value >= 0:
+            if name != "link_gap" and not value >= 0:  # a link may overlap by so much
                 raise ParameterError(name, value, "0 or more")
 
 
