@@ -223,7 +223,7 @@ class Survey:
         ends.set_xlim(0, 100)
         motions.set_xlabel("motions of a turn that reached the target")
         motions.set_xlim(0, None)
-        motions.legend(loc="lower right", frameon=True, fontsize=8)
+        motions.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False, fontsize=8)
         return figure
 
     def report(self, folder: Path) -> Report:
