@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 
 import torch
@@ -30,6 +31,27 @@ class FakePlant:
 
     def close(self) -> None:
         self.closed = True
+
+
+class HoldingPlant(FakePlant):
+    """Encoders obey; joints and object stay, but for a hair in each reading: no sensor is frozen."""
+
+    def __init__(self, seen: Observation) -> None:
+        super().__init__()
+        self.seen = seen
+        self.commands: list[torch.Tensor] = []
+        self.looks = 0
+
+    def reading(self, **changes: torch.Tensor) -> Observation:
+        """The next one, with what a subclass changes."""
+        self.looks += 1
+        hair, time = 1e-9 * self.looks, self.seen.time + len(self.commands)
+        still = {"q": self.seen.q + hair, "position": self.seen.position + hair}
+        return dataclasses.replace(self.seen, **still, **changes, time=time, stamps=None)
+
+    def move(self, delta_a: torch.Tensor) -> None:
+        self.commands.append(delta_a)
+        self.seen = dataclasses.replace(self.seen, a=self.seen.a + delta_a)
 
 
 class ScriptedPlant(FakePlant):

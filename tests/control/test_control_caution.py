@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from fakes import FakePlant
+from fakes import HoldingPlant
 
 from torch_ekm.control import (
     Caution,
@@ -36,26 +36,16 @@ DEG = math.pi / 180
 RULE = StoppingRule(max_steps=20)
 
 
-class Sliding(FakePlant):
-    """Encoders obey; joints and object stay, but for what ``off`` says of each observation after a motion."""
+class Sliding(HoldingPlant):
+    """The object stays, but for what ``off`` says of each observation after a motion."""
 
     def __init__(self, seen: Observation, across: torch.Tensor, off: list[float]) -> None:
-        super().__init__()
-        self.seen, self.across, self.off = seen, across, off
-        self.commands: list[torch.Tensor] = []
-        self.looks = 0
+        super().__init__(seen)
+        self.across, self.off = across, off
 
     def observe(self) -> Observation:
-        self.looks += 1
         angle = self.off[min(len(self.commands), len(self.off) - 1)] * DEG
-        o, q = self.seen.position + 1e-9 * self.looks, self.seen.q + 1e-9 * self.looks
-        time = self.seen.time + len(self.commands)
-        R = exp(angle * self.across) @ self.seen.rotation
-        return dataclasses.replace(self.seen, q=q, position=o, rotation=R, time=time, stamps=None)
-
-    def move(self, delta_a: torch.Tensor) -> None:
-        self.commands.append(delta_a)
-        self.seen = dataclasses.replace(self.seen, a=self.seen.a + delta_a)
+        return self.reading(rotation=exp(angle * self.across) @ self.seen.rotation)
 
 
 @pytest.fixture(scope="module")

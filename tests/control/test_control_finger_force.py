@@ -8,7 +8,7 @@ from unittest.mock import MagicMock
 
 import pytest
 import torch
-from fakes import FakePlant
+from fakes import FakePlant, HoldingPlant
 
 from torch_ekm.control import (
     Caution,
@@ -33,30 +33,18 @@ DEG = torch.pi / 180
 SAFETY = Safety(StoppingRule(max_steps=12))
 
 
-class Pads(FakePlant):
-    """Encoders obey, the object turns as it should; after each command the pads read what ``force`` says."""
+class Pads(HoldingPlant):
+    """After each command the pads read what ``force`` says; the object is turned by ``turn``."""
 
-    def __init__(self, seen: Observation, model: KinematicModel, force) -> None:
-        super().__init__()
-        self.seen, self.model, self.force = seen, model, force
-        self.commands: list[torch.Tensor] = []
+    def __init__(self, seen: Observation, force) -> None:
+        super().__init__(seen)
+        self.force = force
         self.turn = torch.zeros(3, dtype=torch.float64)
-        self.looks = 0
 
     def observe(self) -> Observation:
-        self.looks += 1
         felt = self.seen.fingertip_force.clone()
         felt[:3] = torch.as_tensor(self.force(len(self.commands)), dtype=torch.float64)
-        away = 1e-9 * self.looks
-        R = exp(self.turn) @ self.seen.rotation
-        return dataclasses.replace(
-            self.seen, q=self.seen.q + away, position=self.seen.position + away, rotation=R,
-            fingertip_force=felt, time=self.seen.time + len(self.commands), stamps=None,
-        )  # fmt: skip
-
-    def move(self, delta_a: torch.Tensor) -> None:
-        self.commands.append(delta_a)
-        self.seen = dataclasses.replace(self.seen, a=self.seen.a + delta_a)
+        return self.reading(rotation=exp(self.turn) @ self.seen.rotation, fingertip_force=felt)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +56,7 @@ def held():
 
 def turned(held, force, safety: Safety = SAFETY):
     plant, model, seen = held
-    pads = Pads(seen, model, force)
+    pads = Pads(seen, force)
     loop = ClosedLoop(pads, LookAndMoveController(model, plant.rotation_axis), safety=safety)
     return loop.run(PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0)), pads, loop
 
@@ -129,7 +117,7 @@ def test_a_finger_that_fades_twice_slows_the_pace(held) -> None:
         enhanced = EnhancedModel.for_grasp(model, seen.state)
         pace = Pace(PaceOptions(trust=TrustRegion(smallest=0.01)))
         controller = LookAndMoveController(enhanced, plant.rotation_axis, pace=pace)
-        loop = ClosedLoop(Pads(seen, model, lambda n, f=force: [5.0, 2.5, f[min(n, 2)]]), controller)
+        loop = ClosedLoop(Pads(seen, lambda n, f=force: [5.0, 2.5, f[min(n, 2)]]), controller)
         steps = loop.steps(PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0))
         next(steps)
         judge = controller.pace.judge
@@ -162,7 +150,7 @@ def test_a_pose_that_jumps_while_the_grip_changes_is_the_objects_and_the_hand_go
                 super().move(delta_a)
                 self.turn = (len(self.commands) == 2) * 65 * DEG * plant.rotation_axis
 
-        pads = Jumps(seen, model, lambda n, f=force: f if n == 2 else [5.0, 2.5, 2.5])
+        pads = Jumps(seen, lambda n, f=force: f if n == 2 else [5.0, 2.5, 2.5])
         loop = ClosedLoop(pads, LookAndMoveController(model, plant.rotation_axis), safety=safety)
         done = loop.run(PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0))
         reasons.append((done.reason is Reason.POSE_JUMP, any(step.retreat for step in done.steps)))

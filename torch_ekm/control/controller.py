@@ -179,11 +179,9 @@ class LookAndMoveController:
         travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
         desired, share = self.pace.ask(focused, travel)
         alone = None if fingertip_force is None else self._joint_force(lin)
-        deviation = None if self.forces is None else self.forces.variance.sqrt()
         seen = Situation(
-            hand, self.focus, state, a, fingertip_force, error, desired, alone, self._weight, self.tighter,
-            force_std=deviation,
-        )  # fmt: skip
+            hand, self.focus, state, a, fingertip_force, error, desired, alone, self._weight, self.tighter
+        )
         grips = (task.wanted(lin, seen) for task in self.tasks if isinstance(task, GripForceTask))
         seen = dataclasses.replace(seen, grip=next(grips, None))
         try:
@@ -209,8 +207,10 @@ class LookAndMoveController:
         least = next((limit for limit in self.limits if isinstance(limit, NormalForceLimit)), None)
         if f_n is None or least is None:
             return None
-        figures = f_n, least.least(f_n, seen), seen.contact_force_std(lin)
-        return Grip(*(torch.from_numpy(figure) for figure in figures))
+        force, needed = torch.from_numpy(f_n), torch.from_numpy(least.least(f_n, seen))
+        if self.forces is None:
+            return Grip(force, needed, torch.zeros_like(force))
+        return Grip(force, needed, self.forces.variance.sqrt()[seen.hand.pad_indices(lin.contacts.finger)])
 
     def _none(self, status: StopReason, failure: EKMError, focused: Tensor) -> Decision:
         """No motion, and why."""

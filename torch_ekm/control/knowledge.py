@@ -15,7 +15,8 @@ from .force_sensitivity import ForceSensitivity
 
 
 class HandKnowledge(Recorded, nn.Module):
-    """What a closed loop has learned of its hand, whatever it holds: dead zones and biases of the servos.
+    """What a closed loop has learned of its hand, whatever it holds: dead zones and biases of the servos, and
+    how the forces of the fingers answer to them.
 
     Hand it to the next loop with the same hand, and keep it between sessions::
 

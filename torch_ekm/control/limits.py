@@ -100,6 +100,7 @@ class NormalForceLimit:
     minimum: float = 0.8
     """[N]"""
     share: float = 0.4
+    """Of the force that is wanted of a finger."""
     step: float = 0.7
     """At most this much of what is missing, or too much, is asked for in one step [N]."""
     maximum: float = 10.0

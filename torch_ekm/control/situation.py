@@ -41,8 +41,6 @@ class Situation:
     """Wanted on top of the grip that suits the object [N]."""
     grip: float | None = None
     """Wanted of the finger that opposes the others, see :class:`GripForceTask` [N]; None: nothing."""
-    force_std: Float[Tensor, " n_pads"] | None = None
-    """How far the prediction of each pad's force is off [N]; None: unknown."""
 
     def normal_force(self, kinematic: Linearization) -> Array | None:
         """``f_n`` of each contact [N]: as its pad measures it, or else as the model estimates it.
@@ -54,12 +52,6 @@ class Situation:
             return estimated
         measured = as_array(self.fingertip_force)[self.hand.pad_indices(kinematic.contacts.finger)]
         return np.where(np.isnan(measured), 0.0 if estimated is None else estimated, measured)
-
-    def contact_force_std(self, kinematic: Linearization) -> Array:
-        """How far the prediction of each contact's force is off ``(n_c,)`` [N]; 0 where nobody knows."""
-        if self.force_std is None:
-            return np.zeros(kinematic.contacts.n_c)
-        return as_array(self.force_std)[self.hand.pad_indices(kinematic.contacts.finger)]
 
 
 def grip_shares(f_n: Array, grip: float) -> Array:

@@ -46,7 +46,10 @@ _FIGURES: dict[str, tuple[Any, Any, Any]] = {  # nominal, worn, hostile
     "frame_loss": (0.0, 0.02, 0.1),
     "stuck_joints": ((), (), ("index_3",)),
 }
-_NOMINAL = PlantParameters(**{key: levels[0] for key, levels in _FIGURES.items()})
+_USED = {
+    name: PlantParameters(**{key: levels[k] for key, levels in _FIGURES.items()})
+    for k, name in enumerate(("nominal", "worn", "hostile"))
+}
 # "odd_1" to "odd_5": used hands that are of another kind than their description, mixtures of what others
 # than ours may be. Strengths are those of the families in docs/benchmarks/any_hand.md.
 _ODD: tuple[dict[str, Any], ...] = (
@@ -61,14 +64,11 @@ _ODD: tuple[dict[str, Any], ...] = (
     },
 )  # fmt: skip
 #: Name -> parameters: "none", "nominal", "worn", "hostile" and "odd_1" to "odd_5".
-PRESETS = (
-    {"none": PlantParameters(), "nominal": _NOMINAL}
-    | {
-        name: PlantParameters(**{key: levels[k] for key, levels in _FIGURES.items()})
-        for k, name in ((1, "worn"), (2, "hostile"))
-    }
-    | {f"odd_{k}": _NOMINAL.replace(**figures) for k, figures in enumerate(_ODD, 1)}
-)
+PRESETS = {
+    "none": PlantParameters(),
+    **_USED,
+    **{f"odd_{k}": _USED["nominal"].replace(**figures) for k, figures in enumerate(_ODD, 1)},
+}
 
 
 def preset(name: str) -> PlantParameters:

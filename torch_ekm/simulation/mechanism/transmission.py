@@ -142,7 +142,7 @@ class Transmission:
         A slack tendon takes its stiffness with it: the target then undoes the drive's share.
         """
         inner = q + self._lean
-        stretch = motor - self.offset - self._lead @ self.shape.excursion(inner)
+        stretch = self.stretch(inner, motor)
         pull = self._pull(stretch)
         if self.losses.hysteresis > 0:
             pull = pull + self._hysteresis(stretch)
