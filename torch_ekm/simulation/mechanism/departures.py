@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,17 +42,25 @@ class JointShape:
         """Largest ``d(x + s x^3)/dx`` up to ``farthest`` from the rest ``(n_q,)``."""
         return np.maximum(1.0, 1 + 3 * self.stiffening * farthest**2)
 
+    @functools.cached_property
+    def _round(self) -> bool:
+        return not self.variation.any()
+
     def excursion(self, q: Array) -> Array:
-        """h(q) ``(*batch, n_q)`` [rad]."""
+        """h(q) ``(*batch, n_q)`` [rad]; with round pulleys q itself."""
+        if self._round:  # asked at every time step
+            return q
         return q - 0.5 * self.variation * (np.cos(2 * q + self.phase) - np.cos(self.phase))
 
     def arm(self, q: Array) -> Array:
         """h'(q) ``(*batch, n_q)``."""
+        if self._round:
+            return np.ones_like(q)
         return 1 + self.variation * np.sin(2 * q + self.phase)
 
     def spring(self, x: Array) -> Array:
-        """``x (1 + s x^2)`` ``(*batch, n_q)`` [rad]."""
-        return x * (1 + self.stiffening * x**2)
+        """``x (1 + s x^2)`` ``(*batch, n_q)`` [rad]; of a linear spring x itself."""
+        return x if self.stiffening == 0 else x * (1 + self.stiffening * x**2)
 
 
 @dataclass(frozen=True)
@@ -79,7 +88,7 @@ class CableLosses:
         """No losses."""
         return cls(0.0, 0.0, 0.0, np.zeros(n_q))
 
-    @property
+    @functools.cached_property
     def any_play(self) -> bool:
         """Some joint has play."""
         return bool(self.play.any())

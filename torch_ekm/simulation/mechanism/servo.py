@@ -80,5 +80,5 @@ class Servo:
         """Turn the motors to ``motor``; returns where the tendons are then fixed (after the play)."""
         self.encoder = np.array(motor, dtype=np.float64)
         play = (self.described_backlash + self._p.backlash) / 2
-        self.output = np.clip(self.output, self.encoder - play, self.encoder + play)
+        self.output = np.minimum(np.maximum(self.output, self.encoder - play), self.encoder + play)
         return self.output

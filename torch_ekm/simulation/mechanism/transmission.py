@@ -77,6 +77,7 @@ class Transmission:
         self.losses = CableLosses.none(hand.n_q) if losses is None else losses
         rubs = (self.friction > 0) | ((self.losses.capstan > 0) & self._lead.any(axis=0))
         self._k_f = np.where(rubs, _BRISTLE_STIFFNESS, 0.0)
+        self._bends = self._reach(self.friction)
         self.stiff = bool((stiffness[:, None] * self.J_a**2).max() > _STIFF)
         """Some actuator is: :meth:`drive_targets` takes the joints as they will be after the step."""
         self._compliance = self.losses.compliance(stiffness)
@@ -158,11 +159,15 @@ class Transmission:
             self._lean = np.clip(whole / self._turned, -half, half)
             torque = whole - self._turned * self._lean
         # the anchor follows where the bristle would carry more than friction
-        most = self.friction + self.losses.capstan * np.abs(cables)
-        reach = np.divide(most, self._k_f, out=np.zeros_like(most), where=self._k_f > 0)
-        slip = np.clip(q - self._anchor, -reach, reach)
+        capstan = self.losses.capstan
+        reach = self._reach(self.friction + capstan * np.abs(cables)) if capstan > 0 else self._bends
+        slip = np.minimum(np.maximum(q - self._anchor, -reach), reach)  # np.clip takes twice as long
         self._anchor = q - slip
         return q + (torque - self._k_f * slip) / self.drive_stiffness
+
+    def _reach(self, friction: Array) -> Array:
+        """How far a bristle bends until it carries the friction torque ``(n_q,)`` [rad]."""
+        return np.divide(friction, self._k_f, out=np.zeros_like(friction), where=self._k_f > 0)
 
     def _hysteresis(self, stretch: Array) -> Array:
         """What the transmissions hold against their motion ``(n_a,)`` [N m]."""
