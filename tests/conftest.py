@@ -9,6 +9,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import annotations as shapes  # beside this file
 import hypothesis
 import jaxtyping
+import pinches  # beside this file
 import pytest
 import torch
 
@@ -26,6 +27,10 @@ hypothesis.settings.load_profile("repeatable")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--device", default="cpu", help="device on which the learners' tests run")
+
+
+def pytest_collection_finish() -> None:
+    pinches.install()
 
 
 @pytest.fixture
@@ -51,3 +56,9 @@ def unchecked(_checks_begin_again):
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
+def planned_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No pinch comes from an earlier grasp: the test compares a run with its repetition."""
+    monkeypatch.setattr(pinches, "remembers", False)

@@ -390,6 +390,7 @@ def test_command_refuses_clearly(tmp_path: Path) -> None:
     assert not Path("compare_output").exists()
 
 
+@pytest.mark.usefixtures("planned_anew")
 def test_simulated_hand_repeats_bit_by_bit() -> None:
     pytest.importorskip("sapien")
     from torch_ekm.experiments.learner_comparison.simulated_stream import record_simulated_hand

@@ -119,6 +119,7 @@ def run(plant, seed):
     return torch.cat([torch.cat(part) for part in parts])
 
 
+@pytest.mark.usefixtures("planned_anew")
 @pytest.mark.parametrize("parameters", [preset("none"), preset("nominal")])
 def test_one_seed_gives_one_run_bit_by_bit(parameters):
     first, second = (SimulatedHand("icub_right", "box", parameters=parameters) for _ in range(2))

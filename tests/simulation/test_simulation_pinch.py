@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from torch_ekm.simulation.mechanism.assembly import make_transmission
 G = 9.81
 
 
+@functools.cache  # two tests look at the same plans
 def plan_for(name, request=None, **changes):
     hand, obj = load_hand("icub_right"), load_object(name)
     parameters = PlantParameters(**changes)

@@ -68,6 +68,7 @@ def test_a_trial_says_all_about_itself(unbroken):
     assert entry == TrialEntry(2, 2, 2, round(last.time, 6), "held", "done")
 
 
+@pytest.mark.usefixtures("planned_anew")
 def test_one_configuration_gives_one_log_byte_by_byte(unbroken, tmp_path):
     run(tmp_path, 4)
     assert digests(tmp_path) == digests(unbroken)
