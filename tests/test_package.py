@@ -92,16 +92,12 @@ def test_the_front_door_needs_torch_and_numpy_only() -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("room", ["plant", "sensing", "simulation", "rendering", "interop"])
-def test_rooms_ask_for_their_extras_when_they_need_them(room: str) -> None:
-    code = _LIGHT + f"import torch_ekm.{room}"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-
-
-def test_adapters_name_the_extra_when_they_are_made() -> None:
-    made = """
+_ROOMS = """
+import importlib
 from torch_ekm.exceptions import MissingExtraError
+
+for room in ("plant", "sensing", "simulation", "rendering", "interop"):
+    importlib.import_module(f"torch_ekm.{room}")
 from torch_ekm.interop import GPyTorchSVGP, RiverResidual
 
 for kind in (GPyTorchSVGP, RiverResidual):
@@ -112,20 +108,36 @@ for kind in (GPyTorchSVGP, RiverResidual):
         continue
     raise AssertionError(kind)
 """
-    done = subprocess.run([sys.executable, "-c", _LIGHT + made], capture_output=True, text=True, check=False)
+
+
+def test_rooms_and_their_adapters_ask_for_their_extras_when_they_need_them() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _LIGHT + _ROOMS], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
 
 
 _PLOTS = ("matplotlib", "scipy", "jinja2", "typer", "rich")
 _HEAVY = {"sapien", "vtk", "pyvista", "h5py", "viser", "qpsolvers", "trimesh", "cv2"}
-_COMMAND = f"""
+_COMMANDS = f"""
 import sys
 from torch_ekm.cli import main
 
-try:
-    main()
-finally:
-    assert not {_HEAVY} & {{name.partition('.')[0] for name in sys.modules}}
+def run(*arguments):
+    print("$", *arguments, flush=True)
+    sys.argv = ["torch-ekm", *arguments]
+    try:
+        main()
+    except SystemExit as end:
+        return end.code or 0
+    return 0
+
+learners = ("--learners", "linear RLS,model alone", "--limit", "45", "--out", "out")
+assert run("compare", "--data", "one.csv", "--data", "two.csv", *learners) == 0
+assert run("notebooks", "--copy", "copies") == 0
+assert run("--version") == 0
+assert run("demo") == 1
+assert not {_HEAVY} & {{name.partition('.')[0] for name in sys.modules}}
 """
 
 
@@ -134,24 +146,16 @@ def test_the_command_line_compares_and_copies_with_the_extra_plots_alone(tmp_pat
     rows = ["a,b,y", *(f"{k % 7},{k % 11},{k % 7 + k % 11}" for k in range(50))]
     for name in ("one", "two"):
         (tmp_path / f"{name}.csv").write_text("\n".join(rows))
-
-    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        light = _LIGHT.replace('("scipy", ', "(")  # which this extra brings
-        code = light.replace("ALSO = ()", f"ALSO = {_PLOTS}") + _COMMAND
-        command = [sys.executable, "-c", code, *arguments]
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-
-    learners = ("--learners", "linear RLS,model alone", "--limit", "45", "--out", "out")
-    done = run("compare", "--data", "one.csv", "--data", "two.csv", *learners)
+    light = _LIGHT.replace('("scipy", ', "(")  # which this extra brings
+    code = light.replace("ALSO = ()", f"ALSO = {_PLOTS}") + _COMMANDS
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "On the first 45 of 50 rows" in done.stdout
+    compared, copied_and_told = done.stdout.split("$ notebooks")
+    assert "On the first 45 of 50 rows" in compared
     assert (tmp_path / "out" / "index.html").is_file()
-    done = run("notebooks", "--copy", "copies")
-    assert done.returncode == 0, done.stderr
     assert len(list((tmp_path / "copies").glob("*.ipynb"))) >= 6
-    assert "torch-ekm" in run("--version").stdout
-    done = run("demo")
-    assert done.returncode == 1
+    assert "torch-ekm" in copied_and_told.split("$ --version")[1]
     assert "pip install 'torch_ekm[experiments]'" in done.stderr
 
 

@@ -23,13 +23,22 @@ def square(x: int) -> dict[str, float]:
     return {"x": x, "square": x**2}
 
 
-def test_parallel_equals_serial(tmp_path: Path) -> None:
+def test_parallel_equals_serial_in_fresh_workers_that_take_closures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_WATCH", 7.0)  # a forked worker would see it
+    factor = 3
     jobs = {f"job_{x}": (x,) for x in range(4)}
-    serial = run_jobs(square, jobs, tmp_path / "serial")
-    parallel = run_jobs(square, jobs, tmp_path / "parallel", processes=2)
-    assert serial == parallel
-    assert list(serial) == list(jobs)
-    assert serial["job_3"] == {"x": 3, "square": 9}
+
+    def work(x: int) -> list:
+        return [{**square(x), "product": factor * x}, module._WATCH]
+
+    serial = run_jobs(work, jobs, tmp_path / "serial")
+    parallel = run_jobs(work, jobs, tmp_path / "parallel", processes=2)
+    assert list(serial) == list(parallel) == list(jobs)
+    assert [result for result, _ in serial.values()] == [result for result, _ in parallel.values()]
+    assert serial["job_3"] == [{"x": 3, "square": 9, "product": 9}, 7.0]
+    assert {watch for _, watch in parallel.values()} == {0.25}
 
 
 def test_interrupted_run_resumes(tmp_path: Path) -> None:
@@ -71,18 +80,15 @@ def test_a_result_is_that_of_its_job(tmp_path: Path) -> None:
             read_result(tmp_path / "a.json", "a")
 
 
-def die(x: int) -> int:
-    if x == 0:
-        os._exit(3)
-    return x
-
-
 def mark(folder: str, x: int) -> int:
-    """Leaves a trace; the job 0 fails."""
+    """Leaves a trace; the job 0 fails, and no other ends before."""
+    first = Path(folder) / "0"
     (Path(folder) / str(x)).touch()
     if x == 0:
         raise ValueError("job 0")
-    time.sleep(0.1)
+    while not first.exists():
+        time.sleep(0.05)
+    time.sleep(0.3)
     return x
 
 
@@ -92,38 +98,34 @@ def test_a_failure_cancels_what_has_not_begun(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="job 0") as told:
         run_jobs(mark, {f"job_{x}": (str(traces), x) for x in range(60)}, tmp_path / "runs", processes=2)
     assert told.value.__notes__ == ["in the job 'job_0'"]
-    time.sleep(1.0)  # what had begun ends
+    time.sleep(0.5)  # what had begun ends
     begun = len(list(traces.iterdir()))
     time.sleep(0.5)
     assert len(list(traces.iterdir())) == begun < 60
 
 
-def test_workers_are_fresh_and_take_lambdas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_WATCH", 7.0)  # a forked worker would see it
-    factor = 3
-    jobs = {f"job_{x}": (x,) for x in range(2)}
-    results = run_jobs(lambda x: [factor * x, module._WATCH], jobs, tmp_path, processes=2)
-    assert results == {"job_0": [0, 0.25], "job_1": [3, 0.25]}
+def die(folder: str, x: int) -> int:
+    """The process of the job 0 is killed from outside the first time, that of the job 1 each time.
 
-
-def test_a_job_that_kills_its_process_is_named(tmp_path: Path) -> None:
-    with pytest.raises(WorkerDiedError, match="'job_0' was run 3 times"):
-        run_jobs(die, {f"job_{x}": (x,) for x in range(4)}, tmp_path, processes=2)
-
-
-def die_once(folder: str, x: int) -> int:
-    """Every job is killed from outside the first time."""
-    trace = Path(folder) / str(x)
-    if not trace.exists():
-        trace.touch()
+    Its last time comes when the job 0 is done.
+    """
+    traces = Path(folder) / "traces"
+    times = len(list(traces.glob(f"{x}_*")))
+    (traces / f"{x}_{times}").touch()
+    while x == 1 and times == 2 and not (Path(folder) / "job_0.json").exists():
+        time.sleep(0.05)
+    if x == 1 or times == 0:
         os.kill(os.getpid(), signal.SIGKILL)
     return x
 
 
-def test_a_job_whose_process_was_killed_is_run_again(tmp_path: Path) -> None:
+def test_a_job_whose_process_was_killed_is_run_again_and_named_if_it_dies_each_time(tmp_path: Path) -> None:
     (tmp_path / "traces").mkdir()
-    jobs = {f"job_{x}": (str(tmp_path / "traces"), x) for x in range(3)}
-    assert run_jobs(die_once, jobs, tmp_path / "runs", processes=2) == {"job_0": 0, "job_1": 1, "job_2": 2}
+    with pytest.raises(WorkerDiedError, match="'job_1' was run 3 times"):
+        run_jobs(die, {f"job_{x}": (str(tmp_path), x) for x in range(2)}, tmp_path, processes=2)
+    assert read_result(tmp_path / "job_0.json", "job_0") == 0
+    times = sorted(path.name for path in (tmp_path / "traces").iterdir())
+    assert times == ["0_0", "0_1", "1_0", "1_1", "1_2"]
 
 
 SLEEPERS = """
