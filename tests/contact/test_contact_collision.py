@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -54,6 +55,11 @@ def probe(obj: ObjectDescription, ball: bool = False, **options) -> ContactDetec
     pad = ContactPad("pad", "hand", (-end, 0.0, 0.0), (end, 0.0, 0.0), RADIUS)
     hand = dataclasses.replace(HAND, pads=(pad,))
     return ContactDetector(hand, obj, **{"margin": math.inf, **options})
+
+
+@functools.cache  # many examples ask the same one
+def probe_of(kind: str) -> ContactDetector:
+    return probe(thing(kind))
 
 
 def touch(detector: ContactDetector, position, rotation: torch.Tensor = EYE):
@@ -118,7 +124,7 @@ def test_a_curved_object_has_its_own_contact_point_and_no_crown(kind: str) -> No
         side = torch.linalg.cross(along, axis)
         side = side / side.norm() if kind != "sphere" else torch.tensor([0.0, -0.6, 0.8], dtype=F64)
         at = torch.tensor([0.004, 0.0, 0.0], dtype=F64)
-        contacts = touch(probe(thing(kind)), at + (radius + RADIUS) * side, rotation)
+        contacts = touch(probe_of(kind), at + (radius + RADIUS) * side, rotation)
         expected = at + RADIUS * side
         torch.testing.assert_close(contacts.point[0], expected, atol=1e-9, rtol=0)
         across = torch.linalg.cross(along, contacts.normal[0])
@@ -184,13 +190,13 @@ def test_gap_is_coals_distance(kind: str, pose: tuple[float, ...]) -> None:
     position, rotation = torch.tensor(pose[:3], dtype=F64), turned(*pose[3:])
     expected = coal_distance(obj, position, rotation)
     assume(expected > -0.8 * RADIUS)
-    contacts = touch(probe(obj), position, rotation)
+    contacts = touch(probe_of(kind), position, rotation)
     sagitta = HALF**2 / (2 * 0.5)
     assert -1e-7 < float(contacts.gap) - expected < sagitta + 1e-7
     # a flat enough crown is no crown
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(torch_ekm.contact.detector, "CROWN_RADIUS", 1e4)
-        flat = touch(probe(obj), position, rotation)
+        flat = touch(probe_of(kind), position, rotation)
     assert float(flat.gap) == pytest.approx(expected, abs=1e-7)
 
 
@@ -201,7 +207,7 @@ def test_invariants(kind: str, pose: tuple[float, ...]) -> None:
     """Unit normal, tangent symmetric curvatures >= 0, the point on both surfaces shifted by half the gap."""
     obj = thing(kind)
     position, rotation = torch.tensor(pose[:3], dtype=F64), turned(*pose[3:])
-    contacts = touch(probe(obj), position, rotation)
+    contacts = touch(probe_of(kind), position, rotation)
     n, x, gap = contacts.normal[0], contacts.point[0], float(contacts.gap)
     assert float(n.norm()) == pytest.approx(1.0, abs=1e-9)
     for K in (contacts.finger_curvature[0], contacts.object_curvature[0]):
@@ -256,7 +262,7 @@ def test_the_contact_point_moves_continuously_as_the_finger_tilts(kind: str) -> 
     """Through the line contact (tilt 0): no jump, and never faster than the crown lets it roll."""
     turn = turned(0, math.pi / 2, 0) if kind in ("cylinder", "capsule") else EYE  # axis parallel to the pad
     depth = {"box": 0.015, "cylinder": 0.02, "sphere": 0.025, "capsule": 0.015}[kind]
-    detector = probe(thing(kind))
+    detector = probe_of(kind)
     tilts = np.linspace(-0.05, 0.05, 401)
     points = torch.stack(
         [touch(detector, [0.0, depth + RADIUS, 0.0], turned(0, 0, a) @ turn).point[0] for a in tilts]
@@ -275,7 +281,7 @@ def test_the_contact_point_moves_continuously_as_the_finger_tilts(kind: str) -> 
 def test_no_jumps_anywhere_outside(kind: str, pose: tuple[float, ...], along: tuple[float, ...]) -> None:
     """A change of the pose by 1e-7 (m, rad) moves the contact point by at most R/(0.2 rho) that."""
     position, rotation = torch.tensor(pose[:3], dtype=F64), turned(*pose[3:])
-    detector = probe(thing(kind))
+    detector = probe_of(kind)
     before = touch(detector, position, rotation)
     assume(float(before.gap) > -0.8 * RADIUS)
     change = 1e-7 * torch.tensor(along, dtype=F64)
