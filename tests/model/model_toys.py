@@ -29,6 +29,10 @@ class ChainKinematics(nn.Module):
             [(torch.tensor(T, dtype=F64), torch.tensor(z, dtype=F64)) for T, z in finger]
             for finger in fingers
         ]
+        self.lengths = [len(finger) for finger in fingers]
+        self.origins, self.axes = (
+            torch.stack([joint[k] for finger in self.fingers for joint in finger]) for k in range(2)
+        )
         self.link_names = tuple(f"f{i}_l{j}" for i, finger in enumerate(fingers) for j in range(len(finger)))
         n_q = len(self.link_names)
         upstream = torch.zeros(n_q, n_q, dtype=torch.bool)
@@ -40,22 +44,20 @@ class ChainKinematics(nn.Module):
         self.register_buffer("upstream", upstream)
 
     def forward(self, q):
-        rows, at = [], 0
-        for finger in self.fingers:
-            T = torch.eye(4, dtype=F64).expand(*q.shape[:-1], 4, 4)
-            for origin, z in finger:
-                R = torch.zeros(*q.shape[:-1], 4, 4, dtype=F64)
-                R[..., 3, 3] = 1
-                R[..., :3, :3] = se3.exp(q[..., at, None] * z)
-                T = T @ origin @ R
+        turns = torch.zeros(*q.shape, 4, 4, dtype=F64)
+        turns[..., 3, 3] = 1
+        turns[..., :3, :3] = se3.exp(q[..., None] * self.axes)
+        rows = []
+        for joints in (self.origins @ turns).split(self.lengths, dim=-3):
+            T = torch.eye(4, dtype=F64)
+            for joint in joints.unbind(-3):
+                T = T @ joint
                 rows.append(T)
-                at += 1
         return LinkPoses(torch.stack(rows, dim=-3), self.link_names)
 
     def joint_axes(self, poses):
-        z = torch.stack([z for finger in self.fingers for _, z in finger])
         T = poses.transforms
-        return (T[..., :3, :3] @ z[..., None])[..., 0], T[..., :3, 3]
+        return (T[..., :3, :3] @ self.axes[..., None])[..., 0], T[..., :3, 3]
 
 
 @dataclass(frozen=True)

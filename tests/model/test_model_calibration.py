@@ -28,7 +28,7 @@ def toy():
 
 def test_wrong_figures_are_found_again(toy):
     calibration = calibrate(
-        toy.model(toy.wrong()), toy.recordings(steps=8), ("springs", "moment_arms", "stiffness")
+        toy.model(toy.wrong()), toy.recordings(steps=6), ("springs", "moment_arms", "stiffness")
     )
     truth = {
         "springs": toy.hand.spring_stiffness,
@@ -95,7 +95,7 @@ def test_the_derivative_of_the_residuals(toy, kind, monkeypatch):
 def test_play_is_found(toy, monkeypatch):
     monkeypatch.setitem(PRIORS, "backlash", 1e-4)
     width = torch.tensor([1e-4, 5e-5, 0.0], dtype=F64)
-    recordings = toy.recordings(steps=12, play=Play(width))
+    recordings = toy.recordings(steps=8, play=Play(width))
     calibration = calibrate(toy.model(toy.hand), recordings, ["backlash"])
     found = calibration.hand.actuator_backlash
     np.testing.assert_allclose(found, width, atol=3e-6)
@@ -103,7 +103,7 @@ def test_play_is_found(toy, monkeypatch):
 
 
 def test_the_offset_of_the_objects_pose_is_found(toy):
-    recordings = toy.recordings(steps=6)
+    recordings = toy.recordings(steps=4)
     position, rotation = (
         torch.tensor([4e-4, -3e-4, 2e-4], dtype=F64),
         torch.tensor([0.0, 0.0, 0.0], dtype=F64),
