@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from torch_ekm.cli import app
 from torch_ekm.description import list_hands, load_hand, load_object
 from torch_ekm.exceptions import DescriptionError, EquilibriumError, GraspError
+from torch_ekm.foresight import reachable
 from torch_ekm.inspection import check as module
 from torch_ekm.inspection.check import check_hand
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
@@ -43,9 +44,10 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", list_hands())
 def test_the_hands_of_the_package_pass(name, tmp_path):
-    rows = check_hand(name, picture=tmp_path / "check.png")
+    drawn = name == "icub_right"  # in a process of its own, which takes as long as the rest
+    rows = check_hand(name, picture=tmp_path / "check.png" if drawn else None)
     assert [row for row in rows if row.state != "ok"] == []
-    assert (tmp_path / "check.png").stat().st_size > 5000
+    assert not drawn or (tmp_path / "check.png").stat().st_size > 5000
     assert sum(row.name.startswith("pad ") for row in rows) == len(load_hand(name).pads)
     assert {"tendon", "limits", "pinch", "stability"} <= {row.name.split()[0] for row in rows}
 
@@ -128,6 +130,15 @@ def test_a_pad_that_holds_with_its_back_is_told(monkeypatch):
 def test_a_pinch_that_turns_little_is_told(monkeypatch):
     can = load_object("can")
 
+    found = {}
+
+    def reach_once(controller, seen, *, sign):
+        if sign not in found:
+            found[sign] = reachable(controller, seen, sign=sign)
+        return found[sign]
+
+    monkeypatch.setattr(module, "reachable", reach_once)
+
     def turn(least_deg: float) -> tuple[str, list[int]]:
         monkeypatch.setattr(module, "_LITTLE_TURN", math.radians(least_deg))
         (row,) = module._turn(HAND, can)
@@ -195,7 +206,8 @@ def test_rigid_actuators_that_contradict_each_other_are_told(monkeypatch):
 
 
 @pytest.mark.usefixtures("brief")
-def test_command_line(files, tmp_path):
+def test_command_line(files, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "save_picture", lambda scene, path: path)
     runner = CliRunner()
     picture = ["--picture", str(tmp_path / "check.png")]
     done = runner.invoke(app, ["check", "planar_two_finger", "can", *picture])
