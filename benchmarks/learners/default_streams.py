@@ -86,10 +86,10 @@ def with_outliers(n: int, seed: int) -> Samples:
     return Samples(x, y + 30.0 * torch.randn(n, 2, generator=g, dtype=torch.float64).sign() * hit, f)
 
 
-def from_rest(n: int, seed: int) -> Samples:
-    """It stands still for 300 samples, then moves by millimetres, in metres."""
+def from_rest(n: int, seed: int, rest: int = 300) -> Samples:
+    """It stands still for ``rest`` samples, then moves by millimetres, in metres."""
     g = torch.Generator().manual_seed(seed)
-    moved = (torch.arange(n, dtype=torch.float64) * 0.01 - 3.0).clamp_min(0.0).unsqueeze(-1)
+    moved = (0.01 * (torch.arange(n, dtype=torch.float64) - rest)).clamp_min(0.0).unsqueeze(-1)
     w, phase = (1.0 + 3.0 * torch.rand(4, generator=g, dtype=torch.float64) for _ in range(2))
     x = torch.sin(w * moved + phase) - torch.sin(phase)
     y = torch.sin(2.0 * x @ torch.randn(4, 2, generator=g, dtype=torch.float64))

@@ -41,26 +41,41 @@ def linear(**options):
     return RecursiveLeastSquares(2, 1, noise_variance=0.1, **options)
 
 
-@pytest.mark.parametrize(("pose", "motion"), [(0.0, 0.3), (0.3, 0.3), (0.3, 0.1)])
-def test_carry_reaches_the_kalman_filters_error(pose, motion):
+def in_turn(learner, x, y):
+    """Errors of predictions that come before learning; a fleet takes all its streams at once."""
+    errors = []
+    for x_t, y_t in zip(x, y, strict=True):
+        errors.append(y_t - learner(x_t))
+        learner.update(x_t, y_t)
+    return torch.stack(errors)
+
+
+def side_by_side(streams):
+    """Streams ``(n, d)`` as those of a fleet ``(n, streams, d)``."""
+    return [torch.stack(part, dim=1) for part in zip(*streams, strict=True)]
+
+
+def test_carry_reaches_the_kalman_filters_error():
     """The best error of one step is that of the moving average: ``sd(y - g) / sqrt(1 + kappa^2)``."""
-    x, y = noisy_pose(0, 1500, pose, motion)
-    mixture = MixtureResidual(linear())
-    run = run_prequential(mixture, x, y)
-    kappa = steady_kappa(pose, motion) if pose else 0.0
-    best = math.sqrt((2 * pose**2 + motion**2) / (1 + kappa**2))
-    assert float(run.error[500:].square().mean().sqrt()) < 1.05 * best
-    assert float((mixture.beliefs * mixture._experts[1]).sum()) == pytest.approx(kappa, abs=0.15)
+    cases = [(0.0, 0.3), (0.3, 0.3), (0.3, 0.1)]
+    x, y = side_by_side([noisy_pose(0, 1500, pose, motion) for pose, motion in cases])
+    mixture = MixtureResidual(linear(batch_shape=(3,)))
+    errors = in_turn(mixture, x, y)[500:].square().mean(0).sqrt().flatten()
+    carried = (mixture.beliefs * mixture._experts[1]).sum(-1).flatten()
+    for (pose, motion), error, found in zip(cases, errors.tolist(), carried.tolist(), strict=True):
+        kappa = steady_kappa(pose, motion) if pose else 0.0
+        best = math.sqrt((2 * pose**2 + motion**2) / (1 + kappa**2))
+        assert error < 1.05 * best
+        assert found == pytest.approx(kappa, abs=0.15)
 
 
 def test_carry_is_worth_it_and_costs_nothing_where_there_is_none():
-    for pose, limit in ((0.3, 0.85), (0.0, 1.02)):
-        x, y = noisy_pose(1, 1000, pose)
-        errors = [
-            run_prequential(learner, x, y).error[300:] for learner in (MixtureResidual(linear()), linear())
-        ]
-        ratio = float(errors[0].square().mean().sqrt() / errors[1].square().mean().sqrt())
-        assert ratio < limit
+    x, y = side_by_side([noisy_pose(1, 1000, pose) for pose in (0.3, 0.0)])
+    learners = MixtureResidual(linear(batch_shape=(2,))), linear(batch_shape=(2,))
+    mixed, plain = (in_turn(one, x, y)[300:].square().mean(0).sqrt().flatten() for one in learners)
+    with_noise, without = (mixed / plain).tolist()
+    assert with_noise < 0.85
+    assert without < 1.02
 
 
 def test_what_cannot_be_learned_costs_next_to_nothing():
@@ -104,16 +119,21 @@ def test_level_follows_an_offset():
 
 def test_predictive_law_is_better_than_normal_on_heavy_tails_and_no_worse_on_light_ones():
     torch.manual_seed(5)
-    x = torch.randn(1500, 2, dtype=torch.float64)
-    for nu, gain in ((2.0, 0.2), (1e6, -0.03)):
-        y = 0.2 * StudentT(torch.tensor(nu, dtype=torch.float64)).sample((1500, 1))
-        mixture = MixtureResidual(ZeroResidual(2, 1))
-        run = run_prequential(mixture, x, y)
-        assert run.density is not None
-        heavy, normal = float(-run.density[300:].mean()), run.nll(300)
-        assert heavy < normal - gain
-        true = -StudentT(torch.tensor(nu, dtype=torch.float64), 0.0, 0.2).log_prob(y[300:]).mean()
-        assert heavy < float(true) + 0.06
+    x = torch.randn(1500, 2, 2, dtype=torch.float64)
+    nu = torch.tensor([[2.0], [1e6]], dtype=torch.float64)
+    y = 0.2 * StudentT(nu).sample((1500,))
+    mixture = MixtureResidual(ZeroResidual(2, 1, batch_shape=(2,)))
+    own, normal = [], []
+    for n, (x_t, y_t) in enumerate(zip(x, y, strict=True)):
+        if n >= 300:
+            own.append(-mixture.predictive(x_t).log_prob(y_t))
+            normal.append(-mixture.predict(x_t, observation=True).log_prob(y_t))
+        mixture.update(x_t, y_t)
+    told, as_normal = (torch.stack(parts).mean(0).flatten().tolist() for parts in (own, normal))
+    true = -StudentT(nu, 0.0, 0.2).log_prob(y[300:]).mean(0).flatten()
+    for mine, other, best, gain in zip(told, as_normal, true.tolist(), (0.2, -0.03), strict=True):
+        assert mine < other - gain
+        assert mine < best + 0.06
 
 
 def test_intervals_cover():

@@ -59,18 +59,19 @@ class DeepKernel(Kernel):
 
     def net(self, x: Float[Tensor, "*any n d"]) -> Float[Tensor, "*batch n features"]:
         """The features of x that the network has learned, near 0 at the start."""
-        for weight, bias in zip(self.weights[:-1], self.biases, strict=True):
+        *hidden, last = self.weights  # a slice would be a new module
+        for weight, bias in zip(hidden, self.biases, strict=True):
             x = torch.tanh(x @ weight + bias.unsqueeze(-2))
-        return x @ self.weights[-1]
+        return x @ last
 
     def net_jacobian(self, x: Float[Tensor, "*batch d"]) -> tuple[Tensor, Tensor]:
         """``(net(x), (d net/dx)')``: shapes ``(*batch, features)`` and ``(*batch, d, features)``."""
         x, slope = x.unsqueeze(-2), None
-        for weight, bias in zip(self.weights[:-1], self.biases, strict=True):
+        *hidden, last = self.weights
+        for weight, bias in zip(hidden, self.biases, strict=True):
             x = torch.tanh(x @ weight + bias.unsqueeze(-2))
             step = weight if slope is None else slope @ weight
             slope = step * (1.0 - x * x)
-        last = self.weights[-1]
         return (x @ last).squeeze(-2), last if slope is None else slope @ last
 
     def embed(self, x: Float[Tensor, "*any n d"]) -> Float[Tensor, "*batch n d_plus_features"]:
