@@ -83,9 +83,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
             page.write_text(f"# {name}\n\nNot measured yet.\n", encoding="utf-8")
     for page in ROOT.glob("*.md"):
         shutil.copy2(page, place)
-    command = [sys.executable, "-m", "sphinx", "-W", "-n", "--keep-going", "-q"]
+    # without Python's collector, which takes a quarter of the time and finds little
+    build = "import gc, sys; gc.disable(); from sphinx.cmd.build import main; sys.exit(main(sys.argv[1:]))"
     done = subprocess.run(
-        [*command, str(place / "docs"), str(place / "html")],
+        [sys.executable, "-c", build, "-W", "-n", "--keep-going", "-q", place / "docs", place / "html"],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,

@@ -113,20 +113,39 @@ def test_fingerprint_sees_what_decides() -> None:
     assert len(fingerprint(circle)) == 40
 
 
-def test_fingerprint_is_the_same_in_another_process() -> None:
-    code = (
-        "import torch; from torch_ekm.residual import SparseOnlineGP;"
-        "from torch_ekm.experiments.learner_comparison.fingerprint import fingerprint;"
-        "print(fingerprint(SparseOnlineGP(3, 2), {'a', 'b', 'c'}))"
-    )
-    options = {"capture_output": True, "text": True, "check": True}
-    runs = {
-        subprocess.run(
-            [sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": seed}, **options
-        ).stdout
-        for seed in ("1", "2")  # sets and dictionaries in another order
-    }
-    assert len(runs) == 1
+#: Prints the modules that importing experiments brings, and a fingerprint.
+ELSEWHERE = """
+import sys, torch_ekm.experiments
+print(*sys.modules)
+from torch_ekm.residual import SparseOnlineGP
+from torch_ekm.experiments.learner_comparison.fingerprint import fingerprint
+print(fingerprint(SparseOnlineGP(3, 2), {"a", "b", "c"}))
+"""
+
+
+@pytest.fixture(scope="module")
+def elsewhere() -> list[list[str]]:
+    """What two other processes print, with sets and dictionaries in another order."""
+
+    def lines(seed: str) -> list[str]:
+        env = {**os.environ, "PYTHONHASHSEED": seed}
+        command = [sys.executable, "-c", ELSEWHERE]
+        done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
+        return done.stdout.splitlines()
+
+    return [lines(seed) for seed in ("1", "2")]
+
+
+def test_fingerprint_is_the_same_in_another_process(elsewhere: list[list[str]]) -> None:
+    (_, one), (_, other) = elsewhere
+    assert one == other
+    assert len(one) == 40
+
+
+def test_importing_experiments_is_cheap(elsewhere: list[list[str]]) -> None:
+    brought = set(elsewhere[0][0].split())
+    assert "torch_ekm.experiments" in brought
+    assert not {"sapien", "cv2", "matplotlib", "pyvista", "joblib", "scipy"} & brought
 
 
 def test_what_makes_no_learner_is_refused_by_name_before_anything_runs(tmp_path: Path) -> None:
@@ -159,9 +178,3 @@ def test_nothing_of_the_caller_is_left_changed() -> None:
     finally:
         torch.set_num_threads(threads)
     assert torch.equal(torch.rand(1), expected)
-
-
-def test_importing_experiments_is_cheap() -> None:
-    code = "import sys, torch_ekm.experiments; print(*sys.modules)"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert not {"sapien", "cv2", "matplotlib", "pyvista", "joblib", "scipy"} & set(out.split())
