@@ -159,11 +159,12 @@ def test_served_it_answers_who_has_the_address(folder):
         answers["another name for this machine"] = status(f"/{secret}/", f"evil.example:{port}")
         version = [f"viser-v{viser.__version__}"]
         mine, theirs = f"http://127.0.0.1:{port}", "http://evil.example"
-        with connect(f"ws://127.0.0.1:{port}/{secret}", origin=mine, subprotocols=version) as socket:
+        options = {"subprotocols": version, "open_timeout": 120}
+        with connect(f"ws://127.0.0.1:{port}/{secret}", origin=mine, **options) as socket:
             answers["socket"] = len(socket.recv(timeout=120)) > 0
         for path, origin in ((f"/{secret}", theirs), ("/", mine), (f"/{secret}", None), ("/", theirs)):
             with pytest.raises(refused, match="403"):
-                connect(f"ws://127.0.0.1:{port}{path}", origin=origin, subprotocols=version)
+                connect(f"ws://127.0.0.1:{port}{path}", origin=origin, **options)
             turned_away.append(path)
 
     serve(choose_show(str(folder)), port=8931, on_ready=ask, stop=lambda: bool(turned_away))

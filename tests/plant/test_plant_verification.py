@@ -134,7 +134,7 @@ from test_plant_verification import CONFIGURATION, TrialLog, trajectory
 log = TrialLog({str(tmp_path)!r}, CONFIGURATION)
 log.write(0, trajectory(0))
 print("writing", flush=True)
-time.sleep(100)
+time.sleep(1000)
 """
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as writer:
         try:
