@@ -153,7 +153,6 @@ def test_knock_is_felt_in_its_trial_only(online: dict[str, list[TrialRecord]]) -
     assert third > 3 * calm.true_prediction_km_deg[3]
 
 
-@pytest.mark.usefixtures("planned_anew")
 def test_same_seed_same_session() -> None:
     protocol = Generalize(
         objects=("box",), angles_deg=(4.0,), warm_up=1, long_step_deg=3.0, blind_deg=2.0, poses=True

@@ -62,8 +62,8 @@ def test_report_is_complete(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("made_up")
 def test_a_quick_report_says_so(tmp_path: Path) -> None:
-    quick = reproduce(plan("generalize", (0, 1), quick=True), tmp_path / "quick")
-    whole = reproduce(plan("generalize", (0, 1)), tmp_path / "whole")
+    quick = reproduce(plan("adapt", (0, 1), quick=True), tmp_path / "quick")
+    whole = reproduce(plan("adapt", (0, 1)), tmp_path / "whole")
     assert quick.title == f"{whole.title}: a quick run"
     assert quick.summary.startswith("A quick run shows that it works, and claims nothing.")
     assert "quick" not in whole.summary
