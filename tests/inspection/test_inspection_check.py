@@ -79,7 +79,8 @@ FAULTS = {  # what is changed (0: URDF, 1: transmission file); name, state and t
 
 @pytest.mark.usefixtures("brief")
 @pytest.mark.parametrize("fault", list(FAULTS))
-def test_each_fault_has_its_row(fault, files):
+def test_each_fault_has_its_row(fault, files, monkeypatch):
+    monkeypatch.setattr(module, "_GENTLER", ())  # two tests below look at gentler pinches
     which, old, new, name, state, text = FAULTS[fault]
     content = files[which].read_text()
     assert old in content

@@ -190,7 +190,7 @@ def test_pads_give_way_by_force_over_stiffness() -> None:
 
 def test_one_side_of_the_object_has_less_friction() -> None:
     sides = set()
-    for seed in range(6):
+    for seed in (0, 1):  # one for each side
         plant = SimulatedHand(
             "icub_right", "box", parameters=PlantParameters(friction_unevenness=0.4, hardware_seed=seed)
         )
