@@ -158,6 +158,7 @@ def variants(base: Setting) -> list[Variant]:
         *(Variant("learner", name, {"learner": name, "learner_options": {}}, _LEARNING) for name in others),
         Variant("learner", "rbf over commands", {"learner": "rbf", "servo_inverse": False}, _LEARNING),
         *(Variant(group, name, change(base), controllers) for group, name, change, controllers in _OPTIONS),
+        Variant("online learning", "f as described", {"adapts": False}, _LEARNING),
         *(
             Variant("online learning", f"{capacity} basis vectors", {"capacity": capacity}, _LEARNING)
             for capacity in (15, 30, 120)

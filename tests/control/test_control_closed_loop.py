@@ -174,7 +174,7 @@ def test_an_enhanced_model_learns_unless_seen_motions_not_to(held) -> None:
     for learn in (True, False):
         ekm = EnhancedModel.for_grasp(loop.kinematic, seen.state)
         controller = LookAndMoveController(ekm, axis)
-        knowledge = HandKnowledge.of(loop.kinematic.hand, learns=False)  # it learns from the commands
+        knowledge = HandKnowledge.of(loop.kinematic.hand, learns=False, adapts=False)  # from the commands
         options = {"knowledge": knowledge, "safety": SAFETY}
         driven = ClosedLoop(FrozenPlant(seen), controller, **options, learn=learn)
         steps = driven.run(target).steps
@@ -208,7 +208,8 @@ def test_the_learner_is_seen_motions_what_the_encoders_did(held) -> None:
             self.observation = dataclasses.replace(self.observation, a=self.observation.a + 0.5 * delta_a)
 
     controller = LookAndMoveController(ekm, axis)
-    driven = ClosedLoop(Half(seen), controller, safety=SAFETY)
+    knowledge = HandKnowledge.of(loop.kinematic.hand, adapts=False)
+    driven = ClosedLoop(Half(seen), controller, knowledge=knowledge, safety=SAFETY)
     steps = driven.run(PoseTarget.turned(seen.state, axis, degrees=80)).steps
     for (da, nominal), step in zip(seen_motions, [s for s in steps if s.report is not None], strict=True):
         torch.testing.assert_close(da, step.after.a - step.before.a)

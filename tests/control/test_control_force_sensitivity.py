@@ -33,7 +33,19 @@ def taught(
 def test_it_finds_what_the_description_gets_wrong() -> None:
     described, off = torch.full((2, 3), 10.0, dtype=F64), torch.tensor([[-15.0, 4.0, 0.0], [3.0, 0.0, -8.0]])
     learner = taught(described + off.double(), described, moves(60), noise=0.1)
-    torch.testing.assert_close(learner.correction, off.double(), atol=1.5, rtol=0)
+    found = learner.corrected(described, [0, 1]) - described
+    torch.testing.assert_close(found, off.double(), atol=1.5, rtol=0)
+
+
+def test_it_scales_what_a_stiffer_description_says_everywhere() -> None:
+    """S changes from state to state, and the hand presses .4 as hard as it says."""
+    learner, draw = ForceSensitivity(1, 3), torch.Generator().manual_seed(2)
+    for w in moves(40):
+        S = 20 * torch.randn(1, 3, dtype=F64, generator=draw)
+        learner.update(w, 0.4 * S @ w, S)
+    S = torch.tensor([[10.0, -20.0, 5.0]], dtype=F64)
+    assert float(learner.scale) == pytest.approx(0.4, abs=0.03)
+    torch.testing.assert_close(learner.corrected(S, [0]), 0.4 * S, atol=1.0, rtol=0)
 
 
 def test_without_forgetting_it_is_regularised_least_squares(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,7 +54,7 @@ def test_without_forgetting_it_is_regularised_least_squares(monkeypatch: pytest.
     true, w = torch.tensor([[5.0, -3.0, 2.0]], dtype=F64), moves(8)
     learner = taught(true, torch.zeros_like(true), w)
     y, s, p = w @ true[0], 0.25, 20.0
-    exact = torch.linalg.solve(w.mT @ w / s**2 + torch.eye(3, dtype=F64) / p**2, w.mT @ y / s**2)
+    exact = torch.linalg.solve(w.mT @ w / s**2 + torch.eye(3, dtype=F64) / p**2, w.mT @ y / s**2)  # S = 0
     torch.testing.assert_close(learner.correction[0], exact)
 
 
@@ -89,9 +101,10 @@ def test_bad_input_changes_nothing_and_the_state_dict_carries_all(unchecked) -> 
 def test_a_correction_counts_less_where_the_pads_are_noisy() -> None:
     true, described = torch.tensor([[5.0, -3.0, 2.0]], dtype=F64), torch.zeros(1, 3, dtype=F64)
     quiet, noisy = (taught(true, described, moves(80), noise=noise) for noise in (0.05, 0.8))
-    assert torch.equal(quiet.used, quiet.correction)
+    used = [learner.corrected(described, [0]) for learner in (quiet, noisy)]
+    torch.testing.assert_close(used[0], quiet.correction)
     assert float(noisy.variance.sqrt()) == pytest.approx(0.8, rel=0.4)
-    share = float((noisy.used / noisy.correction).mean())
+    share = float((used[1] / noisy.correction).mean())
     assert share == pytest.approx((0.3**2 / float(noisy.variance)) ** 2)
     assert share < 0.2
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from obedient_plant import Obedient
 
-from torch_ekm.control import ClosedLoop, HandKnowledge, LookAndMoveController, PoseTarget
+from torch_ekm.control import ClosedLoop, DescribedFigures, HandKnowledge, LookAndMoveController, PoseTarget
 from torch_ekm.control.force_sensitivity import ForceSensitivity
 from torch_ekm.enhanced import EnhancedModel, save
 from torch_ekm.exceptions import FileFormatError, ParameterError
@@ -70,9 +70,11 @@ def test_knowledge_of_another_hand_and_another_file_are_refused(held, driven, tm
         ClosedLoop(
             Obedient(model, seen),
             LookAndMoveController(model, axis),
-            knowledge=HandKnowledge(ServoModel(["one", "two"]), ForceSensitivity(5, 2)),
+            knowledge=HandKnowledge(ServoModel(["one", "two"]), ForceSensitivity(5, 2), DescribedFigures()),
         )
-    other = HandKnowledge(ServoModel(model.hand.actuator_names), ForceSensitivity(2, model.hand.n_a))
+    other = HandKnowledge(
+        ServoModel(model.hand.actuator_names), ForceSensitivity(2, model.hand.n_a), DescribedFigures()
+    )
     with pytest.raises(ParameterError, match="a hand with 5 pads and 9 actuators"):
         other.check(model.hand)
     save(SparseOnlineGP(2, 1), tmp_path / "learner.ekm")

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from torch_ekm.control import DescribedFigures
 from torch_ekm.description import load_hand
 from torch_ekm.enhanced import EnhancedModel, GraspEncoding, grasp_learner
 from torch_ekm.kinematics import GraspState, HandKinematics
@@ -19,6 +20,8 @@ F64 = torch.float64
 
 class Held:
     """Whatever moves, it moves by ``J da``; thumb and index touch."""
+
+    figures = DescribedFigures()
 
     def __init__(self) -> None:
         self.hand = load_hand("icub_right")

@@ -11,6 +11,7 @@ import pytest
 import torch
 from turning import turning
 
+from torch_ekm.control import DescribedFigures
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NonFiniteError, ShapeError
 from torch_ekm.foresight import Rollout
@@ -118,7 +119,7 @@ def test_gradients_in_state_and_actions_are_those_of_differences():
 
 def test_the_learner_moves_the_object_and_says_how_sure_it_is():
     model, _, at, lin = started()
-    enhanced = EnhancedModel.for_grasp(model, at.state)
+    enhanced = EnhancedModel.for_grasp(model, at.state, figures=DescribedFigures())
     w = turning(lin, AXIS, 1 * DEG)
     actions = torch.stack([w, w])
     plain, unlearned = (Rollout(m).predict(at.state, actions, start=lin) for m in (model, enhanced))

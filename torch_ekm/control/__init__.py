@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ..enhanced.hand_figures import DescribedFigures, HandFigures
 from .closed_loop import ClosedLoop, Manipulation, Step, Stop
 from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
 from .decision import Decision, StopReason
@@ -25,6 +26,7 @@ __all__ = [
     "ControlProblem",
     "ControlSolution",
     "Decision",
+    "DescribedFigures",
     "EffortTask",
     "Equality",
     "FocusTask",
@@ -32,6 +34,7 @@ __all__ = [
     "ForceSensitivity",
     "GripForceTask",
     "Guards",
+    "HandFigures",
     "HandKnowledge",
     "Inequality",
     "JointLimit",

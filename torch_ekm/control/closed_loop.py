@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import torch
 
+from ..enhanced.hand_figures import DescribedFigures, HandFigures
 from ..model import Linearization
 from ..plant import Observation, Plant, PlantStatus, ServoInverse
 from ..residual import UpdateReport
@@ -128,7 +129,11 @@ class ClosedLoop:
         hand = controller.kinematic.hand
         if knowledge is None:
             knowledge = HandKnowledge.of(hand, learns=controller.enhanced is not None)
+            followed = controller.kinematic.figures
+            if isinstance(followed, HandFigures | DescribedFigures):
+                knowledge.figures = followed
         knowledge.check(hand)
+        controller.follow(knowledge.figures)
         self.plant, self.knowledge = ServoInverse(plant, hand, knowledge.servo), knowledge
         self.controller, self.learn, self.decline = controller, learn, decline
         self.safety = Safety() if safety is None else safety
@@ -179,6 +184,7 @@ class ClosedLoop:
         first = watch.first(self.plant.observe(), self.plant.observe)
         seen = first.seen
         self.controller.reset()
+        self.knowledge.forces.begin()
         self.controller.forces = None if self.controller.enhanced is None else self.knowledge.forces
         progress = Progress(self.safety, target, self.controller.focus, seen, started)
         progress.halt = first.halt
@@ -326,7 +332,9 @@ class ClosedLoop:
             self._learn_forces(lin, expected.moved, felt)
         rho = math.inf if fades else self._disagreement(lin, seen, ds, expected, felt)
         self.controller.pace.judge(rho, decision.share)
-        return enhanced.update(seen.state, expected.moved, ds, expected.nominal)
+        self.knowledge.figures.learn(lin, expected.moved, ds)
+        nominal = self.controller.kinematic.followed(lin).step(expected.moved)  # g learns what they leave
+        return enhanced.update(seen.state, expected.moved, ds, nominal)
 
     def _disagreement(
         self,
@@ -349,8 +357,8 @@ class ClosedLoop:
     def _learn_forces(self, lin: Linearization, moved: Tensor, felt: ForceSurprise) -> None:
         """Pads that touched and measured before and after teach how their forces answer."""
         forces, pads = self.knowledge.forces, list(felt.pads)
-        change = torch.full((len(forces.correction),), torch.nan, dtype=torch.float64)
+        change = torch.full((len(forces.scale),), torch.nan, dtype=torch.float64)
         change[pads] = (felt.after - felt.before).where(~felt.surprise.isnan(), torch.nan)
         described = torch.zeros_like(forces.correction)
-        described[pads] = lin.normal_force_sensitivity - forces.used[pads]
+        described[pads] = lin.described_normal_sensitivity
         forces.update(moved, change, described)

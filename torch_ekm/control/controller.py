@@ -26,6 +26,7 @@ from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
 
 if TYPE_CHECKING:
     from ..model import KinematicModel, Linearization
+    from ..model.linearization import FollowedFigures
     from .force_sensitivity import ForceSensitivity
 
 #: What a step should do by default: effort, off-axis motion, grip force, focus. The figures suit the iCub
@@ -83,6 +84,11 @@ class LookAndMoveController:
         self._weight = float(torch.linalg.vector_norm(self.kinematic.weight))
         self._previous: tuple[Linearization, Tensor] | None = None
 
+    def follow(self, figures: FollowedFigures) -> None:
+        """Let f of the enhanced model follow the figures of the hand as they are learned."""
+        if self.enhanced is not None and self.kinematic.figures is not figures:
+            self.kinematic = self.enhanced.model = self.kinematic.with_figures(figures)
+
     def reset(self) -> None:
         """Forget the contact forces and the tighter grip of the last grasp; a :class:`ClosedLoop` does so
         when it begins."""
@@ -107,7 +113,7 @@ class LookAndMoveController:
         )
         if self.forces is not None:
             pads = self.kinematic.hand.pad_indices(lin.contacts.finger)
-            lin = lin.with_normal_sensitivity(self.forces.used[pads])
+            lin = lin.with_normal_sensitivity(self.forces.corrected(lin.normal_force_sensitivity, pads))
         if lin.forces.solved:
             self._previous = lin, a
         return lin
@@ -125,10 +131,12 @@ class LookAndMoveController:
     def retreat(self, at: Decision, delta_a: Float[Tensor, " n_a"]) -> Decision:
         """The decision to undo a motion, instead of the one that was taken ``at`` the state."""
         lin, still = at.linearization, at.predicted.new_zeros(at.predicted.shape)
-        expected = Expectation(delta_a, still, still, still) if lin is None else self.expect(lin, delta_a)
-        predicted, desired = expected.increment, self.focus.matrix @ expected.increment[-6:]
+        predicted, nominal = still, still
+        if lin is not None:
+            predicted, nominal = self.expect(lin, delta_a).increment, lin.described_jacobian @ delta_a
+        desired = self.focus.matrix @ predicted[-6:]
         return Decision(
-            delta_a, StopReason.RUNNING, desired, predicted, expected.nominal, share=0.0, linearization=lin
+            delta_a, StopReason.RUNNING, desired, predicted, nominal, share=0.0, linearization=lin
         )
 
     def decide(
@@ -182,6 +190,9 @@ class LookAndMoveController:
         seen = Situation(
             hand, self.focus, state, a, fingertip_force, error, desired, alone, self._weight, self.tighter
         )
+        if self.forces is not None:
+            drift = self.forces.drift[hand.pad_indices(lin.contacts.finger)]
+            seen = dataclasses.replace(seen, drift=as_array(drift))
         grips = (task.wanted(lin, seen) for task in self.tasks if isinstance(task, GripForceTask))
         seen = dataclasses.replace(seen, grip=next(grips, None))
         try:
@@ -193,7 +204,7 @@ class LookAndMoveController:
                 da, predicted, problem, solution = self._solve(lin, seen)
         except SolverError as failure:  # it cannot be infeasible, as all rows have slack
             return self._none(StopReason.UNSTABLE_GRASP, failure, focused)
-        nominal = lin.manipulation_jacobian @ da
+        nominal = lin.described_jacobian @ da
         slack = float(np.abs(solution.slack).max(initial=0.0))
         limited = slack > 0.05 * float(desired.abs().max()) and self._at_limit(a, da, problem)
         grip = self._grip(lin, seen)

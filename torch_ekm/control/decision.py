@@ -69,7 +69,7 @@ class Decision:
     predicted: Float[Tensor, " n_s"]
     """(f + g)(s, da)."""
     nominal: Float[Tensor, " n_s"]
-    """f(s, da) = J_m da: what the kinematic model alone predicts."""
+    """J_m da of the hand as described: what the kinematic model alone predicts."""
     share: float = 1.0
     """Of the largest step that the pace allows."""
     limited: bool = False

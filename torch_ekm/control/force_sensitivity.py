@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import nn
 
@@ -10,22 +12,28 @@ from .._recorded import Recorded
 from ..typing import Float, Tensor
 
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
-_NOISE_STD = 0.25  # [N] of a change of force that B does not explain, at least
-_TRUSTED_STD = 0.3  # [N] of what B does not explain; B counts less above it
+_NOISE_STD = 0.25  # [N] of a change of force that c and B do not explain, at least
+_TRUSTED_STD = 0.3  # [N] of what they do not explain; they count less above it
 _FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
 _RECENT = 0.1  # weight of the last motion in the variance of r
+_KEPT, _TAKEN = 0.5, 0.3  # of the drift before, of the last motion
 _CLIP = 4.0  # standard deviations; a contact that slips says nothing of the rest
 
 
 class ForceSensitivity(Recorded, nn.Module):
-    """``f_n+ - f_n = (df_n/da + B) w + noise``: B ``(n_pads, n_a)``, by recursive least squares::
+    """``f_n+ - f_n = (c S + B) w + noise``, S ``= df_n/da`` of the model: by recursive least squares::
 
-        r = (f_n+ - f_n) - (df_n/da + B) w               of each pad that measures
-        D <- D - (1 - .97) D w w' D / (w' D w) + w w'    motions, forgotten in the direction of a new one
-        B <- B + r k',  k = P w / s^2,  P = (D / s^2 + I / 20^2)^-1
-        s^2 <- .9 s^2 + .1 max(r^2 - w' P w, .25^2)      what B does not explain: a pad that rubs teaches less
+        u = [S w; 20 w],  theta = [c - 1; B / 20]        prior N(0, I)
+        r = (f_n+ - f_n) - S w - theta u                 of each pad that measures
+        D <- D - (1 - .97) D u u' D / (u' D u) + u u'    motions, forgotten in the direction of a new one
+        theta <- theta + P u r / s^2,  P = (D / s^2 + I)^-1
+        d <- .5 d + .3 r                                 what motions in succession leave alike
+        s^2 <- .9 s^2 + .1 max(r^2 - u' P u, .25^2)      what is left: a pad that rubs teaches less
 
-    B belongs to the hand: it is kept from grasp to grasp.
+    c of each pad scales what the model says: a hand that gives more than it is described to presses less. B
+    ``(n_pads, n_a)`` says the rest. Both belong to the hand: they are kept from grasp to grasp. The drift d
+    belongs to one grasp: a finger that loses a little with each motion is pressed harder, as by integral
+    action.
 
     Args:
         n_pads, n_a: contact pads and actuators of the hand.
@@ -35,24 +43,48 @@ class ForceSensitivity(Recorded, nn.Module):
 
     def __init__(self, n_pads: int, n_a: int) -> None:
         super().__init__()
-        self.correction = nn.Buffer(torch.zeros(n_pads, n_a, dtype=torch.float64))
-        """B [N/rad]."""
-        self.evidence = nn.Buffer(torch.zeros(n_pads, n_a, n_a, dtype=torch.float64))
-        """D, of the motions that each pad measured [rad^2]."""
+        self.theta = nn.Buffer(torch.zeros(n_pads, 1 + n_a, dtype=torch.float64))
+        self.evidence = nn.Buffer(torch.zeros(n_pads, 1 + n_a, 1 + n_a, dtype=torch.float64))
+        """D, of the motions that each pad measured."""
         self.variance = nn.Buffer(torch.full((n_pads,), _NOISE_STD**2, dtype=torch.float64))
         """s^2 of each pad [N^2]."""
+        self.drift = nn.Buffer(torch.zeros(n_pads, dtype=torch.float64))
+        """d, by which a pad's force changes more than predicted, motion by motion [N]."""
 
     @property
-    def used(self) -> Float[Tensor, "n_pads n_a"]:
-        """``min(1, (0.3 N / s)^4) B`` [N/rad]: small motions that follow the noise of a pad look as if its
-        force did not answer."""
-        return self.correction * (_TRUSTED_STD**4 / self.variance.square()).clamp(max=1.0)[:, None]
+    def scale(self) -> Float[Tensor, " n_pads"]:
+        """c."""
+        return 1 + self.theta[:, 0]
+
+    @property
+    def correction(self) -> Float[Tensor, "n_pads n_a"]:
+        """B [N/rad]."""
+        return _PRIOR_STD * self.theta[:, 1:]
+
+    def corrected(self, described: Float[Tensor, "n_c n_a"], pads: Sequence[int]) -> Float[Tensor, "n_c n_a"]:
+        """``S + k ((c - 1) S + B)``, ``k = min(1, (0.3 N / s)^4)`` [N/rad]: small motions that follow the
+        noise of a pad look as if its force did not answer.
+
+        Args:
+            described: S of the pads in contact [N/rad].
+            pads: which of the hand's they are.
+        """
+        at = list(pads)
+        trust = (_TRUSTED_STD**4 / self.variance[at].square()).clamp(max=1.0)[:, None]
+        change = self.theta[at, :1] * described + self.correction[at]
+        return described + trust * change
+
+    def begin(self) -> None:
+        """A new grasp: nothing drifts yet."""
+        self.drift.zero_()
 
     @property
     def _covariance(self) -> Tensor:
-        """P of each pad ``(n_pads, n_a, n_a)``."""
-        prior = torch.eye(self.correction.shape[-1], dtype=torch.float64) / _PRIOR_STD**2
-        return torch.linalg.inv(self.evidence / self.variance[:, None, None] + prior)
+        """P of each pad."""
+        n = self.theta.shape[-1]
+        return torch.linalg.inv(
+            self.evidence / self.variance[:, None, None] + torch.eye(n, dtype=torch.float64)
+        )
 
     @torch.no_grad()
     def update(
@@ -66,7 +98,7 @@ class ForceSensitivity(Recorded, nn.Module):
         Args:
             moved: w, of the encoders [rad].
             change: ``f_n+ - f_n`` of each pad [N]; NaN: it does not measure, or does not touch.
-            described: ``df_n/da`` of each pad by the model [N/rad].
+            described: S, ``df_n/da`` of each pad by the model [N/rad].
 
         Returns:
             r [N], NaN where nothing was measured.
@@ -74,29 +106,41 @@ class ForceSensitivity(Recorded, nn.Module):
         Raises:
             ShapeError, NonFiniteError: nothing is changed.
         """
-        n_pads, n_a = self.correction.shape
+        n_pads, n_a = len(self.theta), self.theta.shape[-1] - 1
         for name, value, shape in (
             ("moved", moved, (n_a,)), ("change", change, (n_pads,)), ("described", described, (n_pads, n_a))
         ):  # fmt: skip
             check_shape(name, value, shape)
         check_finite("moved", moved)
-        w = moved.to(self.correction)
-        r = change.to(w) - (described.to(w) + self.correction) @ w
+        check_finite("described", described)
+        w = moved.to(self.theta)
+        said = described.to(w) @ w
+        u = torch.cat([said[:, None], _PRIOR_STD * w.expand(n_pads, n_a)], dim=-1)
+        r = change.to(w) - said - (u * self.theta).sum(-1)
         known = ~r.isnan()
         if not bool(known.any()) or not bool(w.any()):
             return r
-        doubt = (self._covariance @ w) @ w  # w' P w
+        doubt = _quadratic(self._covariance, u)  # u' P u
         spread = (self.variance + doubt).sqrt()
-        Dw = self.evidence @ w
-        seen = (Dw @ w).clamp(min=torch.finfo(w.dtype).tiny)[:, None, None]
-        forgotten = (1 - _FORGETTING) * Dw[:, :, None] * Dw[:, None, :] / seen
-        self.evidence[known] += (torch.outer(w, w) - forgotten)[known]
-        gain = self._covariance @ w / self.variance[:, None]
+        Du = _times(self.evidence, u)
+        seen = (Du * u).sum(-1).clamp(min=torch.finfo(w.dtype).tiny)[:, None, None]
+        forgotten = (1 - _FORGETTING) * Du[:, :, None] * Du[:, None, :] / seen
+        self.evidence[known] += (u[:, :, None] * u[:, None, :] - forgotten)[known]
+        self.drift[known] = (_KEPT * self.drift + _TAKEN * r.clamp(-_CLIP * spread, _CLIP * spread))[known]
+        gain = _times(self._covariance, u) / self.variance[:, None]
         bounded = r.clamp(-_CLIP * spread, _CLIP * spread)
-        self.correction[known] += bounded[known, None] * gain[known]
+        self.theta[known] += bounded[known, None] * gain[known]
         unexplained = (bounded.square() - doubt).clamp(min=_NOISE_STD**2)
         self.variance[known] += _RECENT * (unexplained - self.variance)[known]
         return r
 
     def extra_repr(self) -> str:
-        return f"pads={len(self.correction)}, largest={float(self.correction.abs().max()):.3g} N/rad"
+        return f"pads={len(self.theta)}, largest={float(self.correction.abs().max()):.3g} N/rad"
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    return (matrix @ vector[..., None])[..., 0]
+
+
+def _quadratic(matrix: Tensor, vector: Tensor) -> Tensor:
+    return (_times(matrix, vector) * vector).sum(-1)

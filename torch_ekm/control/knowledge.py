@@ -8,6 +8,7 @@ from torch import nn
 
 from .._recorded import Recorded, describe
 from ..description import HandDescription
+from ..enhanced.hand_figures import DescribedFigures, HandFigures
 from ..exceptions import FileFormatError, ParameterError
 from ..kinematics import IdealServos, ServoModel
 from ..residual.files import known_classes, read, rebuild, write
@@ -15,8 +16,8 @@ from .force_sensitivity import ForceSensitivity
 
 
 class HandKnowledge(Recorded, nn.Module):
-    """What a closed loop has learned of its hand, whatever it holds: dead zones and biases of the servos, and
-    how the forces of the fingers answer to them.
+    """What a closed loop has learned of its hand, whatever it holds: dead zones and biases of the servos, how
+    the forces of the fingers answer to them, and the figures by which it moves an object.
 
     Hand it to the next loop with the same hand, and keep it between sessions::
 
@@ -28,27 +29,36 @@ class HandKnowledge(Recorded, nn.Module):
     Args:
         servo: of the actuators.
         forces: how the pads' normal forces answer to the actuators.
+        figures: springs, moment arms and stiffnesses.
     """
 
-    def __init__(self, servo: ServoModel | IdealServos, forces: ForceSensitivity) -> None:
+    def __init__(
+        self,
+        servo: ServoModel | IdealServos,
+        forces: ForceSensitivity,
+        figures: HandFigures | DescribedFigures,
+    ) -> None:
         super().__init__()
-        self.servo, self.forces = servo, forces
+        self.servo, self.forces, self.figures = servo, forces, figures
 
     @classmethod
-    def of(cls, hand: HandDescription, *, learns: bool = True) -> HandKnowledge:
+    def of(cls, hand: HandDescription, *, learns: bool = True, adapts: bool = True) -> HandKnowledge:
         """Nothing is known yet.
 
         Args:
             learns: False takes servos for ideal, and learns nothing of them.
+            adapts: False leaves the figures of the hand as they are described.
         """
         servo = (ServoModel if learns else IdealServos)(hand.actuator_names)
-        return cls(servo, ForceSensitivity(len(hand.pads), hand.n_a))
+        figures = HandFigures.of(hand) if adapts else DescribedFigures()
+        return cls(servo, ForceSensitivity(len(hand.pads), hand.n_a), figures)
 
     def check(self, hand: HandDescription) -> None:
         """That it is of this hand.
 
         Raises:
-            ParameterError: the actuators have other names, or there are more or fewer pads.
+            ParameterError: the actuators have other names, there are more or fewer pads, or the description
+                has other figures.
         """
         if tuple(self.servo.names) != tuple(hand.actuator_names):
             names = ", ".join(self.servo.names)
@@ -58,6 +68,7 @@ class HandKnowledge(Recorded, nn.Module):
         if shape != (len(hand.pads), hand.n_a):
             valid = f"that of a hand with {len(hand.pads)} pads and {hand.n_a} actuators"
             raise ParameterError("knowledge", f"of {shape[0]} pads and {shape[1]} actuators", valid)
+        self.figures.check(hand)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write all of it; the file appears whole or not at all.

@@ -82,7 +82,7 @@ class JointLimit:
 
 @dataclass(frozen=True)
 class NormalForceLimit:
-    """``least_i <= f_n + (df_n/da) u <= maximum`` of each finger, f_n as measured, with::
+    """``least_i <= f_n + (df_n/da) u + d <= maximum`` of each finger, f_n as measured, with::
 
         least_i = max(minimum, share f*_i)
 
@@ -116,8 +116,9 @@ class NormalForceLimit:
             return None
         most = np.maximum(f_n, as_array(forces.normal)) if forces.solved else f_n
         most = most if seen.joint_force is None else np.maximum(most, as_array(seen.joint_force))
-        high = np.maximum(self.maximum - most, -self.step)
-        low = np.minimum(np.minimum(self.least(f_n, seen) - f_n, self.step), high)
+        high = np.maximum(self.maximum - most, -self.step) - seen.drift
+        low = np.minimum(self.least(f_n, seen) - f_n, self.step) - seen.drift
+        low = np.minimum(low, high)
         S = as_array(model.kinematic.normal_force_sensitivity)
         return Inequality(np.concatenate([-S, S]), np.concatenate([-low, high]))
 

@@ -39,6 +39,8 @@ class Situation:
     """Of the object [N]."""
     tighter: float = 0.0
     """Wanted on top of the grip that suits the object [N]."""
+    drift: Array | float = 0.0
+    """By which the normal forces change more than the model says, with each motion ``(n_c,)`` [N]."""
     grip: float | None = None
     """Wanted of the finger that opposes the others, see :class:`GripForceTask` [N]; None: nothing."""
 

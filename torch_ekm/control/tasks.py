@@ -42,7 +42,7 @@ class FocusTask:
 class OffAxisTask:
     """The object stays where it is, and comes back, in the directions that the focus leaves free."""
 
-    rotation_weight: float = 0.3
+    rotation_weight: float = 1.0
     """Per deg^2."""
     translation_weight: float = 0.05
     """Per mm^2."""
@@ -61,8 +61,8 @@ class OffAxisTask:
 
 @dataclass(frozen=True)
 class GripForceTask:
-    """``f_n + (df_n/da) u = f``: f_n as the fingertips measure it, only its sensitivity by the model,
-    corrected by what was learned of it.
+    """``f_n + (df_n/da) u + d = f``: f_n as the fingertips measure it, only its sensitivity by the model,
+    corrected by what was learned of it; d is what the last motions left.
 
     A grip force computed from a wrong model drops the object; a hand without fingertip sensors has no better.
 
@@ -94,7 +94,7 @@ class GripForceTask:
         if f_n is None:
             return None
         wanted = grip_shares(f_n, self.wanted(model.kinematic, seen))
-        change = np.clip(wanted - f_n, -self.step, self.step)
+        change = np.clip(wanted - f_n, -self.step, self.step) - seen.drift
         return Squares(as_array(model.kinematic.normal_force_sensitivity), change, self.weight)
 
     def wanted(self, kinematic: Linearization, seen: Situation) -> float:

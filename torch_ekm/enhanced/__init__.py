@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from .adaptive_model import AdaptiveModel
 from .encoding import GraspEncoding
 from .enhanced_model import EnhancedModel
 from .grasp_learner import grasp_learner
+from .parameter_filter import ParameterFilter
 from .saving import load, save
 
 __all__ = [
+    "AdaptiveModel",
     "EnhancedModel",
     "GraspEncoding",
+    "ParameterFilter",
     "grasp_learner",
     "load",
     "save",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
@@ -22,6 +23,7 @@ from .model_jacobian import differentiated, finite_differences
 
 if TYPE_CHECKING:
     from ..model import KinematicModel
+    from ..model.linearization import FollowedFigures
 
 
 class EnhancedModel(Recorded, nn.Module):
@@ -87,6 +89,7 @@ class EnhancedModel(Recorded, nn.Module):
         state: GraspState,
         learner: ResidualLearner | Callable[[int, int], ResidualLearner] | None = None,
         encode: GraspEncoding | None = None,
+        figures: FollowedFigures | None = None,
     ) -> EnhancedModel:
         """An E-KM of a grasped object, with nothing learned yet.
 
@@ -99,14 +102,24 @@ class EnhancedModel(Recorded, nn.Module):
             learner: of ``[encode(s); da]``, or ``learner(n_s, n_a)`` that makes one for ``n_s`` features of
                 the state and ``n_a`` actuators; None: :func:`~torch_ekm.enhanced.grasp_learner`.
             encode: what it sees of a state; None: of this grasp.
+            figures: of the hand, which f follows: :class:`~torch_ekm.control.HandFigures` that know it
+                already, or :class:`~torch_ekm.control.DescribedFigures`. None: those that the model follows,
+                or new ones. A :class:`~torch_ekm.control.ClosedLoop` brings those of its knowledge.
 
         Raises:
             NoContactError: nothing touches the object.
         """
         n_q, n_a = state.q.shape[-1], model.hand.n_a
+        if figures is None and model.figures is None:
+            from .hand_figures import HandFigures  # the model is slow to import
+
+            figures = HandFigures.of(model.hand)
+        model = model if figures is None else model.with_figures(figures)
         encode = GraspEncoding.of(model, state) if encode is None else encode
         if not isinstance(learner, ResidualLearner):
-            learner = (grasp_learner if learner is None else learner)(encode.n_features, n_a)
+            adapts = model.figures is not None and model.figures.learns
+            made = partial(grasp_learner, adapts=adapts) if learner is None else learner
+            learner = made(encode.n_features, n_a)
         scale = torch.tensor([1e3] * 3 + [180 / math.pi] * 3, dtype=state.q.dtype)  # m -> mm, rad -> deg
         rows = list(range(n_q, n_q + 6))
         step = math.radians(2.0)
@@ -151,7 +164,8 @@ class EnhancedModel(Recorded, nn.Module):
             state: state before the motion.
             action: increment that was commanded.
             increment: what happened, ``ds``.
-            nominal: ``f(s, da)`` if it is known already; computed if None.
+            nominal: ``f(s, da)`` if it is known already. None: it is computed, by a model that adapts
+                (:class:`AdaptiveModel`, a KM with figures) after it has learned from the motion.
 
         Returns:
             The learner's report.
@@ -166,6 +180,9 @@ class EnhancedModel(Recorded, nn.Module):
             raise ParameterError(
                 "increment", type(increment).__name__, "a tensor: torch.as_tensor(increment)"
             )
+        if nominal is None and hasattr(self.model, "adapt"):
+            check_finite("increment", increment)
+            self.model.adapt(state, action, increment)
         predicted = self.nominal(state, action) if nominal is None else nominal
         check_shape("increment", increment, predicted.shape, "as the prediction has")
         if self.learner.on_invalid == "raise":  # else the learner leaves such a sample out, and counts it

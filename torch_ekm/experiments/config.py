@@ -46,6 +46,8 @@ class Setting:
     safety: Safety = field(default_factory=Safety)
     servo_inverse: bool = True
     """The E-KM commands through one; without it the dead zone is learned together with the hand."""
+    adapts: bool = True
+    """f of the E-KM follows the figures of the hand as they are learned; else its description."""
     learner: str = DEFAULT_LEARNER
     learner_options: Mapping[str, Any] = field(default_factory=dict)
     capacity: int = 60

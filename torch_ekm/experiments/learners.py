@@ -9,7 +9,7 @@ import torch
 
 from .. import interop, residual
 from .._recorded import describe
-from ..enhanced.grasp_learner import NOISE_VARIANCE, grasp_kernel
+from ..enhanced.grasp_learner import ACTION_VARIANCE, NOISE_VARIANCE, grasp_kernel
 from ..exceptions import UnknownNameError
 from ..residual import ResidualLearner
 
@@ -103,9 +103,12 @@ def _rbf(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearn
     return _ON_A_HAND(d, m, **{"kernel": kernel, **options})
 
 
-def _action_linear(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearner:
+def _action_linear(
+    d: int, m: int, *, n_actions: int = 0, action_variance: float = ACTION_VARIANCE, **options: Any
+) -> ResidualLearner:
     """The learner of :meth:`EnhancedModel.for_grasp`."""
-    return _ON_A_HAND(d, m, **{"kernel": grasp_kernel(d - n_actions, n_actions), **options})
+    kernel = grasp_kernel(d - n_actions, n_actions, action_variance)
+    return _ON_A_HAND(d, m, **{"kernel": kernel, **options})
 
 
 _ON_A_HAND = Sparse(robust=3.0, forgetting_factor=0.995)

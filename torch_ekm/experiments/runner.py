@@ -21,6 +21,7 @@ from ..control import (
 )
 from ..description import ObjectDescription
 from ..enhanced import EnhancedModel, GraspEncoding
+from ..enhanced.grasp_learner import SMALL_ACTION_VARIANCE
 from ..exceptions import EquilibriumError, GraspError
 from ..foresight import BlindPose
 from ..kinematics import GraspState
@@ -29,7 +30,7 @@ from ..plant import FramesAtRest, Plant
 from ..residual import ResidualLearner
 from ..simulation import DisturbedPlant, PlantChange, SimulatedHand, Tug
 from .config import Setting, object_name
-from .learners import make_learner
+from .learners import DEFAULT_LEARNER, make_learner
 from .records import NotGrasped, Record, Trial, TrialRecord, true_state
 
 _DEG = math.pi / 180
@@ -61,7 +62,8 @@ class Bench:
         else:
             self.plant = FramesAtRest(self.plant, setting.frames)
         inverse = controller == "KM+S" or (self.learns and setting.servo_inverse)
-        self.knowledge = HandKnowledge.of(self.hand.hand, learns=inverse)
+        adapts = self.learns and setting.adapts
+        self.knowledge = HandKnowledge.of(self.hand.hand, learns=inverse, adapts=adapts)
         """Of the hand; it stays when the object changes."""
         self.pace = Pace(setting.pace, adapts=self.learns)
         self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model)
@@ -199,8 +201,13 @@ class Bench:
             self.encoding = GraspEncoding.of(self.model, start)
         if self.learner is None:
             sizes = self.encoding.n_features, self.model.hand.n_a, setting.capacity
-            self.learner = make_learner(setting.learner, *sizes, **setting.learner_options)
-        self.enhanced = EnhancedModel.for_grasp(self.model, start, self.learner, self.encoding)
+            options = dict(setting.learner_options)
+            if setting.adapts and setting.learner == DEFAULT_LEARNER:
+                options = {"action_variance": SMALL_ACTION_VARIANCE, **options}
+            self.learner = make_learner(setting.learner, *sizes, **options)
+        self.enhanced = EnhancedModel.for_grasp(
+            self.model, start, self.learner, self.encoding, self.knowledge.figures
+        )
 
 
 def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting, keep_images: bool) -> Plant:

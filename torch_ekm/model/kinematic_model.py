@@ -21,7 +21,8 @@ from .checks import at_pads, check_contacts, check_inertia, check_state, joint_i
 from .force_balance import ForceBalance, KnownForces, Statics
 from .gradients import following, only_if_asked
 from .grasp_forces import ExpectedForces, GraspForces
-from .linearization import Linearization
+from .linearization import FollowedFigures, Linearization
+from .motion_equations import MotionEquations
 from .options import ModelOptions
 from .reduction import Reduction
 from .sensitivity import force_change, margin_sensitivity, normal_motion, normal_sensitivity
@@ -66,6 +67,8 @@ class KinematicModel(nn.Module):
     """Of the object, hand frame [N]."""
     com: Float[Tensor, " 3"]
     """Of the object, in its own frame [m]."""
+    figures: FollowedFigures | None = None
+    """What J_m follows in place of the description, see :meth:`with_figures`."""
     plane: Float[Tensor, " 3"] | None
     """Normal of a planar hand's plane; None: a spatial hand."""
     precedes: Bool[Tensor, "n_q n_q"]
@@ -105,6 +108,34 @@ class KinematicModel(nn.Module):
         )
         self.register_buffer("precedes", precedence(self.kinematics.upstream), persistent=False)
 
+    def with_figures(self, figures: FollowedFigures) -> KinematicModel:
+        """A model of the same hand and object whose J_m follows ``figures`` as they are learned.
+
+        Forces, their sensitivities and stability stay those of the description. A batch of states, and a
+        grasp that would buckle with these figures, get the description's J_m.
+        """
+        made = KinematicModel(
+            self.hand, self.obj, self.options, kinematics=self.kinematics, detector=self.detector,
+            dtype=self.weight.dtype,
+        )  # fmt: skip
+        object.__setattr__(made, "figures", figures)  # they belong to the hand, not to the model's state
+        return made
+
+    def followed(self, lin: Linearization) -> Linearization:
+        """The same state with J_m of the present figures."""
+        found = None if self.figures is None or lin.equations is None else self.figures.solve(lin.equations)
+        if found is None:
+            return lin
+        return dataclasses.replace(
+            lin, manipulation_jacobian=found.jacobian, described=lin.described_jacobian
+        )
+
+    def adapt(
+        self, state: GraspState, action: Float[Tensor, " n_a"], increment: Float[Tensor, " n_s"]
+    ) -> object:
+        """Let the figures learn from one motion; nothing without figures."""
+        return None if self.figures is None else self.figures.learn(self.linearize(state), action, increment)
+
     def extra_repr(self) -> str:
         return f"hand={self.hand.name}, n_q={self.hand.n_q}, n_a={self.hand.n_a}"
 
@@ -138,6 +169,10 @@ class KinematicModel(nn.Module):
         if contacts.n_c == 0:
             raise NoContactError("no finger touches the object, so no actuator can move it")
         return following(contacts, self.contacts, state) if torch.is_grad_enabled() else contacts
+
+    def moving(self, contacts: ContactSet) -> Bool[Tensor, " n_q"]:
+        """Joints that move a contact."""
+        return self.kinematics.upstream[[self.link_names.index(name) for name in contacts.link]].any(0)
 
     def contact_kinematics(
         self,
@@ -227,12 +262,16 @@ class KinematicModel(nn.Module):
         D = self.load_stiffness(kin, forces) + V_ss
         held = self.balance.held_by_stops(state.q, forces.stop_torque)
         held[..., lock] = True
-        J, dmu, dlam, stability = self.reduction.solve(
-            D, A, kin.rows, held, self.balance.slack(forces), o.on_unstable
-        )
+        slack = self.balance.slack(forces)
+        J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held, slack, o.on_unstable)
+        equations = None
+        if held.dim() == 1:
+            equations = MotionEquations(
+                self.reduction, D, A, tuple(kin.rows), held, slack, self.moving(contacts)
+            )
         df, dn = force_change(kin, dmu), normal_motion(kin, J)
         normal = normal_sensitivity(kin, forces, df, dn)
-        return Linearization(
+        found = Linearization(
             state=state,
             contacts=contacts,
             forces=forces,
@@ -247,6 +286,7 @@ class KinematicModel(nn.Module):
             held_joints=held,
             stability=stability,
             options=o,
+            equations=equations,
             doubts=find_doubts(
                 o,
                 self.hand.joint_names,
@@ -258,6 +298,7 @@ class KinematicModel(nn.Module):
                 before=() if previous is None else previous.contacts.finger,
             ),
         )
+        return self.followed(found)
 
     def load_stiffness(self, kin: ContactKinematics, forces: GraspForces) -> Float[Tensor, "*batch n_s n_s"]:
         """``dF/ds`` at constant contact forces: lever arms of hand and object, rolling, soft-finger spin."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 
@@ -14,6 +15,7 @@ from ..kinematics.grasp_state import GraspState
 from ..kinematics.tensors import as_tensors
 from ..typing import Bool, Float, Tensor
 from .grasp_forces import ExpectedForces, GraspForces, drift, friction_use, margin_std, start_covariance
+from .motion_equations import Motion, MotionEquations
 from .options import ModelOptions
 from .validity import Doubt, ModelStatus
 
@@ -50,6 +52,12 @@ class Linearization:
     """Smallest eigenvalue of the stiffness with locked actuators, translations in units of L [N m/rad]."""
     options: ModelOptions
     """Those of the model."""
+    equations: MotionEquations | None = None
+    """What J_m follows from; None: of a batch."""
+    described: Float[Tensor, "n_s n_a"] | None = None
+    """J_m of the description, where J_m follows figures that were learned; None: it is that."""
+    described_normal: Float[Tensor, "n_c n_a"] | None = None
+    """d f_n/da of the model, where what was measured corrects it; None: it is that."""
     doubts: tuple[Doubt, ...] = ()
     """What speaks against this linearization, worst first."""
 
@@ -73,12 +81,23 @@ class Linearization:
         return self.manipulation_jacobian[..., self.n_q :, :]
 
     @property
+    def described_jacobian(self) -> Float[Tensor, "*batch n_s n_a"]:
+        """J_m of the hand as described."""
+        return self.manipulation_jacobian if self.described is None else self.described
+
+    @property
     def margins(self) -> Float[Tensor, "*batch n_c"]:
         """``mu_s f_n - |f_t|`` of each contact [N]."""
         return self.forces.margin
 
-    def with_normal_sensitivity(self, correction: Float[Tensor, "n_c n_a"]) -> Linearization:
-        """The same with ``df_n/da + correction`` [N/rad]; margins and force vectors follow."""
+    @property
+    def described_normal_sensitivity(self) -> Float[Tensor, "*batch n_c n_a"]:
+        """d f_n/da of the model [N/rad]."""
+        return self.normal_force_sensitivity if self.described_normal is None else self.described_normal
+
+    def with_normal_sensitivity(self, normal: Float[Tensor, "n_c n_a"]) -> Linearization:
+        """The same with another ``df_n/da`` [N/rad]; margins and force vectors follow."""
+        correction = normal - self.normal_force_sensitivity
         mu_s, inward = self.contacts.friction[..., None], -self.contacts.normal[..., None]
         dmu = self.contact_force_sensitivity.index_add(
             -2, torch.tensor(self.normal_rows), correction.to(self.contact_force_sensitivity)
@@ -86,7 +105,8 @@ class Linearization:
         return dataclasses.replace(
             self,
             contact_force_sensitivity=dmu,
-            normal_force_sensitivity=self.normal_force_sensitivity + correction,
+            normal_force_sensitivity=normal,
+            described_normal=self.described_normal_sensitivity,
             margin_sensitivity=self.margin_sensitivity + mu_s * correction,
             force_vector_sensitivity=self.force_vector_sensitivity + inward * correction[..., None, :],
         )
@@ -152,6 +172,20 @@ class Linearization:
             raise ShapeError("delta_a", f"(*batch, {n_a})", delta_a.shape, "one entry per actuator")
         check_finite("delta_a", delta_a)
         return delta_a
+
+
+@runtime_checkable
+class FollowedFigures(Protocol):
+    """Figures of a hand, which J_m follows."""
+
+    learns: bool
+    """They adapt."""
+
+    def solve(self, equations: MotionEquations) -> Motion | None:
+        """J_m with the present figures; None: that of the description holds."""
+
+    def learn(self, lin: Linearization, moved: Tensor, increment: Tensor) -> object:
+        """Learn from one motion."""
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from ..description.hand import HandDescription
 from ..exceptions import SingularGraspError, UnstableGraspError
 from ..kinematics.null_space import null_space
 from ..typing import Bool, Float, Tensor
-from .manipulation import two_stage
+from .manipulation import KKTSolution, two_stage
 from .options import ModelOptions
 
 
@@ -27,6 +27,15 @@ class GraspResponse(NamedTuple):
     """dlam/da."""
     stability: Float[Tensor, "*batch"]
     """Smallest eigenvalue of the stiffness with the actuators locked."""
+
+
+class Drives(NamedTuple):
+    """How the actuators drive the joints."""
+
+    actuation: Float[Tensor, "n_a n_q"]
+    """J_a: moment arms [rad/rad]."""
+    stiffness: Float[Tensor, " n_a"]
+    """K_a [N m/rad]; infinite: rigid."""
 
 
 class Reduction(nn.Module):
@@ -111,24 +120,36 @@ class Reduction(nn.Module):
                 whole[at] = part
         return GraspResponse(*(part.reshape(*batch, *part.shape[1:]) for part in parts))
 
-    def _solve(
-        self, D: Tensor, A: Tensor, rows: list[int], held: Tensor, slack: Tensor, on_unstable: str
-    ) -> GraspResponse:
-        n_a, n_q = self.actuation.shape
+    @property
+    def drives(self) -> Drives:
+        """Those of the description."""
+        return Drives(self.actuation, self.stiffness)
+
+    def reduced(
+        self, D: Tensor, A: Tensor, rows: list[int], held: Tensor, slack: Tensor, drives: Drives | None = None
+    ) -> ReducedStep:
+        """The equations in permitted coordinates z, scaled, of states in which the same joints are held.
+
+        Args:
+            D, A, rows, held, slack: as in :meth:`solve`; held and slack of one state.
+            drives: in place of the description's.
+        """
+        J_a, K_a = self.drives if drives is None else drives
+        n_a, n_q = J_a.shape
         n_h, L, S = len(rows), CHARACTERISTIC_LENGTH, self.scaled_basis
         D = _left(S, D @ S)
         row_scale = torch.tensor(
             [1 / L if row % 6 < 3 else 1.0 for row in rows], dtype=D.dtype, device=D.device
         )
         A = row_scale[:, None] * (A @ S)
-        B = self.actuation @ S[:n_q]
-        finite = torch.isfinite(self.stiffness)
+        B = J_a @ S[:n_q]
+        finite = torch.isfinite(K_a)
         taut = ~slack
         rigid, soft = (taut & ~finite).nonzero()[:, 0], (taut & finite).nonzero()[:, 0]
         eye = torch.eye(n_a, dtype=D.dtype, device=D.device)
         F = None
         if len(soft):
-            K_B = self.stiffness[soft, None] * B[soft]
+            K_B = K_a[soft, None] * B[soft]
             D = D + B[soft].mT @ K_B
             F = K_B.mT @ eye[soft]
         batch = D.shape[:-2]
@@ -137,19 +158,55 @@ class Reduction(nn.Module):
         E = torch.cat([A, *(part.expand(*batch, *part.shape) for part in fixed if len(part))], dim=-2)
         R = D.new_zeros(E.shape[-2], n_a)
         R[n_h : n_h + len(rigid)] = eye[rigid] / arm
+        return ReducedStep(D, E, R, F, row_scale, B, K_a, rigid, soft, arm)
+
+    def _solve(
+        self, D: Tensor, A: Tensor, rows: list[int], held: Tensor, slack: Tensor, on_unstable: str
+    ) -> GraspResponse:
+        system, S, n_h = self.reduced(D, A, rows, held, slack), self.scaled_basis, len(rows)
         try:
-            step = two_stage(D, E, R, F, on_unstable=on_unstable, actuators=self.actuators)
+            step = two_stage(
+                system.D, system.E, system.R, system.F, on_unstable=on_unstable, actuators=self.actuators
+            )
         except (SingularGraspError, UnstableGraspError) as error:
             if error.direction is not None:  # into state coordinates
                 direction = S @ error.direction
                 error.direction = direction / torch.linalg.vector_norm(direction).clamp_min(1e-300)
             raise
-        dlam = D.new_zeros(*batch, n_a, n_a)
-        dlam[..., rigid, :] = step.reaction[..., n_h : n_h + len(rigid), :] / arm
-        if len(soft):
-            dlam[..., soft, :] = self.stiffness[soft, None] * (_left(B[soft].mT, step.motion) - eye[soft])
-        dmu = row_scale[:, None] * step.reaction[..., :n_h, :]
+        dlam = system.actuator_force(step, n_h)
+        dmu = system.row_scale[:, None] * step.reaction[..., :n_h, :]
         return GraspResponse(_left(S.mT, step.motion), dmu, dlam, step.stability)
+
+
+class ReducedStep(NamedTuple):
+    """``D dz + E^T dnu = F da``, ``E dz = R da`` in permitted, scaled coordinates."""
+
+    D: Float[Tensor, "*batch n_z n_z"]
+    """Compliant actuators included."""
+    E: Float[Tensor, "*batch m n_z"]
+    """Rows: contacts, rigid actuators in units of their arm, held joints."""
+    R: Float[Tensor, "m n_a"]
+    F: Float[Tensor, "n_z n_a"] | None
+    row_scale: Float[Tensor, " n_h"]
+    B: Float[Tensor, "n_a n_z"]
+    stiffness: Float[Tensor, " n_a"]
+    rigid: Tensor
+    """Taut actuators without compliance."""
+    soft: Tensor
+    """Taut actuators with it."""
+    arm: Float[Tensor, "n_rigid 1"]
+    """Norm of the rows of B of the rigid ones."""
+
+    def actuator_force(self, step: KKTSolution, n_h: int) -> Float[Tensor, "*batch n_a n_a"]:
+        """dlam/da of a solution; 0 of slack tendons."""
+        n_a, J = len(self.B), step.motion
+        dlam = J.new_zeros(*J.shape[:-2], n_a, n_a)
+        rigid, soft = self.rigid, self.soft
+        dlam[..., rigid, :] = step.reaction[..., n_h : n_h + len(rigid), :] / self.arm
+        if len(soft):
+            eye = torch.eye(n_a, dtype=J.dtype, device=J.device)
+            dlam[..., soft, :] = self.stiffness[soft, None] * (_left(self.B[soft].mT, J) - eye[soft])
+        return dlam
 
 
 def _left(S: Tensor, X: Tensor) -> Tensor:

@@ -127,7 +127,7 @@ class Evidence:
                         parts |= self._encoders(lin, rest, state.position, figures)
                     if last is not None:
                         motion = self._motion(last, lin, grasp[k - 1], rest, dx, figures)
-                        moving = motion[: self.model.hand.n_q][self._moving(lin)]
+                        moving = motion[: self.model.hand.n_q][self.model.moving(lin.contacts)]
                         do, dphi = motion[-6:].split(3)
                         parts |= _scaled(joints=moving, position=do, rotation=dphi)
                 if parts:
@@ -135,7 +135,7 @@ class Evidence:
                 last = lin
 
     def _equilibrium(self, lin: Linearization, rest: Rest) -> dict[str, Tensor]:
-        parts = [lin.forces.residual[self._moving(lin)] / self.model.options.forces.torque_std]
+        parts = [lin.forces.residual[self.model.moving(lin.contacts)] / self.model.options.forces.torque_std]
         if rest.force is not None:
             measured = rest.force[self.model.hand.pad_indices(lin.contacts.finger)]
             known = torch.isfinite(measured)
@@ -158,11 +158,6 @@ class Evidence:
         dq, do, dphi = ds.split([self.model.hand.n_q, 3, 3])
         predicted = torch.cat([dq, do + lever - exp(dphi) @ lever, dphi])
         return after.state.minus(before.state) - predicted
-
-    def _moving(self, lin: Linearization) -> Tensor:
-        """Joints of the fingers that touch."""
-        links = [self.model.link_names.index(name) for name in lin.contacts.link]
-        return self.model.kinematics.upstream[links].any(0)
 
     def _linearize(self, rest: Rest, figures: Figures) -> Linearization:
         offset, state = torch.cat([figures.object_position, figures.object_rotation]), rest.state

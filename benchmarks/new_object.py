@@ -1,0 +1,229 @@
+"""A hand that has learned its figures with one object, and objects that it has never held.
+
+    python benchmarks/new_object.py --first box --then can,bottle,jar --seeds 1000:1003
+
+The hand makes thirty motions with the first object. Then it turns each of the others by 9, 19 and 27 deg,
+without any warm-up on it. Poses come from camera images, joint angles from Hall counts. Finished sessions
+stay in ``--out``: an interrupted run goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from any_hand import Turns
+
+from torch_ekm._terminal import progress
+from torch_ekm.cli._app import parse_seeds
+from torch_ekm.experiments.config import Setting, digest, object_name
+from torch_ekm.experiments.jobs import run_jobs
+from torch_ekm.experiments.records import TrialRecord
+from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
+from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
+from torch_ekm.experiments.runner import Bench
+from torch_ekm.simulation import PRESETS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ANGLES = (9.0, 19.0, 27.0)
+MOTIONS = 30  # with the first object
+_FIRST_ANGLES = (14.0, -8.0, 22.0)
+_MOST_TURNS = 12  # with the first object, if turns end early
+_WARM_UP = 1000  # number of the first grasp of the first object
+EARLY = 5  # motions with a new object
+_SHOWN = 25  # of the picture
+#: What an E-KM begins a new object with.
+CONTENDERS: dict[str, dict[str, Any]] = {
+    "empty": {"adapts": False},
+    "learned hand": {},
+    "learned hand, f alone": {"learner": "model alone"},
+}
+_COLOURS = {
+    "KM": COLOURS["KM"], "empty": "#56B4E9", "learned hand": COLOURS["E-KM"],
+    "learned hand, f alone": "#CC79A7",
+}  # fmt: skip
+
+
+def session(setting: Setting, first: str, then: Sequence[str], seed: int) -> list[dict[str, Any]]:
+    """Turns of the first object, kind "first", then those of the others."""
+    setting = setting.hardware_instance(seed)
+    records, knowledge = [], None
+    for item in (first, *then):
+        bench = Bench(setting, item, "E-KM")
+        bench.knowledge = knowledge = bench.knowledge if knowledge is None else knowledge
+        if item == first and not records:
+            made = 0
+            for k in range(_MOST_TURNS):
+                if made >= MOTIONS:
+                    break
+                angle = _FIRST_ANGLES[k % len(_FIRST_ANGLES)]
+                one = bench.trial(seed, _WARM_UP + k, angle, "first")
+                made += one.steps if isinstance(one, TrialRecord) else 0
+                records.append(one)
+        else:
+            records += [bench.trial(seed, k, angle) for k, angle in enumerate(ANGLES)]
+        bench.close()
+    return [one.to_json() for one in records]
+
+
+class Comparison:
+    """Turns of all sessions, by contender, seed and object in the order in which they were made."""
+
+    def __init__(self, results: dict[tuple[str, int], list[TrialRecord]]) -> None:
+        self.results = results
+        self.contenders = list(dict.fromkeys(name for name, _ in results))
+        self.objects = list(dict.fromkeys(one.object for records in results.values() for one in records))
+
+    def turns(self, contender: str, item: str | None = None, kind: str = "turn") -> Turns:
+        """Turns of one object, or of all new ones."""
+        return Turns(
+            tuple(
+                one
+                for (name, _), records in self.results.items()
+                for one in records
+                if name == contender and one.kind == kind and item in (None, one.object)
+            )
+        )
+
+    def errors(
+        self, contender: str, which: str, item: str | None = None, kind: str = "turn"
+    ) -> list[list[float]]:
+        """One-step errors [deg] in the order of motions, for each seed and object.
+
+        Args:
+            which: "km" or "ekm".
+        """
+        found: dict[tuple[int, str], list[float]] = defaultdict(list)
+        for (name, seed), records in self.results.items():
+            for one in records:
+                if name == contender and one.kind == kind and item in (None, one.object):
+                    found[seed, one.object] += getattr(one, f"true_prediction_{which}_deg")
+        return list(found.values())
+
+    def early(self, contender: str, which: str, item: str | None = None, kind: str = "turn") -> float:
+        """Mean one-step error of the first motions with an object [deg]."""
+        return _mean(
+            [error for errors in self.errors(contender, which, item, kind) for error in errors[:EARLY]]
+        )
+
+    def later(self, contender: str, which: str, item: str | None = None) -> float:
+        """Of the others."""
+        return _mean([error for errors in self.errors(contender, which, item) for error in errors[EARLY:]])
+
+    def first_motion(self, contender: str, which: str, item: str | None = None) -> float:
+        """Of the first motion of each turn."""
+        name = f"true_prediction_{which}_deg"
+        firsts = (getattr(one, name) for one in self.turns(contender, item).records)
+        return _mean([errors[0] for errors in firsts if errors])
+
+    @property
+    def verdict(self) -> str:
+        """The last line."""
+        ours, best = self.turns("learned hand"), "learned hand"
+        return (
+            f"first five motions KM {self.early(best, 'km'):.2f}, empty {self.early('empty', 'ekm'):.2f},"
+            f" learned hand {self.early(best, 'ekm'):.2f} deg;"
+            f" first motion {self.first_motion(best, 'ekm'):.2f} deg; lost {ours.lost} of {len(ours.records)}"
+        )
+
+    def table(self) -> Table:
+        """A row for each object and contender."""
+        rows: list[list[Cell]] = []
+        first, *others = self.objects
+        for item in [*others, None]:
+            for name in self.contenders:
+                turns = self.turns(name, item)
+                first_km, first_ekm = (self.first_motion(name, which, item) for which in ("km", "ekm"))
+                rows.append(
+                    [
+                        "all" if item is None else item.replace("_", " "), name, len(turns.records),
+                        self.early(name, "km", item), self.early(name, "ekm", item),
+                        self.later(name, "ekm", item), first_ekm, first_ekm / first_km,
+                        turns.lost, turns.missed, turns.motions,
+                    ]
+                )  # fmt: skip
+        columns = [
+            "object", "begins with", "turns", Column("KM, first 5 [deg]", ".2f"),
+            Column("E-KM, first 5 [deg]", ".2f"), Column("later [deg]", ".2f"),
+            Column("first of a turn [deg]", ".2f"), Column("of KM's [%]", ".0f", percent=True),
+            "lost", "not reached", Column("motions", ".1f"),
+        ]  # fmt: skip
+        before = ", ".join(
+            f"{name} {self.early(name, 'ekm', first, 'first'):.2f}" for name in self.contenders
+        )
+        note = (
+            "One-step errors of the rotation about the axis against what really happened, predicted before"
+            " the model learns from the motion; motions of turns that reached the target. First five motions"
+            f" of the first object ({first}): KM {self.early(self.contenders[0], 'km', first, 'first'):.2f},"
+            f" {before} deg."
+        )
+        return Table("objects", "Objects that the hand has never held", columns, rows, note)
+
+    def picture(self) -> Figure:
+        """One-step error against the number of motions with a new object."""
+        figure, (axes,) = new_figure(6.0, 3.2)
+        curves = [("KM", "learned hand", "km"), *((name, name, "ekm") for name in self.contenders)]
+        for label, name, which in curves:
+            errors = self.errors(name, which)
+            means = [_mean([one[k] for one in errors if len(one) > k]) for k in range(_SHOWN)]
+            axes.plot(range(1, _SHOWN + 1), means, "o-", ms=3, color=_COLOURS[label], label=label)
+        axes.set_xlabel("motion with a new object")
+        axes.set_ylabel("one-step error [deg]")
+        axes.set_ylim(0, None)
+        axes.legend(frameon=False, fontsize=8)
+        return figure
+
+    def report(self, folder: Path) -> Report:
+        """Table, picture and verdict, in ``folder``."""
+        caption = "Mean one-step error about the axis, all new objects and seeds."
+        shown = save_figure(self.picture(), folder, "new_object", caption)
+        report = Report("Objects that the hand has never held", f"{self.verdict}.", [self.table()], [shown])
+        report.write(folder)
+        return report
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
+
+
+def main() -> None:
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
+    parser.add_argument("--first", default="box", help="name or path of the object that the hand learns with")
+    parser.add_argument("--then", default="can,bottle,jar", help="names or paths")
+    parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1003"), help="FIRST:END")
+    parser.add_argument("--preset", default="nominal", choices=list(PRESETS))
+    parser.add_argument("--jobs", type=int, default=2, help="processes at once")
+    parser.add_argument("--out", type=Path, default=Path("new_object_output"), help="keeps what is finished")
+    parser.add_argument("--quick", action="store_true", help="one new object, one seed, no camera")
+    given = parser.parse_args()
+    then, seeds = given.then.split(","), given.seeds
+    if given.quick:
+        then, seeds = then[:1], seeds[:1]
+    todo, where = {}, {}
+    for name, changes in CONTENDERS.items():
+        setting = Setting(preset=given.preset, sensing=not given.quick, **changes)
+        for seed in seeds:
+            key = (
+                f"{object_name(given.first)}_{digest(setting, (given.first, *then), ANGLES, MOTIONS)}_{seed}"
+            )
+            todo[key], where[key] = (setting, given.first, then, seed), (name, seed)
+    with progress("running", len(todo)) as advance:
+        results = run_jobs(session, todo, given.out, given.jobs, advance)
+    made = {
+        where[key]: [one for one in map(TrialRecord.from_json, trials) if isinstance(one, TrialRecord)]
+        for key, trials in results.items()
+    }
+    comparison = Comparison(made)
+    print(comparison.report(given.out).markdown())
+    print(comparison.verdict)
+
+
+if __name__ == "__main__":
+    main()

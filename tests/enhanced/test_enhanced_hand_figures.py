@@ -1,0 +1,157 @@
+"""The figures of a hand, learned from how objects move."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm.control import DescribedFigures, HandFigures
+from torch_ekm.description import load_hand
+from torch_ekm.enhanced import EnhancedModel
+from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
+from torch_ekm.model import KinematicModel
+from torch_ekm.simulation import SimulatedHand
+
+F64 = torch.float64
+
+
+@pytest.fixture(scope="module")
+def held():
+    plant = SimulatedHand("icub_right", "box")
+    seen = plant.reset(seed=4)
+    return seen.state, KinematicModel(plant.hand, plant.object)
+
+
+@pytest.fixture(scope="module")
+def other(held):
+    """The same hand with pulleys 1.3 times as large, one of 1.5 times, and soft tendons."""
+    _, model = held
+    hand = model.hand
+    arms = 1.3 * hand.actuation_jacobian
+    arms[hand.actuator_names.index("index_proximal")] *= 1.5 / 1.3
+    actuators = tuple(dataclasses.replace(one, stiffness=0.6 * one.stiffness) for one in hand.actuators)
+    made = dataclasses.replace(
+        hand, actuation_jacobian=arms, actuators=actuators, spring_stiffness=0.8 * hand.spring_stiffness
+    )
+    return KinematicModel(made, model.obj, kinematics=model.kinematics, detector=model.detector)
+
+
+def motions(state, model, true, n: int, seed: int = 0, noise: float = 0.0):
+    """(linearization, w, ds) near a state; forces are those of the description, as the filter takes them."""
+    draw = torch.Generator().manual_seed(seed)
+    where = state
+    for _ in range(n):
+        lin = model.linearize(where)
+        w = math.radians(3) * torch.randn(model.hand.n_a, generator=draw, dtype=F64)
+        w[0], w[-1] = 0.0, 0.0
+        ds = true.linearize(where, lin.contacts, forces=lin.forces).step(w)
+        yield lin, w, ds + noise * torch.randn(len(ds), generator=draw, dtype=F64)
+        where = state.plus(0.2 * torch.randn(1, generator=draw, dtype=F64) * ds)
+
+
+def error(figures, stream) -> tuple[float, float]:
+    """Mean errors of the object's twist: with the figures, and of the description."""
+    errors = []
+    for lin, w, ds in stream:
+        motion = figures.solve(lin.equations)
+        errors.append([float((J @ w - ds)[-6:].norm()) for J in (motion.jacobian, lin.manipulation_jacobian)])
+    return tuple(np.mean(errors, axis=0))
+
+
+@pytest.fixture(scope="module")
+def learned(held, other) -> HandFigures:
+    state, model = held
+    figures = HandFigures.of(model.hand)
+    for lin, w, ds in motions(state, model, other, 30, noise=1e-4):
+        figures.learn(lin, w, ds)
+    return figures
+
+
+def test_nothing_learned_is_the_description(held) -> None:
+    state, model = held
+    figures = HandFigures.of(model.hand)
+    followed = model.with_figures(figures)
+    lin, same = followed.linearize(state), model.linearize(state)
+    torch.testing.assert_close(lin.manipulation_jacobian, same.manipulation_jacobian, rtol=0, atol=1e-13)
+    assert model.figures is None
+    assert "not told" in str(figures)
+    assert not any(figure.told for figure in figures.figures)
+
+
+def test_motions_that_were_not_seen_are_predicted(held, other, learned) -> None:
+    state, model = held
+    mine, described = error(learned, motions(state, model, other, 10, seed=9))
+    assert mine < 0.1 * described
+
+
+def test_what_motions_tell_is_found_and_the_rest_is_said_to_be_unknown(learned) -> None:
+    found = {one.name: one for one in learned.figures}
+    arm = found["moment arm of index_proximal at index_1"]
+    assert arm.told
+    assert arm.factor == pytest.approx(1.5, abs=0.15)
+    assert not found["spring of little_1"].told  # the finger does not touch
+    assert f"moment arm of index_proximal at index_1: {arm.factor:.2f} times" in str(learned)
+    assert "spring of little_1" in str(learned).split("not told")[1]
+
+
+def test_a_tendon_that_is_replaced_is_named(held, other, learned) -> None:
+    state, model = held
+    hand = other.hand
+    arms = hand.actuation_jacobian.copy()
+    arms[hand.actuator_names.index("thumb_distal")] *= 0.3
+    new = KinematicModel(
+        dataclasses.replace(hand, actuation_jacobian=arms), model.obj, kinematics=model.kinematics,
+        detector=model.detector,
+    )  # fmt: skip
+    figures = copy.deepcopy(learned)
+    for lin, w, ds in motions(state, model, new, 12, seed=3, noise=1e-4):
+        figures.learn(lin, w, ds)
+    first = figures.changes[0]
+    assert "thumb_distal" in first.name
+    assert 30 <= first.motion <= 32
+    assert first.factor == pytest.approx(0.3, abs=0.12)
+    assert f"changed after {first.motion} motions" in str(figures)
+    mine, described = error(figures, motions(state, model, new, 10, seed=9))
+    assert mine < 0.3 * described
+
+
+def test_the_enhanced_model_adapts_outside_a_loop_too(held, other) -> None:
+    state, model = held
+    ekm = EnhancedModel.for_grasp(model, state)
+    fixed = EnhancedModel.for_grasp(model, state, figures=DescribedFigures())
+    for lin, w, ds in motions(state, model, other, 10):
+        ekm.update(lin.state, w, ds)
+        fixed.update(lin.state, w, ds)
+    assert int(ekm.model.figures.count) == 10
+    lin, w, ds = next(iter(motions(state, model, other, 1, seed=9)))
+    torch.testing.assert_close(ekm.nominal(state, w), ekm.model.figures.solve(lin.equations).jacobian @ w)
+    torch.testing.assert_close(fixed.nominal(state, w), lin.step(w))
+    wrong = [float((one(state, w) - ds)[-6:].norm()) for one in (ekm, fixed)]
+    assert wrong[0] < 0.5 * wrong[1]
+
+
+def test_bad_motions_are_refused_bit_for_bit(held, other, learned, unchecked) -> None:
+    state, model = held
+    lin, w, ds = next(iter(motions(state, model, other, 1)))
+    kept = {name: value.clone() for name, value in learned.state_dict().items()}
+    with pytest.raises(NonFiniteError, match="increment"):
+        learned.learn(lin, w, ds * math.nan)
+    with pytest.raises(ShapeError, match="moved"):
+        learned.learn(lin, w[:-1], ds)
+    assert learned.learn(lin, 0 * w, ds) is None
+    assert all(torch.equal(value, kept[name]) for name, value in learned.state_dict().items())
+
+
+def test_the_figures_of_another_hand_are_refused_by_name_and_digest(held, learned) -> None:
+    _, model = held
+    learned.check(model.hand)
+    with pytest.raises(ParameterError, match=r"of 'icub_right' \([0-9a-f]{8}\).* those of 'yale_t42"):
+        learned.check(load_hand("yale_t42"))
+    corrected = dataclasses.replace(model.hand, spring_stiffness=2 * model.hand.spring_stiffness)
+    with pytest.raises(ParameterError, match=r"spring of thumb_0 0.01 there, 0.02 in the description"):
+        learned.check(corrected)

@@ -1,0 +1,68 @@
+"""Any model with parameters, which adapts while it is used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import nn
+
+from .._checks import check_shape
+from ..exceptions import NoDerivativeError, ParameterError
+from ..typing import Float, Tensor
+from .parameter_filter import FilterReport, ParameterFilter
+
+
+class AdaptiveModel(nn.Module):
+    """``f(s, da; theta)`` with ``theta`` from a :class:`ParameterFilter`, as f of an enhanced model.
+
+    ::
+
+        f = AdaptiveModel(lambda s, a, theta: theta[0] * a, ParameterFilter(["gain"], [1.0], [0.3]), 0.01)
+        model = EnhancedModel(f, learner)
+
+    Args:
+        function: ``(state, action, theta) -> increment``, of torch, differentiable by theta.
+        parameters: theta; it learns with :meth:`EnhancedModel.update`.
+        noise_std: of an increment, what the best theta leaves unexplained: one, or one for each entry.
+
+    Raises:
+        ParameterError: the noise is not positive.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Any, Tensor, Tensor], Tensor],
+        parameters: ParameterFilter,
+        noise_std: float | Sequence[float] | Float[Tensor, " n_s"],
+    ) -> None:
+        super().__init__()
+        self.function, self.theta = function, parameters
+        noise = torch.as_tensor(noise_std).double()
+        if not bool((noise > 0).all()) or not bool(noise.isfinite().all()):
+            raise ParameterError("noise_std", noise_std, "positive")
+        self.noise_std = nn.Buffer(noise)
+
+    def forward(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_s"]:
+        """``f(s, da; m)``."""
+        return self.function(state, action, self.theta.mean.to(action))
+
+    def adapt(
+        self, state: Any, action: Float[Tensor, " n_a"], increment: Float[Tensor, " n_s"]
+    ) -> FilterReport:
+        """Learn from one motion.
+
+        Raises:
+            NoDerivativeError: f carries no derivative by theta.
+            ShapeError, NonFiniteError: nothing is changed.
+        """
+        theta = self.theta.mean.to(action).requires_grad_(True)
+        with torch.enable_grad():
+            predicted = self.function(state, action.detach(), theta)
+            check_shape("increment", increment, predicted.shape, "as the prediction has")
+            if not predicted.requires_grad:
+                raise NoDerivativeError("its result carries none by theta")
+            rows = [torch.autograd.grad(one, theta, retain_graph=True)[0] for one in predicted]
+        noise = self.noise_std.square().expand(len(predicted))
+        return self.theta.update(increment - predicted.detach(), torch.stack(rows), noise)

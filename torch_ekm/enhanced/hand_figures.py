@@ -1,0 +1,275 @@
+"""The figures of one hand, corrected by how objects moved."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import nn
+
+from .._checks import check_finite, check_shape
+from .._recorded import Recorded
+from ..description import HandDescription
+from ..exceptions import GraspError, ParameterError
+from ..model import Linearization
+from ..model.calibration.parameters import PRIORS, Parameter, Unknowns
+from ..model.motion_equations import Motion, MotionEquations
+from ..model.reduction import Drives
+from ..typing import Float, Tensor
+from .parameter_filter import FilterReport, ParameterFilter
+
+KINDS = ("springs", "moment_arms", "stiffness")
+# of the prior, in units of those of the calibration: one lathe turns all pulleys, one cable strings them
+_COMMON, _OWN = 1.0, 0.4
+_FURTHEST = 5.0  # priors: bounds
+_TOLD = 0.7  # of the variance that a figure of its kind has of which nothing was seen
+# [m], [rad], [rad]: what no figures explain of a motion of the object and of a joint; and its share of it
+_POSITION_STD, _ROTATION_STD, _JOINT_STD = 0.3e-3, math.radians(0.2), math.radians(0.5)
+_RELATIVE = 0.08
+
+
+class Figure(NamedTuple):
+    """One figure of the hand against its description."""
+
+    name: str
+    factor: float
+    """Of the described figure."""
+    std: float
+    """Standard deviation of the factor."""
+    told: bool
+    """Motions tell it; else it stands where the prior and the others put it."""
+
+
+class Change(NamedTuple):
+    """A figure that changed while the hand worked."""
+
+    name: str
+    motion: int
+    """After how many motions."""
+    factor: float
+    """Of its former value."""
+    z: float
+    """Standard deviations that it moved."""
+
+
+class DescribedFigures(Recorded, nn.Module):
+    """The hand is as described; nothing is learned of it."""
+
+    learns = False
+
+    def check(self, hand: HandDescription) -> None:
+        """They are of any hand."""
+
+    def solve(self, equations: MotionEquations) -> None:
+        """J_m is the description's."""
+
+    def learn(self, lin: Linearization, moved: Tensor, increment: Tensor) -> None:
+        """Does nothing."""
+
+
+class HandFigures(ParameterFilter):
+    """``ds = J_m(s; theta) w``: springs, moment arms and stiffnesses of a hand, from its motions.
+
+    The filter of :class:`~torch_ekm.enhanced.ParameterFilter`, about the present theta, on the object's
+    twist and the joints of the fingers that touch. ``theta`` are logarithms of factors of the description,
+    in units of their priors (.5 of springs, .3 of moment arms, .7 of stiffnesses), which are common to all
+    of a kind for the most part. Contact forces are those that were found with the description: motions do
+    not tell the scale that forces need.
+
+    The figures belong to the hand, whatever it holds. :class:`~torch_ekm.model.KinematicModel.with_figures`
+    gives a model that follows them.
+
+    Args:
+        hand: its name.
+        entries: ``(kind, name, index, described value)`` of each figure.
+    """
+
+    learns = True
+
+    def __init__(self, hand: str, entries: Sequence[Sequence[Any]]) -> None:
+        found = [
+            Parameter(kind, name, tuple(index), value, PRIORS[kind]) for kind, name, index, value in entries
+        ]
+        kind = torch.tensor([KINDS.index(one.kind) for one in found])
+        prior = _COMMON**2 * (kind[:, None] == kind).double() + _OWN**2 * torch.eye(len(found)).double()
+        bound = torch.full((len(found),), _FURTHEST)
+        super().__init__([one.label for one in found], torch.zeros(len(found)), prior, -bound, bound)
+        self.hand, self._entries, self._kind = hand, tuple(found), kind
+        self._described = torch.tensor([one.nominal for one in found], dtype=torch.float64)
+        self._prior_std = torch.tensor([one.prior for one in found], dtype=torch.float64)
+        self._solved: tuple[MotionEquations, Tensor, Motion | None] | None = None
+        self._at = [  # where the figures of each kind stand in its array
+            tuple(map(torch.tensor, zip(*(one.index for one in found if one.kind == name), strict=True)))
+            for name in KINDS
+        ]
+
+    @classmethod
+    def of(cls, hand: HandDescription) -> HandFigures:
+        """Nothing is known yet: the figures of the description.
+
+        Raises:
+            ParameterError: the hand has no springs, moment arms or stiffnesses.
+        """
+        return cls(hand.name, _entries(hand))
+
+    def check(self, hand: HandDescription) -> None:
+        """That they are of this hand.
+
+        Raises:
+            ParameterError: another hand's, or its description has other figures.
+        """
+        ours = {one.label: one.nominal for one in self._entries}
+        theirs = {
+            Parameter(kind, name, index, value, 1.0).label: value
+            for kind, name, index, value in _entries(hand)
+        }
+        other = [name for name in {**ours, **theirs} if ours.get(name) != theirs.get(name)]
+        if other:
+            had, has = (figures.get(other[0], "no such figure") for figures in (ours, theirs))
+            value = f"of '{self.hand}' ({_digest(ours)}): {other[0]} {had} there, {has} in the description"
+            valid = f"those of '{hand.name}' ({_digest(theirs)})"
+            raise ParameterError("knowledge", value, valid)
+
+    @property
+    def factors(self) -> Float[Tensor, " n"]:
+        """Of the described figures."""
+        return (self._prior_std * self.mean).exp()
+
+    def solve(self, equations: MotionEquations) -> Motion | None:
+        """J_m with the present figures; None where the grasp would buckle with them."""
+        if self._solved is not None:  # a motion is decided, expected and learned from at the same figures
+            of, mean, motion = self._solved
+            if of is equations and torch.equal(mean, self.mean):
+                return motion
+        described = equations.reduction.drives
+        values = (self._described * self.factors).to(described.actuation)
+        springs, arms, stiffness = (values[self._kind == k] for k in range(len(KINDS)))
+        J_a = described.actuation.index_put(self._at[1], arms) if len(arms) else described.actuation
+        K_a = described.stiffness
+        if len(stiffness):  # a model without compliance keeps its actuators rigid
+            K_a = K_a.where(K_a.isinf(), K_a.index_put(self._at[2], stiffness))
+        change = J_a.new_zeros(J_a.shape[-1])
+        if len(springs):
+            change[self._at[0]] = springs - self._described[self._kind == 0].to(change)
+        try:
+            motion = equations.solve(change, Drives(J_a, K_a))
+        except GraspError:
+            motion = None
+        self._solved = equations, self.mean.clone(), motion
+        return motion
+
+    @torch.no_grad()
+    def learn(
+        self, lin: Linearization, moved: Float[Tensor, " n_a"], increment: Float[Tensor, " n_s"]
+    ) -> FilterReport | None:
+        """Learn from one motion.
+
+        Args:
+            lin: of the state before it.
+            moved: w, what the encoders did [rad].
+            increment: ds, as measured.
+
+        Returns:
+            None: the motion cannot be modelled, or nothing moved.
+
+        Raises:
+            ShapeError, NonFiniteError: nothing is changed.
+        """
+        for name, value, like in (("moved", moved, lin.manipulation_jacobian[0]),
+                                  ("increment", increment, lin.manipulation_jacobian[:, 0])):  # fmt: skip
+            check_shape(name, value, like.shape)
+            check_finite(name, value)
+        if lin.equations is None or not bool(moved.any()):
+            return None
+        motion = self.solve(lin.equations)
+        if motion is None:
+            return None
+        n_q = lin.n_q
+        joints = lin.equations.moving.nonzero()[:, 0].tolist()
+        rows = [*joints, *range(n_q, n_q + 6)]
+        predicted = (motion.jacobian @ moved.to(motion.jacobian))[rows]
+        by = motion.derivative(moved.to(motion.jacobian), rows)
+        phi = torch.cat(
+            [
+                part[(slice(None), *at)]
+                for part, at in zip((by.springs, by.moment_arms, by.stiffness), self._at, strict=True)
+                if len(at)
+            ],
+            dim=-1,
+        )
+        slope = self._prior_std * self._described * self.factors
+        noise = _noise(predicted, len(joints), lin)
+        return self.update(increment[rows] - predicted, phi.double() * slope, noise)
+
+    @property
+    def figures(self) -> tuple[Figure, ...]:
+        """Each figure against its description."""
+        std, told = self.stddev, self._told
+        return tuple(
+            Figure(name, float(factor), float(factor * prior * spread), bool(known))
+            for name, factor, prior, spread, known in zip(
+                self.names, self.factors, self._prior_std, std, told, strict=True
+            )
+        )
+
+    @property
+    def _told(self) -> Tensor:
+        """Of which figures motions say more than they say of all of the kind."""
+        variance = self.covariance.diagonal()
+        told = torch.zeros(len(self), dtype=torch.bool)
+        for k in range(len(KINDS)):
+            own = self._kind == k
+            n = int(own.sum())
+            if n:
+                common = (self.covariance[own][:, own].sum() - variance[own].sum()) / max(n * (n - 1), 1)
+                told[own] = variance[own] < _TOLD * (common.clamp(min=0.0) + _OWN**2)
+        return told
+
+    @property
+    def changes(self) -> tuple[Change, ...]:
+        """What changed at the last change, by more than two standard deviations; most certain first."""
+        if self.changed_at < 0:
+            return ()
+        step = self.mean - self.before
+        z = step / (self.covariance.diagonal() + self.before_covariance.diagonal()).sqrt()
+        factor, at = (self._prior_std * step).exp(), int(self.changed_at)
+        found = [
+            Change(name, at, float(f), float(size))
+            for name, f, size in zip(self.names, factor, z, strict=True)
+            if abs(size) > 2
+        ]
+        return tuple(sorted(found, key=lambda one: -abs(one.z)))
+
+    def __str__(self) -> str:
+        known = [one for one in self.figures if one.told]
+        lines = [f"{one.name}: {one.factor:.2f} times the description, +-{one.std:.2f}" for one in known]
+        rest = [one.name for one in self.figures if not one.told]
+        if rest:
+            lines.append(f"not told: {', '.join(rest)}")
+        lines += [
+            f"{one.name}: changed after {one.motion} motions, to {one.factor:.2f} times its value"
+            for one in self.changes
+        ]
+        return "\n".join(lines)
+
+
+def _entries(hand: HandDescription) -> list[tuple[str, str, tuple[int, ...], float]]:
+    return [(one.kind, one.name, one.index, one.nominal) for one in Unknowns(hand, KINDS).parameters]
+
+
+def _digest(figures: Mapping[str, float]) -> str:
+    return hashlib.sha256(repr(sorted(figures.items())).encode()).hexdigest()[:8]
+
+
+def _noise(predicted: Tensor, n_joints: int, lin: Linearization) -> Tensor:
+    """R: sensors, and a share of the motion."""
+    dq, twist = predicted[:n_joints], predicted[n_joints:]
+    lever = float((lin.contacts.point - lin.state.position).square().sum(-1).mean().sqrt())
+    unit = predicted.new_tensor([lever] * 3 + [1.0] * 3)
+    std = predicted.new_tensor([_POSITION_STD] * 3 + [_ROTATION_STD] * 3)
+    size = _RELATIVE * torch.linalg.vector_norm(twist / unit)
+    of_joints = _JOINT_STD**2 + (_RELATIVE * torch.linalg.vector_norm(dq)) ** 2
+    return torch.cat([of_joints.expand(n_joints), std.square() + (size * unit).square()])

@@ -1,0 +1,182 @@
+"""Parameters of a model, estimated motion by motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import nn
+
+from .._checks import check_finite, check_shape
+from .._recorded import Recorded
+from ..exceptions import ParameterError
+from ..typing import Float, Tensor
+
+_DRIFT = 1e-3  # q: share of the prior that comes back with each motion
+_SURPRISE = 3.0  # times what is usual, from which a motion counts less, and speaks for a change
+_RECENT = 0.05  # weight of the last motion in what is usual
+_IN_A_ROW = 2  # such motions in succession are a change: a contact that slides once is none
+
+
+class FilterReport(NamedTuple):
+    """What one motion taught."""
+
+    surprise: float
+    """z = ``r' S^-1 r / n_r``, of the order of 1 where the model and its uncertainty explain the motion."""
+    weight: float
+    """w, in (0, 1]."""
+    opened: bool
+    """The parameters were taken for changed."""
+    bounded: tuple[str, ...]
+    """Parameters that stand at a bound."""
+
+
+class ParameterFilter(Recorded, nn.Module):
+    """``theta ~ N(m, P)``, an extended Kalman filter on ``r = ds - f(s, da; m)``, ``phi = df/dtheta``::
+
+        m <- m_0 + sqrt(1 - q) (m - m_0),  P <- (1 - q) P + q P_0          q = 1e-3
+        S = phi P phi' + R / w,  K = P phi' S^-1       w = min(1, 3 max(1, u) / z)
+        z = r' S^-1 r / n_r at w = 1,  u: mean of the last z
+        m <- m + K r                                   within the bounds
+        P <- (I - K phi) P (I - K phi)' + K (R / w) K'
+
+    One motion costs the same time and memory however many came before. What motions do not tell returns to
+    the start m_0 and its covariance P_0. A motion that the present uncertainty does not explain, as where a
+    contact slides, counts less; two of them in succession are taken for a change of the plant, and P is P_0
+    again.
+
+    Args:
+        names: of the parameters.
+        start: m before the first motion, in the parameters' units.
+        prior: P_0 ``(n, n)``, or standard deviations ``(n,)``.
+        lower, upper: bounds; None: there are none.
+
+    Raises:
+        ParameterError: sizes do not go together, P_0 is no covariance, or ``start`` is out of bounds.
+
+    Source: Jazwinski, Stochastic Processes and Filtering Theory (1970), ch. 8; the weight is that of a t law,
+    see Agamennoni et al., IEEE Trans. Signal Processing 60 (2012).
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        start: Sequence[float] | Float[Tensor, " n"],
+        prior: Sequence[float] | Float[Tensor, " n"] | Float[Tensor, "n n"],
+        lower: Sequence[float] | Float[Tensor, " n"] | None = None,
+        upper: Sequence[float] | Float[Tensor, " n"] | None = None,
+    ) -> None:
+        super().__init__()
+        self.names, n = tuple(names), len(names)
+
+        def vector(name: str, values: object, default: float = 0.0) -> Tensor:
+            full = torch.full((n,), default) if values is None else torch.as_tensor(values)
+            if full.shape != (n,) or bool(full.isnan().any()):
+                raise ParameterError(name, values, f"{n} numbers, one for each of the names")
+            return full.double()
+
+        covariance = torch.as_tensor(prior).double()
+        if covariance.dim() == 1:
+            covariance = torch.diag(vector("prior", prior).square())
+        good = covariance.shape == (n, n) and bool(covariance.isfinite().all())
+        if not good or float(torch.linalg.eigvalsh(covariance)[0]) <= 0:
+            raise ParameterError("prior", prior, f"{n} standard deviations, or a covariance {n} x {n}")
+        self.prior = nn.Buffer(covariance, persistent=False)
+        """P_0."""
+        self.lower = nn.Buffer(vector("lower", lower, -torch.inf), persistent=False)
+        self.upper = nn.Buffer(vector("upper", upper, torch.inf), persistent=False)
+        self.start = nn.Buffer(vector("start", start), persistent=False)
+        """m_0."""
+        self.mean = nn.Buffer(self.start.clone())
+        """m."""
+        if bool(((self.mean < self.lower) | (self.mean > self.upper)).any()):
+            raise ParameterError("start", start, "within the bounds")
+        self.covariance = nn.Buffer(covariance.clone())
+        """P."""
+        self.count = nn.Buffer(torch.zeros((), dtype=torch.int64))
+        """Motions learned."""
+        self.usual = nn.Buffer(torch.ones((), dtype=torch.float64))
+        """Mean of the last surprises, see :class:`FilterReport`."""
+        self.surprises = nn.Buffer(torch.zeros((), dtype=torch.int64))
+        """Surprising motions in succession."""
+        self.changed_at = nn.Buffer(torch.full((), -1, dtype=torch.int64))
+        """Count at the last change; -1: there was none."""
+        self.before = nn.Buffer(self.mean.clone())
+        """m before the last change."""
+        self.before_covariance = nn.Buffer(covariance.clone())
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def stddev(self) -> Float[Tensor, " n"]:
+        """Standard deviations of the parameters."""
+        return self.covariance.diagonal().sqrt()
+
+    @torch.no_grad()
+    def update(
+        self,
+        residual: Float[Tensor, " n_r"],
+        derivative: Float[Tensor, "n_r n"],
+        noise: Float[Tensor, " n_r"],
+    ) -> FilterReport:
+        """Learn from one motion.
+
+        Args:
+            residual: r, measured less predicted at m.
+            derivative: phi at m.
+            noise: diagonal of R, variances of what theta does not explain.
+
+        Raises:
+            ShapeError, NonFiniteError: nothing is changed.
+            ParameterError: a variance is not positive; nothing is changed.
+        """
+        n_r, n = len(residual), len(self)
+        check_shape("derivative", derivative, (n_r, n))
+        check_shape("noise", noise, (n_r,))
+        for name, value in (("residual", residual), ("derivative", derivative), ("noise", noise)):
+            check_finite(name, value)
+        if not bool((noise > 0).all()):
+            raise ParameterError("noise", noise.tolist(), "positive variances")
+        r, phi, R = (value.to(self.mean) for value in (residual, derivative, noise))
+        P = (1 - _DRIFT) * self.covariance + _DRIFT * self.prior
+        mean = self.start + (1 - _DRIFT) ** 0.5 * (self.mean - self.start)
+        S = phi @ P @ phi.mT + torch.diag(R)
+        surprise = float(r @ torch.linalg.solve(S, r)) / n_r
+        most = _SURPRISE * max(1.0, float(self.usual))
+        self.usual += _RECENT * (min(surprise, most) - self.usual)
+        self.surprises.copy_(self.surprises + 1 if surprise > most else torch.zeros_like(self.surprises))
+        opened = int(self.surprises) >= _IN_A_ROW
+        if opened:
+            self.before.copy_(self.mean)
+            self.before_covariance.copy_(self.covariance)
+            self.changed_at.copy_(self.count)
+            self.surprises.zero_()
+            P = self.prior
+        weight = min(1.0, most / surprise) if surprise > 0 else 1.0
+        S = phi @ P @ phi.mT + torch.diag(R / weight)
+        K = torch.linalg.solve(S, phi @ P).mT
+        wanted = mean + K @ (r + phi @ (self.mean - mean))
+        self.mean.copy_(wanted.clamp(self.lower, self.upper))
+        left = torch.eye(n, dtype=P.dtype) - K @ phi
+        P = left @ P @ left.mT + (K * (R / weight)) @ K.mT
+        self.covariance.copy_(0.5 * (P + P.mT))
+        self.count += 1
+        bounded = tuple(name for name, out in zip(self.names, wanted != self.mean, strict=True) if out)
+        return FilterReport(surprise, weight, opened, bounded)
+
+    def state_problems(self, state: dict[str, Tensor]) -> list[str]:
+        """What is wrong with the entries of a state that is to be loaded."""
+        wrong = []
+        for name in ("covariance", "before_covariance"):
+            P = state.get(name)
+            if P is not None and float(torch.linalg.eigvalsh(P)[0]) <= 0:
+                wrong.append(f"{name} is no covariance")
+        mean = state.get("mean")
+        if mean is not None and bool(((mean < self.lower) | (mean > self.upper)).any()):
+            wrong.append("mean is out of bounds")
+        return wrong
+
+    def extra_repr(self) -> str:
+        return f"parameters={len(self)}, motions={int(self.count)}"
