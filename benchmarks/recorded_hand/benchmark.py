@@ -18,6 +18,7 @@ from torch_ekm.experiments.learner_comparison.fingerprint import fingerprint
 from torch_ekm.experiments.learners import LEARNERS
 from torch_ekm.typing import Array
 
+from .adapting import adapting_predictions
 from .finger_markers import FingerMarkers
 from .fingers import identify_markers
 from .learning import learned_predictions
@@ -123,7 +124,7 @@ def count_jobs(data: str | Path | None, learners: int, *, quick: bool = False) -
         DescriptionError: as :func:`predict_recorded_hand`.
     """
     paths = OBJECTS if data is None else _chosen(data, "", quick)
-    return len(paths) + 1 + learners * len(NOMINALS) * len(HORIZONS)
+    return len(paths) + 1 + len({*HORIZONS, *CURVE}) + learners * len(NOMINALS) * len(HORIZONS)
 
 
 def _chosen(data: str | Path | None, temporary: str, quick: bool) -> dict[str, list[RecordedPath]]:
@@ -177,7 +178,8 @@ def _run(
         (nominal.name, horizon): predictions(nominal, taken, by_state, APART)
         for horizon, taken in samples.items()
         for nominal in NOMINALS
-    }
+        if nominal.kind != "online"
+    } | _online(hand, samples, states, by_state["published"], cache, processes, on_done)
     predicted = alone | _with_learners(learners, samples, states, alone, cache, processes, quick, on_done)
     reported = [name for name in paths if name != APART]
     rows = []
@@ -187,6 +189,37 @@ def _run(
         for subset in SUBSETS if horizon in HORIZONS else SUBSETS[:1]:
             rows.append(score(name, horizon, subset, taken, own, unit))
     return RecordedHandResult(paths, states, samples, predicted, rows, markers, found, quick)
+
+
+def _online(
+    hand: HandDescription,
+    samples: dict[int, dict[str, Samples]],
+    states: dict[str, States],
+    usual: dict[str, Array],
+    cache: Path,
+    processes: int,
+    on_done: Callable[[str], None] | None,
+) -> dict[tuple[str, int], Predicted]:
+    """The figures begin as published, and see the recording set apart first."""
+    order = [APART, *sorted(name for name in states if name != APART)]
+    jobs = {str(horizon): (hand, taken, states, usual, order) for horizon, taken in samples.items()}
+    results = _cached("online", _adapting, jobs, cache, processes, on_done)
+    (online,) = [nominal for nominal in NOMINALS if nominal.kind == "online"]
+    return {
+        (online.name, int(horizon)): {name: np.array(one).reshape(-1, 3) for name, one in result.items()}
+        for horizon, result in results.items()
+    }
+
+
+def _adapting(
+    hand: HandDescription,
+    samples: dict[str, Samples],
+    states: dict[str, States],
+    usual: dict[str, Array],
+    order: list[str],
+) -> dict[str, Any]:
+    found = adapting_predictions(hand, samples, states, usual, order)
+    return {name: values.tolist() for name, values in found.items()}
 
 
 def _with_learners(

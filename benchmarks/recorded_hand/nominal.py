@@ -25,7 +25,7 @@ CALIBRATED = ("springs", "moment_arms", "stiffness")
 """Kinds of figures that are calibrated: chosen by halves of the recording set apart."""
 EVERY = 5
 """States between two that the calibration takes for rests: 5 s."""
-_LARGEST = 0.2  # [m/rad]: a Jacobian five times that of the hand's middle is not believed
+LARGEST = 0.2  # [m/rad]: a Jacobian five times that of the hand's middle is not believed
 _SMOOTH = 2  # frames on either side whose median is a less noisy pose
 
 
@@ -35,7 +35,7 @@ class Nominal:
 
     name: str
     kind: str
-    """"none", "constant", "constant per object", "published" or "calibrated"."""
+    """"none", "constant", "constant per object", "published", "calibrated" or "online" (adapting.py)."""
     play: bool = False
     """Whether the motors' motion goes through the play of the drive first."""
 
@@ -48,6 +48,7 @@ NOMINALS = (
     Nominal("KM, published figures", "published"),
     Nominal("KM, published figures, play", "published", play=True),
     Nominal("KM, calibrated, play", "calibrated", play=True),
+    Nominal("KM, figures online, play", "online", play=True),
 )
 """The one fitted to each object sees what it is tested on: an upper reference for what is constant."""
 
@@ -70,6 +71,8 @@ class Samples(NamedTuple):
     """A command changed in the second before or on the way ``(n,)``."""
     loads: Array
     """At the beginning ``(n, 2)``."""
+    horizon: int
+    """Steps."""
 
 
 def through_play(paths: Sequence[RecordedPath], hand: HandDescription) -> list[Array]:
@@ -114,7 +117,7 @@ def take_samples(
                 path.loads[t],
             )
         )
-    return Samples(*(np.array(column) for column in zip(*rows, strict=True)))
+    return Samples(*(np.array(column) for column in zip(*rows, strict=True)), horizon)
 
 
 def jacobians(hand: HandDescription, states: States, *, rigid: bool) -> Array:
@@ -128,7 +131,7 @@ def jacobians(hand: HandDescription, states: States, *, rigid: bool) -> Array:
     model = KinematicModel(hand, obj, dataclasses.replace(OPTIONS, actuator_compliance=not rigid))
     linear = model.linearize(states.grasps(), states.contact_set(obj.friction))
     J = linear.object_jacobian[:, [0, 1, 5]].numpy()
-    believed = np.abs(J[:, :2]).max((1, 2)) < _LARGEST
+    believed = np.abs(J[:, :2]).max((1, 2)) < LARGEST
     usual = np.median(J[believed], axis=0) if believed.any() else np.zeros((3, 2))
     J = np.where(believed[:, None, None], J, usual)
     c, s = np.cos(states.camera[:, 0]), np.sin(states.camera[:, 0])

@@ -20,10 +20,11 @@ from .scores import COORDINATES, compare_errors, score
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_CONSTANT, _PUBLISHED, _CALIBRATED = (
-    "constant Jacobian, play", "KM, published figures, play", "KM, calibrated, play"
+_CONSTANT, _PUBLISHED, _CALIBRATED, _ONLINE = (
+    "constant Jacobian, play", "KM, published figures, play", "KM, calibrated, play",
+    "KM, figures online, play",
 )  # fmt: skip
-_COLOURS = {_CONSTANT: "#E69F00", _PUBLISHED: "#009E73", _CALIBRATED: "#0072B2"}
+_COLOURS = {_CONSTANT: "#E69F00", _PUBLISHED: "#009E73", _CALIBRATED: "#0072B2", _ONLINE: "#CC79A7"}
 _SUBSET_WORDS = {
     "all": "all samples",
     "first": "the first 50 samples of each object",
@@ -78,13 +79,13 @@ def summary(result: RecordedHandResult) -> str:
         f"{len(result.reported)} objects on which nothing was identified; error over motion, "
         f"{horizon * STEP:g} s ahead."
     ]
-    for name in (_CONSTANT, _PUBLISHED, _CALIBRATED):
+    for name in (_CONSTANT, _PUBLISHED, _CALIBRATED, _ONLINE):
         ratio = result.row(name, horizon).ratio
         said.append(f"{name}: x {ratio['x'].mean:.2f}, y {ratio['y'].mean:.2f}.")
-    learned = f"{_CALIBRATED} + {LEARNER}"
-    if any(row.name == learned for row in result.rows):
-        ratio = result.row(learned, horizon).ratio
-        said.append(f"{learned}: x {ratio['x'].mean:.2f}, y {ratio['y'].mean:.2f}.")
+    for learned in (f"{_CALIBRATED} + {LEARNER}", f"{_ONLINE} + {LEARNER}"):
+        if any(row.name == learned for row in result.rows):
+            ratio = result.row(learned, horizon).ratio
+            said.append(f"{learned}: x {ratio['x'].mean:.2f}, y {ratio['y'].mean:.2f}.")
     return " ".join(said)
 
 
@@ -115,6 +116,7 @@ def paired_table(result: RecordedHandResult) -> Table:
     for horizon in HORIZONS:
         taken = {name: result.samples[horizon][name] for name in result.reported}
         pairs = [(_PUBLISHED, _CONSTANT), (_CALIBRATED, _CONSTANT), (_CALIBRATED, _PUBLISHED)]
+        pairs += [(_ONLINE, _PUBLISHED), (_ONLINE, _CALIBRATED)]
         learned = [f"{n.name} + {LEARNER}" for n in NOMINALS]
         if (learned[0], horizon) in result.predicted:
             pairs += [(ours, n.name) for ours, n in zip(learned, NOMINALS, strict=True)]
