@@ -142,17 +142,17 @@ class Comparison:
                 first_km, first_ekm = (self.first_motion(name, which, item) for which in ("km", "ekm"))
                 rows.append(
                     [
-                        "all" if item is None else item.replace("_", " "), name, len(turns.records),
+                        "all" if item is None else item.replace("_", " "), name,
                         self.early(name, "km", item), self.early(name, "ekm", item),
-                        self.later(name, "ekm", item), first_ekm, first_ekm / first_km,
-                        turns.lost, turns.missed, turns.motions,
+                        self.later(name, "ekm", item),
+                        f"{first_ekm:.2f} ({100 * first_ekm / first_km:.0f} %)",
+                        f"{turns.lost}, {turns.reached} of {len(turns.records)}", turns.motions,
                     ]
                 )  # fmt: skip
         columns = [
-            "object", "begins with", "turns", Column("KM, first 5 [deg]", ".2f"),
+            "object", "begins with", Column("KM, first 5 [deg]", ".2f"),
             Column("E-KM, first 5 [deg]", ".2f"), Column("later [deg]", ".2f"),
-            Column("first of a turn [deg]", ".2f"), Column("of KM's [%]", ".0f", percent=True),
-            "lost", "not reached", Column("motions", ".1f"),
+            "first of a turn [deg] (of KM's)", "lost, reached", Column("motions", ".1f"),
         ]  # fmt: skip
         before = ", ".join(
             f"{name} {self.early(name, 'ekm', first, 'first'):.2f}" for name in self.contenders

@@ -42,7 +42,7 @@ def test_first_motions_are_those_of_an_object_and_of_a_turn(tmp_path: Path) -> N
     )
     assert found.verdict == verdict
     row = found.table().text()[1]
-    assert row == ["can", "learned hand", "2", "0.50", "0.20", "0.30", "0.25", "50", "0", "0", "3.0"]
+    assert row == ["can", "learned hand", "0.50", "0.20", "0.30", "0.25 (50 %)", "0, 2 of 2", "3.0"]
     found.report(tmp_path)
     assert verdict in (tmp_path / "report.md").read_text(encoding="utf-8")
     assert (tmp_path / "new_object.svg").exists()
