@@ -135,6 +135,22 @@ def test_the_enhanced_model_adapts_outside_a_loop_too(held, other) -> None:
     assert wrong[0] < 0.5 * wrong[1]
 
 
+def test_a_motion_that_is_left_out_teaches_neither_figures_nor_learner(held) -> None:
+    """``on_invalid="skip"``: counted, and nothing else; "raise" names what is wrong."""
+    state, model = held
+    for on_invalid in ("skip", "raise"):
+        ekm = EnhancedModel.for_grasp(model, state)
+        ekm.learner.on_invalid = on_invalid
+        w, ds = torch.zeros(model.hand.n_a, dtype=F64), torch.full((state.n_s,), math.nan, dtype=F64)
+        if on_invalid == "skip":
+            ekm.update(state, w, ds)
+            assert int(ekm.learner.n_refused) == 1
+        else:
+            with pytest.raises(NonFiniteError, match="increment"):
+                ekm.update(state, w, ds)
+        assert int(ekm.model.figures.count) == 0
+
+
 def test_bad_motions_are_refused_bit_for_bit(held, other, learned, unchecked) -> None:
     state, model = held
     lin, w, ds = next(iter(motions(state, model, other, 1)))

@@ -306,7 +306,7 @@ class ClosedLoop:
             fades = decision.share > 0 and not verdict.note and watch.grip.follow(decision, felt)
             if verdict.teaches and self.learn:
                 report = self._learn(seen, decision, lin, increment, expected, felt, fades)
-            if turns and decision.share > 0 and self._slides(lin, seen, increment, expected):
+            if turns and decision.share > 0 and self._slides(lin, increment, expected):
                 self.controller.tighter += self.safety.caution.slip
         seconds += time.perf_counter() - began
         if turns:
@@ -330,7 +330,7 @@ class ClosedLoop:
             expected = self.controller.expect(lin, decision.delta_a)
         if felt is not None:
             self._learn_forces(lin, expected.moved, felt)
-        rho = math.inf if fades else self._disagreement(lin, seen, ds, expected, felt)
+        rho = math.inf if fades else self._disagreement(lin, ds, expected, felt)
         self.controller.pace.judge(rho, decision.share)
         self.knowledge.figures.learn(lin, expected.moved, ds)
         nominal = self.controller.kinematic.followed(lin).step(expected.moved)  # g learns what they leave
@@ -339,20 +339,18 @@ class ClosedLoop:
     def _disagreement(
         self,
         lin: Linearization,
-        seen: Observation,
         ds: Tensor,
         expected: Expectation,
         felt: ForceSurprise | None = None,
     ) -> float:
         """rho of a motion, see :class:`~torch_ekm.control.TrustRegion`."""
-        lever = float((lin.contacts.point - seen.position).square().sum(-1).mean().sqrt())
         trust = self.controller.pace.options.trust
-        return trust.disagreement(expected.increment[-6:], ds[-6:], lever, felt)
+        return trust.disagreement(expected.increment[-6:], ds[-6:], float(lin.lever), felt)
 
-    def _slides(self, lin: Linearization, seen: Observation, ds: Tensor, expected: Expectation) -> bool:
+    def _slides(self, lin: Linearization, ds: Tensor, expected: Expectation) -> bool:
         """The object moved otherwise than an E-KM predicted: it slides, or turns out of the grip."""
         learns = self.controller.enhanced is not None
-        return learns and self._disagreement(lin, seen, ds, expected) > SLIDES
+        return learns and self._disagreement(lin, ds, expected) > SLIDES
 
     def _learn_forces(self, lin: Linearization, moved: Tensor, felt: ForceSurprise) -> None:
         """Pads that touched and measured before and after teach how their forces answer."""

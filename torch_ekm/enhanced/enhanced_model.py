@@ -180,8 +180,8 @@ class EnhancedModel(Recorded, nn.Module):
             raise ParameterError(
                 "increment", type(increment).__name__, "a tensor: torch.as_tensor(increment)"
             )
-        if nominal is None and hasattr(self.model, "adapt"):
-            check_finite("increment", increment)
+        finite = bool(increment.isfinite().all() and torch.as_tensor(action).isfinite().all())
+        if nominal is None and finite and hasattr(self.model, "adapt"):  # else it is refused below
             self.model.adapt(state, action, increment)
         predicted = self.nominal(state, action) if nominal is None else nominal
         check_shape("increment", increment, predicted.shape, "as the prediction has")

@@ -267,8 +267,7 @@ def _digest(figures: Mapping[str, float]) -> str:
 def _noise(predicted: Tensor, n_joints: int, lin: Linearization) -> Tensor:
     """R: sensors, and a share of the motion."""
     dq, twist = predicted[:n_joints], predicted[n_joints:]
-    lever = float((lin.contacts.point - lin.state.position).square().sum(-1).mean().sqrt())
-    unit = predicted.new_tensor([lever] * 3 + [1.0] * 3)
+    unit = predicted.new_tensor([float(lin.lever)] * 3 + [1.0] * 3)
     std = predicted.new_tensor([_POSITION_STD] * 3 + [_ROTATION_STD] * 3)
     size = _RELATIVE * torch.linalg.vector_norm(twist / unit)
     of_joints = _JOINT_STD**2 + (_RELATIVE * torch.linalg.vector_norm(dq)) ** 2

@@ -86,6 +86,11 @@ class Linearization:
         return self.manipulation_jacobian if self.described is None else self.described
 
     @property
+    def lever(self) -> Float[Tensor, "*batch"]:
+        """Distance of the contacts from the object's point, root mean square [m]."""
+        return (self.contacts.point - self.state.position[..., None, :]).square().sum(-1).mean(-1).sqrt()
+
+    @property
     def margins(self) -> Float[Tensor, "*batch n_c"]:
         """``mu_s f_n - |f_t|`` of each contact [N]."""
         return self.forces.margin

@@ -56,13 +56,14 @@ class MotionEquations:
         n_q = len(springs)
         D = self.stiffness.clone()
         D[:n_q, :n_q] += torch.diag(springs)
-        return Motion(self.reduction, D, self, drives)
+        return Motion(self, D, drives)
 
 
 class Motion:
     """``ds = J_m w`` of one state and one set of figures, and its derivative by the figures."""
 
-    def __init__(self, reduction: Reduction, D: Tensor, of: MotionEquations, drives: Drives) -> None:
+    def __init__(self, of: MotionEquations, D: Tensor, drives: Drives) -> None:
+        reduction = of.reduction
         self.drives, self._S, self._n_h = drives, reduction.scaled_basis, len(of.rows)
         self._system = system = reduction.reduced(D, of.constraints, list(of.rows), of.held, of.slack, drives)
         self._step = two_stage(system.D, system.E, system.R, system.F, actuators=reduction.actuators)
@@ -86,7 +87,7 @@ class Motion:
         adjoint = two_stage(system.D.mT.contiguous(), system.E, R, S[rows].mT.contiguous())
         J_a, K_a = self.drives
         n_a, n_q = J_a.shape
-        ds = (self._S @ (self._step.motion @ moved))[:n_q]
+        ds = (S @ (self._step.motion @ moved))[:n_q]
         dlam = system.actuator_force(self._step, n_h) @ moved
         y = (S[:n_q] @ adjoint.motion).mT  # (n_r, n_q)
         pull = y.new_zeros(len(rows), n_a)  # what a row answers to a change of each tendon's length
