@@ -224,10 +224,9 @@ def _impossible(module: nn.Module, own: Mapping[str, Any], state: Mapping[str, A
         lead = f"{prefix}." if prefix else ""
         inner = {name[len(lead) :]: value for name, value in state.items() if name.startswith(lead)}
         if type(one).__module__.startswith(("torch_ekm.", "torch.nn.")):
-            free = getattr(one, "unbounded", ())  # entries that may be infinite, or below 0
             kept = (*one.named_parameters(recurse=False), *one.named_buffers(recurse=False))
             for name, ours in kept:
-                if name not in free and name in inner and not in_bounds(inner[name], ours):
+                if name in inner and not in_bounds(inner[name], ours):
                     wrong.append(f"{lead}{name} is infinite, or counts and is below 0")
         ask = getattr(one, "state_problems", None)
         if ask is not None and not wrong:  # it may count on what was looked at here

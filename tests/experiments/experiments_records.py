@@ -7,7 +7,6 @@ from typing import Any
 
 import pandas
 
-from torch_ekm.experiments.protocols.object_memory import MemoryTurn
 from torch_ekm.experiments.records import NotGrasped, Record, TrialRecord
 from torch_ekm.experiments.reporting.trials import trial_frame
 
@@ -31,11 +30,6 @@ def not_grasped(controller: str = "KM", seed: int = 0, **changes: Any) -> NotGra
     """The same without a grasp."""
     about = {key: FIGURES[key] for key in ("object", "kind", "trial", "angle_deg")}
     return NotGrasped(**{**about, "controller": controller, "seed": seed, "message": "too wide", **changes})
-
-
-def memory_turn(**changes: Any) -> MemoryTurn:
-    """A turn of the object memory."""
-    return MemoryTurn(**{**FIGURES, "controller": "E-KM", **changes})
 
 
 def frame(records: Iterable[Record], limit: int = 40) -> pandas.DataFrame:

@@ -8,7 +8,6 @@ import numpy as np
 from experiments_records import turn
 
 from torch_ekm.experiments.protocols.generalize import Generalize
-from torch_ekm.experiments.protocols.object_memory import MemoryTurn, ObjectMemory
 from torch_ekm.experiments.protocols.online import Online
 from torch_ekm.experiments.records import TrialRecord
 
@@ -40,14 +39,3 @@ def made_up_generalize(protocol: Generalize, item: str, controller: str, seed: i
     dark = made_up_turn(controller, seed, 99, 12.0, item)
     step = turn(controller, seed, error, kind="long step", angle_deg=5.0, object=item)
     return [*records, step, dataclasses.replace(dark, kind="camera off")]
-
-
-def made_up_memory(protocol: ObjectMemory, seed: int) -> list[MemoryTurn]:
-    names = ("none", "bank", "labelled", "one model", "fresh")
-    records = []
-    for k in range(8):
-        record = made_up_turn("E-KM", seed, k, 10.0, protocol.objects[k % 2])
-        errors = {name: [0.1 * (i + 1)] * record.steps for i, name in enumerate(names)}
-        posterior = (0.9, 0.1, *[0.0] * 7)
-        records.append(MemoryTurn(**vars(record), model=k % 2, posterior=posterior, memory_errors_deg=errors))
-    return records

@@ -55,7 +55,7 @@ reproduce online --step 0 | more than 0 and at most 45 deg
 reproduce online --step -1 | more than 0 and at most 45 deg
 reproduce online --step nan | more than 0 and at most 45 deg
 reproduce online --step x | --step
-reproduce online --objects box | only generalize, adapt
+reproduce online --objects box | only generalize
 reproduce online --angles 5 | only generalize
 reproduce generalize --objects nothing | unknown object
 reproduce generalize --objects folder | *.urdf files

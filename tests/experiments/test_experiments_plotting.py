@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from experiments_records import frame, memory_turn, turn
+from experiments_records import frame, turn
 
-from torch_ekm.experiments.reporting.plots import plot_bank, plot_steady_state_error
+from torch_ekm.experiments.reporting.plots import plot_steady_state_error
 
 pytest.importorskip("matplotlib")
 
@@ -26,8 +26,3 @@ def test_a_lost_object_does_not_hide_the_others() -> None:
     (plain,) = plot_steady_state_error(turns[turns["error_deg"] < 2]).axes
     assert plain.get_ylim()[1] > 1.2  # nothing lost: the whole range, no crosses
     assert all(len(line.get_xdata()) == 0 for line in plain.lines if line.get_marker() == "x")
-
-
-def test_a_probability_an_ulp_above_one_is_sure() -> None:
-    (axis,) = plot_bank(frame([memory_turn(model=0, posterior=(1.0 + 2.3e-16, 0.0))])).axes
-    assert axis.lines[0].get_alpha() == 1.0

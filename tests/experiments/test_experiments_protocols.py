@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from experiments_records import frame, not_grasped
@@ -16,7 +15,6 @@ from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
 from torch_ekm.experiments.learners import LEARNERS, make_learner
 from torch_ekm.experiments.protocols.generalize import Generalize
-from torch_ekm.experiments.protocols.object_memory import ObjectMemory
 from torch_ekm.experiments.protocols.online import Online
 from torch_ekm.experiments.records import NotGrasped, TrialRecord
 from torch_ekm.experiments.runner import Bench
@@ -113,8 +111,6 @@ def test_impossible_protocols_are_refused() -> None:
     for angles in ((0.0,), (200.0,), ()):
         with pytest.raises(ParameterError, match="angles_deg"):
             Generalize(angles_deg=angles)
-    with pytest.raises(ParameterError, match="turn"):
-        ObjectMemory(turns_each=0)
     with pytest.raises(UnknownNameError, match="KM\\+I"):
         Generalize(controllers=("PID",))
     with pytest.raises(UnknownNameError, match="KM\\+I"):
@@ -201,14 +197,3 @@ def test_the_report_names_what_was_never_grasped(tmp_path: Path) -> None:
     assert "box was never grasped (too wide)" in report.summary
     report.write(tmp_path)
     assert "never grasped" in (tmp_path / "index.html").read_text()
-
-
-def test_object_memory_runs_and_all_memories_see_the_same_motions() -> None:
-    records = ObjectMemory(objects=("box", "can"), turns_each=1).session(0)
-    assert len(records) == 2
-    for record in records:
-        assert {len(errors) for errors in record.memory_errors_deg.values()} == {record.steps}
-    assert records[0].model == 0
-    np.testing.assert_allclose(sum(records[0].posterior), 1.0)
-    # nothing is known at first: every memory predicts what the KM does
-    assert len({errors[0] for errors in records[0].memory_errors_deg.values()}) == 1

@@ -9,14 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up_sessions import made_up_generalize, made_up_memory, made_up_online
+from made_up_sessions import made_up_generalize, made_up_online
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
 from torch_ekm.description.registry import object_paths
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
 from torch_ekm.experiments.protocols.generalize import Generalize
-from torch_ekm.experiments.protocols.object_memory import ObjectMemory
 from torch_ekm.experiments.protocols.online import Online
 from torch_ekm.experiments.reproduce import PROTOCOLS, plan, reproduce
 
@@ -26,7 +25,6 @@ def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sessions without a simulation."""
     monkeypatch.setattr(Online, "session", made_up_online)
     monkeypatch.setattr(Generalize, "session", made_up_generalize)
-    monkeypatch.setattr(ObjectMemory, "session", made_up_memory)
 
 
 def read(folder: Path) -> dict[str, bytes]:
@@ -62,8 +60,8 @@ def test_report_is_complete(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("made_up")
 def test_a_quick_report_says_so(tmp_path: Path) -> None:
-    quick = reproduce(plan("adapt", (0, 1), quick=True), tmp_path / "quick")
-    whole = reproduce(plan("adapt", (0, 1)), tmp_path / "whole")
+    quick = reproduce(plan("online", (0, 1), quick=True), tmp_path / "quick")
+    whole = reproduce(plan("online", (0, 1)), tmp_path / "whole")
     assert quick.title == f"{whole.title}: a quick run"
     assert quick.summary.startswith("A quick run shows that it works, and claims nothing.")
     assert "quick" not in whole.summary

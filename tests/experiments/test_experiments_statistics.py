@@ -9,11 +9,10 @@ import pandas
 import pytest
 import scipy.stats
 import torch
-from experiments_records import frame, memory_turn, not_grasped, turn
+from experiments_records import frame, not_grasped, turn
 
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.protocols.generalize import ends_table, object_table
-from torch_ekm.experiments.protocols.object_memory import MemoryTurn, judge_assignment
 from torch_ekm.experiments.protocols.online import Online, prediction_curves, recovery_trials
 from torch_ekm.experiments.records import NotGrasped, TrialRecord, prediction_error
 from torch_ekm.experiments.reporting.report import Column, Table
@@ -41,12 +40,9 @@ from torch_ekm.experiments.reporting.trials import select
 
 
 def test_records_come_back_from_json_as_they_were() -> None:
-    memory = memory_turn(
-        model=1, posterior=(0.9, 0.1), n_models=2, memory_errors_deg={"bank": [0.1, 0.2], "none": [1.0, 2.0]}
-    )
-    for record in (turn(first_step_deg=None), not_grasped(), memory):
+    for record in (turn(first_step_deg=None), not_grasped()):
         kept = json.loads(json.dumps(record.to_json()))
-        again = (MemoryTurn if record is memory else TrialRecord).from_json(kept)
+        again = TrialRecord.from_json(kept)
         assert again == record
         assert type(again) is type(record)
 
@@ -342,15 +338,3 @@ def test_learning_table_finds_the_last_negative_result() -> None:
     assert row[4:] == [1, None]  # after the last trial there is nothing to see
     ekm, _ = prediction_curves(frame(records[:5]), 6)
     assert ekm.loc[0].notna().tolist() == [True] * 5 + [False]
-
-
-def test_assignment_gives_every_object_one_model_at_most() -> None:
-    def turns(pairs: str) -> pandas.DataFrame:
-        return frame(memory_turn(object=pair[0], model=int(pair[1])) for pair in pairs.split())
-
-    perfect = judge_assignment(turns("a0 b1 a0 b1 a0 b1 a0 b1 a0 b1"))
-    assert (perfect.right, perfect.judged, perfect.n_models) == (4, 4, 2)
-    merged = judge_assignment(turns("a0 b0 a0 b0 a0 b0 a0 b0 a0 b0"))
-    assert (merged.right, merged.judged) == (2, 4)  # one model cannot be both
-    split = judge_assignment(turns("a0 a0 a0 a0 a1 a0"))
-    assert (split.right, split.judged, split.n_models) == (2, 3, 2)

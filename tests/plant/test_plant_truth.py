@@ -36,7 +36,7 @@ def mentions(source: str) -> list[int]:
 def test_nothing_that_controls_senses_or_learns_reads_the_truth() -> None:
     files = {path.relative_to(PACKAGE).as_posix(): path for path in PACKAGE.rglob("*.py")}
     assert {name.split("/")[0] for name in files} >= {
-        *("control", "enhanced", "object_memory", "sensing", "model", "residual")
+        *("control", "enhanced", "sensing", "model", "residual")
     }
     found = {name: mentions(path.read_text(encoding="utf-8")) for name, path in files.items()}
     readers = {name for name, lines in found.items() if lines and not name.startswith(tuple(MAY))}

@@ -57,14 +57,13 @@ def demo(
 @app.command()
 @needs("experiments")
 def reproduce(
-    experiment: Annotated[str, Argument(help="generalize, online or adapt.")] = "generalize",
+    experiment: Annotated[str, Argument(help="generalize or online.")] = "generalize",
     seeds: Annotated[str, Option(help="FIRST:END; each seed is an independent run.")] = "1000:1020",
     jobs: Jobs = 2,
     out: Annotated[Path | None, Option(help="Folder for the report [reproduce_<experiment>].")] = None,
     quick: Annotated[bool, Option(help="Two seeds, small turns: to see that it works.")] = False,
     objects: Annotated[
-        str,
-        Option(help="Names separated by commas, or a folder with URDF files (generalize, adapt)."),
+        str, Option(help="Names separated by commas, or a folder with URDF files (generalize).")
     ] = "",
     hand: Hand = "icub_right",
     preset: Preset = "nominal",
@@ -87,7 +86,6 @@ def reproduce(
     experiment  sessions  of                                       time
     generalize       400  8 to 11 turns: 5 objects, 4 controllers  1.5 h
     online            80  45 turns: 4 controllers                  1.5 h
-    adapt             20  48 turns of 6 objects in random order    0.3 h
 
     Time grows with the number of seeds and objects. With --quick: one or two minutes.
     """

@@ -13,13 +13,12 @@ from ..exceptions import ParameterError, UnknownNameError
 from .config import FIRST_REPORTED, Setting
 from .jobs import run_jobs
 from .protocols.generalize import Generalize
-from .protocols.object_memory import ObjectMemory
 from .protocols.online import Online
 from .protocols.protocol import Protocol
 from .reporting.report import Report
 from .reporting.trials import trial_frame
 
-PROTOCOLS: dict[str, type[Protocol]] = {"online": Online, "generalize": Generalize, "adapt": ObjectMemory}
+PROTOCOLS: dict[str, type[Protocol]] = {"online": Online, "generalize": Generalize}
 #: Seeds that nobody tuned on, at least twenty for each case.
 REPORTED_SEEDS = tuple(range(FIRST_REPORTED, FIRST_REPORTED + 20))
 

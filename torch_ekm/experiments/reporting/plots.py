@@ -160,24 +160,3 @@ def plot_convergence(turns: DataFrame, target: str = "") -> Figure:
     axis.set_title(f"Error on the way{' to ' + target if target else ''}", loc="left")
     axis.legend(frameon=False)
     return figure
-
-
-def plot_bank(turns: DataFrame) -> Figure:
-    """Which model of an object memory each turn went to (none: not drawn), and how sure it was: the
-    probabilities of the models at its end."""
-    names = list(turns["object"].unique())
-    figure, (axis,) = new_figure(8.0, 3.2)
-    palette, marks, used = list(COLOURS.values()), "osD^v*PX", {*turns["model"].dropna().astype(int)}
-    for k, turn in enumerate(turns.itertuples(), start=1):
-        if not np.isnan(turn.model):
-            sure, model = min(max(turn.posterior), 1.0), int(turn.model)  # a sum may end an ulp above 1
-            style = {"color": palette[model % len(palette)], "alpha": 0.25 + 0.75 * sure}
-            axis.plot(k, names.index(turn.object), marks[model % 8], **style)
-    for model in sorted(used):
-        axis.plot([], [], marks[model % 8], color=palette[model % len(palette)], label=f"model {model}")
-    axis.set_yticks(range(len(names)), names)
-    axis.set(xlabel="turn")
-    axis.set_title("Which model took the turn (pale: unsure)", loc="left")
-    if used:
-        axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
-    return figure
