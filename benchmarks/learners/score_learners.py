@@ -53,7 +53,6 @@ HAND: dict[str, Factory] = {
     "random features, forgetting .99, robust 3": chosen("random features", **_LOUD),
     "sliding-window GP 100, robust 3": chosen("window GP", **_LOUD),
     "KRLS-T 100, forgetting .99": chosen("KRLS-T", **_LOUD),
-    "local GPs, 40 x 100": chosen("local GPs", **_LOUD),
     "ensemble of four networks": chosen("MLP ensemble", members=4),
     "river, adaptive random forest": chosen("river forest"),
 }
@@ -70,7 +69,6 @@ STREAMS: dict[str, Factory] = {
     "deep SOGP 300": chosen("SOGP deep", parts=(), robust=None, capacity=300),
     "sliding-window GP 100": chosen("window GP", robust=None),
     "KRLS-T 100": chosen("KRLS-T", forgetting_factor=1.0),
-    "local GPs, 40 x 100": chosen("local GPs"),
     "GPyTorch SVGP 100": chosen("GPyTorch SVGP", memory=1, minibatch=1),
     "river, adaptive random forest": chosen("river forest"),
     "ensemble of four networks, all replayed": chosen("MLP ensemble", members=4, memory=10_000),

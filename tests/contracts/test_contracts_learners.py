@@ -23,7 +23,6 @@ from torch_ekm.residual import (
     LastResidual,
     LearnerFleet,
     LearnHyperparameters,
-    LocalGPs,
     MixtureResidual,
     ProcessNoise,
     RandomFeatureRLS,
@@ -58,7 +57,6 @@ LEARNERS = {
     "rff": lambda **o: RandomFeatureRLS(3, 2, n_frequencies=20, **o),
     "window": lambda **o: WindowGP(3, 2, window=10, **o),
     "krls_t": lambda **o: KRLSTracker(3, 2, capacity=8, forgetting_factor=0.99, **o),
-    "local": lambda **o: LocalGPs(3, 2, experts=3, window=6, **o),
     "mlp": lambda **o: ReplayMLP(3, 2, hidden=(8,), **o),
     "ensemble": lambda **o: ReplayMLP(3, 2, hidden=(8,), members=3, **o),
     "sogp": sogp,
@@ -115,7 +113,6 @@ def test_contract_of_fleets(name, shape):
 
 SINGLE = {
     "krls_t": (KRLSTracker, {"capacity": 8, "forgetting_factor": 0.99}),
-    "local": (LocalGPs, {"experts": 3, "window": 6}),
     "mlp": (ReplayMLP, {"hidden": (8,)}),
     "ensemble": (ReplayMLP, {"hidden": (8,), "members": 3}),
     "deep_sogp": (DeepKernelSOGP, {"capacity": 8, "hidden": (8,), "refresh_every": 4}),

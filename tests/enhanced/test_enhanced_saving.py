@@ -24,7 +24,6 @@ from torch_ekm.residual import (
     KRLSTracker,
     LearnerFleet,
     LearnHyperparameters,
-    LocalGPs,
     Matern32,
     MixtureResidual,
     RecursiveLeastSquares,
@@ -55,7 +54,6 @@ LEARNERS = {
     "learns": lambda: sogp(parts=[ForgettingFactor(0.9), LearnHyperparameters(memory=20)], refresh_every=8),
     "mixture": lambda: MixtureResidual([sogp(), RecursiveLeastSquares(3, 2)], shares=(0.0, 1.0)),
     "krls": lambda: KRLSTracker(3, 2, capacity=8),
-    "local": lambda: LocalGPs(3, 2, experts=3, window=6),
     "network": lambda: ReplayMLP(3, 2, hidden=(8,), members=2),
     "single": lambda: sogp(dtype=torch.float32),
 }
@@ -168,7 +166,7 @@ def hostile_values(value):
         yield torch.full_like(value, -7)
 
 
-@pytest.mark.parametrize("name", ["sogp", "learns", "mixture", "local", "network", "svgp"])
+@pytest.mark.parametrize("name", ["sogp", "learns", "mixture", "network", "svgp"])
 def test_a_state_is_loaded_whole_or_not_at_all(name: str) -> None:
     """Each of its entries in turn is a hostile one."""
     if name == "svgp":

@@ -22,6 +22,7 @@ from torch_ekm.residual import (
     ProcessNoise,
     RandomFeatureRLS,
     RecursiveLeastSquares,
+    ReplayMLP,
     RobustWeight,
     SquaredExponential,
     Standardize,
@@ -311,12 +312,9 @@ def test_krls_tracker_without_forgetting_is_the_exact_gp():
     torch.testing.assert_close(tracker.predict(x).variance, gp.predict(x).variance, atol=1e-7, rtol=0)
 
 
-@pytest.mark.parametrize("name", ["LocalGPs", "ReplayMLP"])
-def test_the_others_learn_too(name):
-    import torch_ekm.residual as field
-
+def test_networks_learn_too():
     x, y = system(19, 400)
-    learner = getattr(field, name)(4, 2)
+    learner = ReplayMLP(4, 2)
     learner.update(x, y)
     xs, ys = system(20, 200, noise=0.0)
     assert float((learner(xs) - ys).square().mean()) < 0.3 * float(ys.square().mean())

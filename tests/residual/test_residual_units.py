@@ -10,7 +10,6 @@ import torch
 from torch_ekm.residual import (
     DeepKernelSOGP,
     KRLSTracker,
-    LocalGPs,
     RandomFeatureRLS,
     RecursiveLeastSquares,
     ReplayMLP,
@@ -29,7 +28,6 @@ SMALL = {
     "rff": lambda **o: RandomFeatureRLS(3, 2, n_frequencies=30, **o),
     "krls_t": lambda **o: KRLSTracker(3, 2, capacity=30, **o),
     "window": lambda **o: WindowGP(3, 2, window=40, **o),
-    "local": lambda **o: LocalGPs(3, 2, experts=5, window=30, **o),
     "mlp": lambda **o: ReplayMLP(3, 2, hidden=(16,), members=2, **o),
 }
 EVERY = pytest.mark.parametrize("make", SMALL.values(), ids=SMALL)

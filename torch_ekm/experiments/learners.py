@@ -126,7 +126,6 @@ LEARNERS: dict[str, Factory] = {
     "linear RLS": Kind(residual.RecursiveLeastSquares, **_FRESH),
     "random features": Kind(residual.RandomFeatureRLS, "n_frequencies", **_FRESH),
     "window GP": Kind(residual.WindowGP, "window", "kernel", robust=3.0, **_AS_GIVEN),
-    "local GPs": Kind(residual.LocalGPs, "window", "kernel", experts=40, **_AS_GIVEN),
     "KRLS-T": Kind(residual.KRLSTracker, "capacity", "kernel", forgetting_factor=0.99, **_AS_GIVEN),
     "MLP": Kind(residual.ReplayMLP, standardize=False),
     "MLP ensemble": Kind(residual.ReplayMLP, members=3, standardize=False),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from .base import ResidualLearner
 from .baselines.krls_t import KRLSTracker
 from .baselines.linear import RandomFeatureRLS, RecursiveLeastSquares
-from .baselines.local_gps import LocalGPs
 from .baselines.replay_mlp import ReplayMLP
 from .baselines.window_gp import WindowGP
 from .baselines.zero import ZeroResidual
@@ -38,7 +37,6 @@ __all__ = [
     "LearnHyperparameters",
     "LastResidual",
     "LearnerFleet",
-    "LocalGPs",
     "Matern32",
     "Matern52",
     "MixtureResidual",

@@ -21,7 +21,7 @@ class LearnerFleet(ResidualLearner):
     Each does exactly what it would do alone, one after the other: n times the time of one; a learner that
     draws its weights from a seed draws the same in every place. Learners that take ``batch_shape``
     themselves (``SparseOnlineGP`` among them) update all models in one call and are much faster. This is
-    for those that do not, such as ``KRLSTracker``, ``LocalGPs``, ``ReplayMLP`` and the adapters of other
+    for those that do not, such as ``KRLSTracker``, ``ReplayMLP`` and the adapters of other
     libraries. What is special to a kind is found on ``fleet[k]``; the law of y is taken to be normal.
 
     Args:
