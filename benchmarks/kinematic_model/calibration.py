@@ -22,7 +22,8 @@ import torch
 from torch_ekm.contact.forces.options import ForceOptions
 from torch_ekm.description import HandDescription, load_hand, load_object
 from torch_ekm.exceptions import GraspError, SolverError
-from torch_ekm.model import Calibration, KinematicModel, ModelOptions, calibrate
+from torch_ekm.model import KinematicModel, ModelOptions, calibrate
+from torch_ekm.model.calibration import Calibration
 from torch_ekm.plant import PlantStatus, RecordingPlant, Trajectory
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
 

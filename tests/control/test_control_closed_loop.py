@@ -13,7 +13,6 @@ from obedient_plant import watched
 
 from torch_ekm.control import (
     ClosedLoop,
-    ControlProblem,
     HandKnowledge,
     LookAndMoveController,
     PoseTarget,
@@ -21,6 +20,7 @@ from torch_ekm.control import (
     StoppingRule,
 )
 from torch_ekm.control import StopReason as Reason
+from torch_ekm.control.qp import ControlProblem
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NonFiniteError, ParameterError, SolverError
 from torch_ekm.kinematics.se3 import exp

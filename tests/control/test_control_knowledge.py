@@ -12,7 +12,8 @@ from torch_ekm.control import ClosedLoop, DescribedFigures, HandKnowledge, LookA
 from torch_ekm.control.force_sensitivity import ForceSensitivity
 from torch_ekm.enhanced import EnhancedModel, save
 from torch_ekm.exceptions import FileFormatError, ParameterError
-from torch_ekm.kinematics import IdealServos, ServoModel
+from torch_ekm.kinematics import ServoModel
+from torch_ekm.kinematics.servo_model import IdealServos
 from torch_ekm.model import KinematicModel
 from torch_ekm.residual import SparseOnlineGP
 from torch_ekm.simulation import SimulatedHand

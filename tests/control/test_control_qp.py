@@ -9,12 +9,11 @@ import pytest
 
 from torch_ekm.control import (
     Bounds,
-    ControlSolution,
     Equality,
     Inequality,
     Squares,
-    build_qp,
 )
+from torch_ekm.control.qp import ControlSolution, build_qp
 from torch_ekm.exceptions import ParameterError
 
 DEG = math.pi / 180

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torch_ekm.description import Shape, list_cylinders, list_objects, load_object
+from torch_ekm.description import Shape, list_objects, load_object
+from torch_ekm.description.registry import list_cylinders
 from torch_ekm.description.shape import merge_capsules
 
 

@@ -17,8 +17,9 @@ import model_toys
 from torch_ekm.control import ClosedLoop, FocusedPose, LookAndMoveController, PoseTarget, Safety, StopReason
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NoContactError, ParameterError
-from torch_ekm.foresight import BeyondReach, ModelHand, ReachEnd, friction_share, reachable
+from torch_ekm.foresight import BeyondReach, ModelHand, ReachEnd, reachable
 from torch_ekm.foresight import reach as reach_module
+from torch_ekm.foresight.friction_share import friction_share
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantStatus

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from torch_ekm.contact.contact_set import ContactSet
-from torch_ekm.description import Actuator, HandDescription, UrdfModel
+from torch_ekm.description import Actuator, HandDescription
+from torch_ekm.description.urdf import UrdfModel
 from torch_ekm.kinematics import LinkPoses, se3
 
 F64 = torch.float64

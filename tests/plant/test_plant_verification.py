@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torch_ekm.description import file_digests
-from torch_ekm.description.registry import object_paths
+from torch_ekm.description.registry import file_digests, object_paths
 from torch_ekm.exceptions import FolderInUseError, OutputError
 from torch_ekm.plant import Observation, PlantStatus, Trajectory, TrialLog, verify_log
 

@@ -43,7 +43,8 @@ def hands(
 @needs("robot")
 def objects() -> None:
     """List the objects of the package: mass [g], friction, grasp width [mm] and shapes."""
-    from ..description import list_cylinders, list_objects, load_object
+    from ..description import list_objects, load_object
+    from ..description.registry import list_cylinders
 
     rows = []
     for name in (*list_objects(), *list_cylinders()):

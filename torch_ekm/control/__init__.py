@@ -11,7 +11,7 @@ from .force_sensitivity import ForceSensitivity
 from .knowledge import HandKnowledge
 from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
 from .pace import LimitingFunction, Pace, PaceOptions, StepBound, TrustRegion
-from .qp import Bounds, ControlProblem, ControlSolution, Equality, Inequality, Squares, build_qp
+from .qp import Bounds, Equality, Inequality, Squares
 from .safety import Caution, Guards, Safety, StoppingRule
 from .situation import LinearizedModel, Situation
 from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
@@ -23,8 +23,6 @@ __all__ = [
     "Bounds",
     "Caution",
     "ClosedLoop",
-    "ControlProblem",
-    "ControlSolution",
     "Decision",
     "DescribedFigures",
     "EffortTask",
@@ -58,5 +56,4 @@ __all__ = [
     "StoppingRule",
     "Task",
     "TrustRegion",
-    "build_qp",
 ]

@@ -10,7 +10,8 @@ from .._recorded import Recorded, describe
 from ..description import HandDescription
 from ..enhanced.hand_figures import DescribedFigures, HandFigures
 from ..exceptions import FileFormatError, ParameterError
-from ..kinematics import IdealServos, ServoModel
+from ..kinematics import ServoModel
+from ..kinematics.servo_model import IdealServos
 from ..residual.files import known_classes, read, rebuild, write
 from .force_sensitivity import ForceSensitivity
 

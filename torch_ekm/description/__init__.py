@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from .hand import Actuator, ContactPad, HandDescription
 from .objects import ObjectDescription
-from .registry import file_digests, list_cylinders, list_hands, list_objects, load_hand, load_object
+from .registry import list_hands, list_objects, load_hand, load_object
 from .shape import Shape
 from .template import write_template
 from .transmission_file import write_transmission
-from .urdf import UrdfModel
 
 __all__ = [
     "Actuator",
@@ -16,13 +15,10 @@ __all__ = [
     "HandDescription",
     "ObjectDescription",
     "Shape",
-    "UrdfModel",
-    "list_cylinders",
     "list_hands",
     "list_objects",
     "load_hand",
     "load_object",
     "write_template",
     "write_transmission",
-    "file_digests",
 ]

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from ..control import DEFAULT_LIMITS, DEFAULT_TASKS, Limit, PaceOptions, Safety, Task
-from ..description import file_digests, list_hands
+from ..description import list_hands
+from ..description.registry import file_digests
 from ..exceptions import ParameterError, UnknownNameError
 from ..model import ModelOptions
 from ..simulation import PlantConfig, PlantParameters, preset

@@ -102,11 +102,6 @@ class Bench:
         self._failed += 1
         return None
 
-    def adopt(self, learner: ResidualLearner, encoding: GraspEncoding) -> None:
-        """Learn with this learner (e.g. one that knows other objects) instead of a fresh one."""
-        self.learner, self.encoding, self.enhanced = learner, encoding, None
-        self.pace = Pace(self.setting.pace, adapts=True)
-
     def trial(self, seed: int, trial: int, angle_deg: float, kind: str = "turn", **options: Any) -> Record:
         """Turn the object by ``angle_deg`` from a fresh grasp, with the options of :meth:`turn`."""
         start = self.grasp(seed, trial)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from .blind_pose import BlindPose
-from .friction_share import friction_share
 from .model_hand import ModelHand
-from .pose_filter import PoseFilter
 from .prediction import Prediction
 from .reach import BeyondReach, Reach, ReachEnd, reachable
 from .rollout import Rollout
@@ -14,11 +12,9 @@ __all__ = [
     "BeyondReach",
     "BlindPose",
     "ModelHand",
-    "PoseFilter",
     "Prediction",
     "Reach",
     "ReachEnd",
     "Rollout",
-    "friction_share",
     "reachable",
 ]

@@ -100,7 +100,7 @@ def reachable(
             it would lie 0.3 mm deep, which is when noisy readings show it.
 
     A turn also ends where the grasp needs more than 70 % of its friction to hold the object
-    (:func:`~torch_ekm.foresight.friction_share`).
+    (``friction_share``).
 
     Raises:
         ParameterError: a focus that is no single rotation, a sign that is none, or an angle outside 0 to

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from .capymoa_regressor import CapyMOARegressor as as_capymoa  # noqa: N813  called like the others
 from .gpytorch_svgp import GPyTorchSVGP
-from .online_regressor import LearnerLike, OnlineRegressor
+from .online_regressor import OnlineRegressor
 from .river_residual import RiverResidual
 
 if TYPE_CHECKING:
@@ -41,7 +41,6 @@ def __getattr__(name: str) -> Any:
 
 __all__ = [
     "GPyTorchSVGP",
-    "LearnerLike",
     "OnlineRegressor",
     "RiverResidual",
     "as_capymoa",

@@ -7,13 +7,12 @@ from .grasp_state import GraspState
 from .hand_kinematics import HandKinematics
 from .link_poses import LinkPoses
 from .play import Play
-from .servo_model import IdealServos, ServoModel
+from .servo_model import ServoModel
 
 __all__ = [
     "ActuationMap",
     "GraspState",
     "HandKinematics",
-    "IdealServos",
     "LinkPoses",
     "Play",
     "ServoModel",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .calibration import Calibration, calibrate
+from .calibration import calibrate
 from .grasp_forces import GraspForces
 from .kinematic_model import KinematicModel
 from .linearization import Linearization
@@ -10,7 +10,6 @@ from .options import ModelOptions
 from .validity import ModelStatus
 
 __all__ = [
-    "Calibration",
     "GraspForces",
     "KinematicModel",
     "Linearization",

@@ -6,7 +6,8 @@ from typing import Any
 import torch
 
 from ..description import HandDescription
-from ..kinematics import IdealServos, ServoModel
+from ..kinematics import ServoModel
+from ..kinematics.servo_model import IdealServos
 from ..typing import Float, Tensor
 from .observation import Observation
 from .plant import Plant

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from ..description import file_digests
+from ..description.registry import file_digests
 from ..exceptions import EKMError, ParameterError
 from .trajectory import Trajectory
 from .trial_log import (

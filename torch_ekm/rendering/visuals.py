@@ -13,8 +13,9 @@ from typing import Any, cast
 import numpy as np
 
 from .._extras import require
-from ..description import Shape, UrdfModel
+from ..description import Shape
 from ..description.shape import Kind, merge_capsules
+from ..description.urdf import UrdfModel
 from ..typing import Array
 
 _SUFFIXES = (".stl", ".obj", ".ply", ".off", ".dae", ".glb")

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ...description import file_digests, load_hand
+from ...description import load_hand
+from ...description.registry import file_digests
 from ...exceptions import EKMError, ParameterError
 from ...plant import RecordingPlant, TrialLog
 from ..config import Setting
