@@ -105,10 +105,14 @@ def test_contract(name):
     check_residual_learner(LEARNERS[name], n_samples=n_samples, separates_noise=name != "mlp")
 
 
-@pytest.mark.parametrize("shape", [(1,), (5,), (2, 3)])
-@pytest.mark.parametrize("name", FLEETS)
+@pytest.mark.parametrize(  # shapes are those of one base class: two learners show the others
+    ("name", "shape"),
+    [*((name, (2, 3)) for name in FLEETS), *((name, n) for name in ("rls", "sogp_all") for n in ((1,), (5,)))],
+)
 def test_contract_of_fleets(name, shape):
-    check_residual_learner(lambda **o: LEARNERS[name](batch_shape=shape, **o), dtypes=(torch.float64,))
+    check_residual_learner(
+        lambda **o: LEARNERS[name](batch_shape=shape, **o), dtypes=(torch.float64,), n_samples=16
+    )
 
 
 SINGLE = {
@@ -142,7 +146,7 @@ def test_contract_of_river():
     from torch_ekm.interop import RiverResidual
 
     options = {"differentiable": False, "separates_noise": False, "has_state": False}
-    check_residual_learner(lambda **o: RiverResidual(3, 2, **o), **options)
+    check_residual_learner(lambda **o: RiverResidual(3, 2, **o), n_samples=12, **options)
     check_residual_learner(
         lambda **o: LearnerFleet(RiverResidual, 3, 2, batch_shape=(2,), **o),
         dtypes=(torch.float64,),

@@ -80,19 +80,18 @@ def test_a_result_is_that_of_its_job(tmp_path: Path) -> None:
             read_result(tmp_path / "a.json", "a")
 
 
-def mark(folder: str, x: int) -> int:
-    """Leaves a trace; the job 0 fails, and no other ends before."""
-    first = Path(folder) / "0"
-    (Path(folder) / str(x)).touch()
-    if x == 0:
-        raise ValueError("job 0")
-    while not first.exists():
-        time.sleep(0.05)
-    time.sleep(0.3)
-    return x
-
-
 def test_a_failure_cancels_what_has_not_begun(tmp_path: Path) -> None:
+    def mark(folder: str, x: int) -> int:  # local, so that its process need not import this file
+        """Leaves a trace; the job 0 fails, and no other ends before."""
+        first = Path(folder) / "0"
+        (Path(folder) / str(x)).touch()
+        if x == 0:
+            raise ValueError("job 0")
+        while not first.exists():
+            time.sleep(0.05)
+        time.sleep(0.3)
+        return x
+
     traces = tmp_path / "traces"
     traces.mkdir()
     with pytest.raises(ValueError, match="job 0") as told:
@@ -104,22 +103,21 @@ def test_a_failure_cancels_what_has_not_begun(tmp_path: Path) -> None:
     assert len(list(traces.iterdir())) == begun < 60
 
 
-def die(folder: str, x: int) -> int:
-    """The process of the job 0 is killed from outside the first time, that of the job 1 each time.
-
-    Its last time comes when the job 0 is done.
-    """
-    traces = Path(folder) / "traces"
-    times = len(list(traces.glob(f"{x}_*")))
-    (traces / f"{x}_{times}").touch()
-    while x == 1 and times == 2 and not (Path(folder) / "job_0.json").exists():
-        time.sleep(0.05)
-    if x == 1 or times == 0:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return x
-
-
 def test_a_job_whose_process_was_killed_is_run_again_and_named_if_it_dies_each_time(tmp_path: Path) -> None:
+    def die(folder: str, x: int) -> int:
+        """The process of the job 0 is killed from outside the first time, that of the job 1 each time.
+
+        Its last time comes when the job 0 is done.
+        """
+        traces = Path(folder) / "traces"
+        times = len(list(traces.glob(f"{x}_*")))
+        (traces / f"{x}_{times}").touch()
+        while x == 1 and times == 2 and not (Path(folder) / "job_0.json").exists():
+            time.sleep(0.05)
+        if x == 1 or times == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return x
+
     (tmp_path / "traces").mkdir()
     with pytest.raises(WorkerDiedError, match="'job_1' was run 3 times"):
         run_jobs(die, {f"job_{x}": (str(tmp_path), x) for x in range(2)}, tmp_path, processes=2)

@@ -71,7 +71,10 @@ OPTIONS = {
 
 
 def pair(name: str, shape: tuple[int, ...] = ()) -> list[SparseOnlineGP]:
-    common = {"capacity": 12, "batch_shape": shape, "noise_variance": 0.1, "parts": (), "standardize": False}
+    common = {
+        "capacity": 12, "batch_shape": shape, "noise_variance": 0.1, "parts": (), "standardize": False,
+        "refresh_every": 64,
+    }  # fmt: skip
     made = [SparseOnlineGP(D, M, **{**common, **OPTIONS[name](shape)}) for _ in range(2)]
     made[0].engine = ReferenceEngine()
     return made
@@ -94,7 +97,7 @@ def assert_alike(a: SparseOnlineGP, b: SparseOnlineGP, x: torch.Tensor, largest:
 @pytest.mark.parametrize("name", OPTIONS)
 def test_compiled_loops_do_what_torch_does(name, shape):
     reference, fast = pair(name, shape)
-    x, y = hard_stream(280, *shape)  # caches are rebuilt after 256
+    x, y = hard_stream(140, *shape)  # caches are rebuilt after 64
     for t in range(len(x)):
         a, b = reference.update(x[t], y[t]), fast.update(x[t], y[t])
         assert torch.equal(a.event, b.event), t

@@ -114,18 +114,23 @@ def test_one_specification_serves_several_learners(name):
 
 
 @every_part
-@pytest.mark.parametrize("moment", [0, 1, 5, 8, 13, 29, 38, 47])
-def test_a_copy_goes_on_with_the_same_bits_whenever_it_is_made(name, moment):
+def test_a_copy_goes_on_with_the_same_bits_whenever_it_is_made(name):
     x, y = stream(60)
-    whole, first, second = (learner(PARTS[name]) for _ in range(3))
+    whole, first = learner(PARTS[name]), learner(PARTS[name])
     whole.update(x, y)
-    if moment:
-        first.update(x[:moment], y[:moment])
-    second.load_state_dict(first.state_dict())
-    for g in (second, copy.deepcopy(first), copy.deepcopy(first).to(torch.float64)):
-        assert same(g, first, x)
-        g.update(x[moment:], y[moment:])
-        assert same(g, whole, x)
+    done = 0
+    for moment in (0, 1, 5, 8, 13, 29, 38, 47):
+        if moment:
+            first.update(x[done:moment], y[done:moment])
+        done, reloaded = moment, learner(PARTS[name])
+        reloaded.load_state_dict(first.state_dict())
+        copies = [reloaded]
+        if moment in (5, 29):  # these are made otherwise, of the same buffers
+            copies += [copy.deepcopy(first), copy.deepcopy(first).to(torch.float64)]
+        for g in copies:
+            assert same(g, first, x), moment
+            g.update(x[moment:], y[moment:])
+            assert same(g, whole, x), moment
 
 
 @every_part

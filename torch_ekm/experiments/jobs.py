@@ -105,7 +105,7 @@ def _in_processes(processes: int, function: Callable[..., Any], jobs: Jobs) -> O
     env = {name: os.environ.get(name, threads) for name in names}
 
     def new() -> Any:
-        return loky.ProcessPoolExecutor(1, env=env, initializer=_end_with, initargs=(os.getpid(),))
+        return loky.ProcessPoolExecutor(1, env=env, initializer=_watching(os.getpid()))
 
     pools, idle = [new() for _ in range(n)], list(range(n))
     waiting = deque((name, 1) for name in jobs)
@@ -136,16 +136,22 @@ def _in_processes(processes: int, function: Callable[..., Any], jobs: Jobs) -> O
             pool.shutdown(kill_workers=True)
 
 
-def _end_with(parent: int) -> None:
-    """End this process when its parent has: killed, a parent gives no notice."""
+def _watching(parent: int) -> Callable[[], None]:
+    """Ends a process when its parent has: killed, a parent gives no notice.
+
+    A local function goes to the process by value, which so imports what its jobs need and no more.
+    """
 
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(_WATCH)
         os._exit(1)
 
-    if os.name != "nt":  # there a process keeps the number of a parent that is gone
-        threading.Thread(target=watch, daemon=True).start()
+    def begin() -> None:
+        if os.name != "nt":  # there a process keeps the number of a parent that is gone
+            threading.Thread(target=watch, daemon=True).start()
+
+    return begin
 
 
 def read_result(path: Path, name: str) -> Any:
