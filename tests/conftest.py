@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import gc
 import os
+from collections.abc import Iterator
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import annotations as shapes  # beside this file
+import coarse_time
 import hypothesis
 import jaxtyping
 import pinches  # beside this file
@@ -45,6 +47,12 @@ def device(request: pytest.FixtureRequest) -> torch.device:
 def generator() -> torch.Generator:
     """Seeded source of randomness."""
     return torch.Generator().manual_seed(7)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _coarse_time(request: pytest.FixtureRequest) -> Iterator[None]:
+    with coarse_time.steps_for(request.path.parent.name):
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -107,7 +107,10 @@ def test_contract(name):
 
 @pytest.mark.parametrize(  # shapes are those of one base class: two learners show the others
     ("name", "shape"),
-    [*((name, (2, 3)) for name in FLEETS), *((name, n) for name in ("rls", "sogp_all") for n in ((1,), (5,)))],
+    [
+        *((name, (2, 3)) for name in FLEETS),
+        *((name, n) for name in ("rls", "sogp_all") for n in ((1,), (5,))),
+    ],
 )
 def test_contract_of_fleets(name, shape):
     check_residual_learner(

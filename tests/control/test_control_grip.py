@@ -23,7 +23,7 @@ from torch_ekm.control import (
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantWrapper
-from torch_ekm.simulation import PlantConfig, SimulatedHand
+from torch_ekm.simulation import SimulatedHand
 
 
 class Felt(PlantWrapper):
@@ -43,7 +43,7 @@ class Felt(PlantWrapper):
 
 @pytest.fixture(scope="module")
 def plant() -> SimulatedHand:
-    return SimulatedHand("icub_right", "box", PlantConfig(time_step=0.002), preset="nominal")  # half the time
+    return SimulatedHand("icub_right", "box", preset="nominal")
 
 
 @pytest.mark.parametrize(
