@@ -1,7 +1,7 @@
 """Hands are simulated in steps of 2 ms, which takes half the time of the usual 1 ms.
 
-Tests of the simulator, and of the model against it, have the usual steps, and so has what runs in a process
-of its own.
+Tests of the simulated hand itself, and of the model against it, have the usual steps, and so has what runs in
+a process of its own.
 """
 
 from __future__ import annotations
@@ -11,14 +11,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-_EXACT = ("simulation", "model")  # folders of tests
+_EXACT = (
+    "test_simulation_hand.py",
+    "test_simulation_model_agreement.py",
+    "test_simulation_sensor_disturbances.py",
+    "test_simulation_trial_log.py",  # compares with what another process has written
+    "test_model_sapien.py",
+)
 
 
 @contextmanager
-def steps_for(folder: str) -> Iterator[None]:
-    """The default of ``PlantConfig.time_step`` is 2 ms in most folders, if a test has that class."""
+def steps_for(file: str) -> Iterator[None]:
+    """The default of ``PlantConfig.time_step`` is 2 ms in most files, if a collected test has that class."""
     module: Any = sys.modules.get("torch_ekm.simulation.config")
-    if module is None or folder in _EXACT:
+    if module is None or file in _EXACT:
         yield
         return
     init = module.PlantConfig.__init__

@@ -51,7 +51,7 @@ def generator() -> torch.Generator:
 
 @pytest.fixture(autouse=True, scope="module")
 def _coarse_time(request: pytest.FixtureRequest) -> Iterator[None]:
-    with coarse_time.steps_for(request.path.parent.name):
+    with coarse_time.steps_for(request.path.name):
         yield
 
 

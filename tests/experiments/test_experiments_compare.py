@@ -395,11 +395,11 @@ def test_simulated_hand_repeats_bit_by_bit() -> None:
     pytest.importorskip("sapien")
     from torch_ekm.experiments.learner_comparison.simulated_stream import record_simulated_hand
 
-    one = record_simulated_hand(16, seed=3)
-    assert one.x.shape == (16, 26)
-    assert one.y.shape == (16, 6)
-    assert sum(one.segments) == 16
+    one = record_simulated_hand(12, seed=3)
+    assert one.x.shape == (12, 26)
+    assert one.y.shape == (12, 6)
+    assert sum(one.segments) == 12
     assert len(one.segments) > 1  # grasped again
-    same = record_simulated_hand(16, seed=3)
+    same = record_simulated_hand(12, seed=3)
     assert torch.equal(one.x, same.x)
     assert torch.equal(one.y, same.y)

@@ -1,7 +1,7 @@
 """Meshes drawn off screen by PyVista.
 
-Run as a file it draws one picture in a process of its own, and imports nothing of the package: half of the time
-of a small picture would be the import of torch.
+Run as a file it draws one picture in a process of its own, and imports nothing of the package: half of the
+time of a small picture would be the import of torch.
 """
 
 from __future__ import annotations
