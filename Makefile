@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 JOBS ?= 2
 
 export OMP_NUM_THREADS ?= 1
+# compiled once, and read by the many processes of the tests
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test test-fast coverage docs notebooks notebooks-smoke lint types imports check install clean
 

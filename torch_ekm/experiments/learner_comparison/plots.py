@@ -58,12 +58,9 @@ def plot_scores(comparison: Comparison) -> Figure:
 
 
 def plot_learning_curves(
-    comparison: Comparison,
-    stream: str,
-    learners: Sequence[str] | None = None,
-    mark: dict[int, str] | None = None,
+    comparison: Comparison, stream: str, learners: Sequence[str] | None = None
 ) -> Figure:
-    """Error over the time of one stream, in windows; ``mark``: sample -> what happened there."""
+    """Error over the time of one stream, in windows; ``learners``: those that are drawn, all if None."""
     figure, (axis,) = new_figure(7.5, 3.4)
     one = comparison.stream(stream)
     n = len(one) - one.warm_up
@@ -76,9 +73,6 @@ def plot_learning_curves(
         windowed = np.split(comparison.errors[stream, name], edges[1:-1])
         error = np.sqrt([reduce(squared) for squared in windowed])
         axis.plot(middle, error, color=colour, linewidth=1.4, label=name)
-    for sample, text in (mark or {}).items():
-        axis.axvline(sample, color="black", linewidth=0.8, linestyle="--")
-        axis.annotate(text, (sample, 0.97), xycoords=("data", "axes fraction"), fontsize=8, va="top")
     axis.set(xlabel="sample", ylabel=f"{measure} error [sd of y]", ylim=(0, None))
     axis.set_title(f"{stream}: {one.about}", loc="left", fontsize=9)
     axis.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
