@@ -35,7 +35,7 @@ class Plotter:
         import pyvista
 
         self._plotter: Any = pyvista.Plotter(
-            off_screen=True, shape=(1, frames), border=False, window_size=(frames * size[0], size[1])
+            off_screen=True, shape=(1, frames), border=False, window_size=[frames * size[0], size[1]]
         )
         made = [(pyvista.PolyData.from_regular_faces(v, f), c, o) for v, f, c, o in meshes]
         look = {"smooth_shading": True, "split_sharp_edges": True, "specular": 0.3, "specular_power": 15}
