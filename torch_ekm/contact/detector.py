@@ -95,6 +95,45 @@ class ContactDetector:
             ShapeError: not a single posture or pose.
             NonFiniteError: an entry is NaN or infinite.
         """
+        frames, solids = self._placed(q, position, rotation)
+        found: list[tuple[int, PadContact]] = []
+        missed: list[NearMiss] = []
+        for k, (pad, link) in enumerate(zip(self._pads, self._links, strict=True)):
+            contact = self._nearest(pad, frames[link], solids, self.margin)
+            if isinstance(contact, PadContact):
+                found.append((k, contact))
+            else:
+                missed.append(NearMiss(self.hand.pads[k].link, self.hand.pads[k].name, contact))
+        missed += self._other_links.touching(frames, solids)
+        return self._contact_set(found, missed, position.dtype, position.device)
+
+    def near(
+        self,
+        q: LinkPoses | Float[Tensor, " n_q"],
+        position: Float[Tensor, " 3"],
+        rotation: Float[Tensor, "3 3"],
+        margin: float,
+    ) -> ContactSet:
+        """The pads, then the links without a pad, whose gap is at most ``margin`` [m].
+
+        A link's ``finger`` is the link's own name. Its friction is that of the object.
+
+        Raises:
+            ShapeError, NonFiniteError: as of a call.
+        """
+        frames, solids = self._placed(q, position, rotation)
+        found = []
+        for k, (pad, link) in enumerate(zip(self._pads, self._links, strict=True)):
+            contact = self._nearest(pad, frames[link], solids, margin)
+            if isinstance(contact, PadContact):
+                found.append((k, contact))
+        links = self._other_links.contacts(frames, solids, margin, CROWN_RADIUS)
+        return self._contact_set(found, [], position.dtype, position.device, links)
+
+    def _placed(
+        self, q: LinkPoses | Tensor, position: Tensor, rotation: Tensor
+    ) -> tuple[Array, list[tuple[Solid, Array]]]:
+        """Poses of the links, and the object's primitives with theirs."""
         _check("position", position, (3,))
         _check("rotation", rotation, (3, 3))
         if isinstance(q, LinkPoses):
@@ -110,32 +149,24 @@ class ContactDetector:
         T_object[:3, :3] = rotation.detach().to("cpu", torch.float64).numpy()
         T_object[:3, 3] = position.detach().to("cpu", torch.float64).numpy()
         solids = [(solid, T_object @ solid.shape.transform) for solid in self._shapes]
+        return frames, solids
 
-        found: list[tuple[int, PadContact]] = []
-        missed: list[NearMiss] = []
-        for k, (pad, link) in enumerate(zip(self._pads, self._links, strict=True)):
-            contact = self._nearest(pad, frames[link], solids)
-            if isinstance(contact, PadContact):
-                found.append((k, contact))
-            else:
-                missed.append(NearMiss(self.hand.pads[k].link, self.hand.pads[k].name, contact))
-        missed += self._other_links.touching(frames, solids)
-        return self._contact_set(found, missed, position.dtype, position.device)
-
-    def _nearest(self, pad: Pad, T_link: Array, solids: list[tuple[Solid, Array]]) -> PadContact | float:
+    def _nearest(
+        self, pad: Pad, T_link: Array, solids: list[tuple[Solid, Array]], margin: float
+    ) -> PadContact | float:
         """The contact with the smallest gap over the object's primitives (the first one of equals), or else
         that gap."""
         T_pad = T_link @ pad.transform
         best: PadContact | None = None
         least = math.inf
         for solid, T_solid in solids:
-            if math.isfinite(self.margin):
+            if math.isfinite(margin):
                 coarse = self._coarse_distance(pad, T_pad, solid, T_solid)
                 least = min(least, coarse)
-                if coarse > self.margin:
+                if coarse > margin:
                     continue
             contact = pad_contact(pad, T_pad, solid, T_solid, CROWN_RADIUS)
-            if contact.gap <= self.margin and (best is None or contact.gap < best.gap):
+            if contact.gap <= margin and (best is None or contact.gap < best.gap):
                 best = contact
         return least if best is None else best
 
@@ -152,19 +183,22 @@ class ContactDetector:
         missed: list[NearMiss],
         dtype: torch.dtype,
         device: torch.device,
+        links: list[tuple[str, PadContact]] | None = None,
     ) -> ContactSet:
-        pads = [self.hand.pads[k] for k, _ in found]
-        contacts = [contact for _, contact in found]
+        pads, links = [self.hand.pads[k] for k, _ in found], links or []
+        contacts = [contact for _, contact in (*found, *links)]
         # the softer of the two surfaces makes the patch that resists spinning
         torsional = [max(pad.torsional_friction, self.obj.torsional_friction) for pad in pads]
+        torsional += [self.obj.torsional_friction] * len(links)
+        names = [name for name, _ in links]
 
         def tensor(values: list, *shape: int) -> Tensor:
-            array = np.array(values, dtype=np.float64).reshape(len(found), *shape)
+            array = np.array(values, dtype=np.float64).reshape(len(contacts), *shape)
             return torch.from_numpy(array).to(device, dtype)
 
         return ContactSet(
-            finger=tuple(pad.name for pad in pads),
-            link=tuple(pad.link for pad in pads),
+            finger=(*(pad.name for pad in pads), *names),
+            link=(*(pad.link for pad in pads), *names),
             point=tensor([c.point for c in contacts], 3),
             normal=tensor([c.normal for c in contacts], 3),
             gap=tensor([c.gap for c in contacts]),

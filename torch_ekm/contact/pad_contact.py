@@ -1,4 +1,4 @@
-"""Where a capsule touches a primitive: one point, its normal, both curvatures."""
+"""Where a primitive of a finger touches a primitive of the object: one point, its normal, both curvatures."""
 
 from __future__ import annotations
 
@@ -26,6 +26,16 @@ class Pad:
             self.geometry = coal.Sphere(self.radius)
 
 
+class LinkCapsule:
+    """The same of a link's own capsule or ball."""
+
+    def __init__(self, solid: Solid) -> None:
+        shape = solid.shape
+        self.geometry, self.transform = solid.geometry, np.array(shape.transform)
+        self.radius = shape.size[0]
+        self.half = shape.size[1] / 2 if shape.kind == "capsule" else 0.0
+
+
 class Solid:
     """A primitive of the object, for coal and for the closed form."""
 
@@ -46,7 +56,31 @@ class PadContact:
         self.finger_curvature, self.object_curvature, self.pinned = K_f, K_o, pinned
 
 
-def pad_contact(pad: Pad, T_pad: Array, solid: Solid, T_solid: Array, R: float) -> PadContact:
+def flat_contact(coal, link: Solid, T_link: Array, solid: Solid, T_solid: Array) -> PadContact:
+    """The contact of a link's box or cylinder with one primitive, by coal's nearest points.
+
+    The link counts as flat there; where the object is flat, too, nothing rolls.
+
+    Args:
+        T_link, T_solid: poses of the two primitives in the hand frame, ``(4, 4)``.
+    """
+    result = coal.DistanceResult()
+    here, there = (coal.Transform3s(T[:3, :3], T[:3, 3]) for T in (T_link, T_solid))
+    gap = coal.distance(link.geometry, here, solid.geometry, there, coal.DistanceRequest(), result)
+    points = result.getNearestPoint1().ravel(), result.getNearestPoint2().ravel()
+    point = 0.5 * (points[0] + points[1])
+    n = -np.asarray(result.normal).ravel()  # from the object to the link
+    local = T_solid[:3, :3].T @ (points[1] - T_solid[:3, 3])
+    inner = T_solid[:3, :3].T @ n
+    principal, sharp = surface_curvature(solid.shape, tuple(local.tolist()), tuple(inner.tolist()))
+    K_o = np.zeros((3, 3))
+    for curvature, direction in principal:
+        e = T_solid[:3, :3] @ direction
+        K_o += curvature * np.outer(e, e)
+    return PadContact(point, n, gap, np.zeros((3, 3)), K_o, sharp or not principal)
+
+
+def pad_contact(pad: Pad | LinkCapsule, T_pad: Array, solid: Solid, T_solid: Array, R: float) -> PadContact:
     """The contact of a pad with one primitive; the equations are those of ``ContactDetector``.
 
     Args:
