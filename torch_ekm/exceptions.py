@@ -201,6 +201,10 @@ class UnstableGraspError(GraspError):
         super().__init__(message)
 
 
+class GraspEndsError(GraspError):
+    """No equilibrium is near after a motion: the object slips away, or the grasp jumps to another one."""
+
+
 class ObjectLostError(GraspError):
     """The object has left the hand (dropped, thrown, or not seen any more)."""
 

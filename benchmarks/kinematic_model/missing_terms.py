@@ -9,7 +9,7 @@ import torch
 
 from torch_ekm.contact.contact_kinematics import ContactKinematics
 from torch_ekm.kinematics.se3 import hat
-from torch_ekm.model import GraspForces, KinematicModel
+from torch_ekm.model import KinematicModel
 from torch_ekm.model.stiffness.potential import posture_stiffness
 
 
@@ -18,13 +18,15 @@ class _Without(KinematicModel):
 
     terms: tuple[str, ...] = ()
 
-    def load_stiffness(self, kin: ContactKinematics, forces: GraspForces) -> torch.Tensor:
-        D, n_q = super().load_stiffness(kin, forces), self.hand.n_q
+    def load_stiffness(
+        self, kin: ContactKinematics, force: torch.Tensor, spin_moment: torch.Tensor
+    ) -> torch.Tensor:
+        D, n_q = super().load_stiffness(kin, force, spin_moment), self.hand.n_q
         if "S" in self.terms:
             arms = kin.point_jacobian.mT
-            D[..., :n_q, :n_q] -= posture_stiffness(forces.force, arms, kin.axis, self.precedes)
+            D[..., :n_q, :n_q] -= posture_stiffness(force, arms, kin.axis, self.precedes)
         if "T" in self.terms:
-            D[..., n_q + 3 :, n_q + 3 :] += (hat(forces.force) @ hat(kin.lever)).sum(-3)
+            D[..., n_q + 3 :, n_q + 3 :] += (hat(force) @ hat(kin.lever)).sum(-3)
         return D
 
 

@@ -6,10 +6,16 @@ from .calibration import calibrate
 from .grasp_forces import GraspForces
 from .kinematic_model import KinematicModel
 from .linearization import Linearization
+from .moving_contacts.contact_motion import ContactMode, ContactMotion, ContactStep
+from .moving_contacts.placed_grasp import ContactLoads
 from .options import ModelOptions
 from .validity import ModelStatus
 
 __all__ = [
+    "ContactLoads",
+    "ContactMode",
+    "ContactMotion",
+    "ContactStep",
     "GraspForces",
     "KinematicModel",
     "Linearization",

@@ -63,7 +63,7 @@ def check_contacts(
 def at_pads(
     hand: HandDescription, contacts: ContactSet, fingertip_force: Float[Tensor, "*batch n_pads"]
 ) -> dict[str, Float[Tensor, "*batch"]]:
-    """What the pads measure, by name [N]."""
+    """What the pads measure, by name [N]; NaN of links that touch and are no pads."""
     (fingertip_force,) = as_tensors(fingertip_force=fingertip_force)
     if bool(((fingertip_force < _LOWEST) | torch.isinf(fingertip_force)).any()):
         valid = f"finite or NaN, and above {_LOWEST} N: a pad cannot pull (is its zero or its sign wrong?)"
@@ -73,10 +73,12 @@ def at_pads(
         raise ShapeError(
             "fingertip_force", f"(*batch, {len(pads)})", fingertip_force.shape, f"pads: {', '.join(pads)}"
         )
-    for name in contacts.finger:
-        if name not in pads:
+    measured = dict(zip(pads, fingertip_force.unbind(-1), strict=True))
+    for name, link in zip(contacts.finger, contacts.link, strict=True):
+        if name not in pads and name != link:
             raise UnknownNameError("pad", name, pads)
-    return dict(zip(pads, fingertip_force.unbind(-1), strict=True))
+        measured.setdefault(name, torch.full_like(fingertip_force[..., 0], torch.nan))
+    return measured
 
 
 def joint_index(hand: HandDescription, name: str) -> int:

@@ -23,12 +23,16 @@ from .gradients import following, only_if_asked
 from .grasp_forces import ExpectedForces, GraspForces
 from .linearization import FollowedFigures, Linearization
 from .motion_equations import MotionEquations
+from .moving_contacts.contact_motion import ContactMotion, ContactStep
 from .options import ModelOptions
 from .reduction import Reduction
 from .sensitivity import force_change, margin_sensitivity, normal_motion, normal_sensitivity
 from .stiffness.geometric import geometric_stiffness, precedence
 from .stiffness.potential import gravity_gradient, gravity_hessian, spring_torque
 from .validity import find_doubts
+
+TOUCHING = 0.2e-3
+"""Gap of a link that counts as touching [m]."""
 
 
 class KinematicModel(nn.Module):
@@ -170,6 +174,56 @@ class KinematicModel(nn.Module):
             raise NoContactError("no finger touches the object, so no actuator can move it")
         return following(contacts, self.contacts, state) if torch.is_grad_enabled() else contacts
 
+    @torch.no_grad()
+    def touching(self, state: GraspState) -> ContactSet:
+        """:meth:`contacts`, and links without a pad within 0.2 mm of the object, by the links' names.
+
+        Raises:
+            NoContactError: nothing touches the object.
+        """
+        contacts = self.contacts(state)
+        if not isinstance(self.detector, ContactDetector):
+            return contacts
+        margin = max(self.detector.margin, TOUCHING)
+        near = self.detector.near(state.q, state.position, state.rotation, margin)
+        pads = len(contacts.finger)  # they come first, in the same order
+        links = [i for i in range(pads, near.n_c) if float(near.gap[i]) < TOUCHING]
+        return near.select([*range(pads), *links])
+
+    def step(
+        self,
+        state: GraspState,
+        delta_a: Float[Tensor, " n_a"],
+        *,
+        fingertip_force: Float[Tensor, " n_pads"] | None = None,
+        expected: ExpectedForces | None = None,
+        a: Float[Tensor, " n_a"] | None = None,
+    ) -> ContactStep:
+        """The state after a motion in which contacts stick, slide, open and close, links and stops bear, and
+        tendons go slack: the equilibrium of a :class:`~torch_ekm.model.ContactMotion` that begins here.
+
+        :meth:`forward` is its derivative while nothing of that happens. Not differentiable by autograd:
+        ``ContactStep.jacobian`` is its derivative.
+
+        Args:
+            state: one state.
+            delta_a: increment of the encoders [rad].
+            fingertip_force, expected: what is known of the forces, as in :meth:`linearize`.
+            a: encoders [rad], of a hand that is as described.
+
+        Raises:
+            GraspEndsError: no equilibrium is near.
+            GraspError: what :meth:`linearize` raises.
+        """
+        start = self.linearize(
+            state,
+            self.touching(state),
+            fingertip_force=fingertip_force,
+            expected=expected,
+            on_unstable="flag",
+        )
+        return ContactMotion(self, start, a=a).move(delta_a)
+
     def moving(self, contacts: ContactSet) -> Bool[Tensor, " n_q"]:
         """Joints that move a contact."""
         return self.kinematics.upstream[[self.link_names.index(name) for name in contacts.link]].any(0)
@@ -259,7 +313,7 @@ class KinematicModel(nn.Module):
         o = self.options
         if on_unstable is not None and on_unstable != o.on_unstable:
             o = dataclasses.replace(o, on_unstable=on_unstable)
-        D = self.load_stiffness(kin, forces) + V_ss
+        D = self.load_stiffness(kin, forces.force, forces.spin_moment) + V_ss
         held = self.balance.held_by_stops(state.q, forces.stop_torque)
         held[..., lock] = True
         slack = self.balance.slack(forces)
@@ -300,9 +354,14 @@ class KinematicModel(nn.Module):
         )
         return self.followed(found)
 
-    def load_stiffness(self, kin: ContactKinematics, forces: GraspForces) -> Float[Tensor, "*batch n_s n_s"]:
+    def load_stiffness(
+        self,
+        kin: ContactKinematics,
+        force: Float[Tensor, "*batch n_c 3"],
+        spin_moment: Float[Tensor, "*batch n_c"],
+    ) -> Float[Tensor, "*batch n_s n_s"]:
         """``dF/ds`` at constant contact forces: lever arms of hand and object, rolling, soft-finger spin."""
-        return geometric_stiffness(kin, forces.force, forces.spin_moment, self.precedes)
+        return geometric_stiffness(kin, force, spin_moment, self.precedes)
 
     def potential(
         self, state: GraspState

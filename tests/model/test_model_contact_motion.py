@@ -1,0 +1,210 @@
+"""Motions whose contacts stick, slide, open and close: derivatives in each mode, and the simulated hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import model_toys
+import pytest
+import torch
+
+from torch_ekm.exceptions import GraspError
+from torch_ekm.model import ContactMode, ContactMotion, KinematicModel
+from torch_ekm.model.moving_contacts import contact_laws, contact_motion
+from torch_ekm.simulation import SimulatedHand
+
+sys.path.append(str(Path(__file__).parents[1] / "foresight"))
+from planar import planar
+from turning import turning
+
+F64 = torch.float64
+DEG = torch.pi / 180
+
+
+@pytest.fixture(scope="module")
+def held():
+    """Model, start, encoders and axis of a box in the hand as described."""
+    plant = SimulatedHand("icub_right", "box", preset="none")
+    seen = plant.reset(0).truth
+    model = KinematicModel(plant.hand, plant.object)
+    force = seen.fingertip_force
+    start = model.linearize(seen.state, model.touching(seen.state), fingertip_force=force)
+    yield model, start, plant.reset(0).a, plant.rotation_axis
+    plant.close()
+
+
+@pytest.fixture
+def exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Corrections to the last digit, for differences."""
+    monkeypatch.setattr(contact_motion, "_FINE", 1e-10)
+    monkeypatch.setattr(contact_motion, "_SAME", 1e-10)
+    monkeypatch.setattr(contact_motion, "_CORRECTIONS", 20)
+    monkeypatch.setattr(contact_laws, "_TOLERANCE", 1e-13)
+
+
+def differences(motion: ContactMotion, w: torch.Tensor, h: float) -> torch.Tensor:
+    """``d increment/d da`` at w by central differences."""
+    place = motion.state, None, motion.loads
+    columns = []
+    for e in torch.eye(len(w), dtype=F64):
+        ends = []
+        for sign in (1, -1):
+            motion._stand(*place)
+            ends.append(motion.move(w + sign * h * e).increment)
+        columns.append((ends[0] - ends[1]) / (2 * h))
+    motion._stand(*place)
+    return torch.stack(columns, dim=1)
+
+
+def off(motion: ContactMotion, w: torch.Tensor) -> float:
+    """Relative error of the derivative in the mode of w; the little finger, which is free, is left out."""
+    columns = [i for i, name in enumerate(motion.model.hand.actuator_names) if name != "pinky"]
+    J, by_hand = (
+        motion.linearize(w).manipulation_jacobian,
+        differences(motion, w, 1e-4 * float(w.abs().max()))[:, columns],
+    )
+    return float((J[:, columns] - by_hand).norm() / by_hand.norm())
+
+
+def compare(motion: ContactMotion, w: torch.Tensor) -> None:
+    """The derivative is that of small motions, as exact as they are small."""
+    errors = [off(motion, share * w) for share in (1e-2, 1e-3)]
+    assert errors[1] < 1e-4
+    assert errors[1] < 0.3 * errors[0]
+
+
+def test_where_contacts_stick_it_moves_as_the_manipulation_jacobian_says(held, exact) -> None:
+    model, start, _, axis = held
+    w = turning(start, axis, 0.5 * DEG)
+    motion = ContactMotion(model, start)
+    lin = motion.linearize(1e-3 * w)
+    torch.testing.assert_close(lin.object_jacobian, start.object_jacobian, rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        lin.normal_force_sensitivity, start.normal_force_sensitivity, rtol=1e-4, atol=1e-2
+    )
+    torch.testing.assert_close(lin.margin_sensitivity, start.margin_sensitivity, rtol=1e-4, atol=1e-2)
+    step = motion.move(w)
+    assert set(step.modes.values()) <= {ContactMode.STICK, ContactMode.OPEN}
+    assert not step.slid
+    assert (step.increment - start.step(w)).norm() < 0.05 * step.increment.norm()
+    compare(motion, w)
+
+
+def test_where_a_contact_slides_the_derivative_is_that_of_sliding(held, exact) -> None:
+    model, start, a, axis = held
+    motion, w = ContactMotion(model, start, a=a), turning(start, axis, 2.5 * DEG)
+    for _ in range(4):
+        step = motion.move(w)
+    (slides,) = [name for name, mode in step.modes.items() if mode is ContactMode.SLIDE]
+    assert step.slid[slides] > 3e-5
+    assert abs(step.margin[slides]) < 1e-3
+    assert step.normal[slides] > 0.5
+    compare(motion, w)
+    at = motion.linearize(1e-3 * w)
+    k = at.contacts.finger.index(slides)
+    assert abs(float(at.margin_sensitivity[k] @ w)) < 1e-2 * float(at.normal_force_sensitivity[k].abs().max())
+
+
+def test_a_finger_that_is_taken_away_opens_and_bears_nothing(held) -> None:
+    model, start, a, _ = held
+    motion, away = ContactMotion(model, start, a=a), torch.zeros(model.hand.n_a, dtype=F64)
+    away[model.hand.actuator_names.index("middle_proximal")] = -0.3
+    step = motion.move(away)
+    assert step.modes["middle"] is ContactMode.OPEN
+    assert step.normal["middle"] == pytest.approx(0.0, abs=1e-9)
+    assert step.normal["index"] > 0.3
+    assert "middle" not in motion.linearize(1e-3 * away).contacts.finger
+
+
+def test_a_link_comes_to_bear(exact) -> None:
+    plant = SimulatedHand("icub_right", "tea_tin", preset="none")
+    seen, axis = plant.reset(0), plant.rotation_axis
+    model = KinematicModel(plant.hand, plant.object)
+    start = now = model.linearize(seen.truth.state, fingertip_force=seen.truth.fingertip_force)
+    motion = ContactMotion(model, start, a=seen.a)
+    plant.close()
+    for _ in range(14):
+        w = turning(now, axis, 2.0 * DEG)
+        step = motion.move(w)
+        if step.normal.get("thumb_2", 0.0) > 0.3:
+            break
+        now = motion.linearize(1e-3 * w)
+    assert step.modes["thumb_2"] is not ContactMode.OPEN
+    gap = model.detector.near(step.state.q, step.state.position, step.state.rotation, 1e-3)
+    assert abs(float(gap.gap[gap.finger.index("thumb_2")])) < 1e-6
+    assert off(motion, 1e-3 * w) < 0.01  # an edge of the tin, along which the model lets nothing roll
+    assert "thumb_2" in motion.linearize(1e-3 * w).contacts.finger
+
+
+def test_two_halves_are_a_whole(held) -> None:
+    model, start, _, axis = held
+    w = turning(start, axis, 3.0 * DEG)
+    whole, halves = ContactMotion(model, start), ContactMotion(model, start)
+    step = whole.move(w)
+    halves.move(w / 2)
+    halves.move(w / 2)
+    assert step.state.minus(halves.state).norm() < 0.02 * step.increment.norm()
+
+
+def test_a_shift_by_nothing_changes_nothing(held) -> None:
+    model, start, _, axis = held
+    w = turning(start, axis, 1.0 * DEG)
+    plain, shifted = ContactMotion(model, start), ContactMotion(model, start)
+    plain.move(w)
+    shifted.move(w)
+    shifted.shift(torch.zeros_like(plain.move(w).increment))
+    assert shifted.move(w).state.minus(plain.state).norm() < 1e-4
+
+
+def test_where_the_object_slips_away_nothing_has_moved(held) -> None:
+    model, start, a, _ = held
+    slippery = KinematicModel(model.hand, dataclasses.replace(model.obj, friction=0.05))
+    lin = slippery.linearize(start.state, on_unstable="flag")
+    motion = ContactMotion(slippery, lin, a=a)
+    open_hand = torch.zeros(model.hand.n_a, dtype=F64)
+    open_hand[1:3] = -0.2
+    with pytest.raises(GraspError):
+        motion.move(open_hand)
+    assert motion.state is lin.state
+
+
+@pytest.mark.parametrize("toy", ["planar", "soft"])
+def test_toys_move_as_their_jacobian_says(toy: str) -> None:
+    """In a plane, with a detector of one's own; and with fingers that resist spin."""
+    if toy == "planar":
+        model, _, lin = planar()
+    else:
+        soft = model_toys.soft_two_finger(com=(0.0, 0.002, 0.0))
+        model = soft.model
+        model.detector = lambda *_: soft.contacts
+        lin = model.linearize(soft.state, soft.contacts, forces=soft.forces())
+    w = 1e-4 * torch.ones(model.hand.n_a, dtype=F64)
+    found = ContactMotion(model, lin).linearize(w)
+    size = lin.manipulation_jacobian.norm()
+    assert (found.manipulation_jacobian - lin.manipulation_jacobian).norm() < 1e-4 * size
+    assert (found.contact_force_sensitivity - lin.contact_force_sensitivity).norm() < 1e-3 * (
+        lin.contact_force_sensitivity.norm()
+    )
+
+
+def test_steps_that_slide_are_predicted_better_than_by_contacts_that_stick() -> None:
+    """Against the simulator; its friction is a pyramid, so a slide is not exact."""
+    plant = SimulatedHand("icub_right", "box", preset="none")
+    seen, axis = plant.reset(1), plant.rotation_axis
+    model = KinematicModel(plant.hand, plant.object)
+    sticks, steps = [], []
+    for _ in range(8):
+        state, force = seen.truth.state, seen.truth.fingertip_force
+        lin = model.linearize(state, model.touching(state), fingertip_force=force)
+        after = plant.command(turning(lin, axis, -3.0 * DEG))
+        w, ds = after.a - seen.a, after.truth.state.minus(state)
+        step = model.step(state, w, fingertip_force=force, a=seen.a)
+        if step.farthest_slide > 1e-4:
+            sticks.append(float((ds - model.linearize(state, fingertip_force=force).step(w))[-3:].norm()))
+            steps.append(float((ds - step.increment)[-3:].norm()))
+        seen = after
+    plant.close()
+    assert len(steps) >= 3
+    assert sum(steps) < 0.5 * sum(sticks)

@@ -1,0 +1,369 @@
+"""Motions of a grasp whose contacts stick, slide, open and close."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+from ...contact.detector import ContactDetector
+from ...exceptions import GraspEndsError, NoContactError
+from ...kinematics.grasp_state import GraspState
+from ...typing import Array, Float, Tensor
+from .contact_laws import Response, StepSolution, solve
+from .mode_linearization import mode_linearization
+from .placed_grasp import ContactLoads, GraspModel, L, PlacedGrasp
+from .step_program import HandLaws, StepProgram, Way
+
+if TYPE_CHECKING:
+    from ..linearization import Linearization
+
+NEAR = 0.004
+"""Gap [m] up to which a pad or a link may close in a motion."""
+_FINE = 2e-3  # [rad] a correction this small is the last: what is left is its square
+_SAME = 1e-6  # [rad] or this small, whatever the contacts do
+_CORRECTIONS = 8
+_LARGEST = 0.1  # [rad] of an actuator in one substep
+_SMALLEST = 1 / 64  # share of a motion
+_DAMPING = 0.5  # [N m/rad] of a fall to the next equilibrium
+_FALLS = 60  # steps of a fall
+_CALM = 1e-3  # [rad] a step of a fall this small has come to rest
+_FARTHEST = 0.3  # [rad] of a fall
+
+
+class ContactMode(Enum):
+    """What a contact does at the end of a motion."""
+
+    STICK = "stick"
+    """It sticks or rolls."""
+    SLIDE = "slide"
+    OPEN = "open"
+
+
+@dataclass(frozen=True)
+class ContactStep:
+    """One motion, and what the contacts did in it; pads by name, links without a pad by the link's name."""
+
+    state: GraspState
+    """After it."""
+    increment: Float[Tensor, " n_s"]
+    """``[dq; do; dphi]`` [rad, m, rad]."""
+    loads: ContactLoads
+    normal: dict[str, float]
+    """f_n after it [N]."""
+    margin: dict[str, float]
+    """``mu_s f_n - |u|`` after it [N]: 0 while a contact slides."""
+    modes: dict[str, ContactMode]
+    slid: dict[str, float]
+    """How far each contact slid [m]; those that did not are left out."""
+    jacobian: Float[Tensor, "n_s n_a"]
+    """``d increment/d da`` of the last substep, contacts doing what they do at its end."""
+    substeps: int
+    iterations: int
+    """Of all programs."""
+
+    @property
+    def farthest_slide(self) -> float:
+        """Of any contact [m]."""
+        return max(self.slid.values(), default=0.0)
+
+
+class _Solved(NamedTuple):
+    names: tuple[str, ...]
+    """Of the contacts of the program."""
+    program: StepProgram
+    answer: StepSolution
+    loads: ContactLoads
+    state: GraspState
+
+    @property
+    def doing(self) -> tuple[object, ...]:
+        """What the contacts do."""
+        return self.names, self.answer.active.tolist(), self.answer.slides.tolist()
+
+
+@dataclass(frozen=True)
+class _Substep:
+    last: _Solved
+    rates: Response
+    """By da."""
+    slid: dict[str, float]
+    iterations: int
+
+
+class ContactMotion:
+    """``V_s + A^T mu + B^T lam = load`` after every motion, under one-sided contacts, stops and tendons, and
+    Coulomb friction.
+
+    ```
+    gap_i >= 0,  f_n,i >= 0,  gap_i f_n,i = 0                  every pad, and every link within 4 mm
+    |f_t,i| <= mu_s f_n,i,  along the slide where it slides    slide: mean of both ends, times ds
+    p_j = K_a (a - a_0 - J_a q),  p_j >= 0 of tendons
+    q_min <= q <= q_max
+    ```
+
+    The equilibrium of the end is found by Newton's method on the state: contacts are detected, and the
+    stiffness is taken, at the end itself. A motion is divided where that does not converge. Where there is no
+    equilibrium near, the grasp falls, damped, to the next one.
+
+    Two forms. Without ``a`` the present reading is an equilibrium under the forces of ``start``: what they
+    leave unbalanced is a constant load, and the gaps of contacts that bear count from where they are. With
+    ``a`` nothing is remembered: encoders and joints give the forces of compliant actuators, gaps are those of
+    the detector. The first is for a hand that is not quite as described, the second for one that is.
+
+    With a detector of one's own only what it reports can touch. Joints locked by name are free here.
+
+    Args:
+        model: of hand and object.
+        start: the model linearized where the motion begins, with the forces there, best with the contacts of
+            :meth:`KinematicModel.touching`.
+        a: encoders there [rad].
+    """
+
+    state: GraspState
+    """Where the grasp is now."""
+    loads: ContactLoads
+    """Forces there."""
+
+    def __init__(
+        self, model: GraspModel, start: Linearization, *, a: Float[Tensor, " n_a"] | None = None
+    ) -> None:
+        self.model, self.state = model, start.state
+        self._laws = laws = HandLaws(model)
+        self._placed: PlacedGrasp | None = None
+        self.loads = _loads(start)
+        if a is not None:
+            stretch = a.numpy() - model.hand.actuator_offset - laws.J_a @ start.state.q.numpy()
+            self.loads.pull[laws.soft] = laws.K[laws.soft] * stretch[laws.soft]
+        self._zero: dict[str, float] = {}
+        self._count_gaps(absolute=a is not None)
+        still = np.zeros(laws.S.shape[1])
+        self._load = still if a is not None else laws.unbalance(self._grasp, self.loads)
+
+    @property
+    def _grasp(self) -> PlacedGrasp:
+        """Contacts and matrices at the present state, found when they are first asked for."""
+        if self._placed is None:
+            self._placed = self._place(self.state)
+        return self._placed
+
+    def _stand(self, state: GraspState, placed: PlacedGrasp | None, loads: ContactLoads) -> None:
+        self.state, self._placed, self.loads = state, placed, loads
+
+    def move(self, delta_a: Float[Tensor, " n_a"]) -> ContactStep:
+        """The state after the encoders moved by ``delta_a`` [rad]; the next motion begins there.
+
+        Raises:
+            NoContactError: nothing touches the object any more.
+            GraspEndsError: no equilibrium is found: the object slips away. The motion stands where it began.
+        """
+        before = self.state, self._grasp, self.loads
+        names = self._grasp.contacts.finger
+        way, slid = delta_a.detach().double().numpy(), dict[str, float]()
+        share = 1 / max(1, math.ceil(float(np.abs(way).max(initial=0.0)) / _LARGEST))
+        done, substeps, iterations = 0.0, 0, 0
+        while True:
+            share = min(share, 1 - done)
+            found = self._substep(share * way)
+            if found is None and share / 2 >= _SMALLEST:
+                share /= 2
+                continue
+            found = found or self._fall(share * way)
+            if found is None:
+                ends = self._why()
+                self._stand(*before)
+                raise ends
+            _add(slid, found.slid)
+            done, substeps, iterations = done + share, substeps + 1, iterations + found.iterations
+            if done > 1 - 1e-9:
+                return self._report(before[0], names, found, slid, substeps, iterations)
+
+    def linearize(self, delta_a: Float[Tensor, " n_a"]) -> Linearization:
+        """``d increment/d da`` here, in the mode that a motion by ``delta_a`` [rad] brings: contacts stick,
+        slide and open as they do at its end, to first order.
+
+        The contacts of the answer are those that bear, links included. The increment is ``J_m da`` where they
+        do the same all the way.
+
+        Raises:
+            NoContactError: nothing bears.
+            GraspEndsError: no equilibrium is near.
+        """
+        grasp, laws = self._grasp, self._laws
+        n_c, still = grasp.contacts.n_c, np.zeros(laws.S.shape[1])
+        done = self._solve(
+            grasp, self.loads, Way(grasp, self.loads.pull, delta_a.detach().double().numpy(), still)
+        )
+        if done is None:
+            raise self._why()
+        bears = np.flatnonzero(done.answer.active[:n_c])
+        if not len(bears):
+            raise NoContactError("no finger touches the object after this motion")
+        program, rates = done.program, laws.response(done.program.problem, done.answer)
+        turn = np.einsum("idz,za->ida", grasp.turn, rates.z)  # of the frames that the forces turned with
+        return mode_linearization(
+            self.model,
+            grasp,
+            self.loads,
+            bears.tolist(),
+            motion=laws.S @ rates.z,
+            normal=rates.lam[:n_c] + np.einsum("id,ida->ia", program.t, turn),
+            tangential=rates.t - program.lam[:n_c, None, None] * turn,
+            actuator=laws.actuator_response(rates, n_c),
+            stop=laws.stop_torque(program, done.answer),
+        )
+
+    def shift(self, increment: Float[Tensor, " n_s"]) -> None:
+        """Go on from ``s (+) increment`` [rad, m, rad] as from a reading: the forces are those of now, which
+        a constant load balances, and the gaps of contacts that bear count from where they are."""
+        self._stand(self.state.plus(increment), None, self.loads)
+        self._count_gaps(absolute=False)
+        self._load = self._laws.unbalance(self._grasp, self.loads)
+
+    def _count_gaps(self, *, absolute: bool) -> None:
+        """From where gaps are counted [m]: one that overlaps, or bears in the incremental form, is closed."""
+        lam, _ = self._grasp.components(self.loads)
+        contacts = self._grasp.contacts
+        for name, gap, bears in zip(contacts.finger, contacts.gap.tolist(), lam > 0, strict=True):
+            self._zero[name] = gap if bears and not absolute else min(gap, 0.0)
+
+    def _substep(self, da: Array) -> _Substep | None:
+        """Newton on the state: equilibrium, gaps and cones of the end. None: no convergence."""
+        here, loads, iterations, was = self._grasp, self.loads, 0, None
+        way = Way(here, loads.pull, da, np.zeros(self._laws.S.shape[1]))
+        for correction in range(_CORRECTIONS):
+            done = self._solve(here, loads, way)
+            if done is None:
+                return None
+            iterations += done.answer.iterations
+            size, doing = float(np.abs(done.answer.z).max()), done.doing
+            if correction and (size < _SAME or (size < _FINE and doing == was)):
+                self._stand(done.state, None, done.loads)
+                rates = self._laws.response(done.program.problem, done.answer)
+                return _Substep(done, rates, _slides(done), iterations)
+            loads, here, was = done.loads, self._place(done.state), doing
+            way = way._replace(total=way.total + done.answer.z)
+        return None
+
+    def _fall(self, da: Array) -> _Substep | None:
+        """A motion after which no equilibrium is near: the grasp moves on, damped, until it finds one.
+        None: it finds none."""
+        begin, iterations, slid = self.state, 0, dict[str, float]()
+        for _ in range(_FALLS):
+            way = Way(self._grasp, self.loads.pull, da, np.zeros(self._laws.S.shape[1]))
+            done = self._solve(self._grasp, self.loads, way, _DAMPING)
+            if done is None or _farthest(done.state.minus(begin)) > _FARTHEST:
+                return None
+            self._stand(done.state, None, done.loads)
+            da = np.zeros(len(da))
+            iterations += done.answer.iterations
+            _add(slid, _slides(done))
+            rest = self._substep(da) if float(np.abs(done.answer.z).max()) < _CALM else None
+            if rest is not None:
+                _add(slid, rest.slid)
+                return dataclasses.replace(rest, slid=slid, iterations=iterations + rest.iterations)
+        return None
+
+    def _solve(
+        self, here: PlacedGrasp, loads: ContactLoads, way: Way, damping: float = 0.0
+    ) -> _Solved | None:
+        """One program, and what it makes of forces and state."""
+        contacts = here.contacts
+        if not contacts.n_c:
+            return None
+        gap = [
+            gap - self._zero.setdefault(name, min(gap, 0.0))
+            for name, gap in zip(contacts.finger, contacts.gap.tolist(), strict=True)
+        ]
+        program = self._laws.program(here, loads, way, np.array(gap), self._load, damping)
+        answer = solve(program.problem, program.lam, program.t)
+        if answer is None:
+            return None
+        after = self._laws.loads(here, program, answer, way)
+        state = here.state.plus(torch.from_numpy(self._laws.S @ answer.z))
+        return _Solved(contacts.finger, program, answer, after, state)
+
+    def _report(
+        self,
+        before: GraspState,
+        names: tuple[str, ...],
+        last: _Substep,
+        slid: dict[str, float],
+        substeps: int,
+        iterations: int,
+    ) -> ContactStep:
+        """Of a whole motion; ``names``: contacts that were near when it began."""
+        answer, mu_s = last.last.answer, last.last.program.problem.mu_s
+        lam = answer.lam[: len(mu_s)]
+        margins = mu_s * lam - np.linalg.norm(answer.t, axis=1)
+        modes = dict.fromkeys((*names, *last.last.names), ContactMode.OPEN)
+        normal, margin = dict.fromkeys(modes, 0.0), dict.fromkeys(modes, 0.0)
+        for i, name in enumerate(last.last.names):
+            normal[name], margin[name] = float(lam[i]) / L, float(margins[i]) / L
+            if answer.active[i]:
+                modes[name] = ContactMode.SLIDE if answer.slides[i] else ContactMode.STICK
+        if all(mode is ContactMode.OPEN for mode in modes.values()):
+            raise NoContactError("no finger touches the object after this motion")
+        return ContactStep(
+            state=self.state,
+            increment=self.state.minus(before),
+            loads=self.loads,
+            normal=normal,
+            margin=margin,
+            modes=modes,
+            slid=slid,
+            jacobian=torch.from_numpy(self._laws.S @ last.rates.z),
+            substeps=substeps,
+            iterations=iterations,
+        )
+
+    def _place(self, state: GraspState) -> PlacedGrasp:
+        model, detector = self.model, self.model.detector
+        poses = model.kinematics(state.q)
+        if isinstance(detector, ContactDetector):
+            contacts = detector.near(poses, state.position, state.rotation, NEAR)
+        else:
+            contacts = detector(state.q, state.position, state.rotation)
+        return PlacedGrasp(model, state, contacts, poses)
+
+    def _why(self) -> GraspEndsError:
+        """What ends the grasp, as it stands now."""
+        lam, t = self._grasp.components(self.loads)
+        full = (np.linalg.norm(t, axis=1) >= 0.95 * self._grasp.mu_s * lam) & (lam > 0)
+        at = [name for name, used in zip(self._grasp.contacts.finger, full, strict=True) if used]
+        why = f"{' and '.join(at)} at the friction limit: " if at else ""
+        return GraspEndsError(f"{why}no equilibrium is near after this motion; the object slips away")
+
+
+def _farthest(increment: Tensor) -> float:
+    """Largest entry, translations in units of L."""
+    *joints, x, y, z, a, b, c = increment.abs().tolist()
+    return max(*joints, x / L, y / L, z / L, a, b, c)
+
+
+def _slides(done: _Solved) -> dict[str, float]:
+    """How far contacts slid, of those that did [m]."""
+    answer = done.answer
+    far = np.linalg.norm(done.program.problem.slides(answer.z, answer.t)[:, :2], axis=1) * L
+    return {name: x for name, x, one in zip(done.names, far.tolist(), answer.slides, strict=True) if one}
+
+
+def _add(total: dict[str, float], more: dict[str, float]) -> None:
+    for name, distance in more.items():
+        total[name] = total.get(name, 0.0) + distance
+
+
+def _loads(lin: Linearization) -> ContactLoads:
+    forces = lin.forces
+    force, pull, stop = (x.detach().double().numpy() for x in (forces.force, -forces.lam, forces.stop_torque))
+    return ContactLoads(
+        dict(zip(lin.contacts.finger, force, strict=True)),
+        dict(zip(lin.contacts.finger, forces.spin_moment.tolist(), strict=True)),
+        pull.copy(),
+        stop.copy(),
+    )

@@ -1,0 +1,148 @@
+"""A grasp at one state, as the equations of a step see it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+
+from ...contact.contact_kinematics import ContactKinematics, full_grasp_matrix, full_hand_jacobian
+from ...contact.contact_model import ContactModel
+from ...contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet, Detector
+from ...description.hand import HandDescription
+from ...kinematics.grasp_state import GraspState
+from ...kinematics.link_poses import Kinematics, LinkPoses
+from ...kinematics.se3 import hat
+from ...typing import Array, Tensor
+from ..options import ModelOptions
+from ..reduction import Reduction
+from ..sensitivity import normal_motion
+
+L = CHARACTERISTIC_LENGTH
+
+
+@runtime_checkable
+class GraspModel(Protocol):
+    """What is asked of a model of hand and object: :class:`~torch_ekm.model.KinematicModel`."""
+
+    hand: HandDescription
+    options: ModelOptions
+    kinematics: Kinematics
+    detector: Detector
+    reduction: Reduction
+
+    def contact_kinematics(
+        self, state: GraspState, contacts: ContactSet, *, poses: LinkPoses | None = None
+    ) -> ContactKinematics: ...
+
+    def potential(self, state: GraspState) -> tuple[Tensor, Tensor]: ...
+
+    def load_stiffness(self, kin: ContactKinematics, force: Tensor, spin_moment: Tensor) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class ContactLoads:
+    """Forces that finger and object exchange, by contact; what is not named bears nothing."""
+
+    force: dict[str, Array]
+    """f_i of the finger on the object, hand axes [N]."""
+    spin: dict[str, float]
+    """About the inward normal [N m]."""
+    pull: Array
+    """Force of each actuator along +a, ``(n_a,)`` [N m]; of a tendon below 0 where it is slack, by what it
+    would have to be shortened times its stiffness."""
+    stop: Array
+    """Torque of joint stops on the joints, ``(n_q,)`` [N m]."""
+
+
+class PlacedGrasp:
+    """Matrices of one state and its contacts in permitted, scaled coordinates z: ``ds = S z``.
+
+    Args:
+        model: its detector finds pads and links.
+        state: where.
+        contacts: there.
+        poses: of the links there.
+    """
+
+    def __init__(self, model: GraspModel, state: GraspState, contacts: ContactSet, poses: LinkPoses) -> None:
+        self.state, self.contacts = state, contacts
+        self.kin: ContactKinematics = model.contact_kinematics(state, contacts, poses=poses)
+        self._model = model
+        kin, S = self.kin, model.reduction.scaled_basis
+        A = torch.cat([full_hand_jacobian(kin), -full_grasp_matrix(kin).mT], dim=-1) @ S
+        A = A.unflatten(-2, (contacts.n_c, 6)).numpy() / np.array([L, L, L, 1.0, 1.0, 1.0])[:, None]
+        self.normal_rate = A[:, 0]  # how fast the finger nears the object
+        mu_s, gamma = contacts.friction.numpy(), contacts.torsional_friction.numpy()
+        self.frame = kin.frame.numpy()
+        # where a contact slides, its point moves over the object by M K_f v and over the finger by -M K_o v
+        slide = L * self.frame[:, :, 1:] @ A[:, 1:3]  # v of hand axes, (n_c, 3, n_z)
+        mobility, K_o = kin.mobility.numpy(), contacts.object_curvature.numpy()
+        self._object_run = mobility @ contacts.finger_curvature.numpy() @ slide
+        self._finger_run = -mobility @ K_o @ slide
+        turn = normal_motion(kin, S).numpy() + K_o @ self._object_run  # (n_c, 3, n_z)
+        d = max([len(one.rows) - 1 for one in kin.models], default=0)
+        n_c, n_z = contacts.n_c, S.shape[1]
+        self.mu_s, self.T, self.turn = mu_s, np.zeros((n_c, d, n_z)), np.zeros((n_c, d, n_z))
+        self.spin_scale = np.zeros(n_c)  # [N m] of spin for a force of 1 N times L
+        for i, one in enumerate(kin.models):
+            n = len(one.rows) - 1
+            self.T[i, :n] = A[i, 1 : n + 1]
+            if one is ContactModel.SOFT_FINGER:
+                self.spin_scale[i] = gamma[i] / (mu_s[i] * L)
+                self.T[i, 2] *= self.spin_scale[i]
+            self.turn[i, : min(n, 2)] = self.frame[i, :, 1 : 1 + min(n, 2)].T @ turn[i]
+        V_s, V_ss = model.potential(state)
+        self._V_ss = V_ss
+        self.torque = (V_s @ S).numpy()
+
+    def stiffness(self, loads: ContactLoads) -> Array:
+        """``Z^T D Z`` at these forces, which turn with the normals."""
+        contacts, model = self.contacts, self._model
+        force = torch.from_numpy(np.stack([loads.force.get(name, np.zeros(3)) for name in contacts.finger]))
+        spin = torch.tensor([loads.spin.get(name, 0.0) for name in contacts.finger], dtype=torch.float64)
+        S = model.reduction.scaled_basis
+        D = model.load_stiffness(self.kin, force, spin) + self._V_ss
+        D = (S.mT @ D @ S).numpy()
+        f_hat = hat(force).numpy()
+        spin_f = (self.kin.spin_jacobian.numpy() @ S.numpy()[: model.hand.n_q]).swapaxes(1, 2)
+        D -= (spin_f @ f_hat @ self._finger_run).sum(0)
+        D += S.numpy()[-3:].T @ (f_hat @ self._object_run).sum(0)
+        lam, t = self.components(loads)
+        inward = (t[:, :, None] * self.turn).sum(1)
+        D += self.normal_rate.T @ inward
+        D -= self.T.reshape(-1, len(D)).T @ (lam[:, None, None] * self.turn).reshape(-1, len(D))
+        return D
+
+    def components(self, loads: ContactLoads) -> tuple[Array, Array]:
+        """Normal forces ``(n_c,)`` and tangential ones ``(n_c, d)``, in contact frames [scaled]."""
+        n_c, d = self.T.shape[:2]
+        lam, t = np.zeros(n_c), np.zeros((n_c, d))
+        for i, name in enumerate(self.contacts.finger):
+            if name in loads.force:
+                local = L * (self.frame[i].T @ loads.force[name])
+                lam[i] = local[0]
+                t[i, :2] = local[1 : 1 + min(d, 2)]
+                if d == 3 and self.spin_scale[i] > 0:
+                    t[i, 2] = loads.spin[name] / self.spin_scale[i]
+        return lam, t
+
+    def loads(self, lam: Array, t: Array, pull: Array, stop: Array) -> ContactLoads:
+        """The inverse of :meth:`components`."""
+        n_c, d = t.shape
+        local = np.zeros((n_c, 3))
+        local[:, 0] = lam
+        local[:, 1 : 1 + min(d, 2)] = t[:, :2]
+        names = self.contacts.finger
+        force = (self.frame @ local[:, :, None])[..., 0] / L
+        spin = t[:, 2] * self.spin_scale if d == 3 else np.zeros(n_c)
+        return ContactLoads(
+            dict(zip(names, force, strict=True)), dict(zip(names, spin.tolist(), strict=True)), pull, stop
+        )
+
+    def turned(self, lam: Array, t: Array, lam_0: Array, t_0: Array, z: Array) -> tuple[Array, Array]:
+        """Components in the frames of this state, from those in frames that turned with the normals by z."""
+        turn = self.turn @ z
+        return lam + (t_0 * turn).sum(1), t - lam_0[:, None] * turn

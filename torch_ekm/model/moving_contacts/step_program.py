@@ -1,0 +1,178 @@
+"""The program of one step: a hand's laws, put together with a grasp's contacts."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...typing import Array
+from .contact_laws import Response, StepProblem, StepSolution
+from .placed_grasp import ContactLoads, GraspModel, L, PlacedGrasp
+
+COMPLIANCE = 1e-6
+"""Of contacts and stops [rad/(N m)]."""
+_STOP_RANGE = 0.15  # [rad] from a joint's stop where the stop is in the program
+
+
+class StepProgram(NamedTuple):
+    """What is to be solved, and the forces to begin with."""
+
+    problem: StepProblem
+    lam: Array
+    t: Array
+    low: NDArray[np.int64]
+    """Joints whose lower stop is in it."""
+    high: NDArray[np.int64]
+
+
+class Way(NamedTuple):
+    """How far a step has come."""
+
+    first: PlacedGrasp
+    """Where it began."""
+    pull: Array
+    """Of the actuators there, ``(n_a,)`` [N m]."""
+    da: Array
+    """All of the step [rad]."""
+    total: Array
+    """z so far."""
+
+
+class HandLaws:
+    """Actuators and joint stops of a hand in permitted, scaled coordinates z: ``p = K_a (a - a_0 - J_a q)``,
+    ``p >= 0`` of tendons, ``q_min <= q <= q_max``.
+
+    Args:
+        model: of the hand.
+    """
+
+    def __init__(self, model: GraspModel) -> None:
+        hand = model.hand
+        self.hand = hand
+        self.joints, self.S = model.reduction.joint_basis.numpy(), model.reduction.scaled_basis.numpy()
+        self.J_a, self.K = (x.detach().double().numpy() for x in model.reduction.drives)
+        self.B = np.zeros((hand.n_a, self.S.shape[1]))
+        self.B[:, : self.joints.shape[1]] = self.J_a @ self.joints
+        tendon = np.array([actuator.tendon for actuator in hand.actuators], dtype=bool)
+        self.tendon = tendon & (model.options.slack_tension is not None)
+        self.soft = np.isfinite(self.K)
+        self.springs = np.flatnonzero(self.soft & ~self.tendon)
+        """Actuators whose compliance stands in the stiffness: rods."""
+        self.cables = np.flatnonzero(self.tendon | ~self.soft)
+        """The others: tendons, and what is rigid."""
+        moves = np.abs(self.joints).sum(1) > 1e-9
+        self._stops = np.flatnonzero(moves & np.isfinite(hand.joint_lower + hand.joint_upper))
+
+    def program(
+        self,
+        here: PlacedGrasp,
+        loads: ContactLoads,
+        way: Way,
+        gap: Array,
+        load: Array,
+        damping: float,
+    ) -> StepProgram:
+        """Of what is left of a step.
+
+        Args:
+            here: where it has come to.
+            loads: forces there.
+            way: how it came there.
+            gap: of the contacts [m].
+            load: constant, of all equilibria [scaled].
+            damping: added to the stiffness [N m/rad].
+        """
+        hand, cables, springs, total = self.hand, self.cables, self.springs, way.total
+        q, at = here.state.q.numpy(), self._stops
+        lam, t = here.components(loads)
+        low = at[q[at] - hand.joint_lower[at] < _STOP_RANGE]
+        high = at[hand.joint_upper[at] - q[at] < _STOP_RANGE]
+        stops = np.zeros((len(low) + len(high), len(total)))
+        stops[:, : self.joints.shape[1]] = np.concatenate([self.joints[low], -self.joints[high]])
+        room = np.concatenate([q[low] - hand.joint_lower[low], hand.joint_upper[high] - q[high]])
+        pressed = np.concatenate([loads.stop[low], -loads.stop[high]]).clip(min=0.0)
+        n_c, n_stop = len(gap), len(room)
+        B, K = self.B[springs], self.K[springs]
+        pull = way.pull[springs] + K * (way.da[springs] - B @ total)
+        problem = StepProblem(
+            D=here.stiffness(loads) + B.T @ (K[:, None] * B) + damping * np.eye(len(total)),
+            load=here.torque - load - B.T @ pull,
+            E=np.concatenate([-here.normal_rate, self.B[cables], stops]),
+            gap=np.concatenate([gap / L, self.B[cables] @ total - way.da[cables], room]),
+            compliance=np.concatenate(
+                [np.full(n_c, COMPLIANCE), 1 / self.K[cables], np.full(n_stop, COMPLIANCE)]
+            ),
+            before=np.concatenate([lam.clip(min=0.0), way.pull[cables], pressed]),
+            one_sided=np.concatenate([np.ones(n_c, bool), self.tendon[cables], np.ones(n_stop, bool)]),
+            T=here.T,
+            way=_slid(here, way.first, total),
+            tangential_compliance=COMPLIANCE,
+            t_before=t,
+            mu_s=here.mu_s,
+        )
+        now = loads.pull[cables]
+        now = np.where(self.tendon[cables], now.clip(min=0.0), now)
+        return StepProgram(problem, np.concatenate([lam, now, pressed]), t, low, high)
+
+    def loads(self, here: PlacedGrasp, program: StepProgram, answer: StepSolution, way: Way) -> ContactLoads:
+        """Forces after a program's answer."""
+        n_c, n_k = here.contacts.n_c, len(self.cables)
+        lam, t = here.turned(answer.lam[:n_c], answer.t, program.lam[:n_c], program.t, answer.z)
+        stretch = way.da - self.B @ (way.total + answer.z)
+        pull = way.pull + np.where(self.soft, self.K, 0.0) * np.where(self.soft, stretch, 0.0)
+        bearing = answer.lam[n_c : n_c + n_k]
+        slack = self.tendon[self.cables] & (bearing <= 0)
+        pull[self.cables] = np.where(slack, pull[self.cables].clip(max=0.0), bearing)
+        return here.loads(lam, t, pull, self.stop_torque(program, answer))
+
+    def stop_torque(self, program: StepProgram, answer: StepSolution) -> Array:
+        """Of the stops on the joints, ``(n_q,)`` [N m]."""
+        n = len(program.problem.mu_s) + len(self.cables)
+        stop, n_low = np.zeros(self.hand.n_q), n + len(program.low)
+        np.add.at(stop, program.low, answer.lam[n:n_low])
+        np.add.at(stop, program.high, -answer.lam[n_low:])
+        return stop
+
+    def unbalance(self, grasp: PlacedGrasp, loads: ContactLoads) -> Array:
+        """``V_s + A^T mu + B^T lam`` less the torque of the stops [scaled]."""
+        lam, t = grasp.components(loads)
+        pull = np.where(self.tendon, loads.pull.clip(min=0.0), loads.pull)
+        contact = grasp.normal_rate.T @ lam + np.einsum("idz,id->z", grasp.T, t)
+        load = grasp.torque + contact - self.B.T @ pull
+        load[: self.joints.shape[1]] -= self.joints.T @ loads.stop
+        return load
+
+    def response(self, problem: StepProblem, answer: StepSolution) -> Response:
+        """How an answer changes with da."""
+        n_a = self.hand.n_a
+        load, gap = np.zeros((len(answer.z), n_a)), np.zeros((len(problem.gap), n_a))
+        load[:, self.springs] = -self.B[self.springs].T * self.K[self.springs]
+        gap[len(problem.mu_s) + np.arange(len(self.cables)), self.cables] = -1.0
+        return answer.response(load, gap)
+
+    def actuator_response(self, rates: Response, n_c: int) -> Array:
+        """dlam/da of the actuators, ``(n_a, n_a)`` [N m/rad]; ``n_c``: number of the program's contacts."""
+        change = np.zeros((self.hand.n_a, self.hand.n_a))
+        own = np.eye(len(change))[self.springs]
+        change[self.springs] = self.K[self.springs, None] * (self.B[self.springs] @ rates.z - own)
+        change[self.cables] = -rates.lam[n_c : n_c + len(self.cables)]
+        return change
+
+
+def _slid(here: PlacedGrasp, first: PlacedGrasp, total: Array) -> Array:
+    """Slide of each contact in the step so far: the mean of what z means at both ends [scaled]. A contact
+    that was not near at the beginning has slid half of it."""
+    way = 0.5 * (here.T @ total)
+    if not total.any():
+        return way
+    then = {name: i for i, name in enumerate(first.contacts.finger)}
+    n = min(way.shape[1], 2)
+    for i, name in enumerate(here.contacts.finger):
+        if name in then:
+            j = then[name]
+            begun = 0.5 * (first.T[j] @ total)
+            begun[:n] = here.frame[i][:, 1 : 1 + n].T @ first.frame[j][:, 1 : 1 + n] @ begun[:n]
+            way[i] += begun
+    return way
