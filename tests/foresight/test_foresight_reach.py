@@ -5,21 +5,14 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-import sys
-from pathlib import Path
 
 import pytest
 import torch
-
-sys.path.append(str(Path(__file__).parents[1] / "model"))
-import model_toys
 
 from torch_ekm.control import ClosedLoop, FocusedPose, LookAndMoveController, PoseTarget, Safety, StopReason
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NoContactError, ParameterError
 from torch_ekm.foresight import BeyondReach, ModelHand, ReachEnd, reachable
-from torch_ekm.foresight import reach as reach_module
-from torch_ekm.foresight.friction_share import friction_share
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantStatus
@@ -93,34 +86,6 @@ def test_a_turn_ends_where_the_model_said(grasp) -> None:
     assert "middle_2" in str(other)
 
 
-def test_the_share_of_friction_is_what_statics_say(grasp, monkeypatch) -> None:
-    """At least the weight over all friction; with half the friction twice the share."""
-    _, seen, controller = grasp
-    model = controller.kinematic
-    lin = model.linearize(seen.state, fingertip_force=seen.fingertip_force)
-    share = friction_share(model, lin)
-    # the friction of all pads together bears the weight at least
-    least = float(model.weight.norm() / (lin.contacts.friction * (lin.forces.normal + 0.3)).sum())
-    assert least <= share < 0.6
-    half = dataclasses.replace(lin, contacts=lin.contacts.replace(friction=lin.contacts.friction / 2))
-    assert friction_share(model, half) == pytest.approx(2 * share, rel=1e-3)
-    farther = reachable(controller, seen).angle
-    monkeypatch.setattr(reach_module, "_FRICTION", 1.01 * share)
-    reach = reachable(controller, seen)
-    assert reach.end is ReachEnd.FRICTION
-    assert abs(reach.angle) < farther
-
-
-def test_the_spin_moments_of_soft_fingers_hold_what_two_points_cannot() -> None:
-    """Two pads, the weight 20 mm beside the line through both: m g (1/mu + d/gamma) over normal forces."""
-    toy = model_toys.soft_two_finger(com=(0.0, 0.02, 0.0))
-    lin = toy.model.linearize(toy.state, toy.contacts, forces=toy.forces())
-    by_hand = 0.05 * 9.81 * (1 / 3.0 + 0.02 / 0.03) / float(lin.forces.normal.sum())
-    assert friction_share(toy.model, lin) == pytest.approx(by_hand, rel=0.2)
-    slippery = lin.contacts.replace(torsional_friction=lin.contacts.torsional_friction / 100)
-    assert friction_share(toy.model, dataclasses.replace(lin, contacts=slippery)) > 1
-
-
 def test_what_lies_within_reach_ends_by_nothing(grasp) -> None:
     _, seen, controller = grasp
     reach = reachable(controller, seen, limit=5 * DEG)
@@ -171,6 +136,4 @@ def test_a_planar_hand_reaches_as_far_as_its_plane_lets_it() -> None:
     plant = SimulatedHand("planar_two_finger", "can", preset="none")
     seen = plant.reset(0)
     controller = LookAndMoveController(KinematicModel(plant.hand, plant.object), plant.rotation_axis)
-    lin = controller.kinematic.linearize(seen.state, fingertip_force=seen.fingertip_force)
-    assert friction_share(controller.kinematic, lin) < 0.6
     assert reachable(controller, seen, limit=12 * DEG).angle > 5 * DEG

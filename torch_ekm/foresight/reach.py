@@ -10,7 +10,6 @@ from enum import Enum
 import torch
 
 from ..control import (
-    Caution,
     ClosedLoop,
     FocusedPose,
     HandKnowledge,
@@ -25,14 +24,10 @@ from ..kinematics import GraspState
 from ..model import Linearization
 from ..plant import Observation
 from ..typing import Float, Tensor
-from .friction_share import friction_share
 from .model_hand import ModelHand
 
 _DEG = math.pi / 180
-_FRICTION = 0.7  # largest share of its friction that a grasp may need to hold the object
 _BEARS = 0.01  # [N m] of a stop that ends a turn
-_PRESSED = -0.3e-3
-"""Gap of a link that bears on the object [m]: links sink in here, where real ones push; noise hides less."""
 
 
 class ReachEnd(Enum):
@@ -96,11 +91,7 @@ def reachable(
         seen: the grasp.
         sign: 1 or -1, which way.
         limit: farthest angle that is tried [rad].
-        safety: as in :class:`~torch_ekm.control.ClosedLoop`; None: the usual one, but a link bears only where
-            it would lie 0.3 mm deep, which is when noisy readings show it.
-
-    A turn also ends where the grasp needs more than 70 % of its friction to hold the object
-    (``friction_share``).
+        safety: as in :class:`~torch_ekm.control.ClosedLoop`.
 
     Raises:
         ParameterError: a focus that is no single rotation, a sign that is none, or an angle outside 0 to
@@ -122,7 +113,7 @@ def reachable(
     idle = set(hand.at_limits())
     path, angles = [start.state], [0.0]
     standing = _Standing([], [], hand.linearization)
-    safety = Safety(caution=Caution(link_gap=_PRESSED)) if safety is None else safety
+    safety = Safety() if safety is None else safety
     ideal = HandKnowledge.of(hand.hand, learns=False)
     loop = ClosedLoop(hand, controller, knowledge=ideal, safety=safety, learn=False)
     motions = loop.steps(PoseTarget.turned(start.state, about, sign * limit))
@@ -131,12 +122,6 @@ def reachable(
             step = next(motions)
         except StopIteration as over:
             stop: Stop = over.value
-            break
-        lin = hand.linearization
-        share = 0.0 if hand.failure or lin is None else friction_share(f, lin)
-        if share > _FRICTION:
-            said = f"the object needs {100 * share:.0f} % of the friction, more than {100 * _FRICTION:.0f} %"
-            stop = Stop(StopReason.GIVEN_UP, step.after, said)
             break
         turned = float(about @ step.after.state.minus(start.state)[-3:])
         if not hand.failure and sign * turned > max(sign * angle for angle in angles):
