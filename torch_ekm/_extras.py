@@ -15,6 +15,7 @@ _BRINGS = {
     "notebooks": ("IPython", "pyarrow"),
     "peers": ("gpytorch", "river"),
     "fast": ("numba",),
+    "dynamixel": ("dynamixel_sdk",),
     "interop": ("sklearn", "onnx", "onnxscript", "casadi", "rosbags"),
 }
 _EXTRA_OF = {module: extra for extra, modules in _BRINGS.items() for module in modules}
