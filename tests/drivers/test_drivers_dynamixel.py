@@ -60,6 +60,7 @@ def test_a_motion_over_the_bus(bus, tmp_path) -> None:
 def test_stuffed_bytes_arrive(bus, tmp_path) -> None:
     with open_at(bus, tmp_path) as plant:
         plant._sync_write((116, 4), [0x01FDFFFF, 5])
+        plant._read()  # a sync write has no answer: what comes after it has
         assert bus.goals[-1] == [float(0x01FDFFFF), 5.0]
         bus.motors = Motors([0x01FDFFFF, 5.0], 1.0)
         assert plant._read().motors == [0x01FDFFFF, 5]
@@ -107,8 +108,12 @@ def test_a_fault_of_the_bus_is_named_and_nothing_moves(name, bus, tmp_path) -> N
     with open_at(bus, tmp_path) as plant:
         sent = len(bus.goals)
         bus.spoil = spoil
-        with pytest.raises(BusError, match=words):
-            plant.command(radians(0.1, 0.1))
+        for _ in range(5):  # on a busy machine an answer may also come too late
+            with pytest.raises(BusError) as error:
+                plant.command(radians(0.1, 0.1))
+            if re.search(words, str(error.value)):
+                break
+        assert re.search(words, str(error.value))
         assert len(bus.goals) == sent
         bus.spoil = lambda packet: packet
 
@@ -160,6 +165,8 @@ def test_garbled_messages_send_no_motor_beyond_its_limits(bus, tmp_path) -> None
     with open_at(bus, tmp_path, still="still_for = 0.05|still_for = 0.01") as plant:
         bus.spoil, failures, motions = spoil, 0, 0
         for _ in range(25):
+            while bus.motors.moving:
+                time.sleep(0.002)
             at = [one.value(x) for one, x in zip(plant.wiring.motors, bus.motors.now(), strict=True)]
             sent = len(bus.goals)
             try:

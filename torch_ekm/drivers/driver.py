@@ -19,7 +19,7 @@ from .wiring import Channel, Wiring
 
 _REACH = 0.08  # [s] a motion goes out in pieces of so much: a hand whose computer dies goes no farther
 _POLL = 0.005  # [s]
-_TRIES = 5  # of a motion that a watchdog stops
+_TRIES = 5  # of a motion that a watchdog stops, of readings that disagree
 _BEYOND = math.radians(15)  # a motor that reads farther outside its range is not sent anywhere
 _SLACK = 1e-6  # [rad] of a limit: sums of floats
 
@@ -169,7 +169,7 @@ class HandDriver(ABC):
                 f"a command of {math.degrees(float(delta[worst])):.3g} deg, [limits] increment in "
                 f"{self.wiring.path} is {most:.3g} deg: make smaller motions, or allow more",
             )
-        start = self._a(self._read()).numpy()
+        start = self._stands().numpy()
         goal = self._within(start, start + delta.numpy())
         if self.dry_run:
             shown = zip(self.wiring.motors, self._bus(goal), strict=True)
@@ -202,6 +202,19 @@ class HandDriver(ABC):
         self.close()
 
     # -- inside -------------------------------------------------------------------------------------
+
+    def _stands(self) -> Tensor:
+        """Where the motors are, by two readings that agree: one alone may be an old packet."""
+        last = self._a(self._read())
+        for _ in range(_TRIES):
+            a = self._a(self._read())
+            if float((a - last).abs().max()) <= self.limits.still:
+                return a
+            last = a
+        problem = (
+            f"the motors' readings disagree in {_TRIES} looks: something moves them, or the bus is noisy"
+        )
+        raise BusError(self.wiring.path.name, problem)
 
     def _move(self, start: Array, goal: Array) -> None:
         """Send a motion piece by piece, and wait for its end."""
