@@ -145,7 +145,7 @@ class HandDriver(ABC):
             fingertip_force=force.clamp(min=0.0) if len(force) else None,
             time=now,
             status=PlantStatus.NOT_SEEN,
-            info={"load": tuple(reading.load)},
+            info={"load": tuple(reading.load), "sensed": tuple(one.name for one in self.wiring.joints)},
             stamps=stamps._replace(pose=now),
         )
 

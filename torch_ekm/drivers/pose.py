@@ -94,6 +94,7 @@ class WithPose(PlantWrapper):
         stamps = seen.taken._replace(pose=min(sighting.taken, now))
         if sighting.q is not None:
             stamps = stamps._replace(joints=stamps.pose)
+            info.pop("sensed", None)
         return dataclasses.replace(
             seen,
             position=R @ sighting.position.double() + o,
