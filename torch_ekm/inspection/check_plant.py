@@ -83,7 +83,7 @@ class _Checked:
         if blind and (self.object is None or seen.status is not PlantStatus.HELD):
             mend = "look which way each goes, or hold an object, see it, and give its description"
             yield Check(
-                "signs", "warning", f"no sensors at the joints of {', '.join(blind)}: not checked", mend
+                "signs", "warning", f"not checked: no sensors at the joints of {', '.join(blind)}", mend
             )
         yield Check("at rest", "ok", f"encoders and {int(self.sensed.sum())} joint sensors agree")
         motions, rows = self._motions(seen)
