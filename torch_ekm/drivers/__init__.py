@@ -10,6 +10,7 @@ from .dynamixel import DynamixelPlant
 from .opening import open_driver
 from .pose import MarkerPose, Sighting, WithPose
 from .wiring import Channel, Limits, Wiring
+from .yarp import YarpPlant
 
 __all__ = [
     "BusReading",
@@ -21,5 +22,6 @@ __all__ = [
     "Sighting",
     "WithPose",
     "Wiring",
+    "YarpPlant",
     "open_driver",
 ]

@@ -10,8 +10,9 @@ from ..exceptions import UnknownNameError
 from .driver import HandDriver
 from .dynamixel import DynamixelPlant
 from .wiring import driver_of
+from .yarp import YarpPlant
 
-DRIVERS = {"dynamixel": DynamixelPlant}
+DRIVERS = {"dynamixel": DynamixelPlant, "yarp": YarpPlant}
 
 
 def open_driver(wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> HandDriver:
