@@ -116,6 +116,21 @@ def test_a_motion_that_does_not_end_is_a_typed_error_and_the_hand_holds(driver) 
     assert driver.written[-1][0][0] == 1600.0  # where it stands
 
 
+def test_a_bus_that_falls_silent_in_a_motion_is_not_at_rest(driver) -> None:
+    """One reading that grows old is no hand that stands still."""
+    kept = []
+
+    def silent(reading):
+        if driver.written and time.monotonic() - driver.motors._at > 0.005:
+            kept.append(reading)
+            return dataclasses.replace(kept[0], moving=False)
+        return reading
+
+    driver.spoil = silent
+    with pytest.raises(NeverAtRestError, match="sends nothing new"):
+        driver.command(radians(0.05, 0.0))
+
+
 def test_a_stale_sensor_is_named(driver) -> None:
     old = time.monotonic() - 1.0
     driver.spoil = lambda reading: dataclasses.replace(reading, taken=old)

@@ -68,7 +68,7 @@ def test_a_motor_that_is_missing_and_a_file_that_is_not_there(tmp_path) -> None:
         read(write(tmp_path, text))
     with pytest.raises(DescriptionError, match="no such wiring file"):
         read(tmp_path / "none.toml")
-    with pytest.raises(UnknownNameError, match="unknown driver 'mine'; valid are: dynamixel, yarp"):
+    with pytest.raises(UnknownNameError, match="unknown driver 'mine'; valid are: dynamixel, ros2, yarp"):
         open_driver(write(tmp_path, change='"dynamixel"|"mine"'))
     with pytest.raises(ParameterError, match="rate"):
         Limits(rate=0.0)

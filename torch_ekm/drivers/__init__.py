@@ -9,6 +9,7 @@ from .driver import BusReading, HandDriver
 from .dynamixel import DynamixelPlant
 from .opening import open_driver
 from .pose import MarkerPose, Sighting, WithPose
+from .ros2 import Ros2Plant, RosPose
 from .wiring import Channel, Limits, Wiring
 from .yarp import YarpPlant
 
@@ -19,6 +20,8 @@ __all__ = [
     "HandDriver",
     "Limits",
     "MarkerPose",
+    "Ros2Plant",
+    "RosPose",
     "Sighting",
     "WithPose",
     "Wiring",

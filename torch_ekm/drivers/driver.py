@@ -248,9 +248,10 @@ class HandDriver(ABC):
             if reading.taken > (seen[-1][0] if seen else began):
                 seen.append((reading.taken, self._a(reading), reading.moving))
             now = time.monotonic()
-            while len(seen) > 1 and seen[1][0] <= now - self.limits.still_for:
+            while len(seen) > 1 and seen[1][0] <= seen[-1][0] - self.limits.still_for:
                 seen.pop(0)
-            if seen and seen[0][0] <= now - self.limits.still_for and not any(one[2] for one in seen):
+            spans = bool(seen) and seen[-1][0] - seen[0][0] >= self.limits.still_for
+            if spans and not any(one[2] for one in seen):
                 way = torch.stack([one[1] for one in seen])
                 spread = way.amax(0) - way.amin(0)
                 if float(spread.max()) <= self.limits.still:

@@ -9,10 +9,11 @@ from ..description import HandDescription
 from ..exceptions import UnknownNameError
 from .driver import HandDriver
 from .dynamixel import DynamixelPlant
+from .ros2 import Ros2Plant
 from .wiring import driver_of
 from .yarp import YarpPlant
 
-DRIVERS = {"dynamixel": DynamixelPlant, "yarp": YarpPlant}
+DRIVERS = {"dynamixel": DynamixelPlant, "ros2": Ros2Plant, "yarp": YarpPlant}
 
 
 def open_driver(wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> HandDriver:
