@@ -197,6 +197,8 @@ def test_every_optional_module_has_an_extra_that_brings_it() -> None:
         "cv2": "opencv-python",
         "IPython": "ipykernel",
         "sklearn": "scikit-learn",
+        "rclpy": "ros-rclpy",
+        **{f"{name}_msgs": f"ros-{name}-msgs" for name in ("sensor", "trajectory", "geometry", "std")},
     }
     for root, extra in _EXTRA_OF.items():
         listed = {re.split(r"[\[>=]", line)[0] for line in extras[extra]}

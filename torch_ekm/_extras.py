@@ -15,6 +15,8 @@ _BRINGS = {
     "notebooks": ("IPython", "pyarrow"),
     "peers": ("gpytorch", "river"),
     "fast": ("numba",),
+    "dynamixel": ("dynamixel_sdk",),
+    "ros2": ("rclpy", "sensor_msgs", "trajectory_msgs", "geometry_msgs", "std_msgs"),
     "interop": ("sklearn", "onnx", "onnxscript", "casadi", "rosbags"),
 }
 _EXTRA_OF = {module: extra for extra, modules in _BRINGS.items() for module in modules}

@@ -11,10 +11,11 @@ from collections.abc import Iterable
 from typing import Any
 
 __all__ = [
-    "CalibrationError", "DescriptionError", "EKMError", "EquilibriumError", "FileFormatError",
-    "FolderInUseError", "GraspError", "JointMismatchError", "MissingExtraError", "NoContactError",
-    "NoDerivativeError", "NoStateError", "NonFiniteError", "NonMonotoneFitError", "ObjectLostError",
-    "OutputError", "ParameterError", "PenetrationError", "ShapeError", "SingularGraspError", "SolverError",
+    "BusError", "CalibrationError", "CommandRefusedError", "DescriptionError", "DeviceError", "EKMError",
+    "EquilibriumError", "FileFormatError", "FolderInUseError", "GraspError", "JointMismatchError",
+    "MissingExtraError", "NeverAtRestError", "NoContactError", "NoDerivativeError", "NoStateError",
+    "NonFiniteError", "NonMonotoneFitError", "ObjectLostError", "OutputError", "ParameterError",
+    "PenetrationError", "ShapeError", "SingularGraspError", "SolverError", "StaleReadingError",
     "StateMismatchError", "UnknownNameError", "UnstableGraspError", "WorkerDiedError",
 ]  # fmt: skip
 
@@ -354,3 +355,35 @@ class NonMonotoneFitError(CalibrationError):
             f"the fitted curve turns back at reading {reading:.1f}, within {valid}; sweep the joint "
             "over its whole range, slowly, and leave out readings taken while it was blocked",
         )
+
+
+# -- devices ----------------------------------------------------------------------------------
+
+
+class DeviceError(EKMError):
+    """Root of what a driver of a real hand raises.
+
+    Attributes:
+        device: port, topic or motor.
+        problem: what is wrong with it, and what to do.
+    """
+
+    def __init__(self, device: object, problem: str) -> None:
+        self.device, self.problem = str(device), problem
+        super().__init__(f"{device}: {problem}")
+
+
+class BusError(DeviceError):
+    """A device does not answer, or not as its protocol says."""
+
+
+class StaleReadingError(DeviceError):
+    """A sensor has sent nothing new for too long."""
+
+
+class NeverAtRestError(DeviceError):
+    """A motion did not come to rest in time."""
+
+
+class CommandRefusedError(DeviceError):
+    """A command beyond the limits of the wiring; nothing was sent."""

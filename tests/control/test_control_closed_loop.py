@@ -21,6 +21,7 @@ from torch_ekm.control import (
 )
 from torch_ekm.control import StopReason as Reason
 from torch_ekm.control.qp import ControlProblem
+from torch_ekm.description import load_hand, load_object
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NonFiniteError, ParameterError, SolverError
 from torch_ekm.kinematics.se3 import exp
@@ -147,9 +148,36 @@ def test_object_out_of_reach_of_the_fingers_is_lost(held) -> None:
     assert done.reason is Reason.POSE_JUMP
 
 
-def test_observation_that_is_not_finite_is_refused(held) -> None:
-    with pytest.raises(NonFiniteError, match=r"Observation\.position"):
-        drive(held, lambda seen: dataclasses.replace(seen, position=seen.position * math.nan))
+def test_observation_that_is_not_finite_ends_the_loop_with_its_steps(held) -> None:
+    done, _ = drive(held, lambda seen: dataclasses.replace(seen, position=seen.position * math.nan))
+    assert done.reason is Reason.PLANT_FAILED
+    assert isinstance(done.stop.cause, NonFiniteError)
+    assert "Observation.position" in done.stop.message
+    assert len(done.steps) == 1
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_observation_that_is_one_joint_short_is_named(held) -> None:
+    done, _ = drive(held, lambda seen: dataclasses.replace(seen, q=seen.q[:-1]))
+    assert done.reason is Reason.PLANT_FAILED
+    assert "ShapeError: Observation.q" in done.stop.message
+    assert "'icub_right'" in done.stop.message
+    assert len(done.steps) == 1
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_readings_in_float32_are_taken(held) -> None:
+    seen, axis, _ = held
+    parts = {name: getattr(seen, name).float() for name in ("q", "a", "position", "rotation")}
+    model = KinematicModel(load_hand("icub_right"), load_object("box"))
+    ekm = EnhancedModel.for_grasp(model, seen.state)
+    plant = FrozenPlant(dataclasses.replace(seen, **parts, fingertip_force=seen.fingertip_force.float()))
+    done = ClosedLoop(plant, LookAndMoveController(ekm, axis), safety=SAFETY).run(
+        PoseTarget.turned(seen.state, axis, degrees=80)
+    )
+    assert done.steps
+    assert done.stop.final.q.dtype == torch.float64
+    assert done.stop.cause is None
 
 
 def test_steps_are_a_generator_that_tells_why_it_ends(held) -> None:
@@ -235,12 +263,30 @@ class Noted(FrozenPlant):
         return super().command(delta_a)
 
 
+def test_a_plant_that_fails_before_the_first_reading_raises(held) -> None:
+    seen, axis, controller = held
+
+    class Dead(FrozenPlant):
+        def observe(self) -> Observation:
+            raise OSError("no such port")
+
+    with pytest.raises(OSError, match="no such port"):
+        ClosedLoop(Dead(seen), controller).run(PoseTarget.turned(seen.state, axis, degrees=80))
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("bus is down")])
 def test_the_hand_holds_after_an_error_of_the_driver_and_after_ctrl_c(held, error) -> None:
     seen, axis, controller = held
     plant = Noted(seen, error)
-    with pytest.raises(type(error)):
-        ClosedLoop(plant, controller, safety=SAFETY).run(PoseTarget.turned(seen.state, axis, degrees=80))
+    with ClosedLoop(plant, controller, safety=SAFETY) as loop:
+        done = loop.run(PoseTarget.turned(seen.state, axis, degrees=80))
+        assert not plant.closed
+    assert plant.closed
+    assert done.stop.cause is error
+    assert done.reason is (Reason.PLANT_FAILED if isinstance(error, OSError) else Reason.STOPPED)
+    assert done.stop.message in ("OSError: bus is down", "Ctrl-C")
+    assert len(done.steps) == 1  # what was learned until then is there
+    assert len(done.errors) == 2
     assert [bool(da.any()) for da in plant.given] == [True, True, False]
 
 

@@ -14,7 +14,7 @@ from torch_ekm.control import StopReason as Reason
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.model import KinematicModel
-from torch_ekm.plant import Observation, PlantStatus, ServoInverse, Stamps
+from torch_ekm.plant import Observation, PlantStatus, PlantWrapper, ServoInverse, Stamps
 from torch_ekm.simulation import SimulatedHand
 from torch_ekm.testing import FuzzedPlant
 
@@ -139,6 +139,61 @@ def test_a_glitch_of_one_reading_leaves_no_trace(held) -> None:
     assert looks == expected + 1
     error = (run.loop.knowledge.servo.dead_zone - clean.loop.knowledge.servo.dead_zone).abs().max()
     assert float(error) < 0.01 * DEG
+
+
+def test_events_survive_a_second_look(held) -> None:
+    """What happened before the first reading of a motion is told with the one that is believed."""
+    first = []
+
+    def tugged(plant: Obedient, seen: Observation) -> Observation:
+        if len(plant.given) != 2 or first:
+            return seen
+        first.append(1)
+        return dataclasses.replace(unseen(plant, seen), info={"events": ("tug",)})
+
+    run = Run(held, tugged)
+    assert run.done.steps[1].after.info["events"] == ("tug",)
+    assert all(run.taught)
+
+
+def test_a_pose_that_jumps_and_stays_is_told_where_the_target_is_reached(held) -> None:
+    """The camera was moved: nothing but the pose shows it, and the target is off by as much."""
+    axis = held[1]
+    run = Run(held, lambda plant, seen: turned(seen, axis, -8 * DEG), angle=12.0)
+    assert run.reason is Reason.REACHED
+    assert "in motion 2 the object turned" in run.message
+    assert "if the camera was moved" in run.message
+    assert not Run(held, angle=12.0).message
+
+
+# -- a sign that is wrong ----------------------------------------------------------------------------------
+
+
+class Reversed(PlantWrapper):
+    """The motors do as commanded, by their encoders; in truth they all go the other way."""
+
+    def reset(self, seed):
+        self.start = self.plant.observe().a
+        return self.observe()
+
+    def command(self, delta_a):
+        return self.observation(self.plant.command(-delta_a))
+
+    def observation(self, seen):
+        start = self.__dict__.setdefault("start", seen.a)
+        return dataclasses.replace(seen, a=2 * start - seen.a)
+
+
+@pytest.mark.parametrize("learns", [True, False])
+def test_an_object_that_goes_the_wrong_way_ends_the_loop_after_three_motions(held, learns) -> None:
+    seen, axis, model = held
+    chosen = EnhancedModel.for_grasp(model, seen.state) if learns else model
+    plant = Reversed(Obedient(model, seen))
+    loop = ClosedLoop(plant, LookAndMoveController(chosen, axis), safety=SAFETY)
+    done = loop.run(PoseTarget.turned(seen.state, axis, degrees=8))
+    assert done.reason is Reason.WRONG_WAY
+    assert sum(not step.retreat for step in done.steps) == 3
+    assert "torch-ekm check --plant" in done.stop.message
 
 
 # -- every guard has a reason of its own -------------------------------------------------------------------

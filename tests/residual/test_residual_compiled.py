@@ -218,3 +218,5 @@ def test_where_numba_can_write_no_cache_torch_does_it_all():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+    assert "compiled loops are off" in done.stderr  # said once, not silent
+    assert done.stderr.count("NUMBA_CACHE_DIR") == 1

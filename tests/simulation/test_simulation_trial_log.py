@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torch_ekm.exceptions import DescriptionError, GraspError, ParameterError
+from torch_ekm.exceptions import DescriptionError, GraspError, OutputError, ParameterError
 from torch_ekm.plant import RecordingPlant, Trajectory, TrialLog
 from torch_ekm.plant.trial_log import TrialEntry
 from torch_ekm.simulation import PlantParameters, SimulatedHand
@@ -193,3 +193,24 @@ def test_a_damaged_trial_is_named(unbroken, tmp_path):
     assert aside.read_bytes() == before
     aside.unlink()
     assert digests(tmp_path) == digests(unbroken)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pipes in folders")
+@pytest.mark.timeout(60)
+def test_what_is_no_file_is_refused_at_once(tmp_path):
+    """A pipe would be waited for, a device be read for ever."""
+    os.mkfifo(tmp_path / "trial_000000.h5")
+    (tmp_path / "trial_000001.h5").symlink_to("/dev/zero")
+    for trial in range(2):
+        with pytest.raises(DescriptionError, match="no recording: it is no file"):
+            Trajectory.load(tmp_path / f"trial_{trial:06d}.h5")
+    with pytest.raises(DescriptionError, match="no file but"):
+        TrialLog.open(tmp_path)
+
+
+def test_an_index_that_is_a_folder_is_named(tmp_path):
+    (tmp_path / "index.csv").mkdir()
+    with pytest.raises(OutputError, match=r"index.csv cannot be written: it is no file"):
+        TrialLog(tmp_path, {})
+    (tmp_path / "index.csv").rmdir()
+    TrialLog(tmp_path, {}).close()

@@ -57,16 +57,37 @@ def objects() -> None:
 @app.command()
 @needs("experiments")
 def check(
-    hand: Annotated[str, Argument(help="A hand (see 'torch-ekm hands') or a path to a URDF.")],
+    hand: Annotated[str, Argument(help="A hand (see 'torch-ekm hands') or a path to a URDF.")] = "",
     object: Annotated[str, Argument(help=AN_OBJECT)] = "box",
     picture: Annotated[Path, Option(help="Picture of pads and contact frames.")] = Path("check.png"),
+    plant: Annotated[
+        Path | None,
+        Option(metavar="TOML", help="A real hand's wiring file: its motors move by 1 deg."),
+    ] = None,
+    dry_run: Annotated[bool, Option(help="With --plant: print the commands, move nothing.")] = False,
 ) -> None:
-    """Check a hand, from its files to a pinch of an object.
+    """Check a hand, from its files to a pinch of an object; or the wiring of a real one.
 
-    Files, pads, axes, limits, tendons, and a pinch of the object in simulation and model. Each row says what
-    was found and what to mend. Ends with 1 if there is an error, with 0 if not.
+    Files, pads, axes, limits, tendons, and a pinch of the object in simulation and model. With --plant:
+    signs, units, order, zeros and sensors of a real hand, by motions of 1 deg (up to 4 where its motors
+    stick), one motor after the other. Each row says what was found and what to mend. Ends with 1 if there is
+    an error, with 0 if not.
     """
-    from ..inspection.check import Check, check_hand
+    from ..inspection.row import Check
+
+    if plant is not None:
+        from ..drivers import open_driver
+        from ..inspection.check_plant import check_plant
+
+        with open_driver(plant, dry_run=dry_run, say=say) as driver:
+            rows = check_plant(driver, driver.hand)
+        print_table(Check._fields, rows, str(plant))
+        if any(row.state == "error" for row in rows):
+            raise typer.Exit(1)
+        return
+    if not hand:
+        raise ParameterError("hand", hand, "a hand or a path to a URDF; or --plant with a wiring file")
+    from ..inspection.check import check_hand
 
     if picture.is_dir() or not picture.resolve().parent.is_dir():
         raise OutputError(picture, "there is no such folder, or a folder of this name")

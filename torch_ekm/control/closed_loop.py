@@ -24,6 +24,7 @@ from .focus import FocusedPose, PoseTarget
 from .knowledge import HandKnowledge
 from .pace import SLIDES, ForceSurprise
 from .safety import Safety
+from .safety.checked_plant import CheckedPlant, PlantFailedError
 from .safety.progress import Progress
 from .safety.watch import Watch
 
@@ -58,6 +59,8 @@ class Stop(NamedTuple):
     reason: StopReason
     final: Observation
     message: str = ""
+    cause: BaseException | None = None
+    """What the plant raised, or Ctrl-C; ``raise result.stop.cause`` goes on with it."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +99,9 @@ class ClosedLoop:
             for step in loop.steps(target):
                 print(step.increment)
 
-    Whatever ends the manipulation early (an exception, Ctrl-C, a ``break``), the hand is commanded to hold
-    its position, and what was raised goes on. In a ``with`` block that is so for errors of the block, too.
+    What the plant raises, and Ctrl-C, end the manipulation with a :class:`Stop` that has it as its cause: no
+    step is lost. Whatever ends it early (these, another exception, a ``break``), the hand is commanded to
+    hold its position. At the end of a ``with`` block the plant is closed, after it holds if the block failed.
 
     Commands go through a :class:`~torch_ekm.plant.ServoInverse`, and the model learns from what the encoders
     did; with servos that are taken for ideal both are the increments that were decided.
@@ -134,7 +138,8 @@ class ClosedLoop:
                 knowledge.figures = followed
         knowledge.check(hand)
         controller.follow(knowledge.figures)
-        self.plant, self.knowledge = ServoInverse(plant, hand, knowledge.servo), knowledge
+        self._checked = CheckedPlant(plant, hand)
+        self.plant, self.knowledge = ServoInverse(self._checked, hand, knowledge.servo), knowledge
         self.controller, self.learn, self.decline = controller, learn, decline
         self.safety = Safety() if safety is None else safety
         self._stop = threading.Event()
@@ -143,8 +148,11 @@ class ClosedLoop:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
-        if kind is not None:
-            self.hold()
+        try:
+            if kind is not None:
+                self.hold()
+        finally:
+            self.plant.close()
 
     def stop(self) -> None:
         """End the manipulation after the motion under way; from any thread."""
@@ -160,7 +168,8 @@ class ClosedLoop:
         """Drive the object to ``target``.
 
         Raises:
-            EKMError: see :meth:`LookAndMoveController.decide`, and what the plant raises.
+            EKMError: see :meth:`LookAndMoveController.decide`, and what the plant raises before there is a
+                reading.
         """
         steps, motions = [], self.steps(target)
         while True:
@@ -172,15 +181,28 @@ class ClosedLoop:
     def steps(self, target: PoseTarget) -> Generator[Step, None, Stop]:
         """The motions one by one; the generator's return value is the :class:`Stop`."""
         self._stop.clear()
+        self._checked.last = None
         try:
             return (yield from self._motions(target))
-        except BaseException:  # Ctrl-C and a closed generator as well: the hand must not go on
+        except PlantFailedError as failed:
+            self.hold()
+            error, last = failed.cause, self._checked.last
+            if last is None:
+                raise error from None
+            return Stop(StopReason.PLANT_FAILED, last, f"{type(error).__name__}: {error}", error)
+        except KeyboardInterrupt as stopped:
+            self.hold()
+            if (last := self._checked.last) is None:
+                raise
+            return Stop(StopReason.STOPPED, last, "Ctrl-C", stopped)
+        except BaseException:  # a closed generator as well: the hand must not go on
             self.hold()
             raise
 
     def _motions(self, target: PoseTarget) -> Generator[Step, None, Stop]:
         started = time.monotonic()
-        watch = Watch(self.safety.guards, self.controller.kinematic, self.controller.expect)
+        safety, tolerance = self.safety, self.safety.rule.tolerance
+        watch = Watch(safety.guards, self.controller.kinematic, self.controller.expect, tolerance)
         first = watch.first(self.plant.observe(), self.plant.observe)
         seen = first.seen
         self.controller.reset()
@@ -311,6 +333,11 @@ class ClosedLoop:
         seconds += time.perf_counter() - began
         if turns:
             progress.add(after, blind=watch.blind > 0)
+            if verdict.note and expected is not None and not (watch.blind or watch.slid):
+                off = torch.linalg.vector_norm((increment - expected.increment)[-3:])
+                progress.leapt(float(off), verdict.note)
+            if progress.halt is None:
+                progress.halt = watch.way(progress.errors, decision, after.a - seen.a)
         return Step(seen, decision, after, increment, report, seconds, verdict.note)
 
     def _learn(

@@ -147,7 +147,7 @@ class Bench:
             )
         known = {"knowledge": self.knowledge, "safety": self.setting.safety}
         loop = ClosedLoop(plant, self.look_and_move(), **known, learn=learn)
-        self.last = loop.run(target)
+        self.last = _whole(loop.run(target))
         return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
 
     def long_step(self, seed: int, trial: int, step_deg: float) -> Record:
@@ -171,7 +171,7 @@ class Bench:
         rule = replace(setting.safety.rule, max_steps=1, off_limit=math.inf)
         safety = replace(setting.safety, rule=rule)
         loop = ClosedLoop(self.plant, controller, knowledge=self.knowledge, safety=safety, learn=False)
-        done = loop.run(PoseTarget.turned(start, axis, step_deg * _DEG))
+        done = _whole(loop.run(PoseTarget.turned(start, axis, step_deg * _DEG)))
         before = true_state(done.steps[0].before if done.steps else done.stop.final)
         turned = true_state(done.stop.final).minus(before)[-3:] @ axis
         record = TrialRecord.of(about, done, axis, learns=self.learns)
@@ -216,3 +216,10 @@ def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting, k
         hall.stuck = {k: math.nan for k, joint in enumerate(hall.joints) if joint in stuck}
     rested = FramesAtRest(sensed, setting.frames)
     return rested if hall is None else ContactAligned(rested, hand, simulated.object)
+
+
+def _whole(done: Manipulation) -> Manipulation:
+    """One that Ctrl-C or a failure of the plant has cut short is no trial."""
+    if done.stop.cause is not None:
+        raise done.stop.cause
+    return done

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -27,6 +26,7 @@ from ..simulation.grasp_planning.requirements import direction_unmet, unmet
 from ..simulation.parameters import PlantParameters
 from ..simulation.physics.bodies import x_axis_to
 from ..typing import Array
+from .row import Check, State
 
 _SURFACE = 2e-4  # [m] between a pad and its link's collision shape
 _LOW_MARGIN = 0.1  # of the friction cone
@@ -38,17 +38,6 @@ _LEAST_SLACK = 0.005  # of an actuator's range; less is a spring that just rests
 _FRACTIONS = np.linspace(0.0, 1.0, 21)  # of an actuator's range
 _LITTLE_TURN = math.radians(3.0)
 _DISTURBED = 3  # pinches with the faults of the preset nominal
-
-State = Literal["ok", "warning", "error"]
-
-
-class Check(NamedTuple):
-    """One row of the table: what was looked at, how it is, what was found, and what mends it."""
-
-    name: str
-    state: State
-    found: str
-    mend: str = ""
 
 
 def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> list[Check]:

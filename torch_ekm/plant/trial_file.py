@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import re
+import stat
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,11 @@ def read_trial(
         DescriptionError: no such file, no recording, or a damaged one.
     """
     try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise DescriptionError(path, "no recording: it is no file but a folder, a pipe or a device")
+        if status.st_size > _LARGEST:
+            raise DescriptionError(path, f"more than {_LARGEST} bytes")
         content = bytearray(path.read_bytes())
     except FileNotFoundError:
         raise DescriptionError(path, "no such recording") from None

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from .._files import WriterLock, make_folder, told_as_output_error, write_whole
 from .._versions import versions_of
-from ..exceptions import DescriptionError, ParameterError
+from ..exceptions import DescriptionError, OutputError, ParameterError
 from .trajectory import Trajectory, plain
 from .trial_file import read_trial
 
@@ -189,6 +189,8 @@ class TrialLog:
 
     def _write_index(self) -> None:
         path, right = self.folder / INDEX, index_lines(self._index)
+        if path.exists() and not path.is_file():
+            raise OutputError(path, "it is no file but a folder or a device: move it away")
         if not path.exists() or path.read_bytes() != right:
             write_whole(path, right)
 

@@ -12,6 +12,8 @@ from ..decision import Decision, StopReason
 from ..focus import FocusedPose, PoseTarget
 from .safety import Objection, Safety
 
+_LEAP = math.radians(4)  # of a pose beyond what was predicted, where nothing else has changed: worth a word
+
 
 class Progress:
     """Errors, motions and alarms of one manipulation, judged by :class:`~torch_ekm.control.Safety`.
@@ -27,6 +29,8 @@ class Progress:
     """What a guard says against going on."""
     limited = False
     """The last step was cut short by an actuator's limit."""
+    leap = ""
+    """The largest turn of the object that no motion explains, of those that were believed."""
     alarms = 0
     """How often a sign of a loss was heeded."""
 
@@ -60,7 +64,9 @@ class Progress:
         if time.monotonic() - self._started > self.safety.rule.max_seconds:
             return Objection(StopReason.TIME_OUT)
         reason = self.safety.rule.judge(self.errors, self.limited)
-        return None if reason is StopReason.RUNNING else Objection(reason)
+        if reason is StopReason.RUNNING:
+            return None
+        return Objection(reason, self.leap if reason is StopReason.REACHED else "")
 
     def lost(self, seen: Observation) -> bool:
         """The plant reports it, or the object is dislocated."""
@@ -95,6 +101,14 @@ class Progress:
         error = self.focus.error(self.target, after.state)
         # a goal that nobody saw is not reached
         self.errors.append(max(error, 1.001 * self.safety.rule.tolerance) if blind else error)
+
+    def leapt(self, off: float, note: str) -> None:
+        """The object has turned by ``off`` [rad] more than predicted, and what a guard says of it."""
+        if off > _LEAP and not self.leap:
+            self.leap = (
+                f"in motion {len(self.errors) - 1} {note}: if the camera was moved, or took one marker for "
+                "another, the target is off by as much"
+            )
 
     def _off_rotation(self, seen: Observation) -> float:
         """Of the object off the focus since the start [rad]."""

@@ -167,6 +167,9 @@ class Guards:
     stuck_command: float = 4 * _DEG
     """An actuator that stands still in two such commands running is stuck [rad]; so is one that the
     servo model calls so."""
+    wrong_way: int = 3
+    """Motions running that take the object farther from its target, each by more than the rule's tolerance,
+    while the motors do as commanded: a sign is wrong. One more is not made."""
     force_ceiling: float = 12.0
     """Of a pad, as measured, or as estimated where it is not [N]."""
     fingertip_repeats: int = 8

@@ -47,10 +47,15 @@ class Watch:
         guards: limits.
         model: f, with the hand.
         expect: f + g of what the encoders did, from where the model was linearized.
+        tolerance: of the target [unit of the focus]; errors that grow by more are no noise.
     """
 
     def __init__(
-        self, guards: Guards, model: KinematicModel, expect: Callable[[Linearization, Tensor], Expectation]
+        self,
+        guards: Guards,
+        model: KinematicModel,
+        expect: Callable[[Linearization, Tensor], Expectation],
+        tolerance: float = math.inf,
     ) -> None:
         self.guards, self.hand, self._expect = guards, model.hand, expect
         self.readings, self.fingertips = ReadingTests(guards, model.hand), FingertipWatch(guards, model)
@@ -62,6 +67,7 @@ class Watch:
         self.slid = ""
         """How the object has slid in the last motion, farther than the guards let a pose jump; or empty."""
         self._still = torch.zeros(self.hand.n_a, dtype=torch.long)
+        self._tolerance, self._away = tolerance, 0
 
     def first(self, seen: Observation, look: Callable[[], Observation]) -> Verdict:
         """The reading before the first motion; further ones from ``look`` where it is in doubt."""
@@ -110,7 +116,7 @@ class Watch:
             doubt = self.readings.after_motion(before, decision, seen, expected, self.blind)
             if left == 0 or (doubt is None and not self.fingertips.high(seen)):
                 break
-            last, seen = seen, look()
+            last, seen = seen, _with_events(look(), seen)
         if doubt is not None and not (doubt.blind or doubt.gated):
             if doubt.reason is StopReason.POSE_JUMP:
                 self.slid = self._slid(decision, before, expected, last, seen)
@@ -159,6 +165,22 @@ class Watch:
         way, turn = (float(torch.linalg.vector_norm(part)) for part in ds.split(3))
         return f"the object has slid {1e3 * way:.1f} mm and {deg(turn)} farther than predicted"
 
+    def way(self, errors: list[float], decision: Decision, moved: Tensor) -> Objection | None:
+        """The object goes away from its target, again and again, while the motors obey."""
+        da = decision.delta_a
+        if decision.share == 0.0:  # the way back
+            return None
+        away = errors[-1] - errors[-2] > self._tolerance and float(moved @ da) > 0.5 * float(da @ da)
+        self._away = self._away + 1 if away else 0
+        if self._away < self.guards.wrong_way:
+            return None
+        message = (
+            f"the object has gone away from its target in {self._away} motions running, while the motors did "
+            "as commanded: a motor's or a joint's sign is wrong, or the pose is in another frame; see "
+            "'torch-ekm check --plant'"
+        )
+        return Objection(StopReason.WRONG_WAY, message)
+
     def forget(self) -> None:
         """Signs of a loss are heeded: the hand goes back."""
         self.slid = ""
@@ -194,3 +216,9 @@ class Watch:
         return dataclasses.replace(
             seen, position=pose.position, rotation=pose.rotation, status=PlantStatus.NOT_SEEN
         )
+
+
+def _with_events(seen: Observation, earlier: Observation) -> Observation:
+    """What happened before an earlier look at the same motion belongs to this one, too."""
+    events = (*earlier.info.get("events", ()), *seen.info.get("events", ()))
+    return dataclasses.replace(seen, info={**seen.info, "events": events}) if events else seen

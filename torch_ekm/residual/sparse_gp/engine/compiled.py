@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from functools import cache
 from types import ModuleType
@@ -24,13 +25,20 @@ from ..part import Host
 from .recursion import Absorbed
 from .reference import ReferenceEngine
 
+_SLOW = "compiled loops are off, and sparse GPs take longer: {}; numba's folder is named by NUMBA_CACHE_DIR"
+
 
 @cache
 def load_kernels() -> ModuleType | None:
     """The compiled loops; None where numba is missing, does not fit numpy, or cannot write its cache."""
     try:
         from . import numba_kernels
-    except (ImportError, RuntimeError):
+    except ImportError as error:
+        if error.name not in ("numba", "llvmlite"):  # it is there, and does not fit
+            warnings.warn(_SLOW.format(error), stacklevel=2)
+        return None
+    except RuntimeError as error:
+        warnings.warn(_SLOW.format(error), stacklevel=2)
         return None
     return numba_kernels
 

@@ -1,0 +1,224 @@
+"""DynamixelPlant: the genuine SDK against a bus of servos on a pseudo terminal."""
+
+from __future__ import annotations
+
+import math
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from wirings import T42, write
+
+pytest.importorskip("dynamixel_sdk")
+
+from torch_ekm.drivers import DynamixelPlant
+from torch_ekm.exceptions import BusError, DescriptionError, DeviceError
+from torch_ekm.testing import DynamixelBus, Motors
+
+DEG = math.pi / 180
+TICK = 2 * math.pi / 4096
+
+
+@pytest.fixture
+def bus():
+    with DynamixelBus([1, 2], Motors([1600.0, 2400.0], 4000.0)) as bus:
+        yield bus
+
+
+def open_at(bus: DynamixelBus, folder: Path, **changes: str) -> DynamixelPlant:
+    return DynamixelPlant(write(folder, port=bus.port, **changes))
+
+
+def radians(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def test_a_motion_over_the_bus(bus, tmp_path) -> None:
+    with open_at(bus, tmp_path, current="baud =|current_ma = 269\nbaud =") as plant:
+        left, right = bus.tables[1], bus.tables[2]
+        assert (left[11], left[64], left[98]) == (5, 1, 0)  # current-based position, torque, watchdog
+        assert int.from_bytes(left[102:104], "little") == 100
+        assert int.from_bytes(right[112:116], "little") == 146  # 200 deg/s in 0.229 rpm
+        assert bus.goals[0] == [1600.0, 2400.0]  # torque comes on where it stands
+        bus.tables[2][126:128] = (-50).to_bytes(2, "little", signed=True)
+        seen = plant.reset(seed=0)
+        torch.testing.assert_close(seen.a, TICK * radians(600.0, 600.0))
+        assert seen.info["load"] == (0, -50)
+        after = plant.command(radians(5 * DEG, -5 * DEG))
+        torch.testing.assert_close(after.a, seen.a + radians(5 * DEG, -5 * DEG), atol=TICK / 2, rtol=0)
+        assert left[98] == 0  # at rest no watchdog
+    assert not plant._handler.is_open
+
+
+def test_stuffed_bytes_arrive(bus, tmp_path) -> None:
+    with open_at(bus, tmp_path) as plant:
+        plant._sync_write((116, 4), [0x01FDFFFF, 5])
+        plant._read()  # a sync write has no answer: what comes after it has
+        assert bus.goals[-1] == [float(0x01FDFFFF), 5.0]
+        bus.motors = Motors([0x01FDFFFF, 5.0], 1.0)
+        assert plant._read().motors == [0x01FDFFFF, 5]
+
+
+def test_a_servo_that_is_lost_is_named_with_its_line(bus, tmp_path) -> None:
+    bus.silent.add(1)
+    with pytest.raises(BusError, match=r"motor 'left', id 1 \(.*my_hand.toml:15\): no answer.*baud rate"):
+        open_at(bus, tmp_path)
+    bus.silent.clear()
+    with pytest.raises(DescriptionError, match=r"my_hand.toml:7: .*'baud' 1234 is none"):
+        open_at(bus, tmp_path, baud="1000000|1234")
+    with pytest.raises(BusError, match="none-such"):
+        DynamixelPlant(write(tmp_path, port="none-such"))
+
+
+FAULTS = {
+    "checksum": (lambda packet: packet[:-1] + bytes([packet[-1] ^ 1]), "checksum: noise, or two servos"),
+    "wrong id": (lambda packet: _as(packet, 9), "servo 9 answers in its place"),
+    "short": (lambda packet: _cut(packet), "too short or too long"),
+    "half": (lambda packet: packet[: len(packet) // 2], "checksum|no answer"),
+    "nothing": (lambda packet: b"", "no answer"),
+    "noise": (lambda packet: bytes(random.Random(3).randbytes(40)), "checksum|no answer"),
+}
+
+
+def _signed(packet: bytes) -> bytes:
+    from torch_ekm.testing.dynamixel_bus import checksum
+
+    return packet + checksum(packet).to_bytes(2, "little")
+
+
+def _as(packet: bytes, servo: int) -> bytes:
+    return _signed(packet[:4] + bytes([servo]) + packet[5:-2])
+
+
+def _cut(packet: bytes) -> bytes:
+    size = int.from_bytes(packet[5:7], "little") - 3
+    return _signed(packet[:5] + size.to_bytes(2, "little") + packet[7:-5])
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_of_the_bus_is_named_and_nothing_moves(name, bus, tmp_path) -> None:
+    spoil, words = FAULTS[name]
+    with open_at(bus, tmp_path) as plant:
+        sent = len(bus.goals)
+        bus.spoil = spoil
+        for _ in range(5):  # on a busy machine an answer may also come too late
+            with pytest.raises(BusError) as error:
+                plant.command(radians(0.1, 0.1))
+            if re.search(words, str(error.value)):
+                break
+        assert re.search(words, str(error.value))
+        assert len(bus.goals) == sent
+        bus.spoil = lambda packet: packet
+
+
+def test_a_packet_that_is_lost_is_asked_for_again(bus, tmp_path) -> None:
+    with open_at(bus, tmp_path) as plant:
+        lost = [True]
+        bus.spoil = lambda packet: b"" if lost and lost.pop() else packet
+        plant.observe()
+        assert not lost
+
+
+def test_a_servo_that_has_switched_off_says_why(bus, tmp_path) -> None:
+    with open_at(bus, tmp_path) as plant:
+        bus.tables[2][70] = 0b100100
+        with pytest.raises(BusError, match="servo 2: overheated, overload: it has switched off"):
+            plant.observe()
+        bus.tables[2][70] = 0
+
+
+def test_two_servos_with_one_id(bus, tmp_path) -> None:
+    """Both answer at once: bytes of one and of the other."""
+    bus.spoil = lambda packet: packet[:6] + bytes(x ^ 0x14 for x in packet[6:]) if packet[4] == 1 else packet
+    with pytest.raises(BusError, match=r"motor 'left', id 1.*two servos with one id"):
+        open_at(bus, tmp_path)
+
+
+def test_garbled_messages_send_no_motor_beyond_its_limits(bus, tmp_path) -> None:
+    """Cut, doubled, late and garbled answers: the command is right, or there is a typed error."""
+    draw = random.Random(0)
+    kept: list[bytes] = [b""]
+
+    def spoil(packet: bytes) -> bytes:
+        if draw.random() > 0.3:
+            return packet
+        kind, last = draw.randrange(5), kept[0]
+        kept[0] = packet
+        if kind == 0:
+            return packet[: draw.randrange(len(packet))]
+        if kind == 1:
+            return packet + packet
+        if kind == 2:
+            return last
+        if kind == 3:
+            return last + packet
+        place = draw.randrange(len(packet))
+        return packet[:place] + bytes([draw.randrange(256)]) + packet[place + 1 :]
+
+    with open_at(bus, tmp_path, still="still_for = 0.05|still_for = 0.01") as plant:
+        bus.spoil, failures, motions = spoil, 0, 0
+        for _ in range(25):
+            while bus.motors.moving:
+                time.sleep(0.002)
+            at = [one.value(x) for one, x in zip(plant.wiring.motors, bus.motors.now(), strict=True)]
+            sent = len(bus.goals)
+            try:
+                plant.command(radians(draw.uniform(-0.05, 0.05), draw.uniform(-0.05, 0.05)))
+                motions += 1
+            except DeviceError:
+                failures += 1
+            for goal in bus.goals[sent:]:
+                a = [one.value(x) for one, x in zip(plant.wiring.motors, goal, strict=True)]
+                assert all(abs(x - y) <= 0.05 + 2 * TICK for x, y in zip(a, at, strict=True))
+        assert failures > 0
+        assert motions > 0
+        bus.spoil = lambda packet: packet
+
+
+def test_a_cable_that_is_pulled_is_a_typed_error(bus, tmp_path) -> None:
+    plant = open_at(bus, tmp_path)
+    bus.close()
+    with pytest.raises(BusError, match=re.escape(bus.port)):
+        plant.command(radians(0.1, 0.0))
+    plant.close()
+
+
+_MOVES = """
+import sys, torch
+from torch_ekm.drivers import DynamixelPlant
+plant = DynamixelPlant(sys.argv[1])
+print("moving", flush=True)
+while True:
+    for sign in (1.0, -1.0):
+        plant.command(sign * torch.tensor([0.3, 0.3], dtype=torch.float64))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo terminals")
+def test_the_hand_stands_within_100_ms_after_its_process_is_killed(tmp_path) -> None:
+    with DynamixelBus([1, 2], Motors([1600.0, 2400.0], 300.0)) as bus:
+        path = write(tmp_path, T42, port=bus.port, change="timeout = 0.5|timeout = 5")
+        child = subprocess.Popen([sys.executable, "-c", _MOVES, str(path)], stdout=subprocess.PIPE, text=True)
+        assert child.stdout is not None
+        child.stdout.readline()
+        start = bus.motors.now()
+        while bus.motors.now() == start or not bus.motors.moving:
+            time.sleep(0.005)
+        time.sleep(0.1)
+        os.kill(child.pid, signal.SIGKILL)
+        time.sleep(0.1 + 0.05)  # the watchdog's 80 ms, and what the emulator takes on a busy machine
+        stands = bus.motors.now()
+        time.sleep(0.2)
+        assert bus.motors.now() == stands
+        child.wait()
+        assert bus.tables[1][98] == 255
+        plant = DynamixelPlant(path)  # the next process clears the watchdog
+        plant.command(radians(0.05, 0.0))
+        plant.close()

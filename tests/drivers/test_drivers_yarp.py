@@ -1,0 +1,154 @@
+"""YarpPlant: the text carrier, against the bytes of a genuine network, and against a genuine one."""
+
+from __future__ import annotations
+
+import math
+import random
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from yarp_golden import GoldenYarp
+
+from torch_ekm.description import load_hand
+from torch_ekm.drivers import YarpPlant
+from torch_ekm.exceptions import BusError, DescriptionError, DeviceError
+
+DEG = math.pi / 180
+ICUB = load_hand("icub_right")
+
+
+def wiring(folder: Path, port: int, extra: str = "", bus: str = "") -> Path:
+    text = (
+        '[hand]\ndriver = "yarp"\ndescription = "icub_right"\n[bus]\n'
+        f'name_server = "127.0.0.1:{port}"\npart = "/icub/right_arm"\n{bus}'
+        "[limits]\nstill_for = 0.02\nrate_deg = 150\ntimeout = 0.5\n"
+    )
+    for k, name in enumerate(ICUB.actuator_names):
+        text += f'[[motors]]\nname = "{name}"\nid = {7 + k}\n'
+    path = folder / "icub.toml"
+    path.write_text(text + extra)
+    return path
+
+
+HALL = '[[joints]]\nname = "index_1"\nid = 3\nsign = -1\nzero = 255\nper_rad = 162.3\n'
+ANALOG = 'analog = "/icub/right_hand/analog:o"\n'
+
+
+@pytest.fixture
+def yarp():
+    network = GoldenYarp()
+    yield network
+    network.close()
+
+
+def increment(**moves: float) -> torch.Tensor:
+    delta = torch.zeros(ICUB.n_a, dtype=torch.float64)
+    for name, value in moves.items():
+        delta[ICUB.actuator_names.index(name)] = value
+    return delta
+
+
+def test_axes_7_to_15_are_the_hand_and_the_arm_is_left_alone(yarp, tmp_path) -> None:
+    with YarpPlant(wiring(tmp_path, yarp.server, HALL, ANALOG)) as plant:
+        assert yarp.commands[:2] == ["[set] [icmd] [cmod] 7 [pos]", "[set] [vel] 7 150"]
+        seen = plant.reset(seed=0)
+        torch.testing.assert_close(seen.a, torch.full((9,), 45 * DEG, dtype=torch.float64))
+        at = ICUB.joint_names.index("index_1")
+        assert float(seen.q[at]) == pytest.approx((255 - 131) / 162.3, abs=0.02)  # count 3 of the stream
+        after = plant.command(increment(thumb_distal=4 * DEG))
+        moved = after.a - seen.a
+        torch.testing.assert_close(moved, increment(thumb_distal=4 * DEG), atol=1e-6, rtol=0)
+        assert after.taken.joints > seen.time
+    axes = {int(text.split()[2]) for text in yarp.commands if "[pos]" in text and "cmod" not in text}
+    assert axes == set(range(7, 16))
+
+
+def test_a_port_that_is_not_there_is_named(yarp, tmp_path) -> None:
+    path = wiring(tmp_path, yarp.server)
+    path.write_text(path.read_text().replace("right_arm", "left_arm"))
+    with pytest.raises(BusError, match=r"/icub/left_arm/rpc:i: the name server has no such port"):
+        YarpPlant(path)
+    with pytest.raises(BusError, match="name server: ConnectionRefusedError"):
+        YarpPlant(wiring(tmp_path, 9))
+    path = wiring(tmp_path, 9)
+    path.write_text(path.read_text().replace("127.0.0.1:9", "localhost"))
+    with pytest.raises(DescriptionError, match=r"icub.toml:5: .*host:port"):
+        YarpPlant(path)
+    with pytest.raises(DescriptionError, match="'analog' is missing"):
+        YarpPlant(wiring(tmp_path, yarp.server, HALL))
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (b"[fail]\r\n", "answers"),
+        (b"[is] encs (1.0 nan) [ok]\r\n", "no numbers"),
+        (b"[is] encs (1.0 2.0) 1.5 [ok]\r\n", "has 2 axes, .*asks for 15|answers"),
+        (b"[is] encs (1.0\r\n", "answers"),
+        (b"", "TimeoutError"),
+    ],
+)
+def test_answers_that_cannot_be_right_are_typed_errors(answer, words, yarp, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("torch_ekm.drivers.yarp._TIMEOUT", 0.2)
+    plant = YarpPlant(wiring(tmp_path, yarp.server))
+    yarp.spoil = lambda data: answer
+    sent = len(yarp.commands)
+    with pytest.raises(BusError, match=words):
+        plant.command(increment(thumb_distal=0.1))
+    assert len(yarp.commands) == sent
+    yarp.spoil = lambda data: data
+    plant.observe()  # connected again where it must be
+    plant.close()
+
+
+def test_a_cable_that_is_pulled_is_a_typed_error(yarp, tmp_path) -> None:
+    plant = YarpPlant(wiring(tmp_path, yarp.server, HALL, ANALOG))
+    plant.observe()
+    yarp.close()
+    with pytest.raises(BusError, match="YARP port"):
+        plant.command(increment(thumb_distal=0.1))
+    plant.close()
+
+
+def test_garbled_messages_send_no_axis_beyond_its_limits(yarp, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("torch_ekm.drivers.yarp._TIMEOUT", 0.1)
+    draw, kept = random.Random(1), [b""]
+
+    def spoil(data: bytes) -> bytes:
+        if draw.random() > 0.1:
+            return data
+        kind, last = draw.randrange(4), kept[0]
+        kept[0] = data
+        if kind == 0:
+            return data[: draw.randrange(len(data))]
+        if kind == 1:
+            return data + data
+        if kind == 2:
+            return last
+        place = draw.randrange(len(data))
+        return data[:place] + bytes([draw.randrange(32, 127)]) + data[place + 1 :]
+
+    plant, failed, moved = YarpPlant(wiring(tmp_path, yarp.server, HALL, ANALOG)), 0, 0
+    yarp.spoil = spoil
+    for _ in range(25):
+        while yarp.motors.moving:
+            time.sleep(0.005)
+        at, sent = yarp.motors.now(), len(yarp.commands)
+        try:
+            plant.command(increment(thumb_distal=draw.uniform(-0.03, 0.03)))
+            moved += 1
+        except DeviceError:
+            failed += 1
+        for text in yarp.commands[sent:]:
+            words = text.split()
+            if words[1] == "[pos]":
+                goal, axis = float(words[3]), int(words[2]) - 7
+                lower, upper = ICUB.actuator_lower[axis] / DEG, ICUB.actuator_upper[axis] / DEG
+                assert lower - 1e-6 <= goal <= upper + 1e-6
+                assert abs(goal - at[axis]) < 20.0
+    assert failed
+    assert moved
+    yarp.spoil = lambda data: data
+    plant.close()

@@ -1,0 +1,30 @@
+"""Drivers of real hands: one TOML file each, and one base for what all have in common.
+
+Tested against the genuine protocols; none was tried on hardware.
+"""
+
+from __future__ import annotations
+
+from .driver import BusReading, HandDriver
+from .dynamixel import DynamixelPlant
+from .opening import open_driver
+from .pose import MarkerPose, Sighting, WithPose
+from .ros2 import Ros2Plant, RosPose
+from .wiring import Channel, Limits, Wiring
+from .yarp import YarpPlant
+
+__all__ = [
+    "BusReading",
+    "Channel",
+    "DynamixelPlant",
+    "HandDriver",
+    "Limits",
+    "MarkerPose",
+    "Ros2Plant",
+    "RosPose",
+    "Sighting",
+    "WithPose",
+    "Wiring",
+    "YarpPlant",
+    "open_driver",
+]

@@ -1,0 +1,328 @@
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from .._checks import check_finite, check_shape
+from ..exceptions import BusError, CommandRefusedError, NeverAtRestError, StaleReadingError
+from ..plant import Observation, PlantStatus, Stamps
+from ..typing import Array, Float, Tensor
+from .posture import Posture
+from .wiring import Channel, Wiring
+
+_REACH = 0.08  # [s] a motion goes out in pieces of so much: a hand whose computer dies goes no farther
+_POLL = 0.005  # [s]
+_TRIES = 5  # of a motion that a watchdog stops, of readings that disagree
+_BEYOND = math.radians(15)  # a motor that reads farther outside its range is not sent anywhere
+_SLACK = 1e-6  # [rad] of a limit: sums of floats
+
+
+@dataclass(frozen=True)
+class BusReading:
+    """What a bus says, in its own units, in the order of the wiring; times of ``time.monotonic()`` [s]."""
+
+    motors: Sequence[float]
+    taken: float
+    """When the motors were read."""
+    moving: bool = False
+    """The bus says that a motor moves; False: it does not, or does not tell."""
+    joints: Sequence[float] = ()
+    joints_taken: float = math.inf
+    fingertips: Sequence[float] = ()
+    fingertips_taken: float = math.inf
+    load: Sequence[float] = ()
+    """Current or torque of each motor, for ``Observation.info`` [unit of the bus]."""
+
+
+class HandDriver(ABC):
+    """Base of the drivers: units, order, clock, limits, rest; implements :class:`~torch_ekm.plant.Plant`.
+
+    A subclass says how the bus is read and written. All else is the same for every bus:
+
+    * ``bus = zero + sign per_unit value`` for each motor, joint and fingertip of the wiring;
+    * a command is a position, encoders + ``delta_a``, within the motors' ranges; one above
+      ``limits.increment`` is refused;
+    * a motion goes out in pieces of 0.08 s at ``limits.rate``: if this process dies, the hand stands after
+      the piece under way;
+    * ``command`` returns when the hand rests; each reading is dated by ``time.monotonic()``, and newer than
+      the motion before it.
+
+    The object is ``NOT_SEEN``, at the origin: :class:`WithPose` adds its pose. Joints without a sensor are
+    estimated (:class:`~torch_ekm.drivers.posture.Posture`).
+
+    Args:
+        wiring: channels and limits.
+        dry_run: commands are printed, and nothing is sent.
+        joints: (readings of the joints' sensors ``(n,)`` [bus units], a ``(n_a,)`` [rad]) -> q ``(n_q,)``
+            [rad], such as one with a :class:`~torch_ekm.sensing.JointEstimator`; None: the wiring's straight
+            lines.
+        say: prints the commands of a dry run.
+
+    Raises:
+        BusError: a device does not answer.
+    """
+
+    def __init__(
+        self,
+        wiring: Wiring,
+        *,
+        dry_run: bool = False,
+        joints: Callable[[Float[Tensor, " n"], Float[Tensor, " n_a"]], Float[Tensor, " n_q"]] | None = None,
+        say: Callable[[str], object] = print,
+    ) -> None:
+        self.wiring, self.hand, self.limits = wiring, wiring.hand, wiring.limits
+        self.dry_run, self._say = dry_run, say
+        self._posture = Posture(wiring.hand, [one.name for one in wiring.joints])
+        self._joints = self._by_lines if joints is None else joints
+        self._after = -math.inf  # a reading must be newer: of the last motion's end
+
+    # -- what a bus does ----------------------------------------------------------------------------
+
+    @abstractmethod
+    def _read(self) -> BusReading:
+        """The newest reading.
+
+        Raises:
+            BusError: no answer, or none that can be right.
+        """
+
+    @abstractmethod
+    def _write(self, goal: Sequence[float], seconds: float) -> None:
+        """Send the motors to positions [bus units], to be reached in about ``seconds``.
+
+        Raises:
+            BusError: the bus does not take them.
+        """
+
+    @contextlib.contextmanager
+    def _moving(self) -> Iterator[None]:
+        """Around a motion: a bus with a watchdog of its own sets it here."""
+        yield
+
+    def _cut_short(self) -> bool:
+        """A watchdog has stopped the motion; it is begun again."""
+        return False
+
+    @abstractmethod
+    def _release(self) -> None:
+        """Give the port or connection back; the motors hold."""
+
+    # -- the plant contract -------------------------------------------------------------------------
+
+    def reset(self, seed: int) -> Observation:
+        """Read the sensors: a person puts the object between the fingers."""
+        return self.observe()
+
+    def observe(self) -> Observation:
+        """Read the sensors.
+
+        Raises:
+            BusError: a device does not answer.
+            StaleReadingError: a sensor sends nothing new.
+        """
+        reading = self._fresh()
+        now, a = time.monotonic(), self._a(reading)
+        read = torch.tensor(list(reading.joints), dtype=torch.float64)
+        force = self._values(self.wiring.fingertips, reading.fingertips)
+        stamps = Stamps(
+            reading.taken,
+            min(reading.joints_taken, reading.taken),
+            -math.inf,
+            min(reading.fingertips_taken, now),
+        )
+        return Observation(
+            q=self._joints(read, a),
+            a=a,
+            position=torch.zeros(3, dtype=torch.float64),
+            rotation=torch.eye(3, dtype=torch.float64),
+            fingertip_force=force.clamp(min=0.0) if len(force) else None,
+            time=now,
+            status=PlantStatus.NOT_SEEN,
+            info={"load": tuple(reading.load), "sensed": tuple(one.name for one in self.wiring.joints)},
+            stamps=stamps._replace(pose=now),
+        )
+
+    def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
+        """Move the motors by ``delta_a`` [rad] relative to their encoders, wait until they rest, read.
+
+        Raises:
+            ShapeError, NonFiniteError: it is not ``n_a`` finite numbers; nothing moves.
+            CommandRefusedError: beyond ``limits.increment``; nothing moves.
+            BusError: a device does not answer.
+            NeverAtRestError: the motion does not end; the motors are commanded to hold.
+        """
+        delta = torch.as_tensor(delta_a).detach().cpu().double()
+        check_shape("delta_a", delta, (self.hand.n_a,), f"in order: {', '.join(self.hand.actuator_names)}")
+        check_finite("delta_a", delta)
+        worst = int(delta.abs().argmax())
+        if float(delta[worst].abs()) > self.limits.increment + _SLACK:
+            motor, most = self.wiring.motors[worst], math.degrees(self.limits.increment)
+            raise CommandRefusedError(
+                f"motor '{motor.name}'",
+                f"a command of {math.degrees(float(delta[worst])):.3g} deg, [limits] increment in "
+                f"{self.wiring.path} is {most:.3g} deg: make smaller motions, or allow more",
+            )
+        start = self._stands().numpy()
+        goal = self._within(start, start + delta.numpy())
+        if self.dry_run:
+            shown = zip(self.wiring.motors, self._bus(goal), strict=True)
+            self._say("dry run: " + ", ".join(f"{one.name} (id {one.id}) to {bus:.6g}" for one, bus in shown))
+        elif np.any(goal != start):
+            self._move(start, goal)
+        else:
+            self.hold()
+        return self.observe()
+
+    def hold(self) -> None:
+        """Command the motors to stay where they are.
+
+        Raises:
+            BusError: the bus does not take it.
+        """
+        if not self.dry_run:
+            self._write(list(self._read().motors), _REACH)
+
+    def close(self) -> None:
+        """Hold, and give the bus back; errors of the bus are ignored."""
+        with contextlib.suppress(Exception):
+            self.hold()
+        self._release()
+
+    def __enter__(self) -> HandDriver:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    # -- inside -------------------------------------------------------------------------------------
+
+    def _stands(self) -> Tensor:
+        """Where the motors are, by two readings that agree: one alone may be an old packet."""
+        last = self._a(self._read())
+        for _ in range(_TRIES):
+            a = self._a(self._read())
+            if float((a - last).abs().max()) <= self.limits.still:
+                return a
+            last = a
+        problem = (
+            f"the motors' readings disagree in {_TRIES} looks: something moves them, or the bus is noisy"
+        )
+        raise BusError(self.wiring.path.name, problem)
+
+    def _move(self, start: Array, goal: Array) -> None:
+        """Send a motion piece by piece, and wait for its end."""
+        for _ in range(_TRIES):
+            pieces = max(1, math.ceil(float(np.abs(goal - start).max()) / (self.limits.rate * _REACH) - 1e-9))
+            seconds = float(np.abs(goal - start).max()) / pieces / self.limits.rate
+            with self._moving():
+                for k in range(1, pieces + 1):
+                    self._write(self._bus(start + k / pieces * (goal - start)), seconds)
+                    if k < pieces:
+                        self._wait(seconds)
+                self._rest(seconds)
+                cut_short = self._cut_short()
+            if not cut_short:
+                return
+            start = self._a(self._read()).numpy()
+        problem = f"the watchdog has stopped a motion {_TRIES} times: this process is too slow for it"
+        raise BusError(self.wiring.path.name, problem)
+
+    def _wait(self, seconds: float) -> None:
+        """Read until so much time is over: a bus with a watchdog is kept awake."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self._read()
+            time.sleep(min(_POLL, max(0.0, end - time.monotonic())))
+
+    def _rest(self, seconds: float) -> None:
+        began, seen = time.monotonic(), []
+        while True:
+            reading = self._read()
+            if reading.taken > (seen[-1][0] if seen else began):
+                seen.append((reading.taken, self._a(reading), reading.moving))
+            now = time.monotonic()
+            while len(seen) > 1 and seen[1][0] <= seen[-1][0] - self.limits.still_for:
+                seen.pop(0)
+            spans = bool(seen) and seen[-1][0] - seen[0][0] >= self.limits.still_for
+            if spans and not any(one[2] for one in seen):
+                way = torch.stack([one[1] for one in seen])
+                spread = way.amax(0) - way.amin(0)
+                if float(spread.max()) <= self.limits.still:
+                    self._after = seen[0][0]
+                    return
+            if now - began > seconds + self.limits.timeout:
+                break
+            time.sleep(_POLL)
+        with contextlib.suppress(Exception):
+            self.hold()
+        names = [m.name for m, way in zip(self.wiring.motors, self._spread(seen), strict=True) if way]
+        what = f"motor '{', '.join(names)}'" if names else str(self.wiring.path)
+        raise NeverAtRestError(
+            what,
+            f"does not come to rest within {seconds + self.limits.timeout:.3g} s of a command: it swings "
+            "([limits] still, timeout), or sends nothing new",
+        )
+
+    def _spread(self, seen: list[tuple[float, Tensor, bool]]) -> list[bool]:
+        """Which motors moved within the last readings."""
+        if not seen:
+            return [False] * self.hand.n_a
+        way = torch.stack([one[1] for one in seen])
+        return (way.amax(0) - way.amin(0) > self.limits.still).tolist()
+
+    def _fresh(self) -> BusReading:
+        """A reading whose sensors are all newer than the last motion, and no older than two periods."""
+        began, reading = time.monotonic(), self._read()
+        while True:
+            old = {
+                "motors": reading.taken,
+                "joints": reading.joints_taken,
+                "fingertips": reading.fingertips_taken,
+            }
+            # two periods before this call, not before now: a reading does not grow stale by being waited for
+            late = {k: at for k, at in old.items() if at < max(began - 2 * self.limits.period, self._after)}
+            if not late:
+                return reading
+            if time.monotonic() - began > max(1.0, 4 * self.limits.period):
+                name, at = min(late.items(), key=lambda one: one[1])
+                raise StaleReadingError(
+                    f"{name} of {self.wiring.path.name}",
+                    f"the newest reading is {time.monotonic() - at:.3g} s old, [limits] period allows "
+                    f"{2 * self.limits.period:.3g} s: look after the sensor's cable or node",
+                )
+            time.sleep(_POLL)
+            reading = self._read()
+
+    def _within(self, start: Array, goal: Array) -> Array:
+        """The goal, cut at the motors' ranges; one that stands outside is never sent farther out."""
+        lower = np.array([one.lower for one in self.wiring.motors])
+        upper = np.array([one.upper for one in self.wiring.motors])
+        beyond = np.maximum(lower - start, start - upper)
+        k = int(beyond.argmax())
+        if not beyond[k] <= _BEYOND:
+            at, low, high = (f"{math.degrees(x):.4g}" for x in (start[k], lower[k], upper[k]))
+            motor, place = self.wiring.motors[k], f"{self.wiring.path}:{self.wiring.motors[k].line}"
+            problem = f"it reads {at} deg, its range is {low} to {high} deg: mend 'zero' or 'range' ({place})"
+            raise CommandRefusedError(f"motor '{motor.name}'", problem)
+        return np.clip(goal, np.minimum(lower, start), np.maximum(upper, start))
+
+    def _bus(self, a: Array) -> list[float]:
+        return [one.bus(float(x)) for one, x in zip(self.wiring.motors, a, strict=True)]
+
+    def _a(self, reading: BusReading) -> Tensor:
+        return self._values(self.wiring.motors, reading.motors)
+
+    @staticmethod
+    def _values(channels: Sequence[Channel], bus: Sequence[float]) -> Tensor:
+        values = [one.value(float(x)) for one, x in zip(channels, bus, strict=True)]
+        return torch.tensor(values, dtype=torch.float64)
+
+    def _by_lines(self, readings: Tensor, a: Tensor) -> Tensor:
+        return self._posture(self._values(self.wiring.joints, readings.tolist()), a)

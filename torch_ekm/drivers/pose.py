@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from ..exceptions import ObjectLostError
+from ..plant import Observation, Plant, PlantStatus, PlantWrapper
+from ..sensing.vision.tracker import MarkerTracker
+from ..typing import Float, Tensor
+
+_POLL = 0.005  # [s]
+
+
+class Sighting(NamedTuple):
+    """The object as something saw it."""
+
+    position: Float[Tensor, " 3"]
+    """Object point o in the frame of the source [m]."""
+    rotation: Float[Tensor, "3 3"]
+    """Object frame to the source's frame."""
+    taken: float
+    """When the picture was taken, of ``time.monotonic()`` [s]."""
+    q: Float[Tensor, " n_q"] | None = None
+    """Joint angles, where they are seen, too: markers on the links [rad]."""
+    covariance: Float[Tensor, "6 6"] | None = None
+    """Of the error twist (v; w), hand axes [m, rad]."""
+
+
+class WithPose(PlantWrapper):
+    """A hand, and a source of the object's pose: what a control loop needs.
+
+    After each motion the source is asked until its sighting is newer than the encoders' reading. One that
+    sees nothing in time gives the last pose again, with its old stamp and the status NOT_SEEN.
+
+    Args:
+        plant: a driver.
+        source: gives the newest :class:`Sighting`, or None: not seen.
+        frame: pose of the source's frame in the hand frame ``(4, 4)`` [m]; None: the source uses the hand
+            frame.
+        patience: how long a new sighting is waited for [s].
+        lost: (sighting) -> True: the object is out of the hand. None: the source never says so.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        source: Callable[[], Sighting | None],
+        *,
+        frame: Float[Tensor, "4 4"] | None = None,
+        patience: float = 0.5,
+        lost: Callable[[Sighting], bool] | None = None,
+    ) -> None:
+        super().__init__(plant)
+        self.source, self.patience, self.lost = source, patience, lost
+        self.frame = torch.eye(4, dtype=torch.float64) if frame is None else frame.double()
+        self._last: Sighting | None = None
+
+    def reset(self, seed: int) -> Observation:
+        """Grasp, and see the object.
+
+        Raises:
+            ObjectLostError: the source does not see it.
+        """
+        self._last = None
+        return super().reset(seed)
+
+    def observation(self, seen: Observation) -> Observation:
+        """``seen`` with the object's pose, and joint angles if the source has them.
+
+        Raises:
+            ObjectLostError: it was never seen.
+        """
+        sighting, status = self._look(seen.taken.encoders), PlantStatus.HELD
+        if sighting is None:
+            sighting, status = self._last, PlantStatus.NOT_SEEN
+        if sighting is None:
+            raise ObjectLostError(
+                f"the object is not seen within {self.patience:g} s: look after camera, light, markers"
+            )
+        self._last = sighting
+        if self.lost is not None and self.lost(sighting):
+            status = PlantStatus.LOST
+        R, o = self.frame[:3, :3], self.frame[:3, 3]
+        info: dict[str, Any] = dict(seen.info)
+        if sighting.covariance is not None:
+            info["estimate"] = {"pose_covariance": sighting.covariance}
+        now = max(seen.time, time.monotonic())
+        changes: dict[str, Any] = {} if sighting.q is None else {"q": sighting.q}
+        stamps = seen.taken._replace(pose=min(sighting.taken, now))
+        if sighting.q is not None:
+            stamps = stamps._replace(joints=stamps.pose)
+            info.pop("sensed", None)
+        return dataclasses.replace(
+            seen,
+            position=R @ sighting.position.double() + o,
+            rotation=R @ sighting.rotation.double(),
+            status=status,
+            info=info,
+            time=now,
+            stamps=stamps,
+            **changes,
+        )
+
+    def _look(self, after: float) -> Sighting | None:
+        """One that is newer than ``after``; None: there was none in time."""
+        end = time.monotonic() + self.patience
+        while True:
+            sighting = self.source()
+            if sighting is not None and sighting.taken >= after:
+                return sighting
+            if time.monotonic() > end:
+                return None
+            time.sleep(_POLL)
+
+
+class MarkerPose:
+    """The object's pose by the marker boards on palm and object; a source for :class:`WithPose`.
+
+    Args:
+        grab: takes a picture ``(h, w)`` or ``(h, w, 3)``, uint8; None: the camera gave none.
+        tracker: knows lens and boards; its poses are in the hand frame.
+    """
+
+    def __init__(self, grab: Callable[[], np.ndarray | None], tracker: MarkerTracker) -> None:
+        self.grab, self.tracker = grab, tracker
+
+    def __call__(self) -> Sighting | None:
+        """The pose in a new picture; None: it does not show both boards."""
+        taken, image = time.monotonic(), self.grab()
+        track = self.tracker.track(image)
+        if not track.ok:
+            return None
+        return Sighting(*track.pose(), taken=taken, covariance=track.covariance)

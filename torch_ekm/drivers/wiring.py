@@ -1,0 +1,298 @@
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .._checks import check_positive
+from ..description import Actuator, HandDescription, load_hand
+from ..description._toml import TomlTable, read_toml
+from ..exceptions import DescriptionError, ParameterError
+
+_TABLES = ("hand", "bus", "motors", "joints", "fingertips", "limits")
+_HAND = ("driver", "description")
+_CHANNEL = ("name", "id", "sign", "zero", "per_rad")
+_MOTOR = (*_CHANNEL, "range", "range_deg")
+_FINGERTIP = ("name", "id", "count", "zero", "per_newton")
+_LIMITS = {"increment": math.radians(20), "rate": math.radians(60), "still": math.radians(0.2)}
+_SECONDS = {"still_for": 0.1, "timeout": 3.0, "period": 0.02}
+_HEADER = re.compile(r"^\s*(\[\[?)\s*([\w.-]+)\s*\]")
+_KEY = re.compile(r"""^\s*["']?([\w-]+)["']?\s*=""")
+_QUOTED = re.compile(r"'([\w-]+)'")
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One number of the bus, and the quantity that it stands for: ``bus = zero + sign per_unit value``."""
+
+    name: str
+    """Of the actuator, joint or pad in the description."""
+    id: int | str
+    """Servo's number, axis, place in a message, or name on the bus."""
+    sign: int = 1
+    zero: float = 0.0
+    """What the bus reads where the quantity is 0 [bus units]."""
+    per_unit: float = 1.0
+    """Bus units per rad or N."""
+    lower: float = -math.inf
+    """A motor is commanded to no less [rad]."""
+    upper: float = math.inf
+    count: int = 1
+    """A fingertip's force is the sum of so many taxels, the first at ``id``."""
+    line: int = 0
+    """Where it begins in the wiring file."""
+
+    def value(self, bus: float) -> float:
+        """What a reading means [rad, N]."""
+        return self.sign * (bus - self.zero) / self.per_unit
+
+    def bus(self, value: float) -> float:
+        """What is written for a position [rad]."""
+        return self.zero + self.sign * self.per_unit * value
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a driver allows, and when it calls a hand at rest; angles [rad], times [s].
+
+    Raises:
+        ParameterError: a figure is not positive.
+    """
+
+    increment: float = _LIMITS["increment"]
+    """Largest command to a motor; a larger one is refused."""
+    rate: float = _LIMITS["rate"]
+    """Of a motor [rad/s]."""
+    still: float = _LIMITS["still"]
+    """A hand rests when no motor moves more than this within ``still_for``."""
+    still_for: float = _SECONDS["still_for"]
+    timeout: float = _SECONDS["timeout"]
+    """A motion that takes longer, on top of its distance over ``rate``, never comes to rest."""
+    period: float = _SECONDS["period"]
+    """Between two messages of the slowest sensor; a reading older than two is stale."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            check_positive(name, value)
+
+
+class LinedTable(TomlTable):
+    """A table whose errors name the line: of the key that the problem quotes, else of the table's head."""
+
+    def __init__(
+        self, path: Path, place: str, data: Any, valid: Iterable[str], lines: dict[str, int]
+    ) -> None:
+        self.lines = lines
+        super().__init__(path, place, data, valid)
+
+    @property
+    def line(self) -> int:
+        """Of the table's head, from 1 on; 0: it has none."""
+        return self.lines.get("", 0)
+
+    def error(self, problem: str) -> DescriptionError:
+        named = (key for name in _QUOTED.findall(problem) for key in (name, f"{name}_deg"))
+        keys = (key for key in named if key in self.lines)
+        line = self.lines.get(next(keys, ""), 0)
+        return DescriptionError(f"{self.path}:{line}" if line else self.path, f"{self.place}: {problem}")
+
+    def whole(self, key: str, default: int, least: int = 0) -> int:
+        """A whole number of at least ``least``."""
+        value = self.number(key, default, minimum=least)
+        if value != int(value):
+            raise self.error(f"'{key}' must be a whole number, got {value:g}")
+        return int(value)
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """How a hand's motors and sensors are wired: its TOML file, read and checked.
+
+    Channels are in the order of the description. :meth:`read` makes one.
+    """
+
+    path: Path
+    driver: str
+    hand: HandDescription
+    motors: tuple[Channel, ...]
+    joints: tuple[Channel, ...]
+    """Of the joints that have a sensor."""
+    fingertips: tuple[Channel, ...]
+    """Of all pads, or none."""
+    limits: Limits
+    bus: LinedTable
+    """The table ``[bus]``, whose keys are the driver's."""
+    lines: dict[str, dict[str, int]]
+    """Line of each key of each table, such as ``lines["motors 2"]["sign"]``; "" is the table's head."""
+
+    @classmethod
+    def read(
+        cls,
+        path: str | Path,
+        driver: str,
+        per_rad: float,
+        bus: Iterable[str],
+        *,
+        named: bool = False,
+        hand: HandDescription | None = None,
+    ) -> Wiring:
+        """Read a wiring file.
+
+        Args:
+            path: of the TOML file.
+            driver: that it must be for.
+            per_rad: the bus's units per rad, where the file does not say.
+            bus: valid keys of ``[bus]``.
+            named: channels are called by names, not by numbers.
+            hand: its description; None: the one that the file names.
+
+        Raises:
+            DescriptionError: the file is missing or wrong; the message names line and remedy.
+        """
+        path = Path(path)
+        data = read_toml(path, "wiring file")
+        lines = _lines(path.read_text(encoding="utf-8"))
+        top = LinedTable(path, "file", data, _TABLES, {name: at.get("", 0) for name, at in lines.items()})
+        head = LinedTable(path, "[hand]", data.get("hand"), _HAND, lines.get("hand", {}))
+        if head.text("driver") != driver:
+            raise head.error(f"'driver' is '{head.text('driver')}', this is the driver '{driver}'")
+        if hand is None:
+            name = head.text("description")
+            beside = path.parent / name
+            hand = load_hand(beside if beside.suffix == ".urdf" else name)
+
+        def at(kind: str, k: int) -> dict[str, int]:
+            return lines.get(f"{kind} {k}", {})
+
+        def channel(kind: str, valid: tuple[str, ...], names: tuple[str, ...], unit: float) -> list[Channel]:
+            found = [
+                _channel(LinedTable(path, f"[[{kind}]]", one, valid, at(kind, k)), hand, names, named, unit)
+                for k, one in enumerate(_list(top, kind))
+            ]
+            for what in ("name", "id"):
+                _unique(path, kind, what, found, lines)
+            return sorted(found, key=lambda one: names.index(one.name))
+
+        motors = channel("motors", _MOTOR, hand.actuator_names, per_rad)
+        joints = channel("joints", _CHANNEL, hand.joint_names, per_rad)
+        pads = tuple(pad.name for pad in hand.pads)
+        fingertips = channel("fingertips", _FINGERTIP, pads, 1.0)
+        for kind, found, needed in (
+            ("motors", motors, hand.actuator_names),
+            ("fingertips", fingertips, pads),
+        ):
+            missing = [name for name in needed if name not in [one.name for one in found]]
+            if missing and (found or kind == "motors"):
+                raise DescriptionError(path, f"[[{kind}]]: there is none for {', '.join(missing)}")
+        valid = (*(f"{key}{end}" for key in _LIMITS for end in ("", "_deg")), *_SECONDS)
+        given = LinedTable(path, "[limits]", data.get("limits", {}), valid, lines.get("limits", {}))
+        figures = {key: given.angle(key, default) for key, default in _LIMITS.items()}
+        figures |= {key: given.number(key, default) for key, default in _SECONDS.items()}
+        try:
+            limits = Limits(**figures)
+        except ParameterError as error:
+            raise given.error(f"'{error.name}' must be {error.valid}, got {error.value}") from None
+        table = LinedTable(path, "[bus]", data.get("bus", {}), bus, lines.get("bus", {}))
+        return cls(path, driver, hand, tuple(motors), tuple(joints), tuple(fingertips), limits, table, lines)
+
+    def line(self, kind: str, name: str, key: str = "") -> int:
+        """Line of a key of the motor, joint or fingertip ``name``, or of its table's head; 0: it has none."""
+        head = next((one.line for one in getattr(self, kind) if one.name == name), 0)
+        tables = (at for place, at in self.lines.items() if place.startswith(f"{kind} "))
+        return next((at.get(key, head) for at in tables if at[""] == head), head)
+
+
+def driver_of(path: str | Path) -> str:
+    """Which driver a wiring file is for.
+
+    Raises:
+        DescriptionError: the file is missing or wrong.
+    """
+    data, path = read_toml(Path(path), "wiring file"), Path(path)
+    lines = _lines(path.read_text(encoding="utf-8")).get("hand", {})
+    return LinedTable(path, "[hand]", data.get("hand"), _HAND, lines).text("driver")
+
+
+def _list(top: LinedTable, kind: str) -> list[Any]:
+    found = top.data.get(kind, [])
+    if not isinstance(found, list):
+        raise top.error(f"'{kind}' must be written as [[{kind}]], a table for each")
+    return found
+
+
+def _channel(
+    table: LinedTable, hand: HandDescription, names: tuple[str, ...], named: bool, per_rad: float
+) -> Channel:
+    name = table.text("name")
+    if name not in names:
+        raise table.error(f"'name': the description has no '{name}'; it has: {', '.join(names)}")
+    table.place += f" '{name}'"
+    if not named and "id" not in table.data:
+        raise table.error("the key 'id' is missing")
+    sign = table.number("sign", 1)
+    if sign not in (1, -1):
+        raise table.error(f"'sign' must be 1 or -1, got {sign:g}")
+    lower, upper = -math.inf, math.inf
+    if names == hand.actuator_names:
+        lower, upper = _range(table, hand.actuators[names.index(name)])
+    return Channel(
+        name=name,
+        id=table.text("id", name) if named else table.whole("id", 0),
+        sign=int(sign),
+        zero=table.number("zero", 0.0),
+        per_unit=table.number(
+            "per_newton" if "per_newton" in table.data else "per_rad", per_rad, positive=True
+        ),
+        lower=lower,
+        upper=upper,
+        count=table.whole("count", 1, least=1),
+        line=table.line,
+    )
+
+
+def _range(table: LinedTable, own: Actuator) -> tuple[float, float]:
+    """Of a motor [rad]: that of the description, or a part of it."""
+    lower, upper = table.angles("range", 2, (own.lower, own.upper))
+    key = "range_deg" if "range_deg" in table.data else "range"
+    shown = [f"{math.degrees(x):.4g}" for x in (lower, upper, own.lower, own.upper)]
+    if lower >= upper:
+        raise table.error(f"'{key}' is turned round or empty, {shown[0]} to {shown[1]} deg")
+    if lower < own.lower - 1e-9 or upper > own.upper + 1e-9:
+        allowed = f"the description allows {shown[2]} to {shown[3]} deg"
+        raise table.error(f"'{key}' is {shown[0]} to {shown[1]} deg, {allowed}")
+    return lower, upper
+
+
+def _unique(path: Path, kind: str, what: str, found: list[Channel], lines: dict[str, dict[str, int]]) -> None:
+    first: dict[Any, Channel] = {}
+    for k, one in enumerate(found):
+        value = getattr(one, what)
+        if value in first:
+            line = lines.get(f"{kind} {k}", {}).get(what, one.line)
+            other = f"line {first[value].line}"
+            if what == "id":
+                other = f"'{first[value].name}', {other}"
+            problem = f"{what} {value!r} is that of {other}, too; each has its own"
+            raise DescriptionError(f"{path}:{line}", f"[[{kind}]] '{one.name}': {problem}")
+        first[value] = one
+
+
+def _lines(text: str) -> dict[str, dict[str, int]]:
+    """Table -> key -> line; entries of lists of tables are called "motors 0", "motors 1", ..."""
+    found: dict[str, dict[str, int]] = {}
+    count: dict[str, int] = {}
+    table = found.setdefault("", {})
+    for number, line in enumerate(text.splitlines(), 1):
+        if (head := _HEADER.match(line)) is not None:
+            name = head[2]
+            if head[1] == "[[":
+                found.setdefault(name, {"": number})
+                count[name] = count.get(name, -1) + 1
+                name = f"{name} {count[name]}"
+            table = found.setdefault(name, {"": number})
+        elif (key := _KEY.match(line)) is not None:
+            table.setdefault(key[1], number)
+    return found

@@ -1,0 +1,327 @@
+"""Whether a real hand is wired as its description says: found with motions of 1 deg, before anything else."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from ..description import HandDescription, ObjectDescription
+from ..drivers import Channel, Wiring
+from ..exceptions import EKMError, GraspError
+from ..kinematics import ActuationMap, HandKinematics
+from ..model import KinematicModel
+from ..plant import Observation, Plant, PlantStatus
+from ..typing import Array
+from .row import Check
+from .wirings import Mistake, Motion, Readings, WiringTest
+
+_DEG = math.pi / 180
+_STEPS = (0.1 * _DEG, 1 * _DEG, 2 * _DEG, 4 * _DEG)  # larger ones where dead zones swallow the smaller
+_MOVED, _STANDS = 0.9 * _DEG, 0.3 * _DEG
+_WILD = 4 * _DEG  # [rad] more than any of these commands may move
+_LOOKS = 20
+_FITS = 1.8  # times the tolerance
+_NEAR = 2.0  # of the best explanation's sum of squares: as good
+_FAR = 0.12  # [m] of an object from the middle of the pads
+_CLOCK = "Observation(time=time.monotonic(), ...) in the driver"
+_ANGLE = 0.3  # cosine between predicted and measured motion of the object
+
+
+def check_plant(
+    plant: Plant, description: HandDescription, object: ObjectDescription | None = None
+) -> list[Check]:
+    """Check the wiring of a hand: at rest first, then with motions of 1 deg, one motor after the other.
+
+    Found are: a wrong sign or unit, swapped motors or joints, a zero that is off by half a turn, a motor or
+    a sensor that is dead or constant, a clock that stands or is missing, float32, a pose in another frame.
+    Nothing moves while readings at rest contradict each other. Where dead zones swallow 1 deg, 2 and 4 deg
+    are tried; each motor goes back. While an object is held, motors that shape the hand rest.
+
+    Args:
+        plant: opened, and reset if it needs that. A :class:`~torch_ekm.drivers.HandDriver` inside it gives
+            the lines of its wiring file.
+        description: what the hand is.
+        object: what it holds; its pose is then checked, and signs where joints have no sensors.
+
+    Returns:
+        A row for each thing; with "error" where it must be mended, and how.
+    """
+    return list(_Checked(plant, description, object).rows())
+
+
+class _Checked:
+    def __init__(self, plant: Plant, hand: HandDescription, obj: ObjectDescription | None) -> None:
+        self.plant, self.hand, self.object = plant, hand, obj
+        self.wiring: Wiring | None = getattr(plant, "wiring", None)
+        self.free = ActuationMap(hand).free_motion.numpy()
+        self.looks: list[Observation] = []
+
+    def rows(self) -> Iterator[Check]:
+        try:
+            seen = self._look()
+        except EKMError as error:
+            yield Check("sensors", "error", str(error), "mend this first")
+            return
+        yield from self._clock(seen)
+        yield self._dtype(seen)
+        sensed = seen.info.get("sensed", self.hand.joint_names)
+        self.sensed = np.array([name in sensed for name in self.hand.joint_names])
+        self.test = WiringTest(self.hand, self.sensed, self._channel)
+        pose = self._place(seen)
+        yield from pose
+        a, q = self._mean()
+        readings = Readings(a, q)
+        if (self.test.misfit(readings) > _FITS).any():
+            yield from self._explained(readings)
+            return
+        blind = [n for n, told in zip(self.hand.actuator_names, self.test.rows, strict=True) if not told]
+        if blind and (self.object is None or seen.status is not PlantStatus.HELD):
+            mend = "look which way each goes, or hold an object, see it, and give its description"
+            yield Check(
+                "signs", "warning", f"not checked: no sensors at the joints of {', '.join(blind)}", mend
+            )
+        yield Check("at rest", "ok", f"encoders and {int(self.sensed.sum())} joint sensors agree")
+        motions, rows = self._motions(seen)
+        yield from rows
+        if motions and seen.dated and not self.looks[-1].time > seen.time:
+            yield Check("clock", "error", f"the clock stands at {seen.time:g} s", _CLOCK)
+        yield from self._constant(motions)
+        readings = Readings(a, q, motions)
+        if (self.test.misfit(readings) > _FITS).any():
+            yield from self._explained(readings)
+        elif not any(row.state == "error" for row in rows):
+            yield Check("wiring", "ok", f"{len(motions)} motors go as commanded, and joints with them")
+
+    # -- single readings ----------------------------------------------------------------------------
+
+    def _clock(self, seen: Observation) -> Iterator[Check]:
+        if not seen.dated:
+            yield Check(
+                "clock", "error", "readings have no date: guards against frozen sensors are off", _CLOCK
+            )
+        elif seen.time < self.looks[0].time:
+            yield Check("clock", "error", "the clock goes back", _CLOCK)
+        else:
+            yield Check("clock", "ok", f"{seen.time - self.looks[0].time:.3g} s for {_LOOKS} readings")
+
+    def _dtype(self, seen: Observation) -> Check:
+        kinds = {n: getattr(seen, n).dtype for n in ("q", "a", "position", "rotation")}
+        wrong = [name for name, kind in kinds.items() if kind != torch.float64]
+        if not wrong:
+            return Check("precision", "ok", "float64")
+        found = f"{', '.join(wrong)}: {str(kinds[wrong[0]]).removeprefix('torch.')}"
+        return Check("precision", "error", found, "torch.tensor(..., dtype=torch.float64) in the driver")
+
+    def _place(self, seen: Observation) -> list[Check]:
+        """The object is between the pads."""
+        if seen.status is not PlantStatus.HELD:
+            return [
+                Check("pose", "warning", "the object is not seen: its pose is not checked", "WithPose(...)")
+            ]
+        mend = "give WithPose(frame=<pose of the camera's frame in the hand frame>), or mend it"
+        links = HandKinematics(self.hand)(seen.q.double())
+        points = []
+        for pad in self.hand.pads:
+            pose, middle = links.of(pad.link), (np.array(pad.start) + pad.end) / 2
+            points.append(pose[:3, :3] @ torch.from_numpy(middle) + pose[:3, 3])
+        points = torch.stack(points)
+        away = float(torch.linalg.vector_norm(points - seen.position.double(), dim=-1).min())
+        if away > _FAR:
+            found = (
+                f"the object is {1e3 * away:.0f} mm away from the nearest pad: the pose is in another frame"
+            )
+            return [Check("pose", "error", f"{found}, or in mm", mend)]
+        if self.object is None:
+            return [Check("pose", "ok", f"the object is {1e3 * away:.0f} mm from the nearest pad")]
+        try:
+            self.model.linearize(_double(seen).state)
+        except GraspError as error:
+            return [Check("pose", "error", f"no grasp at this pose: {error}", mend)]
+        return [Check("pose", "ok", "pads touch the object where the pose has it")]
+
+    @property
+    def model(self) -> KinematicModel:
+        assert self.object is not None
+        return KinematicModel(self.hand, self.object)
+
+    # -- motions ------------------------------------------------------------------------------------
+
+    def _motions(self, seen: Observation) -> tuple[tuple[Motion, ...], list[Check]]:
+        motions, rows, jacobian = [], [], None
+        held = seen.status is PlantStatus.HELD
+        if held and self.object is not None:
+            with contextlib.suppress(GraspError):  # said already
+                lin = self.model.linearize(_double(seen).state)
+                eye = torch.eye(self.hand.n_a, dtype=torch.float64)
+                jacobian = torch.stack([lin.step(one) for one in eye], dim=1).numpy()
+        gain = jacobian[: self.hand.n_q] if jacobian is not None else None if held else self.free
+        along: list[tuple[Array, Array]] = []
+        for i, actuator in enumerate(self.hand.actuators):
+            if held and actuator.posture:
+                continue
+            try:
+                motion, row, pose = self._motion(i)
+            except EKMError as error:
+                rows.append(
+                    Check(f"motor '{actuator.name}'", "error", str(error), self._mend("motors", i, ""))
+                )
+                break
+            rows += [row] if row is not None else []
+            if motion is None:
+                continue
+            if jacobian is not None:
+                predicted = jacobian[-6:] @ motion.a
+                along.append((predicted, pose))
+                rows += self._by_pose(i, predicted, pose)
+            motions.append(replace(motion, gain=gain))
+            if (
+                row is not None
+                or max(np.abs(motion.a).max(), np.abs(motion.q[self.sensed]).max(initial=0)) > 2 * _WILD
+            ):
+                break
+        if along and not any(row.state == "error" for row in rows):
+            rows += self._frame(along)
+        return tuple(motions), rows
+
+    def _motion(self, i: int) -> tuple[Motion | None, Check | None, Array]:
+        """A motor goes as little as shows, and back; what speaks against it at once."""
+        before = self._look()
+        a0, q0 = self._mean()
+        name, upper = f"motor '{self.hand.actuator_names[i]}'", self.hand.actuator_upper[i]
+        sign = 1.0 if upper - a0[i] > 2 * _STEPS[-1] else -1.0
+        delta = torch.zeros(self.hand.n_a, dtype=torch.float64)
+        for step in _STEPS:
+            delta[i] = sign * step
+            self.plant.command(delta)
+            after = self._look()
+            a1, q1 = self._mean()
+            noise = torch.stack([o.q.double() for o in self._last]).std(0).numpy() * math.sqrt(2 / _LOOKS)
+            motion = Motion(a1 - a0, q1 - q0, None, noise)
+            most = np.abs(np.concatenate([motion.a, motion.q[self.sensed]])).max()
+            if abs(motion.a[i]) > _MOVED or most > _WILD:
+                break
+        pose = _double(after).state.minus(_double(before).state)[-6:].numpy()
+        went, others = motion.a[i] * sign, np.where(np.arange(len(a0)) == i, 0, np.abs(motion.a))
+        k, row = int(np.argmax(others)), None
+        if others[k] > max(_MOVED, abs(went)):
+            found = f"encoder '{self.hand.actuator_names[k]}' moves in its place: two motors are swapped"
+            row = Check(name, "error", found, self._mend("motors", i, "id"))
+        elif went < -_STANDS:
+            found = f"its encoder went {went / _DEG:.3g} deg where {step / _DEG:.3g} deg were commanded"
+            found += ": the sign of commands or of the encoder is wrong"
+            row = Check(name, "error", found, self._mend("motors", i, "sign"))
+        elif went > 3 * step + _MOVED:
+            found = f"its encoder went {went / _DEG:.3g} deg where {step / _DEG:.3g} deg were commanded"
+            row = Check(
+                name, "error", f"{found}: commands have another unit", self._mend("motors", i, "per_rad")
+            )
+        elif went < _STANDS:
+            moved = np.abs(self.hand.actuation_jacobian[i] @ motion.q) > _MOVED and self.test.rows[i]
+            found = "its encoder stands still while its joints move" if moved else "it does not move"
+            row = Check(name, "error", f"{found} (4 deg commanded)", self._mend("motors", i, "id"))
+            return None, row, pose
+        if row is None:
+            delta[i] = -motion.a[i]
+            self.plant.command(delta)
+        return motion, row, pose
+
+    def _by_pose(self, i: int, predicted: Array, pose: Array) -> list[Check]:
+        """Where no joint tells a motor's sign, the object does."""
+        if self.test.rows[i] or self._cosine(predicted, pose) > -0.5:
+            return []
+        found = "the object moves against what the model predicts: sign reversed"
+        name = f"motor '{self.hand.actuator_names[i]}'"
+        return [Check(name, "error", found, self._mend("motors", i, "sign"))]
+
+    def _frame(self, along: list[tuple[Array, Array]]) -> list[Check]:
+        predicted, pose = (np.concatenate(list(part)) for part in zip(*along, strict=True))
+        cosine = self._cosine(predicted, pose)
+        if cosine > _ANGLE:
+            return [Check("pose's motions", "ok", f"as the model predicts (cosine {cosine:.2f})")]
+        found = f"the object moves otherwise than the model predicts (cosine {cosine:.2f}): another frame"
+        return [Check("pose's motions", "error", found, "give WithPose(frame=...), or mend it")]
+
+    @staticmethod
+    def _cosine(predicted: Array, pose: Array) -> float:
+        scale = np.tile([50.0] * 3 + [1.0] * 3, len(pose) // 6)  # 20 mm is a radian
+        x, y = predicted * scale, pose * scale
+        return float(x @ y / max(np.linalg.norm(x) * np.linalg.norm(y), 1e-12))
+
+    # -- what explains it ---------------------------------------------------------------------------
+
+    def _explained(self, readings: Readings) -> Iterator[Check]:
+        """The single mistake that explains what was read, or those that explain it alike."""
+        found: list[tuple[float, Mistake]] = []
+        for mistake in self.test.mistakes(readings):
+            misfit = self.test.misfit(mistake.readings)
+            if (misfit <= _FITS).all():
+                found.append((float(np.square(misfit).sum()) + mistake.penalty, mistake))
+        if not found:
+            yield self._unexplained(readings)
+            return
+        least = min(score for score, _ in found)
+        for _, one in sorted((pair for pair in found if pair[0] <= least + _NEAR), key=lambda pair: pair[0]):
+            at = [getattr(self.hand, _NAMES[one.kind]).index(name) for name in one.names]
+            mend = "; ".join(self._mend(one.kind, k, one.key) for k in at)
+            name = f"{one.kind[:-1]} " + " and ".join(f"'{name}'" for name in one.names)
+            yield Check(name, "error", one.what, mend)
+
+    def _unexplained(self, readings: Readings) -> Check:
+        off = readings.a - self.hand.actuator_offset - self.hand.actuation_jacobian @ readings.q
+        i = int(np.argmax(np.where(self.test.rows, np.abs(off), 0)))
+        name = self.hand.actuator_names[i]
+        found = (
+            f"its encoder and the sensors of its joints differ by {off[i] / _DEG:.3g} deg, or move otherwise"
+        )
+        mend = self._mend("motors", i, "zero") + ", or the zeros of its joints; several entries may be wrong"
+        return Check(f"motor '{name}'", "error", found, mend)
+
+    def _constant(self, motions: tuple[Motion, ...]) -> Iterator[Check]:
+        """Joint sensors that read the same, bit by bit, while motors moved: left out from here on."""
+        moves = np.zeros(self.hand.n_q)
+        for motion in motions:
+            moves = np.maximum(moves, np.abs(self.free @ motion.a))
+        read = torch.stack([seen.q for seen in self.looks])
+        dead = (read == read[0]).all(0).numpy() & self.sensed & (moves > _STANDS)
+        for j in np.flatnonzero(dead):
+            found = "its sensor reads the same, bit by bit, while its motor moves"
+            mend = self._mend("joints", int(j), "id") + ", or its cable"
+            yield Check(f"joint '{self.hand.joint_names[j]}'", "error", found, mend)
+        self.test = WiringTest(self.hand, self.sensed & ~dead, self._channel)
+
+    # -- inside -------------------------------------------------------------------------------------
+
+    def _look(self) -> Observation:
+        self._last = [self.plant.observe() for _ in range(_LOOKS)]
+        self.looks += self._last
+        return self._last[-1]
+
+    def _mean(self) -> tuple[Array, Array]:
+        """Of the last looks: a, q [rad]."""
+        a, q = (torch.stack([getattr(o, name).double() for o in self._last]).mean(0) for name in "aq")
+        return a.numpy(), q.numpy()
+
+    def _channel(self, kind: str, i: int) -> Channel | None:
+        if self.wiring is None:
+            return None
+        name = getattr(self.hand, _NAMES[kind])[i]
+        return next((one for one in getattr(self.wiring, kind) if one.name == name), None)
+
+    def _mend(self, kind: str, i: int, key: str) -> str:
+        name = getattr(self.hand, _NAMES[kind])[i]
+        if self.wiring is None:
+            return f"{key or 'wiring'} of '{name}' in the driver"
+        return f"{self.wiring.path}:{self.wiring.line(kind, name, key)}: {key or 'wiring'} of '{name}'"
+
+
+_NAMES = {"motors": "actuator_names", "joints": "joint_names"}
+
+
+def _double(seen: Observation) -> Observation:
+    parts = {name: getattr(seen, name).double() for name in ("q", "a", "position", "rotation")}
+    return replace(seen, **parts)
