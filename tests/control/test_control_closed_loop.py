@@ -8,7 +8,7 @@ import threading
 
 import pytest
 import torch
-from fakes import FakePlant
+from fakes import FakePlant, HoldingPlant
 from obedient_plant import watched
 
 from torch_ekm.control import (
@@ -350,3 +350,37 @@ def test_a_time_out_is_a_reason_of_its_own(held) -> None:
     assert not done.steps
     with pytest.raises(ParameterError, match="max_seconds"):
         dataclasses.replace(RULE, max_seconds=0)
+
+
+class Overshooting(HoldingPlant):
+    """The object turns for four motions, then comes back; motions that are undone turn it forth again."""
+
+    ANGLES = (0.0, 3.0, 6.0, 8.0, 9.0, 7.0, 7.1, 6.0, 6.1, 6.0, 6.1)
+
+    def __init__(self, seen: Observation, axis: torch.Tensor) -> None:
+        super().__init__(dataclasses.replace(seen, fingertip_force=None))
+        self.axis, self.way, self.rotation = axis, [], seen.rotation
+
+    def move(self, delta_a: torch.Tensor) -> None:
+        super().move(delta_a)
+        undone = self.way and torch.allclose(self.way[-1], -delta_a, atol=1e-9)
+        self.way = self.way[:-1] if undone else [*self.way, delta_a]
+
+    @property
+    def turned(self) -> float:
+        return self.ANGLES[min(len(self.way), 10)]
+
+    def observe(self) -> Observation:
+        return self.reading(rotation=exp(self.turned * DEG * self.axis) @ self.rotation)
+
+
+def test_a_turn_that_stalls_returns_to_its_best_state(held) -> None:
+    seen, axis, controller = held
+    plant = Overshooting(seen, axis)
+    rule = StoppingRule(max_steps=12, stall_window=5)
+    done = ClosedLoop(plant, controller, safety=Safety(rule=rule)).run(
+        PoseTarget.turned(seen.state, axis, degrees=20)
+    )
+    assert done.reason is Reason.STALLED
+    assert max(plant.ANGLES) - plant.turned < 1.0  # two tolerances
+    assert len(plant.commands) == len(done.steps) > len(plant.way)

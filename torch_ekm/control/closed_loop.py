@@ -219,11 +219,14 @@ class ClosedLoop:
             watch.grip.forget()
             if weak and progress.halt is None and not progress.lost(seen):
                 return Stop(StopReason.WEAK_GRASP, seen, weak)
+        decision = None
         while True:
             over = progress.over(seen, self._stop.is_set())
             if over is not None:
                 if progress.halt is not None:
                     self.hold()
+                elif over.reason is StopReason.STALLED:
+                    seen = yield from self._return_to_best(seen, decision, progress, watch)
                 return Stop(over.reason, seen, over.message)
             seen, decision, sign, seconds = self._decide(seen, progress, watch)
             if sign and progress.way and decision.status is not StopReason.OBJECT_LOST:
@@ -245,7 +248,7 @@ class ClosedLoop:
             if progress.halt is not None:
                 continue
             step = self._move(seen, decision, progress, watch, seconds)
-            progress.way.append(step.after.a - seen.a)
+            progress.come(step.after, step.after.a - seen.a)
             yield step
             seen, progress.limited = step.after, decision.limited
 
@@ -300,6 +303,17 @@ class ClosedLoop:
             if not sign:
                 return seen, True
         return seen, False
+
+    def _return_to_best(
+        self, seen: Observation, decision: Decision | None, progress: Progress, watch: Watch
+    ) -> Generator[Step, None, Observation]:
+        """Undo the motions that led away from where the object was nearest to its target."""
+        while decision is not None and progress.strayed(seen) and progress.halt is None:
+            back = self.controller.retreat(decision, -progress.way.pop())
+            step = self._move(seen, back, progress, watch)
+            yield step
+            seen = step.after
+        return seen
 
     def _move(
         self,

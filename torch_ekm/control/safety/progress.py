@@ -14,6 +14,8 @@ from .safety import Objection, Safety
 
 _LEAP = math.radians(4)  # of a pose beyond what was predicted, where nothing else has changed: worth a word
 
+_STRAYED = 2.0  # tolerances of the error by which a turn that stalls has left its best state
+
 
 class Progress:
     """Errors, motions and alarms of one manipulation, judged by :class:`~torch_ekm.control.Safety`.
@@ -42,6 +44,7 @@ class Progress:
         """|e| before each motion and after the last [unit of the focus]."""
         self.way: list[Tensor] = []
         """What the encoders did [rad], motion by motion, without what was undone."""
+        self._best = self.errors[0], 0  # the smallest of them, and the motions until then
         self._start, self._started = seen.state, started
         self._off_allowed = safety.caution.off_rotation
         # links without a pad that bear on the object at the start
@@ -109,6 +112,20 @@ class Progress:
                 f"in motion {len(self.errors) - 1} {note}: if the camera was moved, or took one marker for "
                 "another, the target is off by as much"
             )
+
+    def come(self, after: Observation, moved: Tensor) -> None:
+        """One more motion that counts, of the encoders by ``moved`` [rad]."""
+        self.way.append(moved)
+        error = self.focus.error(self.target, after.state)
+        if error < self._best[0]:
+            self._best = error, len(self.way)
+
+    def strayed(self, seen: Observation) -> bool:
+        """The object was nearer to its target by more than two tolerances, and that motion is not undone yet."""
+        least, motions = self._best
+        error = self.focus.error(self.target, seen.state)
+        further = error > least + _STRAYED * self.safety.rule.tolerance
+        return further and len(self.way) > motions and seen.status is PlantStatus.HELD
 
     def _off_rotation(self, seen: Observation) -> float:
         """Of the object off the focus since the start [rad]."""
