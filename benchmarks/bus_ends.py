@@ -78,6 +78,7 @@ def publish(end: End) -> None:
 
 
 def main() -> None:
+    sys.setswitchinterval(5e-4)  # the simulation must not keep the bus from answering
     end = End(sys.argv[1], "motors" in sys.argv)
     if sys.argv[1] == "ros2":
         publish(end)
