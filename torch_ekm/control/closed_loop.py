@@ -378,11 +378,7 @@ class ClosedLoop:
         return enhanced.update(seen.state, expected.moved, ds, nominal)
 
     def _disagreement(
-        self,
-        lin: Linearization,
-        ds: Tensor,
-        expected: Expectation,
-        felt: ForceSurprise | None = None,
+        self, lin: Linearization, ds: Tensor, expected: Expectation, felt: ForceSurprise | None = None
     ) -> float:
         """rho of a motion, see :class:`~torch_ekm.control.TrustRegion`."""
         trust = self.controller.pace.options.trust

@@ -32,7 +32,7 @@ class StopReason(Enum):
     STOPPED = "stopped"
     """By :meth:`ClosedLoop.stop`, or by Ctrl-C."""
     PLANT_FAILED = "plant failed"
-    """It raised :attr:`Stop.cause`: its bus, a sensor, a reading of the wrong length."""
+    """It raised ``Stop.cause``: its bus, a sensor, a reading of the wrong length."""
     WRONG_WAY = "wrong way"
     """See :attr:`~torch_ekm.control.Guards.wrong_way`."""
     STALE_SENSOR = "stale sensor"

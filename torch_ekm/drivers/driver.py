@@ -55,7 +55,7 @@ class HandDriver(ABC):
       the motion before it.
 
     The object is ``NOT_SEEN``, at the origin: :class:`WithPose` adds its pose. Joints without a sensor are
-    estimated (:class:`~torch_ekm.drivers.posture.Posture`).
+    estimated from encoders, couplings and springs: as of a hand that touches nothing.
 
     Args:
         wiring: channels and limits.

@@ -17,6 +17,8 @@ T = TypeVar("T")
 _TICKS = 4096 / (2 * math.pi)  # per rad
 _VELOCITY = 0.229 * 2 * math.pi / 60  # [rad/s] of a unit of Profile Velocity
 _WATCHDOG_MS = 80
+_TRIES = 2  # of a question
+_PATIENCE_MS = 100.0  # for an answer, where the SDK's 34 ms are less: both ends may share a busy machine
 # control table of the X series: (address, bytes)
 _MODE, _TORQUE, _HARDWARE, _WATCHDOG = (11, 1), (64, 1), (70, 1), (98, 1)
 _CURRENT, _PROFILE, _GOAL = (102, 2), (112, 4), (116, 4)
@@ -26,11 +28,22 @@ _FAULTS = {0: "the voltage is wrong", 2: "overheated", 3: "the encoder is dead",
 _BUS = ("port", "baud", "mode", "current_ma")
 
 
+def _patient(sdk: Any) -> type[Any]:
+    """The SDK's port, which waits longer for an answer."""
+
+    class PatientPort(sdk.PortHandler):
+        def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802 (the SDK's name)
+            super().setPacketTimeout(packet_length)
+            self.packet_timeout = max(self.packet_timeout, _PATIENCE_MS)
+
+    return PatientPort
+
+
 class DynamixelPlant(HandDriver):
     """A hand on Dynamixel servos of the X series, protocol 2: Yale OpenHand, LEAP, most student hands.
 
     One tick is 2 pi/4096 rad. During a motion the servos' own Bus Watchdog is set to 80 ms: they stop if
-    this process dies. A read that fails is tried once more. ``info["load"]`` is the current [2.69 mA].
+    this process dies. A question without an answer is asked once more. ``info["load"]`` is the current [2.69 mA].
 
     Args:
         wiring: the TOML file; ``[bus]``: ``port``, ``baud`` (57600), ``mode`` (5: current-based position; 3,
@@ -50,7 +63,7 @@ class DynamixelPlant(HandDriver):
         self._sdk, self._packets = sdk, sdk.PacketHandler(2.0)
         self._ids: list[int] = [int(one.id) for one in self.wiring.motors]
         self.port = bus.text("port")
-        baud, self._handler = bus.whole("baud", 57600), sdk.PortHandler(self.port)
+        baud, self._handler = bus.whole("baud", 57600), _patient(sdk)(self.port)
         with self._told(), contextlib.redirect_stdout(None):
             if not self._handler.setBaudRate(baud):
                 raise bus.error(f"'baud' {baud} is none of the SDK's, such as 57600, 1000000, 4000000")
@@ -81,7 +94,7 @@ class DynamixelPlant(HandDriver):
     # -- what HandDriver asks for -------------------------------------------------------------------
 
     def _read(self) -> BusReading:
-        taken, found = self._twice(self._state)
+        taken, found = self._again(self._state)
         return BusReading(
             motors=[int.from_bytes(one[10:14], "little", signed=True) for one in found],
             taken=taken,
@@ -104,7 +117,7 @@ class DynamixelPlant(HandDriver):
 
     def _cut_short(self) -> bool:
         """The watchdog of a servo has run out: this process was asleep."""
-        return any(one[0] == 255 for one in self._twice(lambda: self._sync_read(*_WATCHDOG)))
+        return any(one[0] == 255 for one in self._again(lambda: self._sync_read(*_WATCHDOG)))
 
     def _release(self) -> None:
         with contextlib.suppress(Exception):
@@ -151,7 +164,7 @@ class DynamixelPlant(HandDriver):
             self._check(result, f"servo {servo}")
             self._healthy(servo, error)
 
-        self._twice(write)
+        self._again(write)
 
     def _get(self, servo: int, place: tuple[int, int]) -> int:
         def read() -> int:
@@ -159,11 +172,11 @@ class DynamixelPlant(HandDriver):
             self._check(result, f"servo {servo}")
             return int.from_bytes(bytes(data), "little")
 
-        return self._twice(read)
+        return self._again(read)
 
     def _ping(self, servo: int, what: str) -> None:
         try:
-            self._twice(lambda: self._check(self._packets.ping(self._handler, servo)[1], what))
+            self._again(lambda: self._check(self._packets.ping(self._handler, servo)[1], what))
         except BusError as error:
             problem = f"{error.problem}; is it powered, is its baud rate that of [bus], has it this id?"
             raise BusError(what, problem) from error
@@ -188,13 +201,13 @@ class DynamixelPlant(HandDriver):
         if result != sdk.COMM_SUCCESS:
             raise BusError(what, self._packets.getTxRxResult(result))
 
-    def _twice(self, ask: Callable[[], T]) -> T:
-        try:
-            with self._told():
+    def _again(self, ask: Callable[[], T]) -> T:
+        """What a question brings; one without an answer, or with a spoilt one, is asked again."""
+        for _ in range(_TRIES - 1):
+            with contextlib.suppress(BusError), self._told():
                 return ask()
-        except BusError:
-            with self._told():
-                return ask()
+        with self._told():
+            return ask()
 
     @contextlib.contextmanager
     def _told(self) -> Iterator[None]:

@@ -1,0 +1,18 @@
+"""A turn over a bus is the turn of the same hand in process."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import drivers as module  # of benchmarks/
+import pytest
+
+pytest.importorskip("sapien")
+
+
+@pytest.mark.parametrize("bus", module.BUSES, ids=lambda bus: bus.kind)
+def test_the_same_hand_behind_a_bus_makes_the_same_turn(bus, tmp_path) -> None:
+    if find_spec(bus.needs) is None:
+        pytest.skip(f"{bus.needs} is not installed")
+    agree, _ = module.turns(bus, tmp_path, 3)
+    assert agree >= 1  # on a busy machine the emulated hand keeps its own bus waiting: typed stops
