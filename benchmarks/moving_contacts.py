@@ -177,8 +177,8 @@ class Comparison:
                 km, step = (np.array([one[key] for one in group]) for key in ("km", "step"))
                 rows.append([name, len(group), *_pair(km), *_pair(step)])
         columns = [
-            "motions", "n", Column("KM, median [deg]", ".3f"), Column("rms", ".3f"),
-            Column("step, median [deg]", ".3f"), Column("rms", ".3f"),
+            "motions", "n", Column("KM, median [deg]", ".3f"), Column("KM, rms [deg]", ".3f"),
+            Column("step, median [deg]", ".3f"), Column("step, rms [deg]", ".3f"),
         ]  # fmt: skip
         note = "Error of the object's rotation, all axes, after one motion; hand as described, true states."
         return Table("steps", "One motion", columns, rows, note)
@@ -195,8 +195,8 @@ class Comparison:
                 ]
                 rows.append([object_name(name) if name != "all" else name, len(every), *cells])
         columns = [
-            "object", "turns", Column("rollout, median [deg]", ".2f"), Column("largest", ".2f"),
-            Column("step, median [deg]", ".2f"), Column("largest", ".2f"),
+            "object", "turns", Column("rollout, median [deg]", ".2f"), Column("rollout, largest [deg]", ".2f"),
+            Column("step, median [deg]", ".2f"), Column("step, largest [deg]", ".2f"),
         ]  # fmt: skip
         note = (
             "Error of the rotation, all axes, at the end of a turn of 9 to 25 motions, foreseen from its"
@@ -221,7 +221,7 @@ class Comparison:
         note = (
             f"A motion slips where a pad slides by more than {1e3 * SLIP:.2f} mm; nothing slid: less than"
             f" {1e3 * STILL:.2f} mm. Announced: the KM's margin after it is below -{RELEASE} N; a step"
-            f" slides by more than {1e3 * _SLIDES:.3f} mm. Readings with noise but of the hand as described."
+            f" slides by more than {1e3 * _SLIDES:.3f} mm. The sensed and the nominal hand give noisy readings."
         )
         return Table("slips", "Slips announced one motion ahead", columns, rows, note)
 

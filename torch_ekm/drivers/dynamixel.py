@@ -43,7 +43,8 @@ class DynamixelPlant(HandDriver):
     """A hand on Dynamixel servos of the X series, protocol 2: Yale OpenHand, LEAP, most student hands.
 
     One tick is 2 pi/4096 rad. During a motion the servos' own Bus Watchdog is set to 80 ms: they stop if
-    this process dies. A question without an answer is asked once more. ``info["load"]`` is the current [2.69 mA].
+    this process dies. A question without an answer is asked once more. ``info["load"]`` is the current
+    [2.69 mA].
 
     Args:
         wiring: the TOML file; ``[bus]``: ``port``, ``baud`` (57600), ``mode`` (5: current-based position; 3,

@@ -121,7 +121,7 @@ class Progress:
             self._best = error, len(self.way)
 
     def strayed(self, seen: Observation) -> bool:
-        """The object was nearer to its target by more than two tolerances, and that motion is not undone yet."""
+        """The object was nearer to its target by more than two tolerances, by motions that are not undone."""
         least, motions = self._best
         error = self.focus.error(self.target, seen.state)
         further = error > least + _STRAYED * self.safety.rule.tolerance
