@@ -195,7 +195,8 @@ class Comparison:
                 ]
                 rows.append([object_name(name) if name != "all" else name, len(every), *cells])
         columns = [
-            "object", "turns", Column("rollout, median [deg]", ".2f"), Column("rollout, largest [deg]", ".2f"),
+            "object", "turns",
+            Column("rollout, median [deg]", ".2f"), Column("rollout, largest [deg]", ".2f"),
             Column("step, median [deg]", ".2f"), Column("step, largest [deg]", ".2f"),
         ]  # fmt: skip
         note = (
@@ -221,7 +222,7 @@ class Comparison:
         note = (
             f"A motion slips where a pad slides by more than {1e3 * SLIP:.2f} mm; nothing slid: less than"
             f" {1e3 * STILL:.2f} mm. Announced: the KM's margin after it is below -{RELEASE} N; a step"
-            f" slides by more than {1e3 * _SLIDES:.3f} mm. The sensed and the nominal hand give noisy readings."
+            f" slides by more than {1e3 * _SLIDES:.3f} mm. Sensed and nominal hands give noisy readings."
         )
         return Table("slips", "Slips announced one motion ahead", columns, rows, note)
 
