@@ -7,6 +7,7 @@ because the witness points of a distance query jump along a line of contact.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -209,6 +210,10 @@ class ContactDetector:
             pinned=tuple(c.pinned for c in contacts),
             near_misses=tuple(missed),
         )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Made again from its arguments: coal's shapes can be neither copied nor pickled."""
+        return ContactDetector, (self.hand, self.obj, self.margin, self.kinematics)
 
     def __repr__(self) -> str:
         return f"ContactDetector('{self.hand.name}', '{self.obj.name}', margin={self.margin})"
