@@ -129,7 +129,8 @@ def solve(problem: StepProblem, lam: Array, t: Array) -> StepSolution | None:
         count += used
         if found is not None:
             return found._replace(iterations=count)
-        split = _split(problem, lam, t, _RHO_SPLITTING[attempt % len(_RHO_SPLITTING)])
+        with np.errstate(over="ignore", invalid="ignore"):  # it may diverge where D is indefinite
+            split = _split(problem, lam, t, _RHO_SPLITTING[attempt % len(_RHO_SPLITTING)])
         count += _SPLITTING
         if np.isfinite(split[1]).all():
             z, lam, t = split
