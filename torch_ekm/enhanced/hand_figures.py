@@ -66,6 +66,10 @@ class DescribedFigures(Recorded, nn.Module):
     def solve(self, equations: MotionEquations) -> None:
         """J_m is the description's."""
 
+    def present(self, described: Drives) -> tuple[Float[Tensor, " n_q"], Drives]:
+        """The description's."""
+        return described.actuation.new_zeros(described.actuation.shape[-1]), described
+
     def learn(self, lin: Linearization, moved: Tensor, increment: Tensor) -> None:
         """Does nothing."""
 
@@ -144,7 +148,15 @@ class HandFigures(ParameterFilter):
             of, mean, motion = self._solved
             if of is equations and torch.equal(mean, self.mean):
                 return motion
-        described = equations.reduction.drives
+        try:
+            motion = equations.solve(*self.present(equations.reduction.drives))
+        except GraspError:
+            motion = None
+        self._solved = equations, self.mean.clone(), motion
+        return motion
+
+    def present(self, described: Drives) -> tuple[Float[Tensor, " n_q"], Drives]:
+        """Change of the springs against the description [N m/rad] and the drives, both as known now."""
         values = (self._described * self.factors).to(described.actuation)
         springs, arms, stiffness = (values[self._kind == k] for k in range(len(KINDS)))
         J_a = described.actuation.index_put(self._at[1], arms) if len(arms) else described.actuation
@@ -154,12 +166,7 @@ class HandFigures(ParameterFilter):
         change = J_a.new_zeros(J_a.shape[-1])
         if len(springs):
             change[self._at[0]] = springs - self._described[self._kind == 0].to(change)
-        try:
-            motion = equations.solve(change, Drives(J_a, K_a))
-        except GraspError:
-            motion = None
-        self._solved = equations, self.mean.clone(), motion
-        return motion
+        return change, Drives(J_a, K_a)
 
     @torch.no_grad()
     def learn(

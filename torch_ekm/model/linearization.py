@@ -17,6 +17,7 @@ from ..typing import Bool, Float, Tensor
 from .grasp_forces import ExpectedForces, GraspForces, drift, friction_use, margin_std, start_covariance
 from .motion_equations import Motion, MotionEquations
 from .options import ModelOptions
+from .reduction import Drives
 from .validity import Doubt, ModelStatus
 
 
@@ -188,6 +189,10 @@ class FollowedFigures(Protocol):
 
     def solve(self, equations: MotionEquations) -> Motion | None:
         """J_m with the present figures; None: that of the description holds."""
+
+    def present(self, described: Drives) -> tuple[Tensor, Drives]:
+        """Change of the springs against the description [N m/rad], and the drives."""
+        ...
 
     def learn(self, lin: Linearization, moved: Tensor, increment: Tensor) -> object:
         """Learn from one motion."""

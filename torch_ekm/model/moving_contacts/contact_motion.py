@@ -116,6 +116,8 @@ class ContactMotion:
     ``a`` nothing is remembered: encoders and joints give the forces of compliant actuators, gaps are those of
     the detector. The first is for a hand that is not quite as described, the second for one that is.
 
+    A model that follows figures of the hand moves with those that are known when the motion begins.
+
     With a detector of one's own only what it reports can touch. Joints locked by name are free here.
 
     Args:
@@ -134,7 +136,12 @@ class ContactMotion:
         self, model: GraspModel, start: Linearization, *, a: Float[Tensor, " n_a"] | None = None
     ) -> None:
         self.model, self.state = model, start.state
-        self._laws = laws = HandLaws(model)
+        drives = model.reduction.drives
+        self._springs = torch.zeros(model.hand.n_q, dtype=torch.float64)
+        figures, equations = model.figures, start.equations
+        if figures is not None and equations is not None and figures.solve(equations) is not None:
+            self._springs, drives = figures.present(drives)
+        self._laws = laws = HandLaws(model, drives)
         self._placed: PlacedGrasp | None = None
         self.loads = _loads(start)
         if a is not None:
@@ -329,7 +336,7 @@ class ContactMotion:
             contacts = detector.near(poses, state.position, state.rotation, NEAR)
         else:
             contacts = detector(state.q, state.position, state.rotation)
-        return PlacedGrasp(model, state, contacts, poses)
+        return PlacedGrasp(model, state, contacts, poses, self._springs)
 
     def _why(self) -> GraspEndsError:
         """What ends the grasp, as it stands now."""

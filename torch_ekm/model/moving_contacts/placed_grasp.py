@@ -16,6 +16,7 @@ from ...kinematics.grasp_state import GraspState
 from ...kinematics.link_poses import Kinematics, LinkPoses
 from ...kinematics.se3 import hat
 from ...typing import Array, Tensor
+from ..linearization import FollowedFigures
 from ..options import ModelOptions
 from ..reduction import Reduction
 from ..sensitivity import normal_motion
@@ -32,6 +33,8 @@ class GraspModel(Protocol):
     kinematics: Kinematics
     detector: Detector
     reduction: Reduction
+    spring_rest: Tensor
+    figures: FollowedFigures | None
 
     def contact_kinematics(
         self, state: GraspState, contacts: ContactSet, *, poses: LinkPoses | None = None
@@ -65,9 +68,12 @@ class PlacedGrasp:
         state: where.
         contacts: there.
         poses: of the links there.
+        springs: change of their stiffness against the description, ``(n_q,)`` [N m/rad].
     """
 
-    def __init__(self, model: GraspModel, state: GraspState, contacts: ContactSet, poses: LinkPoses) -> None:
+    def __init__(
+        self, model: GraspModel, state: GraspState, contacts: ContactSet, poses: LinkPoses, springs: Tensor
+    ) -> None:
         self.state, self.contacts = state, contacts
         self.kin: ContactKinematics = model.contact_kinematics(state, contacts, poses=poses)
         self._model = model
@@ -94,8 +100,10 @@ class PlacedGrasp:
                 self.spin_scale[i] = gamma[i] / (mu_s[i] * L)
                 self.T[i, 2] *= self.spin_scale[i]
             self.turn[i, : min(n, 2)] = self.frame[i, :, 1 : 1 + min(n, 2)].T @ turn[i]
-        V_s, V_ss = model.potential(state)
-        self._V_ss = V_ss
+        V_s, self._V_ss = model.potential(state)
+        n_q = len(springs)
+        V_s[:n_q] += springs * (state.q - model.spring_rest)
+        self._V_ss[:n_q, :n_q] += torch.diag(springs)
         self.torque = (V_s @ S).numpy()
 
     def stiffness(self, loads: ContactLoads) -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...typing import Array
+from ..reduction import Drives
 from .contact_laws import Response, StepProblem, StepSolution
 from .placed_grasp import ContactLoads, GraspModel, L, PlacedGrasp
 
@@ -46,13 +47,14 @@ class HandLaws:
 
     Args:
         model: of the hand.
+        drives: moment arms and stiffnesses of the actuators.
     """
 
-    def __init__(self, model: GraspModel) -> None:
+    def __init__(self, model: GraspModel, drives: Drives) -> None:
         hand = model.hand
         self.hand = hand
         self.joints, self.S = model.reduction.joint_basis.numpy(), model.reduction.scaled_basis.numpy()
-        self.J_a, self.K = (x.detach().double().numpy() for x in model.reduction.drives)
+        self.J_a, self.K = (x.detach().double().numpy() for x in drives)
         self.B = np.zeros((hand.n_a, self.S.shape[1]))
         self.B[:, : self.joints.shape[1]] = self.J_a @ self.joints
         tendon = np.array([actuator.tendon for actuator in hand.actuators], dtype=bool)
