@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyBboxPatch, Rectangle
 
 from torch_ekm.kinematics import ServoModel
-from torch_ekm.residual import SparseOnlineGP, SquaredExponential, WindowGP
+from torch_ekm.residual import KRLSTracker, SparseOnlineGP, SquaredExponential
 
 IMAGES = Path(__file__).parent / "images"
 INK, BLUE, ORANGE, GREEN = "#7a7a7a", "#3b82c4", "#d9822b", "#3f9e5a"
@@ -150,7 +150,10 @@ def sparse_gp() -> Figure:
     sparse = SparseOnlineGP(
         1, 1, capacity=8, kernel=SquaredExponential(1, lengthscale=0.8), parts=[], **options
     )
-    exact = WindowGP(1, 1, window=60, kernel=SquaredExponential(1, lengthscale=0.8), **options)
+    # with room for all samples, and nothing forgotten, it is the exact GP
+    exact = KRLSTracker(
+        1, 1, capacity=60, kernel=SquaredExponential(1, lengthscale=0.8), forgetting_factor=1.0, **options
+    )
     for learner in (sparse, exact):
         learner.update(x, y)
     at = torch.linspace(-3.3, 3.3, 200, dtype=torch.float64)[:, None]

@@ -13,7 +13,7 @@ _BRINGS = {
     "plots": ("matplotlib", "jinja2", "typer", "rich"),
     "experiments": ("joblib", "pandas", "pyvista", "viser", "websockets"),
     "notebooks": ("IPython", "pyarrow"),
-    "peers": ("gpytorch", "river"),
+    "peers": ("river",),
     "fast": ("numba",),
     "dynamixel": ("dynamixel_sdk",),
     "ros2": ("rclpy", "sensor_msgs", "trajectory_msgs", "geometry_msgs", "std_msgs"),

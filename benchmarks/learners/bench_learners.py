@@ -194,7 +194,7 @@ def gpytorch_fantasy(capacity: int, m: int) -> Callable:
 def gpytorch_svgp(capacity: int, m: int) -> Callable:
     """One variational step on one sample."""
     pytest.importorskip("gpytorch")
-    from torch_ekm.interop import GPyTorchSVGP
+    from gpytorch_svgp import GPyTorchSVGP
 
     return Timed(GPyTorchSVGP(D, m, inducing=capacity).update, *stream(64, m))
 

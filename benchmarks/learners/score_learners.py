@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from gpytorch_svgp import GPyTorchSVGP
 from stream_scores import load_split, score_objects, score_split
 
 from torch_ekm.experiments.learner_comparison.recordings import load_t42
@@ -51,7 +52,6 @@ HAND: dict[str, Factory] = {
     "deep SOGP, process noise .003, robust 3": chosen("SOGP deep", parts=_WANDERING, **_LOUD),
     "RLS, forgetting .99, robust 3": chosen("linear RLS", **_LOUD),
     "random features, forgetting .99, robust 3": chosen("random features", **_LOUD),
-    "sliding-window GP 100, robust 3": chosen("window GP", **_LOUD),
     "KRLS-T 100, forgetting .99": chosen("KRLS-T", **_LOUD),
     "ensemble of four networks": chosen("MLP ensemble", members=4),
     "river, adaptive random forest": chosen("river forest"),
@@ -67,9 +67,8 @@ STREAMS: dict[str, Factory] = {
     "SOGP 300, adaptation": chosen("SOGP plain", capacity=300, parts=[LearnHyperparameters()]),
     "deep SOGP 100": chosen("SOGP deep", parts=(), robust=None),
     "deep SOGP 300": chosen("SOGP deep", parts=(), robust=None, capacity=300),
-    "sliding-window GP 100": chosen("window GP", robust=None),
     "KRLS-T 100": chosen("KRLS-T", forgetting_factor=1.0),
-    "GPyTorch SVGP 100": chosen("GPyTorch SVGP", memory=1, minibatch=1),
+    "GPyTorch SVGP 100": GPyTorchSVGP,
     "river, adaptive random forest": chosen("river forest"),
     "ensemble of four networks, all replayed": chosen("MLP ensemble", members=4, memory=10_000),
 }

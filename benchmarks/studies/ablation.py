@@ -67,7 +67,7 @@ DISTURBANCES: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 
 LEARNERS = (
-    "action-linear", "rbf", "SOGP plain", "SOGP deep", "linear RLS", "random features", "window GP", "MLP",
+    "action-linear", "rbf", "SOGP plain", "SOGP deep", "linear RLS", "random features", "MLP",
     "model alone",
 )  # fmt: skip
 

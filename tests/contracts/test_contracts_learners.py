@@ -21,7 +21,6 @@ from torch_ekm.residual import (
     ForgettingFactor,
     KRLSTracker,
     LastResidual,
-    LearnerFleet,
     LearnHyperparameters,
     MixtureResidual,
     ProcessNoise,
@@ -32,7 +31,6 @@ from torch_ekm.residual import (
     SparseOnlineGP,
     SquaredExponential,
     Standardize,
-    WindowGP,
     ZeroResidual,
     default_learner,
 )
@@ -55,7 +53,6 @@ LEARNERS = {
     "zero": lambda **o: ZeroResidual(3, 2, **o),
     "rls": lambda **o: RecursiveLeastSquares(3, 2, forgetting_factor=0.99, robust=3.0, **o),
     "rff": lambda **o: RandomFeatureRLS(3, 2, n_frequencies=20, **o),
-    "window": lambda **o: WindowGP(3, 2, window=10, **o),
     "krls_t": lambda **o: KRLSTracker(3, 2, capacity=8, forgetting_factor=0.99, **o),
     "mlp": lambda **o: ReplayMLP(3, 2, hidden=(8,), **o),
     "ensemble": lambda **o: ReplayMLP(3, 2, hidden=(8,), members=3, **o),
@@ -89,7 +86,6 @@ FLEETS = (
     "zero",
     "rls",
     "rff",
-    "window",
     "sogp",
     "sogp_all",
     "sogp_process_noise",
@@ -118,56 +114,12 @@ def test_contract_of_fleets(name, shape):
     )
 
 
-SINGLE = {
-    "krls_t": (KRLSTracker, {"capacity": 8, "forgetting_factor": 0.99}),
-    "mlp": (ReplayMLP, {"hidden": (8,)}),
-    "ensemble": (ReplayMLP, {"hidden": (8,), "members": 3}),
-    "deep_sogp": (DeepKernelSOGP, {"capacity": 8, "hidden": (8,), "refresh_every": 4}),
-}
-
-
-@pytest.mark.parametrize(  # such a fleet is the same code for all: one learner shows all shapes and dtypes
-    ("name", "shape", "dtypes"),
-    [
-        *((name, (3,), (torch.float64,)) for name in SINGLE),
-        ("krls_t", (1,), (torch.float64,)),
-        ("krls_t", (1, 2), (torch.float64, torch.float32)),
-    ],
-)
-def test_contract_of_fleets_of_single_learners(name, shape, dtypes):
-    kind, options = SINGLE[name]
-    check_residual_learner(
-        lambda **o: LearnerFleet(kind, 3, 2, batch_shape=shape, **options, **o),
-        dtypes=dtypes,
-        n_samples=12,
-        separates_noise=name != "mlp",
-    )
-
-
 def test_contract_of_river():
     pytest.importorskip("river")
     from torch_ekm.interop import RiverResidual
 
     options = {"differentiable": False, "separates_noise": False, "has_state": False}
     check_residual_learner(lambda **o: RiverResidual(3, 2, **o), n_samples=12, **options)
-    check_residual_learner(
-        lambda **o: LearnerFleet(RiverResidual, 3, 2, batch_shape=(2,), **o),
-        dtypes=(torch.float64,),
-        n_samples=8,
-        **options,
-    )
-
-
-def test_contract_of_gpytorch():
-    pytest.importorskip("gpytorch")
-    from torch_ekm.interop import GPyTorchSVGP
-
-    check_residual_learner(lambda **o: GPyTorchSVGP(3, 2, inducing=6, **o), n_samples=12, vmap=False)
-    check_residual_learner(
-        lambda **o: LearnerFleet(GPyTorchSVGP, 3, 2, batch_shape=(2,), inducing=6, **o),
-        dtypes=(torch.float64,),
-        n_samples=6,
-    )
 
 
 def test_the_learner_of_the_docs_uses_public_names_only(monkeypatch, tmp_path):

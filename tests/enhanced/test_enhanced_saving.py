@@ -22,7 +22,6 @@ from torch_ekm.residual import (
     DeepKernelSOGP,
     ForgettingFactor,
     KRLSTracker,
-    LearnerFleet,
     LearnHyperparameters,
     Matern32,
     MixtureResidual,
@@ -84,9 +83,6 @@ def test_a_fleet_of_single_learners_and_a_learner_of_ones_own(tmp_path: Path) ->
             super().__init__(in_features, out_features, **options)
             self.slope = slope
 
-    fleet = LearnerFleet(KRLSTracker, 3, 2, batch_shape=(2,), capacity=4)
-    torch_ekm.save(fleet, tmp_path / "fleet")
-    assert repr(torch_ekm.load(tmp_path / "fleet")) == repr(fleet)
     torch_ekm.save(Mine(3, 2, slope=0.5), tmp_path / "mine")
     assert torch_ekm.load(tmp_path / "mine", classes=[Mine]).slope == 0.5
     with pytest.raises(exceptions.ParameterError, match="Mine"):
@@ -166,14 +162,10 @@ def hostile_values(value):
         yield torch.full_like(value, -7)
 
 
-@pytest.mark.parametrize("name", ["sogp", "learns", "mixture", "network", "svgp"])
+@pytest.mark.parametrize("name", ["sogp", "learns", "mixture", "network"])
 def test_a_state_is_loaded_whole_or_not_at_all(name: str) -> None:
     """Each of its entries in turn is a hostile one."""
-    if name == "svgp":
-        pytest.importorskip("gpytorch")
-    from torch_ekm.interop import GPyTorchSVGP
-
-    make = {**LEARNERS, "svgp": lambda: GPyTorchSVGP(3, 2, inducing=4)}[name]
+    make = LEARNERS[name]
     x, y = stream()
     other, learner = make(), make()
     other.update(x[:20], y[:20])
@@ -315,17 +307,3 @@ def test_another_librarys_objects_are_not_saved(tmp_path: Path) -> None:
     state = torch.frombuffer(bytearray(b"cos\nsystem\n"), dtype=torch.uint8)
     with pytest.raises(exceptions.EKMError):
         learner.load_state_dict({"_extra_state": state, "noise": learner.noise})
-
-
-def test_gpytorch_holds_plain_figures(tmp_path: Path) -> None:
-    pytest.importorskip("gpytorch")
-    from torch_ekm.interop import GPyTorchSVGP
-
-    x, y = stream(12)
-    learner = GPyTorchSVGP(3, 2, inducing=6)
-    learner.update(x, y)
-    torch_ekm.save(learner, tmp_path / "svgp")
-    loaded = torch_ekm.load(tmp_path / "svgp")
-    for both in (learner, loaded):
-        both.update(x, y)
-    assert torch.equal(loaded(x), learner(x))

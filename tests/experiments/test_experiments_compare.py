@@ -195,7 +195,7 @@ def test_every_kind_of_learner_in_the_package_contends() -> None:
     import torch_ekm.residual as residual
 
     kinds = tuple(type(make(2, 1)) for name, make in LEARNERS.items() if name in COMPARED)
-    holders = {"LearnerFleet", "LastResidual"}  # of other learners
+    holders = {"LastResidual"}  # of another learner
     for name in dir(residual):
         cls = getattr(residual, name)
         if isinstance(cls, type) and issubclass(cls, residual.ResidualLearner) and name not in holders:

@@ -25,7 +25,6 @@ from torch_ekm.residual import (
     SparseOnlineGP,
     SquaredExponential,
     Standardize,
-    WindowGP,
     ZeroResidual,
 )
 
@@ -41,7 +40,6 @@ def stream(n: int, *shape: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tens
     "make",
     [
         lambda: sogp(3, 2, capacity=30),
-        lambda: WindowGP(3, 2, window=40),
         lambda: KRLSTracker(3, 2, capacity=30),
     ],
 )
@@ -119,7 +117,6 @@ def test_a_query_may_ask_all_models_of_a_fleet(shape):
         ZeroResidual(3, 2, batch_shape=(5,)),
         RecursiveLeastSquares(3, 2, batch_shape=(5,)),
         RandomFeatureRLS(3, 2, n_frequencies=9, batch_shape=(5,)),
-        WindowGP(3, 2, window=9, batch_shape=(5,)),
         sogp(3, 2, capacity=6, batch_shape=(5,)),
         deep_sogp(3, 2, capacity=6, hidden=(4,), features=2, batch_shape=(5,)),
         MixtureResidual(sogp(3, 2, capacity=6, batch_shape=(5,))),

@@ -26,7 +26,6 @@ from torch_ekm.residual import (
     RobustWeight,
     SquaredExponential,
     Standardize,
-    WindowGP,
     action_covariance,
 )
 from torch_ekm.residual.sparse_gp.engine import recursion
@@ -287,18 +286,6 @@ def test_random_features_approach_the_gp():
     gp.update(x, y)
     rff.update(x, y)
     assert float((gp(x) - rff(x)).square().mean().sqrt()) < 0.05
-
-
-def test_window_gp_is_the_exact_gp_of_the_window():
-    x, y = system(17, 50)
-    gp = WindowGP(4, 2, window=20, kernel=SquaredExponential(4), noise_variance=0.05, **AS_GIVEN)
-    gp.update(x, y)
-    k = SquaredExponential(4)
-    K = k(x[30:], x[30:]) + 0.05 * torch.eye(20, dtype=torch.float64)
-    ks = k(x[:7], x[30:])
-    torch.testing.assert_close(gp(x[:7]), ks @ torch.linalg.solve(K, y[30:]), atol=1e-10, rtol=0)
-    v = 1 - (ks * torch.linalg.solve(K, ks.mT).mT).sum(-1)
-    torch.testing.assert_close(gp.predict(x[:7]).variance[:, 0], v, atol=1e-10, rtol=0)
 
 
 def test_krls_tracker_without_forgetting_is_the_exact_gp():

@@ -15,7 +15,6 @@ from torch_ekm.residual import (
     ReplayMLP,
     SparseOnlineGP,
     Standardize,
-    WindowGP,
     default_learner,
 )
 from torch_ekm.residual.running_scale import RunningScale
@@ -27,13 +26,12 @@ SMALL = {
     "rls": lambda **o: RecursiveLeastSquares(3, 2, **o),
     "rff": lambda **o: RandomFeatureRLS(3, 2, n_frequencies=30, **o),
     "krls_t": lambda **o: KRLSTracker(3, 2, capacity=30, **o),
-    "window": lambda **o: WindowGP(3, 2, window=40, **o),
     "mlp": lambda **o: ReplayMLP(3, 2, hidden=(16,), members=2, **o),
 }
 EVERY = pytest.mark.parametrize("make", SMALL.values(), ids=SMALL)
 #: Their g can take the shape of what is learned here: a linear one cannot, and a network is slow.
 FLEXIBLE = pytest.mark.parametrize(
-    "make", [SMALL[name] for name in ("sogp", "deep", "default", "rff", "krls_t", "window")]
+    "make", [SMALL[name] for name in ("sogp", "deep", "default", "rff", "krls_t")]
 )
 
 
@@ -119,7 +117,7 @@ def test_least_squares_in_single_precision_far_from_the_origin():
     assert float((far - y)[:, 1].square().mean().sqrt() / y[:, 1].square().mean().sqrt()) < 0.3
 
 
-@pytest.mark.parametrize("kind", ["sogp", "deep", "default", "rls", "krls_t", "window"])
+@pytest.mark.parametrize("kind", ["sogp", "deep", "default", "rls", "krls_t"])
 def test_an_offset_of_the_outputs(kind):
     """Far from all samples the prediction is the mean of y, whose size does not matter."""
     x, y = stream(150)
@@ -128,7 +126,7 @@ def test_an_offset_of_the_outputs(kind):
     assert torch.equal(learner(x[:2]), torch.zeros(2, 2, dtype=torch.float64))
     learner.update(x, y + 300.0)
     assert float((learner(x) - y - 300.0).square().mean().sqrt()) < 0.45
-    if kind in ("sogp", "krls_t", "window"):
+    if kind in ("sogp", "krls_t"):
         torch.testing.assert_close(learner(x[0] + 1e3), (y + 300.0).mean(0), rtol=0, atol=0.3)
 
 

@@ -111,7 +111,7 @@ def compare(
     learners: Annotated[
         str,
         Option(
-            help="Names, separated by commas: default, SOGP, linear RLS, window GP, model alone, ...; an "
+            help="Names, separated by commas: default, SOGP, linear RLS, model alone, ...; an "
             "unknown name lists all. If left out: all but those of other libraries."
         ),
     ] = "",

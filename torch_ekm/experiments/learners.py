@@ -125,7 +125,6 @@ LEARNERS: dict[str, Factory] = {
     "model alone": Kind(residual.ZeroResidual),
     "linear RLS": Kind(residual.RecursiveLeastSquares, **_FRESH),
     "random features": Kind(residual.RandomFeatureRLS, "n_frequencies", **_FRESH),
-    "window GP": Kind(residual.WindowGP, "window", "kernel", robust=3.0, **_AS_GIVEN),
     "KRLS-T": Kind(residual.KRLSTracker, "capacity", "kernel", forgetting_factor=0.99, **_AS_GIVEN),
     "MLP": Kind(residual.ReplayMLP, standardize=False),
     "MLP ensemble": Kind(residual.ReplayMLP, members=3, standardize=False),
@@ -147,10 +146,9 @@ LEARNERS: dict[str, Factory] = {
     ),
     "SOGP mixture": Mixture(),
     "river forest": Kind(interop.RiverResidual),
-    "GPyTorch SVGP": Kind(interop.GPyTorchSVGP, "inducing", memory=500, minibatch=20),
 }
 #: Learners of other libraries: ten to a hundred times as slow, and in an extra of their own.
-PEERS = ("river forest", "GPyTorch SVGP")
+PEERS = ("river forest",)
 #: The default learner, and the sparse online GP in its forms.
 OURS = ("default", *(name for name in LEARNERS if name.startswith("SOGP")))
 #: What a comparison takes if nobody says otherwise: not those that want to know which inputs are an action.

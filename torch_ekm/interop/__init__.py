@@ -1,4 +1,4 @@
-"""Both ways between learners and other libraries: river, scikit-learn, CapyMOA, CasADi, GPyTorch, ROS.
+"""Both ways between learners and other libraries: river, scikit-learn, CapyMOA, CasADi, ROS.
 
 Learners of this package in their interfaces, and theirs as a :class:`~torch_ekm.ResidualLearner` (extra
 ``peers``). What needs another library is imported when it is first asked for, by its name here; a missing
@@ -11,7 +11,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from .capymoa_regressor import CapyMOARegressor as as_capymoa  # noqa: N813  called like the others
-from .gpytorch_svgp import GPyTorchSVGP
 from .online_regressor import OnlineRegressor
 from .river_residual import RiverResidual
 
@@ -40,7 +39,6 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
-    "GPyTorchSVGP",
     "OnlineRegressor",
     "RiverResidual",
     "as_capymoa",

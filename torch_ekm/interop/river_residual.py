@@ -26,7 +26,7 @@ class RiverResidual(SingleLearner):
 
     Args:
         model: a river regressor, copied; default ARFRegressor.
-        options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
+        options: see ResidualLearner (``batch_shape`` must be ()).
     """
 
     def __init__(self, in_features: int, out_features: int, *, model: Any = None, **options: Any) -> None:

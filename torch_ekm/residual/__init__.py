@@ -6,10 +6,8 @@ from .base import ResidualLearner
 from .baselines.krls_t import KRLSTracker
 from .baselines.linear import RandomFeatureRLS, RecursiveLeastSquares
 from .baselines.replay_mlp import ReplayMLP
-from .baselines.window_gp import WindowGP
 from .baselines.zero import ZeroResidual
 from .default import default_learner
-from .fleet import LearnerFleet
 from .kernels.action_linear import ActionLinearKernel, action_covariance
 from .kernels.deep import DeepKernel
 from .kernels.kernel import Kernel
@@ -36,7 +34,6 @@ __all__ = [
     "Kernel",
     "LearnHyperparameters",
     "LastResidual",
-    "LearnerFleet",
     "Matern32",
     "Matern52",
     "MixtureResidual",
@@ -52,7 +49,6 @@ __all__ = [
     "Standardize",
     "UpdateEvent",
     "UpdateReport",
-    "WindowGP",
     "ZeroResidual",
     "action_covariance",
     "default_learner",

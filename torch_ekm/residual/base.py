@@ -298,7 +298,7 @@ class DoubleStateLearner(ResidualLearner):
 
 
 class SingleLearner(ResidualLearner):
-    """A learner that is one model: ``batch_shape`` must be ``()``; ``LearnerFleet`` holds several.
+    """A learner that is one model: ``batch_shape`` must be ``()``.
 
     Its ``absorb`` gets samples only, never a mask.
     """
@@ -306,7 +306,7 @@ class SingleLearner(ResidualLearner):
     def __init__(self, in_features: int, out_features: int, **options) -> None:
         super().__init__(in_features, out_features, **options)
         if self.batch_shape:
-            valid = "() for this learner; LearnerFleet holds several"
+            valid = "() for this learner; make one for each model"
             raise ParameterError("batch_shape", tuple(self.batch_shape), valid)
 
     def _step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:

@@ -30,7 +30,7 @@ class KRLSTracker(ScaledLearner, SingleLearner, DoubleStateLearner):
         kernel: default Matern 3/2 with lengthscale sqrt(in_features).
         noise_variance: s2.
         forgetting_factor: lam in (0, 1].
-        options: see ScaledLearner; ``batch_shape`` must be (): several are a ``LearnerFleet``.
+        options: see ScaledLearner; ``batch_shape`` must be ().
     """
 
     jitter = 1e-6  #: nugget relative to k**, also the tolerance below which a sample is not novel

@@ -31,7 +31,7 @@ class ReplayMLP(ScaledLearner, SingleLearner):
         members: networks in the ensemble.
         memory: samples kept for replay (the oldest goes).
         seed: of weights and minibatches.
-        options: see ScaledLearner; ``batch_shape`` must be (): several are a ``LearnerFleet``.
+        options: see ScaledLearner; ``batch_shape`` must be ().
     """
 
     def __init__(

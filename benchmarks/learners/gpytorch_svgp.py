@@ -1,24 +1,19 @@
-"""GPyTorch's streaming variational GP behind the contract (extra ``peers``)."""
+"""GPyTorch's streaming variational GP behind the contract of learners, to be compared with."""
 
 from __future__ import annotations
 
-import copy
-import pickle
-from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import nn
 from torch.distributions import Normal
 
-from .._checks import check_count
-from .._extras import require
-from .._recorded import ill_formed, in_bounds
-from ..residual.base import SingleLearner
-from ..residual.report import UpdateReport
-from ..typing import Tensor
+from torch_ekm._checks import check_count
+from torch_ekm._extras import require
+from torch_ekm.residual.base import SingleLearner
+from torch_ekm.residual.report import UpdateReport
+from torch_ekm.typing import Tensor
 
-_OPTIONS = ("inducing", "minibatch", "memory", "on_invalid", "dtype")
 _RATE = 0.01  # of Adam
 
 
@@ -26,13 +21,13 @@ class GPyTorchSVGP(SingleLearner):
     """GPyTorch's variational GP on inducing points, an Adam step on each sample and a replay.
 
     Independent outputs share inducing points that start as the first distinct samples. The bound's data
-    term is scaled to the number of samples seen. GPyTorch's state lies partly outside of state dicts, so the
-    model is no submodule: a copy is made again and loads its state.
+    term is scaled to the number of samples seen. GPyTorch's state lies partly outside of state dicts: the
+    model is no submodule, and is not saved.
 
     Args:
         inducing: number of inducing points.
         minibatch, memory: samples of a step, and those kept to draw them from.
-        options: see ResidualLearner (``batch_shape`` must be (); several: ``LearnerFleet``).
+        options: see ResidualLearner (``batch_shape`` must be ()).
     """
 
     def __init__(
@@ -135,37 +130,6 @@ class GPyTorchSVGP(SingleLearner):
         self._learn(place)
         return UpdateReport.of(nis, mask)
 
-    def get_extra_state(self) -> dict[str, Any]:
-        """Sample count, and the state dicts of what GPyTorch made."""
-        peer = {type(part).__name__: part.state_dict() for part in self._peer}
-        return {**super().get_extra_state(), "count": self._count, **peer}
-
-    def state_problems(self, state: dict[str, Any]) -> list[str]:
-        """What GPyTorch refuses is tried on another model: it would leave this one half loaded."""
-        extra = state["_extra_state"]
-        try:
-            for part in self._build():
-                given = extra[type(part).__name__]
-                if isinstance(part, nn.Module):
-                    own = part.state_dict()
-                    wrong = ill_formed(own, given)
-                    wrong += [name for name in own if not wrong and not in_bounds(given[name], own[name])]
-                    if wrong:
-                        return wrong
-                part.load_state_dict(copy.deepcopy(given))
-                if isinstance(part, torch.optim.Optimizer) and (wrong := _optimizer_problems(part, given)):
-                    return wrong
-        except Exception as error:
-            return [f"not a state of GPyTorch's model: {type(error).__name__}: {error}"]
-        return []
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        self._count = int(state["count"])
-        self._peer = self._build()
-        for part in self._peer:
-            part.load_state_dict(copy.deepcopy(state[type(part).__name__]))
-        self._settle()
-
     def _apply(self, fn, recurse=True):
         super()._apply(fn, recurse)
         for part in self._peer:
@@ -173,31 +137,3 @@ class GPyTorchSVGP(SingleLearner):
                 part._apply(fn)
         self._settle()
         return self
-
-    def __deepcopy__(self, memo: dict) -> GPyTorchSVGP:
-        return pickle.loads(pickle.dumps(self))
-
-    def __reduce__(self):
-        options = {name: getattr(self, name) for name in _OPTIONS}
-        return _rebuild, (self.in_features, self.out_features, options, self.state_dict())
-
-
-def _rebuild(n_in: int, n_out: int, options: dict[str, Any], state: dict) -> GPyTorchSVGP:
-    learner = GPyTorchSVGP(n_in, n_out, **options)
-    learner.load_state_dict(state)
-    return learner
-
-
-def _optimizer_problems(optimizer: torch.optim.Optimizer, given: Mapping[str, Any]) -> list[str]:
-    """An optimizer takes whatever it is given, and fails at its next step."""
-    if given["param_groups"] != optimizer.state_dict()["param_groups"]:
-        return ["the optimizer's options are others"]
-    parameters = [one for group in optimizer.param_groups for one in group["params"]]
-    for place, averages in given["state"].items():
-        for name, value in averages.items():
-            shape, dtype = parameters[place].shape, parameters[place].dtype
-            if name == "step":
-                shape, dtype = torch.Size(), torch.float32
-            if value.shape != shape or value.dtype != dtype or not bool(value.isfinite().all()):
-                return [f"the optimizer's {name} of parameter {place} is not a {tuple(shape)} of {dtype}"]
-    return []
