@@ -57,17 +57,6 @@ def test_an_unknown_start_is_bounded_and_found_out(seed):
     assert (unknown.high - unknown.low).max() < 1e-12
 
 
-def test_a_command_transmits_what_is_wanted():
-    play, mechanism = Play(WIDTH), servo()
-    state = play.at(torch.zeros(3, dtype=F64))
-    for wanted in walk(7):
-        wanted = wanted * torch.tensor([1.0, 0.0, 1.0], dtype=F64)  # nothing asked of one of them
-        before, delta = mechanism.output, play.command(state, wanted)
-        output = mechanism.move_to(mechanism.encoder + delta.numpy())
-        np.testing.assert_allclose(output - before, wanted, atol=1e-14)
-        _, state = play.advance(state, delta)
-
-
 @pytest.mark.parametrize("batch", [(), (1,), (5,), (2, 3)])
 def test_batches(batch):
     play = Play(WIDTH)

@@ -1,9 +1,8 @@
-"""The play that a transmission file states: the simulated hand has it, a wrapper takes it up."""
+"""The play that a transmission file states: the simulated hand has it, and `Play` follows it."""
 
 from __future__ import annotations
 
 import dataclasses
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ pytest.importorskip("sapien")
 
 from torch_ekm.description import load_hand
 from torch_ekm.kinematics import Play
-from torch_ekm.plant import PlayCompensation
 from torch_ekm.simulation import SimulatedHand
 
 F64 = torch.float64
@@ -30,26 +28,6 @@ def wanted(steps):
     delta = torch.zeros(9, dtype=F64)
     delta[[2, 3, 5, 7]] = 0.02
     return [delta * sign for sign in ([1, -1] * steps)[:steps]]
-
-
-def turned(plant, seed=0):
-    first = plant.reset(seed)
-    states = [first.truth.state]
-    states += [plant.command(delta).truth.state for delta in wanted(5)]
-    plant.close()
-    return torch.stack([after.minus(before) for before, after in pairwise(states)])
-
-
-def test_compensated_play_moves_the_object_as_no_play_does():
-    hand = hand_with_play(0.02)
-    free = turned(SimulatedHand("icub_right", "box"))
-    lost = turned(SimulatedHand(hand, "box"))
-    plant = PlayCompensation(SimulatedHand(hand, "box"), Play.of(hand))
-    found = turned(plant)
-    rotation = slice(-3, None)
-    size = free[:, rotation].norm(dim=-1)
-    assert ((lost - free)[1:, rotation].norm(dim=-1) > 0.5 * size[1:]).all()
-    assert ((found - free)[:, rotation].norm(dim=-1) < 0.03 * size).all()
 
 
 def test_the_state_follows_the_tendons_of_the_simulation():

@@ -71,17 +71,6 @@ class Play:
         after = PlayState(self.at(state.low - delta_a).low, self.at(state.high - delta_a).low)
         return delta_a + after.position - state.position, after
 
-    def command(self, state: PlayState, wanted: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
-        """``da = dx + sign(dx) (w/2 + sign(dx) z)``: the motion of the motors that transmits ``wanted``.
-
-        Nothing where nothing is wanted.
-
-        Raises:
-            ShapeError: ``wanted`` has not one entry per actuator.
-        """
-        self._check(wanted)
-        return wanted + 0.5 * self.width * torch.sign(wanted) + state.position * torch.sign(wanted).abs()
-
     def _check(self, increment: Tensor) -> None:
         if increment.shape[-1:] != self.width.shape[-1:]:
             expected = f"(*batch, {self.width.shape[-1]})"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from .frames_at_rest import FramesAtRest
 from .observation import Observation, PlantStatus, Stamps, Truth
 from .plant import Plant
-from .play_compensation import PlayCompensation
 from .recording_plant import RecordingPlant
 from .replayed_plant import ReplayedPlant
 from .servo_inverse import ServoInverse
@@ -20,7 +19,6 @@ __all__ = [
     "Plant",
     "PlantStatus",
     "PlantWrapper",
-    "PlayCompensation",
     "RecordingPlant",
     "ReplayedPlant",
     "ServoInverse",
