@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -107,7 +107,6 @@ class PoseFilter:
         self,
         moved: Float[Tensor, " n_a"],
         fingertip_force: Float[Tensor, " n_pads"] | None = None,
-        lin: Linearization | None = None,
     ) -> None:
         """Carry the state along with a motion. A state that the model refuses has no predicted motion, but
         one that may be as large as the actuators', as far as contacts that roll allow.
@@ -115,10 +114,8 @@ class PoseFilter:
         Args:
             moved: w [rad].
             fingertip_force: before it [N].
-            lin: the model at the state, where it is known; joints that it holds then do not move at all.
         """
-        held = None if lin is None else lin.held_joints
-        lin = self._linearize(moved, fingertip_force) if lin is None else lin
+        lin = self._linearize(moved, fingertip_force)
         ds = unsure = torch.zeros_like(self.covariance[0])
         if lin is not None:
             ds = lin.step(moved)
@@ -126,9 +123,6 @@ class PoseFilter:
                 g, unsure = self.enhanced.correction(self.state, moved, len(ds))
                 ds = ds + g
         Q = self._motion_covariance(moved, None if lin is None else ds, unsure)
-        if held is not None:
-            moves = torch.cat([~held, held.new_ones(6)]).to(Q)
-            Q = Q * moves * moves[:, None]
         middle = self.state.plus(0.5 * ds)
         with contextlib.suppress(NoContactError):
             contacts = self._touching(middle, fingertip_force)
@@ -146,16 +140,6 @@ class PoseFilter:
         joints = torch.eye(len(q), len(self.covariance), dtype=q.dtype)
         variance = _JOINT**2 * torch.eye(len(q), dtype=q.dtype)
         self._update(Measurement(joints, lambda at: q - at.q, variance), fingertip_force)
-
-    def close_gaps(self) -> None:
-        """Close the gaps of the pads that are next to the object."""
-        self._update(None, None)
-
-    def hold(self, joints: Sequence[int], q: Float[Tensor, " n_joints"]) -> None:
-        """Some joints stand at known angles [rad], such as stops."""
-        H = torch.eye(len(self.covariance), dtype=self.covariance.dtype)[list(joints)]
-        exactly = 1e-12 * torch.eye(len(H), dtype=H.dtype)
-        self._update(Measurement(H, lambda at: q - at.q[..., list(joints)], exactly), None)
 
     def look(self, seen: GraspState, pose_covariance: Float[Tensor, "6 6"] | None = None) -> None:
         """What the camera says; the joints of ``seen`` are not used. See :meth:`start`."""
