@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .online_regressor import LearnerLike, OnlineRegressor, make_learner
+from torch_ekm.interop.online_regressor import LearnerLike, OnlineRegressor, make_learner
 
 
 class CapyMOARegressor:

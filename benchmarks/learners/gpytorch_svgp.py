@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import gpytorch
 import torch
 from torch import nn
 from torch.distributions import Normal
 
 from torch_ekm._checks import check_count
-from torch_ekm._extras import require
 from torch_ekm.residual.base import SingleLearner
 from torch_ekm.residual.report import UpdateReport
 from torch_ekm.typing import Tensor
@@ -49,7 +49,6 @@ class GPyTorchSVGP(SingleLearner):
 
     def _build(self) -> tuple[Any, ...]:
         """All that has a state dict: model, likelihood, optimizer."""
-        gpytorch = require("gpytorch")
         m, d = self.out_features, self.in_features
         generator = torch.Generator().manual_seed(0)
         points = torch.randn(self.inducing, d, generator=generator, dtype=torch.float64).to(self._like)
@@ -79,7 +78,7 @@ class GPyTorchSVGP(SingleLearner):
     def _learn(self, place: int) -> None:
         """The sample at this place of the memory is new."""
         model, likelihood, optimizer = self._peer
-        objective = require("gpytorch").mlls.VariationalELBO(likelihood, model, num_data=self._count)
+        objective = gpytorch.mlls.VariationalELBO(likelihood, model, num_data=self._count)
         generator = torch.Generator().manual_seed(self._count - 1)
         model.train()
         index = torch.randint(min(self._count, self.memory), (self.minibatch,), generator=generator)

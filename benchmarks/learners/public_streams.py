@@ -26,9 +26,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from capymoa_regressor import CapyMOARegressor
 
 from torch_ekm import default_learner
-from torch_ekm.interop import as_capymoa, as_river
+from torch_ekm.interop import as_river
 from torch_ekm.residual import LearnHyperparameters, RobustWeight, SparseOnlineGP, Standardize
 from torch_ekm.typing import Array
 
@@ -117,7 +118,7 @@ def river_peers() -> dict[str, Callable[[], Any]]:
 
 def fried(method: str, factory: Callable, x: Array, y: Array) -> Iterator[Row]:
     """The first 1000 samples and all of them, in one pass."""
-    model, spread = as_capymoa(learner=factory), float(np.ptp(y))
+    model, spread = CapyMOARegressor(learner=factory), float(np.ptp(y))
     ends, begin = np.empty((len(y), 3)), time.perf_counter()
     for t, (row, target) in enumerate(zip(x, y, strict=True)):
         instance = SimpleNamespace(x=row, y_value=target)

@@ -1,9 +1,8 @@
-"""Learners keep river's, scikit-learn's and CapyMOA's contracts."""
+"""Learners keep river's and scikit-learn's contracts."""
 
 from __future__ import annotations
 
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import torch
 
 from torch_ekm import LearnHyperparameters, SparseOnlineGP, Standardize, interop
 from torch_ekm.exceptions import MissingExtraError, ParameterError, ShapeError
-from torch_ekm.interop import OnlineRegressor, as_capymoa, as_river, as_sklearn
+from torch_ekm.interop import OnlineRegressor, as_river, as_sklearn
 
 river = pytest.importorskip("river", reason="extra 'interop'")
 sklearn = pytest.importorskip("sklearn", reason="extra 'interop'")
@@ -103,33 +102,6 @@ def test_scikit_learn_example() -> None:
     whole = as_sklearn(small).fit(x[:200], y[:200])
     assert np.array_equal(whole.predict(x[200:]), mean), "rows learned at once or in turn are the same"
     assert cross_val_score(make_pipeline(StandardScaler(), as_sklearn(small)), x, y, cv=3).min() > 0.7
-
-
-def test_what_capymoa_asks_of_a_regressor() -> None:
-    x, y = wave(200)
-    regressor, errors, held = as_capymoa(learner=small), [], []
-    for row, target in zip(x, y, strict=True):
-        instance = SimpleNamespace(x=row, y_value=target)
-        low, mean, high = regressor.predict_interval(instance)
-        assert mean == pytest.approx(regressor.predict(instance))
-        errors.append(target - mean)
-        held.append(low <= target <= high)
-        regressor.train(instance)
-    assert errors[0] == y[0], "before the first sample it predicts 0"
-    assert np.std(errors[100:]) < 0.45 * y.std()
-    assert np.mean(held[100:]) > 0.85
-    assert str(regressor) == "torch_ekm SparseOnlineGP"
-
-
-def test_capymoa_example() -> None:
-    pytest.importorskip("capymoa", reason="CapyMOA needs Java and is not among the extras")
-    from capymoa.evaluation import prequential_evaluation
-    from capymoa.stream import NumpyStream
-
-    x, y = wave(300)
-    stream = NumpyStream(x, y, dataset_name="wave", target_type="numeric")
-    result = prequential_evaluation(stream, as_capymoa(stream.get_schema(), small))
-    assert result.cumulative.rmse() < 45.0
 
 
 def test_a_wrong_learner_is_named() -> None:

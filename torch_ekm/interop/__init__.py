@@ -1,4 +1,4 @@
-"""Both ways between learners and other libraries: river, scikit-learn, CapyMOA, CasADi, ROS.
+"""Both ways between learners and other libraries: river, scikit-learn, CasADi, ROS.
 
 Learners of this package in their interfaces, and theirs as a :class:`~torch_ekm.ResidualLearner` (extra
 ``peers``). What needs another library is imported when it is first asked for, by its name here; a missing
@@ -10,7 +10,6 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .capymoa_regressor import CapyMOARegressor as as_capymoa  # noqa: N813  called like the others
 from .online_regressor import OnlineRegressor
 from .river_residual import RiverResidual
 
@@ -41,7 +40,6 @@ def __getattr__(name: str) -> Any:
 __all__ = [
     "OnlineRegressor",
     "RiverResidual",
-    "as_capymoa",
     "as_river",
     "as_sklearn",
     "log_from_mcap",
