@@ -57,8 +57,6 @@ KINDS = (
     "stiffness",
     "offset",
     "backlash",
-    "object_position",
-    "object_rotation",
 )
 
 
@@ -100,19 +98,6 @@ def test_play_is_found(toy, monkeypatch):
     found = calibration.hand.actuator_backlash
     np.testing.assert_allclose(found, width, atol=3e-6)
     assert np.linalg.norm(calibration.errors_after) < 0.2 * np.linalg.norm(calibration.errors_before)
-
-
-def test_the_offset_of_the_objects_pose_is_found(toy):
-    recordings = toy.recordings(steps=4)
-    position, rotation = (
-        torch.tensor([4e-4, -3e-4, 2e-4], dtype=F64),
-        torch.tensor([0.0, 0.0, 0.0], dtype=F64),
-    )
-    for seen in recordings[0].observations:  # the marker sits elsewhere than it is thought to
-        seen.position = seen.position - seen.rotation @ position
-    calibration = calibrate(toy.model(toy.hand), recordings, ["object_position"])
-    np.testing.assert_allclose(calibration.object_offset[0], position, atol=5e-5)
-    np.testing.assert_allclose(calibration.object_offset[1], rotation, atol=1e-12)
 
 
 def test_one_joint_or_one_actuator_can_be_chosen(toy):

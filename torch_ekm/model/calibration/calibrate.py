@@ -43,11 +43,10 @@ def calibrate(
         model: of the hand as described and of the object that was moved.
         recordings: trajectories of it, say 30 motions of 1 to 3 deg in several grasps. The encoders' readings
             give the increments, so the faults of a position controller do no harm.
-        parameters: kinds ("springs", "rest", "moment_arms", "stiffness", "offset", "backlash",
-            "object_position", "object_rotation"), or one of a kind: "springs:thumb_2",
-            "moment_arms:thumb_distal".
+        parameters: kinds ("springs", "rest", "moment_arms", "stiffness", "offset", "backlash"), or one
+            of a kind: "springs:thumb_2", "moment_arms:thumb_distal".
             Priors are standard deviations of 0.5 (springs), 0.3 (moment arms), 0.7 (stiffness), these of the
-            logarithm, 10 deg (rest), 5 deg (offset), 1 deg (backlash), 2 mm and 2 deg (object).
+            logarithm, 10 deg (rest), 5 deg (offset), 1 deg (backlash).
 
     Raises:
         UnknownNameError: no such kind of parameter, joint or actuator.

@@ -9,7 +9,6 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 
 from ...kinematics.grasp_state import GraspState
-from ...kinematics.se3 import exp
 from ...typing import Float, Tensor
 
 
@@ -32,11 +31,6 @@ class Rest:
     state: GraspState
     a: Float[Tensor, " n_a"]
     force: Float[Tensor, " n_pads"] | None
-
-    def shifted(self, position: Float[Tensor, " 3"], rotation: Float[Tensor, " 3"]) -> GraspState:
-        """``o' = o + R t``, ``R' = R exp([phi]x)``: where an object read with an offset is."""
-        R, o = self.state.rotation, self.state.position
-        return GraspState(self.state.q, o + R @ position, R @ exp(rotation))
 
 
 def rests(recordings: Iterable[Recording]) -> list[list[Rest]]:

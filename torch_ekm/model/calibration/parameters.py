@@ -22,11 +22,9 @@ PRIORS = {
     "stiffness": 0.7,
     "offset": math.radians(5),
     "backlash": math.radians(1),
-    "object_position": 0.002,
-    "object_rotation": math.radians(2),
 }
 """Kinds of parameters, and how far off each may well be (one standard deviation): of the logarithm for
-springs, moment arms and stiffness, else [rad] or [m]."""
+springs, moment arms and stiffness, else [rad]."""
 _LOGARITHMIC = ("springs", "moment_arms", "stiffness")
 _WORDS = {
     "springs": "spring",
@@ -44,7 +42,7 @@ class Parameter:
 
     kind: str
     name: str
-    """Joint, actuator, "actuator at joint" for a moment arm, or axis of the object's frame."""
+    """Joint, actuator, "actuator at joint" for a moment arm."""
     index: tuple[int, ...]
     """Where it stands in the hand's array of its kind."""
     nominal: float
@@ -55,9 +53,7 @@ class Parameter:
         """What the parameter is called in tables and messages."""
         if self.kind == "moment_arms":
             return f"moment arm of {self.name}"
-        if self.kind in _WORDS:
-            return f"{_WORDS[self.kind]} of {self.name}"
-        return f"{self.kind.replace('_', ' ')} {self.name}"
+        return f"{_WORDS[self.kind]} of {self.name}"
 
     @property
     def logarithmic(self) -> bool:
@@ -74,7 +70,7 @@ class Parameter:
 
 
 class Figures(NamedTuple):
-    """What a model and its play are made of; ``object_offset`` is ``(t, phi)`` in the object's frame."""
+    """What a model and its play are made of."""
 
     springs: Float[Tensor, " n_q"]
     rest: Float[Tensor, " n_q"]
@@ -82,16 +78,13 @@ class Figures(NamedTuple):
     stiffness: Float[Tensor, " n_a"]
     offset: Float[Tensor, " n_a"]
     backlash: Float[Tensor, " n_a"]
-    object_position: Float[Tensor, " 3"]
-    object_rotation: Float[Tensor, " 3"]
 
     @classmethod
     def of(cls, hand: HandDescription) -> Figures:
-        """The figures of a hand as its description has them, no object offset."""
-        zero = np.zeros(3)
+        """The figures of a hand as its description has them."""
         stiffness = [actuator.stiffness for actuator in hand.actuators]
         arrays = (hand.spring_stiffness, hand.spring_rest, hand.actuation_jacobian, stiffness)
-        parts = (*arrays, hand.actuator_offset, hand.actuator_backlash, zero, zero)
+        parts = (*arrays, hand.actuator_offset, hand.actuator_backlash)
         return cls(*(torch.as_tensor(np.array(part), dtype=torch.float64) for part in parts))
 
 
@@ -129,9 +122,7 @@ class Unknowns:
     def _all(self, kind: str, with_posture: bool) -> list[Parameter]:
         hand, values = self.hand, getattr(self.nominal, kind)
         motors = [k for k, a in enumerate(hand.actuators) if with_posture or not a.posture]
-        if kind.startswith("object"):
-            names = {(k,): axis for k, axis in enumerate("xyz")}
-        elif kind == "moment_arms":
+        if kind == "moment_arms":
             at = np.argwhere(hand.actuation_jacobian != 0).tolist()
             names = {(a, j): f"{hand.actuator_names[a]} at {hand.joint_names[j]}" for a, j in at}
             names = {index: name for index, name in names.items() if index[0] in motors}
@@ -169,7 +160,7 @@ class Unknowns:
     def described(self, x: Array) -> HandDescription:
         """The description of the hand with the figures at x in place of its own."""
         figures = self.figures(torch.from_numpy(x))
-        springs, rest, J_a, stiffness, offset, backlash = (part.numpy() for part in figures[:6])
+        springs, rest, J_a, stiffness, offset, backlash = (part.numpy() for part in figures)
         actuators = tuple(
             dataclasses.replace(actuator, stiffness=float(k), offset=float(a), backlash=float(w))
             for actuator, k, a, w in zip(self.hand.actuators, stiffness, offset, backlash, strict=True)

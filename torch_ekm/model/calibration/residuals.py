@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from ...exceptions import GraspError
 from ...kinematics.play import Play
-from ...kinematics.se3 import exp
 from ...typing import Array, Tensor
 from ..kinematic_model import KinematicModel
 from ..linearization import Linearization
@@ -116,7 +115,7 @@ class Evidence:
         for grasp, usable in zip(self.grasps, self.usable, strict=True):
             state, last = play.unknown(), None
             for k, rest in enumerate(grasp):
-                lin = self._linearize(rest, figures) if usable[k] else None
+                lin = self._linearize(rest) if usable[k] else None
                 dx = torch.zeros(0)
                 if k:
                     dx, state = play.advance(state, rest.a - grasp[k - 1].a)
@@ -126,7 +125,8 @@ class Evidence:
                     if self.with_offset:
                         parts |= self._encoders(lin, rest, state.position, figures)
                     if last is not None:
-                        motion = self._motion(last, lin, grasp[k - 1], rest, dx, figures)
+                        measured = rest.state.minus(grasp[k - 1].state)
+                        motion = measured - 0.5 * (last.step(dx) + lin.step(dx))
                         moving = motion[: self.model.hand.n_q][self.model.moving(lin.contacts)]
                         do, dphi = motion[-6:].split(3)
                         parts |= _scaled(joints=moving, position=do, rotation=dphi)
@@ -149,28 +149,15 @@ class Evidence:
         unexplained = taut * (stretch + lam / self.model.reduction.stiffness)
         return _scaled(encoder=unexplained[self.with_offset])
 
-    def _motion(
-        self, last: Linearization, lin: Linearization, before: Rest, after: Rest, dx: Tensor, at: Figures
-    ) -> Tensor:
-        """Measured less predicted increment, both of the object's point as measured."""
-        ds = 0.5 * (last.step(dx) + lin.step(dx))
-        lever = before.state.rotation @ at.object_position
-        dq, do, dphi = ds.split([self.model.hand.n_q, 3, 3])
-        predicted = torch.cat([dq, do + lever - exp(dphi) @ lever, dphi])
-        return after.state.minus(before.state) - predicted
-
-    def _linearize(self, rest: Rest, figures: Figures) -> Linearization:
-        offset, state = torch.cat([figures.object_position, figures.object_rotation]), rest.state
-        if offset.requires_grad or bool((offset != 0).any()):
-            state = rest.shifted(figures.object_position, figures.object_rotation)
-        lin = self.model.linearize(state, fingertip_force=rest.force)
+    def _linearize(self, rest: Rest) -> Linearization:
+        lin = self.model.linearize(rest.state, fingertip_force=rest.force)
         if not lin.forces.solved:
             raise GraspError(f"no forces balance the object: {lin.forces.status[0].value}")
         return lin
 
     def _found(self, rest: Rest) -> bool:
         try:
-            self._linearize(rest, self.unknowns.nominal)
+            self._linearize(rest)
         except GraspError:
             return False
         return True

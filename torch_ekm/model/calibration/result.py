@@ -64,12 +64,6 @@ class Calibration:
             rows.append(Calibrated(p.label, p.nominal, value, error * p.slope(value), error < 0.5))
         return tuple(rows)
 
-    @property
-    def object_offset(self) -> tuple[Array, Array]:
-        """``(t, phi)``: the object stands at ``o + R t``, ``R exp([phi]x)`` of what was measured [m, rad]."""
-        figures = self.unknowns.figures(torch.from_numpy(self.x))
-        return figures.object_position.numpy(), figures.object_rotation.numpy()
-
     def save(self, path: str | Path) -> Path:
         """Write the hand: ``<stem>.transmission.toml`` at ``path``, the URDF next to it if there is none.
 
