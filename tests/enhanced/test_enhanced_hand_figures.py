@@ -14,7 +14,7 @@ from torch_ekm.control import DescribedFigures, HandFigures
 from torch_ekm.description import load_hand
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
-from torch_ekm.model import KinematicModel
+from torch_ekm.model import ContactMotion, KinematicModel
 from torch_ekm.simulation import SimulatedHand
 
 F64 = torch.float64
@@ -171,3 +171,15 @@ def test_the_figures_of_another_hand_are_refused_by_name_and_digest(held, learne
     corrected = dataclasses.replace(model.hand, spring_stiffness=2 * model.hand.spring_stiffness)
     with pytest.raises(ParameterError, match=r"spring of thumb_0 0.01 there, 0.02 in the description"):
         learned.check(corrected)
+
+
+def test_motions_with_contacts_go_by_the_learned_figures(held, learned) -> None:
+    state, model = held
+    followed = model.with_figures(learned)
+    lin = followed.linearize(state, followed.touching(state))
+    w = torch.full((model.hand.n_a,), 1e-5, dtype=F64)
+    found = ContactMotion(followed, lin).linearize(w).object_jacobian
+    described = model.linearize(state).object_jacobian
+    size = float(lin.object_jacobian.norm())
+    assert float((found - lin.object_jacobian).norm()) < 1e-3 * size
+    assert float((described - lin.object_jacobian).norm()) > 0.05 * size

@@ -170,6 +170,18 @@ def test_where_the_object_slips_away_nothing_has_moved(held) -> None:
     assert motion.state is lin.state
 
 
+def test_a_motion_that_lets_go_is_followed_and_does_not_leap(held) -> None:
+    """Newton's method on the whole motion finds another equilibrium."""
+    model, start, a, _ = held
+    w = 0.1 * torch.randn(model.hand.n_a, generator=torch.Generator().manual_seed(30), dtype=F64)
+    w[0] = w[-1] = 0.0
+    whole, parts = (ContactMotion(model, start, a=a) for _ in range(2))
+    whole.move(w)
+    for _ in range(16):
+        parts.move(w / 16)
+    assert whole.state.minus(parts.state).norm() < 0.02 * whole.state.minus(start.state).norm()
+
+
 @pytest.mark.parametrize("toy", ["planar", "soft"])
 def test_toys_move_as_their_jacobian_says(toy: str) -> None:
     """In a plane, with a detector of one's own; and with fingers that resist spin."""

@@ -107,7 +107,11 @@ class StepSolution(NamedTuple):
         for i in np.flatnonzero(self.slides):  # the disc of a contact that slides shrinks as its gap grows
             rows = slice(n_z + m + i * self.t.shape[1], n_z + m + (i + 1) * self.t.shape[1])
             rates[rows] = _RHO_NEWTON * np.outer(self.t[i] / self.lam[i], gap[i])
-        change = np.asarray(-np.linalg.solve(self.jacobian, rates), dtype=np.float64)
+        try:
+            change = np.linalg.solve(self.jacobian, -rates)
+        except np.linalg.LinAlgError:  # forces that no motion tells apart: the least of their changes
+            change = np.linalg.lstsq(self.jacobian, -rates, rcond=None)[0]
+        change = np.asarray(change, dtype=np.float64)
         z, lam, t = np.split(change, [n_z, n_z + m])
         return Response(z, lam, t.reshape(*self.t.shape, k))
 
@@ -132,7 +136,7 @@ def solve(problem: StepProblem, lam: Array, t: Array) -> StepSolution | None:
         with np.errstate(over="ignore", invalid="ignore"):  # it may diverge where D is indefinite
             split = _split(problem, lam, t, _RHO_SPLITTING[attempt % len(_RHO_SPLITTING)])
         count += _SPLITTING
-        if np.isfinite(split[1]).all():
+        if split is not None and np.isfinite(split[1]).all():
             z, lam, t = split
     return None
 
@@ -209,9 +213,9 @@ def _residual(p: StepProblem, x: Array) -> tuple[Array, Array, Mask, Mask]:
     return F, J, active, slides
 
 
-def _split(p: StepProblem, lam: Array, t: Array, rho: float) -> tuple[Array, Array, Array]:
+def _split(p: StepProblem, lam: Array, t: Array, rho: float) -> tuple[Array, Array, Array] | None:
     """Some iterations of ``y <- P_K(y - rho s)``, ``s = G z + g + c y``, z the minimum of the augmented
-    Lagrangian; ``y = [lam; t]``, ``G = [E; -T]``."""
+    Lagrangian; ``y = [lam; t]``, ``G = [E; -T]``. None: it has no minimum."""
     (m, n_z), (n_c, d) = p.E.shape, p.way.shape
     G = np.concatenate([p.E, -p.T.reshape(-1, n_z)])
     c = np.concatenate([p.compliance, np.full(n_c * d, p.tangential_compliance)])
@@ -220,7 +224,10 @@ def _split(p: StepProblem, lam: Array, t: Array, rho: float) -> tuple[Array, Arr
         [p.gap - p.compliance * p.before, -(p.way - p.tangential_compliance * p.t_before).ravel()]
     )
     share = 1 / (1 + rho * c)
-    inverse = np.linalg.inv(p.D + (G.T * (rho * share)) @ G)
+    try:
+        inverse = np.linalg.inv(p.D + (G.T * (rho * share)) @ G)
+    except np.linalg.LinAlgError:  # D is indefinite
+        return None
     z = np.zeros(n_z)
     for _ in range(_SPLITTING):
         g = g0.copy()

@@ -33,7 +33,7 @@ _SMALLEST = 1 / 64  # share of a motion
 _DAMPING = 0.5  # [N m/rad] of a fall to the next equilibrium
 _FALLS = 60  # steps of a fall
 _CALM = 1e-3  # [rad] a step of a fall this small has come to rest
-_FARTHEST = 0.3  # [rad] of a fall
+_FARTHEST = 0.3  # [rad] of a substep, beyond which Newton's method has left for elsewhere, and of a fall
 
 
 class ContactMode(Enum):
@@ -245,7 +245,7 @@ class ContactMotion:
         way = Way(here, loads.pull, da, np.zeros(self._laws.S.shape[1]))
         for correction in range(_CORRECTIONS):
             done = self._solve(here, loads, way)
-            if done is None:
+            if done is None or _farthest(done.state.minus(self.state)) > _FARTHEST:
                 return None
             iterations += done.answer.iterations
             size, doing = float(np.abs(done.answer.z).max()), done.doing
