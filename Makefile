@@ -37,9 +37,11 @@ test-fast: install
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(addprefix tests/,$(FAST)) \
 		--ignore=tests/description/test_description_hostile.py --ignore=tests/description/test_description_docs.py
 
-# the site, docs/_build/html/index.html; a warning is an error
+# the site, docs/_build/html/index.html; a warning is an error, and so is a link that leads nowhere
 docs: install
+	rm -rf docs/_build/html docs/reference/api/generated
 	$(BIN)/python -m sphinx -E -W -n --keep-going docs docs/_build/html
+	TORCH_EKM_SITE=docs/_build/html $(BIN)/python -m pytest -q tests/docs/test_docs_site.py
 
 # executed in place, outputs stored; 04 reads recordings in TORCH_EKM_DATA, 05 finished runs in TORCH_EKM_REPORTS
 NBCONVERT := $(BIN)/jupyter nbconvert --to notebook --inplace

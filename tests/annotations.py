@@ -1,4 +1,4 @@
-"""Shape annotations are checked in the first thousand calls of each test.
+"""Shape annotations are checked in the first hundreds of calls of each test.
 
 :mod:`jaxtyping` binds the sizes of a call to each other; :mod:`beartype` checks types. ``int`` is taken where
 ``float`` is annotated, as type checkers do (PEP 484).
@@ -16,7 +16,7 @@ import jaxtyping
 from beartype import BeartypeConf, beartype
 
 #: Checks of one test; the rest of its calls, most of them in long streams, repeat the same shapes.
-BUDGET = 1000
+BUDGET = 300
 #: Packages whose annotations are checked.
 CHECKED: tuple[str, ...] = ("kinematics", "contact", "model", "residual", "enhanced", "control")
 
@@ -46,7 +46,7 @@ def check(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def begin_test() -> None:
-    """The next test has its own thousand checks."""
+    """The next test has checks of its own."""
     _count[0] = 0
     jaxtyping.config.update("jaxtyping_disable", False)
 
