@@ -169,7 +169,7 @@ class Guards:
     servo model calls so."""
     wrong_way: int = 3
     """Motions running that take the object farther from its target, each by more than the rule's tolerance,
-    while the motors do as commanded: a sign is wrong. One more is not made."""
+    while the motors do as commanded, before half the way is made: a sign is wrong. One more is not made."""
     force_ceiling: float = 12.0
     """Of a pad, as measured, or as estimated where it is not [N]."""
     fingertip_repeats: int = 8

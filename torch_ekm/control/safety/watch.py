@@ -166,9 +166,10 @@ class Watch:
         return f"the object has slid {1e3 * way:.1f} mm and {deg(turn)} farther than predicted"
 
     def way(self, errors: list[float], decision: Decision, moved: Tensor) -> Objection | None:
-        """The object goes away from its target, again and again, while the motors obey."""
+        """The object goes away from its target, again and again, while the motors obey. Where it has come half
+        the way, no sign is wrong: the grasp turns no further, and the stopping rule says so."""
         da = decision.delta_a
-        if decision.share == 0.0:  # the way back
+        if decision.share == 0.0 or min(errors) < 0.5 * errors[0]:  # the way back, or a way that led there
             return None
         away = errors[-1] - errors[-2] > self._tolerance and float(moved @ da) > 0.5 * float(da @ da)
         self._away = self._away + 1 if away else 0
