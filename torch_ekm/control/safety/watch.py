@@ -166,8 +166,8 @@ class Watch:
         return f"the object has slid {1e3 * way:.1f} mm and {deg(turn)} farther than predicted"
 
     def way(self, errors: list[float], decision: Decision, moved: Tensor) -> Objection | None:
-        """The object goes away from its target, again and again, while the motors obey. Where it has come half
-        the way, no sign is wrong: the grasp turns no further, and the stopping rule says so."""
+        """The object goes away from its target, again and again, while the motors obey. Where it has come
+        half the way, no sign is wrong: the grasp turns no further, and the stopping rule says so."""
         da = decision.delta_a
         if decision.share == 0.0 or min(errors) < 0.5 * errors[0]:  # the way back, or a way that led there
             return None
