@@ -158,6 +158,19 @@ def test_a_shift_by_nothing_changes_nothing(held) -> None:
     assert shifted.move(w).state.minus(plain.state).norm() < 1e-4
 
 
+def test_joints_follow_a_shift_and_contacts_stay_closed(held) -> None:
+    """What a learner adds to the object's motion opens no contact."""
+    model, start, _, _ = held
+    motion = ContactMotion(model, start)
+    increment = torch.zeros(start.state.n_s, dtype=F64)
+    increment[-6:] = torch.tensor([3e-4, -2e-4, 1e-4, 0.5 * DEG, -1.0 * DEG, 0.7 * DEG])
+    motion.shift(increment)
+    torch.testing.assert_close(motion.state.minus(start.state)[-6:], increment[-6:], atol=1e-9, rtol=0.0)
+    gap, still = start.contacts.gap, start.state.plus(increment)
+    assert float((model.contacts(motion.state).gap - gap).abs().max()) < 1e-5
+    assert float((model.contacts(still).gap - gap).abs().max()) > 1e-4  # where joints do not follow
+
+
 def test_where_the_object_slips_away_nothing_has_moved(held) -> None:
     model, start, a, _ = held
     slippery = KinematicModel(model.hand, dataclasses.replace(model.obj, friction=0.05))

@@ -227,8 +227,10 @@ class ContactMotion:
 
     def shift(self, increment: Float[Tensor, " n_s"]) -> None:
         """Go on from ``s (+) increment`` [rad, m, rad] as from a reading: the forces are those of now, which
-        a constant load balances, and the gaps of contacts that bear count from where they are."""
-        self._stand(self.state.plus(increment), None, self.loads)
+        a constant load balances, and the gaps of contacts that bear count from where they are. Joints follow
+        by the least motion that lets no contact that bears open or slide."""
+        follow = self._grasp.follow(increment.numpy(), self.loads)
+        self._stand(self.state.plus(increment + torch.from_numpy(follow)), None, self.loads)
         self._count_gaps(absolute=False)
         self._load = self._laws.unbalance(self._grasp, self.loads)
 

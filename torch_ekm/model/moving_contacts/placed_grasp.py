@@ -150,6 +150,14 @@ class PlacedGrasp:
             dict(zip(names, force, strict=True)), dict(zip(names, spin.tolist(), strict=True)), pull, stop
         )
 
+    def follow(self, increment: Array, loads: ContactLoads) -> Array:
+        """The least motion of the joints after which contacts that bear are where they were, ``(n_s,)``."""
+        S, n_y = self._model.reduction.scaled_basis.numpy(), self._model.reduction.joint_basis.shape[1]
+        bears = self.components(loads)[0] > 0
+        rows = np.concatenate([self.normal_rate[:, None], self.T], axis=1)[bears].reshape(-1, S.shape[1])
+        away = rows @ np.linalg.lstsq(S, increment, rcond=None)[0]
+        return -S[:, :n_y] @ np.linalg.lstsq(rows[:, :n_y], away, rcond=1e-3)[0]
+
     def turned(self, lam: Array, t: Array, lam_0: Array, t_0: Array, z: Array) -> tuple[Array, Array]:
         """Components in the frames of this state, from those in frames that turned with the normals by z."""
         turn = self.turn @ z
