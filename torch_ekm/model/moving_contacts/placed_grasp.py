@@ -156,7 +156,8 @@ class PlacedGrasp:
         bears = self.components(loads)[0] > 0
         rows = np.concatenate([self.normal_rate[:, None], self.T], axis=1)[bears].reshape(-1, S.shape[1])
         away = rows @ np.linalg.lstsq(S, increment, rcond=None)[0]
-        return -S[:, :n_y] @ np.linalg.lstsq(rows[:, :n_y], away, rcond=1e-3)[0]
+        back = np.linalg.lstsq(rows[:, :n_y], away, rcond=1e-3)[0]
+        return np.asarray(-S[:, :n_y] @ back, dtype=np.float64)
 
     def turned(self, lam: Array, t: Array, lam_0: Array, t_0: Array, z: Array) -> tuple[Array, Array]:
         """Components in the frames of this state, from those in frames that turned with the normals by z."""
