@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import math
 
 import torch
@@ -32,8 +34,6 @@ class ModelHand:
 
     failure: str
     """Why the grasp ends, after which the object counts as lost; empty: it holds."""
-    linearization: Linearization | None
-    """At the present state; None where the model refused it."""
 
     def __init__(
         self,
@@ -52,14 +52,17 @@ class ModelHand:
     def reset(self, seed: int) -> Observation:
         """Back to where it began; there is no noise to be seeded."""
         self.state, self.a, force = self._start
-        self.time, self.failure, self.linearization, self._motion = 0.0, "", None, None
+        self.time, self.failure = 0.0, ""
+        self._motion: ContactMotion | None = None
+        self._linearization: Linearization | None = None
+        self._way = self.a.new_zeros(self.hand.n_a)
         self.force = self.a.new_zeros(len(self.hand.pads)) if force is None else force
         try:
             contacts = self.kinematic.touching(self.state)
             lin = self.kinematic.linearize(self.state, contacts, fingertip_force=force, on_unstable="flag")
             if not lin.forces.solved:
                 self.failure = str(lin.doubts[0])
-            self._motion, self.linearization = ContactMotion(self.kinematic, lin), lin
+            self._motion, self._linearization = ContactMotion(self.kinematic, lin), lin
         except GraspError as error:
             self.failure = str(error)
         return self.observe()
@@ -78,15 +81,25 @@ class ModelHand:
         self.time += 1.0
         return self.observe()
 
+    @property
+    def linearization(self) -> Linearization | None:
+        """At the present state, contacts doing what they do in another motion like the last one; None where
+        the model refuses."""
+        if self._linearization is None and self._motion is not None:
+            with contextlib.suppress(GraspError):
+                self._linearization = self._motion.linearize(self._way)
+        return self._linearization
+
     def close(self) -> None:
         """Does nothing: the model holds no device."""
 
     def at_stops(self, push: float = 0.0) -> list[str]:
         """Joints of the fingers that touch, at a stop that bears more than ``push`` [N m]."""
-        if self._motion is None or self.linearization is None:
+        lin = self.linearization
+        if self._motion is None or lin is None:
             return []
         bears = torch.from_numpy(self._motion.loads.stop).abs() > max(push, 1e-6)
-        bears &= self.kinematic.moving(self.linearization.contacts)
+        bears &= self.kinematic.moving(lin.contacts)
         return [self.hand.joint_names[j] for j in torch.nonzero(bears).flatten().tolist()]
 
     def at_limits(self) -> list[str]:
@@ -98,14 +111,15 @@ class ModelHand:
         correction = None
         if self._enhanced is not None:
             correction, _ = self._enhanced.correction(self.state, w, self.state.n_s)
+        motion = copy.copy(motion)  # a copy of this hand stays where it is
         try:
             step = motion.move(w)
             if correction is not None:
                 motion.shift(correction)
-            self.linearization = motion.linearize(w)
         except GraspError as error:
             self.failure = str(error)
             return
+        self._motion, self._linearization, self._way = motion, None, w
         self.state, self.a = motion.state, self.a + w
         pads = [pad.name for pad in self.hand.pads]
         self.force = self.force.new_tensor([step.normal.get(pad, 0.0) for pad in pads])

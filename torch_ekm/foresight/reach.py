@@ -61,6 +61,8 @@ class Reach:
     """Before the first motion and after each, up to the largest angle."""
     angles: tuple[float, ...]
     """Turned at each state of the path [rad]."""
+    safe: float
+    """Turned where nothing speaks for a loss yet, neither there nor after the next motion [rad]."""
 
     @property
     def ends_by(self) -> str:
@@ -111,8 +113,8 @@ def reachable(
         f.linearize(seen.state)  # raises, and says why
     start = hand.observe()
     idle = set(hand.at_limits())
-    path, angles = [start.state], [0.0]
-    standing = _Standing([], [], hand.linearization)
+    path, angles, safe = [start.state], [0.0], math.nan
+    farthest = copy.copy(hand)
     safety = Safety() if safety is None else safety
     ideal = HandKnowledge.of(hand.hand, learns=False)
     loop = ClosedLoop(hand, controller, knowledge=ideal, safety=safety, learn=False)
@@ -123,15 +125,20 @@ def reachable(
         except StopIteration as over:
             stop: Stop = over.value
             break
+        if step.retreat and math.isnan(safe):
+            safe = angles[-2] if len(angles) > 1 else 0.0
         turned = float(about @ step.after.state.minus(start.state)[-3:])
         if not hand.failure and sign * turned > max(sign * angle for angle in angles):
             path.append(step.after.state)
             angles.append(turned)
-            limits = [name for name in hand.at_limits() if name not in idle]
-            standing = _Standing(hand.at_stops(_BEARS), limits, hand.linearization)
+            farthest = copy.copy(hand)
     motions.close()
+    limits = [name for name in farthest.at_limits() if name not in idle]
+    standing = _Standing(farthest.at_stops(_BEARS), limits, farthest.linearization)
     end, what, message = _end(stop, hand, standing)
-    return Reach(angles[-1], end, what, message, tuple(path), tuple(angles))
+    if math.isnan(safe):
+        safe = angles[-1] if end is ReachEnd.NOTHING or len(angles) < 2 else angles[-2]
+    return Reach(angles[-1], end, what, message, tuple(path), tuple(angles), safe)
 
 
 class BeyondReach:

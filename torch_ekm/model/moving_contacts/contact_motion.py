@@ -238,8 +238,10 @@ class ContactMotion:
         """From where gaps are counted [m]: one that overlaps, or bears in the incremental form, is closed."""
         lam, _ = self._grasp.components(self.loads)
         contacts = self._grasp.contacts
-        for name, gap, bears in zip(contacts.finger, contacts.gap.tolist(), lam > 0, strict=True):
-            self._zero[name] = gap if bears and not absolute else min(gap, 0.0)
+        self._zero = {  # a copy of this motion keeps its own
+            name: gap if bears and not absolute else min(gap, 0.0)
+            for name, gap, bears in zip(contacts.finger, contacts.gap.tolist(), lam > 0, strict=True)
+        }
 
     def _substep(self, da: Array) -> _Substep | None:
         """Newton on the state: equilibrium, gaps and cones of the end. None: no convergence."""
