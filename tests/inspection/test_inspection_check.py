@@ -11,9 +11,9 @@ import pytest
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
+from torch_ekm.control import ClosedLoop
 from torch_ekm.description import list_hands, load_hand, load_object
 from torch_ekm.exceptions import DescriptionError, EquilibriumError, GraspError
-from torch_ekm.foresight import reachable
 from torch_ekm.inspection import check as module
 from torch_ekm.inspection.check import check_hand
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
@@ -135,12 +135,13 @@ def test_a_pinch_that_turns_little_is_told(monkeypatch):
 
     found = {}
 
-    def reach_once(controller, seen, *, sign):
+    def reach_once(loop, *, sign):
         if sign not in found:
-            found[sign] = reachable(controller, seen, sign=sign)
+            found[sign] = reach(loop, sign=sign)
         return found[sign]
 
-    monkeypatch.setattr(module, "reachable", reach_once)
+    reach = ClosedLoop.reach
+    monkeypatch.setattr(ClosedLoop, "reach", reach_once)
 
     def turn(least_deg: float) -> tuple[str, list[int]]:
         monkeypatch.setattr(module, "_LITTLE_TURN", math.radians(least_deg))

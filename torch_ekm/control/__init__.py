@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from ..enhanced.hand_figures import DescribedFigures, HandFigures
-from .closed_loop import ClosedLoop, Manipulation, Step, Stop
+from .closed_loop import ClosedLoop
 from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
 from .decision import Decision, StopReason
 from .focus import FocusedPose, PoseTarget
 from .force_sensitivity import ForceSensitivity
 from .knowledge import HandKnowledge
 from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
+from .manipulation import Manipulation, Step, Stop
+from .model_hand import ModelHand
 from .pace import LimitingFunction, Pace, PaceOptions, StepBound, TrustRegion
 from .qp import Bounds, Equality, Inequality, Squares
+from .reach import Reach, ReachEnd
 from .safety import Caution, Guards, Safety, StoppingRule
 from .situation import LinearizedModel, Situation
 from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
@@ -41,11 +44,14 @@ __all__ = [
     "LinearizedModel",
     "LookAndMoveController",
     "Manipulation",
+    "ModelHand",
     "NormalForceLimit",
     "OffAxisTask",
     "Pace",
     "PaceOptions",
     "PoseTarget",
+    "Reach",
+    "ReachEnd",
     "Safety",
     "Situation",
     "Squares",

@@ -7,9 +7,7 @@ import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable, Generator
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Generator
 
 import torch
 
@@ -17,77 +15,21 @@ from ..enhanced.hand_figures import DescribedFigures, HandFigures
 from ..model import Linearization
 from ..plant import Observation, Plant, PlantStatus, ServoInverse
 from ..residual import UpdateReport
-from ..typing import Float, Tensor
+from ..typing import Tensor
 from .controller import LookAndMoveController
 from .decision import Decision, Expectation, StopReason
-from .focus import FocusedPose, PoseTarget
+from .focus import PoseTarget
 from .knowledge import HandKnowledge
+from .manipulation import Manipulation, Step, Stop
 from .pace import SLIDES, ForceSurprise
+from .reach import Reach, follow_to_the_end, out_of_reach
 from .safety import Safety
 from .safety.checked_plant import CheckedPlant, PlantFailedError
 from .safety.progress import Progress
 from .safety.watch import Watch
 
+_KNOWN = 15  # motions from which the figures of a hand are learned
 _GRIP_SHARE = 0.5  # of a motion that only grips: too little for the pace to grow
-
-
-@dataclass(frozen=True)
-class Step:
-    """One motion: what was seen, what was decided, what came of it, what was learned."""
-
-    before: Observation
-    decision: Decision
-    after: Observation
-    increment: Float[Tensor, " n_s"]
-    """ds as measured, ``after.state.minus(before.state)``."""
-    report: UpdateReport | None
-    """Of the learner; None where nothing was learned."""
-    seconds: float
-    """Decision and training, without the plant [s]."""
-    note: str = ""
-    """What a guard objects to in this motion, see :class:`~torch_ekm.control.Guards`."""
-
-    @property
-    def retreat(self) -> bool:
-        """The motion undid an earlier one."""
-        return self.decision.share == 0.0
-
-
-class Stop(NamedTuple):
-    """Why a manipulation ended, and what was seen last."""
-
-    reason: StopReason
-    final: Observation
-    message: str = ""
-    cause: BaseException | None = None
-    """What the plant raised, or Ctrl-C; ``raise result.stop.cause`` goes on with it."""
-
-
-@dataclass(frozen=True)
-class Manipulation:
-    """A finished manipulation, whatever its end."""
-
-    target: PoseTarget
-    focus: FocusedPose
-    steps: tuple[Step, ...]
-    stop: Stop
-
-    @property
-    def errors(self) -> list[float]:
-        """``|e|`` before each motion and at the end, as measured [unit of the focus]; the last is the
-        steady-state error of a controller that came to rest."""
-        seen = [*(step.before for step in self.steps), self.stop.final]
-        return [self.focus.error(self.target, o.state) for o in seen]
-
-    @property
-    def reason(self) -> StopReason:
-        """Why it ended."""
-        return self.stop.reason
-
-    @property
-    def lost(self) -> bool:
-        """The object was dropped, or turned off the focus beyond help."""
-        return self.reason is StopReason.OBJECT_LOST
 
 
 class ClosedLoop:
@@ -113,8 +55,9 @@ class ClosedLoop:
             learned of the servos if the controller's model is no enhanced one.
         safety: when it looks again, goes back, stops and gives up.
         learn: False leaves the learner as it is.
-        decline: is asked before anything moves; a text ends the manipulation as out of reach, with the object
-            in the hand (:class:`~torch_ekm.foresight.BeyondReach`). None: nothing is declined.
+        decline: once the hand's figures are known from 15 motions, a target of 25 deg or more that lies 5 deg
+            beyond :meth:`reach` ends the manipulation as out of reach before anything moves. False: it is
+            tried all the same.
 
     Raises:
         ParameterError: the knowledge is of another hand.
@@ -128,7 +71,7 @@ class ClosedLoop:
         knowledge: HandKnowledge | None = None,
         safety: Safety | None = None,
         learn: bool = True,
-        decline: Callable[[Observation, PoseTarget], str] | None = None,
+        decline: bool = True,
     ) -> None:
         hand = controller.kinematic.hand
         if knowledge is None:
@@ -163,6 +106,34 @@ class ClosedLoop:
         still = torch.zeros(self.controller.kinematic.hand.n_a, dtype=torch.float64)
         with contextlib.suppress(Exception):
             self.plant.command(still)
+
+    def reach(self, *, sign: int = 1, limit: float = math.radians(90)) -> Reach:
+        """``max |angle|`` of this loop on a :class:`ModelHand`: its programs, limits and signs of a loss, and
+        a controller that knows the description, with f + g in place of the plant. Nothing moves, and nothing
+        is learned.
+
+        It is no better than the model's contacts and forces, and knows nothing of noise. ::
+
+            reach = loop.reach()
+            loop.run(PoseTarget.turned(plant.observe().state, axis, reach.safe / DEG))
+
+        Args:
+            sign: 1 or -1, which way about the controller's focus.
+            limit: farthest angle that is tried [rad].
+
+        Raises:
+            ParameterError: a focus that is no single rotation, a sign that is none, or an angle outside 0 to
+                170 deg.
+            GraspError: the model refuses the grasp as it is.
+        """
+        return follow_to_the_end(self._rehearsal, self.controller, self.plant.observe(), sign, limit)
+
+    def _rehearsal(self, hand: Plant, controller: LookAndMoveController) -> ClosedLoop:
+        """On a hand that does what was learned, with a controller that knows the description alone: what it
+        gets wrong stands for what no model knows of states that nobody has seen."""
+        known = HandKnowledge.of(controller.kinematic.hand, learns=False, adapts=False)
+        controller.enhanced, controller.kinematic = None, controller.kinematic.with_figures(known.figures)
+        return ClosedLoop(hand, controller, knowledge=known, safety=self.safety, learn=False, decline=False)
 
     def run(self, target: PoseTarget) -> Manipulation:
         """Drive the object to ``target``.
@@ -210,8 +181,11 @@ class ClosedLoop:
         self.controller.forces = None if self.controller.enhanced is None else self.knowledge.forces
         progress = Progress(self.safety, target, self.controller.focus, seen, started)
         progress.halt = first.halt
-        if self.decline is not None and progress.halt is None and seen.status is not PlantStatus.LOST:
-            against = self.decline(seen, target)
+        known = (
+            isinstance(self.knowledge.figures, HandFigures) and int(self.knowledge.figures.count) >= _KNOWN
+        )
+        if self.decline and known and progress.halt is None and seen.status is not PlantStatus.LOST:
+            against = out_of_reach(self._rehearsal, self.controller, seen, target)
             if against:
                 return Stop(StopReason.OUT_OF_REACH, seen, against)
         if progress.halt is None and seen.status is PlantStatus.HELD:

@@ -146,7 +146,7 @@ class Bench:
                 **{"touch": False, **blind},
             )
         known = {"knowledge": self.knowledge, "safety": self.setting.safety}
-        loop = ClosedLoop(plant, self.look_and_move(), **known, learn=learn)
+        loop = ClosedLoop(plant, self.look_and_move(), **known, learn=learn, decline=False)
         self.last = _whole(loop.run(target))
         return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
 
@@ -170,7 +170,9 @@ class Bench:
         controller = LookAndMoveController(self._predictor, axis, setting.tasks, limits, pace)
         rule = replace(setting.safety.rule, max_steps=1, off_limit=math.inf)
         safety = replace(setting.safety, rule=rule)
-        loop = ClosedLoop(self.plant, controller, knowledge=self.knowledge, safety=safety, learn=False)
+        loop = ClosedLoop(
+            self.plant, controller, knowledge=self.knowledge, safety=safety, learn=False, decline=False
+        )
         done = _whole(loop.run(PoseTarget.turned(start, axis, step_deg * _DEG)))
         before = true_state(done.steps[0].before if done.steps else done.stop.final)
         turned = true_state(done.stop.final).minus(before)[-3:] @ axis

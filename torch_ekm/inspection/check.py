@@ -13,10 +13,9 @@ import torch
 from ..contact import ContactSet
 from ..contact.contact_kinematics import contact_frames
 from ..contact.signed_distance import signed_distance
-from ..control import LookAndMoveController
+from ..control import ClosedLoop, LookAndMoveController
 from ..description import HandDescription, ObjectDescription, Shape, load_hand, load_object
 from ..exceptions import EKMError, MissingExtraError
-from ..foresight import reachable
 from ..kinematics import ActuationMap, HandKinematics, LinkPoses
 from ..model import KinematicModel, Linearization, ModelOptions, ModelStatus
 from ..rendering import make_scene, save_picture
@@ -169,10 +168,10 @@ def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     mend = "stiffer springs, another 'pinch_force', more friction, wider limits"
     try:
         plant = SimulatedHand(hand, obj)
-        seen = plant.reset(0)
+        plant.reset(0)
         model = KinematicModel(plant.hand, obj)
         controller = LookAndMoveController(model, plant.rotation_axis)
-        ends = [reachable(controller, seen, sign=sign) for sign in (-1, 1)]
+        ends = [ClosedLoop(plant, controller).reach(sign=sign) for sign in (-1, 1)]
     except MissingExtraError:
         return
     except EKMError as error:

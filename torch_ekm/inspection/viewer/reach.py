@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ...control import LookAndMoveController
-from ...foresight import Reach, reachable
+from ...control import ClosedLoop, LookAndMoveController, Reach
 from ...kinematics import GraspState
 from ...model import KinematicModel
 from ...rendering.scene import Scene
@@ -25,9 +24,9 @@ class ReachShow:
         self._grasp = GraspShow(hand, object, seed)
         plant = self._grasp.plant
         controller = LookAndMoveController(KinematicModel(plant.hand, plant.object), plant.rotation_axis)
-        seen = plant.observe()
+        loop = ClosedLoop(plant, controller)
         self.reaches: tuple[Reach, Reach] = tuple(  # type: ignore[assignment]
-            reachable(controller, seen, sign=sign) for sign in (-1, 1)
+            loop.reach(sign=sign) for sign in (-1, 1)
         )
         back, forth = self.reaches
         self.path: tuple[GraspState, ...] = (*reversed(back.path), *forth.path[1:])

@@ -9,10 +9,17 @@ import math
 import pytest
 import torch
 
-from torch_ekm.control import ClosedLoop, FocusedPose, LookAndMoveController, PoseTarget, Safety, StopReason
+from torch_ekm.control import (
+    ClosedLoop,
+    FocusedPose,
+    LookAndMoveController,
+    ModelHand,
+    PoseTarget,
+    ReachEnd,
+    StopReason,
+)
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NoContactError, ParameterError
-from torch_ekm.foresight import BeyondReach, ModelHand, ReachEnd, reachable
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantStatus
@@ -69,71 +76,93 @@ def test_joints_keep_their_stops_and_encoders_their_ranges(grasp) -> None:
 def test_a_turn_ends_where_the_model_said(grasp) -> None:
     plant, _, controller = grasp
     seen = plant.reset(0)
-    reach = reachable(controller, seen, safety=Safety())
+    reach = ClosedLoop(plant, controller).reach()
     assert reach.end is ReachEnd.LINK
     assert reach.what == ("thumb_2",)
     assert reach.angles == tuple(sorted(reach.angles))
     assert len(reach.path) == len(reach.angles)
     assert turned(plant.rotation_axis, reach.path[0], reach.path[-1]) == pytest.approx(reach.angle)
-    done = ClosedLoop(plant, controller).run(PoseTarget.turned(seen.state, plant.rotation_axis, degrees=60))
+    done = ClosedLoop(plant, controller, decline=False).run(
+        PoseTarget.turned(seen.state, plant.rotation_axis, degrees=60)
+    )
     real = max(turned(plant.rotation_axis, seen.state, step.after.state) for step in done.steps)
     assert done.reason is StopReason.GIVEN_UP
     assert "thumb_2" in done.stop.message
     assert abs(reach.angle - real) < 3 * DEG
-    other = reachable(controller, plant.reset(0), sign=-1)
+    assert 0 < reach.safe <= reach.angle
+    plant.reset(0)
+    other = ClosedLoop(plant, controller).reach(sign=-1)
     assert other.angle <= 0
     assert other.angle > -10 * DEG
     assert "middle_2" in str(other)
 
 
 def test_what_lies_within_reach_ends_by_nothing(grasp) -> None:
-    _, seen, controller = grasp
-    reach = reachable(controller, seen, limit=5 * DEG)
+    plant, _, controller = grasp
+    plant.reset(0)
+    reach = ClosedLoop(plant, controller).reach(limit=5 * DEG)
     assert reach.end is ReachEnd.NOTHING
     assert reach.angle == pytest.approx(5 * DEG, abs=0.3 * DEG)
 
 
-def test_nothing_of_the_controller_changes(grasp) -> None:
-    plant, seen, _ = grasp
+def test_nothing_of_the_loop_changes(grasp) -> None:
+    """Nor does f forget the figures of the hand that were learned."""
+    plant, _, _ = grasp
+    seen = plant.reset(0)
     ekm = EnhancedModel.for_grasp(KinematicModel(plant.hand, plant.object), seen.state)
     controller = LookAndMoveController(ekm, plant.rotation_axis)
-    before = controller.pace.factor, controller.tighter
-    assert reachable(controller, seen).end is not ReachEnd.NOTHING
-    assert (controller.pace.factor, controller.tighter) == before
+    loop = ClosedLoop(plant, controller)
+    before = controller.pace.factor, controller.tighter, loop.knowledge.servo.state_dict()
+    assert loop.reach().end is not ReachEnd.NOTHING
+    assert (controller.pace.factor, controller.tighter) == before[:2]
+    assert all(torch.equal(x, before[2][name]) for name, x in loop.knowledge.servo.state_dict().items())
     assert controller.enhanced is ekm
+    assert ekm.model is controller.kinematic
+    assert ekm.model.figures is loop.knowledge.figures
 
 
 def test_a_target_out_of_reach_is_declined_and_the_object_stays(grasp) -> None:
-    plant, _, controller = grasp
+    """Once the hand is known; before that, and where one asks for it, it is tried."""
+    plant, _, _ = grasp
     seen = plant.reset(0)
-    loop = ClosedLoop(plant, controller, decline=BeyondReach(controller))
+    ekm = EnhancedModel.for_grasp(KinematicModel(plant.hand, plant.object), seen.state)
+    loop = ClosedLoop(plant, LookAndMoveController(ekm, plant.rotation_axis))
     far, near = (PoseTarget.turned(seen.state, plant.rotation_axis, degrees=angle) for angle in (45, 6))
+    assert next(loop.steps(far)).after.status is PlantStatus.HELD
+    seen = plant.reset(0)
+    loop.knowledge.figures.count.fill_(15)
     done = loop.run(far)
     assert done.reason is StopReason.OUT_OF_REACH
     assert not done.steps
-    assert "thumb_2" in done.stop.message
+    assert "deg nothing speaks against it" in done.stop.message
     assert done.stop.final.status is PlantStatus.HELD
     assert loop.run(near).reason is StopReason.REACHED
+    plant.reset(0)
+    loop.decline = False
+    assert next(loop.steps(far)).after.status is PlantStatus.HELD
 
 
 def test_what_cannot_be_asked_is_refused(grasp) -> None:
-    _, seen, controller = grasp
+    plant, _, controller = grasp
+    seen = plant.reset(0)
+    loop = ClosedLoop(plant, controller)
     with pytest.raises(ParameterError, match="sign"):
-        reachable(controller, seen, sign=0)
+        loop.reach(sign=0)
     with pytest.raises(ParameterError, match="limit"):
-        reachable(controller, seen, limit=4.0)
-    away = dataclasses.replace(seen, position=seen.position + 0.2)
+        loop.reach(limit=4.0)
+    away = ModelHand(controller.kinematic, seen.state, seen.a)
+    away.state = dataclasses.replace(seen.state, position=seen.position + 0.2)
     with pytest.raises(NoContactError):
-        reachable(controller, away)
+        ClosedLoop(away, controller).reach()
     whole = copy.copy(controller)
     whole.focus = FocusedPose(torch.eye(6, dtype=torch.float64))
     with pytest.raises(ParameterError, match="one axis"):
-        reachable(whole, seen)
+        ClosedLoop(plant, whole).reach()
 
 
 def test_a_planar_hand_reaches_as_far_as_its_plane_lets_it() -> None:
     """Two pads hold no moment about the line through them, nor has a plane of motion any."""
     plant = SimulatedHand("planar_two_finger", "can", preset="none")
-    seen = plant.reset(0)
+    plant.reset(0)
     controller = LookAndMoveController(KinematicModel(plant.hand, plant.object), plant.rotation_axis)
-    assert reachable(controller, seen, limit=12 * DEG).angle > 5 * DEG
+    assert ClosedLoop(plant, controller).reach(limit=12 * DEG).angle > 5 * DEG

@@ -4,30 +4,28 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from enum import Enum
+from typing import Protocol
 
 import torch
 
-from ..control import (
-    ClosedLoop,
-    FocusedPose,
-    HandKnowledge,
-    LookAndMoveController,
-    PoseTarget,
-    Safety,
-    Stop,
-    StopReason,
-)
 from ..exceptions import GraspError, ParameterError
 from ..kinematics import GraspState
 from ..model import Linearization
-from ..plant import Observation
+from ..plant import Observation, Plant
 from ..typing import Float, Tensor
+from .controller import LookAndMoveController
+from .decision import StopReason
+from .focus import FocusedPose, PoseTarget
+from .manipulation import Step, Stop
 from .model_hand import ModelHand
 
 _DEG = math.pi / 180
 _BEARS = 0.01  # [N m] of a stop that ends a turn
+_ASKED = 25 * _DEG  # [rad] the model is asked about turns as far as this
+_BEYOND = 5 * _DEG  # [rad] beyond the predicted reach a target is declined; nine of ten ends are as near
 
 
 class ReachEnd(Enum):
@@ -73,33 +71,25 @@ class Reach:
         return f"{self.angle / _DEG:.1f} deg ({self.ends_by})"
 
 
+class _Loop(Protocol):
+    """What is asked of a :class:`~torch_ekm.control.ClosedLoop`."""
+
+    def steps(self, target: PoseTarget) -> Generator[Step, None, Stop]: ...
+
+
+Rehearsal = Callable[[Plant, LookAndMoveController], _Loop]
+"""The loop of a hand and a controller that are not those of the plant."""
+
+
 @torch.no_grad()
-def reachable(
+def follow_to_the_end(
+    rehearsal: Rehearsal,
     controller: LookAndMoveController,
     seen: Observation,
-    *,
-    sign: int = 1,
-    limit: float = 90 * _DEG,
-    safety: Safety | None = None,
+    sign: int,
+    limit: float,
 ) -> Reach:
-    """``max |angle|`` of the closed loop on a :class:`ModelHand`: the controller's own programs, limits and
-    signs of a loss, on f + g in place of the plant.
-
-    Nothing moves, nothing is learned, and the controller stays as it is. The answer holds for this controller
-    and this grasp; it is no better than the model's contacts and forces, and knows nothing of noise.
-
-    Args:
-        controller: with the axis about which the object is to be turned as its focus.
-        seen: the grasp.
-        sign: 1 or -1, which way.
-        limit: farthest angle that is tried [rad].
-        safety: as in :class:`~torch_ekm.control.ClosedLoop`.
-
-    Raises:
-        ParameterError: a focus that is no single rotation, a sign that is none, or an angle outside 0 to
-            170 deg.
-        GraspError: the model refuses the grasp as it is.
-    """
+    """See :meth:`~torch_ekm.control.ClosedLoop.reach`."""
     if sign not in (1, -1):
         raise ParameterError("sign", sign, "1 or -1")
     if not 0 < limit <= 170 * _DEG:
@@ -115,10 +105,7 @@ def reachable(
     idle = set(hand.at_limits())
     path, angles, safe = [start.state], [0.0], math.nan
     farthest = copy.copy(hand)
-    safety = Safety() if safety is None else safety
-    ideal = HandKnowledge.of(hand.hand, learns=False)
-    loop = ClosedLoop(hand, controller, knowledge=ideal, safety=safety, learn=False)
-    motions = loop.steps(PoseTarget.turned(start.state, about, sign * limit))
+    motions = rehearsal(hand, controller).steps(PoseTarget.turned(start.state, about, sign * limit))
     while True:
         try:
             step = next(motions)
@@ -141,42 +128,25 @@ def reachable(
     return Reach(angles[-1], end, what, message, tuple(path), tuple(angles), safe)
 
 
-class BeyondReach:
-    """Declines targets that the model does not reach::
-
-        loop = ClosedLoop(plant, controller, decline=BeyondReach(controller))
-        loop.run(target).reason                                  # StopReason.OUT_OF_REACH; nothing has moved
-
-    Args:
-        controller: of the loop.
-        beyond: a target this far beyond the reach is tried nonetheless [rad]; negative: one that is nearer to
-            the end is declined, too.
-        safety: of the loop.
-    """
-
-    def __init__(
-        self, controller: LookAndMoveController, beyond: float = 2 * _DEG, *, safety: Safety | None = None
-    ) -> None:
-        self.controller, self.beyond, self.safety = controller, beyond, safety
-        self.reach: Reach | None = None
-        """The last that was found."""
-
-    def __call__(self, seen: Observation, target: PoseTarget) -> str:
-        """Why a target is declined; empty: it is not.
-
-        Raises:
-            ParameterError: the focus is no rotation about one axis.
-        """
-        about = _axis_of(self.controller.focus)
+def out_of_reach(
+    rehearsal: Rehearsal, controller: LookAndMoveController, seen: Observation, target: PoseTarget
+) -> str:
+    """Why a target is declined; empty: it is not, or the focus is no rotation about one axis."""
+    try:
+        about = _axis_of(controller.focus)
         asked = float(about @ target.error(seen.state)[3:])
-        sign, limit = (1 if asked >= 0 else -1), min(max(abs(asked), 1 * _DEG), 170 * _DEG)
-        try:
-            self.reach = reachable(self.controller, seen, sign=sign, limit=limit, safety=self.safety)
-        except GraspError:  # the loop will say so itself
+        if abs(asked) < _ASKED:
             return ""
-        if self.reach.end is ReachEnd.NOTHING or abs(asked) <= abs(self.reach.angle) + self.beyond:
-            return ""
-        return f"{asked / _DEG:.1f} deg are out of reach: this grasp turns {self.reach}; grasp it again"
+        sign = 1 if asked >= 0 else -1
+        reach = follow_to_the_end(rehearsal, controller, seen, sign, min(abs(asked), 170 * _DEG))
+    except (ParameterError, GraspError):  # the loop will say so itself
+        return ""
+    if reach.end is ReachEnd.NOTHING or abs(asked) <= abs(reach.angle) + _BEYOND:
+        return ""
+    return (
+        f"{asked / _DEG:.1f} deg are out of reach: this grasp turns {reach}; up to "
+        f"{reach.safe / _DEG:.1f} deg nothing speaks against it. Ask for less, or grasp it again"
+    )
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,71 @@
+"""What a closed loop did: its motions, one by one, and why it ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from ..plant import Observation
+from ..residual import UpdateReport
+from ..typing import Float, Tensor
+from .decision import Decision, StopReason
+from .focus import FocusedPose, PoseTarget
+
+
+@dataclass(frozen=True)
+class Step:
+    """One motion: what was seen, what was decided, what came of it, what was learned."""
+
+    before: Observation
+    decision: Decision
+    after: Observation
+    increment: Float[Tensor, " n_s"]
+    """ds as measured, ``after.state.minus(before.state)``."""
+    report: UpdateReport | None
+    """Of the learner; None where nothing was learned."""
+    seconds: float
+    """Decision and training, without the plant [s]."""
+    note: str = ""
+    """What a guard objects to in this motion, see :class:`~torch_ekm.control.Guards`."""
+
+    @property
+    def retreat(self) -> bool:
+        """The motion undid an earlier one."""
+        return self.decision.share == 0.0
+
+
+class Stop(NamedTuple):
+    """Why a manipulation ended, and what was seen last."""
+
+    reason: StopReason
+    final: Observation
+    message: str = ""
+    cause: BaseException | None = None
+    """What the plant raised, or Ctrl-C; ``raise result.stop.cause`` goes on with it."""
+
+
+@dataclass(frozen=True)
+class Manipulation:
+    """A finished manipulation, whatever its end."""
+
+    target: PoseTarget
+    focus: FocusedPose
+    steps: tuple[Step, ...]
+    stop: Stop
+
+    @property
+    def errors(self) -> list[float]:
+        """``|e|`` before each motion and at the end, as measured [unit of the focus]; the last is the
+        steady-state error of a controller that came to rest."""
+        seen = [*(step.before for step in self.steps), self.stop.final]
+        return [self.focus.error(self.target, o.state) for o in seen]
+
+    @property
+    def reason(self) -> StopReason:
+        """Why it ended."""
+        return self.stop.reason
+
+    @property
+    def lost(self) -> bool:
+        """The object was dropped, or turned off the focus beyond help."""
+        return self.reason is StopReason.OBJECT_LOST
