@@ -272,16 +272,16 @@ def test_deep_kernel_gradient_is_autograds():
 
 
 def test_a_learner_with_a_memory_goes_on_after_a_reload_as_if_nothing_had_been():
-    x, y = system(13, 400)
+    x, y = system(13, 260)
     options = {"hidden": (8,), "features": 2, "capacity": 15}
-    options["parts"] = [Standardize(), LearnHyperparameters(steps=2, memory=150)]
+    options["parts"] = [Standardize(), LearnHyperparameters(steps=2, memory=100)]
     options["refresh_every"] = 8  # so that a turn is a part of the memory
     whole, first, second = (deep_sogp(4, 2, **options) for _ in range(3))
     whole.update(x, y)
-    first.update(x[:238], y[:238])
+    first.update(x[:142], y[:142])
     second.load_state_dict(first.state_dict())
     for half in (second, copy.deepcopy(first)):
-        half.update(x[238:], y[238:])
+        half.update(x[142:], y[142:])
         assert torch.equal(half(x), whole(x))
     whole.reset()
     assert float(past_of(whole).weight.sum()) == 0
