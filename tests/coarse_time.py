@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from typing import Any
 
 _EXACT = (
+    "test_benchmarks_drivers.py",  # so has the hand behind the bus
+    "test_description_docs.py",  # figures are found within 10 %
     "test_simulation_hand.py",
     "test_simulation_model_agreement.py",
     "test_simulation_sensor_disturbances.py",

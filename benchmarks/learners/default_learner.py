@@ -1,7 +1,7 @@
 """The default learner against each of ours on many streams, and what it must bear.
 
 ``default_learner.py --seed 1000`` (settings were chosen on seeds below 100); ``--quick`` runs
-sixty samples of one stream. Recordings are taken along where ``TORCH_EKM_DATA`` names their folder.
+thirty samples of one stream. Recordings are taken along where ``TORCH_EKM_DATA`` names their folder.
 Errors are rms of the second half over that of the model alone; rows appear as they are ready.
 """
 
@@ -140,9 +140,9 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     if options.quick:
-        table(60, options.seed, ("smooth",))
-        bars(60, options.seed)
-        overfitting(60, options.seed, 30)
+        table(30, options.seed, ("smooth",))
+        bars(30, options.seed)
+        overfitting(30, options.seed, 15)
         return
     table(options.samples, options.seed, tuple(options.stream))
     if not options.stream:

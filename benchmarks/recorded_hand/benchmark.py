@@ -303,9 +303,17 @@ def _cached(
 ) -> dict[str, Any]:
     """:func:`run_jobs`, each job's file named after what decides its result."""
     files = {}
+    digests: dict[int, str] = {}  # most arguments are those of all jobs
+
+    def digest(value: object) -> str:
+        if id(value) not in digests:
+            digests[id(value)] = fingerprint(value)
+        return digests[id(value)]
+
     for name, arguments in jobs.items():
         plain = "".join(c if c.isalnum() else "_" for c in name)
-        files[f"{kind}_{plain}_{fingerprint(function, *arguments)[:10]}"] = name
+        decides = fingerprint(*map(digest, (function, *arguments)))
+        files[f"{kind}_{plain}_{decides[:10]}"] = name
     named = {file: jobs[name] for file, name in files.items()}
     results = run_jobs(function, named, cache, processes, on_done)
     return {files[file]: result for file, result in results.items()}

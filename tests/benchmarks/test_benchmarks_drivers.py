@@ -14,5 +14,5 @@ pytest.importorskip("sapien")
 def test_the_same_hand_behind_a_bus_makes_the_same_turn(bus, tmp_path) -> None:
     if find_spec(bus.needs) is None:
         pytest.skip(f"{bus.needs} is not installed")
-    agree, _ = module.turns(bus, tmp_path, 3)
-    assert agree >= 1  # on a busy machine the emulated hand keeps its own bus waiting: typed stops
+    # on a busy machine the emulated hand keeps its own bus waiting, which ends turns: then two more are tried
+    assert module.turns(bus, tmp_path, 1)[0] or module.turns(bus, tmp_path, 3)[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -63,6 +64,7 @@ def test_the_hand_is_kept_and_the_learner_is_not(tmp_path: Path, monkeypatch, ca
             return done
 
     monkeypatch.setattr(new_object, "Bench", Noted)
+    monkeypatch.setattr(new_object, "Setting", partial(new_object.Setting, hand="planar_two_finger"))
     words = ["new_object.py", "--quick", "--then", "can", "--seeds", "6:7", "--jobs", "1"]
     monkeypatch.setattr("sys.argv", [*words, "--out", str(tmp_path)])
     new_object.main()

@@ -6,6 +6,7 @@ import math
 import os
 import runpy
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +30,14 @@ from torch_ekm.exceptions import CalibrationError, DescriptionError, ParameterEr
 from torch_ekm.experiments.learner_comparison.recordings import load_t42
 
 DATA = os.environ.get("TORCH_EKM_DATA", "")
+STEPS = 200  # of a path; each reverses at least once
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Four objects, two paths each, of the model's own making."""
     folder = tmp_path_factory.mktemp("recording")
-    write_synthetic(folder)
+    write_synthetic(folder, steps=STEPS)
     return folder
 
 
@@ -204,6 +206,7 @@ def test_command_line_runs_without_data_and_goes_on(result, out, monkeypatch, ca
     assert len(kept) == count_jobs(None, 1, quick=True)
     times = {path: path.stat().st_mtime_ns for path in kept}
     place = str(Path(recorded_hand.benchmark.__file__).parent)
+    monkeypatch.setattr(recorded_hand.benchmark, "write_synthetic", partial(write_synthetic, steps=STEPS))
     options = ["--quick", "--jobs", "1", "--learners", "linear RLS", "--out", str(out)]
     monkeypatch.setattr(sys, "argv", [place, *options])
     runpy.run_path(place, run_name="__main__")

@@ -59,8 +59,7 @@ def test_the_printed_calibration_runs(
     draw = torch.Generator().manual_seed(0)
     for trial in range(2):
         plant.reset(trial)
-        for _ in range(3):
-            plant.command(0.06 * torch.rand(2, generator=draw, dtype=torch.float64) - 0.03)
+        plant.command(0.06 * torch.rand(2, generator=draw, dtype=torch.float64) - 0.03)
         log.write(trial, plant.trajectory)
     plant.close()
     names: dict = {}

@@ -25,7 +25,7 @@ from torch_ekm.model import ModelOptions
 
 #: The dead zone stops a plain KM: it would go on for 30 motions until it is said to stall.
 BRIEF = Setting(safety=Safety(rule=StoppingRule(max_steps=16)))
-EXPERIMENT = Experiment(Demo(BRIEF, angles_deg=(9.0, 14.0)), (0, 1))
+EXPERIMENT = Experiment(Demo(BRIEF, angles_deg=(9.0, 14.0)), (1,))
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def records(report: Report, folder: Path) -> list[TrialRecord]:
 
 
 def test_every_target_is_approached_and_reached_by_the_enhanced_model(records: list[TrialRecord]) -> None:
-    assert len(records) == 8
+    assert len(records) == 4
     for record in records:
         assert not record.lost
         # the dead zone stops a plain KM
@@ -84,7 +84,7 @@ def test_report_is_complete_and_says_how_it_was_made(report: Report, folder: Pat
         assert figure.path in page
     assert "Development seeds" in page  # seeds below 1000 are not for claims
     configuration = json.loads((folder / "configuration.json").read_text())
-    assert configuration["seeds"] == [0, 1]
+    assert configuration["seeds"] == [1]
     assert configuration["experiment"]["objects"] == ["box"]
     assert configuration["versions"]["torch"]
     by_angle = next(table for table in report.tables if table.name == "by_angle")

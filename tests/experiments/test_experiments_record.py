@@ -22,8 +22,9 @@ pytest.importorskip("sapien")
 pytest.importorskip("h5py")
 
 LEARNS = RecordConfig(
-    Setting(plant=PlantParameters(moment_arm=1.3)), controller="E-KM", angles_deg=(3.0, 5.0)
-)
+    Setting(hand="planar_two_finger", plant=PlantParameters(moment_arm=1.3)), controller="E-KM",
+    object="can", angles_deg=(3.0, 5.0),
+)  # fmt: skip
 
 
 def digests(folder):
@@ -76,7 +77,7 @@ def test_a_trial_that_fails_is_logged_with_what_happened_until_then(tmp_path, mo
         raise SolverError("qp", "infeasible")
 
     monkeypatch.setattr(Bench, "trial", fail)
-    log = record(RecordConfig(Setting(), angles_deg=(3.0, 4.0)), (0,), tmp_path)
+    log = record(RecordConfig(Setting(hand="planar_two_finger"), angles_deg=(3.0, 4.0)), (0,), tmp_path)
     assert [entry.reason for entry in log.index] == ["SolverError"] * 2
     assert len(log.read(1).observations) == 1
     assert "infeasible" in log.read(1).about["outcome"]["message"]

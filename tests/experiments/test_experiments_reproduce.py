@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import functools
 import html
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from torch_ekm.description.registry import object_paths
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.protocols.online import Online
+from torch_ekm.experiments.reporting.report import Report
 from torch_ekm.experiments.reproduce import PROTOCOLS, plan, reproduce
 
 
@@ -27,6 +30,18 @@ def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Generalize, "session", made_up_generalize)
 
 
+@pytest.fixture(scope="module")
+def reports(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Report, Path]]:
+    """A protocol's report of three seeds and its folder, made once; with ``made_up``."""
+
+    @functools.cache
+    def report(name: str) -> tuple[Report, Path]:
+        folder = tmp_path_factory.mktemp(name)
+        return reproduce(plan(name, (0, 1, 2)), folder), folder
+
+    return report
+
+
 def read(folder: Path) -> dict[str, bytes]:
     """The report: all that is not kept of single jobs."""
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
@@ -34,11 +49,11 @@ def read(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.usefixtures("made_up")
 @pytest.mark.parametrize("name", PROTOCOLS)
-def test_report_is_complete(name: str, tmp_path: Path) -> None:
-    report = reproduce(plan(name, (0, 1, 2)), tmp_path)
-    page = (tmp_path / "index.html").read_text()
+def test_report_is_complete(name: str, reports: Callable[[str], tuple[Report, Path]]) -> None:
+    report, folder = reports(name)
+    page = (folder / "index.html").read_text()
     for table in report.tables:
-        with (tmp_path / f"{table.name}.csv").open() as stream:
+        with (folder / f"{table.name}.csv").open() as stream:
             rows = list(csv.reader(stream))
         assert rows[0] == list(table.header)
         assert len(rows) == len(table.rows) + 1 > 1, table.name
@@ -48,9 +63,9 @@ def test_report_is_complete(name: str, tmp_path: Path) -> None:
     cells = [cell for table in report.tables for row in table.rows for cell in row]
     assert not any(isinstance(cell, float) and np.isnan(cell) for cell in cells)
     for figure in report.figures:
-        assert (tmp_path / figure.path).stat().st_size > 1000
-        assert (tmp_path / figure.path).with_suffix(".png").exists()
-    configuration = json.loads((tmp_path / "configuration.json").read_text())
+        assert (folder / figure.path).stat().st_size > 1000
+        assert (folder / figure.path).with_suffix(".png").exists()
+    configuration = json.loads((folder / "configuration.json").read_text())
     assert configuration["seeds"] == [0, 1, 2]
     assert configuration["versions"]["torch"]
     assert configuration["plant"]["dead_zone"] > 0
@@ -59,7 +74,8 @@ def test_report_is_complete(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("made_up")
-def test_a_quick_report_says_so(tmp_path: Path) -> None:
+def test_a_quick_report_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)  # of its words alone
     quick = reproduce(plan("online", (0, 1), quick=True), tmp_path / "quick")
     whole = reproduce(plan("online", (0, 1)), tmp_path / "whole")
     assert quick.title == f"{whole.title}: a quick run"
@@ -68,10 +84,11 @@ def test_a_quick_report_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("made_up")
-def test_killed_run_resumes_to_the_same_report(tmp_path: Path) -> None:
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
+def test_killed_run_resumes_to_the_same_report(
+    tmp_path: Path, reports: Callable[[str], tuple[Report, Path]]
+) -> None:
+    (_, whole), broken = reports("generalize"), tmp_path / "broken"
     experiment = plan("generalize", (0, 1, 2))
-    reproduce(experiment, whole)
     done: list[str] = []
 
     def kill(name: str) -> None:

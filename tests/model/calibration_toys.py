@@ -46,7 +46,7 @@ class Toy:
             if k:
                 goal = self.at.a + torch.from_numpy(draw.uniform(-size, size, 3))
                 moved, state = play.advance(state, goal - motor)
-                motor, at = goal, self.solver.move(at, at.a + moved)
+                motor, at = goal, self.solver.moved(at, at.a + moved)
             normal = self.solver.forces(at).normal if force else None
             s = at.state
             seen = {"q": s.q, "position": s.position, "rotation": s.rotation, "a": motor}

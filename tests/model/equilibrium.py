@@ -85,6 +85,7 @@ class EquilibriumSolver:
 
         self.surfaces = TrackedContacts(contacts, link_pose, state.q, state.position, state.rotation)
         self.start = state
+        self._moved: dict[tuple[int, tuple[float, ...]], tuple[Equilibrium, Equilibrium]] = {}
         reduction = model.reduction
         self.Z = reduction.scaled_basis
         self.B = reduction.actuation @ self.Z[: model.hand.n_q]
@@ -146,6 +147,13 @@ class EquilibriumSolver:
         total = a - start.a
         steps = max(1, int(torch.ceil(total.abs().amax() / self.max_step - 1e-9)))
         return _follow(start, lambda at, done: self._newton(at, start.a + done * total), steps)
+
+    def moved(self, start: Equilibrium, a: Float[Tensor, " n_a"]) -> Equilibrium:
+        """As :meth:`move`, found once: several quantities are compared at the same equilibria."""
+        key = id(start), tuple(a.tolist())
+        if key not in self._moved:
+            self._moved[key] = start, self.move(start, a)  # with the start, whose id must not come again
+        return self._moved[key][1]
 
     @torch.no_grad()
     def grip(

@@ -364,7 +364,7 @@ def finite_difference_jacobian(solver, start, step, read=None):
             for sign in (1.0, -1.0):
                 a = start.a.clone()
                 a[k_a] += sign * k * step
-                total = total + sign * weight * read(solver.move(start, a))
+                total = total + sign * weight * read(solver.moved(start, a))
         columns.append(total / (60 * step))
     return torch.stack(columns, dim=-1)
 
@@ -387,7 +387,7 @@ def step_error_slope(solver, start, J, directions, sizes):
     for direction in directions:
         errors = []
         for size in sizes:
-            exact = solver.move(start, start.a + size * direction).state.minus(start.state)
+            exact = solver.moved(start, start.a + size * direction).state.minus(start.state)
             errors.append(float(scaled((exact - J @ (size * direction))[:, None], n_q).norm()))
         slopes.append(np.polyfit(np.log(sizes), np.log(errors), 1)[0])
     return np.array(slopes)

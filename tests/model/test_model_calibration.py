@@ -28,7 +28,7 @@ def toy():
 
 def test_wrong_figures_are_found_again(toy):
     calibration = calibrate(
-        toy.model(toy.wrong()), toy.recordings(steps=6), ("springs", "moment_arms", "stiffness")
+        toy.model(toy.wrong()), toy.recordings(steps=5), ("springs", "moment_arms", "stiffness")
     )
     truth = {
         "springs": toy.hand.spring_stiffness,
@@ -93,7 +93,7 @@ def test_the_derivative_of_the_residuals(toy, kind, monkeypatch):
 def test_play_is_found(toy, monkeypatch):
     monkeypatch.setitem(PRIORS, "backlash", 1e-4)
     width = torch.tensor([1e-4, 5e-5, 0.0], dtype=F64)
-    recordings = toy.recordings(steps=8, play=Play(width))
+    recordings = toy.recordings(steps=6, play=Play(width))
     calibration = calibrate(toy.model(toy.hand), recordings, ["backlash"])
     found = calibration.hand.actuator_backlash
     np.testing.assert_allclose(found, width, atol=3e-6)

@@ -10,12 +10,12 @@ pytest.importorskip("coal")
 
 
 @pytest.mark.slow
-def test_five_motions_find_the_figures_of_a_wrong_hand():
+def test_four_motions_find_the_figures_of_a_wrong_hand():
     from calibration import trial
 
-    outcome, calibration = trial(0, count=5)
+    outcome, calibration = trial(0, count=4)
     assert len(outcome.sure["moment_arms"]) >= 8  # of 10
-    assert np.median(outcome.sure["moment_arms"]) < 0.02  # measured 0.0003
+    assert np.median(outcome.sure["moment_arms"]) < 0.02  # measured 0.0006
     assert np.median(outcome.sure["springs"]) < 0.05
     assert outcome.ratio < 0.3
     assert "ring_1" in calibration.unidentified[0]  # a finger that touches nothing

@@ -18,9 +18,9 @@ from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel, ModelStatus
 
 
-@functools.lru_cache(maxsize=4)
-def truth(shape, gamma=0.0):
-    _, solver, at = gripped(shape, gamma=gamma)
+@functools.cache
+def truth(shape):
+    _, solver, at = gripped(shape)
     return finite_difference_jacobian(solver, at, 2e-4)
 
 
@@ -33,10 +33,11 @@ def variant(model, **changes):
 
 @pytest.mark.parametrize(("shape", "gamma"), [("box", 0.0), ("can", 0.0), ("box", 0.004)])
 def test_jacobian_equals_finite_differences_of_exact_equilibria(shape, gamma):
-    model, solver, at = gripped(shape, gamma=gamma)
+    model, solver, at = gripped(shape, **({"gamma": gamma} if gamma else {}))
     J = model.linearize(at.state, at.contacts, forces=solver.forces(at)).manipulation_jacobian
     assert J.shape == (26, 9)
-    assert relative_error(J, truth(shape, gamma), 20) < 1e-9
+    expected = finite_difference_jacobian(solver, at, 2e-4) if gamma else truth(shape)
+    assert relative_error(J, expected, 20) < 1e-9
 
 
 @pytest.mark.parametrize("shape", ["box", "can"])
@@ -106,14 +107,14 @@ def test_with_noise_forces_are_found_and_the_jacobian_stays_near():
     model, solver, at = gripped("box")
     model = variant(model, on_unstable="flag")
     errors, solved = [], 0
-    for state in noisy_states(at, 60, 0):
+    for state in noisy_states(at, 30, 0):
         contacts = solver.surfaces(state.q, state.position, state.rotation)
         lin = model.linearize(state, contacts)
         solved += lin.forces.solved
         assert torch.isfinite(lin.manipulation_jacobian).all()
         assert float(lin.forces.margin.min()) > -1e-6
         errors.append(relative_error(lin.manipulation_jacobian, truth("box"), 20))
-    assert solved == 60
+    assert solved == 30
     assert np.median(errors) < 0.15
 
 

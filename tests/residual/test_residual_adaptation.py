@@ -247,14 +247,14 @@ def test_deep_kernel_starts_as_the_plain_one_and_does_not_collapse():
 
 def test_features_learned_from_the_past_beat_those_of_the_last_samples():
     rng = np.random.default_rng(3)
-    x = torch.from_numpy(rng.uniform(-1, 1, (2400, 6)))
+    x = torch.from_numpy(rng.uniform(-1, 1, (1800, 6)))
     y = torch.sin(3.0 * x[:, :1] * x[:, 1:2]) + torch.cos(2.5 * (x[:, 2:3] + x[:, 3:4] * x[:, 4:5]))
     errors = []
     for memory in (0, 1000):
         parts = [LearnHyperparameters(steps=2, memory=memory)]
         gp = deep_sogp(6, 1, capacity=40, noise_variance=0.1, parts=parts)
-        gp.update(x[:2000], y[:2000])
-        errors.append(float((gp(x[2000:]) - y[2000:]).square().mean().sqrt()))
+        gp.update(x[:1400], y[:1400])
+        errors.append(float((gp(x[1400:]) - y[1400:]).square().mean().sqrt()))
     assert errors[1] < 0.85 * errors[0]
 
 
@@ -272,16 +272,16 @@ def test_deep_kernel_gradient_is_autograds():
 
 
 def test_a_learner_with_a_memory_goes_on_after_a_reload_as_if_nothing_had_been():
-    x, y = system(13, 400)
+    x, y = system(13, 260)
     options = {"hidden": (8,), "features": 2, "capacity": 15}
-    options["parts"] = [Standardize(), LearnHyperparameters(steps=2, memory=150)]
+    options["parts"] = [Standardize(), LearnHyperparameters(steps=2, memory=100)]
     options["refresh_every"] = 8  # so that a turn is a part of the memory
     whole, first, second = (deep_sogp(4, 2, **options) for _ in range(3))
     whole.update(x, y)
-    first.update(x[:238], y[:238])
+    first.update(x[:142], y[:142])
     second.load_state_dict(first.state_dict())
     for half in (second, copy.deepcopy(first)):
-        half.update(x[238:], y[238:])
+        half.update(x[142:], y[142:])
         assert torch.equal(half(x), whole(x))
     whole.reset()
     assert float(past_of(whole).weight.sum()) == 0

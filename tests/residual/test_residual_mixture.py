@@ -119,9 +119,9 @@ def test_level_follows_an_offset():
 
 def test_predictive_law_is_better_than_normal_on_heavy_tails_and_no_worse_on_light_ones():
     torch.manual_seed(5)
-    x = torch.randn(1500, 2, 2, dtype=torch.float64)
+    x = torch.randn(1000, 2, 2, dtype=torch.float64)
     nu = torch.tensor([[2.0], [1e6]], dtype=torch.float64)
-    y = 0.2 * StudentT(nu).sample((1500,))
+    y = 0.2 * StudentT(nu).sample((1000,))
     mixture = MixtureResidual(ZeroResidual(2, 1, batch_shape=(2,)))
     own, normal = [], []
     for n, (x_t, y_t) in enumerate(zip(x, y, strict=True)):
@@ -138,8 +138,8 @@ def test_predictive_law_is_better_than_normal_on_heavy_tails_and_no_worse_on_lig
 
 def test_intervals_cover():
     torch.manual_seed(6)
-    x = torch.randn(1500, 2, dtype=torch.float64)
-    y = torch.cat([0.1 * torch.randn(1500, 1), 5.0 * torch.randn(1500, 1)], 1).double()
+    x = torch.randn(1000, 2, dtype=torch.float64)
+    y = torch.cat([0.1 * torch.randn(1000, 1), 5.0 * torch.randn(1000, 1)], 1).double()
     run = run_prequential(MixtureResidual(ZeroResidual(2, 2)), x, y)
     assert float((run.coverage(200) - 0.9).abs().max()) < 0.03
 

@@ -256,7 +256,7 @@ def test_errors_say_what_would_be_right(monkeypatch):
     with pytest.raises(ParameterError, match="9"):
         SimulatedHand("icub_right", "box", parameters=PlantParameters(moment_arm=(1.0, 2.0)))
     with pytest.raises(EquilibriumError, match="box"):
-        SimulatedHand("icub_right", "box", parameters=PlantParameters(object_scale=4.0)).reset(0)
+        SimulatedHand("planar_two_finger", "box", parameters=PlantParameters(object_scale=4.0)).reset(0)
 
 
 def test_a_preset_is_given_by_name_or_as_parameters():

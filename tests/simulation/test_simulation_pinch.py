@@ -126,10 +126,12 @@ def test_a_pinch_across_another_axis_is_not_passed_off_as_the_wanted_one(tmp_pat
     )
     settings = tmp_path / "slab.object.toml"
     settings.write_text('[object]\nname = "slab"\nfriction = 0.8\ngrasp_width = 0.1\n')
+    hand, slab = load_hand("planar_two_finger"), str(tmp_path / "slab.urdf")
     monkeypatch.setattr(pinch, "_GUESSES", 1)  # the others fail too
     with pytest.raises(EquilibriumError, match=r"grasp_axis|too wide"):
-        plan_for(str(tmp_path / "slab.urdf"))
+        plan_pinch(pinch_problem(hand, load_object(slab), PlantConfig(), PlantParameters()), PinchRequest())
     monkeypatch.undo()
     settings.write_text(settings.read_text() + "grasp_axis = [0.0, 0.0, 1.0]\n")
-    _, _, plan, _ = plan_for(str(tmp_path / "slab.urdf"))
+    problem = pinch_problem(hand, load_object(slab), PlantConfig(), PlantParameters())
+    plan = plan_pinch(problem, PinchRequest())
     assert abs(plan.normals[0] @ plan.rotation[:, 2]) > 0.95
