@@ -6,7 +6,6 @@ import math
 import os
 import runpy
 import sys
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +30,14 @@ from torch_ekm.experiments.learner_comparison.recordings import load_t42
 
 DATA = os.environ.get("TORCH_EKM_DATA", "")
 STEPS = 200  # of a path; each reverses at least once
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_horizons():
+    """The picture of the models alone has the two horizons of the tables."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recorded_hand.benchmark, "CURVE", recorded_hand.benchmark.HORIZONS)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -200,13 +207,20 @@ def test_what_is_wrong_is_told(tmp_path, folder):
         identify_markers(load_hand("yale_t42"), np.full((30, 4, 2), np.nan), np.zeros((30, 3)), 0.03)
 
 
-def test_command_line_runs_without_data_and_goes_on(result, out, monkeypatch, capsys):
+def test_the_synthetic_recording_is_the_same_each_time(tmp_path):
+    first, second = (np.load(write_synthetic(tmp_path / k, steps=20, paths=1)) for k in ("a", "b"))
+    assert first.files == second.files
+    for name in first.files:
+        np.testing.assert_array_equal(first[name], second[name])
+
+
+def test_command_line_runs_without_data_and_goes_on(folder, result, out, monkeypatch, capsys):
     """Without data it makes the recording of these tests: all its jobs are done, under the same names."""
     kept = list((out / "runs").glob("*.json"))
     assert len(kept) == count_jobs(None, 1, quick=True)
     times = {path: path.stat().st_mtime_ns for path in kept}
     place = str(Path(recorded_hand.benchmark.__file__).parent)
-    monkeypatch.setattr(recorded_hand.benchmark, "write_synthetic", partial(write_synthetic, steps=STEPS))
+    monkeypatch.setattr(recorded_hand.benchmark, "write_synthetic", lambda _: folder)
     options = ["--quick", "--jobs", "1", "--learners", "linear RLS", "--out", str(out)]
     monkeypatch.setattr(sys, "argv", [place, *options])
     runpy.run_path(place, run_name="__main__")

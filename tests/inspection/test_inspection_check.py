@@ -83,10 +83,16 @@ FAULTS = {  # what is changed (0: URDF, 1: transmission file); name, state and t
 }  # fmt: skip
 
 
+#: Their rows come before the pinch, which other tests plan with springs and actuators like theirs.
+NO_PINCH = ("never taut", "rigid")
+
+
 @pytest.mark.usefixtures("brief")
 @pytest.mark.parametrize("fault", list(FAULTS))
 def test_each_fault_has_its_row(fault, files, monkeypatch):
     monkeypatch.setattr(module, "_GENTLER", ())  # two tests below look at gentler pinches
+    if fault in NO_PINCH:
+        monkeypatch.setattr(module, "_pinch", lambda *_: [module.Check("pinch", "error", "not tried")])
     which, old, new, name, state, text = FAULTS[fault]
     content = files[which].read_text()
     assert old in content
