@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from torch_ekm.foresight import reachable
+from torch_ekm.control import ClosedLoop
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 #: Script: what it needs beyond the core, its arguments, and what its output must show.
@@ -41,7 +41,7 @@ def test_the_script_runs(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [str(script), *arguments])
     if name == "own_hand":  # whose check turns the pinch to its end, of which nothing is printed
-        short = functools.partial(reachable, limit=math.radians(5.0))
-        monkeypatch.setattr("torch_ekm.inspection.check.reachable", short)
+        short = functools.partialmethod(ClosedLoop.reach, limit=math.radians(5.0))
+        monkeypatch.setattr(ClosedLoop, "reach", short)
     runpy.run_path(str(script), run_name="__main__")
     assert re.search(shows, capsys.readouterr().out)

@@ -26,7 +26,7 @@ pytest.importorskip("sapien")
 
 HAND = load_hand("planar_two_finger")
 #: A turn of 3 deg is enough for its row to be ok; to its very end one test below follows it.
-SMALL_TURNS = functools.partial(reachable, limit=math.radians(5.0))
+SMALL_TURNS = functools.partialmethod(ClosedLoop.reach, limit=math.radians(5.0))
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
     """One first guess of the planner, one pinch with faults, one gentler pinch, small turns: most rows need
     no more."""
     monkeypatch.setattr(pinch, "_GUESSES", 1)
-    monkeypatch.setattr(module, "reachable", SMALL_TURNS)
+    monkeypatch.setattr(ClosedLoop, "reach", SMALL_TURNS)
     monkeypatch.setattr(module, "_DISTURBED", 1)
     monkeypatch.setattr(module, "_GENTLER", (2.0,))
 
@@ -50,7 +50,7 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("name", list_hands())
 def test_the_hands_of_the_package_pass(name, tmp_path, monkeypatch):
     drawn = name == "icub_right"  # in a process of its own, which takes as long as the rest
-    monkeypatch.setattr(module, "reachable", SMALL_TURNS)
+    monkeypatch.setattr(ClosedLoop, "reach", SMALL_TURNS)
     if name != "planar_two_finger":
         monkeypatch.setattr(module, "_DISTURBED", 1)
     rows = check_hand(name, picture=tmp_path / "check.png" if drawn else None)
