@@ -19,7 +19,7 @@ from foresight_turn import ForesightTurn
 from oracle import OracleBench
 from run_study import run_study
 
-from torch_ekm.control import ClosedLoop, Reach
+from torch_ekm.control import Reach
 from torch_ekm.exceptions import GraspError, ParameterError
 from torch_ekm.experiments.config import Setting, digest, object_name
 from torch_ekm.experiments.protocols.generalize import OTHER_ANGLES, TABLE_I
@@ -160,9 +160,8 @@ class Foresight(Protocol):
 def reach_of(bench: Bench, angle_deg: float) -> Reach | None:
     """How far the model says that the grasp turns, up to ``angle_deg``; None: it refuses the grasp."""
     sign, limit = (1 if angle_deg > 0 else -1), abs(angle_deg) * _DEG
-    known = {"knowledge": bench.knowledge, "safety": bench.setting.safety}
     try:
-        return ClosedLoop(bench.plant, bench.look_and_move(), **known).reach(sign=sign, limit=limit)
+        return bench.closed_loop(bench.plant).reach(sign=sign, limit=limit)
     except GraspError:
         return None
 

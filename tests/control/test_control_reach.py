@@ -112,7 +112,7 @@ def test_nothing_of_the_loop_changes(grasp) -> None:
     ekm = EnhancedModel.for_grasp(KinematicModel(plant.hand, plant.object), seen.state)
     controller = LookAndMoveController(ekm, plant.rotation_axis)
     loop = ClosedLoop(plant, controller)
-    before = controller.pace.factor, controller.tighter, loop.knowledge.servo.state_dict()
+    before = controller.pace.factor, controller.tighter, copy.deepcopy(loop.knowledge.servo.state_dict())
     assert loop.reach().end is not ReachEnd.NOTHING
     assert (controller.pace.factor, controller.tighter) == before[:2]
     assert all(torch.equal(x, before[2][name]) for name, x in loop.knowledge.servo.state_dict().items())
@@ -139,6 +139,10 @@ def test_a_target_out_of_reach_is_declined_and_the_object_stays(grasp) -> None:
     assert loop.run(near).reason is StopReason.REACHED
     plant.reset(0)
     loop.decline = False
+    assert next(loop.steps(far)).after.status is PlantStatus.HELD
+    plain = LookAndMoveController(KinematicModel(plant.hand, plant.object), plant.rotation_axis)
+    plant.reset(0)  # a model that follows nothing of what was learned is not asked
+    loop = ClosedLoop(plant, plain, knowledge=loop.knowledge)
     assert next(loop.steps(far)).after.status is PlantStatus.HELD
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import math
 import threading
@@ -55,9 +56,9 @@ class ClosedLoop:
             learned of the servos if the controller's model is no enhanced one.
         safety: when it looks again, goes back, stops and gives up.
         learn: False leaves the learner as it is.
-        decline: once the hand's figures are known from 15 motions, a target of 25 deg or more that lies 5 deg
-            beyond :meth:`reach` ends the manipulation as out of reach before anything moves. False: it is
-            tried all the same.
+        decline: once an enhanced model knows the hand's figures from 15 motions, a target of 25 deg or more
+            that lies 5 deg beyond :meth:`reach` ends the manipulation as out of reach before anything moves.
+            False: it is tried all the same.
 
     Raises:
         ParameterError: the knowledge is of another hand.
@@ -128,9 +129,11 @@ class ClosedLoop:
         """
         return follow_to_the_end(self._rehearsal, self.controller, self.plant.observe(), sign, limit)
 
-    def _rehearsal(self, hand: Plant, controller: LookAndMoveController) -> ClosedLoop:
+    def _rehearsal(self, hand: Plant) -> ClosedLoop:
         """On a hand that does what was learned, with a controller that knows the description alone: what it
         gets wrong stands for what no model knows of states that nobody has seen."""
+        controller = copy.copy(self.controller)
+        controller.pace = copy.deepcopy(controller.pace)
         known = HandKnowledge.of(controller.kinematic.hand, learns=False, adapts=False)
         controller.enhanced, controller.kinematic = None, controller.kinematic.with_figures(known.figures)
         return ClosedLoop(hand, controller, knowledge=known, safety=self.safety, learn=False, decline=False)
@@ -181,9 +184,7 @@ class ClosedLoop:
         self.controller.forces = None if self.controller.enhanced is None else self.knowledge.forces
         progress = Progress(self.safety, target, self.controller.focus, seen, started)
         progress.halt = first.halt
-        known = (
-            isinstance(self.knowledge.figures, HandFigures) and int(self.knowledge.figures.count) >= _KNOWN
-        )
+        known = self.controller.enhanced is not None and int(self.knowledge.figures.count) >= _KNOWN
         if self.decline and known and progress.halt is None and seen.status is not PlantStatus.LOST:
             against = out_of_reach(self._rehearsal, self.controller, seen, target)
             if against:

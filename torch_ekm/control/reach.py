@@ -25,7 +25,7 @@ from .model_hand import ModelHand
 _DEG = math.pi / 180
 _BEARS = 0.01  # [N m] of a stop that ends a turn
 _ASKED = 25 * _DEG  # [rad] the model is asked about turns as far as this
-_BEYOND = 5 * _DEG  # [rad] beyond the predicted reach a target is declined; nine of ten ends are as near
+_BEYOND = 5 * _DEG  # [rad] beyond the predicted reach a target is declined; two of three ends are as near
 
 
 class ReachEnd(Enum):
@@ -77,8 +77,8 @@ class _Loop(Protocol):
     def steps(self, target: PoseTarget) -> Generator[Step, None, Stop]: ...
 
 
-Rehearsal = Callable[[Plant, LookAndMoveController], _Loop]
-"""The loop of a hand and a controller that are not those of the plant."""
+Rehearsal = Callable[[Plant], _Loop]
+"""The loop on a hand that is not the plant; nothing that it does changes its original."""
 
 
 @torch.no_grad()
@@ -94,8 +94,6 @@ def follow_to_the_end(
         raise ParameterError("sign", sign, "1 or -1")
     if not 0 < limit <= 170 * _DEG:
         raise ParameterError("limit", limit, "above 0 and at most 170 deg [rad]")
-    controller = copy.copy(controller)
-    controller.pace = copy.deepcopy(controller.pace)
     about, f = _axis_of(controller.focus), controller.kinematic
     predictor = f if controller.enhanced is None else controller.enhanced
     hand = ModelHand(predictor, seen.state, seen.a, seen.fingertip_force)
@@ -103,19 +101,19 @@ def follow_to_the_end(
         f.linearize(seen.state)  # raises, and says why
     start = hand.observe()
     idle = set(hand.at_limits())
-    path, angles, safe = [start.state], [0.0], math.nan
+    path, angles, calm = [start.state], [0.0], None  # states before the first sign of a loss
     farthest = copy.copy(hand)
-    motions = rehearsal(hand, controller).steps(PoseTarget.turned(start.state, about, sign * limit))
+    motions = rehearsal(hand).steps(PoseTarget.turned(start.state, about, sign * limit))
     while True:
         try:
             step = next(motions)
         except StopIteration as over:
             stop: Stop = over.value
             break
-        if step.retreat and math.isnan(safe):
-            safe = angles[-2] if len(angles) > 1 else 0.0
+        if step.retreat and calm is None:
+            calm = len(angles)
         turned = float(about @ step.after.state.minus(start.state)[-3:])
-        if not hand.failure and sign * turned > max(sign * angle for angle in angles):
+        if not hand.failure and sign * turned > sign * angles[-1]:
             path.append(step.after.state)
             angles.append(turned)
             farthest = copy.copy(hand)
@@ -123,9 +121,10 @@ def follow_to_the_end(
     limits = [name for name in farthest.at_limits() if name not in idle]
     standing = _Standing(farthest.at_stops(_BEARS), limits, farthest.linearization)
     end, what, message = _end(stop, hand, standing)
-    if math.isnan(safe):
-        safe = angles[-1] if end is ReachEnd.NOTHING or len(angles) < 2 else angles[-2]
-    return Reach(angles[-1], end, what, message, tuple(path), tuple(angles), safe)
+    until = angles[:calm]
+    if calm is not None or end is not ReachEnd.NOTHING:  # the last of them leads to the sign
+        until = until[:-1] or until
+    return Reach(angles[-1], end, what, message, tuple(path), tuple(angles), until[-1])
 
 
 def out_of_reach(

@@ -59,6 +59,8 @@ class DescribedFigures(Recorded, nn.Module):
     """The hand is as described; nothing is learned of it."""
 
     learns = False
+    count = 0
+    """Motions from which they were learned."""
 
     def check(self, hand: HandDescription) -> None:
         """They are of any hand."""

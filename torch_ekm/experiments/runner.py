@@ -145,9 +145,7 @@ class Bench:
                 switch_off=lambda seen: abs(float(axis @ target.error(seen.state)[3:])) <= blind_deg * _DEG,
                 **{"touch": False, **blind},
             )
-        known = {"knowledge": self.knowledge, "safety": self.setting.safety}
-        loop = ClosedLoop(plant, self.look_and_move(), **known, learn=learn, decline=False)
-        self.last = _whole(loop.run(target))
+        self.last = _whole(self.closed_loop(plant, learn=learn).run(target))
         return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
 
     def long_step(self, seed: int, trial: int, step_deg: float) -> Record:
@@ -191,6 +189,11 @@ class Bench:
         """The controller of the next turn: about the hand's axis, by what is known now."""
         setting, axis = self.setting, self.hand.rotation_axis
         return LookAndMoveController(self._predictor, axis, setting.tasks, setting.limits, self.pace)
+
+    def closed_loop(self, plant: Plant, *, learn: bool = True) -> ClosedLoop:
+        """The loop of the next turn; no target is declined."""
+        known = {"knowledge": self.knowledge, "safety": self.setting.safety}
+        return ClosedLoop(plant, self.look_and_move(), **known, learn=learn, decline=False)
 
     def _prepare_learner(self, start: GraspState) -> None:
         setting = self.setting

@@ -171,7 +171,8 @@ def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
         plant.reset(0)
         model = KinematicModel(plant.hand, obj)
         controller = LookAndMoveController(model, plant.rotation_axis)
-        ends = [ClosedLoop(plant, controller).reach(sign=sign) for sign in (-1, 1)]
+        loop = ClosedLoop(plant, controller)
+        ends = [loop.reach(sign=sign) for sign in (-1, 1)]
     except MissingExtraError:
         return
     except EKMError as error:

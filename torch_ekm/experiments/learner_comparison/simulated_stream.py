@@ -39,7 +39,7 @@ def record_simulated_hand(n: int = 400, seed: int = 1000) -> Stream:
         controller = LookAndMoveController(model, plant.rotation_axis)
         target = PoseTarget.turned(start, plant.rotation_axis, draw.uniform(5, 20) * _DEG)
         before = len(x)
-        for step in ClosedLoop(disturbed, controller, safety=safety, decline=False).steps(target):
+        for step in ClosedLoop(disturbed, controller, safety=safety).steps(target):
             x.append(enhanced.features(step.before.state, step.decision.delta_a))
             y.append((step.increment - step.decision.nominal)[enhanced.outputs] * enhanced.output_scale)
         segments.append(len(x) - before)

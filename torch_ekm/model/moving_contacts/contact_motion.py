@@ -152,6 +152,11 @@ class ContactMotion:
         still = np.zeros(laws.S.shape[1])
         self._load = still if a is not None else laws.unbalance(self._grasp, self.loads)
 
+    def __copy__(self) -> ContactMotion:
+        made = object.__new__(ContactMotion)
+        made.__dict__.update(self.__dict__, _zero=dict(self._zero))  # all else is replaced, never changed
+        return made
+
     @property
     def _grasp(self) -> PlacedGrasp:
         """Contacts and matrices at the present state, found when they are first asked for."""
@@ -238,10 +243,8 @@ class ContactMotion:
         """From where gaps are counted [m]: one that overlaps, or bears in the incremental form, is closed."""
         lam, _ = self._grasp.components(self.loads)
         contacts = self._grasp.contacts
-        self._zero = {  # a copy of this motion keeps its own
-            name: gap if bears and not absolute else min(gap, 0.0)
-            for name, gap, bears in zip(contacts.finger, contacts.gap.tolist(), lam > 0, strict=True)
-        }
+        for name, gap, bears in zip(contacts.finger, contacts.gap.tolist(), lam > 0, strict=True):
+            self._zero[name] = gap if bears and not absolute else min(gap, 0.0)
 
     def _substep(self, da: Array) -> _Substep | None:
         """Newton on the state: equilibrium, gaps and cones of the end. None: no convergence."""
