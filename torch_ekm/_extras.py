@@ -15,6 +15,7 @@ _BRINGS = {
     "notebooks": ("IPython", "pyarrow"),
     "peers": ("river",),
     "fast": ("numba",),
+    "mujoco": ("mujoco",),
     "dynamixel": ("dynamixel_sdk",),
     "ros2": ("rclpy", "sensor_msgs", "trajectory_msgs", "geometry_msgs", "std_msgs"),
     "interop": ("sklearn", "onnx", "onnxscript", "casadi", "rosbags"),

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "model"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
-from test_model_sapien import true_state, turning_step
+from turning_step import true_state, turning_step
 
 from torch_ekm.exceptions import GraspError
 from torch_ekm.model import KinematicModel, ModelOptions

@@ -7,7 +7,7 @@ import pytest
 
 from torch_ekm.contact.signed_distance import point_distance, signed_distance
 from torch_ekm.description.shape import Shape
-from torch_ekm.simulation.physics.bodies import x_axis_to
+from torch_ekm.simulation.physics.sapien_bodies import x_axis_to
 
 coal = pytest.importorskip("coal")
 

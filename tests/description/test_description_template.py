@@ -78,7 +78,7 @@ def test_a_mimic_becomes_a_coupling(tmp_path: Path) -> None:
 
 def test_what_no_template_is_written_for(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="urdf"):
-        write_template(tmp_path / "hand.xml")
+        write_template(tmp_path / "hand.json")
     with pytest.raises(DescriptionError, match="no such URDF"):
         write_template(tmp_path / "hand.urdf")
     (tmp_path / "thing.urdf").write_text('<robot name="thing"><link name="thing"/></robot>')

@@ -18,13 +18,17 @@ from typer import Argument, Option  # isort: skip
 def hands(
     new: Annotated[
         Path | None,
-        Option(metavar="URDF", help="Write NAME.transmission.toml next to this NAME.urdf, to be filled in."),
+        Option(
+            metavar="FILE",
+            help="Write NAME.transmission.toml next to this NAME.urdf or NAME.xml (MJCF), to be filled in.",
+        ),
     ] = None,
 ) -> None:
     """List the hands of the package, or begin your own.
 
     With --new: all joints of the URDF with their limits, a coupling for each <mimic>, and examples of
-    actuators and pads. Fill in what is marked with TODO; 'torch-ekm check NAME.urdf' lists what is missing.
+    actuators and pads; of an MJCF, its own tendons, springs, couplings and actuators. Fill in what is marked
+    with TODO; 'torch-ekm check NAME.urdf' lists what is missing.
     A file that is there is not overwritten.
     """
     from ..description import list_hands, load_hand, write_template

@@ -10,6 +10,7 @@ from .._terminal import print_report, progress, say
 from ..exceptions import ParameterError
 from ._app import (
     AN_OBJECT,
+    Engine,
     Hand,
     Jobs,
     Preset,
@@ -67,6 +68,7 @@ def reproduce(
     ] = "",
     hand: Hand = "icub_right",
     preset: Preset = "nominal",
+    engine: Engine = "sapien",
     learner: Annotated[
         str, Option(help="action-linear, rbf, SOGP deep, ...; an unknown name lists all.")
     ] = "action-linear",
@@ -95,7 +97,7 @@ def reproduce(
 
     limiting = LimitingFunction() if step is None else LimitingFunction(step=parse_step(step))
     pace = PaceOptions(limiting=limiting)
-    setting = Setting(hand=hand, preset=preset, learner=learner, sensing=sensing, pace=pace)
+    setting = Setting(hand=hand, preset=preset, engine=engine, learner=learner, sensing=sensing, pace=pace)
     turns = parse_angles(angles) if angles else None
     chosen, things = parse_seeds(seeds), objects or None
     planned = plan(experiment, chosen, setting=setting, objects=things, angles_deg=turns, quick=quick)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from .._terminal import print_table, progress, say
-from ._app import AN_OBJECT, Hand, Html, Port, Preset, Sensing, app, needs, parse_angles, parse_seeds
+from ._app import AN_OBJECT, Engine, Hand, Html, Port, Preset, Sensing, app, needs, parse_angles, parse_seeds
 
 import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
@@ -26,6 +26,7 @@ def record(
     seeds: Annotated[str, Option(help="FIRST:END; each angle is turned once for each seed.")] = "0:3",
     controller: Annotated[str, Option(help="KM, KM+I, KM+S or E-KM.")] = "KM",
     preset: Preset = "nominal",
+    engine: Engine = "sapien",
     sensing: Sensing = True,
     images: Annotated[bool, Option(help="Keep the camera's images too.")] = False,
 ) -> None:
@@ -38,7 +39,7 @@ def record(
     from ..experiments.protocols.record import RecordConfig
     from ..experiments.protocols.record import record as run
 
-    setting = Setting(hand=hand, preset=preset, sensing=sensing)
+    setting = Setting(hand=hand, preset=preset, engine=engine, sensing=sensing)
     config = RecordConfig(setting, object, controller, parse_angles(angles), images)
     chosen = parse_seeds(seeds)
     with progress("recording", len(chosen) * len(config.angles_deg)) as advance:

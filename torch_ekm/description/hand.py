@@ -106,6 +106,9 @@ class HandDescription:
     pinch_force: float = 5.0
     """Normal force with which the thumb pinches an object in simulation [N]; soft springs bear less."""
 
+    notes: tuple[str, ...] = ()
+    """What an MJCF says that is left out or approximated here."""
+
     def __post_init__(self) -> None:
         if self.planar_normal is not None:
             self._check_plane(np.array(self.planar_normal, dtype=float))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..exceptions import DescriptionError, UnknownNameError
 from .hand import HandDescription
+from .mjcf_hand import read_mjcf
 from .objects import ObjectDescription, read_object
 from .transmission import read_transmission
 from .urdf import read_urdf
@@ -52,13 +53,19 @@ def list_cylinders() -> tuple[str, ...]:
 def load_hand(name: str | Path) -> HandDescription:
     """A hand by name, or from a path to a URDF with ``<stem>.transmission.toml`` next to it.
 
+    An MJCF (``.xml``, extra ``mujoco``) says itself what transmits its motors; a transmission file next to it
+    has the last word, and adds the pads.
+
     Raises:
-        UnknownNameError: ``name`` is neither a known hand nor a path to a ``.urdf`` file.
+        UnknownNameError: ``name`` is neither a known hand nor a path to a ``.urdf`` or ``.xml`` file.
         DescriptionError: a file is missing or wrong; the message names file and place.
         JointMismatchError: URDF and transmission file name different joints.
     """
-    urdf, transmission = hand_paths(name)
-    return read_transmission(transmission, read_urdf(urdf))
+    path, transmission = hand_paths(name)
+    if path.suffix == ".xml":
+        mjcf = read_mjcf(path)
+        return read_transmission(transmission, mjcf.urdf, mjcf)
+    return read_transmission(transmission, read_urdf(path))
 
 
 def load_object(name: str | Path) -> ObjectDescription:
@@ -73,12 +80,13 @@ def load_object(name: str | Path) -> ObjectDescription:
 
 
 def hand_paths(name: str | Path) -> tuple[Path, Path]:
-    """URDF and transmission file of a hand, whether they exist or not.
+    """URDF or MJCF and transmission file of a hand, whether they exist or not.
 
     Raises:
         UnknownNameError: as :func:`load_hand`.
     """
-    path = _resolve("hand", name, {key: urdf_folder() / file for key, file in _HANDS.items()})
+    known = {key: urdf_folder() / file for key, file in _HANDS.items()}
+    path = _resolve("hand", name, known, (".urdf", ".xml"))
     return path, path.with_suffix(".transmission.toml")
 
 
@@ -89,7 +97,8 @@ def object_paths(name: str | Path) -> tuple[Path, Path]:
         UnknownNameError: as :func:`load_object`.
     """
     folder = urdf_folder() / "objects"
-    path = _resolve("object", name, {key: folder / f"{key}.urdf" for key in (*_OBJECTS, *_CYLINDERS)})
+    known = {key: folder / f"{key}.urdf" for key in (*_OBJECTS, *_CYLINDERS)}
+    path = _resolve("object", name, known, (".urdf",))
     return path, path.with_suffix(".object.toml")
 
 
@@ -103,7 +112,9 @@ def file_digests(hand: str | Path, objects: Iterable[str | Path]) -> dict[str, s
         UnknownNameError: no such hand or object.
         DescriptionError: a file cannot be read.
     """
-    named = [("hand", path) for path in hand_paths(hand)]
+    described, transmission = hand_paths(hand)
+    alone = described.suffix == ".xml" and not transmission.exists()  # an MJCF may say it all
+    named = [("hand", path) for path in (described, transmission)[: 1 if alone else 2]]
     named += [("object", path) for item in objects for path in object_paths(item)]
     digests = {}
     for kind, path in named:
@@ -114,10 +125,10 @@ def file_digests(hand: str | Path, objects: Iterable[str | Path]) -> dict[str, s
     return digests
 
 
-def _resolve(kind: str, name: str | Path, known: dict[str, Path]) -> Path:
+def _resolve(kind: str, name: str | Path, known: dict[str, Path], endings: tuple[str, ...]) -> Path:
     if isinstance(name, str) and name in known:
         return known[name]
     path = Path(name)
-    if path.suffix != ".urdf":
-        raise UnknownNameError(kind, str(name), (*known, "a path to a .urdf file"))
+    if path.suffix not in endings:
+        raise UnknownNameError(kind, str(name), (*known, f"a path to a {' or '.join(endings)} file"))
     return path

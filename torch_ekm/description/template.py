@@ -11,8 +11,9 @@ import numpy as np
 
 from .._files import write_whole
 from ..exceptions import DescriptionError, UnknownNameError
+from .mjcf_hand import MjcfHand, read_mjcf
 from .transmission import TODO
-from .transmission_file import toml_key
+from .transmission_file import document, toml_key
 from .urdf import UrdfModel, read_urdf
 
 _ROUND = ("capsule", "sphere")
@@ -29,6 +30,12 @@ _HEAD = """\
 name = {name}
 base_link = {base}  # the hand frame: poses, contacts and Jacobians are expressed in it
 gravity = [0.0, 0.0, 9.81]  # [m/s^2] in the hand frame; as it stands, the palm faces down
+"""
+_MJCF_HEAD = """\
+# What transmits the motors of {mjcf}, as read by 'torch-ekm hands --new'; it is this file that is used now.
+# Put a figure wherever "TODO" stands; 'torch-ekm check {mjcf}' lists what is missing.
+# Angles in rad, or in deg where the key ends in _deg; lengths in m; torques in N m.
+# All keys: docs/reference/file_formats.md
 """
 _JOINTS = """
 # spring [N m/rad]: stiffness of the return spring, 0.0 where there is none (0.01 to 0.2 in fingers);
@@ -53,10 +60,11 @@ _PADS = """
 def write_template(urdf: str | Path) -> Path:
     """Write ``<stem>.transmission.toml`` next to a URDF: all joints, and couplings for ``<mimic>``.
 
-    Figures that the URDF does not state are ``"TODO"``; as long as one is left, ``load_hand`` names them all.
+    Of an MJCF: all that it says of its transmission, with notes on what it says and a hand has not.
+    Figures that the file does not state are ``"TODO"``; as long as one is left, ``load_hand`` names them all.
 
     Args:
-        urdf: a path that ends in ".urdf".
+        urdf: a path that ends in ".urdf" or ".xml".
 
     Raises:
         UnknownNameError: another ending.
@@ -65,15 +73,25 @@ def write_template(urdf: str | Path) -> Path:
         OutputError: the folder cannot be written to.
     """
     path = Path(urdf)
-    if path.suffix != ".urdf":
-        raise UnknownNameError("URDF", str(urdf), ("a path to a .urdf file",))
-    model, written = read_urdf(path), path.with_suffix(".transmission.toml")
+    if path.suffix not in (".urdf", ".xml"):
+        raise UnknownNameError("URDF or MJCF", str(urdf), ("a path to a .urdf or .xml file",))
+    mjcf = read_mjcf(path) if path.suffix == ".xml" else None
+    model = read_urdf(path) if mjcf is None else mjcf.urdf
+    written = path.with_suffix(".transmission.toml")
     if not model.moving_joints:
         raise DescriptionError(path, "there is no revolute or continuous joint")
     if written.exists():
         raise DescriptionError(written, "is there already and is not overwritten; move it away first")
-    write_whole(written, template(model))
+    write_whole(written, template(model) if mjcf is None else mjcf_template(mjcf))
     return written
+
+
+def mjcf_template(mjcf: MjcfHand) -> str:
+    """The text of the transmission file of an MJCF, with TODO for what its pads need."""
+    notes = [f"# {_comment(note)}" for note in mjcf.notes]
+    head = _MJCF_HEAD.format(mjcf=_comment(mjcf.urdf.path.name)).rstrip("\n")
+    lines = [head, *(["#", *notes] if notes else []), "", document(mjcf.tables).rstrip("\n")]
+    return "\n".join([*lines, *_pads(mjcf.urdf)]) + "\n"
 
 
 def template(model: UrdfModel) -> str:
@@ -88,10 +106,13 @@ def template(model: UrdfModel) -> str:
     fingers = _fingers(model)
     for k, finger in enumerate(fingers, start=1):
         lines += _actuator(model, finger, f"finger_{k}")
-    lines.append(_PADS.rstrip("\n"))
-    for k, finger in enumerate(fingers, start=1):
-        lines += _pad(model, _fingertip(model, finger[-1]), f"tip_{k}")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_pads(model)]) + "\n"
+
+
+def _pads(model: UrdfModel) -> Iterator[str]:
+    yield _PADS.rstrip("\n")
+    for k, finger in enumerate(_fingers(model), start=1):
+        yield from _pad(model, _fingertip(model, finger[-1]), f"tip_{k}")
 
 
 def _joints(model: UrdfModel) -> Iterator[str]:

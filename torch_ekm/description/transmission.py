@@ -16,6 +16,7 @@ from ..exceptions import DescriptionError, JointMismatchError
 from ._toml import TomlTable, read_toml
 from .hand import Actuator, ContactPad, HallSensor, HandDescription
 from .mimic import check_mimics
+from .mjcf_hand import MjcfHand
 from .urdf import UrdfModel
 
 #: Stands for a figure that is still to be filled in.
@@ -33,8 +34,8 @@ HALL = ("joint", "channel", "open", "closed")
 T = TypeVar("T")
 
 
-def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
-    """The hand described by ``urdf`` and the transmission file at ``path``.
+def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None) -> HandDescription:
+    """The hand described by ``urdf`` and the transmission file at ``path``; without the file, by ``mjcf``.
 
     Raises:
         DescriptionError: no such file, malformed TOML, an unknown key, a figure that is not finite,
@@ -42,10 +43,14 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
             coupling holds.
         JointMismatchError: the file names joints that the URDF lacks, or leaves some out.
     """
-    if not path.is_file():
+    written = path
+    if mjcf is not None and not path.is_file():
+        data, path = mjcf.tables, urdf.path  # which errors then name
+    elif not path.is_file():
         problem = f"no such transmission file; 'torch-ekm hands --new {urdf.path}' begins one"
         raise DescriptionError(path, problem)
-    data = read_toml(path, "transmission file")
+    else:
+        data = read_toml(path, "transmission file")
     _check_filled_in(path, data)
     top = TomlTable(path, "top level", data, TABLES)
     if not isinstance(data.get("notes", {}), dict):
@@ -76,7 +81,7 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
     return HandDescription(
         name=hand.text("name"),
         urdf=urdf,
-        transmission_path=path,
+        transmission_path=written,
         base_link=base,
         link_names=tuple(link.name for link in urdf.links),
         joint_names=names,
@@ -93,6 +98,7 @@ def read_transmission(path: Path, urdf: UrdfModel) -> HandDescription:
         planar_normal=None if normal is None else (normal[0], normal[1], normal[2]),
         gravity=(gravity[0], gravity[1], gravity[2]),
         pinch_force=hand.number("pinch_force", HandDescription.pinch_force, positive=True),
+        notes=() if mjcf is None else tuple(mjcf.notes),
     )
 
 
@@ -225,8 +231,11 @@ def _check_mechanism(
             loose = np.abs(N @ modes[:, 0])
             pairs = zip(names, loose, strict=True)
             joints = ", ".join(name for name, part in pairs if part > 0.3 * loose.max())
-            problem = "no spring, actuator or coupling holds the joints"
-            raise DescriptionError(path, f"{problem} {joints}: give them a positive 'spring' in [joints]")
+            problem = f"no spring, actuator or coupling holds the joints {joints}"
+            problem += ": give them a positive 'spring' in [joints]"
+            if path.suffix == ".xml":
+                problem += f" of a transmission file; 'torch-ekm hands --new {path}' writes one"
+            raise DescriptionError(path, problem)
 
 
 def _check_base(path: Path, base: str, urdf: UrdfModel) -> None:

@@ -11,6 +11,7 @@ from .._files import write_whole
 from ..exceptions import DescriptionError
 from ._toml import read_toml
 from .hand import HandDescription
+from .mjcf_hand import read_mjcf
 
 _ENDING = ".transmission.toml"
 
@@ -19,7 +20,8 @@ def write_transmission(hand: HandDescription, path: str | Path) -> Path:
     """Write springs, rest angles, friction, moment arms, offsets, stiffness and play of ``hand`` to ``path``.
 
     Everything else (ranges, couplings, pads, sensors, notes) is that of ``hand.transmission_path``; comments
-    are lost. The URDF is copied next to it if there is none, so that ``load_hand`` reads the hand back.
+    are lost. The URDF is copied next to it if there is none, so that ``load_hand`` reads the hand back; an
+    MJCF is not, since it may be of several files.
 
     Args:
         hand: its description.
@@ -32,7 +34,10 @@ def write_transmission(hand: HandDescription, path: str | Path) -> Path:
     path = Path(path)
     if not path.name.endswith(_ENDING):
         raise DescriptionError(path, f"the name must end in '{_ENDING}'")
-    data = read_toml(hand.transmission_path, "transmission file")
+    if hand.transmission_path.is_file() or hand.urdf_path.suffix != ".xml":
+        data = read_toml(hand.transmission_path, "transmission file")
+    else:
+        data = read_mjcf(hand.urdf_path).tables
     for j, name in enumerate(hand.joint_names):
         data["joints"][name] = {
             "spring": float(hand.spring_stiffness[j]),
@@ -49,14 +54,15 @@ def write_transmission(hand: HandDescription, path: str | Path) -> Path:
         for key in ("offset", "backlash"):
             if getattr(actuator, key):
                 table[key] = float(getattr(actuator, key))
-    write_whole(path, _document(data))
+    write_whole(path, document(data))
     urdf = path.with_name(path.name.removesuffix(_ENDING) + ".urdf")
-    if not urdf.exists():
+    if not urdf.exists() and hand.urdf_path.suffix == ".urdf":
         write_whole(urdf, hand.urdf_path.read_bytes())
     return path
 
 
-def _document(data: dict[str, Any]) -> str:
+def document(data: dict[str, Any]) -> str:
+    """Tables of a transmission file as TOML."""
     lines: list[str] = []
     for name, value in data.items():
         for table in value if isinstance(value, list) else [value]:

@@ -15,7 +15,7 @@ from ..description import list_hands
 from ..description.registry import file_digests
 from ..exceptions import ParameterError, UnknownNameError
 from ..model import ModelOptions
-from ..simulation import PlantConfig, PlantParameters, preset
+from ..simulation import ENGINES, PlantConfig, PlantParameters, preset
 from .learners import DEFAULT_LEARNER, LEARNERS, learner_figures
 
 #: The controllers that are compared on the same seeds, grasps, limits and stopping rule. "+I" is integral
@@ -32,7 +32,7 @@ class Setting:
     written down and compared.
 
     Raises:
-        UnknownNameError: no such hand, preset or learner; the message lists them.
+        UnknownNameError: no such hand, preset, engine or learner; the message lists them.
         ParameterError: a figure outside its range.
     """
 
@@ -40,6 +40,8 @@ class Setting:
     preset: str = "nominal"
     plant: PlantParameters | None = None
     """In place of the preset's."""
+    engine: str = "sapien"
+    """The physics of the simulated hand; or "mujoco"."""
     model: ModelOptions = field(default_factory=ModelOptions)
     tasks: tuple[Task, ...] = DEFAULT_TASKS
     limits: tuple[Limit, ...] = DEFAULT_LIMITS
@@ -60,8 +62,9 @@ class Setting:
     def __post_init__(self) -> None:
         if self.hand not in list_hands() and not Path(self.hand).exists():
             raise UnknownNameError("hand", self.hand, (*list_hands(), "a path to a .urdf file"))
-        if self.learner not in LEARNERS:
-            raise UnknownNameError("learner", self.learner, LEARNERS)
+        for name, known in (("learner", LEARNERS), ("engine", ENGINES)):
+            if getattr(self, name) not in known:
+                raise UnknownNameError(name, getattr(self, name), known)
         for name in ("capacity", "frames"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
@@ -73,7 +76,8 @@ class Setting:
 
     def __str__(self) -> str:
         seen = "camera images and Hall counts" if self.sensing else "true poses plus noise"
-        return f"Simulated hand {Path(self.hand).stem}, preset {self.preset}, {seen}"
+        engine = {"sapien": "SAPIEN", "mujoco": "MuJoCo"}[self.engine]
+        return f"Hand {Path(self.hand).stem} simulated in {engine}, preset {self.preset}, {seen}"
 
     @property
     def parameters(self) -> PlantParameters:

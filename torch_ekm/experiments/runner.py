@@ -54,7 +54,7 @@ class Bench:
         self.setting, self.controller = setting, controller
         config = setting.plant_config(controller)
         self.name = object_name(object) if isinstance(object, str) else object.name
-        self.hand = SimulatedHand(setting.hand, object, config, setting.parameters)
+        self.hand = SimulatedHand(setting.hand, object, config, setting.parameters, engine=setting.engine)
         self.disturbed = DisturbedPlant(self.hand)
         self.plant: Plant = self.disturbed
         if setting.sensing:

@@ -23,7 +23,7 @@ from ..simulation import PlantConfig, SimulatedHand
 from ..simulation.grasp_planning.pinch import pinch_problem
 from ..simulation.grasp_planning.requirements import direction_unmet, unmet
 from ..simulation.parameters import PlantParameters
-from ..simulation.physics.bodies import x_axis_to
+from ..simulation.physics.sapien_bodies import x_axis_to
 from ..typing import Array
 from .row import Check, State
 

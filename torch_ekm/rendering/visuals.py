@@ -54,6 +54,8 @@ def visuals(urdf: UrdfModel) -> Visuals:
     try:
         changed = os.stat(urdf.path).st_mtime_ns
     except OSError:  # a description that outlived its file
+        changed = 0
+    if not changed or urdf.path.suffix != ".urdf":
         return Visuals({link.name: tuple(link.collisions) for link in urdf.links})
     drawn, problems = _read(urdf.path.resolve(), changed)
     meshes = {name: parts for (name, tag), parts in drawn.items() if tag == "collision"}

@@ -7,11 +7,13 @@ from .disturbances import DisturbedPlant, PlantChange, Tug
 from .hall_sensors import HallSensors
 from .imaging.simulated_camera import ImageQuality, SimulatedCamera
 from .parameters import PlantParameters
+from .physics.scene import ENGINES
 from .presets import PRESETS, preset
 from .sensed_plant import SensedPlant
 from .simulated_hand import SimulatedHand
 
 __all__ = [
+    "ENGINES",
     "PlantChange",
     "DisturbedPlant",
     "HallSensors",

@@ -70,6 +70,7 @@ class InHandRotation(gymnasium.Env):
         angles: least and largest target [rad].
         step_limit: largest increment of an actuator [rad].
         render_mode: None or "rgb_array" (PyVista).
+        engine: the physics, as :class:`SimulatedHand` takes it.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 2}
@@ -83,6 +84,7 @@ class InHandRotation(gymnasium.Env):
         angles: tuple[float, float] = (5 * _DEG, 25 * _DEG),
         step_limit: float = 3 * _DEG,
         render_mode: str | None = None,
+        engine: str = "sapien",
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ParameterError("render_mode", render_mode, "None or 'rgb_array'")
@@ -90,7 +92,7 @@ class InHandRotation(gymnasium.Env):
             raise ParameterError("step_limit, angles", (step_limit, angles), "positive and in order")
         if isinstance(parameters, str):
             parameters = preset(parameters)
-        self.plant = SimulatedHand(hand, object, config, parameters)
+        self.plant = SimulatedHand(hand, object, config, parameters, engine=engine)
         self.angles, self.step_limit = angles, step_limit
         self.render_mode = render_mode
         self._picture: Picture | None = None

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..description import HandDescription, ObjectDescription, load_hand, load_object
-from ..exceptions import EquilibriumError, GraspError, ParameterError
+from ..exceptions import EquilibriumError, GraspError, ParameterError, UnknownNameError
 from ..kinematics import GraspState
 from ..plant import Observation, PlantStatus, Stamps, Truth
 from ..typing import Array, Float, Tensor
@@ -19,10 +19,15 @@ from .grasp_planning.pinch import PinchPlan, pinch_hint, pinch_problem, plan_pin
 from .grasp_planning.pinch_problem import PinchRequest
 from .mechanism.assembly import true_hand, true_object
 from .parameters import PlantParameters
-from .physics.rig import COMMAND_TIME, Rig, RigState
+from .physics.rig import COMMAND_TIME, Rig, RigState, changes_transmission
+from .physics.scene import ENGINES
 from .presets import preset as parameters_of
 from .sensors import Sensors, TimedState
 
+_NOT_NATIVE = (
+    "joint_friction", "arm_variation", "spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling",
+    "joint_play",
+)  # fmt: skip
 _ATTEMPTS = 5
 _FAR = 0.05  # [m] from where it was grasped: out of the hand
 _OFFSET_ALONG, _OFFSET_ACROSS = 0.010, 0.002  # [m]: grasp points are drawn within +- these, object's axes
@@ -39,7 +44,7 @@ class PlantSnapshot(NamedTuple):
 
 
 class SimulatedHand:
-    """A hand with tendons that holds an object, in SAPIEN; implements :class:`Plant`.
+    """A hand with tendons that holds an object, in SAPIEN or MuJoCo; implements :class:`Plant`.
 
     ::
 
@@ -56,10 +61,13 @@ class SimulatedHand:
         config: time, gravity, the grasp.
         parameters: what the plant really is; as described by default.
         preset: the parameters by name, as :func:`torch_ekm.simulation.preset` takes it.
+        engine: the physics, "sapien" or "mujoco" (extra ``mujoco``).
+        tendon: "computed" here, or "native": by MuJoCo, where they have neither friction nor departures of
+            another kind; they cannot be changed in mid-run.
 
     Raises:
-        UnknownNameError: there is no such hand, object or preset; the message lists them.
-        ParameterError: both ``parameters`` and ``preset`` are given.
+        UnknownNameError: there is no such hand, object, preset or engine; the message lists them.
+        ParameterError: both ``parameters`` and ``preset`` are given; native tendons cannot be as they say.
     """
 
     def __init__(
@@ -69,16 +77,22 @@ class SimulatedHand:
         config: PlantConfig | None = None,
         parameters: PlantParameters | None = None,
         preset: str | None = None,
+        engine: str = "sapien",
+        tendon: str = "computed",
     ) -> None:
         if parameters is not None and preset is not None:
             valid = "None with parameters: preset(name).replace(...) changes single figures of a preset"
             raise ParameterError("preset", preset, valid)
+        if engine not in ENGINES:
+            raise UnknownNameError("engine", engine, ENGINES)
+        self.engine = engine
         self.hand = load_hand(hand) if isinstance(hand, str) else hand
         self.object = load_object(object) if isinstance(object, str) else object
         self.config = PlantConfig() if config is None else config
         if self.config.gravity is not None:
             self.hand = dataclasses.replace(self.hand, gravity=self.config.gravity)
         self.parameters = parameters_of(preset or "none") if parameters is None else parameters
+        self._native = self._checked(tendon)
         self._problem = pinch_problem(self.hand, self.object, self.config, self.parameters)
         self._sensors = Sensors(self.parameters, self.hand.n_q, len(self.hand.pads), self.hand.joint_names)
         self._generator = np.random.default_rng(0)
@@ -102,6 +116,8 @@ class SimulatedHand:
                 self.config,
                 self.parameters,
                 lambda frame: self._sensors.remember(frame),  # a restored plant has other sensors
+                self.engine,
+                self._native,
             )
         unplanned = 0
         for _ in range(_ATTEMPTS):
@@ -240,6 +256,8 @@ class SimulatedHand:
                 new.object_scale,
                 f"{self.parameters.object_scale:g} while it is held; close(), change it, then reset(seed)",
             )
+        if self._native and changes_transmission(self.parameters, new):
+            raise ParameterError("tendon", "native", '"computed", for tendons that change in mid-run')
         self._adopt(new)
 
     def tug(self, force: Array, torque: Array, duration: float = 0.05) -> Observation:
@@ -255,6 +273,20 @@ class SimulatedHand:
         if self._rig is None or self._plan is None:
             raise GraspError("there is no grasp yet: call reset(seed) first")
         return self._rig
+
+    def _checked(self, tendon: str) -> bool:
+        """Whether the engine runs the tendons."""
+        if tendon not in ("computed", "native"):
+            raise UnknownNameError("tendon", tendon, ("computed", "native"))
+        if tendon == "computed":
+            return False
+        if self.engine != "mujoco":
+            raise ParameterError("tendon", tendon, '"computed" in SAPIEN; "native" needs engine="mujoco"')
+        lost = [name for name in _NOT_NATIVE if getattr(self.parameters, name) != 0]
+        lost = [name for name in lost if name != "joint_friction" or self.hand.joint_friction.any()]
+        if lost:
+            raise ParameterError("tendon", tendon, f'"computed", or {", ".join(lost)} = 0: MuJoCo has none')
+        return True
 
     def _adopt(self, parameters: PlantParameters) -> None:
         self._problem = pinch_problem(self.hand, self.object, self.config, parameters)  # may refuse: first

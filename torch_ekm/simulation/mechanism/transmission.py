@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from ...description.hand import HandDescription
@@ -96,6 +98,10 @@ class Transmission:
     def stiffness(self) -> Array:
         """Series stiffness k_a of each actuator, ``(n_a,)`` [N m/rad]."""
         return self._k[: self.n_a]
+
+    def parts(self) -> Iterator[tuple[Array, float, bool]]:
+        """Actuators, then couplings: moment arms ``(n_q,)``, stiffness [N m/rad], whether it only pulls."""
+        return zip(self._M, self._k.tolist(), self._pulls_only.tolist(), strict=True)
 
     def relax(self, q: Array) -> None:
         """Put the friction's anchors at ``q``: no friction torque, no hysteresis, joints amid their play."""

@@ -17,7 +17,7 @@ from ..mechanism.servo import Servo
 from ..mechanism.transmission import Transmission
 from ..parameters import PlantParameters
 from ..sensors import TimedState
-from .hand_scene import HandScene
+from .scene import make_scene
 
 _FORCE_WINDOW = 10  # steps over which a fingertip force is averaged
 _STILL = 2e-3  # [rad/s] and [m/s x 10]: slower than this is settled
@@ -48,6 +48,8 @@ class Rig:
         config: time steps and rates.
         parameters: what they really are.
         remember: called every 10 steps if the camera is late.
+        engine: which physics, one of :data:`ENGINES`.
+        native: the engine runs the tendons, which change no more.
     """
 
     def __init__(
@@ -57,9 +59,11 @@ class Rig:
         config: PlantConfig,
         parameters: PlantParameters,
         remember: Callable[[TimedState], None],
+        engine: str = "sapien",
+        native: bool = False,
     ) -> None:
         self.hand, self.obj, self.config, self.parameters = hand, obj, config, parameters
-        self.remember = remember
+        self.remember, self.engine, self.native = remember, engine, native
         self.transmission = make_transmission(hand, parameters)
         self.servo = Servo(
             hand.actuator_lower,
@@ -80,7 +84,14 @@ class Rig:
     def _build(self) -> None:
         p = self.parameters
         obj, step = true_object(self.obj, p), self.config.time_step
-        self.scene = HandScene(self.hand, obj, step, p.contact_stiffness)
+        self.scene = make_scene(
+            self.engine,
+            self.hand,
+            obj,
+            step,
+            p.contact_stiffness,
+            self.transmission if self.native else None,
+        )
         thumb, _ = opposing_pads(self.hand, self.config)
         pad = next(pad.link for pad in self.hand.pads if pad.name == thumb)
         finger = self._finger_of.get(pad)  # None: a part of the palm
@@ -88,12 +99,13 @@ class Rig:
         self._set_friction()
         self.scene.set_link_weight(p.link_weight)
         self._built_scale = p.object_scale
-        self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
+        if not self.native:
+            self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
 
     def grasp(self, plan: PinchPlan) -> None:
         """Close on the object held in its planned place, release it, let it settle.
 
-        The scene is new each time, so that nothing of an earlier run is left in PhysX.
+        The scene is new each time, so that nothing of an earlier run is left in the engine.
         """
         self.transmission = make_transmission(self.hand, self.parameters)
         self._build()
@@ -144,10 +156,13 @@ class Rig:
         window = min(_FORCE_WINDOW, steps)
         for k in range(1, steps + 1):
             output = servo.move_to(motor_at(k / steps))
-            q = scene.next_q if transmission.stiff else scene.q
             if push is not None:
                 scene.push(*push)
-            scene.step(transmission.drive_targets(q, output))
+            if self.native:
+                scene.step(output - transmission.offset)
+            else:
+                q = scene.next_q if transmission.stiff else scene.q
+                scene.step(transmission.drive_targets(q, output))
             if self.parameters.latency > 0 and k % _FORCE_WINDOW == 0:
                 time = self.time + k * self.config.time_step
                 self.remember(TimedState(time, scene.q, *scene.object_pose))
@@ -169,7 +184,7 @@ class Rig:
         """
         old, self.parameters = self.parameters, new
         self.servo.set_parameters(new)
-        if _differ(old, new, *_TRANSMISSION):
+        if changes_transmission(old, new):
             previous, self.transmission = self.transmission, make_transmission(self.hand, new)
             self.transmission.take_over(previous, self.scene.q, self.servo.output)
             self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
@@ -215,6 +230,11 @@ _TRANSMISSION = (
     "moment_arm", "spring", "servo_stiffness", "joint_friction", "tendon_creep", "arm_variation", "arm_phase",
     "spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling", "joint_play", "hardware_seed",
 )  # fmt: skip
+
+
+def changes_transmission(old: PlantParameters, new: PlantParameters) -> bool:
+    """Whether tendons, springs or joints become others."""
+    return _differ(old, new, *_TRANSMISSION)
 
 
 def _differ(old: PlantParameters, new: PlantParameters, *names: str) -> bool:

@@ -9,14 +9,14 @@ import numpy as np
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import ParameterError
 from ...typing import Array
-from .bodies import build_hand, build_object, set_inertia
-from .engine import new_scene, sapien
+from .links import JOINT_DAMPING
+from .sapien_bodies import build_hand, build_object, set_inertia
+from .sapien_engine import new_scene, sapien
 
-_JOINT_DAMPING = 5e-3  # [N m s/rad]; the softest freedom (springs alone) settles in 0.1 s
 _TORQUE_LIMIT = 100.0  # [N m]; a limit that never acts
 
 
-class HandScene:
+class SapienScene:
     """Bodies, time and contacts: physics only, nothing of transmissions, servos or sensors.
 
     Args:
@@ -82,7 +82,7 @@ class HandScene:
 
     def set_drive_stiffness(self, stiffness: Array) -> None:
         for joint, value in zip(self._hand.joints, stiffness, strict=True):
-            joint.set_drive_properties(float(value), _JOINT_DAMPING, _TORQUE_LIMIT, "force")
+            joint.set_drive_properties(float(value), JOINT_DAMPING, _TORQUE_LIMIT, "force")
 
     # -- state --------------------------------------------------------------------------------------
 

@@ -1,0 +1,313 @@
+"""Hands from MJCF: the tree and the transmission that MuJoCo itself has."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm.description import HandDescription, load_hand, write_template, write_transmission
+from torch_ekm.exceptions import DescriptionError, UnknownNameError
+from torch_ekm.kinematics import HandKinematics
+from torch_ekm.rendering.visuals import visuals
+
+mujoco = pytest.importorskip("mujoco")
+
+# two fingers in our own words: anchors off the body's origin, a reference angle, two joints in one body, a
+# fixed tendon, a joint that follows another, and a tendon under an equality
+FINGERS = """
+<mujoco model="two fingers">
+  <compiler angle="degree" meshdir="/nowhere"/>
+  <option gravity="0 0 -9.81"/>
+  <default>
+    <joint range="-10 90" limited="true" stiffness="0.05" springref="5" frictionloss="0.002"
+           damping="0.02" armature="1e-4"/>
+    <geom type="capsule" size="0.008"/>
+    <default class="drawn"><geom type="mesh" contype="0" conaffinity="0"/></default>
+  </default>
+  <asset><mesh name="shell" file="shell.stl"/></asset>
+  <worldbody>
+    <light pos="0 0 1"/>
+    <body name="palm" pos="0.1 0.2 0.3" euler="20 -30 40">
+      <inertial mass="0.5" pos="0.01 0 0" diaginertia="1e-4 2e-4 2e-4"/>
+      <geom class="drawn" mesh="shell"/>
+      <body name="first" pos="0.02 0 0" euler="0 0 15">
+        <joint name="f0" axis="0 1 0" pos="0 0 -0.004" ref="10"/>
+        <joint name="f1" axis="1 0 0" pos="0.003 0 0"/>
+        <geom name="first" fromto="0 0 0 0 0 0.03"/>
+        <body name="tip" pos="0 0 0.035">
+          <joint name="f2" axis="0 1 0"/>
+          <geom name="tip" fromto="0 0 0 0.004 0 0.02"/>
+          <body name="nail" pos="0 0 0.02"><geom name="nail" type="box" size="0.004 0.004 0.001"/></body>
+        </body>
+      </body>
+      <body name="thumb" pos="-0.03 0 0">
+        <joint name="t0" axis="0 -1 0" ref="4"/>
+        <geom name="thumb" fromto="0 0 0 0 0 0.03"/>
+        <body name="thumb_tip" pos="0 0 0.03">
+          <joint name="t1" axis="0 -1 0" stiffness="0"/>
+          <joint name="t2" axis="1 0 0" stiffness="0"/>
+          <geom name="thumb_tip" type="sphere"/>
+        </body>
+      </body>
+    </body>
+    <body name="ball" pos="1 0 0"><freejoint/><geom type="sphere" size="0.02"/></body>
+  </worldbody>
+  <tendon>
+    <fixed name="flexor"><joint joint="f0" coef="0.9"/><joint joint="f2" coef="0.4"/></fixed>
+    <fixed name="four_bar"><joint joint="t0" coef="1"/><joint joint="t2" coef="-2"/></fixed>
+    <fixed name="stop" limited="true" range="-3 3">
+      <joint joint="f0" coef="1"/><joint joint="f1" coef="1"/>
+    </fixed>
+  </tendon>
+  <equality>
+    <joint joint1="t1" joint2="t0" polycoef="0.1 0.7 0 0 0"/>
+    <tendon name="four_bar" tendon1="four_bar"/>
+  </equality>
+  <actuator>
+    <position name="finger" tendon="flexor" kp="4" ctrlrange="0 2" forcerange="0 50"/>
+    <position name="spread" joint="f1" kp="6" ctrlrange="-0.1 1"/>
+    <position name="thumb" joint="t0" gear="2" kp="3" ctrlrange="0 3"/>
+  </actuator>
+</mujoco>
+"""
+SPATIAL = """
+<mujoco>
+  <worldbody>
+    <site name="a" pos="0 0 0.01"/>
+    <body name="link" pos="0.03 0 0">
+      <joint name="q" axis="0 1 0" range="0 {most}" limited="true" stiffness="0.1"/>
+      <geom size="0.01"/><site name="b" pos="0.02 0 0.01"/>
+    </body>
+  </worldbody>
+  <tendon><spatial name="wire"><site site="a"/><site site="b"/></spatial></tendon>
+  <actuator><position name="pull" tendon="wire" kp="100" ctrlrange="0.03 0.05" forcerange="-9 0"/></actuator>
+</mujoco>
+"""
+
+
+def written(folder: Path, text: str, name: str = "hand.xml") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def engine(path: Path) -> tuple[Any, Any]:
+    """MuJoCo's own model of the same file, without what is only drawn."""
+    text = path.read_text().replace('<geom class="drawn" mesh="shell"/>', "")
+    asset = '<asset><mesh name="shell" file="shell.stl"/></asset>'
+    model = mujoco.MjModel.from_xml_string(text.replace(asset, ""))
+    return model, mujoco.MjData(model)
+
+
+def postures(hand: HandDescription, count: int = 5) -> np.ndarray:
+    return np.random.default_rng(0).uniform(hand.joint_lower, hand.joint_upper, (count, hand.n_q))
+
+
+def test_every_shape_is_where_mujoco_has_it(tmp_path: Path) -> None:
+    path = written(tmp_path, FINGERS)
+    hand, (model, data) = load_hand(path), engine(path)
+    kinematics = HandKinematics(hand)
+    for q in postures(hand):
+        for name, angle in zip(hand.joint_names, q, strict=True):
+            data.joint(name).qpos = angle
+        mujoco.mj_kinematics(model, data)
+        poses = kinematics(torch.from_numpy(q))
+        for link in hand.urdf.links:
+            for shape in link.collisions:
+                there = poses.of(link.name).numpy() @ shape.transform
+                geom = data.geom(link.name)
+                np.testing.assert_allclose(there[:3, 3], geom.xpos, atol=1e-12)
+                axes = there[:3, :3].T @ geom.xmat.reshape(3, 3)
+                np.testing.assert_allclose(np.abs(axes[2, 2]), 1.0, atol=1e-12)
+    masses = {link.name: link.mass for link in hand.urdf.links}
+    assert masses["palm"] == 0.5
+    assert masses["first"] == pytest.approx(model.body("first").mass[0])
+
+
+def test_the_transmission_is_mujocos(tmp_path: Path) -> None:
+    path = written(tmp_path, FINGERS)
+    hand, (model, data) = load_hand(path), engine(path)
+    place = [model.joint(name).dofadr[0] for name in hand.joint_names]
+    for q in postures(hand):
+        for name, angle in zip(hand.joint_names, q, strict=True):
+            data.joint(name).qpos = angle
+        mujoco.mj_forward(model, data)
+        moment = np.zeros((model.nu, model.nv))
+        sparse = data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        mujoco.mju_sparse2dense(moment, data.actuator_moment, *sparse)
+        np.testing.assert_allclose(hand.actuation_jacobian, moment[:, place], atol=1e-12)
+        np.testing.assert_allclose(
+            hand.actuator_offset + hand.actuation_jacobian @ q, data.actuator_length, atol=1e-12
+        )
+    assert [actuator.stiffness for actuator in hand.actuators] == [4, 6, 3]
+    assert [actuator.tendon for actuator in hand.actuators] == [True, False, False]
+    np.testing.assert_allclose(hand.actuator_upper, [2, 1, 3])
+    spring = dict(zip(hand.joint_names, hand.spring_stiffness, strict=True))
+    assert spring["f0"] == 0.05
+    assert spring["t1"] == 0
+
+
+def test_couplings_hold_what_mujoco_holds(tmp_path: Path) -> None:
+    """The equalities pull the joints to where ``C q = C q0``."""
+    path = written(tmp_path, FINGERS)
+    hand, (model, data) = load_hand(path), engine(path)
+    assert hand.coupling.shape == (2, hand.n_q)
+    data.ctrl[:] = [1.0, 0.3, 1.2]
+    for _ in range(20_000):
+        mujoco.mj_step(model, data)
+    q = np.array([data.joint(name).qpos[0] for name in hand.joint_names])
+    assert q[hand.joint_names.index("t0")] > 0.4
+    np.testing.assert_allclose(hand.coupling @ q, hand.coupling @ hand.spring_rest, atol=2e-3)
+
+
+def test_what_has_no_counterpart_is_said(tmp_path: Path) -> None:
+    notes = "; ".join(load_hand(written(tmp_path, FINGERS)).notes)
+    for said in ("'ball' floats and has no joints", "those of palm touch nothing", "left out: stop"):
+        assert said in notes
+
+
+@pytest.mark.parametrize(("most", "where"), [(1, "everywhere"), (150, "within")])
+def test_a_spatial_tendon_says_where_its_arms_hold(most: int, where: str, tmp_path: Path) -> None:
+    hand = load_hand(written(tmp_path, SPATIAL.format(most=most)))
+    (note,) = hand.notes[:1]
+    assert "right to 10 %" in note
+    assert where in note
+    # it shortens to pull: `a` is the negative length here
+    assert hand.actuators[0].tendon
+    assert hand.actuators[0].lower == pytest.approx(-0.05)
+    model, data = engine(tmp_path / "hand.xml")
+    mujoco.mj_forward(model, data)
+    assert hand.actuation_jacobian[0, 0] == pytest.approx(-data.ten_J[0], abs=1e-12)
+
+
+def test_a_template_is_filled_in_and_has_the_last_word(tmp_path: Path) -> None:
+    path = written(tmp_path, FINGERS)
+    alone = load_hand(path)
+    toml = write_template(path)
+    with pytest.raises(DescriptionError, match=r"pads\[tip_1\].direction"):
+        load_hand(path)
+    text = toml.read_text()
+    assert "# 'ball' floats" in text
+    toml.write_text(
+        text.replace('["TODO", "TODO", "TODO"]', "[0.0, 0.0, 1.0]").replace(
+            "stiffness = 4.0", "stiffness = 5.0"
+        )
+    )
+    hand = load_hand(path)
+    assert [pad.link for pad in hand.pads] == ["tip", "thumb_tip"]
+    assert hand.actuators[0].stiffness == 5.0
+    np.testing.assert_array_equal(hand.actuation_jacobian, alone.actuation_jacobian)
+    np.testing.assert_array_equal(hand.spring_rest, alone.spring_rest)
+    with pytest.raises(DescriptionError, match="not overwritten"):
+        write_template(path)
+    copied = write_transmission(alone, tmp_path / "other.transmission.toml")
+    assert copied.is_file()
+    assert not (tmp_path / "other.urdf").exists()
+
+
+def test_pictures_do_with_what_touches(tmp_path: Path) -> None:
+    hand = load_hand(written(tmp_path, FINGERS))
+    assert len(visuals(hand.urdf).of_link["tip"]) == 1
+
+
+def test_files_are_put_together(tmp_path: Path) -> None:
+    start, end = FINGERS.index("<tendon>"), FINGERS.index("</mujoco>")
+    (tmp_path / "parts").mkdir()
+    written(tmp_path / "parts", f"<mujocoinclude>{FINGERS[start:end]}</mujocoinclude>", "drive.xml")
+    path = written(tmp_path, FINGERS[:start] + '<include file="parts/drive.xml"/></mujoco>')
+    assert load_hand(path).n_a == 3
+
+
+WORLD = '<body name="b"><joint name="j" range="0 1" {more}/><geom size=".01"/></body>'
+ACTUATOR = '<actuator><position joint="j" kp="1" ctrlrange="0 1"/></actuator>'
+
+
+def mjcf(body: str = WORLD.format(more=""), rest: str = ACTUATOR) -> str:
+    return f"<mujoco><worldbody>{body}</worldbody>{rest}</mujoco>"
+
+
+REFUSED = {
+    "slides": (mjcf(WORLD.format(more='type="slide"')), "joint 'j' slides"),
+    "ball": (mjcf(WORLD.format(more='type="ball"')), "joint 'j' is a ball joint"),
+    "no joint": (mjcf("<geom size='.1'/>", ""), "no hinge joint"),
+    "no actuator": (mjcf(rest=""), "no actuator"),
+    "loop": (mjcf(rest=ACTUATOR + "<equality><weld body1='b'/></equality>"), "closes a loop"),
+    "curve": (
+        mjcf(rest=ACTUATOR + "<equality><joint joint1='j' polycoef='0 1 1 0 0'/></equality>"),
+        "is not linear",
+    ),
+    "missing joint": (mjcf(rest=ACTUATOR.replace('"j"', '"k"')), "MuJoCo: .*'k'|unknown"),
+    "not XML": ("<mujoco><worldbody>", "not well-formed XML"),
+    "another root": ("<robot/>", "must be <mujoco>"),
+    "file of an element": (mjcf().replace("<geom", "<geom file='/etc/passwd'"), "only <include> may name"),
+    "attached": (
+        mjcf().replace("<geom", "<attach model='m' body='b' prefix='p'/><geom"), "<attach> is not supported",
+    ),
+    "outside": ("<mujoco><include file='../other.xml'/></mujoco>", "outside"),
+    "absolute": ("<mujoco><include file='/etc/hostname'/></mujoco>", "outside"),
+    "itself": ("<mujoco><include file='hand.xml'/></mujoco>", "includes this file"),
+    "nothing": ("<mujoco><include/></mujoco>", "has no file"),
+    "not there": ("<mujoco><include file='gone.xml'/></mujoco>", "no such MJCF file"),
+    "huge": ("<mujoco>" + "<!-- x -->" * 500_000 + "</mujoco>", "at most .* bytes"),
+    "many": (mjcf("<body/>" * 30_000), "at most 20000 elements"),
+    "entities": (
+        "<!DOCTYPE x [<!ENTITY a 'aaaaaaaaaa'>"
+        + "".join(f"<!ENTITY {b} '{f'&{a};' * 10}'>" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
+        + "]><mujoco model='&i;'/>",
+        "not well-formed XML: limit on input amplification",
+    ),
+    "a file of the system": (
+        "<!DOCTYPE x [<!ENTITY a SYSTEM 'file:///etc/hostname'>]><mujoco model='&a;'/>",
+        "not well-formed XML",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_bad_files_are_refused_by_name(name: str, tmp_path: Path) -> None:
+    text, said = REFUSED[name]
+    folder = tmp_path / "hands"
+    folder.mkdir()
+    written(tmp_path, mjcf(), "other.xml")
+    with pytest.raises(DescriptionError, match=said):
+        load_hand(written(folder, text))
+
+
+def test_a_cycle_of_files_ends(tmp_path: Path) -> None:
+    written(tmp_path, "<mujocoinclude><include file='hand.xml'/></mujocoinclude>", "b.xml")
+    with pytest.raises(DescriptionError, match="includes this file"):
+        load_hand(written(tmp_path, "<mujoco><include file='b.xml'/></mujoco>"))
+
+
+def test_a_loose_joint_is_named_with_what_to_do(tmp_path: Path) -> None:
+    body = WORLD.format(more="") + WORLD.replace('"b"', '"c"').replace('"j"', '"k"').format(more="")
+    with pytest.raises(DescriptionError, match=r"holds the joints k.*hands --new"):
+        load_hand(written(tmp_path, mjcf(body)))
+
+
+def test_another_ending_is_no_hand() -> None:
+    with pytest.raises(UnknownNameError, match=r"\.urdf or \.xml"):
+        load_hand("hand.json")
+
+
+SHADOW = importlib.util.find_spec("gymnasium_robotics")
+
+
+@pytest.mark.skipif(SHADOW is None, reason="gymnasium-robotics is not installed")
+def test_the_shadow_hand_as_others_ship_it() -> None:
+    """Coupled distal joints are fixed tendons that can hardly move."""
+    assert SHADOW is not None
+    assert SHADOW.submodule_search_locations is not None
+    folder = Path(SHADOW.submodule_search_locations[0]) / "envs" / "assets" / "hand"
+    hand = load_hand(folder / "reach.xml")
+    assert (hand.n_q, hand.n_a, len(hand.coupling)) == (24, 20, 4)
+    row = hand.coupling[0]
+    pair = {hand.joint_names[k]: row[k] for k in np.flatnonzero(row)}
+    assert pair == {"robot0:FFJ0": 0.00705, "robot0:FFJ1": -0.00805}
+    q = torch.from_numpy(postures(hand, 1)[0])
+    assert torch.isfinite(HandKinematics(hand)(q).transforms).all()

@@ -1,0 +1,221 @@
+"""One plant, two engines: what holds in MuJoCo as in SAPIEN, and where MuJoCo runs the tendons itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from turning_step import true_state, turning_step
+
+from torch_ekm.exceptions import ParameterError, UnknownNameError
+from torch_ekm.experiments.config import Setting
+from torch_ekm.kinematics.se3 import log
+from torch_ekm.model import KinematicModel
+from torch_ekm.plant import Observation, PlantStatus
+from torch_ekm.simulation import PlantConfig, SimulatedHand, preset
+
+pytest.importorskip("mujoco")
+DEG = np.pi / 180
+LAGS = preset("none").replace(hysteresis=0.1)
+CLOSER = torch.tensor([0.02, 0.0, 0.01, 0.02, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+
+
+def angle(first: Observation, second: Observation) -> float:
+    """[deg] between the object's true orientations."""
+    assert first.truth is not None
+    assert second.truth is not None
+    return float(log(first.truth.rotation @ second.truth.rotation.T).norm()) / DEG
+
+
+def shift(first: Observation, second: Observation) -> float:
+    """[mm] between its true positions."""
+    assert first.truth is not None
+    assert second.truth is not None
+    return 1e3 * float((first.truth.position - second.truth.position).norm())
+
+
+def mujoco_hand(name: str = "box", **options: Any) -> SimulatedHand:
+    return SimulatedHand("icub_right", name, engine="mujoco", **options)
+
+
+def test_the_kinematic_model_predicts_both_alike() -> None:
+    """Five steps of 1.5 deg, nothing unknown: what is left is small in both engines."""
+    errors = {}
+    for engine in ("sapien", "mujoco"):
+        plant = SimulatedHand("icub_right", "box", engine=engine)
+        observation, found = plant.reset(11), []
+        model, axis, state, grip = KinematicModel(plant.hand, plant.object), plant.rotation_axis, None, None
+        for _ in range(5):
+            state = true_state(observation) if state is None else state
+            lin = model.linearize(state)
+            grip = lin.forces.normal if grip is None else grip
+            da = turning_step(lin, axis, 1.5 * DEG, grip)
+            observation = plant.command(da)
+            after = true_state(observation)
+            found.append(float((after.minus(state) - lin.step(da))[-3:].norm()) / DEG)
+            state = after
+        assert plant.status is PlantStatus.HELD
+        errors[engine] = float(np.mean(found))
+    assert max(errors.values()) < 0.05, errors
+
+
+def test_one_seed_gives_one_run_and_a_snapshot_goes_back() -> None:
+    fresh = []
+    for _ in range(2):
+        plant = mujoco_hand(parameters=preset("nominal"))
+        plant.reset(5)
+        fresh.append(plant.command(CLOSER))
+    kept, restored = plant.snapshot(), []
+    for _ in range(2):
+        plant.restore(kept)
+        restored.append(plant.command(CLOSER))
+    for first, second in (fresh, restored):
+        assert torch.equal(first.position, second.position)
+        assert torch.equal(first.q, second.q)
+
+
+def test_a_held_object_stays() -> None:
+    plant = mujoco_hand()
+    before = plant.reset(3)
+    plant.wait(2.0)
+    after = plant.observe()
+    assert angle(before, after) < 0.02
+    assert shift(before, after) < 0.02
+
+
+def test_two_springs_and_a_tendon_are_where_the_forces_say() -> None:
+    """A free planar finger: ``K_s (q - q0) = J_a^T k_a (m - a0 - J_a q)``, tendons by either."""
+    for tendon in ("computed", "native"):
+        plant = SimulatedHand("planar_two_finger", "can", engine="mujoco", tendon=tendon)
+        plant.reset(0)
+        rig = plant._grasped()
+        rig.scene.object_pose = (np.array([0.0, 0.0, 1.0]), np.eye(3))
+        rig.scene.hold_object(True)
+        rig.move(np.array([0.5, 0.8]))
+        rig.wait(2.0)
+        q, hand = rig.scene.q, plant.hand
+        stretch = np.array([0.5, 0.8]) - hand.actuation_jacobian @ q
+        torque = hand.actuation_jacobian.T @ (np.array([a.stiffness for a in hand.actuators]) * stretch)
+        np.testing.assert_allclose(hand.spring_stiffness * (q - hand.spring_rest), torque, atol=1e-4)
+
+
+@pytest.mark.parametrize(("hand", "name"), [("icub_right", "can"), ("planar_two_finger", "can")])
+def test_native_tendons_make_the_same_turn(hand: str, name: str) -> None:
+    ends = []
+    for tendon in ("computed", "native"):
+        plant = SimulatedHand(hand, name, engine="mujoco", tendon=tendon)
+        start = plant.reset(3)
+        motion = CLOSER if hand == "icub_right" else torch.tensor([0.03, -0.03], dtype=torch.float64)
+        for _ in range(3):
+            end = plant.command(motion)
+        ends.append((start, end))
+    (start, computed), (_, native) = ends
+    assert angle(start, computed) > 1.0
+    assert angle(computed, native) < 0.02
+
+
+def test_soft_pads_give_way_by_force_over_stiffness() -> None:
+    """The thumb's pad sinks in by f/k: in by so much more than a hard one."""
+    depths = {}
+    for stiffness in (0.0, 5e3):
+        plant = mujoco_hand(parameters=preset("none").replace(contact_stiffness=stiffness))
+        plant.reset(3)
+        data = plant._grasped().scene._data  # type: ignore[attr-defined]
+        depths[stiffness] = max(-data.contact[k].dist for k in range(data.ncon))
+        force = float(plant._grasped().normal[0])
+    assert depths[0.0] < 2e-4
+    assert 0.3 * force / 5e3 < depths[5e3] < 3 * force / 5e3
+
+
+def test_friction_holds_until_its_cone() -> None:
+    """Pulled along the pads with less and with more than friction bears."""
+    plant = mujoco_hand()
+    plant.reset(3)
+    bears = 2 * plant.object.friction * float(plant._grasped().normal[0])
+    axis = plant.rotation_axis.numpy()
+    kept = plant.snapshot()
+    before = plant.restore(kept)
+    held = plant.tug(0.4 * bears * axis, np.zeros(3))
+    plant.restore(kept)
+    lost = plant.tug(2.5 * bears * axis, np.zeros(3))
+    assert shift(before, held) < 1.0 < 3.0 < shift(before, lost)
+
+
+def test_uneven_friction_is_that_of_the_side() -> None:
+    plant = mujoco_hand(parameters=preset("none").replace(friction_unevenness=0.4))
+    plant.reset(3)
+    model = plant._grasped().scene._model  # type: ignore[attr-defined]
+    values = sorted({round(float(mu), 6) for mu in model.pair_friction[:, 0]})
+    assert values == pytest.approx([0.6 * plant.object.friction, plant.object.friction])
+
+
+def test_links_weigh_where_they_are_said_to() -> None:
+    """Hanging fingers sag: their joints stand elsewhere."""
+    angles = []
+    for weighs in (False, True):
+        plant = SimulatedHand(
+            "icub_right", "box", PlantConfig(gravity=(0.0, 0.0, -9.81)),
+            preset("none").replace(link_weight=weighs), engine="mujoco",
+        )  # fmt: skip
+        plant.reset(3)
+        angles.append(plant.hand_state()[0])
+    assert np.abs(angles[0] - angles[1]).max() > 1e-3
+
+
+def test_a_planar_object_stays_in_its_plane() -> None:
+    plant = SimulatedHand("planar_two_finger", "can", engine="mujoco")
+    start = plant.reset(1)
+    for _ in range(3):
+        end = plant.command(torch.tensor([0.05, -0.05], dtype=torch.float64))
+    assert start.truth is not None
+    assert end.truth is not None
+    turned = log(end.truth.rotation @ start.truth.rotation.T).numpy()
+    assert abs(turned[2]) > 1 * DEG
+    assert np.abs(turned[:2]).max() < 1e-9
+    assert abs(float(end.truth.position[2] - start.truth.position[2])) < 1e-9
+
+
+@pytest.mark.parametrize(
+    "change", [{"mass": 3.0}, {"link_weight": True}, {"moment_arm": 1.2, "friction": 0.8}]
+)
+def test_changes_in_mid_run_do_in_both_the_same(change: dict[str, Any]) -> None:
+    moved = []
+    for engine in ("sapien", "mujoco"):
+        plant = SimulatedHand("icub_right", "box", engine=engine)
+        before = plant.reset(3)
+        plant.change(**change)
+        plant.wait(0.5)
+        moved.append(angle(before, plant.observe()))
+    assert (moved[0] > 0.1) == ("moment_arm" not in change)  # new tendons are put on without a jolt
+    assert abs(moved[1] - moved[0]) < 0.02 + 0.03 * moved[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"tendon": "native", "engine": "sapien"}, 'needs engine="mujoco"'),
+        ({"tendon": "native", "engine": "mujoco", "preset": "nominal"}, "joint_friction"),
+        ({"tendon": "native", "engine": "mujoco", "parameters": LAGS}, "hysteresis = 0"),
+    ],
+)  # fmt: skip
+def test_native_tendons_that_cannot_be_are_refused(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(ParameterError, match=said):
+        SimulatedHand("icub_right", "box", **options)
+
+
+def test_native_tendons_do_not_change() -> None:
+    plant = mujoco_hand(tendon="native")
+    plant.reset(3)
+    with pytest.raises(ParameterError, match="change in mid-run"):
+        plant.change(moment_arm=1.2)
+    plant.change(friction=0.9)
+
+
+@pytest.mark.parametrize("make", [lambda name: SimulatedHand(engine=name), lambda name: Setting(engine=name)])
+def test_an_unknown_engine_is_named_with_those_there_are(make: Any) -> None:
+    with pytest.raises(UnknownNameError, match="sapien, mujoco"):
+        make("bullet")
+    with pytest.raises(UnknownNameError, match="computed, native"):
+        SimulatedHand(tendon="rope")

@@ -1,0 +1,108 @@
+"""Read an MJCF through MuJoCo: what stands in the file and in those that it includes, and nothing else.
+
+Only what a hand needs is handed over: bodies, joints, primitive shapes, tendons, equalities, actuators.
+Meshes and textures are never opened, and no file outside the folder of the first one is.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+from .._extras import require
+from ..exceptions import DescriptionError
+from ._toml import read_bounded
+
+_LARGEST_FILE = 4 << 20  # bytes
+_MOST_ELEMENTS = 20_000  # of all files together
+_MOST_FILES = 50
+_READ = ("compiler", "option", "default", "worldbody", "tendon", "equality", "actuator")
+_NOT_READ = {  # of elements that are
+    "camera", "light", "plugin", "flag", "material", "texture", "hfield", "skin", "flexcomp", "numeric",
+}  # fmt: skip
+_BUILDS = {"attach", "composite", "replicate"}  # bodies that do not stand in the file
+_ATTRIBUTES = {"compiler": ("meshdir", "texturedir", "assetdir", "coordinate"), "": ("material", "user")}
+
+
+def compile_mjcf(path: Path) -> tuple[Any, set[str]]:
+    """MuJoCo's model, and the names of the bodies that have meshes.
+
+    A body without a mass of its own gets 1 mg: it may have stood in a mesh.
+
+    Raises:
+        DescriptionError: a file is missing, too large, malformed, outside the folder or includes itself, or
+            MuJoCo refuses what it says.
+        MissingExtraError: mujoco is not installed.
+    """
+    reader = _Reader(path)
+    root = reader.read(path, ())
+    strict = ET.Element("mujoco", model=root.get("model", path.stem))
+    ET.SubElement(strict, "compiler", boundmass="1e-6", boundinertia="1e-12", balanceinertia="true")
+    for element in root:
+        if element.tag in _READ:
+            strict.append(element)
+    meshes: set[str] = set()
+    for body in strict.iter():
+        _strip(path, body, meshes)
+    mujoco = require("mujoco")
+    try:
+        return mujoco.MjModel.from_xml_string(ET.tostring(strict, encoding="unicode")), meshes
+    except (ValueError, RuntimeError) as error:
+        raise DescriptionError(path, f"MuJoCo: {' '.join(str(error).split())}") from None
+
+
+class _Reader:
+    """Files of one folder, each in the place of its ``<include>``."""
+
+    def __init__(self, path: Path) -> None:
+        self.folder = path.resolve().parent
+        self.elements = self.files = 0
+
+    def read(self, path: Path, above: tuple[Path, ...]) -> ET.Element:
+        real = path.resolve()
+        if not real.is_relative_to(self.folder):
+            raise DescriptionError(above[-1], f"<include> of '{path}', which is outside {self.folder}")
+        if real in above:
+            raise DescriptionError(above[-1], f"<include> of '{path.name}', which includes this file")
+        self.files += 1
+        content = read_bounded(path, "MJCF file", _LARGEST_FILE)
+        try:
+            root = ET.fromstring(content)  # fetches no external entity, refuses those that blow up
+        except (ET.ParseError, ValueError, LookupError) as error:
+            raise DescriptionError(path, f"not well-formed XML: {error}") from None
+        if root.tag not in ("mujoco", "mujocoinclude"):
+            raise DescriptionError(path, f"the root element must be <mujoco>, found <{root.tag}>")
+        self.elements += sum(1 for _ in root.iter())
+        if self.elements > _MOST_ELEMENTS or self.files > _MOST_FILES:
+            most = f"at most {_MOST_ELEMENTS} elements and {_MOST_FILES} files are read"
+            raise DescriptionError(path, f"{most}, includes among them")
+        self._expand(path, root, (*above, real))
+        return root
+
+    def _expand(self, path: Path, element: ET.Element, above: tuple[Path, ...]) -> None:
+        for child in list(element):
+            if child.tag != "include":
+                self._expand(path, child, above)
+                continue
+            file = child.get("file")
+            if not file:
+                raise DescriptionError(path, "an <include> has no file")
+            place = list(element).index(child)
+            element[place : place + 1] = list(self.read(self.folder / file, above))
+
+
+def _strip(path: Path, element: ET.Element, meshes: set[str]) -> None:
+    """Take out what is not read."""
+    for name in (*_ATTRIBUTES.get(element.tag, ()), *_ATTRIBUTES[""]):
+        element.attrib.pop(name, None)
+    for child in list(element):
+        if child.tag in _BUILDS:
+            raise DescriptionError(path, f"<{child.tag}> is not supported: write out what it makes")
+        mesh = child.tag == "geom" and (child.get("mesh") or child.get("type") in ("mesh", "hfield", "sdf"))
+        if mesh and element.tag == "body":
+            meshes.add(element.get("name", ""))
+        if child.tag in _NOT_READ or (mesh and element.tag != "default"):
+            element.remove(child)
+        elif "file" in child.attrib:
+            raise DescriptionError(path, f"<{child.tag} file=...>: only <include> may name a file")

@@ -1,0 +1,107 @@
+"""The moving links of a hand, for any engine: links on fixed joints are part of what carries them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ...description import HandDescription
+from ...description.shape import Shape
+from ...description.urdf import UrdfJoint, UrdfLink, UrdfModel
+from ...exceptions import DescriptionError
+from ...typing import Array
+
+ARMATURE = 1e-4  # [kg m^2] motor inertia seen at a joint; lets 1 ms steps carry stiff tendons
+JOINT_DAMPING = 5e-3  # [N m s/rad]; the softest freedom (springs alone) settles in 0.1 s
+
+
+@dataclass
+class MovingLink:
+    """A link on a joint, or the root (without parent and joint), with all that is fixed to it.
+
+    ``placed`` is the joint's frame in the parent's, or the root's in the hand frame; ``shapes`` have
+    their frame in this link's and the name of the URDF's link to which they belong. Mass [kg], centre of mass
+    [m] and inertia about it [kg m^2] are in this link's frame.
+    """
+
+    name: str
+    parent: str | None
+    joint: UrdfJoint | None
+    placed: Array
+    shapes: list[tuple[Array, Shape, str]] = field(default_factory=list)
+    mass: float = 0.0
+    com: Array = field(default_factory=lambda: np.zeros(3))
+    inertia: Array = field(default_factory=lambda: np.zeros((3, 3)))
+
+
+def moving_links(hand: HandDescription) -> list[MovingLink]:
+    """The root and the links on joints, each after the one that carries it.
+
+    Raises:
+        DescriptionError: the link of a pad has nothing but meshes to touch with, or the base link moves.
+    """
+    urdf = hand.urdf
+    for pad in hand.pads:
+        if urdf.link(pad.link).has_mesh and not urdf.link(pad.link).collisions:
+            problem = f"link '{pad.link}' carries the pad '{pad.name}', and its only <collision> is a mesh"
+            remedy = "write the pad's capsule there: contacts need box, cylinder, sphere or capsule"
+            raise DescriptionError(hand.urdf_path, f"{problem}; {remedy}")
+    root = urdf.root
+    links = {root: MovingLink(root, None, None, np.eye(4))}
+    carrier: dict[str, tuple[str, Array]] = {root: (root, np.eye(4))}
+    parts: dict[str, list[tuple[Array, UrdfLink]]] = {root: [(np.eye(4), urdf.link(root))]}
+    for joint in _parents_first(urdf):
+        owner, offset = carrier[joint.parent]
+        placed, child = offset @ joint.transform, urdf.link(joint.child)
+        if joint.kind == "fixed":
+            carrier[joint.child] = (owner, placed)
+            parts[owner].append((placed, child))
+            continue
+        carrier[joint.child] = (joint.child, np.eye(4))
+        parts[joint.child] = [(np.eye(4), child)]
+        links[joint.child] = MovingLink(joint.child, owner, joint, placed)
+    owner, base = carrier[hand.base_link]
+    if owner != root:
+        raise DescriptionError(hand.urdf_path, f"the base link '{hand.base_link}' must not move with a joint")
+    links[root].placed = np.asarray(np.linalg.inv(base), dtype=np.float64)
+    for name, link in links.items():
+        _fill(link, parts[name])
+    return list(links.values())
+
+
+def _fill(link: MovingLink, pieces: list[tuple[Array, UrdfLink]]) -> None:
+    first, about_frame = np.zeros(3), np.zeros((3, 3))
+    for placed, piece in pieces:
+        link.shapes += [(placed @ shape.transform, shape, piece.name) for shape in piece.collisions]
+        if piece.mass > 0:
+            rotation = placed[:3, :3]
+            centre = rotation @ piece.com + placed[:3, 3]
+            link.mass += piece.mass
+            first += piece.mass * centre
+            about_frame += rotation @ piece.inertia @ rotation.T + piece.mass * _steiner(centre)
+    if link.mass > 0:
+        link.com = first / link.mass
+        link.inertia = about_frame - link.mass * _steiner(link.com)
+
+
+def _parents_first(urdf: UrdfModel) -> list[UrdfJoint]:
+    """The joints, each after the one that carries its parent link."""
+    placed, waiting, order = {urdf.root}, list(urdf.joints), []
+    while waiting:
+        ready = [joint for joint in waiting if joint.parent in placed]
+        order += ready
+        placed |= {joint.child for joint in ready}
+        waiting = [joint for joint in waiting if joint.child not in placed]
+    return order
+
+
+def principal(inertia: Array) -> tuple[Array, Array]:
+    """Principal inertias [kg m^2] and their axes, a rotation ``(3, 3)``."""
+    values, axes = np.linalg.eigh(inertia)
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    return values, axes
+
+
+def _steiner(point: Array) -> Array:
+    return point @ point * np.eye(3) - np.outer(point, point)

@@ -1,0 +1,118 @@
+"""What an engine does for the simulated hand: bodies, time and contacts."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from ...description import HandDescription, ObjectDescription
+from ...exceptions import UnknownNameError
+from ...typing import Array
+from ..mechanism.transmission import Transmission
+
+ENGINES = ("sapien", "mujoco")
+
+
+class Scene(Protocol):
+    """A fixed hand and one free object; hand frame = world frame, SI units.
+
+    Physics only, nothing of transmissions, servos or sensors: each joint has one drive of a given stiffness,
+    which is integrated implicitly and aims at a target that :meth:`step` is given.
+    """
+
+    time_step: float
+
+    @property
+    def q(self) -> Array:
+        """Joint angles in the hand's order ``(n_q,)`` [rad]."""
+        ...
+
+    @q.setter
+    def q(self, value: Array) -> None: ...
+
+    @property
+    def next_q(self) -> Array:
+        """Joint angles after the next step, if they keep their speed ``(n_q,)`` [rad]."""
+        ...
+
+    @property
+    def object_pose(self) -> tuple[Array, Array]:
+        """The object frame in the hand frame: ``(3,)`` [m] and an orthogonal ``(3, 3)``."""
+        ...
+
+    @object_pose.setter
+    def object_pose(self, pose: tuple[Array, Array]) -> None: ...
+
+    @property
+    def object_speed(self) -> tuple[float, float]:
+        """Linear [m/s] and angular speed [rad/s] of the object, norms."""
+        ...
+
+    def set_object(self, obj: ObjectDescription) -> None:
+        """Mass, centre of mass and inertia; the shapes stay."""
+        ...
+
+    def oppose(self, links: set[str]) -> None:
+        """These links are of the finger that opposes the others."""
+        ...
+
+    def set_friction(self, friction: float, opposed: float) -> None:
+        """Coefficients of the object's two sides, the second at the finger that opposes the others."""
+        ...
+
+    def set_link_weight(self, pulls: bool) -> None:
+        """Whether gravity pulls at the links too; without, only at the object."""
+        ...
+
+    def set_drive_stiffness(self, stiffness: Array) -> None:
+        """Of each joint's drive ``(n_q,)`` [N m/rad]."""
+        ...
+
+    def hold_object(self, held: bool) -> None:
+        """Fix the object where it is, or let it go at rest."""
+        ...
+
+    def step(self, drive_targets: Array) -> None:
+        """One time step with the joints' drives aimed at the targets ``(n_q,)`` [rad]."""
+        ...
+
+    def push(self, force: Array, torque: Array) -> None:
+        """Push the object during the next step: [N] at its centre of mass and [N m], hand frame."""
+        ...
+
+    def touches(self) -> dict[str, float]:
+        """Links that touch the object now, each with the sum of the sizes of its normal forces [N]."""
+        ...
+
+    def snapshot(self) -> bytes:
+        """All that moves, for :meth:`restore`; restored runs are all alike."""
+        ...
+
+    def restore(self, state: bytes) -> None: ...
+
+
+def make_scene(
+    engine: str,
+    hand: HandDescription,
+    obj: ObjectDescription,
+    time_step: float,
+    contact_stiffness: float,
+    native: Transmission | None = None,
+) -> Scene:
+    """The scene of an engine, ``contact_stiffness`` [N/m] of each contact, 0: as rigid as the engine has it.
+
+    ``native``: tendons for MuJoCo to run, as :class:`~.mujoco_scene.MujocoScene` takes it.
+
+    Raises:
+        UnknownNameError: there is no such engine; the message lists them.
+        MissingExtraError: it is not installed.
+        DescriptionError: what stands in the hand's URDF cannot be simulated.
+    """
+    if engine == "sapien":
+        from .sapien_scene import SapienScene
+
+        return SapienScene(hand, obj, time_step, contact_stiffness)
+    if engine == "mujoco":
+        from .mujoco_scene import MujocoScene
+
+        return MujocoScene(hand, obj, time_step, contact_stiffness, native)
+    raise UnknownNameError("engine", engine, ENGINES)
