@@ -29,7 +29,7 @@ from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
-from torch_ekm.simulation import PlantParameters, preset
+from torch_ekm.simulation import ENGINES, PlantParameters, preset
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -84,14 +84,16 @@ def plants(names: list[str]) -> dict[tuple[str, str], PlantParameters]:
     return found
 
 
-def setting_of(plant: PlantParameters) -> Setting:
+def setting_of(plant: PlantParameters, engine: str = "sapien") -> Setting:
     """True poses plus noise; a dead joint sensor is known as such from the Hall sensors' calibration only."""
-    return Setting(plant=plant, sensing=bool(plant.stuck_joints))
+    return Setting(plant=plant, engine=engine, sensing=bool(plant.stuck_joints))
 
 
-def session(plant: PlantParameters, item: str, controller: str, seed: int) -> list[dict[str, Any]]:
+def session(
+    plant: PlantParameters, item: str, controller: str, seed: int, engine: str = "sapien"
+) -> list[dict[str, Any]]:
     """Warm-up (E-KM only), then the turns: how each ended."""
-    setting = setting_of(plant)
+    setting = setting_of(plant, engine)
     protocol = Generalize(setting, (item,), ANGLES, WARM_UP, 0.0, 0.0)
     return [one.to_json() for one in protocol.session(item, controller, seed) if one.kind == "turn"]
 
@@ -101,6 +103,7 @@ def jobs(
     objects: list[str],
     seeds: Sequence[int],
     controllers: list[str],
+    engine: str,
 ) -> dict[str, Any]:
     """One for each plant, object, controller and seed."""
     return {
@@ -109,10 +112,10 @@ def jobs(
                 *filter(None, (family, strength)),
                 object_name(item),
                 controller,
-                digest(setting_of(plant), (item,), ANGLES, WARM_UP),
+                digest(setting_of(plant, engine), (item,), ANGLES, WARM_UP),
                 str(seed),
             ]
-        ): (plant, item, controller, seed)
+        ): (plant, item, controller, seed, engine)
         for (family, strength), plant in found.items()
         for seed in seeds
         for item in objects
@@ -245,6 +248,7 @@ def main() -> None:
     parser.add_argument("--objects", default="box,bottle", help="names or paths")
     parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1002"), help="FIRST:END")
     parser.add_argument("--controllers", default=",".join(CONTROLLERS))
+    parser.add_argument("--engine", default="sapien", choices=ENGINES)
     parser.add_argument("--jobs", type=int, default=2, help="processes at once")
     parser.add_argument("--out", type=Path, default=Path("any_hand_output"), help="keeps what is finished")
     parser.add_argument(
@@ -256,13 +260,13 @@ def main() -> None:
     if given.quick:
         wanted, objects, seeds = ["odd_1"], objects[:1], seeds[:1]
     found = plants(wanted)
-    todo = jobs(found, objects, seeds, given.controllers.split(","))
+    todo = jobs(found, objects, seeds, given.controllers.split(","), given.engine)
     with progress("running", len(todo)) as advance:
         results = run_jobs(session, todo, given.out, given.jobs, advance)
     turns: dict[tuple[str, str, str], list[TrialRecord]] = defaultdict(list)
     where = {plant: key for key, plant in found.items()}
     for name, trials in results.items():
-        plant, _, controller, _ = todo[name]
+        plant, _, controller, *_ = todo[name]
         made = (TrialRecord.from_json(trial) for trial in trials)
         turns[*where[plant], controller] += [one for one in made if isinstance(one, TrialRecord)]
     survey = Survey(turns)

@@ -26,7 +26,7 @@ from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
 from torch_ekm.experiments.runner import Bench
-from torch_ekm.simulation import PRESETS
+from torch_ekm.simulation import ENGINES, PRESETS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -199,6 +199,7 @@ def main() -> None:
     parser.add_argument("--then", default="can,bottle,jar", help="names or paths")
     parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1003"), help="FIRST:END")
     parser.add_argument("--preset", default="nominal", choices=list(PRESETS))
+    parser.add_argument("--engine", default="sapien", choices=ENGINES)
     parser.add_argument("--jobs", type=int, default=2, help="processes at once")
     parser.add_argument("--out", type=Path, default=Path("new_object_output"), help="keeps what is finished")
     parser.add_argument("--quick", action="store_true", help="one new object, one seed, no camera")
@@ -208,7 +209,7 @@ def main() -> None:
         then, seeds = then[:1], seeds[:1]
     todo, where = {}, {}
     for name, changes in CONTENDERS.items():
-        setting = Setting(preset=given.preset, sensing=not given.quick, **changes)
+        setting = Setting(preset=given.preset, engine=given.engine, sensing=not given.quick, **changes)
         for seed in seeds:
             key = (
                 f"{object_name(given.first)}_{digest(setting, (given.first, *then), ANGLES, MOTIONS)}_{seed}"
