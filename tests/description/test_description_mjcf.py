@@ -12,6 +12,7 @@ import torch
 
 from torch_ekm.description import HandDescription, load_hand, write_template, write_transmission
 from torch_ekm.exceptions import DescriptionError, UnknownNameError
+from torch_ekm.inspection.check import check_hand
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.rendering.visuals import visuals
 
@@ -208,6 +209,12 @@ def test_a_template_is_filled_in_and_has_the_last_word(tmp_path: Path) -> None:
     copied = write_transmission(alone, tmp_path / "other.transmission.toml")
     assert copied.is_file()
     assert not (tmp_path / "other.urdf").exists()
+
+
+def test_check_says_what_is_left_out(tmp_path: Path) -> None:
+    rows = check_hand(str(written(tmp_path, FINGERS)), "no object")
+    assert sum(row.name == "MJCF" and row.state == "warning" for row in rows) == 3
+    assert rows[-1].name == "object's files"
 
 
 def test_pictures_do_with_what_touches(tmp_path: Path) -> None:

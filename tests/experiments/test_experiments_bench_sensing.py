@@ -13,7 +13,7 @@ from torch_ekm.simulation import PRESETS
 
 def test_object_is_turned_with_camera_and_hall_sensors() -> None:
     pytest.importorskip("cv2")
-    bench = Bench(Setting(sensing=True), "box", "E-KM")
+    bench = Bench(Setting(engine="mujoco", sensing=True), "box", "E-KM")
     record = bench.trial(0, 0, 6.0)
     assert isinstance(record, TrialRecord)
     assert record.reason == "reached", record.message

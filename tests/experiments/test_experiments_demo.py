@@ -24,7 +24,7 @@ from torch_ekm.experiments.runner import Bench
 from torch_ekm.model import ModelOptions
 
 #: The dead zone stops a plain KM: it would go on for 30 motions until it is said to stall.
-BRIEF = Setting(safety=Safety(rule=StoppingRule(max_steps=16)))
+BRIEF = Setting(engine="mujoco", safety=Safety(rule=StoppingRule(max_steps=16)))
 EXPERIMENT = Experiment(Demo(BRIEF, angles_deg=(9.0, 14.0)), (1,))
 
 

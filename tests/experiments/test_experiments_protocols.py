@@ -151,8 +151,8 @@ def test_knock_is_felt_in_its_trial_only(online: dict[str, list[TrialRecord]]) -
 
 def test_same_seed_same_session() -> None:
     protocol = Generalize(
-        Setting(hand="planar_two_finger"), objects=("can",), angles_deg=(4.0,), warm_up=1, long_step_deg=3.0,
-        blind_deg=2.0, poses=True,
+        Setting(hand="planar_two_finger", engine="mujoco"), objects=("can",), angles_deg=(4.0,), warm_up=1,
+        long_step_deg=3.0, blind_deg=2.0, poses=True,
     )  # fmt: skip
     runs = [protocol.session("can", "E-KM", 1) for _ in range(2)]
     for ours, theirs in zip(*runs, strict=True):

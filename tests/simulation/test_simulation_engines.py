@@ -15,6 +15,7 @@ from torch_ekm.kinematics.se3 import log
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantStatus
 from torch_ekm.simulation import PlantConfig, SimulatedHand, preset
+from torch_ekm.simulation.env import InHandRotation
 
 pytest.importorskip("mujoco")
 DEG = np.pi / 180
@@ -41,13 +42,13 @@ def mujoco_hand(name: str = "box", **options: Any) -> SimulatedHand:
 
 
 def test_the_kinematic_model_predicts_both_alike() -> None:
-    """Five steps of 1.5 deg, nothing unknown: what is left is small in both engines."""
+    """Three steps of 1.5 deg, nothing unknown: what is left is small in both engines."""
     errors = {}
     for engine in ("sapien", "mujoco"):
         plant = SimulatedHand("icub_right", "box", engine=engine)
         observation, found = plant.reset(11), []
         model, axis, state, grip = KinematicModel(plant.hand, plant.object), plant.rotation_axis, None, None
-        for _ in range(5):
+        for _ in range(3):
             state = true_state(observation) if state is None else state
             lin = model.linearize(state)
             grip = lin.forces.normal if grip is None else grip
@@ -203,6 +204,15 @@ def test_changes_in_mid_run_do_in_both_the_same(change: dict[str, Any]) -> None:
 def test_native_tendons_that_cannot_be_are_refused(options: dict[str, Any], said: str) -> None:
     with pytest.raises(ParameterError, match=said):
         SimulatedHand("icub_right", "box", **options)
+
+
+def test_the_environment_takes_it_too() -> None:
+    env = InHandRotation("planar_two_finger", "can", engine="mujoco")
+    first, _ = env.reset(seed=0)
+    again, *_ = env.step(env.action_space.sample())
+    assert env.plant.engine == "mujoco"
+    assert env.observation_space.contains(first)
+    assert env.observation_space.contains(again)
 
 
 def test_native_tendons_do_not_change() -> None:
