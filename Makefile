@@ -12,12 +12,13 @@ export PYTHONDONTWRITEBYTECODE :=
 
 install: $(VENV)/installed
 
-# bytecode comes with the first import of each module: compiling all of it takes as long as the rest
+# pip compiles one file after the other: compileall takes all cores; some packages ship files that do not compile
 # torch first, at exactly the version of constraints.txt: a later resolver would bring CUDA builds
 $(VENV)/installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt torch numpy
 	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m compileall -q -j 0 -x '/tests?/' $(VENV)/lib > $(VENV)/compiled.log || true
 	touch $@
 
 demo: install
