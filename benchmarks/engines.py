@@ -166,7 +166,7 @@ class Comparison:
 
     def picture(self) -> Figure:
         """Errors of a step of the model, and motions of the turns."""
-        figure, (steps, motions) = new_figure(8.0, 3.0, 1, 2)
+        figure, (steps, motions) = new_figure(9.0, 3.2, 2, 1)
         items = sorted({item for _, item in self.probes})
         for k, engine in enumerate(ENGINES):
             for i, item in enumerate(items):
@@ -179,8 +179,9 @@ class Comparison:
             share = np.arange(1, len(counted) + 1) / max(len(counted), 1)
             motions.step(counted, 100 * share, where="post", color=_COLOURS[engine], label=_NAMES[engine])
         steps.set_xticks(range(len(items)), [item.replace("_", "\n") for item in items], fontsize=8)
-        steps.set_ylabel("KM, nothing unknown:\nerror of a step [deg]")
+        steps.set_ylabel("error of a step [deg]")
         steps.set_ylim(0, None)
+        steps.set_title("KM with nothing unknown", fontsize=9)
         motions.set_xlabel("motions of a turn, E-KM, nominal")
         motions.set_ylabel("share of turns [%]")
         motions.legend(frameon=False, fontsize=8)
