@@ -99,8 +99,7 @@ class Rig:
         self._set_friction()
         self.scene.set_link_weight(p.link_weight)
         self._built_scale = p.object_scale
-        if not self.native:
-            self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
+        self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
 
     def grasp(self, plan: PinchPlan) -> None:
         """Close on the object held in its planned place, release it, let it settle.
