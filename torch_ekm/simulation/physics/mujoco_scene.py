@@ -33,7 +33,7 @@ class MujocoScene:
         time_step: [s].
         contact_stiffness: of each contact [N/m]; 0: as stiff as the time step allows.
         native: its tendons, springs and couplings become MuJoCo's own, without friction and what else it does
-            not have; :meth:`step` then takes ``m - a0`` ``(n_a,)`` [rad], and of the drives the joints keep the
+            not have; :meth:`step` then takes ``m - a0`` ``(n_a,)`` [rad], and joints keep of their drives the
             damping alone. None: joints have drives.
     """
 
