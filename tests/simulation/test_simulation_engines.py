@@ -100,6 +100,10 @@ def test_two_springs_and_a_tendon_are_where_the_forces_say() -> None:
         stretch = np.array([0.5, 0.8]) - hand.actuation_jacobian @ q
         torque = hand.actuation_jacobian.T @ (np.array([a.stiffness for a in hand.actuators]) * stretch)
         np.testing.assert_allclose(hand.spring_stiffness * (q - hand.spring_rest), torque, atol=1e-4)
+        rig.transmission.lengthen(0.5)  # slack: a tendon does not push
+        rig.move(np.zeros(2))
+        rig.wait(2.0)
+        np.testing.assert_allclose(rig.scene.q, hand.spring_rest, atol=1e-3)
 
 
 @pytest.mark.parametrize(("hand", "name"), [("icub_right", "box"), ("planar_two_finger", "can")])
