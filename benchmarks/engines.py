@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DEG = np.pi / 180
-_NAMES = {"sapien": "SAPIEN", "mujoco": "MuJoCo"}
 _COLOURS = {"sapien": "#0072B2", "mujoco": "#D55E00"}
 _STEPS, _STEP = 6, 1.5 * _DEG  # of the probe of the kinematic model
 _TO_SPARE = 0.1  # of a contact's friction, from which on it may slide in a step
@@ -48,9 +47,8 @@ _REST = 20.0  # [s] that a held object is left alone
 _WARM_UP = 3
 
 
-def session(engine: str, preset: str, item: str, controller: str, seed: int) -> list[dict[str, Any]]:
+def session(setting: Setting, item: str, controller: str, seed: int) -> list[dict[str, Any]]:
     """Turns of Table I, after the warm-up."""
-    setting = Setting(preset=preset, engine=engine, sensing=True)
     protocol = Generalize(setting, (item,), None, _WARM_UP, 0.0, 0.0)
     return [one.to_json() for one in protocol.session(item, controller, seed) if one.kind == "turn"]
 
@@ -107,11 +105,11 @@ class Comparison:
     @property
     def verdict(self) -> str:
         """The last line."""
+        found = {engine: self.turns.get((engine, "nominal", "E-KM"), []) for engine in ENGINES}
         return "; ".join(
-            f"{engine} {_error(records):.3f} deg {Turns(tuple(records)).motions:.1f} motions"
-            f" lost {Turns(tuple(records)).lost}"
-            for engine in ENGINES
-            if (records := self.turns.get((engine, "nominal", "E-KM"), []))
+            f"{engine} {_error(records):.3f} deg {turns.motions:.1f} motions lost {turns.lost}"
+            for engine, records in found.items()
+            if (turns := Turns(tuple(records))).records
         )
 
     def table(self) -> Table:
@@ -120,7 +118,7 @@ class Comparison:
             turns = Turns(tuple(records))
             rows.append(
                 [
-                    f"{preset}, {controller}", _NAMES[engine], len(records), turns.lost, turns.reached,
+                    f"{preset}, {controller}", ENGINES[engine], len(records), turns.lost, turns.reached,
                     turns.motions, _error(records), self._one_step(records),
                 ]
             )  # fmt: skip
@@ -148,7 +146,7 @@ class Comparison:
             middle = {key: float(np.median([one[key] for one in found])) for key in found[0]}
             rows.append(
                 [
-                    item.replace("_", " "), _NAMES[engine], len(found), middle["error"], middle["shift"],
+                    item.replace("_", " "), ENGINES[engine], len(found), middle["error"], middle["shift"],
                     f"{middle['creep']:.3f}, {middle['moved']:.3f}", middle["time"],
                 ]
             )  # fmt: skip
@@ -177,7 +175,7 @@ class Comparison:
                 one.steps for one in self.turns.get((engine, "nominal", "E-KM"), []) if not one.lost
             )
             share = np.arange(1, len(counted) + 1) / max(len(counted), 1)
-            motions.step(counted, 100 * share, where="post", color=_COLOURS[engine], label=_NAMES[engine])
+            motions.step(counted, 100 * share, where="post", color=_COLOURS[engine], label=ENGINES[engine])
         steps.set_xticks(range(len(items)), [item.replace("_", "\n") for item in items], fontsize=8)
         steps.set_ylabel("error of a step [deg]")
         steps.set_ylim(0, None)
@@ -225,7 +223,7 @@ def main() -> None:
                         setting = Setting(preset=preset, engine=engine, sensing=True)
                         mark = digest(setting, (item,), TABLE_I.get(item), _WARM_UP)
                         key = f"{engine}_{preset}_{object_name(item)}_{controller}_{mark}_{seed}"
-                        todo[key] = (engine, preset, item, controller, seed)
+                        todo[key] = (setting, item, controller, seed)
                         where[key] = (engine, preset, controller)
     with progress("turning", len(todo)) as advance:
         results = run_jobs(session, todo, given.out, given.jobs, advance)

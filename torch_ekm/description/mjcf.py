@@ -43,8 +43,8 @@ def compile_mjcf(path: Path) -> tuple[Any, set[str]]:
         if element.tag in _READ:
             strict.append(element)
     meshes: set[str] = set()
-    for body in strict.iter():
-        _strip(path, body, meshes)
+    for element in strict.iter():
+        _strip(path, element, meshes)
     mujoco = require("mujoco")
     try:
         return mujoco.MjModel.from_xml_string(ET.tostring(strict, encoding="unicode")), meshes

@@ -206,9 +206,8 @@ class _Conversion:
             }
             for k, j in enumerate(self.hinges)
         }
-        gravity = (self.urdf.pose(_WORLD)[:3, :3].T @ self.model.opt.gravity).tolist()
         tables = [{"name": label, "joints": self._named(row)} for label, row, _ in couplings]
-        hand = {"name": name, "base_link": _WORLD, "gravity": gravity}
+        hand = {"name": name, "base_link": _WORLD, "gravity": self.model.opt.gravity.tolist()}
         return {"hand": hand, "joints": springs, "actuators": actuators, "couplings": tables}
 
     def _rests(self, couplings: list[tuple[str, Array, float]]) -> Array:

@@ -51,12 +51,13 @@ def visuals(urdf: UrdfModel) -> Visuals:
     for ``package://name/rest`` in the folders above it as ``name/rest`` and ``rest``. Pictures do without
     what is missing: a problem is listed, not raised.
     """
+    touched = Visuals({link.name: tuple(link.collisions) for link in urdf.links})
+    if urdf.path.suffix != ".urdf":
+        return touched
     try:
         changed = os.stat(urdf.path).st_mtime_ns
     except OSError:  # a description that outlived its file
-        changed = 0
-    if not changed or urdf.path.suffix != ".urdf":
-        return Visuals({link.name: tuple(link.collisions) for link in urdf.links})
+        return touched
     drawn, problems = _read(urdf.path.resolve(), changed)
     meshes = {name: parts for (name, tag), parts in drawn.items() if tag == "collision"}
     found: dict[str, tuple[Shape | Mesh, ...]] = {}

@@ -67,7 +67,6 @@ class MujocoScene:
         self._data: Any = self._mj.MjData(self._model)
         self._arrange(hand, link_of, shapes)
         self._soften(contact_stiffness)
-        self.set_object(obj)
         self.set_drive_stiffness(np.zeros(hand.n_q))
 
     # -- building -----------------------------------------------------------------------------------

@@ -9,7 +9,8 @@ from ...exceptions import UnknownNameError
 from ...typing import Array
 from ..mechanism.transmission import Transmission
 
-ENGINES = ("sapien", "mujoco")
+ENGINES = {"sapien": "SAPIEN", "mujoco": "MuJoCo"}
+"""The physics that there are, by name, and what they are called."""
 
 
 class Scene(Protocol):
