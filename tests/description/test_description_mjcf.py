@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from torch_ekm.description import HandDescription, load_hand, write_template, write_transmission
+from torch_ekm.description.registry import file_digests
 from torch_ekm.exceptions import DescriptionError, UnknownNameError
 from torch_ekm.inspection.check import check_hand
 from torch_ekm.kinematics import HandKinematics
@@ -228,6 +229,11 @@ def test_files_are_put_together(tmp_path: Path) -> None:
     written(tmp_path / "parts", f"<mujocoinclude>{FINGERS[start:end]}</mujocoinclude>", "drive.xml")
     path = written(tmp_path, FINGERS[:start] + '<include file="parts/drive.xml"/></mujoco>')
     assert load_hand(path).n_a == 3
+    digests = file_digests(path, ())
+    assert list(digests) == ["hand hand.xml", "hand drive.xml"]
+    part = tmp_path / "parts" / "drive.xml"
+    part.write_text(part.read_text().replace('coef="0.4"', 'coef="0.5"'))
+    assert file_digests(path, ()) != digests  # no old results are taken up
 
 
 WORLD = '<body name="b"><joint name="j" range="0 1" {more}/><geom size=".01"/></body>'

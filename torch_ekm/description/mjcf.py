@@ -52,12 +52,24 @@ def compile_mjcf(path: Path) -> tuple[Any, set[str]]:
         raise DescriptionError(path, f"MuJoCo: {' '.join(str(error).split())}") from None
 
 
+def mjcf_files(path: Path) -> list[Path]:
+    """The file and all that it includes, in the order in which they are read.
+
+    Raises:
+        DescriptionError: as :func:`compile_mjcf`, of the files alone.
+    """
+    reader = _Reader(path)
+    reader.read(path, ())
+    return reader.files
+
+
 class _Reader:
     """Files of one folder, each in the place of its ``<include>``."""
 
     def __init__(self, path: Path) -> None:
         self.folder = path.resolve().parent
-        self.elements = self.files = 0
+        self.elements = 0
+        self.files: list[Path] = []
 
     def read(self, path: Path, above: tuple[Path, ...]) -> ET.Element:
         real = path.resolve()
@@ -65,7 +77,7 @@ class _Reader:
             raise DescriptionError(above[-1], f"<include> of '{path}', which is outside {self.folder}")
         if real in above:
             raise DescriptionError(above[-1], f"<include> of '{path.name}', which includes this file")
-        self.files += 1
+        self.files.append(path)
         content = read_bounded(path, "MJCF file", _LARGEST_FILE)
         try:
             root = ET.fromstring(content)  # fetches no external entity, refuses those that blow up
@@ -74,7 +86,7 @@ class _Reader:
         if root.tag not in ("mujoco", "mujocoinclude"):
             raise DescriptionError(path, f"the root element must be <mujoco>, found <{root.tag}>")
         self.elements += sum(1 for _ in root.iter())
-        if self.elements > _MOST_ELEMENTS or self.files > _MOST_FILES:
+        if self.elements > _MOST_ELEMENTS or len(self.files) > _MOST_FILES:
             most = f"at most {_MOST_ELEMENTS} elements and {_MOST_FILES} files are read"
             raise DescriptionError(path, f"{most}, includes among them")
         self._expand(path, root, (*above, real))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..exceptions import DescriptionError, UnknownNameError
 from .hand import HandDescription
+from .mjcf import mjcf_files
 from .mjcf_hand import read_mjcf
 from .objects import ObjectDescription, read_object
 from .transmission import read_transmission
@@ -113,8 +114,10 @@ def file_digests(hand: str | Path, objects: Iterable[str | Path]) -> dict[str, s
         DescriptionError: a file cannot be read.
     """
     described, transmission = hand_paths(hand)
-    alone = described.suffix == ".xml" and not transmission.exists()  # an MJCF may say it all
-    named = [("hand", path) for path in (described, transmission)[: 1 if alone else 2]]
+    files = [described, transmission]
+    if described.suffix == ".xml":  # which may be of several files, and say it all
+        files = [*mjcf_files(described), *([transmission] if transmission.exists() else [])]
+    named = [("hand", path) for path in files]
     named += [("object", path) for item in objects for path in object_paths(item)]
     digests = {}
     for kind, path in named:
