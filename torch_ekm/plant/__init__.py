@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from .frames_at_rest import FramesAtRest
 from .observation import Observation, PlantStatus, Stamps, Truth
 from .plant import Plant
 from .recording_plant import RecordingPlant
@@ -14,7 +13,6 @@ from .verification import verify_log
 from .wrapper import PlantWrapper
 
 __all__ = [
-    "FramesAtRest",
     "Observation",
     "Plant",
     "PlantStatus",

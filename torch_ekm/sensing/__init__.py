@@ -11,7 +11,6 @@ from .contact_alignment import ContactAligned
 from .hall.calibration import HallCalibration
 from .joint_estimator import JointEstimator
 from .vision.board import MarkerBoard
-from .vision.calibration import calibrate_camera
 from .vision.camera import PinholeCamera
 from .vision.track import Track, TrackStatus
 from .vision.tracker import MarkerTracker
@@ -25,5 +24,4 @@ __all__ = [
     "ContactAligned",
     "Track",
     "TrackStatus",
-    "calibrate_camera",
 ]
