@@ -94,8 +94,6 @@ show icub_right --seed -1 | --seed
 show icub_right --reach | without an object
 show icub_right --html folder | cannot be written
 show icub_right --html none/a.html | cannot be written
-show icub_right --port 99999 | --port
-show icub_right --port 0 | --port
 replay none | no such log
 replay file.txt | damaged, or not a recording
 replay folder --trial -1 | --trial

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import model_toys
 import pytest
 import torch
+from planar import planar
+from turning import turning
 
 from torch_ekm.exceptions import GraspError
 from torch_ekm.model import ContactMode, ContactMotion, KinematicModel
 from torch_ekm.model.moving_contacts import contact_laws, contact_motion
 from torch_ekm.simulation import SimulatedHand
-
-sys.path.append(str(Path(__file__).parents[1] / "foresight"))
-from planar import planar
-from turning import turning
 
 F64 = torch.float64
 DEG = torch.pi / 180

@@ -30,8 +30,7 @@ Preset = Annotated[str, Option(help="Faults of the simulated hand: none, nominal
 Engine = Annotated[str, Option(help="Physics of the simulated hand: sapien or mujoco.")]
 Sensing = Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")]
 Jobs = Annotated[int, Option(min=1, help="Processes at once.")]
-Html = Annotated[Path | None, Option(help="Write a stand-alone page instead of serving.")]
-Port = Annotated[int, Option(min=1, max=65535, help="To serve at; the next free one if it is taken.")]
+Page = Annotated[Path, Option(help="The page: one file, shown by any browser without a network.")]
 AN_OBJECT = "An object (see 'torch-ekm objects') or a path to a URDF."
 
 #: Extras, each part of the next: a command names the one that brings all that it needs.

@@ -1,4 +1,4 @@
-"""Commands about recorded trials, and what is looked at in a browser."""
+"""Commands about recorded trials, and pages to look at."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from .._terminal import print_table, progress, say
-from ._app import AN_OBJECT, Engine, Hand, Html, Port, Preset, Sensing, app, needs, parse_angles, parse_seeds
+from ._app import AN_OBJECT, Engine, Hand, Page, Preset, Sensing, app, needs, parse_angles, parse_seeds
 
 import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
 
 if TYPE_CHECKING:
-    from ..inspection.viewer.serve import Show
+    from ..inspection.view import View
 
 
 @app.command()
@@ -57,22 +57,16 @@ def show(
     object: Annotated[str | None, Option(help="An object for the hand to hold.")] = None,
     seed: Annotated[int, Option(min=0, help="Which grasp of the object.")] = 0,
     reach: Annotated[bool, Option(help="How far it can be turned, and what ends it.")] = False,
-    html: Html = None,
-    port: Port = 8080,
+    html: Page = Path("view.html"),
 ) -> None:
-    """Look at a hand, a grasp or a log in the browser.
+    """Write a page that shows a hand, a grasp or a log in any browser.
 
-    A hand has a slider for each actuator, a grasp is simulated while its actuators are moved, a log is
-    played.
+    A hand closes and opens each actuator in turn. In a grasp each actuator is moved by 5 deg, in simulation,
+    and the table says what that does to the object. A log is played.
     """
-    from ..inspection.viewer.serve import ReachShow, choose_show
+    from ..inspection.view import view
 
-    shown = choose_show(what, object, seed, reach)
-    if isinstance(shown, ReachShow):
-        print_table(("direction", "angle [deg]", "ends by"), shown.rows(), shown.title)
-    for note in getattr(shown, "notes", ()):
-        say(f"Not drawn: {note}")
-    _look(shown, html, port)
+    _show(view(what, object, seed, reach=reach), html)
 
 
 @app.command()
@@ -81,20 +75,21 @@ def replay(
     log: Annotated[Path, Argument(help="A log's folder, or the file of one trial.")],
     trial: Annotated[int | None, Option(min=0, help="Which trial; the first one by default.")] = None,
     estimates: Annotated[bool, Option(help="Show what was measured, not the truth.")] = False,
-    html: Html = None,
-    port: Port = 8080,
+    html: Page = Path("view.html"),
 ) -> None:
-    """List the trials of a log, and play one in the browser."""
-    from ..inspection.viewer.trial import LogShow
+    """List the trials of a log, and play one on a page."""
+    from ..inspection.view import view_log
+    from ..plant import TrialLog
     from ..plant.trial_log import TrialEntry
 
-    shown = LogShow(log, trial, estimates)
-    if shown.log is not None:
+    shown = view_log(log, trial, estimates=estimates)
+    if log.is_dir():
+        found = TrialLog.open(log)
         header = ["time [s]" if name == "time" else name for name in TrialEntry._fields]
-        print_table(header, shown.log.index, str(log))
-        for number, problem in shown.log.damaged.items():
+        print_table(header, found.index, str(log))
+        for number, problem in found.damaged.items():
             say(f"trial {number}: {problem}")
-    _look(shown, html, port)
+    _show(shown, html)
 
 
 @app.command()
@@ -114,11 +109,10 @@ def verify(log: Annotated[Path, Argument(help="Folder of the log.")]) -> None:
         raise typer.Exit(1)
 
 
-def _look(show: Show, html: Path | None, port: int) -> None:
-    """Write a page, or serve until Ctrl-C."""
-    from ..inspection.viewer.serve import save_page, serve
-
-    if html is not None:
-        say(f"Page:      {save_page(show, html).resolve()}")
-        return
-    serve(show, port=port, on_ready=lambda address: say(f"Open {address} (Ctrl-C ends)"))
+def _show(shown: View, page: Path) -> None:
+    """The table, and where the page is."""
+    if shown.rows:
+        print_table(shown.header, shown.rows, shown.title)
+    for note in shown.notes:
+        say(f"Not drawn: {note}")
+    say(f"Page:      {shown.save(page).resolve()}")

@@ -3,7 +3,5 @@
 from __future__ import annotations
 
 from .blind_pose import BlindPose
-from .prediction import Prediction
-from .rollout import Rollout
 
-__all__ = ["BlindPose", "Prediction", "Rollout"]
+__all__ = ["BlindPose"]

@@ -1,1 +1,1 @@
-"""Look at a hand, a grasp or a log before anything is driven: ``check`` and the viewer."""
+"""Look at a hand, a grasp or a log before anything is driven: ``check``, and pages of ``show``."""

@@ -1,4 +1,4 @@
-"""A scene in the browser: a stand-alone page, or served while it changes (viser)."""
+"""A scene in the browser: a stand-alone page (viser)."""
 
 from __future__ import annotations
 
@@ -14,44 +14,35 @@ from .._files import write_whole
 from ..typing import Array
 from .scene import Scene, shape_mesh
 from .visuals import Mesh
-from .web_guard import HOST, WebGuard
+
+_FRAME = 0.25  # [s]
 
 
 def save_animation(scene: Scene, path: Path) -> Path:
-    """Write the frames as one stand-alone HTML page that can be turned and zoomed (viser)."""
-    server, _ = start_server()
-    try:
-        serializer = server.get_scene_serializer()
-        nodes = draw(server, scene)
-        for frame in scene.transforms:
-            place(server, nodes, frame)
-            serializer.insert_sleep(0.25)  # [s] for each frame
-        page = serializer.as_html()
-    finally:
-        with contextlib.redirect_stdout(io.StringIO()):
+    """Write the frames as one stand-alone HTML page that can be turned and zoomed.
+
+    viser draws on a server; it listens on 127.0.0.1, at a port of its own, while the page is made.
+
+    Raises:
+        MissingExtraError: viser is not installed.
+        OutputError: ``path`` cannot be written.
+    """
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = require("viser").ViserServer(host="127.0.0.1", port=0, verbose=False)
+        try:
+            serializer = server.get_scene_serializer()
+            nodes = _draw(server, scene)
+            for frame in scene.transforms:
+                _place(server, nodes, frame)
+                serializer.insert_sleep(_FRAME)
+            page = serializer.as_html()
+        finally:
             server.stop()
     write_whole(path, page)
     return path
 
 
-def start_server(port: int = 0) -> tuple[Any, str]:
-    """A viser server for this machine, and the address to be opened: only who has it gets an answer.
-
-    Args:
-        port: the next free one is taken if it is not.
-
-    Raises:
-        MissingExtraError: viser is not installed.
-        ParameterError: this version of viser cannot be guarded.
-    """
-    viser, guard = require("viser"), WebGuard()
-    with contextlib.redirect_stdout(io.StringIO()):  # the caller says what is to be opened
-        server = guard.start(lambda: viser.ViserServer(host=HOST, port=port, verbose=False))
-    server.gui.configure_theme(show_share_button=False)  # it would open the viewer to the internet
-    return server, guard.address(server.get_port())
-
-
-def draw(server: Any, scene: Scene) -> list[Any]:
+def _draw(server: Any, scene: Scene) -> list[Any]:
     """Add the scene to a viser server, seen from its side; returns a node for each shape."""
     server.scene.set_up_direction(tuple(-scene.down))
     nodes = []
@@ -69,7 +60,7 @@ def draw(server: Any, scene: Scene) -> list[Any]:
     return nodes
 
 
-def place(server: Any, nodes: list[Any], transforms: Array) -> None:
+def _place(server: Any, nodes: list[Any], transforms: Array) -> None:
     """Move the nodes to one frame of a scene, ``(n_shapes, 4, 4)``, all at once."""
     rotation = require("scipy.spatial.transform").Rotation
     with server.atomic():

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from functools import lru_cache
-from pathlib import Path
 
 import torch
-
-sys.path.append(str(Path(__file__).parents[1] / "model"))
 from equilibrium import EquilibriumSolver
 from test_model_planar_hand import pinch
 

@@ -1,0 +1,154 @@
+"""A hand, a grasp and a log can be looked at; what is none of them is named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from torch_ekm.cli import app
+from torch_ekm.description import load_hand
+from torch_ekm.exceptions import DescriptionError, OutputError, ParameterError, UnknownNameError
+from torch_ekm.inspection.view import view, view_hand, view_log
+from torch_ekm.plant import RecordingPlant, Trajectory, TrialLog
+from torch_ekm.rendering import make_scene
+from torch_ekm.simulation import SimulatedHand
+
+pytest.importorskip("viser")
+pytest.importorskip("sapien")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two trials of two commands each; the third is of a learner that never grasped."""
+    folder = tmp_path_factory.mktemp("log")
+    log = TrialLog(folder, {"hand": "planar_two_finger", "object": "box", "gravity": [0, -9.81, 0]})
+    plant = RecordingPlant(SimulatedHand("planar_two_finger", "box"))
+    for trial in range(2):
+        plant.reset(trial)
+        for step in (0.03, 0.03):
+            plant.command(torch.tensor([step, -step]))
+        log.write(trial, plant.trajectory, {"reason": "stalled"})
+    log.write(2, Trajectory(9), {"reason": "not grasped"})
+    return folder
+
+
+def test_each_actuator_of_a_hand_closes_and_opens() -> None:
+    hand = load_hand("icub_right")
+    page = view_hand(hand).scene.transforms
+    assert len(page) == 1 + 9 * 20
+    index = hand.actuator_names.index("index_distal")
+    closed = page[1 + 20 * index + 9]
+    owners = [link.name for link in hand.urdf.links for _ in link.collisions]
+    way = np.linalg.norm(closed[:, :3, 3] - page[0][:, :3, 3], axis=1)
+    own = np.array([name.startswith("index") for name in owners])
+    assert way[own].max() > 0.01
+    assert way[~own].max() < 1e-9
+    np.testing.assert_allclose(page[20 * (index + 1)], page[0], atol=1e-12)
+
+
+def test_a_grasp_says_what_each_actuator_does() -> None:
+    seen = view("planar_two_finger", "box")
+    hand = load_hand("planar_two_finger")
+    assert [row[0] for row in seen.rows] == ["at rest", *hand.actuator_names]
+    assert seen.rows[0][1:3] == ("0.0", "0.0")
+    assert all(float(row[2]) > 0.1 for row in seen.rows[1:])  # [mm]
+    frames = seen.scene.transforms
+    assert len(frames) == 1 + 4 * hand.n_a
+    np.testing.assert_allclose(frames[4], frames[0])  # the same grasp for each
+    turned = frames[2][-1][:3, :3] @ frames[0][-1][:3, :3].T
+    angle = np.degrees(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)))
+    assert abs(angle - float(seen.rows[1][1])) < 0.06
+
+
+def test_the_reach_goes_to_both_ends_and_home() -> None:
+    seen = view("icub_right", "tea_tin", reach=True)
+    back, forth = seen.rows
+    assert float(back[1]) < 0 < float(forth[1])
+    assert "thumb_2" in forth[2]
+    np.testing.assert_allclose(seen.scene.transforms[0], seen.scene.transforms[-1])
+    with pytest.raises(ParameterError, match="without an object"):
+        view("icub_right", reach=True)
+
+
+def test_a_log_is_played_from_command_to_command(folder) -> None:
+    seen = view_log(folder, trial=1)
+    recording = TrialLog.open(folder).read(1)
+    assert len(seen.scene.transforms) == len(seen.rows) == 3
+    for k, one in enumerate(recording.observations):
+        np.testing.assert_allclose(seen.scene.transforms[k, -1, :3, 3], one.truth.position, atol=1e-12)
+    estimated = view_log(folder, trial=1, estimates=True).scene.transforms[1, -1, :3, 3]
+    np.testing.assert_allclose(estimated, recording.observations[1].position, atol=1e-12)
+    assert seen.rows[0][1:3] == ("held", "0.0")
+    assert "+1.7" in seen.rows[1][4]  # 0.03 rad
+
+
+def test_a_page_stands_alone_and_has_no_text_of_the_log(folder, tmp_path) -> None:
+    script = "<iframe srcdoc='<script>parent.alert(1)</script>'></iframe>"
+    recording = TrialLog.open(folder).read(0)
+    recording.observations[0].info["events"] = (script,)
+    seen = view_log(recording.save(tmp_path / "trial.h5"))
+    assert script in seen.rows[0][-1]
+    page = seen.save(tmp_path / "log.html").read_text(encoding="utf-8")
+    assert len(page) > 500_000
+    assert 'src="http' not in page
+    assert "iframe srcdoc" not in page
+    with pytest.raises(OutputError, match="cannot be written"):
+        seen.save(tmp_path / "nowhere" / "log.html")
+
+
+def test_what_cannot_be_shown_is_named(folder, tmp_path) -> None:
+    with pytest.raises(UnknownNameError, match=r"icub_right.*a log's folder"):
+        view("nonsense")
+    with pytest.raises(ParameterError, match="left out with a log"):
+        view(str(folder), object="box")
+    with pytest.raises(DescriptionError, match="nothing to show: not grasped"):
+        view_log(folder, trial=2)
+    with pytest.raises(DescriptionError, match="no trial 7; there are 0, 1, 2"):
+        view_log(folder, trial=7)
+    with pytest.raises(DescriptionError, match="no such log"):
+        view_log(tmp_path / "none")
+    with pytest.raises(DescriptionError, match="name its folder"):
+        view_log(folder / "trial_000001.h5", trial=1)
+    recording = TrialLog.open(folder).read(0)
+    for configuration, match in (
+        ({"hand": "icub_right"}, "no object"),
+        ({"hand": "icub_right", "object": "box"}, "4 joints"),
+    ):
+        path = Trajectory(
+            0, recording.commands, recording.observations, {"configuration": configuration}
+        ).save(tmp_path / "trial.h5")
+        with pytest.raises(DescriptionError, match=match):
+            view_log(path)
+
+
+def test_a_scene_without_an_object_is_the_hand_alone() -> None:
+    hand, q = load_hand("planar_two_finger"), np.zeros((2, 4))
+    scene = make_scene(hand, None, q, None, None, np.array([0, -9.81, 0]))
+    assert len(scene.shapes) == sum(len(link.collisions) for link in hand.urdf.links)
+
+
+def test_command_line(folder, tmp_path) -> None:
+    runner = CliRunner()
+    page = tmp_path / "page.html"
+    done = runner.invoke(app, ["replay", str(folder), "--trial", "1", "--html", str(page)])
+    assert done.exit_code == 0, done.output
+    assert "stalled" in done.output
+    assert "held" in done.output
+    assert page.stat().st_size > 500_000
+    page.unlink()
+    done = runner.invoke(app, ["show", "yale_t42", "--object", "cylinder_45mm", "--html", str(page)])
+    assert done.exit_code == 0, done.output
+    assert page.exists()
+    failed = runner.invoke(app, ["replay", str(tmp_path / "nothing")])
+    assert isinstance(failed.exception, DescriptionError)
+    made = tmp_path / "made"
+    arguments = ["record", str(made), "--seeds", "0:1", "--preset", "none", "--no-sensing", "--angles", "3"]
+    done = runner.invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    assert TrialLog.open(made).index[0].reason == "reached"
+    assert "1 reached" in done.output.replace("\n", " ")
+    failed = runner.invoke(app, [*arguments[:-1], "x,3"])
+    assert isinstance(failed.exception, ParameterError)
+    assert "x,3" in str(failed.exception)

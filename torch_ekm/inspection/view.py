@@ -1,0 +1,217 @@
+"""A hand, a grasp, its reach or a log to look at: a page of its own for any browser, and a table."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..control import ClosedLoop, LookAndMoveController
+from ..description import HandDescription, list_hands, load_hand, load_object
+from ..exceptions import DescriptionError, OutputError, ParameterError, UnknownNameError
+from ..kinematics import ActuationMap, GraspState
+from ..kinematics.se3 import log as rotation_vector
+from ..model import KinematicModel
+from ..plant import Observation, PlantStatus, Trajectory, TrialLog
+from ..rendering import Scene, make_scene, save_animation
+from ..rendering.visuals import visuals
+from ..simulation import SimulatedHand
+from ..typing import Array
+
+_FRAMES = 10  # of one actuator's way through its range
+_STEP, _STEPS = math.radians(2.5), 2  # an actuator of a grasp is moved so far at once, and so often
+
+
+@dataclass(frozen=True)
+class View:
+    """What there is to look at."""
+
+    title: str
+    scene: Scene
+    """Its frames are played one after another."""
+    header: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+    """What there is to read."""
+    notes: tuple[str, ...] = ()
+    """What could not be drawn."""
+
+    def save(self, path: Path) -> Path:
+        """Write a stand-alone page that any browser shows, without a network.
+
+        Raises:
+            OutputError: ``path`` cannot be written.
+        """
+        if path.is_dir() or not path.resolve().parent.is_dir():
+            raise OutputError(path, "there is no such folder, or a folder of this name")
+        return save_animation(self.scene, path)
+
+
+def view(what: str, object: str | None = None, seed: int = 0, *, reach: bool = False) -> View:
+    """A hand (name or file), alone or holding an object, or the first trial of a log.
+
+    Args:
+        object: name or URDF.
+        seed: which grasp of it.
+        reach: how far it can be turned.
+
+    Raises:
+        UnknownNameError: no such hand, and no log of that name; the message lists the hands.
+        ParameterError: an object was given to a log, or none to a hand whose reach is asked for.
+        DescriptionError: the log is damaged or has nothing to show.
+        EquilibriumError, GraspError: the object cannot be pinched by this hand.
+    """
+    path = Path(what)
+    if what not in list_hands() and path.suffix not in (".urdf", ".xml"):
+        if not path.exists():
+            raise UnknownNameError("hand or log", what, (*list_hands(), "a URDF file", "a log's folder"))
+        if object is not None:
+            raise ParameterError("object", object, "left out with a log, which knows its own")
+        return view_log(path)
+    if object is None:
+        if reach:
+            raise ParameterError("reach", reach, "False without an object: it is that of a grasp")
+        return view_hand(load_hand(what))
+    plant = SimulatedHand(what, object)
+    try:
+        seen = plant.reset(seed)
+        return _reach(plant) if reach else _grasp(plant, seen)
+    finally:
+        plant.close()
+
+
+def view_hand(hand: HandDescription) -> View:
+    """``q(a) = argmin 1/2 q^T K_s q  s.t.  J_a q = a - a_0,  C q = 0``: each actuator closes and opens.
+
+    The hand touches nothing; joint stops are kept.
+    """
+    upper = np.array([part.upper for part in hand.actuators])
+    start = np.clip(0.0, [part.lower for part in hand.actuators], upper)
+    ways = np.r_[np.linspace(0, 1, _FRAMES), np.linspace(1, 0, _FRAMES)]
+    postures = [start, *(start + way * np.diag(upper - start)[i] for i in range(hand.n_a) for way in ways)]
+    q = ActuationMap(hand).joints(torch.from_numpy(np.array(postures))).numpy()
+    q = q.clip(hand.joint_lower, hand.joint_upper)
+    scene = make_scene(hand, None, q, None, None, np.array(hand.gravity))
+    return View(hand.name, scene, notes=tuple(visuals(hand.urdf).problems))
+
+
+def _grasp(plant: SimulatedHand, seen: Observation) -> View:
+    """A pinch, and what each actuator does to it by itself."""
+    hand, start, grasp = plant.hand, _truth(seen), plant.snapshot()
+    states, rows = [start], [("at rest", *_moved(start, start), _forces(hand, seen))]
+    for i, name in enumerate(hand.actuator_names):
+        step = torch.zeros(hand.n_a, dtype=torch.float64)
+        step[i] = _STEP
+        way = [plant.command(step) for _ in range(_STEPS)]
+        there = [_truth(one) for one in way]
+        states += [*there, *reversed(there[:-1]), start]
+        lost = ", lost" if way[-1].status is PlantStatus.LOST else ""
+        rows.append((name + lost, *_moved(start, there[-1]), _forces(hand, way[-1])))
+        plant.restore(grasp)
+    moved = f"actuator, {_STEPS * math.degrees(_STEP):g} deg"
+    header = (moved, "object turned [deg]", "moved [mm]", "forces [N]")
+    return View(f"{hand.name} holds {plant.object.name}", _scene(plant, states), header, tuple(rows))
+
+
+def _reach(plant: SimulatedHand) -> View:
+    """A pinch, turned on the model from the grasp to one end, to the other, and home."""
+    controller = LookAndMoveController(KinematicModel(plant.hand, plant.object), plant.rotation_axis)
+    loop = ClosedLoop(plant, controller)
+    back, forth = (loop.reach(sign=sign) for sign in (-1, 1))
+    states = [*forth.path, *reversed(forth.path[:-1]), *back.path[1:], *reversed(back.path[:-1])]
+    rows = tuple(
+        (name, f"{math.degrees(reach.angle):.1f}", reach.ends_by)
+        for name, reach in (("back", back), ("forth", forth))
+    )
+    header = ("direction", "angle [deg]", "ends by")
+    return View(f"{plant.hand.name} turns {plant.object.name}", _scene(plant, states), header, rows)
+
+
+def view_log(log: Path, trial: int | None = None, *, estimates: bool = False) -> View:
+    """One trial of a log, command by command: the truth where it is known, else what was estimated.
+
+    Args:
+        log: a folder with trials (see :class:`~torch_ekm.plant.TrialLog`) or one trial's file.
+        trial: which; the first one by default.
+        estimates: show what was estimated although the truth is known.
+
+    Raises:
+        DescriptionError: no such log or trial, a damaged or empty one, or one that does not name its
+            hand and object.
+        UnknownNameError: its hand or object is not on this machine; the message lists those that are.
+    """
+    if log.is_file():
+        if trial is not None:
+            raise DescriptionError(log, f"this is one trial's file; to choose trial {trial}, name its folder")
+        trajectory = Trajectory.load(log)
+    else:
+        trials = TrialLog.open(log)
+        trial = trial if trial is not None or not trials.trials else trials.trials[0]
+        trajectory, log = trials.read(trial or 0), trials.path(trial or 0)
+    if not trajectory.observations:
+        reason = trajectory.about.get("outcome", {}).get("reason", "it holds no observation")
+        raise DescriptionError(log, f"there is nothing to show: {reason}")
+    configuration = trajectory.about.get("configuration", {})
+    for name in ("hand", "object"):
+        if not isinstance(configuration.get(name), str):
+            raise DescriptionError(log, f"its configuration names no {name}, needed to draw it")
+    hand, obj = load_hand(configuration["hand"]), load_object(configuration["object"])
+    gravity = np.array(configuration.get("gravity", hand.gravity), dtype=np.float64)
+    states = [seen.state if estimates else _truth(seen) for seen in trajectory.observations]
+    if states[0].q.shape[-1] != hand.n_q:
+        problem = f"has {states[0].q.shape[-1]} joints, the hand '{hand.name}' {hand.n_q}: of another hand"
+        raise DescriptionError(log, problem)
+    scene = make_scene(hand, obj, *_arrays(states), gravity)
+    header = ("time [s]", "object", "turned [deg]", "wrong by [deg]", "commanded [deg]", "events")
+    return View(log.stem, scene, header, tuple(_moments(trajectory, hand)))
+
+
+def _moments(trajectory: Trajectory, hand: HandDescription) -> list[tuple[str, ...]]:
+    """What is known of each observation."""
+    rows = []
+    first = trajectory.observations[0]
+    for k, seen in enumerate(trajectory.observations):
+        wrong = "" if seen.truth is None else f"{_angle(seen.rotation @ seen.truth.rotation.mT):.2f}"
+        moved = trajectory.commands[k - 1].rad2deg().tolist() if k else ()
+        names = zip(hand.actuator_names, moved, strict=False)
+        motion = ", ".join(f"{name} {value:+.1f}" for name, value in names if abs(value) >= 0.05)
+        turned = f"{_angle(seen.rotation @ first.rotation.mT):.1f}"
+        events = ", ".join(map(str, seen.info.get("events", ())))
+        rows.append((f"{seen.time:.2f}", seen.status.value, turned, wrong, motion, events))
+    return rows
+
+
+def _scene(plant: SimulatedHand, states: list[GraspState]) -> Scene:
+    """Seen along the axis about which the object turns."""
+    hand, axis = plant.hand, plant.rotation_axis.numpy()
+    return make_scene(hand, plant.object, *_arrays(states), np.array(hand.gravity), axis=axis)
+
+
+def _arrays(states: list[GraspState]) -> tuple[Array, Array, Array]:
+    parts = zip(*((s.q.numpy(), s.position.numpy(), s.rotation.numpy()) for s in states), strict=True)
+    q, position, rotation = map(np.stack, parts)
+    return q, position, rotation
+
+
+def _truth(seen: Observation) -> GraspState:
+    return seen.state if seen.truth is None else seen.truth.state
+
+
+def _moved(before: GraspState, after: GraspState) -> tuple[str, str]:
+    *_, x, y, z, a, b, c = after.minus(before).tolist()
+    return f"{math.degrees(math.hypot(a, b, c)):.1f}", f"{1e3 * math.hypot(x, y, z):.1f}"
+
+
+def _forces(hand: HandDescription, seen: Observation) -> str:
+    """Of the pads that press."""
+    if seen.fingertip_force is None:
+        return "no sensors"
+    forces = zip(hand.pads, seen.fingertip_force.tolist(), strict=True)
+    return ", ".join(f"{pad.name} {force:.1f}" for pad, force in forces if force > 0.05)
+
+
+def _angle(rotation: torch.Tensor) -> float:
+    """[deg]"""
+    return math.degrees(float(rotation_vector(rotation).norm()))
