@@ -14,12 +14,12 @@ import numpy as np
 from torch_ekm.description import HandDescription, load_hand
 from torch_ekm.exceptions import DescriptionError, UnknownNameError
 from torch_ekm.experiments.jobs import run_jobs
-from torch_ekm.experiments.learner_comparison.fingerprint import fingerprint
 from torch_ekm.experiments.learners import LEARNERS
 from torch_ekm.typing import Array
 
 from .adapting import adapting_predictions
 from .finger_markers import FingerMarkers
+from .fingerprint import fingerprint
 from .fingers import identify_markers
 from .learning import learned_predictions
 from .nominal import (

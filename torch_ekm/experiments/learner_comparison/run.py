@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import pickle
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -12,12 +13,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..._recorded import describe
 from ...exceptions import MissingExtraError, NoStateError, ParameterError, ShapeError
 from ...residual import ResidualLearner
 from ...typing import Array
 from ..jobs import run_jobs
 from ..learners import COMPARED, Factory, learner_factory
-from .fingerprint import fingerprint
 from .prequential import run_prequential
 from .recordings import LIMIT, load_recording
 from .report import ComparisonReport
@@ -50,10 +51,9 @@ def compare(
         inputs: columns of the files to predict from; all but the targets if none is named.
         limit: only the first so many samples of a file or recording; None: all.
         folder: keeps what is finished, so that an interrupted comparison goes on where it stopped. A result
-            is read again if the samples and the learner are the same: all that the learner holds when it is
-            made (numbers, parameters, parts), and the code of its class, of what it holds, and of the
-            functions and constants that this code names in its own module. What it calls in *other* modules
-            of yours does not count: after a change there, use another folder.
+            is read again if the samples are the same, and a learner of that name is made with the same
+            arguments and says the same of the first 40 samples. A change of code that shows later only is
+            not noticed: use another folder.
         processes: how many at once (timings are then those of a busy machine).
         on_done: called with each finished job's name.
 
@@ -148,8 +148,15 @@ def _made(name: str, factory: Factory, stream: Stream) -> ResidualLearner:
 
 
 def _job_name(stream: Stream, name: str, learner: ResidualLearner) -> str:
-    decides = fingerprint(stream.x, stream.y, stream.warm_up, stream.segments, name, learner)
-    return re.sub(r"[^\w.+-]", "-", f"{stream.name}_{decides[:8]}_{name}")
+    """Named after what decides the result: samples, arguments, and what the learner does at first."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        made_with, first = describe(learner), run_prequential(learner, stream.x[:LEAST], stream.y[:LEAST])
+    said = [f"{value:.6g}" for value in torch.cat([first.mean, first.deviation]).flatten().tolist()]
+    decides = hashlib.sha256(repr((name, stream.warm_up, stream.segments, made_with, said)).encode())
+    for values in (stream.x, stream.y):
+        decides.update(values.detach().cpu().numpy().tobytes())
+    return re.sub(r"[^\w.+-]", "-", f"{stream.name}_{decides.hexdigest()[:8]}_{name}")
 
 
 def _squared(error: torch.Tensor) -> Array:

@@ -1,3 +1,5 @@
+"""What decides a job's result, as a digest: values, and the code of functions and classes."""
+
 from __future__ import annotations
 
 import hashlib
