@@ -188,7 +188,6 @@ def test_every_optional_module_has_an_extra_that_brings_it() -> None:
     packages = {
         "cv2": "opencv-python",
         "IPython": "ipykernel",
-        "sklearn": "scikit-learn",
         "rclpy": "ros-rclpy",
         **{f"{name}_msgs": f"ros-{name}-msgs" for name in ("sensor", "trajectory", "geometry", "std")},
     }

@@ -1,8 +1,8 @@
-"""Trials leave as MCAP and come back with the same figures; any recording is read without ROS."""
+"""Trials leave as MCAP; any recording is read without ROS."""
 
 from __future__ import annotations
 
-import hashlib
+import json
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
-from torch_ekm.interop import log_from_mcap, log_to_mcap, read_bag
+from torch_ekm.interop import log_to_mcap, read_bag
 from torch_ekm.kinematics import se3
 from torch_ekm.plant import Observation, PlantStatus, Trajectory, TrialLog, Truth
 
-pytest.importorskip("rosbags", reason="extra 'interop'")
+AnyReader = pytest.importorskip("rosbags.highlevel", reason="extra 'interop'").AnyReader
 pytest.importorskip("h5py", reason="extra 'sim'")
 
 
@@ -42,27 +42,26 @@ def trajectory(seed: int, n: int = 3, forces: bool = True) -> Trajectory:
     return Trajectory(seed, [some(2) for _ in range(n)], seen, {"note": "made up"})
 
 
-def digests(folder: Path) -> dict[str, str]:
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
-
-
-def test_a_log_comes_back_byte_by_byte(tmp_path: Path) -> None:
+def test_a_log_has_a_recording_for_each_trial(tmp_path: Path) -> None:
     log = TrialLog(tmp_path / "log", {"hand": "made up"})
-    for trial in range(2):
-        log.write(trial, trajectory(trial, forces=trial == 0), {"reason": "done"})
-    log.write(2, Trajectory(7), {"reason": "not grasped"})
+    one = trajectory(0)
+    log.write(0, one, {"reason": "done"})
+    log.write(1, Trajectory(7), {"reason": "not grasped"})
     log.close()
     bags = log_to_mcap(log, tmp_path / "bags")
-    assert [bag.name for bag in bags] == ["trial_000000", "trial_000001", "trial_000002"]
-    again = log_from_mcap(tmp_path / "bags", tmp_path / "again")
-    assert digests(tmp_path / "again") == digests(tmp_path / "log")
-    assert again.index == log.index
+    assert [bag.name for bag in bags] == ["trial_000000", "trial_000001"]
+    with AnyReader([bags[0]]) as reader:
+        said: dict[str, list] = {}
+        for connection, _, raw in reader.messages():
+            said.setdefault(connection.topic, []).append(reader.deserialize(raw, connection.msgtype))
+    kept = log.read(0).arrays()
+    assert set(said) == {"/about", "/object_pose", *(f"/{place}" for place in kept)}
+    assert json.loads(said["/about"][0].data)["about"]["outcome"]["reason"] == "done"
+    (image,) = (messages for topic, messages in said.items() if topic.endswith("/image"))
+    assert [int(np.asarray(message.data).max()) for message in image] == [0, 1, 2, 3]
+    assert [message.position.tolist() for message in said["/q"]] == [o.q.tolist() for o in one.observations]
     with pytest.raises(ParameterError, match="does not exist yet"):
         log_to_mcap(log, tmp_path / "bags")
-    with pytest.raises(ParameterError, match="without this trial"):
-        log_from_mcap(tmp_path / "bags", tmp_path / "again")
-    with pytest.raises(DescriptionError, match="trial_000000"):
-        log_from_mcap(tmp_path, tmp_path / "nothing")
 
 
 def test_a_recording_is_a_table(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Learners keep river's and scikit-learn's contracts."""
+"""Learners keep river's contract."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import torch
 
 from torch_ekm import LearnHyperparameters, SparseOnlineGP, Standardize, interop
 from torch_ekm.exceptions import MissingExtraError, ParameterError, ShapeError
-from torch_ekm.interop import OnlineRegressor, as_river, as_sklearn
+from torch_ekm.interop import OnlineRegressor, as_river
+from torch_ekm.interop.online_regressor import make_learner
 
 river = pytest.importorskip("river", reason="extra 'interop'")
-sklearn = pytest.importorskip("sklearn", reason="extra 'interop'")
 
 
 def small(d: int, m: int) -> SparseOnlineGP:
@@ -78,41 +78,15 @@ def test_features_come_and_go_by_name() -> None:
         one.learn_one({"a": 0.0, "d": 1.0}, 0.0)
 
 
-def test_scikit_learn_finds_nothing_wrong() -> None:
-    from sklearn.utils.estimator_checks import check_estimator
-
-    results = check_estimator(as_sklearn(small), on_skip=None)
-    assert {result["status"] for result in results} <= {"passed", "skipped"}
-    skipped = {result["check_name"] for result in results if result["status"] == "skipped"}
-    assert skipped <= {"check_array_api_input"}
-
-
-def test_scikit_learn_example() -> None:
-    from sklearn.model_selection import cross_val_score
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-
-    x, y = wave(240)
-    regressor = as_sklearn(small)
-    for start in range(0, 200, 50):
-        regressor.partial_fit(x[start : start + 50], y[start : start + 50])
-    assert regressor.score(x[200:], y[200:]) > 0.85
-    mean, deviation = regressor.predict(x[200:], return_std=True)
-    assert mean.shape == deviation.shape == (40,)
-    whole = as_sklearn(small).fit(x[:200], y[:200])
-    assert np.array_equal(whole.predict(x[200:]), mean), "rows learned at once or in turn are the same"
-    assert cross_val_score(make_pipeline(StandardScaler(), as_sklearn(small)), x, y, cv=3).min() > 0.7
-
-
 def test_a_wrong_learner_is_named() -> None:
     with pytest.raises(ParameterError, match="one model of 3 inputs and 1 outputs"):
-        as_sklearn(small(2, 1)).fit(*wave(20))
+        make_learner(small(2, 1), 3, 1)
     regressor = OnlineRegressor(small(3, 1))
     with pytest.raises(ParameterError, match="level"):
         regressor.interval(np.zeros((1, 3)), 95.0)
 
 
-@pytest.mark.parametrize(("module", "name"), [("river", "as_river"), ("sklearn", "as_sklearn")])
+@pytest.mark.parametrize(("module", "name"), [("river", "as_river"), ("casadi", "to_casadi")])
 def test_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, module: str, name: str) -> None:
     for known in [known for known in sys.modules if known.split(".")[0] == module or "interop." in known]:
         monkeypatch.delitem(sys.modules, known)

@@ -1,4 +1,4 @@
-"""Both ways between learners and other libraries: river, scikit-learn, CasADi, ROS.
+"""Both ways between learners and other libraries: river, CasADi, ROS.
 
 Learners of this package in their interfaces, and theirs as a :class:`~torch_ekm.ResidualLearner` (extra
 ``peers``). What needs another library is imported when it is first asked for, by its name here; a missing
@@ -16,14 +16,11 @@ from .river_residual import RiverResidual
 if TYPE_CHECKING:
     from .bags import read_bag
     from .casadi_residual import CasadiResidual as to_casadi  # noqa: N813
-    from .mcap_log import log_from_mcap, log_to_mcap
+    from .mcap_log import log_to_mcap
     from .river_regressor import RiverRegressor as as_river  # noqa: N813
-    from .sklearn_regressor import SklearnRegressor as as_sklearn  # noqa: N813
 
 _ASKED_FOR = {
     "as_river": ("river_regressor", "RiverRegressor"),
-    "as_sklearn": ("sklearn_regressor", "SklearnRegressor"),
-    "log_from_mcap": ("mcap_log", "log_from_mcap"),
     "log_to_mcap": ("mcap_log", "log_to_mcap"),
     "read_bag": ("bags", "read_bag"),
     "to_casadi": ("casadi_residual", "CasadiResidual"),
@@ -41,8 +38,6 @@ __all__ = [
     "OnlineRegressor",
     "RiverResidual",
     "as_river",
-    "as_sklearn",
-    "log_from_mcap",
     "log_to_mcap",
     "read_bag",
     "to_casadi",

@@ -1,4 +1,4 @@
-"""Trials as rosbag2 recordings in MCAP, and back with the same figures (extra ``interop``)."""
+"""Trials as rosbag2 recordings in MCAP (extra ``interop``)."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from .._extras import require
-from .._files import WriterLock, make_folder
-from ..exceptions import DescriptionError, ParameterError
+from .._files import make_folder
+from ..exceptions import ParameterError
 from ..kinematics import se3
 from ..plant import Trajectory, TrialLog
 
-AnyReader, _typesys = require("rosbags.highlevel").AnyReader, require("rosbags.typesys")
+_typesys = require("rosbags.typesys")
 _rosbag2 = require("rosbags.rosbag2")
 _TYPES = _typesys.get_typestore(_typesys.Stores.ROS2_HUMBLE)
 
@@ -31,8 +31,7 @@ def _write_trial(trajectory: Trajectory, folder: str | Path) -> Path:
         raise ParameterError("folder", str(folder), "a folder that does not exist yet")
     arrays = trajectory.arrays()
     stamps = [round(1e9 * time) for time in arrays["time"].tolist()]
-    shapes = {place: [list(array.shape), array.dtype.str] for place, array in arrays.items()}
-    about = {"seed": trajectory.seed, "about": trajectory.about, "arrays": shapes}
+    about = {"seed": trajectory.seed, "about": trajectory.about}
     with _rosbag2.Writer(folder, version=9, storage_plugin=_rosbag2.StoragePlugin.MCAP) as writer:
 
         def topic(name: str, kind: str, rows: list[tuple[int, Any]]) -> None:
@@ -52,32 +51,6 @@ def _write_trial(trajectory: Trajectory, folder: str | Path) -> Path:
     return folder
 
 
-def _read_trial(folder: str | Path) -> Trajectory:
-    """Read what :func:`_write_trial` wrote, figure by figure, or raise DescriptionError."""
-    folder = Path(folder)
-    if not folder.exists():
-        raise DescriptionError(folder, "there is no such recording")
-    rows: dict[str, list[Any]] = {}
-    try:
-        with AnyReader([folder], default_typestore=_TYPES) as reader:
-            for connection, _, raw in reader.messages():
-                message: Any = reader.deserialize(raw, connection.msgtype)
-                if connection.topic != _POSE:
-                    rows.setdefault(connection.topic[1:], []).append(message)
-    except Exception as error:
-        raise DescriptionError(folder, f"this recording cannot be read: {error}") from error
-    if _ABOUT[1:] not in rows:
-        raise DescriptionError(folder, "this recording has no topic '/about': it is not one of torch_ekm")
-    about = json.loads(rows[_ABOUT[1:]][0].data)
-    arrays = {}
-    for place, (shape, dtype) in about["arrays"].items():
-        values = [_values(message) for message in rows.get(place, [])]
-        if len(values) != (shape[0] if shape else 0):
-            raise DescriptionError(folder, f"'/{place}' has {len(values)} messages instead of {shape[0]}")
-        arrays[place] = np.array(values).reshape(shape).astype(np.dtype(dtype))
-    return Trajectory.from_arrays(about["seed"], about["about"], arrays)
-
-
 def log_to_mcap(log: TrialLog, folder: str | Path) -> list[Path]:
     """Every trial of a log as a rosbag2 recording in MCAP, one folder each; returns the folders.
 
@@ -91,30 +64,6 @@ def log_to_mcap(log: TrialLog, folder: str | Path) -> list[Path]:
     folder = Path(folder)
     make_folder(folder)
     return [_write_trial(log.read(trial), folder / f"trial_{trial:06d}") for trial in log.trials]
-
-
-def log_from_mcap(folder: str | Path, target: str | Path) -> TrialLog:
-    """The log again, in ``target``, from the recordings in ``folder``: the same figures.
-
-    Raises:
-        DescriptionError: there is no recording, or one cannot be read.
-        ParameterError: a trial is in the target already.
-    """
-    found = sorted(Path(folder).glob("trial_[0-9]*"))
-    if not found:
-        problem = "no recording: there is no folder named trial_000000 or the like in it"
-        raise DescriptionError(folder, problem)
-    target = Path(target)
-    make_folder(target)
-    with WriterLock(target):
-        for recording in found:
-            path = target / f"{recording.stem}.h5"
-            if path.exists():
-                raise ParameterError("target", str(path), "a log without this trial")
-            trajectory = _read_trial(recording)
-            trajectory.save(path)
-    with TrialLog(target, trajectory.about.get("configuration", {})) as log:  # makes the index
-        return log
 
 
 def _message(kind: str, **fields: Any) -> Any:
@@ -160,10 +109,3 @@ def _pose(stamp: int, position: Any, rotation: Any) -> Any:
 def _header(stamp: int) -> Any:
     time = _message("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
     return _message("std_msgs/msg/Header", stamp=time, frame_id="hand")
-
-
-def _values(message: Any) -> Any:
-    """What a message of ours carries."""
-    if hasattr(message, "position"):
-        return message.position
-    return message.data.encode() if isinstance(message.data, str) else message.data
