@@ -81,7 +81,7 @@ def test_jacobians_of_a_mixture_are_those_of_autograd() -> None:
         torch.testing.assert_close(getattr(prediction, field), slope, rtol=1e-8, atol=1e-9)
 
 
-@pytest.mark.parametrize(("name", "format"), [("plain", "pt2"), ("default", "onnx")])
+@pytest.mark.parametrize(("name", "format"), [("plain", "pt2"), ("mixture", "onnx")])
 def test_an_exported_learner_says_the_same(name: str, format: str, tmp_path: Path) -> None:
     learner = trained(name)
     if format == "onnx":
