@@ -143,7 +143,7 @@ def variants(base: Setting) -> list[Variant]:
     """All variants of a setting; most groups begin with the unchanged one."""
     nominal, exact = vars(PRESETS["nominal"]), PRESETS["none"]
     rule = replace(base.safety.rule, tolerance=0.1 * _DEG)
-    finer = {"safety": replace(base.safety, rule=rule)}
+    finer = {"frames": 6, "safety": replace(base.safety, rule=rule)}
     others = [name for name in LEARNERS if name != base.learner]
     plants = {
         name: exact.replace(**{key: nominal[key] for key in keys}) for name, keys in DISTURBANCES.items()
@@ -152,7 +152,8 @@ def variants(base: Setting) -> list[Variant]:
         *(Variant(group, _BASE) for group in ("learner", "online learning", "model")),
         *(Variant(group, _BASE, controllers=_ALL) for group in ("controller", "care")),
         Variant("care", "oracle: true model, pose and forces", {}, ("KM+S",), OracleGeneralize),
-        Variant("care", "to a tolerance of 0.1 deg", finer, _ALL),
+        Variant("care", "pose and joints from six readings at rest", {"frames": 6}, _ALL),
+        Variant("care", "the same, to a tolerance of 0.1 deg", finer, _ALL),
         Variant("preset", f"{base.preset}: {_BASE}"),
         *(Variant("learner", name, {"learner": name, "learner_options": {}}, _LEARNING) for name in others),
         Variant("learner", "rbf over commands", {"learner": "rbf", "servo_inverse": False}, _LEARNING),

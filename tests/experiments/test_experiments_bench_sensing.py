@@ -34,3 +34,12 @@ def test_a_stuck_hall_channel_keeps_its_first_reading() -> None:
     after = bench.plant.command(delta).info["raw"]["hall"]
     assert after[names.index("index_3")] == before[names.index("index_3")]
     assert after[names.index("index_2")] != before[names.index("index_2")]
+
+
+def test_bench_takes_the_mean_of_as_many_frames_as_it_is_told() -> None:
+    spread = []
+    for frames in (1, 6):
+        bench = Bench(Setting(frames=frames), "box", "KM+S")
+        bench.plant.reset(0)
+        spread.append(torch.stack([bench.plant.observe().position for _ in range(40)]).std(0).mean())
+    assert float(spread[1] / spread[0]) < 0.6

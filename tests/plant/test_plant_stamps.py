@@ -6,8 +6,9 @@ import dataclasses
 
 import pytest
 import torch
+from fakes import ScriptedPlant
 
-from torch_ekm.plant import Observation, Stamps, Trajectory
+from torch_ekm.plant import FramesAtRest, Observation, Stamps, Trajectory
 
 Q = torch.zeros(2, dtype=torch.float64)
 EYE = torch.eye(3, dtype=torch.float64)
@@ -24,6 +25,12 @@ def test_all_readings_are_of_the_observations_time_unless_told() -> None:
     assert reading(3.0).dated
     assert reading(0.0, 0.0).dated
     assert not reading(0.0).dated
+
+
+def test_the_mean_of_frames_is_no_newer_than_any_of_them() -> None:
+    camera = ScriptedPlant(reading(5.0, pose) for pose in (4.9, 4.8, 5.0))
+    seen = FramesAtRest(camera, 3).observe()
+    assert seen.taken == Stamps(5.0, 5.0, 4.8, 5.0)
 
 
 def test_a_recording_keeps_stamps_and_does_without(tmp_path) -> None:

@@ -56,6 +56,8 @@ class Setting:
     capacity: int = 60
     sensing: bool = False
     """Poses from rendered camera images and joint angles from Hall counts, not truth plus noise."""
+    frames: int = 1
+    """Readings at rest after each motion; their mean is taken (:class:`~torch_ekm.plant.FramesAtRest`)."""
 
     def __post_init__(self) -> None:
         if self.hand not in list_hands() and not Path(self.hand).exists():
@@ -63,8 +65,9 @@ class Setting:
         for name, known in (("learner", LEARNERS), ("engine", ENGINES)):
             if getattr(self, name) not in known:
                 raise UnknownNameError(name, getattr(self, name), known)
-        if not self.capacity > 0:
-            raise ParameterError("capacity", self.capacity, "positive")
+        for name in ("capacity", "frames"):
+            if not getattr(self, name) > 0:
+                raise ParameterError(name, getattr(self, name), "positive")
         kinds = {"plant": PlantParameters, "model": ModelOptions, "pace": PaceOptions, "safety": Safety}
         for name, kind in kinds.items():
             value = self.parameters if name == "plant" else getattr(self, name)

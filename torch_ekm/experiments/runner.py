@@ -26,7 +26,7 @@ from ..exceptions import EquilibriumError, GraspError
 from ..foresight import BlindPose
 from ..kinematics import GraspState
 from ..model import KinematicModel
-from ..plant import Plant
+from ..plant import FramesAtRest, Plant
 from ..residual import ResidualLearner
 from ..simulation import DisturbedPlant, PlantChange, SimulatedHand, Tug
 from .config import Setting, object_name
@@ -59,6 +59,8 @@ class Bench:
         self.plant: Plant = self.disturbed
         if setting.sensing:
             self.plant = _sensed(self.disturbed, self.hand, setting, keep_images)
+        else:
+            self.plant = FramesAtRest(self.plant, setting.frames)
         inverse = controller == "KM+S" or (self.learns and setting.servo_inverse)
         adapts = self.learns and setting.adapts
         self.knowledge = HandKnowledge.of(self.hand.hand, learns=inverse, adapts=adapts)
@@ -217,7 +219,8 @@ def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting, k
     sensed = SensedPlant(plant, hand, simulated.object, hall=hall, keep_images=keep_images)
     if hall is not None:  # after the calibration: a channel that was dead by then would not be believed
         hall.stuck = {k: math.nan for k, joint in enumerate(hall.joints) if joint in stuck}
-    return sensed if hall is None else ContactAligned(sensed, hand, simulated.object)
+    rested = FramesAtRest(sensed, setting.frames)
+    return rested if hall is None else ContactAligned(rested, hand, simulated.object)
 
 
 def _whole(done: Manipulation) -> Manipulation:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from .frames_at_rest import FramesAtRest
 from .observation import Observation, PlantStatus, Stamps, Truth
 from .plant import Plant
 from .recording_plant import RecordingPlant
@@ -13,6 +14,7 @@ from .verification import verify_log
 from .wrapper import PlantWrapper
 
 __all__ = [
+    "FramesAtRest",
     "Observation",
     "Plant",
     "PlantStatus",
