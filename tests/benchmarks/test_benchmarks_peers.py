@@ -12,7 +12,8 @@ pytest.importorskip("capymoa_regressor", reason="the benchmarks are not part of 
 
 from capymoa_regressor import CapyMOARegressor
 
-from torch_ekm.residual import LearnHyperparameters, SparseOnlineGP, Standardize
+from torch_ekm.residual import LearnHyperparameters, SparseOnlineGP, SquaredExponential, Standardize
+from torch_ekm.testing import check_residual_learner
 
 
 def small(d: int, m: int) -> SparseOnlineGP:
@@ -65,3 +66,29 @@ def test_gpytorch_learns() -> None:
     assert (learner(x) - y).square().mean() < 0.3 * y.square().mean()
     law = learner.predict(x, observation=True)
     assert law.mean.shape == law.stddev.shape == y.shape
+
+
+def test_krls_tracker_without_forgetting_is_the_exact_gp() -> None:
+    from krls_tracker import KRLSTracker
+
+    draw = torch.Generator().manual_seed(18)
+    x, y = (torch.randn(30, n, dtype=torch.float64, generator=draw) for n in (4, 2))
+    kernel = SquaredExponential(4)
+    tracker = KRLSTracker(4, 2, capacity=40, kernel=kernel, noise_variance=0.05, standardize=False)
+    tracker.jitter = 1e-9
+    tracker.update(x, y)
+    K = kernel(x, x)
+    solved = torch.linalg.solve(K + 0.05 * torch.eye(30, dtype=torch.float64), torch.cat([y, K], dim=-1))
+    law = tracker.predict(x)
+    torch.testing.assert_close(law.mean, K @ solved[:, :2], atol=1e-6, rtol=0)
+    variance = (K - K @ solved[:, 2:]).diagonal()[:, None].expand(-1, 2)
+    torch.testing.assert_close(law.variance, variance, atol=1e-6, rtol=0)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_krls_tracker_keeps_the_contract() -> None:
+    from krls_tracker import KRLSTracker
+
+    check_residual_learner(
+        lambda **options: KRLSTracker(3, 2, capacity=8, forgetting_factor=0.99, **options), n_samples=16
+    )

@@ -21,7 +21,6 @@ from torch_ekm.residual import (
     ActionLinearKernel,
     DeepKernelSOGP,
     ForgettingFactor,
-    KRLSTracker,
     LearnHyperparameters,
     Matern32,
     MixtureResidual,
@@ -52,7 +51,6 @@ LEARNERS = {
     "deep": lambda: DeepKernelSOGP(3, 2, capacity=8, hidden=(8,), seed=3, parts=[Standardize()]),
     "learns": lambda: sogp(parts=[ForgettingFactor(0.9), LearnHyperparameters(memory=20)], refresh_every=8),
     "mixture": lambda: MixtureResidual([sogp(), RecursiveLeastSquares(3, 2)], shares=(0.0, 1.0)),
-    "krls": lambda: KRLSTracker(3, 2, capacity=8),
     "network": lambda: ReplayMLP(3, 2, hidden=(8,), members=2),
     "single": lambda: sogp(dtype=torch.float32),
 }

@@ -22,7 +22,13 @@ from torch_ekm import (
 )
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.interop import to_casadi
-from torch_ekm.residual import ActionLinearKernel, KRLSTracker, Matern32, Matern52, SquaredExponential
+from torch_ekm.residual import (
+    ActionLinearKernel,
+    Matern32,
+    Matern52,
+    RecursiveLeastSquares,
+    SquaredExponential,
+)
 
 
 def deep(d: int = 3, m: int = 2) -> SparseOnlineGP:
@@ -105,13 +111,13 @@ def test_an_exported_learner_says_the_same(name: str, format: str, tmp_path: Pat
 @pytest.mark.usefixtures("unchecked")
 def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match="SparseOnlineGP or a MixtureResidual"):
-        KRLSTracker(3, 2, capacity=5).export(tmp_path / "a.pt2")
+        RecursiveLeastSquares(3, 2).export(tmp_path / "a.pt2")
     with pytest.raises(ParameterError, match="batch_shape"):
         SparseOnlineGP(3, 2, batch_shape=(2,)).export(tmp_path / "a.pt2")
     with pytest.raises(ParameterError, match="'onnx' or 'pt2'"):
         SparseOnlineGP(3, 2).export(tmp_path / "a.pt2", format="pickle")
-    with pytest.raises(ParameterError, match="KRLSTracker"):
-        MixtureResidual(KRLSTracker(3, 2, capacity=5)).predict_with_jacobians(torch.zeros(3))
+    with pytest.raises(ParameterError, match="RecursiveLeastSquares"):
+        MixtureResidual(RecursiveLeastSquares(3, 2)).predict_with_jacobians(torch.zeros(3))
     assert not list(tmp_path.iterdir())
 
 
@@ -147,7 +153,7 @@ def test_casadi_without_the_variance() -> None:
 
 def test_casadi_names_what_it_cannot_say() -> None:
     pytest.importorskip("casadi", reason="extra 'interop'")
-    with pytest.raises(ParameterError, match="KRLSTracker"):
-        to_casadi(KRLSTracker(3, 2, capacity=5))
+    with pytest.raises(ParameterError, match="RecursiveLeastSquares"):
+        to_casadi(RecursiveLeastSquares(3, 2))
     with pytest.raises(ParameterError, match="one model"):
         to_casadi(SparseOnlineGP(3, 2, batch_shape=(2,)))

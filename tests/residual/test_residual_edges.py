@@ -15,7 +15,6 @@ from torch_ekm.residual import (
     DeepKernelSOGP,
     DetectChanges,
     ForgettingFactor,
-    KRLSTracker,
     LearnHyperparameters,
     MixtureResidual,
     ProcessNoise,
@@ -40,7 +39,6 @@ def stream(n: int, *shape: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tens
     "make",
     [
         lambda: sogp(3, 2, capacity=30),
-        lambda: KRLSTracker(3, 2, capacity=30),
     ],
 )
 def test_a_stationary_kernel_does_not_care_where_the_inputs_lie(make, offset):

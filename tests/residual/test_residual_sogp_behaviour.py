@@ -18,7 +18,6 @@ from torch_ekm.residual import (
     CalibrateNoise,
     DetectChanges,
     ForgettingFactor,
-    KRLSTracker,
     ProcessNoise,
     RandomFeatureRLS,
     RecursiveLeastSquares,
@@ -286,17 +285,6 @@ def test_random_features_approach_the_gp():
     gp.update(x, y)
     rff.update(x, y)
     assert float((gp(x) - rff(x)).square().mean().sqrt()) < 0.05
-
-
-def test_krls_tracker_without_forgetting_is_the_exact_gp():
-    x, y = system(18, 30)
-    tracker = KRLSTracker(4, 2, capacity=40, kernel=SquaredExponential(4), noise_variance=0.05, **AS_GIVEN)
-    tracker.jitter = 1e-9
-    gp = sogp(4, 2, capacity=40, noise_variance=0.05, jitter=1e-9, novelty_threshold=0.0)
-    tracker.update(x, y)
-    gp.update(x, y)
-    torch.testing.assert_close(tracker(x), gp(x), atol=1e-7, rtol=0)
-    torch.testing.assert_close(tracker.predict(x).variance, gp.predict(x).variance, atol=1e-7, rtol=0)
 
 
 def test_networks_learn_too():

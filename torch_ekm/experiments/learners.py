@@ -125,7 +125,6 @@ LEARNERS: dict[str, Factory] = {
     "model alone": Kind(residual.ZeroResidual),
     "linear RLS": Kind(residual.RecursiveLeastSquares, **_FRESH),
     "random features": Kind(residual.RandomFeatureRLS, "n_frequencies", **_FRESH),
-    "KRLS-T": Kind(residual.KRLSTracker, "capacity", "kernel", forgetting_factor=0.99, **_AS_GIVEN),
     "MLP": Kind(residual.ReplayMLP, standardize=False),
     "MLP ensemble": Kind(residual.ReplayMLP, members=3, standardize=False),
     "SOGP default": Kind(residual.SparseOnlineGP, "capacity"),

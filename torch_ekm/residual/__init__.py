@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from .base import ResidualLearner
-from .baselines.krls_t import KRLSTracker
 from .baselines.linear import RandomFeatureRLS, RecursiveLeastSquares
 from .baselines.replay_mlp import ReplayMLP
 from .baselines.zero import ZeroResidual
@@ -30,7 +29,6 @@ __all__ = [
     "DeepKernelSOGP",
     "DetectChanges",
     "ForgettingFactor",
-    "KRLSTracker",
     "Kernel",
     "LearnHyperparameters",
     "LastResidual",

@@ -7,13 +7,11 @@ from typing import Any
 import torch
 from torch import nn
 
-from ..._checks import check_count, check_fraction, check_positive
-from ...typing import Tensor
-from ..base import DoubleStateLearner, SingleLearner
-from ..kernels.kernel import Kernel
-from ..kernels.stationary import Matern32
-from ..report import UpdateEvent, UpdateReport
-from .scaled import ScaledLearner
+from torch_ekm._checks import check_count, check_fraction, check_positive
+from torch_ekm.residual import Kernel, Matern32, UpdateEvent, UpdateReport
+from torch_ekm.residual.base import DoubleStateLearner, SingleLearner
+from torch_ekm.residual.baselines.scaled import ScaledLearner
+from torch_ekm.typing import Tensor
 
 
 class KRLSTracker(ScaledLearner, SingleLearner, DoubleStateLearner):
