@@ -17,7 +17,7 @@ from torch_ekm.exceptions import (
 )
 from torch_ekm.kinematics.grasp_state import GraspState
 from torch_ekm.kinematics.se3 import exp
-from torch_ekm.residual import ActionLinearKernel, SparseOnlineGP
+from torch_ekm.residual import ActionLinearKernel, MixtureResidual, ReplayMLP, SparseOnlineGP
 
 N_S, N_A = 3, 2
 
@@ -183,6 +183,25 @@ def test_a_model_without_derivative_is_refused_and_differences_help(f, generator
         torch.testing.assert_close(given, expected, atol=1e-8, rtol=1e-8)
     with pytest.raises(ShapeError, match="jacobian"):
         EnhancedModel(f, ekm.learner, jacobian=lambda s, a: torch.eye(2)).linearize(state, action)
+
+
+@pytest.mark.parametrize("context", [torch.no_grad, torch.inference_mode])
+@pytest.mark.parametrize("make", [lambda: SparseOnlineGP(N_S + N_A, 3), lambda: ReplayMLP(N_S + N_A, 3)])
+def test_control_loops_need_no_autograd(context, make, generator: torch.Generator) -> None:
+    ekm = train(EnhancedModel(model, make()), generator, 20)
+    state, action = (one[0] for one in sample(generator))
+    expected = ekm.linearize(state, action)
+    with context():
+        torch.testing.assert_close(ekm.linearize(state.clone(), action.clone()), expected, rtol=0, atol=0)
+        ekm.update(state, action, world(state, action))
+
+
+def test_a_new_sequence_carries_nothing_over(generator: torch.Generator) -> None:
+    ekm = train(EnhancedModel(model, MixtureResidual(SparseOnlineGP(N_S + N_A, 3))), generator, 60)
+    assert bool(ekm.learner.innovation.any())
+    ekm.new_sequence()
+    assert not bool(ekm.learner.innovation.any())
+    EnhancedModel(model, SparseOnlineGP(N_S + N_A, 3)).new_sequence()  # has nothing to drop
 
 
 @pytest.mark.parametrize("jacobian", [None, "finite-difference"])

@@ -9,7 +9,7 @@ import pytest
 import torch
 from as_published import deep_sogp, sogp
 
-from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
+from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.residual import (
     ActionLinearKernel,
     DeepKernelSOGP,
@@ -25,6 +25,7 @@ from torch_ekm.residual import (
     SquaredExponential,
     Standardize,
     ZeroResidual,
+    default_learner,
 )
 
 
@@ -206,6 +207,30 @@ def test_no_action_is_not_novel():
 def test_parameters_that_cannot_be_are_named(kind, options):
     with pytest.raises(ParameterError, match=next(iter(options))):
         kind(3, 2, **options)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("make", [lambda: default_learner(3, 2), lambda: RecursiveLeastSquares(3, 2)])
+def test_what_is_no_real_number_is_named(make):
+    learner, x, y = make(), torch.zeros(3), torch.zeros(2)
+    before = copy.deepcopy(learner.state_dict())
+    with pytest.raises(ParameterError, match="x = None"):
+        learner.update(None, y)
+    with pytest.raises(ParameterError, match="y = None"):
+        learner.update(x, None)
+    with pytest.raises(ParameterError, match=r"y = torch.complex64 .* real numbers"):
+        learner.update(x, y.to(torch.complex64))
+    for name, value in learner.state_dict().items():
+        assert not isinstance(value, torch.Tensor) or torch.equal(value, before[name])
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_an_option_of_the_default_learner_that_there_is_not_is_named():
+    with pytest.raises(UnknownNameError, match=r"'forgetting'; valid are: capacity, .*batch_shape"):
+        default_learner(3, 2, forgetting=0.99)
+    for make in (default_learner, SparseOnlineGP, DeepKernelSOGP):
+        with pytest.raises(ParameterError, match="batch_shape = 3"):
+            make(3, 2, batch_shape=3)
 
 
 def test_the_same_learner_twice_is_no_mixture():

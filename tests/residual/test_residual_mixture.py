@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import pytest
@@ -230,3 +231,17 @@ def test_the_last_residual_is_an_input():
     assert float(told.last.abs().max()) == 0.0
     with pytest.raises(ParameterError, match="more than 2 inputs"):
         LastResidual(ZeroResidual(2, 2))
+
+
+def test_the_report_is_that_of_all_members() -> None:
+    """One member knows the place and the other does not: each counts by its weight."""
+    torch.manual_seed(0)
+    seen, empty = (sogp(2, 1, capacity=20, parts=[]) for _ in range(2))
+    x, y = torch.rand(20, 2, dtype=torch.float64), torch.rand(20, 1, dtype=torch.float64)
+    seen.update(x, y)
+    own = [float(copy.deepcopy(one).update(x[0], y[0]).novelty) for one in (seen, empty)]
+    mixture = MixtureResidual([seen, empty])
+    report = mixture.update(x[0], y[0])
+    expected = float(mixture.weights.mean(-2) @ torch.tensor(own, dtype=torch.float64))
+    assert own[0] < 0.1 < 0.9 < own[1]
+    assert float(report.novelty) == pytest.approx(expected)

@@ -193,6 +193,13 @@ class EnhancedModel(Recorded, nn.Module):
         residual = self._gather(increment - predicted) * self.output_scale
         return self.learner.update(self.features(state, action), residual)
 
+    def new_sequence(self) -> None:
+        """The next motion does not follow on the last one: a learner that carries its last error over (a
+        :class:`~torch_ekm.residual.MixtureResidual`) drops it."""
+        begin = getattr(self.learner, "new_sequence", None)
+        if begin is not None:
+            begin()
+
     def linearize(
         self,
         state: Any,

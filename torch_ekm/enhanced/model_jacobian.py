@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
 
 from ..exceptions import NoDerivativeError
+from ..residual.base import value_and_jacobian
 from ..typing import Float, Tensor
 
 Model = Callable[[Any, Tensor], Tensor]
@@ -21,27 +23,26 @@ def differentiated(
     Raises:
         NoDerivativeError: no derivative comes out of f, or none of an output that moves with the action.
     """
-    at = action.detach().requires_grad_(True)
     try:
-        with torch.enable_grad():
-            value = f(state, at)
+        value, J = value_and_jacobian(partial(f, _recorded(state)), action)
     except (RuntimeError, TypeError) as error:  # numpy does not take tensors that carry a derivative
         raise NoDerivativeError(f"{type(error).__name__}: {error}") from error
-    if not value.requires_grad:
+    if J is None:
         raise NoDerivativeError("its result is detached from it")
-    rows = [
-        torch.autograd.grad(one.sum(), at, retain_graph=True, materialize_grads=True)[0]
-        if one.requires_grad
-        else torch.zeros_like(at)
-        for one in value.unbind(-1)
-    ]
-    J, value = torch.stack(rows, dim=-2), value.detach()
     silent = (J == 0).all(-1)
     if bool(silent.any()):  # nothing moves there, or a part of f carries no derivative
         moved = finite_differences(f, state, action)[silent].abs()
         if bool((moved > 1e-3 * J.abs().max()).any()):
             raise NoDerivativeError("some outputs move with the action and carry none")
     return value, J
+
+
+def _recorded(state: Any) -> Any:
+    """A tensor of inference mode as one that autograd takes."""
+    if not (isinstance(state, Tensor) and state.is_inference()):
+        return state
+    with torch.inference_mode(False):
+        return state.clone()
 
 
 @torch.no_grad()

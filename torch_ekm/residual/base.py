@@ -6,6 +6,7 @@ import math
 import pathlib
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -103,17 +104,9 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         self, x: Float[Tensor, "*any in_features"]
     ) -> tuple[Float[Tensor, "*all out_features"], Float[Tensor, "*all out_features in_features"]]:
         """``(g(x), dg/dx)``. Learners with a closed form override this autograd version."""
-        x = self.check_query(x).detach().requires_grad_(True)
-        with torch.enable_grad():
-            mean = self(x)
-            # one backward pass per output; queries do not interact, so their sum separates them
-            rows = [
-                torch.autograd.grad(g.sum(), x, retain_graph=True, materialize_grads=True)[0]
-                if mean.requires_grad
-                else torch.zeros_like(x)
-                for g in mean.unbind(-1)
-            ]
-        return mean.detach(), torch.stack(rows, dim=-2)
+        x = self.check_query(x)
+        mean, J = value_and_jacobian(self, x)
+        return mean, x.new_zeros(*mean.shape, x.shape[-1]) if J is None else J
 
     def export(self, path: str | pathlib.Path, *, format: Literal["onnx", "pt2"] = "pt2") -> pathlib.Path:
         """Write what the learner predicts now to a file that other runtimes read, and return its path.
@@ -160,11 +153,11 @@ class ResidualLearner(Recorded, nn.Module, ABC):
             NonFiniteError: NaN, infinity or a number whose square is infinite in an unmasked sample,
                 under ``on_invalid="raise"``; a block is refused as a whole. The state is untouched.
         """
-        with self.lock:
+        with self.lock, torch.inference_mode(False):  # some learn by autograd
             return self._update(x, y, mask)
 
     def _update(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        x, y = self._cast(x), self._cast(y)
+        x, y = self._cast(x), self._cast(y, "y")
         if mask is not None and not isinstance(mask, Tensor):
             mask = torch.as_tensor(mask, device=self.device)
         time = self._check_pair(x, y, mask)
@@ -218,8 +211,19 @@ class ResidualLearner(Recorded, nn.Module, ABC):
     def device(self) -> torch.device:
         return self._like.device
 
-    def _cast(self, x: Tensor) -> Tensor:
-        return torch.as_tensor(x, dtype=self._like.dtype, device=self._like.device)
+    @property
+    def _kept(self) -> torch.dtype:
+        """Of what is learned."""
+        return self.dtype
+
+    def _cast(self, x: Tensor, name: str = "x") -> Tensor:
+        try:
+            if not (isinstance(x, Tensor) and x.is_complex()):
+                x = torch.as_tensor(x, dtype=self._kept, device=self._like.device)
+                return x.clone() if x.is_inference() and not torch.is_inference_mode_enabled() else x
+        except (TypeError, ValueError) as error:
+            raise ParameterError(name, x, f"real numbers ({error})") from None
+        raise ParameterError(name, x.dtype, "of real numbers")
 
     def check_query(self, x: Float[Tensor, "*any in_features"]) -> Float[Tensor, "*all in_features"]:
         """x in the learner's dtype, with all the fleet's axes.
@@ -293,8 +297,9 @@ class DoubleStateLearner(ResidualLearner):
 
         return super()._apply(keep_double, recurse)
 
-    def _cast(self, x: Tensor) -> Tensor:
-        return torch.as_tensor(x, dtype=torch.float64, device=self.device)
+    @property
+    def _kept(self) -> torch.dtype:
+        return torch.float64
 
 
 class SingleLearner(ResidualLearner):
@@ -313,3 +318,22 @@ class SingleLearner(ResidualLearner):
         if mask is not None and not bool(mask):
             return UpdateReport.of_nothing(mask, self.dtype)
         return self.absorb(x, y, None)
+
+
+def value_and_jacobian(
+    f: Callable[[Tensor], Tensor], x: Float[Tensor, "*any in"]
+) -> tuple[Float[Tensor, "*any out"], Float[Tensor, "*any out in"] | None]:
+    """``(f(x), df/dx)`` by autograd, under ``no_grad`` and in inference mode too; entries of a batch must not
+    depend on each other. None: f carries no derivative."""
+    with torch.inference_mode(False), torch.enable_grad():
+        at = x.detach().clone().requires_grad_(True)
+        value = f(at)
+        if not value.requires_grad:
+            return value, None
+        rows = [  # one backward pass per output
+            torch.autograd.grad(one.sum(), at, retain_graph=True, materialize_grads=True)[0]
+            if one.requires_grad
+            else torch.zeros_like(at)
+            for one in value.unbind(-1)
+        ]
+    return value.detach(), torch.stack(rows, dim=-2)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from typing import Any, Literal
 
+from ..exceptions import UnknownNameError
 from .kernels.stationary import Matern32
 from .last_residual import LastResidual
 from .mixture import MixtureResidual
@@ -13,6 +14,8 @@ from .sparse_gp.hyperparameters import LearnHyperparameters
 from .sparse_gp.monitor import DetectChanges, RobustWeight
 from .sparse_gp.sparse_online_gp import SparseOnlineGP
 from .sparse_gp.units import Standardize
+
+_OPTIONS = ("dtype", "device", "batch_shape", "on_invalid")
 
 
 def default_learner(
@@ -37,7 +40,11 @@ def default_learner(
 
     Raises:
         ParameterError: a figure is outside its range.
+        UnknownNameError: there is no such option; the message lists them.
     """
+    unknown = [name for name in options if name not in _OPTIONS]
+    if unknown:
+        raise UnknownNameError("option", unknown[0], ("capacity", "output_offset", *_OPTIONS))
     d, m = in_features, out_features
     units = Standardize(output_offset=output_offset)
     common: dict[str, Any] = {"capacity": capacity, "standardize": units, **options}

@@ -261,9 +261,14 @@ class MixtureResidual(ResidualLearner):
         self.tails.observe(z, (self.count - _YOUNG).clamp_min(0.0), judged)
         self.count += 1.0 if mask is None else mask.to(self.count.dtype)
         reports = [learner.update(x, y, mask) for learner in self.members]
-        report = reports[0]
         self._settle()
-        return UpdateReport(report.event, report.novelty, nis, report.weight)
+        part = self.weights.mean(-2)  # of each learner, over the outputs
+        novelty, weight = (
+            (part * torch.stack([getattr(one, name) for one in reports], dim=-1).to(part)).sum(-1)
+            for name in ("novelty", "weight")
+        )
+        event = torch.stack([one.event for one in reports]).amax(0)
+        return UpdateReport(event, novelty, nis, weight)
 
     # -- pieces ---------------------------------------------------------------------------------
 

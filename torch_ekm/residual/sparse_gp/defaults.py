@@ -7,6 +7,7 @@ from typing import Any
 
 from torch import nn
 
+from ..._checks import check_counts
 from .forgetting import ProcessNoise
 from .hyperparameters import LearnHyperparameters
 from .monitor import DetectChanges, RobustWeight
@@ -20,7 +21,12 @@ def default_parts() -> list[Part]:
 
 
 def fleet_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of a learner's options that its kernel shares: fleet and device."""
+    """Those of a learner's options that its kernel shares: fleet and device.
+
+    Raises:
+        ParameterError: the fleet's shape is none.
+    """
+    check_counts("batch_shape", options.get("batch_shape", ()))
     return {name: options[name] for name in ("batch_shape", "device") if name in options}
 
 
