@@ -183,3 +183,63 @@ def test_motions_with_contacts_go_by_the_learned_figures(held, learned) -> None:
     size = float(lin.object_jacobian.norm())
     assert float((found - lin.object_jacobian).norm()) < 1e-3 * size
     assert float((described - lin.object_jacobian).norm()) > 0.05 * size
+
+
+PLAY = math.radians(0.8)
+
+
+def test_motors_do_what_the_tendons_shall_do_and_the_play_on_top(held) -> None:
+    _, model = held
+    figures = HandFigures.of(model.hand)
+    n = model.hand.n_a
+    assert torch.equal(figures.pulled(torch.ones(n).double()), torch.ones(n).double())  # no grasp yet
+    a, half = torch.zeros(n, dtype=F64), 0.5 * figures.width
+    figures.begin(a)
+    at = figures._at[-1][0]
+    assert torch.rad2deg(figures.width).tolist() == pytest.approx([0.5] * len(at))
+    for wanted, lost in ((0.03, half), (0.02, 0 * half), (-0.02, -2 * half), (-1e-5, 0 * half)):
+        pull = torch.full((n,), wanted, dtype=F64)
+        w = figures.motors(pull)
+        torch.testing.assert_close((w - pull)[at], lost, rtol=0, atol=1e-12)
+        if abs(wanted) > 1e-3:
+            torch.testing.assert_close(figures.pulled(w), pull, rtol=0, atol=1e-12)
+        a = a + w
+        figures.commit(w, a)
+    stands = figures._play
+    figures.begin(a)  # where the last motion ended
+    assert figures._play is stands
+    figures.begin(a + 0.1)  # another grasp
+    assert float(figures._play.position.abs().max()) == 0
+
+
+def test_play_is_found_from_motions_that_reverse(held) -> None:
+    state, model = held
+    figures, true = HandFigures.of(model.hand), HandFigures.of(model.hand)
+    true.mean[true._is_play] = math.degrees(PLAY)
+    a = torch.zeros(model.hand.n_a, dtype=F64)
+    draw, lin = torch.Generator().manual_seed(0), model.linearize(state)
+    figures.begin(a)
+    true.begin(a)
+    errors = []
+    for _ in range(40):
+        w = math.radians(3) * torch.randn(len(a), generator=draw, dtype=F64)
+        ds = lin.step(true.pulled(w))
+        errors.append(float((lin.step(figures.pulled(w)) - ds).norm()))
+        figures.learn(lin, w, ds)
+        a = a + w
+        figures.commit(w, a)
+        true.commit(w, a)
+    assert np.mean(errors[-10:]) < 0.35 * np.mean(errors[:5])
+    found = torch.rad2deg(figures.width)
+    assert found.median() == pytest.approx(math.degrees(PLAY), abs=0.1)
+    assert "backlash of index_distal: " in str(figures)
+
+
+def test_a_motion_against_its_prediction_teaches_no_figures(held) -> None:
+    state, model = held
+    figures = HandFigures.of(model.hand)
+    lin = model.linearize(state)
+    w = torch.full((model.hand.n_a,), 0.03, dtype=F64)
+    assert figures.learn(lin, w, -lin.step(w)) is None
+    assert int(figures.count) == 0
+    assert figures.learn(lin, w, 0.7 * lin.step(w)) is not None

@@ -13,7 +13,6 @@ from torch_ekm.description import load_hand, write_transmission
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
 from torch_ekm.kinematics import Play
 from torch_ekm.model import calibrate
-from torch_ekm.model.calibration.identifiability import unidentified
 from torch_ekm.model.calibration.motions import rests
 from torch_ekm.model.calibration.parameters import PRIORS, Parameter, Unknowns
 from torch_ekm.model.calibration.residuals import Evidence
@@ -133,20 +132,6 @@ def information(*directions):
     _, _, rest = np.linalg.svd(np.array(directions, dtype=float))
     told = rest[len(directions) :]
     return 1e4 * told.T @ told + 0.02 * np.eye(n)
-
-
-def test_what_cannot_be_told_is_said_in_words():
-    spring, motor, arm = parameter("springs", "knee"), parameter("stiffness", "m1"), parameter("rest", "knee")
-    said = unidentified([spring, motor], information([1, 1]))
-    assert said == ("spring of knee and stiffness of m1 only as a ratio",)
-    assert "product" in unidentified([spring, motor], information([1, -1]))[0]
-    three = [spring, motor, parameter("springs", "hip")]
-    assert "common factor" in unidentified(three, information([1, 1, 1]))[0]
-    assert "cannot be told" in unidentified(three, information([1, 0, 0]))[0]
-    assert "rest angle of knee" in unidentified([spring, arm], information([1, 1]))[0]
-    unseen = np.diag([1e4, 0.0])
-    assert unidentified([spring, motor], unseen) == ("no motion depends on: stiffness of m1",)
-    assert unidentified([spring, motor], np.diag([1e4, 1e4])) == ()
 
 
 @pytest.mark.parametrize("name", ["icub_right", "planar_two_finger"])

@@ -18,4 +18,5 @@ def test_four_motions_find_the_figures_of_a_wrong_hand():
     assert np.median(outcome.sure["moment_arms"]) < 0.02  # measured 0.0006
     assert np.median(outcome.sure["springs"]) < 0.05
     assert outcome.ratio < 0.3
-    assert "ring_1" in calibration.unidentified[0]  # a finger that touches nothing
+    (row,) = (row for row in calibration.parameters if row.label == "spring of ring_1")
+    assert not row.identifiable  # a finger that touches nothing

@@ -82,6 +82,7 @@ class ClosedLoop:
                 knowledge.figures = followed
         knowledge.check(hand)
         controller.follow(knowledge.figures)
+        self._figures = DescribedFigures() if controller.enhanced is None else knowledge.figures
         self._checked = CheckedPlant(plant, hand)
         self.plant, self.knowledge = ServoInverse(self._checked, hand, knowledge.servo), knowledge
         self.controller, self.learn, self.decline = controller, learn, decline
@@ -176,11 +177,12 @@ class ClosedLoop:
     def _motions(self, target: PoseTarget) -> Generator[Step, None, Stop]:
         started = time.monotonic()
         safety, tolerance = self.safety, self.safety.rule.tolerance
-        watch = Watch(safety.guards, self.controller.kinematic, self.controller.expect, tolerance)
+        watch = Watch(safety.guards, self.controller.kinematic, self._expect, tolerance)
         first = watch.first(self.plant.observe(), self.plant.observe)
         seen = first.seen
         self.controller.reset()
         self.knowledge.forces.begin()
+        self._figures.begin(seen.a)
         self.controller.forces = None if self.controller.enhanced is None else self.knowledge.forces
         progress = Progress(self.safety, target, self.controller.focus, seen, started)
         progress.halt = first.halt
@@ -223,7 +225,7 @@ class ClosedLoop:
             if progress.halt is not None:
                 continue
             step = self._move(seen, decision, progress, watch, seconds)
-            progress.come(step.after, step.after.a - seen.a)
+            progress.come(step.after, step.pull)
             yield step
             seen, progress.limited = step.after, decision.limited
 
@@ -300,7 +302,7 @@ class ClosedLoop:
         turns: bool = True,
     ) -> Step:
         """Command, observe, learn."""
-        first = self.plant.command(decision.delta_a)
+        first = self.plant.command(self._figures.motors(decision.delta_a))
         began = time.perf_counter()
         verdict = watch.motion(seen, decision, first, self.plant.observe, self.knowledge.servo.stuck)
         after, progress.halt = verdict.seen, verdict.halt
@@ -316,9 +318,12 @@ class ClosedLoop:
             # what a guard objects to may be a faulty pad
             fades = decision.share > 0 and not verdict.note and watch.grip.follow(decision, felt)
             if verdict.teaches and self.learn:
-                report = self._learn(seen, decision, lin, increment, expected, felt, fades)
+                report = self._learn(seen, after, decision, lin, expected, felt, fades)
             if turns and decision.share > 0 and self._slides(lin, increment, expected):
                 self.controller.tighter += self.safety.caution.slip
+        moved = after.a - seen.a
+        pull = self._figures.pulled(moved)
+        self._figures.commit(moved, after.a)
         seconds += time.perf_counter() - began
         if turns:
             progress.add(after, blind=watch.blind > 0)
@@ -327,14 +332,18 @@ class ClosedLoop:
                 progress.leapt(float(off), verdict.note)
             if progress.halt is None:
                 progress.halt = watch.way(progress.errors, decision, after.a - seen.a)
-        return Step(seen, decision, after, increment, report, seconds, verdict.note)
+        return Step(seen, decision, after, increment, pull, report, seconds, verdict.note)
+
+    def _expect(self, lin: Linearization, moved: Tensor) -> Expectation:
+        """Of what the motors did, less what the play took up."""
+        return self.controller.expect(lin, self._figures.pulled(moved))
 
     def _learn(
         self,
         seen: Observation,
+        after: Observation,
         decision: Decision,
         lin: Linearization,
-        ds: Tensor,
         expected: Expectation,
         felt: ForceSurprise | None,
         fades: bool,
@@ -342,15 +351,18 @@ class ClosedLoop:
         enhanced = self.controller.enhanced
         if enhanced is None:
             return None
+        moved, ds = after.a - seen.a, after.state.minus(seen.state)
         if not self.knowledge.servo.learns:  # then the dead zones are g's to learn
-            expected = self.controller.expect(lin, decision.delta_a)
+            moved = decision.delta_a
+            expected = self._expect(lin, moved)
         if felt is not None:
             self._learn_forces(lin, expected.moved, felt)
         rho = math.inf if fades else self._disagreement(lin, ds, expected, felt)
         self.controller.pace.judge(rho, decision.share)
-        self.knowledge.figures.learn(lin, expected.moved, ds)
-        nominal = self.controller.kinematic.followed(lin).step(expected.moved)  # g learns what they leave
-        return enhanced.update(seen.state, expected.moved, ds, nominal)
+        self._figures.learn(lin, moved, ds)
+        pull = self._figures.pulled(moved)
+        nominal = self.controller.kinematic.followed(lin).step(pull)  # g learns what they leave
+        return enhanced.update(seen.state, pull, ds, nominal)
 
     def _disagreement(
         self, lin: Linearization, ds: Tensor, expected: Expectation, felt: ForceSurprise | None = None

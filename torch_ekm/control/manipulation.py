@@ -21,6 +21,8 @@ class Step:
     after: Observation
     increment: Float[Tensor, " n_s"]
     """ds as measured, ``after.state.minus(before.state)``."""
+    pull: Float[Tensor, " n_a"]
+    """What the tendons did, as far as the play of the drives is known [rad]."""
     report: UpdateReport | None
     """Of the learner; None where nothing was learned."""
     seconds: float

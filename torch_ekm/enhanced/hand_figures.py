@@ -14,6 +14,7 @@ from .._checks import check_finite, check_shape
 from .._recorded import Recorded
 from ..description import HandDescription
 from ..exceptions import GraspError, ParameterError
+from ..kinematics.play import Play, PlayState
 from ..model import Linearization
 from ..model.calibration.parameters import PRIORS, Parameter, Unknowns
 from ..model.motion_equations import Motion, MotionEquations
@@ -21,14 +22,16 @@ from ..model.reduction import Drives
 from ..typing import Float, Tensor
 from .parameter_filter import FilterReport, ParameterFilter
 
-KINDS = ("springs", "moment_arms", "stiffness")
+KINDS = ("springs", "moment_arms", "stiffness", "backlash")
 # of the prior, in units of those of the calibration: one lathe turns all pulleys, one cable strings them
 _COMMON, _OWN = 1.0, 0.4
+_PLAY = 0.5  # of the prior of a backlash: its width where none is described, and how sure it is
 _FURTHEST = 5.0  # priors: bounds
 _TOLD = 0.7  # of the variance that a figure of its kind has of which nothing was seen
 # [m], [rad], [rad]: what no figures explain of a motion of the object and of a joint; and its share of it
 _POSITION_STD, _ROTATION_STD, _JOINT_STD = 0.3e-3, math.radians(0.2), math.radians(0.5)
 _RELATIVE = 0.08
+_SAME = math.radians(0.02)  # [rad] of an encoder: it has not moved
 
 
 class Figure(NamedTuple):
@@ -36,7 +39,7 @@ class Figure(NamedTuple):
 
     name: str
     factor: float
-    """Of the described figure."""
+    """Of the described figure; of a backlash its width [rad]."""
     std: float
     """Standard deviation of the factor."""
     told: bool
@@ -75,15 +78,34 @@ class DescribedFigures(Recorded, nn.Module):
     def learn(self, lin: Linearization, moved: Tensor, increment: Tensor) -> None:
         """Does nothing."""
 
+    def begin(self, a: Tensor) -> None:
+        """There is no play."""
+
+    def commit(self, moved: Tensor, a: Tensor) -> None:
+        """There is no play."""
+
+    def pulled(self, moved: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
+        """Tendons do what the motors do [rad]."""
+        return moved
+
+    def motors(self, pull: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
+        """Motors are to do what the tendons shall do [rad]."""
+        return pull
+
 
 class HandFigures(ParameterFilter):
-    """``ds = J_m(s; theta) w``: springs, moment arms and stiffnesses of a hand, from its motions.
+    """``ds = J_m(s; theta) dx, dx = play(w)``: springs, moment arms, stiffnesses and play of the drives of a
+    hand, from its motions.
 
     The filter of :class:`~torch_ekm.enhanced.ParameterFilter`, about the present theta, on the object's
     twist and the joints of the fingers that touch. ``theta`` are logarithms of factors of the description,
     in units of their priors (.5 of springs, .3 of moment arms, .7 of stiffnesses), which are common to all
     of a kind for the most part. Contact forces are those that were found with the description: motions do
     not tell the scale that forces need.
+
+    Play (:class:`~torch_ekm.kinematics.Play`, one width for each actuator) takes up what a motor does first
+    after a grasp and after each reversal, which encoders at the motors do not show. Where none is described
+    it is thought to be 0.5 deg wide.
 
     The figures belong to the hand, whatever it holds. :class:`~torch_ekm.model.KinematicModel.with_figures`
     gives a model that follows them.
@@ -101,8 +123,12 @@ class HandFigures(ParameterFilter):
         ]
         kind = torch.tensor([KINDS.index(one.kind) for one in found])
         prior = _COMMON**2 * (kind[:, None] == kind).double() + _OWN**2 * torch.eye(len(found)).double()
-        bound = torch.full((len(found),), _FURTHEST)
-        super().__init__([one.label for one in found], torch.zeros(len(found)), prior, -bound, bound)
+        play = torch.tensor([not one.logarithmic for one in found])
+        scale = torch.where(play, _PLAY, 1.0).double()
+        start = [_PLAY * (not one.logarithmic and one.nominal == 0) for one in found]
+        lower, upper = [one.lowest for one in found], [_FURTHEST] * len(found)
+        super().__init__([one.label for one in found], start, scale[:, None] * prior * scale, lower, upper)
+        self._is_play, self._play, self._a = play, None, torch.empty(0)
         self.hand, self._entries, self._kind = hand, tuple(found), kind
         self._described = torch.tensor([one.nominal for one in found], dtype=torch.float64)
         self._prior_std = torch.tensor([one.prior for one in found], dtype=torch.float64)
@@ -141,8 +167,45 @@ class HandFigures(ParameterFilter):
 
     @property
     def factors(self) -> Float[Tensor, " n"]:
-        """Of the described figures."""
-        return (self._prior_std * self.mean).exp()
+        """Of the described figures; of a backlash its width [rad]."""
+        step = self._prior_std * self.mean
+        return torch.where(self._is_play, self._described + step, step.exp())
+
+    @property
+    def width(self) -> Float[Tensor, " n"]:
+        """Of the play of each actuator, from one end to the other [rad]."""
+        return self.factors[self._is_play]
+
+    def begin(self, a: Float[Tensor, " n_a"]) -> None:
+        """The next motion begins at these encoders [rad]. Unless the last one ended there the play may stand
+        anywhere."""
+        if self._a.shape != a.shape or float((a - self._a).abs().max()) > _SAME:
+            one = torch.ones_like(self.width)
+            self._play = PlayState(-one, one) if len(one) else None
+
+    def commit(self, moved: Float[Tensor, " n_a"], a: Float[Tensor, " n_a"]) -> None:
+        """The motors have moved so, and stand at a [rad]."""
+        self._play, self._a = self._pull(moved, self.width)[1], a.clone()
+
+    def pulled(self, moved: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
+        """What the tendons do when the motors do this [rad]: less, where these take up the play."""
+        return self._pull(moved, self.width)[0]
+
+    def motors(self, pull: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
+        """What the motors are to do, so that the tendons do this [rad]."""
+        if self._play is None:
+            return pull
+        wanted = pull[self._at[-1]]
+        lost = 0.5 * self.width * (self._play.position + wanted.sign())
+        return pull.index_put(self._at[-1], wanted + lost * (wanted.abs() > _SAME))
+
+    def _pull(self, moved: Tensor, width: Tensor) -> tuple[Tensor, PlayState | None]:
+        """What the tendons do, and where the play stands after it, in units of half its width."""
+        if self._play is None:
+            return moved, None
+        at, half = self._at[-1], (0.5 * width).clamp(min=1e-9)
+        pulled, after = Play(2 * torch.ones_like(half)).advance(self._play, moved[at] / half)
+        return moved.to(width).index_put(at, half * pulled), PlayState(*(part.detach() for part in after))
 
     def solve(self, equations: MotionEquations) -> Motion | None:
         """J_m with the present figures; None where the grasp would buckle with them."""
@@ -160,7 +223,7 @@ class HandFigures(ParameterFilter):
     def present(self, described: Drives) -> tuple[Float[Tensor, " n_q"], Drives]:
         """Change of the springs against the description [N m/rad] and the drives, both as known now."""
         values = (self._described * self.factors).to(described.actuation)
-        springs, arms, stiffness = (values[self._kind == k] for k in range(len(KINDS)))
+        springs, arms, stiffness, _ = (values[self._kind == k] for k in range(len(KINDS)))
         J_a = described.actuation.index_put(self._at[1], arms) if len(arms) else described.actuation
         K_a = described.stiffness
         if len(stiffness):  # a model without compliance keeps its actuators rigid
@@ -178,11 +241,11 @@ class HandFigures(ParameterFilter):
 
         Args:
             lin: of the state before it.
-            moved: w, what the encoders did [rad].
+            moved: w, what the encoders did [rad]; before :meth:`commit`.
             increment: ds, as measured.
 
         Returns:
-            None: the motion cannot be modelled, or nothing moved.
+            None: the motion cannot be modelled, went against its prediction, or nothing moved.
 
         Raises:
             ShapeError, NonFiniteError: nothing is changed.
@@ -197,32 +260,33 @@ class HandFigures(ParameterFilter):
         if motion is None:
             return None
         n_q = lin.n_q
+        with torch.enable_grad():
+            width = self.width.requires_grad_()
+            pull, _ = self._pull(moved.to(width), width)
+            by_width = torch.zeros_like(width)
+            if pull.requires_grad:  # each tendon's by its own width
+                (by_width,) = torch.autograd.grad(pull.sum(), width)
+        pull = pull.detach().to(motion.jacobian)
         joints = lin.equations.moving.nonzero()[:, 0].tolist()
         rows = [*joints, *range(n_q, n_q + 6)]
-        predicted = (motion.jacobian @ moved.to(motion.jacobian))[rows]
-        by = motion.derivative(moved.to(motion.jacobian), rows)
-        phi = torch.cat(
-            [
-                part[(slice(None), *at)]
-                for part, at in zip((by.springs, by.moment_arms, by.stiffness), self._at, strict=True)
-                if len(at)
-            ],
-            dim=-1,
-        )
-        slope = self._prior_std * self._described * self.factors
+        predicted = (motion.jacobian @ pull)[rows]
         noise = _noise(predicted, len(joints), lin)
-        return self.update(increment[rows] - predicted, phi.double() * slope, noise)
+        against = float((increment[rows] * predicted / noise).sum())
+        if against < -0.5 * float((predicted.square() / noise).sum()):
+            return None  # figures do not turn a motion round: a sign is wrong, or a contact slid
+        derivatives = (*motion.derivative(pull, rows), motion.jacobian[rows])
+        parts = zip(derivatives, self._at, strict=True)
+        phi = torch.cat([part[(slice(None), *at)].double() for part, at in parts if len(at)], dim=-1)
+        phi[:, self._is_play] *= by_width
+        slope = self._prior_std * torch.where(self._is_play, 1.0, self._described * self.factors)
+        return self.update(increment[rows] - predicted, phi * slope, noise)
 
     @property
     def figures(self) -> tuple[Figure, ...]:
         """Each figure against its description."""
-        std, told = self.stddev, self._told
-        return tuple(
-            Figure(name, float(factor), float(factor * prior * spread), bool(known))
-            for name, factor, prior, spread, known in zip(
-                self.names, self.factors, self._prior_std, std, told, strict=True
-            )
-        )
+        std = self._prior_std * self.stddev * torch.where(self._is_play, 1.0, self.factors)
+        columns = self.names, self.factors.tolist(), std.tolist(), self._told.tolist()
+        return tuple(Figure(*row) for row in zip(*columns, strict=True))
 
     @property
     def _told(self) -> Tensor:
@@ -234,7 +298,8 @@ class HandFigures(ParameterFilter):
             n = int(own.sum())
             if n:
                 common = (self.covariance[own][:, own].sum() - variance[own].sum()) / max(n * (n - 1), 1)
-                told[own] = variance[own] < _TOLD * (common.clamp(min=0.0) + _OWN**2)
+                alone = self.prior.diagonal()[own] * _OWN**2 / (_COMMON**2 + _OWN**2)
+                told[own] = variance[own] < _TOLD * (common.clamp(min=0.0) + alone)
         return told
 
     @property
@@ -248,13 +313,18 @@ class HandFigures(ParameterFilter):
         found = [
             Change(name, at, float(f), float(size))
             for name, f, size in zip(self.names, factor, z, strict=True)
-            if abs(size) > 2
+            if abs(size) > 2 and not name.startswith("backlash")
         ]
         return tuple(sorted(found, key=lambda one: -abs(one.z)))
 
     def __str__(self) -> str:
         known = [one for one in self.figures if one.told]
-        lines = [f"{one.name}: {one.factor:.2f} times the description, +-{one.std:.2f}" for one in known]
+        lines = [
+            f"{one.name}: {math.degrees(one.factor):.2f} deg, +-{math.degrees(one.std):.2f}"
+            if one.name.startswith("backlash")
+            else f"{one.name}: {one.factor:.2f} times the description, +-{one.std:.2f}"
+            for one in known
+        ]
         rest = [one.name for one in self.figures if not one.told]
         if rest:
             lines.append(f"not told: {', '.join(rest)}")

@@ -11,7 +11,6 @@ from ..._extras import require
 from ...exceptions import GraspError, ParameterError
 from ...typing import Array
 from ..kinematic_model import KinematicModel
-from .identifiability import unidentified
 from .motions import Recording, rests
 from .parameters import Unknowns
 from .residuals import GROUPS, Evidence, Residuals
@@ -77,8 +76,7 @@ def calibrate(
         if np.abs(np.log(problem.noise / last)).max() < _SETTLED:
             break
     after = problem.at(x)
-    information = problem.information(x)
-    covariance: Array = np.linalg.inv(information + np.eye(len(x))).astype(np.float64)
+    covariance: Array = np.linalg.inv(problem.information(x) + np.eye(len(x))).astype(np.float64)
     return Calibration(
         model=model,
         unknowns=unknowns,
@@ -87,7 +85,6 @@ def calibrate(
         errors_before=before.motion,
         errors_after=after.motion,
         noise=problem.deviations(),
-        unidentified=unidentified(unknowns.parameters, information),
     )
 
 

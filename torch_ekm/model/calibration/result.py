@@ -47,8 +47,6 @@ class Calibration:
     noise: dict[str, float]
     """Estimated standard deviations of motions ("joints" [rad], "position" [m], "rotation" [rad]), of joint
     torques that the equilibrium leaves [N m] and of fingertip forces [N]."""
-    unidentified: tuple[str, ...]
-    """What the data cannot tell, in words."""
 
     @property
     def hand(self) -> HandDescription:
@@ -88,4 +86,4 @@ class Calibration:
             lines.append(
                 f"error of a motion's {name}: {sizes[0]:.3g} {unit} before, {sizes[1]:.3g} after (rms)"
             )
-        return "\n".join([*lines, *self.unidentified])
+        return "\n".join(lines)
