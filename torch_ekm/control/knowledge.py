@@ -30,7 +30,7 @@ class HandKnowledge(Recorded, nn.Module):
     Args:
         servo: of the actuators.
         forces: how the pads' normal forces answer to the actuators.
-        figures: springs, moment arms and stiffnesses.
+        figures: springs, moment arms, stiffnesses, and play of the drives.
     """
 
     def __init__(
