@@ -229,10 +229,10 @@ class Survey:
         motions.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False, fontsize=8)
         return figure
 
-    def report(self, folder: Path) -> Report:
+    def report(self, folder: Path, engine: str) -> Report:
         """Table, picture and verdict, in ``folder``."""
         caption = "What became of the turns on each plant; filled: lost, pale: the target was not reached."
-        shown = save_figure(self.picture(), folder, "any_hand", caption)
+        shown = save_figure(self.picture(), folder, f"any_hand_{engine}", caption)
         report = Report("Hands of other kinds", f"{self.verdict}.", [self.table()], [shown])
         report.write(folder)
         return report
@@ -270,7 +270,7 @@ def main() -> None:
         made = (TrialRecord.from_json(trial) for trial in trials)
         turns[*where[plant], controller] += [one for one in made if isinstance(one, TrialRecord)]
     survey = Survey(turns)
-    print(survey.report(given.out).markdown())
+    print(survey.report(given.out, given.engine).markdown())
     print(survey.verdict)
 
 
