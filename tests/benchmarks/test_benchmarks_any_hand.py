@@ -63,9 +63,9 @@ def test_lost_missed_and_motions_are_counted(tmp_path: Path) -> None:
     assert survey.verdict == verdict
     row = survey.table().text()[0]
     assert row == ["arms strong", "4", "1, 3, 14.0", "1, 2, 7.0", "50", "1 stalled, 1 given up"]
-    survey.report(tmp_path)
+    survey.report(tmp_path, "mujoco")
     assert verdict in (tmp_path / "report.md").read_text(encoding="utf-8")
-    assert (tmp_path / "any_hand.svg").exists()
+    assert (tmp_path / "any_hand_mujoco.svg").exists()
 
 
 def test_a_session_runs_and_is_kept(tmp_path: Path, monkeypatch, capsys) -> None:
