@@ -112,9 +112,11 @@ class PoseFilter:
         one that may be as large as the actuators', as far as contacts that roll allow.
 
         Args:
-            moved: w [rad].
+            moved: w, of the encoders [rad].
             fingertip_force: before it [N].
         """
+        if self.kinematic.figures is not None:
+            moved = self.kinematic.figures.pulled(moved)
         lin = self._linearize(moved, fingertip_force)
         ds = unsure = torch.zeros_like(self.covariance[0])
         if lin is not None:

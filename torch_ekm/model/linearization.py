@@ -194,6 +194,10 @@ class FollowedFigures(Protocol):
         """Change of the springs against the description [N m/rad], and the drives."""
         ...
 
+    def pulled(self, moved: Tensor) -> Tensor:
+        """What the tendons do when the motors do this [rad]."""
+        ...
+
     def learn(self, lin: Linearization, moved: Tensor, increment: Tensor) -> object:
         """Learn from one motion."""
 
