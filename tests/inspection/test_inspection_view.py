@@ -12,7 +12,7 @@ from torch_ekm.description import load_hand
 from torch_ekm.exceptions import DescriptionError, OutputError, ParameterError, UnknownNameError
 from torch_ekm.inspection.view import view, view_hand, view_log
 from torch_ekm.plant import RecordingPlant, Trajectory, TrialLog
-from torch_ekm.rendering import make_scene
+from torch_ekm.rendering import make_scene, save_animation
 from torch_ekm.simulation import SimulatedHand
 
 pytest.importorskip("viser")
@@ -90,12 +90,12 @@ def test_a_page_stands_alone_and_has_no_text_of_the_log(folder, tmp_path) -> Non
     recording.observations[0].info["events"] = (script,)
     seen = view_log(recording.save(tmp_path / "trial.h5"))
     assert script in seen.rows[0][-1]
-    page = seen.save(tmp_path / "log.html").read_text(encoding="utf-8")
+    page = save_animation(seen.scene, tmp_path / "log.html").read_text(encoding="utf-8")
     assert len(page) > 500_000
     assert 'src="http' not in page
     assert "iframe srcdoc" not in page
     with pytest.raises(OutputError, match="cannot be written"):
-        seen.save(tmp_path / "nowhere" / "log.html")
+        save_animation(seen.scene, tmp_path / "nowhere" / "log.html")
 
 
 def test_what_cannot_be_shown_is_named(folder, tmp_path) -> None:

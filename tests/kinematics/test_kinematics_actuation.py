@@ -97,3 +97,4 @@ def test_errors() -> None:
         actuation.joints(torch.zeros(3, dtype=torch.float64))
     with pytest.raises(ShapeError, match="left_0, left_1"):
         actuation.actuators(torch.zeros(2, dtype=torch.float64))
+    assert "free=2" in repr(actuation)

@@ -251,3 +251,4 @@ def test_errors_list_what_would_be_right() -> None:
     with pytest.raises(ShapeError, match="point"):
         kinematics.jacobian(q, "left_tip", torch.zeros(2, dtype=torch.float64))
     assert isinstance(kinematics(q), LinkPoses)
+    assert "planar_two_finger" in repr(kinematics)

@@ -82,9 +82,9 @@ def replay(
     from ..plant import TrialLog
     from ..plant.trial_log import TrialEntry
 
-    shown = view_log(log, trial, estimates=estimates)
-    if log.is_dir():
-        found = TrialLog.open(log)
+    found = None if log.is_file() else TrialLog.open(log)
+    shown = view_log(log if found is None else found, trial, estimates=estimates)
+    if found is not None:
         header = ["time [s]" if name == "time" else name for name in TrialEntry._fields]
         print_table(header, found.index, str(log))
         for number, problem in found.damaged.items():
@@ -111,8 +111,10 @@ def verify(log: Annotated[Path, Argument(help="Folder of the log.")]) -> None:
 
 def _show(shown: View, page: Path) -> None:
     """The table, and where the page is."""
+    from ..rendering import save_animation
+
     if shown.rows:
         print_table(shown.header, shown.rows, shown.title)
     for note in shown.notes:
         say(f"Not drawn: {note}")
-    say(f"Page:      {shown.save(page).resolve()}")
+    say(f"Page:      {save_animation(shown.scene, page).resolve()}")

@@ -311,19 +311,17 @@ class ClosedLoop:
                 self.plant.correct(None)
         elif after is not first:
             self.plant.correct(after)
-        increment = after.state.minus(seen.state)
+        increment, moved = after.state.minus(seen.state), after.a - seen.a
         report, lin, expected = None, decision.linearization, verdict.expected
         if lin is not None and expected is not None and after.status is PlantStatus.HELD:
             felt = watch.grip.surprise(lin, seen, expected.moved, after)
             # what a guard objects to may be a faulty pad
             fades = decision.share > 0 and not verdict.note and watch.grip.follow(decision, felt)
             if verdict.teaches and self.learn:
-                report = self._learn(seen, after, decision, lin, expected, felt, fades)
+                report = self._learn(seen, decision, lin, moved, increment, expected, felt, fades)
             if turns and decision.share > 0 and self._slides(lin, increment, expected):
                 self.controller.tighter += self.safety.caution.slip
-        moved = after.a - seen.a
-        pull = self._figures.pulled(moved)
-        self._figures.commit(moved, after.a)
+        pull = self._figures.commit(moved, after.a)
         seconds += time.perf_counter() - began
         if turns:
             progress.add(after, blind=watch.blind > 0)
@@ -331,7 +329,7 @@ class ClosedLoop:
                 off = torch.linalg.vector_norm((increment - expected.increment)[-3:])
                 progress.leapt(float(off), verdict.note)
             if progress.halt is None:
-                progress.halt = watch.way(progress.errors, decision, after.a - seen.a)
+                progress.halt = watch.way(progress.errors, decision, moved)
         return Step(seen, decision, after, increment, pull, report, seconds, verdict.note)
 
     def _expect(self, lin: Linearization, moved: Tensor) -> Expectation:
@@ -341,9 +339,10 @@ class ClosedLoop:
     def _learn(
         self,
         seen: Observation,
-        after: Observation,
         decision: Decision,
         lin: Linearization,
+        moved: Tensor,
+        ds: Tensor,
         expected: Expectation,
         felt: ForceSurprise | None,
         fades: bool,
@@ -351,7 +350,6 @@ class ClosedLoop:
         enhanced = self.controller.enhanced
         if enhanced is None:
             return None
-        moved, ds = after.a - seen.a, after.state.minus(seen.state)
         if not self.knowledge.servo.learns:  # then the dead zones are g's to learn
             moved = decision.delta_a
             expected = self._expect(lin, moved)

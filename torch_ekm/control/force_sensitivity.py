@@ -134,6 +134,9 @@ class ForceSensitivity(Recorded, nn.Module):
         self.variance[known] += _RECENT * (unexplained - self.variance)[known]
         return r
 
+    def extra_repr(self) -> str:
+        return f"pads={len(self.theta)}, largest={float(self.correction.abs().max()):.3g} N/rad"
+
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector[..., None])[..., 0]

@@ -301,3 +301,6 @@ class Pace(nn.Module):
         """Begin again with half the smallest steps: something went wrong, and is near."""
         if self.adapts:
             self.value.fill_(self.options.trust.smallest / 2)
+
+    def extra_repr(self) -> str:
+        return f"p={self.factor:.3g}"

@@ -196,9 +196,7 @@ class EnhancedModel(Recorded, nn.Module):
     def new_sequence(self) -> None:
         """The next motion does not follow on the last one: a learner that carries its last error over (a
         :class:`~torch_ekm.residual.MixtureResidual`) drops it."""
-        begin = getattr(self.learner, "new_sequence", None)
-        if begin is not None:
-            begin()
+        self.learner.new_sequence()
 
     def linearize(
         self,

@@ -81,8 +81,9 @@ class DescribedFigures(Recorded, nn.Module):
     def begin(self, a: Tensor) -> None:
         """There is no play."""
 
-    def commit(self, moved: Tensor, a: Tensor) -> None:
-        """There is no play."""
+    def commit(self, moved: Float[Tensor, " n_a"], a: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
+        """Tendons have done what the motors did [rad]."""
+        return moved
 
     def pulled(self, moved: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
         """Tendons do what the motors do [rad]."""
@@ -103,9 +104,8 @@ class HandFigures(ParameterFilter):
     of a kind for the most part. Contact forces are those that were found with the description: motions do
     not tell the scale that forces need.
 
-    Play (:class:`~torch_ekm.kinematics.Play`, one width for each actuator) takes up what a motor does first
-    after a grasp and after each reversal, which encoders at the motors do not show. Where none is described
-    it is thought to be 0.5 deg wide.
+    :class:`~torch_ekm.kinematics.Play` of each drive takes up what its motor does first after a grasp and a
+    reversal, which encoders do not show. Where none is described it is thought to be 0.5 deg wide.
 
     The figures belong to the hand, whatever it holds. :class:`~torch_ekm.model.KinematicModel.with_figures`
     gives a model that follows them.
@@ -128,7 +128,9 @@ class HandFigures(ParameterFilter):
         start = [_PLAY * (not one.logarithmic and one.nominal == 0) for one in found]
         lower, upper = [one.lowest for one in found], [_FURTHEST] * len(found)
         super().__init__([one.label for one in found], start, scale[:, None] * prior * scale, lower, upper)
-        self._is_play, self._play, self._a = play, None, torch.empty(0)
+        self._is_play, self._unit = play, Play(torch.full((int(play.sum()),), 2.0).double())
+        self._play: PlayState | None = None  # in units of half the widths
+        self._a = torch.empty(0)  # encoders at the last commit
         self.hand, self._entries, self._kind = hand, tuple(found), kind
         self._described = torch.tensor([one.nominal for one in found], dtype=torch.float64)
         self._prior_std = torch.tensor([one.prior for one in found], dtype=torch.float64)
@@ -180,16 +182,17 @@ class HandFigures(ParameterFilter):
         """The next motion begins at these encoders [rad]. Unless the last one ended there the play may stand
         anywhere."""
         if self._a.shape != a.shape or float((a - self._a).abs().max()) > _SAME:
-            one = torch.ones_like(self.width)
-            self._play = PlayState(-one, one) if len(one) else None
+            self._play = self._unit.unknown() if len(self.width) else None
 
-    def commit(self, moved: Float[Tensor, " n_a"], a: Float[Tensor, " n_a"]) -> None:
-        """The motors have moved so, and stand at a [rad]."""
-        self._play, self._a = self._pull(moved, self.width)[1], a.clone()
+    def commit(self, moved: Float[Tensor, " n_a"], a: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
+        """The motors have moved so, and stand at a [rad]; what the tendons did."""
+        pull, _, self._play = self._pull(moved)
+        self._a = a.clone()
+        return pull
 
     def pulled(self, moved: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
         """What the tendons do when the motors do this [rad]: less, where these take up the play."""
-        return self._pull(moved, self.width)[0]
+        return self._pull(moved)[0]
 
     def motors(self, pull: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
         """What the motors are to do, so that the tendons do this [rad]."""
@@ -199,13 +202,16 @@ class HandFigures(ParameterFilter):
         lost = 0.5 * self.width * (self._play.position + wanted.sign())
         return pull.index_put(self._at[-1], wanted + lost * (wanted.abs() > _SAME))
 
-    def _pull(self, moved: Tensor, width: Tensor) -> tuple[Tensor, PlayState | None]:
-        """What the tendons do, and where the play stands after it, in units of half its width."""
+    def _pull(self, moved: Tensor) -> tuple[Tensor, Tensor, PlayState | None]:
+        """What the tendons do, its derivative by the width of each play, and where the plays stand after it,
+        in units of half their widths."""
+        at, half = self._at[-1], (0.5 * self.width).clamp(min=1e-9)
         if self._play is None:
-            return moved, None
-        at, half = self._at[-1], (0.5 * width).clamp(min=1e-9)
-        pulled, after = Play(2 * torch.ones_like(half)).advance(self._play, moved[at] / half)
-        return moved.to(width).index_put(at, half * pulled), PlayState(*(part.detach() for part in after))
+            return moved, torch.zeros_like(half), None
+        w = moved[at] / half
+        pulled, after = self._unit.advance(self._play, w)
+        at_end = 0.5 * ((after.low.abs() == 1).to(w) + (after.high.abs() == 1).to(w))
+        return moved.to(half).index_put(at, half * pulled), 0.5 * (pulled - at_end * w), after
 
     def solve(self, equations: MotionEquations) -> Motion | None:
         """J_m with the present figures; None where the grasp would buckle with them."""
@@ -260,13 +266,8 @@ class HandFigures(ParameterFilter):
         if motion is None:
             return None
         n_q = lin.n_q
-        with torch.enable_grad():
-            width = self.width.requires_grad_()
-            pull, _ = self._pull(moved.to(width), width)
-            by_width = torch.zeros_like(width)
-            if pull.requires_grad:  # each tendon's by its own width
-                (by_width,) = torch.autograd.grad(pull.sum(), width)
-        pull = pull.detach().to(motion.jacobian)
+        pull, by_width, _ = self._pull(moved.to(self.mean))
+        pull = pull.to(motion.jacobian)
         joints = lin.equations.moving.nonzero()[:, 0].tolist()
         rows = [*joints, *range(n_q, n_q + 6)]
         predicted = (motion.jacobian @ pull)[rows]
@@ -311,21 +312,21 @@ class HandFigures(ParameterFilter):
         z = step / (self.covariance.diagonal() + self.before_covariance.diagonal()).sqrt()
         factor, at = (self._prior_std * step).exp(), int(self.changed_at)
         found = [
-            Change(name, at, float(f), float(size))
-            for name, f, size in zip(self.names, factor, z, strict=True)
-            if abs(size) > 2 and not name.startswith("backlash")
+            Change(self.names[i], at, float(factor[i]), float(z[i]))
+            for i in ((z.abs() > 2) & ~self._is_play).nonzero()[:, 0].tolist()
         ]
         return tuple(sorted(found, key=lambda one: -abs(one.z)))
 
     def __str__(self) -> str:
-        known = [one for one in self.figures if one.told]
+        figures = self.figures
         lines = [
             f"{one.name}: {math.degrees(one.factor):.2f} deg, +-{math.degrees(one.std):.2f}"
-            if one.name.startswith("backlash")
+            if play
             else f"{one.name}: {one.factor:.2f} times the description, +-{one.std:.2f}"
-            for one in known
+            for one, play in zip(figures, self._is_play.tolist(), strict=True)
+            if one.told
         ]
-        rest = [one.name for one in self.figures if not one.told]
+        rest = [one.name for one in figures if not one.told]
         if rest:
             lines.append(f"not told: {', '.join(rest)}")
         lines += [

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import torch
 
 from ..exceptions import NoDerivativeError
-from ..residual.base import value_and_jacobian
+from ..residual.base import recordable, value_and_jacobian
 from ..typing import Float, Tensor
 
 Model = Callable[[Any, Tensor], Tensor]
@@ -24,7 +23,7 @@ def differentiated(
         NoDerivativeError: no derivative comes out of f, or none of an output that moves with the action.
     """
     try:
-        value, J = value_and_jacobian(partial(f, _recorded(state)), action)
+        value, J = value_and_jacobian(lambda a: f(recordable(state), a), action)
     except (RuntimeError, TypeError) as error:  # numpy does not take tensors that carry a derivative
         raise NoDerivativeError(f"{type(error).__name__}: {error}") from error
     if J is None:
@@ -35,14 +34,6 @@ def differentiated(
         if bool((moved > 1e-3 * J.abs().max()).any()):
             raise NoDerivativeError("some outputs move with the action and carry none")
     return value, J
-
-
-def _recorded(state: Any) -> Any:
-    """A tensor of inference mode as one that autograd takes."""
-    if not (isinstance(state, Tensor) and state.is_inference()):
-        return state
-    with torch.inference_mode(False):
-        return state.clone()
 
 
 @torch.no_grad()

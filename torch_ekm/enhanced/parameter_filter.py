@@ -177,3 +177,6 @@ class ParameterFilter(Recorded, nn.Module):
         if mean is not None and bool(((mean < self.lower) | (mean > self.upper)).any()):
             wrong.append("mean is out of bounds")
         return wrong
+
+    def extra_repr(self) -> str:
+        return f"parameters={len(self)}, motions={int(self.count)}"

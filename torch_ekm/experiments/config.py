@@ -76,9 +76,8 @@ class Setting:
 
     def __str__(self) -> str:
         seen = "camera images and Hall counts" if self.sensing else "true poses plus noise"
-        return (
-            f"Hand {Path(self.hand).stem} simulated in {ENGINES[self.engine]}, preset {self.preset}, {seen}"
-        )
+        engine = ENGINES[self.engine]
+        return f"Hand {Path(self.hand).stem} simulated in {engine}, preset {self.preset}, {seen}"
 
     @property
     def parameters(self) -> PlantParameters:

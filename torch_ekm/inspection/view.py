@@ -11,12 +11,12 @@ import torch
 
 from ..control import ClosedLoop, LookAndMoveController
 from ..description import HandDescription, list_hands, load_hand, load_object
-from ..exceptions import DescriptionError, OutputError, ParameterError, UnknownNameError
+from ..exceptions import DescriptionError, ParameterError, UnknownNameError
 from ..kinematics import ActuationMap, GraspState
 from ..kinematics.se3 import log as rotation_vector
 from ..model import KinematicModel
 from ..plant import Observation, PlantStatus, Trajectory, TrialLog
-from ..rendering import Scene, make_scene, save_animation
+from ..rendering import Scene, make_scene
 from ..rendering.visuals import visuals
 from ..simulation import SimulatedHand
 from ..typing import Array
@@ -37,16 +37,6 @@ class View:
     """What there is to read."""
     notes: tuple[str, ...] = ()
     """What could not be drawn."""
-
-    def save(self, path: Path) -> Path:
-        """Write a stand-alone page that any browser shows, without a network.
-
-        Raises:
-            OutputError: ``path`` cannot be written.
-        """
-        if path.is_dir() or not path.resolve().parent.is_dir():
-            raise OutputError(path, "there is no such folder, or a folder of this name")
-        return save_animation(self.scene, path)
 
 
 def view(what: str, object: str | None = None, seed: int = 0, *, reach: bool = False) -> View:
@@ -129,11 +119,11 @@ def _reach(plant: SimulatedHand) -> View:
     return View(f"{plant.hand.name} turns {plant.object.name}", _scene(plant, states), header, rows)
 
 
-def view_log(log: Path, trial: int | None = None, *, estimates: bool = False) -> View:
+def view_log(log: Path | TrialLog, trial: int | None = None, *, estimates: bool = False) -> View:
     """One trial of a log, command by command: the truth where it is known, else what was estimated.
 
     Args:
-        log: a folder with trials (see :class:`~torch_ekm.plant.TrialLog`) or one trial's file.
+        log: a log, its folder, or one trial's file.
         trial: which; the first one by default.
         estimates: show what was estimated although the truth is known.
 
@@ -142,14 +132,14 @@ def view_log(log: Path, trial: int | None = None, *, estimates: bool = False) ->
             hand and object.
         UnknownNameError: its hand or object is not on this machine; the message lists those that are.
     """
-    if log.is_file():
-        if trial is not None:
-            raise DescriptionError(log, f"this is one trial's file; to choose trial {trial}, name its folder")
-        trajectory = Trajectory.load(log)
+    if isinstance(log, TrialLog) or not log.is_file():
+        found = log if isinstance(log, TrialLog) else TrialLog.open(log)
+        trial = found.trials[0] if trial is None else trial
+        trajectory, log = found.read(trial), found.path(trial)
+    elif trial is not None:
+        raise DescriptionError(log, f"this is one trial's file; to choose trial {trial}, name its folder")
     else:
-        trials = TrialLog.open(log)
-        trial = trial if trial is not None or not trials.trials else trials.trials[0]
-        trajectory, log = trials.read(trial or 0), trials.path(trial or 0)
+        trajectory = Trajectory.load(log)
     if not trajectory.observations:
         reason = trajectory.about.get("outcome", {}).get("reason", "it holds no observation")
         raise DescriptionError(log, f"there is nothing to show: {reason}")
@@ -171,13 +161,12 @@ def view_log(log: Path, trial: int | None = None, *, estimates: bool = False) ->
 def _moments(trajectory: Trajectory, hand: HandDescription) -> list[tuple[str, ...]]:
     """What is known of each observation."""
     rows = []
-    first = trajectory.observations[0]
     for k, seen in enumerate(trajectory.observations):
         wrong = "" if seen.truth is None else f"{_angle(seen.rotation @ seen.truth.rotation.mT):.2f}"
         moved = trajectory.commands[k - 1].rad2deg().tolist() if k else ()
         names = zip(hand.actuator_names, moved, strict=False)
         motion = ", ".join(f"{name} {value:+.1f}" for name, value in names if abs(value) >= 0.05)
-        turned = f"{_angle(seen.rotation @ first.rotation.mT):.1f}"
+        turned = f"{_angle(seen.rotation @ trajectory.observations[0].rotation.mT):.1f}"
         events = ", ".join(map(str, seen.info.get("events", ())))
         rows.append((f"{seen.time:.2f}", seen.status.value, turned, wrong, motion, events))
     return rows
@@ -206,8 +195,7 @@ def _moved(before: GraspState, after: GraspState) -> tuple[str, str]:
 
 def _forces(hand: HandDescription, seen: Observation) -> str:
     """Of the pads that press."""
-    if seen.fingertip_force is None:
-        return "no sensors"
+    assert seen.fingertip_force is not None  # the presets' hands have them
     forces = zip(hand.pads, seen.fingertip_force.tolist(), strict=True)
     return ", ".join(f"{pad.name} {force:.1f}" for pad, force in forces if force > 0.05)
 

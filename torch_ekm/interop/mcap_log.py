@@ -31,7 +31,6 @@ def _write_trial(trajectory: Trajectory, folder: str | Path) -> Path:
         raise ParameterError("folder", str(folder), "a folder that does not exist yet")
     arrays = trajectory.arrays()
     stamps = [round(1e9 * time) for time in arrays["time"].tolist()]
-    about = {"seed": trajectory.seed, "about": trajectory.about}
     with _rosbag2.Writer(folder, version=9, storage_plugin=_rosbag2.StoragePlugin.MCAP) as writer:
 
         def topic(name: str, kind: str, rows: list[tuple[int, Any]]) -> None:
@@ -39,8 +38,8 @@ def _write_trial(trajectory: Trajectory, folder: str | Path) -> Path:
             for stamp, message in rows:
                 writer.write(connection, stamp, _TYPES.serialize_cdr(message, kind))
 
-        kind = "std_msgs/msg/String"
-        topic(_ABOUT, kind, [(min(stamps, default=0), _message(kind, data=json.dumps(about)))])
+        kind, about = "std_msgs/msg/String", json.dumps({"seed": trajectory.seed, "about": trajectory.about})
+        topic(_ABOUT, kind, [(min(stamps, default=0), _message(kind, data=about))])
         for place, array in arrays.items():
             kind, make = _of_rows(place, array)
             rows = [(stamp, make(stamp, row)) for stamp, row in zip(stamps, array, strict=False)]

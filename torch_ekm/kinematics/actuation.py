@@ -78,3 +78,7 @@ class ActuationMap(nn.Module):
         if value.dim() == 0 or value.shape[-1] != len(names):
             hint = f"in order: {', '.join(names)}"
             raise ShapeError(name, f"(*batch, {len(names)})", value.shape, hint)
+
+    def extra_repr(self) -> str:
+        free = self.null.shape[-1]
+        return f"'{self.hand.name}', actuators={self.hand.n_a}, couplings={len(self.C)}, free={free}"

@@ -145,6 +145,9 @@ class HandKinematics(nn.Module):
         moves = self.upstream[k][:, None]
         return (torch.cat([v, axis.expand_as(v)], dim=-1) * moves).mT
 
+    def extra_repr(self) -> str:
+        return f"'{self.hand.name}', links={len(self.link_names)}, joints={len(self.joint_names)}"
+
 
 def _build_chain(hand: HandDescription, dtype: torch.dtype, device: torch.device) -> Any:
     """The ``pytorch_kinematics`` chain of a hand, its world frame the hand frame.

@@ -140,6 +140,9 @@ class KinematicModel(nn.Module):
         """Let the figures learn from one motion; nothing without figures."""
         return None if self.figures is None else self.figures.learn(self.linearize(state), action, increment)
 
+    def extra_repr(self) -> str:
+        return f"hand={self.hand.name}, n_q={self.hand.n_q}, n_a={self.hand.n_a}"
+
     def forward(
         self, state: GraspState, delta_a: Float[Tensor, "*batch n_a"], contacts: ContactSet | None = None
     ) -> Float[Tensor, "*batch n_s"]:

@@ -15,8 +15,6 @@ from ..typing import Array
 from .scene import Scene, shape_mesh
 from .visuals import Mesh
 
-_FRAME = 0.25  # [s]
-
 
 def save_animation(scene: Scene, path: Path) -> Path:
     """Write the frames as one stand-alone HTML page that can be turned and zoomed.
@@ -34,7 +32,7 @@ def save_animation(scene: Scene, path: Path) -> Path:
             nodes = _draw(server, scene)
             for frame in scene.transforms:
                 _place(server, nodes, frame)
-                serializer.insert_sleep(_FRAME)
+                serializer.insert_sleep(0.25)  # [s] for each frame
             page = serializer.as_html()
         finally:
             server.stop()
@@ -50,8 +48,7 @@ def _draw(server: Any, scene: Scene) -> list[Any]:
         mesh, flat = shape_mesh(shape), isinstance(shape, Mesh) or shape.kind == "box"
         vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
         look = {"color": tuple(int(255 * c) for c in colour), "opacity": scene.opacity(i)}
-        node = server.scene.add_mesh_simple(f"/shape_{i}", vertices, faces, flat_shading=flat, **look)
-        nodes.append(node)
+        nodes.append(server.scene.add_mesh_simple(f"/shape_{i}", vertices, faces, flat_shading=flat, **look))
     position, focus, up = scene.camera
     server.initial_camera.position = tuple(position)
     server.initial_camera.look_at = tuple(focus)

@@ -93,6 +93,9 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         for buffer in self.buffers(recurse=False):
             buffer.zero_()
 
+    def new_sequence(self) -> None:
+        """The next sample does not follow on the last one: nothing that was carried over holds."""
+
     @abstractmethod
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         """Take in one checked sample per model; models outside ``mask`` must not change.
@@ -219,8 +222,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
     def _cast(self, x: Tensor, name: str = "x") -> Tensor:
         try:
             if not (isinstance(x, Tensor) and x.is_complex()):
-                x = torch.as_tensor(x, dtype=self._kept, device=self._like.device)
-                return x.clone() if x.is_inference() and not torch.is_inference_mode_enabled() else x
+                return recordable(torch.as_tensor(x, dtype=self._kept, device=self._like.device))
         except (TypeError, ValueError) as error:
             raise ParameterError(name, x, f"real numbers ({error})") from None
         raise ParameterError(name, x.dtype, "of real numbers")
@@ -318,6 +320,12 @@ class SingleLearner(ResidualLearner):
         if mask is not None and not bool(mask):
             return UpdateReport.of_nothing(mask, self.dtype)
         return self.absorb(x, y, None)
+
+
+def recordable(x: Any) -> Any:
+    """A tensor of inference mode as one that autograd takes, outside of that mode; all else as it is."""
+    of_inference = isinstance(x, Tensor) and x.is_inference() and not torch.is_inference_mode_enabled()
+    return x.clone() if of_inference else x
 
 
 def value_and_jacobian(

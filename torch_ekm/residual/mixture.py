@@ -13,7 +13,6 @@ from torch.distributions import Distribution, Normal
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import ResidualLearner
-from .last_residual import LastResidual
 from .report import MomentsWithJacobians, UpdateReport
 from .tails import MEMORY, ScaleMixture
 
@@ -221,8 +220,7 @@ class MixtureResidual(ResidualLearner):
         self.trend.zero_()
         self.level.mul_(self._experts[2] <= _SLOW)
         for learner in self.members:
-            if isinstance(learner, LastResidual):
-                learner.new_sequence()
+            learner.new_sequence()
         self._settle()
 
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
@@ -261,11 +259,10 @@ class MixtureResidual(ResidualLearner):
         self.tails.observe(z, (self.count - _YOUNG).clamp_min(0.0), judged)
         self.count += 1.0 if mask is None else mask.to(self.count.dtype)
         reports = [learner.update(x, y, mask) for learner in self.members]
-        self._settle()
-        part = self.weights.mean(-2)  # of each learner, over the outputs
+        part = (self._settle() @ self.owner).mean(-2)  # of each learner, over the outputs
         novelty, weight = (
-            (part * torch.stack([getattr(one, name) for one in reports], dim=-1).to(part)).sum(-1)
-            for name in ("novelty", "weight")
+            (part * torch.stack(each, dim=-1).to(part)).sum(-1)
+            for each in zip(*((one.novelty, one.weight) for one in reports), strict=True)
         )
         event = torch.stack([one.event for one in reports]).amax(0)
         return UpdateReport(event, novelty, nis, weight)
@@ -275,11 +272,12 @@ class MixtureResidual(ResidualLearner):
     def _means(self, means: Float[Tensor, "*any out learners"]) -> Float[Tensor, "*any out experts"]:
         return self.shares * (means @ self.owner.mT) + self.carried
 
-    def _settle(self) -> None:
-        """Gain and offset from the weights."""
+    def _settle(self) -> Float[Tensor, "*batch out experts"]:
+        """Gain and offset from the beliefs, and these."""
         p = self.beliefs
         self.gain.copy_((p * self.shares) @ self.owner)
         self.offset.copy_((p * self.carried).sum(-1))
+        return p
 
     def _standard(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean, the deviation by which innovations are standardised (the learners' own), their means."""

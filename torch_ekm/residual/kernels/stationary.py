@@ -100,6 +100,9 @@ class StationaryKernel(Kernel):
     def shift_invariant(self, in_features: int) -> list[bool]:
         return [True] * in_features
 
+    def extra_repr(self) -> str:
+        return f"in_features={self.log_lengthscale.shape[-1]}"
+
 
 class SquaredExponential(StationaryKernel):
     """``k = v exp(-1/2 |x - z|^2_L)``."""
