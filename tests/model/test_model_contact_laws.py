@@ -131,7 +131,7 @@ def cone_program(p: StepProblem, sweeps: int = 400) -> np.ndarray:
         )
         new = np.array(solver.solve().x)
         slide = np.linalg.norm(p.slides(new, p.t_before), axis=1)
-        if np.abs(new - z).max() < 1e-9:
+        if np.abs(new - z).max() < 5e-8:  # interior points do not settle further on every processor
             return new
         z = new
     pytest.fail("the sweeps do not settle")
