@@ -215,6 +215,9 @@ def test_the_pace_grows_where_the_model_is_right_and_shrinks_where_it_is_not() -
     for _ in range(50):
         pace.judge(0.0)
     assert pace.factor == trust.largest
+    error = torch.tensor([0.5], dtype=torch.float64)  # forces that nobody feels drift: no step beyond pace 1
+    assert float(pace.ask(error)[0]) == pytest.approx(trust.largest * pace.options.limiting.step)
+    assert float(pace.ask(error, measures=False)[0]) == pytest.approx(pace.options.limiting.step)
     other = Pace()
     other.load_state_dict(pace.state_dict())
     assert other.factor == trust.largest

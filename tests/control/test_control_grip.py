@@ -89,16 +89,16 @@ def test_model_stands_in_where_no_pad_measures(situation) -> None:
     assert GripForceTask().rows(lost, at) is NormalForceLimit().rows(lost, at) is None
 
 
-def test_upper_limit_holds_whatever_the_pads_say(situation) -> None:
+def test_pads_loosen_what_is_too_much_and_an_estimate_only_stops_the_squeezing(situation) -> None:
     _, model, at, _ = situation
     f_n, n = model.kinematic.forces.normal.numpy(), model.kinematic.contacts.n_c
-    for reading in (None, torch.full((len(at.hand.pads),), 0.5)):
+    for reading, most in ((None, -0.2), (torch.full((len(at.hand.pads),), 0.5), 0.0)):
         seen = dataclasses.replace(at, fingertip_force=reading)
         rows = NormalForceLimit(maximum=f_n.max() - 0.2).rows(model, seen)
         S, h = model.kinematic.normal_force_sensitivity.numpy(), np.asarray(rows.h)
         np.testing.assert_allclose(rows.C, np.concatenate([-S, S]))
         thumb = f_n.argmax()
-        assert h[n + thumb] == pytest.approx(-0.2)
+        assert h[n + thumb] == pytest.approx(most)
         assert -h[thumb] <= h[n + thumb]  # the lower limit gives way
     strict = NormalForceLimit(maximum=1.0).rows(model, at)
     assert strict.h[n:].min() == -0.7  # no more than a step at a time

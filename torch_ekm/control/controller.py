@@ -185,7 +185,7 @@ class LookAndMoveController:
             return self._none(StopReason.OBJECT_LOST if lost else StopReason.UNSTABLE_GRASP, failure, focused)
 
         travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
-        desired, share = self.pace.ask(focused, travel)
+        desired, share = self.pace.ask(focused, travel, fingertip_force is not None)
         alone = None if fingertip_force is None else self._joint_force(lin)
         seen = Situation(
             hand, self.focus, state, a, fingertip_force, error, desired, alone, self._weight, self.tighter

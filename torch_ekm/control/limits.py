@@ -89,9 +89,10 @@ class NormalForceLimit:
     f*_i is what :class:`GripForceTask` wants of the finger, which follows from load and friction: no finger
     fades.
 
-    For the upper limit the largest of measured and estimated force counts, with the estimate of joints and
-    springs alone where it contradicts the pads: sensors that read too little must not make the hand squeeze.
-    Where both limits contradict each other, the upper one holds.
+    A finger that measures more than ``maximum`` is loosened. Where only the model's estimate is above it, or
+    that of joints and springs alone where it contradicts the pads, the finger is pressed no harder: sensors
+    that read too little must not make the hand squeeze, and springs that are not as described must not make
+    it let go. Where both limits contradict each other, the upper one holds.
 
     Raises:
         ParameterError: ``maximum`` is not above ``minimum``.
@@ -116,7 +117,8 @@ class NormalForceLimit:
             return None
         most = np.maximum(f_n, as_array(forces.normal)) if forces.solved else f_n
         most = most if seen.joint_force is None else np.maximum(most, as_array(seen.joint_force))
-        high = np.maximum(self.maximum - most, -self.step) - seen.drift
+        high = np.maximum(self.maximum - f_n, -self.step)
+        high = np.minimum(high, np.maximum(self.maximum - most, 0.0)) - seen.drift
         low = np.minimum(self.least(f_n, seen) - f_n, self.step) - seen.drift
         low = np.minimum(low, high)
         S = as_array(model.kinematic.normal_force_sensitivity)

@@ -29,6 +29,7 @@ _ROTATION_NOISE = 0.3 * _DEG  # [rad]
 _FORCE_NOISE = 0.5  # [N]
 _FORCE_SHARE = 0.25  # of the force that a finger bears: an error that leaves it its grip
 SLIDES = 2.0  # rho of the twist alone from which the object is thought to slide
+_UNFELT = 1.0  # largest p where no pad measures: forces that nobody sees drift with the way that is made
 _USED = 0.7  # a motion below this share of what was allowed says nothing for a larger one
 
 
@@ -252,16 +253,23 @@ class Pace(nn.Module):
         """p."""
         return float(self.value)
 
-    def ask(self, error: Float[Tensor, " n_x"], travel: float = 0.0) -> tuple[Float[Tensor, " n_x"], float]:
+    def felt(self, measures: bool) -> float:
+        """p of a step: at most 1 where no pad measures."""
+        return self.factor if measures else min(self.factor, _UNFELT)
+
+    def ask(
+        self, error: Float[Tensor, " n_x"], travel: float = 0.0, measures: bool = True
+    ) -> tuple[Float[Tensor, " n_x"], float]:
         """dx_d, and which share of the largest step at this pace it is.
 
         Args:
             error: e, focused error [unit of the focus].
             travel: ``|v(e)|``, see :func:`contact_travel` [m].
+            measures: some pad does.
         """
-        limiting = self.options.limiting
-        share = min(limiting.gain * limiting.steps(error, travel) / self.factor, 1.0)
-        return limiting(error, travel, self.factor), share
+        limiting, pace = self.options.limiting, self.felt(measures)
+        share = min(limiting.gain * limiting.steps(error, travel) / pace, 1.0)
+        return limiting(error, travel, pace), share
 
     def cut(
         self,
@@ -277,7 +285,7 @@ class Pace(nn.Module):
             predicted: increment that the corrected model predicts for ``delta_a``.
             share: of the largest step that was asked for.
         """
-        bound, asked = self.options.bound, share * self.factor
+        bound, asked = self.options.bound, share * self.felt(seen.fingertip_force is not None)
         phi = bound.share(lin, delta_a, predicted, seen, asked)
         return max(phi, min(1.0, bound.least / max(asked, 1e-9)))
 
