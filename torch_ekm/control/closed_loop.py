@@ -187,6 +187,7 @@ class ClosedLoop:
         progress = Progress(self.safety, target, self.controller.focus, seen, started)
         progress.halt = first.halt
         known = self.controller.enhanced is not None and int(self.knowledge.figures.count) >= _KNOWN
+        self.controller.pace.begin(known)
         if self.decline and known and progress.halt is None and seen.status is not PlantStatus.LOST:
             against = out_of_reach(self._rehearsal, self.controller, seen, target)
             if against:

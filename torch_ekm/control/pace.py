@@ -30,6 +30,7 @@ _FORCE_NOISE = 0.5  # [N]
 _FORCE_SHARE = 0.25  # of the force that a finger bears: an error that leaves it its grip
 SLIDES = 2.0  # rho of the twist alone from which the object is thought to slide
 _UNFELT = 1.0  # largest p where no pad measures: forces that nobody sees drift with the way that is made
+_KNOWN = 1.4  # p with an object that is new to a hand whose figures are known
 _USED = 0.7  # a motion below this share of what was allowed says nothing for a larger one
 
 
@@ -247,11 +248,17 @@ class Pace(nn.Module):
         self.adapts = adapts
         start = self.options.trust.start if adapts else 1.0
         self.value = nn.Buffer(torch.tensor(start, dtype=torch.float64))
+        self.count = nn.Buffer(torch.tensor(0))  # motions that were judged
 
     @property
     def factor(self) -> float:
         """p."""
         return float(self.value)
+
+    def begin(self, known: bool) -> None:
+        """A manipulation begins; known: by a hand whose figures are."""
+        if self.adapts and known and not int(self.count):
+            self.value.fill_(max(self.options.trust.start, _KNOWN))
 
     def felt(self, measures: bool) -> float:
         """p of a step: at most 1 where no pad measures."""
@@ -299,6 +306,7 @@ class Pace(nn.Module):
         trust = self.options.trust
         if not self.adapts:
             return
+        self.count += 1
         if disagreement > _DISAGREE:
             least = min(self.factor, trust.smallest)
             self.value.mul_(_SHRINK).clamp_(min=least)
