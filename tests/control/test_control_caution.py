@@ -220,7 +220,13 @@ def test_the_pace_grows_where_the_model_is_right_and_shrinks_where_it_is_not() -
     assert float(pace.ask(error, measures=False)[0]) == pytest.approx(pace.options.limiting.step)
     other = Pace()
     other.load_state_dict(pace.state_dict())
+    other.begin(known=True)  # not new
     assert other.factor == trust.largest
+    other = Pace()
+    other.begin(known=False)
+    assert other.factor == trust.start
+    other.begin(known=True)
+    assert other.factor == 1.4
     pace.restart()
     assert pace.factor == trust.smallest / 2
     pace.judge(9.0)

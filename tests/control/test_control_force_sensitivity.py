@@ -98,15 +98,13 @@ def test_bad_input_changes_nothing_and_the_state_dict_carries_all(unchecked) -> 
     assert torch.equal(other.correction, learner.correction)
 
 
-def test_a_correction_counts_less_where_the_pads_are_noisy() -> None:
-    true, described = torch.tensor([[5.0, -3.0, 2.0]], dtype=F64), torch.zeros(1, 3, dtype=F64)
-    quiet, noisy = (taught(true, described, moves(80), noise=noise) for noise in (0.05, 0.8))
-    used = [learner.corrected(described, [0]) for learner in (quiet, noisy)]
-    torch.testing.assert_close(used[0], quiet.correction)
+def test_what_is_not_explained_is_measured() -> None:
+    true, described = torch.tensor([[5.0, -3.0, 2.0]], dtype=F64), torch.full((1, 3), 2.0, dtype=F64)
+    noisy = taught(true, described, moves(80), noise=0.8)
     assert float(noisy.variance.sqrt()) == pytest.approx(0.8, rel=0.4)
-    share = float((used[1] / noisy.correction).mean())
-    assert share == pytest.approx((0.3**2 / float(noisy.variance)) ** 2)
-    assert share < 0.2
+    torch.testing.assert_close(
+        noisy.corrected(described, [0]), noisy.scale[:, None] * described + noisy.correction
+    )
 
 
 def test_a_pad_that_joins_later_learns_as_fast_as_the_first() -> None:

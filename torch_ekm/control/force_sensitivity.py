@@ -13,7 +13,6 @@ from ..typing import Float, Tensor
 
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
 _NOISE_STD = 0.25  # [N] of a change of force that c and B do not explain, at least
-_TRUSTED_STD = 0.3  # [N] of what they do not explain; they count less above it
 _FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
 _RECENT = 0.1  # weight of the last motion in the variance of r
 _KEPT, _TAKEN = 0.5, 0.3  # of the drift before, of the last motion
@@ -62,17 +61,14 @@ class ForceSensitivity(Recorded, nn.Module):
         return _PRIOR_STD * self.theta[:, 1:]
 
     def corrected(self, described: Float[Tensor, "n_c n_a"], pads: Sequence[int]) -> Float[Tensor, "n_c n_a"]:
-        """``S + k ((c - 1) S + B)``, ``k = min(1, (0.3 N / s)^4)`` [N/rad]: small motions that follow the
-        noise of a pad look as if its force did not answer.
+        """``c S + B`` [N/rad].
 
         Args:
             described: S of the pads in contact [N/rad].
             pads: which of the hand's they are.
         """
         at = list(pads)
-        trust = (_TRUSTED_STD**4 / self.variance[at].square()).clamp(max=1.0)[:, None]
-        change = self.theta[at, :1] * described + self.correction[at]
-        return described + trust * change
+        return self.scale[at, None] * described + self.correction[at]
 
     def begin(self) -> None:
         """A new grasp: nothing drifts yet."""
