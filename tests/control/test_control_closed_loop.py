@@ -23,7 +23,7 @@ from torch_ekm.control import StopReason as Reason
 from torch_ekm.control.qp import ControlProblem
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.exceptions import NonFiniteError, ParameterError, SolverError
+from torch_ekm.exceptions import NonFiniteError, SolverError
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, Plant, PlantStatus
@@ -338,18 +338,6 @@ def test_another_thread_stops_it_after_the_motion_under_way(held) -> None:
     assert done.reason is Reason.STOPPED
     assert len(done.steps) <= 2
     assert loop.run(PoseTarget.turned(seen.state, axis, degrees=80)).reason is Reason.STALLED  # and again
-
-
-def test_a_time_out_is_a_reason_of_its_own(held) -> None:
-    seen, axis, controller = held
-    rule = dataclasses.replace(RULE, max_seconds=1e-9)
-    done = ClosedLoop(Noted(seen), controller, safety=Safety(rule=rule)).run(
-        PoseTarget.turned(seen.state, axis, degrees=80)
-    )
-    assert done.reason is Reason.TIME_OUT
-    assert not done.steps
-    with pytest.raises(ParameterError, match="max_seconds"):
-        dataclasses.replace(RULE, max_seconds=0)
 
 
 class Overshooting(HoldingPlant):

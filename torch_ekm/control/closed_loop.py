@@ -175,7 +175,6 @@ class ClosedLoop:
             raise
 
     def _motions(self, target: PoseTarget) -> Generator[Step, None, Stop]:
-        started = time.monotonic()
         safety, tolerance = self.safety, self.safety.rule.tolerance
         watch = Watch(safety.guards, self.controller.kinematic, self._expect, tolerance)
         first = watch.first(self.plant.observe(), self.plant.observe)
@@ -184,7 +183,7 @@ class ClosedLoop:
         self.knowledge.forces.begin()
         self._figures.begin(seen.a)
         self.controller.forces = None if self.controller.enhanced is None else self.knowledge.forces
-        progress = Progress(self.safety, target, self.controller.focus, seen, started)
+        progress = Progress(self.safety, target, self.controller.focus, seen)
         progress.halt = first.halt
         known = self.controller.enhanced is not None and int(self.knowledge.figures.count) >= _KNOWN
         self.controller.pace.begin(known)

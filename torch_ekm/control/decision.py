@@ -28,7 +28,6 @@ class StopReason(Enum):
     OUT_OF_REACH = "out of reach"
     """Declined before anything moved, see ``decline`` of :class:`~torch_ekm.control.ClosedLoop`."""
     OBJECT_LOST = "object lost"
-    TIME_OUT = "time-out"
     STOPPED = "stopped"
     """By :meth:`ClosedLoop.stop`, or by Ctrl-C."""
     PLANT_FAILED = "plant failed"

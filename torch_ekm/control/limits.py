@@ -89,10 +89,10 @@ class NormalForceLimit:
     f*_i is what :class:`GripForceTask` wants of the finger, which follows from load and friction: no finger
     fades.
 
-    A finger that measures more than ``maximum`` is loosened. Where only the model's estimate is above it, or
-    that of joints and springs alone where it contradicts the pads, the finger is pressed no harder: sensors
-    that read too little must not make the hand squeeze, and springs that are not as described must not make
-    it let go. Where both limits contradict each other, the upper one holds.
+    A finger that measures more than ``maximum`` is loosened. One that only the model's estimate puts above
+    it, or joints and springs where they contradict the pads, is pressed no harder: pads that read too little
+    must not make the hand squeeze, nor springs that are not as described make it let go. Where both limits
+    contradict each other, the upper one holds.
 
     Raises:
         ParameterError: ``maximum`` is not above ``minimum``.

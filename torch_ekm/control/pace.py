@@ -246,8 +246,7 @@ class Pace(nn.Module):
         super().__init__()
         self.options = PaceOptions() if options is None else options
         self.adapts = adapts
-        start = self.options.trust.start if adapts else 1.0
-        self.value = nn.Buffer(torch.tensor(start, dtype=torch.float64))
+        self.value = nn.Buffer(torch.tensor(self.options.trust.start if adapts else 1.0, dtype=torch.float64))
         self.count = nn.Buffer(torch.tensor(0))  # motions that were judged
 
     @property
@@ -260,10 +259,6 @@ class Pace(nn.Module):
         if self.adapts and known and not int(self.count):
             self.value.fill_(max(self.options.trust.start, _KNOWN))
 
-    def felt(self, measures: bool) -> float:
-        """p of a step: at most 1 where no pad measures."""
-        return self.factor if measures else min(self.factor, _UNFELT)
-
     def ask(
         self, error: Float[Tensor, " n_x"], travel: float = 0.0, measures: bool = True
     ) -> tuple[Float[Tensor, " n_x"], float]:
@@ -272,9 +267,9 @@ class Pace(nn.Module):
         Args:
             error: e, focused error [unit of the focus].
             travel: ``|v(e)|``, see :func:`contact_travel` [m].
-            measures: some pad does.
+            measures: some pad does; else p counts as at most 1.
         """
-        limiting, pace = self.options.limiting, self.felt(measures)
+        limiting, pace = self.options.limiting, min(self.factor, math.inf if measures else _UNFELT)
         share = min(limiting.gain * limiting.steps(error, travel) / pace, 1.0)
         return limiting(error, travel, pace), share
 
@@ -292,7 +287,8 @@ class Pace(nn.Module):
             predicted: increment that the corrected model predicts for ``delta_a``.
             share: of the largest step that was asked for.
         """
-        bound, asked = self.options.bound, share * self.felt(seen.fingertip_force is not None)
+        measures = seen.fingertip_force is not None
+        bound, asked = self.options.bound, share * min(self.factor, math.inf if measures else _UNFELT)
         phi = bound.share(lin, delta_a, predicted, seen, asked)
         return max(phi, min(1.0, bound.least / max(asked, 1e-9)))
 

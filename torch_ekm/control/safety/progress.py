@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 
 from ...model import ModelStatus
 from ...plant import Observation, PlantStatus
@@ -13,7 +12,6 @@ from ..focus import FocusedPose, PoseTarget
 from .safety import Objection, Safety
 
 _LEAP = math.radians(4)  # of a pose beyond what was predicted, where nothing else has changed: worth a word
-
 _STRAYED = 2.0  # tolerances of the error by which a turn that stalls has left its best state
 
 
@@ -24,7 +22,6 @@ class Progress:
         safety: figures.
         target, focus: what is to be reached.
         seen: the first reading.
-        started: of a monotonic clock [s].
     """
 
     halt: Objection | None = None
@@ -36,16 +33,14 @@ class Progress:
     alarms = 0
     """How often a sign of a loss was heeded."""
 
-    def __init__(
-        self, safety: Safety, target: PoseTarget, focus: FocusedPose, seen: Observation, started: float
-    ) -> None:
+    def __init__(self, safety: Safety, target: PoseTarget, focus: FocusedPose, seen: Observation) -> None:
         self.safety, self.target, self.focus = safety, target, focus
         self.errors = [focus.error(target, seen.state)]
         """|e| before each motion and after the last [unit of the focus]."""
         self.way: list[Tensor] = []
         """What the encoders did [rad], motion by motion, without what was undone."""
         self._best = self.errors[0], 0  # the smallest of them, and the motions until then
-        self._start, self._started = seen.state, started
+        self._start = seen.state
         self._off_allowed = safety.caution.off_rotation
         # links without a pad that bear on the object at the start
         self._bearing: set[str] | None = None
@@ -64,8 +59,6 @@ class Progress:
             return Objection(StopReason.OBJECT_LOST, "dislocated off the focused axis")
         if stopped:
             return Objection(StopReason.STOPPED)
-        if time.monotonic() - self._started > self.safety.rule.max_seconds:
-            return Objection(StopReason.TIME_OUT)
         reason = self.safety.rule.judge(self.errors, self.limited)
         if reason is StopReason.RUNNING:
             return None

@@ -34,7 +34,7 @@ class StoppingRule:
     * stalled: within the last ``stall_window`` steps the smallest ``|e|`` fell by less than
       ``stall_progress``;
     * actuator limits: as stalled, while some actuator that matters stood at its limit;
-    * step limit: ``max_steps`` commands were given; time-out: ``max_seconds`` are over;
+    * step limit: ``max_steps`` commands were given;
     * object lost: the plant says so, or the object turned off the focus by more than
       ``off_limit`` [rad]: it is dislocated, and no small step brings it back.
     """
@@ -47,11 +47,9 @@ class StoppingRule:
     """[same unit]"""
     max_steps: int = 60
     off_limit: float = 30 * _DEG
-    max_seconds: float = math.inf
-    """From the first observation on; a motion under way is finished [s]."""
 
     def __post_init__(self) -> None:
-        for name in ("tolerance", "settle_steps", "stall_window", "max_steps", "off_limit", "max_seconds"):
+        for name in ("tolerance", "settle_steps", "stall_window", "max_steps", "off_limit"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
 
@@ -192,7 +190,7 @@ class Safety:
     """
 
     rule: StoppingRule = StoppingRule()
-    """Reached, stalled, step limit, actuator limits, time-out, object lost."""
+    """Reached, stalled, step limit, actuator limits, object lost."""
     caution: Caution = Caution()
     """Given up."""
     guards: Guards = Guards()
