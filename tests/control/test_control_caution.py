@@ -220,13 +220,12 @@ def test_the_pace_grows_where_the_model_is_right_and_shrinks_where_it_is_not() -
     assert float(pace.ask(error, measures=False)[0]) == pytest.approx(pace.options.limiting.step)
     other = Pace()
     other.load_state_dict(pace.state_dict())
-    other.begin(known=True)  # not new
+    other.begin(1.0)  # not new
     assert other.factor == trust.largest
-    other = Pace()
-    other.begin(known=False)
-    assert other.factor == trust.start
-    other.begin(known=True)
-    assert other.factor == 1.4
+    for last, first in ((0.0, trust.start), (0.5, trust.start), (1.2, 1.2), (trust.largest, 1.4)):
+        other = Pace()
+        other.begin(last)
+        assert other.factor == first
     pace.restart()
     assert pace.factor == trust.smallest / 2
     pace.judge(9.0)

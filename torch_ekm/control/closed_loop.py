@@ -186,7 +186,7 @@ class ClosedLoop:
         progress = Progress(self.safety, target, self.controller.focus, seen)
         progress.halt = first.halt
         known = self.controller.enhanced is not None and int(self.knowledge.figures.count) >= _KNOWN
-        self.controller.pace.begin(known)
+        self.controller.pace.begin(float(self.knowledge.pace) if known else 0.0)
         if self.decline and known and progress.halt is None and seen.status is not PlantStatus.LOST:
             against = out_of_reach(self._rehearsal, self.controller, seen, target)
             if against:
@@ -357,6 +357,7 @@ class ClosedLoop:
             self._learn_forces(lin, expected.moved, felt)
         rho = math.inf if fades else self._disagreement(lin, ds, expected, felt)
         self.controller.pace.judge(rho, decision.share)
+        self.knowledge.pace.copy_(self.controller.pace.value)
         self._figures.learn(lin, moved, ds)
         pull = self._figures.pulled(moved)
         nominal = self.controller.kinematic.followed(lin).step(pull)  # g learns what they leave

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+import torch
 from torch import nn
 
 from .._recorded import Recorded, describe
@@ -18,7 +19,7 @@ from .force_sensitivity import ForceSensitivity
 
 class HandKnowledge(Recorded, nn.Module):
     """What a closed loop has learned of its hand, whatever it holds: dead zones and biases of the servos, how
-    the forces of the fingers answer to them, and the figures by which it moves an object.
+    the forces of the fingers answer to them, the figures by which it moves an object, and its last pace.
 
     Hand it to the next loop with the same hand, and keep it between sessions::
 
@@ -41,6 +42,7 @@ class HandKnowledge(Recorded, nn.Module):
     ) -> None:
         super().__init__()
         self.servo, self.forces, self.figures = servo, forces, figures
+        self.pace = nn.Buffer(torch.tensor(0.0, dtype=torch.float64))  # of the last motion
 
     @classmethod
     def of(cls, hand: HandDescription, *, learns: bool = True, adapts: bool = True) -> HandKnowledge:

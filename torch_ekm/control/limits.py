@@ -117,12 +117,10 @@ class NormalForceLimit:
             return None
         most = np.maximum(f_n, as_array(forces.normal)) if forces.solved else f_n
         most = most if seen.joint_force is None else np.maximum(most, as_array(seen.joint_force))
-        high = np.maximum(self.maximum - f_n, -self.step)
-        high = np.minimum(high, np.maximum(self.maximum - most, 0.0)) - seen.drift
-        low = np.minimum(self.least(f_n, seen) - f_n, self.step) - seen.drift
-        low = np.minimum(low, high)
+        high = np.minimum(np.maximum(self.maximum - f_n, -self.step), np.maximum(self.maximum - most, 0.0))
+        low = np.minimum(np.minimum(self.least(f_n, seen) - f_n, self.step), high)
         S = as_array(model.kinematic.normal_force_sensitivity)
-        return Inequality(np.concatenate([-S, S]), np.concatenate([-low, high]))
+        return Inequality(np.concatenate([-S, S]), np.concatenate([seen.drift - low, high - seen.drift]))
 
     def least(self, f_n: Array, seen: Situation) -> Array:
         """least_i of each contact ``(n_c,)`` [N]."""

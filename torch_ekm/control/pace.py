@@ -30,7 +30,7 @@ _FORCE_NOISE = 0.5  # [N]
 _FORCE_SHARE = 0.25  # of the force that a finger bears: an error that leaves it its grip
 SLIDES = 2.0  # rho of the twist alone from which the object is thought to slide
 _UNFELT = 1.0  # largest p where no pad measures: forces that nobody sees drift with the way that is made
-_KNOWN = 1.4  # p with an object that is new to a hand whose figures are known
+_KNOWN = 1.4  # largest p with an object that is new to a hand whose figures are known
 _USED = 0.7  # a motion below this share of what was allowed says nothing for a larger one
 
 
@@ -194,8 +194,7 @@ class TrustRegion:
 
     def __post_init__(self) -> None:
         if not 0 < self.smallest <= self.start <= self.largest:
-            valid = f"between smallest and largest, {self.smallest:g} to {self.largest:g}"
-            raise ParameterError("start", self.start, valid)
+            raise ParameterError("start", self.start, f"between {self.smallest:g} and {self.largest:g}")
 
     def disagreement(
         self,
@@ -254,10 +253,10 @@ class Pace(nn.Module):
         """p."""
         return float(self.value)
 
-    def begin(self, known: bool) -> None:
-        """A manipulation begins; known: by a hand whose figures are."""
-        if self.adapts and known and not int(self.count):
-            self.value.fill_(max(self.options.trust.start, _KNOWN))
+    def begin(self, last: float) -> None:
+        """A manipulation begins; last: p of the last motion of a hand whose figures are known, or 0."""
+        if self.adapts and not int(self.count):
+            self.value.clamp_(min=min(last, _KNOWN))
 
     def ask(
         self, error: Float[Tensor, " n_x"], travel: float = 0.0, measures: bool = True
