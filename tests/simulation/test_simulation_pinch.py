@@ -135,3 +135,21 @@ def test_a_pinch_across_another_axis_is_not_passed_off_as_the_wanted_one(tmp_pat
     problem = pinch_problem(hand, load_object(slab), PlantConfig(), PlantParameters())
     plan = plan_pinch(problem, PinchRequest())
     assert abs(plan.normals[0] @ plan.rotation[:, 2]) > 0.95
+
+
+def test_a_descent_in_which_lapack_fails_is_not_the_last(monkeypatch):
+    import scipy.optimize
+
+    calls, descend = [], scipy.optimize.least_squares
+
+    def fails_once(*args, **options):
+        calls.append(args)
+        if len(calls) == 1:
+            raise np.linalg.LinAlgError("SVD did not converge")
+        return descend(*args, **options)
+
+    monkeypatch.setattr(scipy.optimize, "least_squares", fails_once)
+    problem = pinch_problem(load_hand("icub_right"), load_object("box"), PlantConfig(), PlantParameters())
+    plan = plan_pinch(problem, PinchRequest())
+    assert len(calls) > 1
+    assert len(plan.pads) == 3
