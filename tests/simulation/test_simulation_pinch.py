@@ -137,7 +137,7 @@ def test_a_pinch_across_another_axis_is_not_passed_off_as_the_wanted_one(tmp_pat
     assert abs(plan.normals[0] @ plan.rotation[:, 2]) > 0.95
 
 
-def test_a_descent_in_which_lapack_fails_is_not_the_last(monkeypatch):
+def test_a_descent_in_which_lapack_fails_begins_again(monkeypatch):
     import scipy.optimize
 
     calls, descend = [], scipy.optimize.least_squares

@@ -60,8 +60,7 @@ class HandKnowledge(Recorded, nn.Module):
         """That it is of this hand.
 
         Raises:
-            ParameterError: the actuators have other names, there are more or fewer pads, or the description
-                has other figures.
+            ParameterError: actuators, pads or figures of its description are others.
         """
         if tuple(self.servo.names) != tuple(hand.actuator_names):
             names = ", ".join(self.servo.names)

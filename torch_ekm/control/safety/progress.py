@@ -42,8 +42,7 @@ class Progress:
         self._best = self.errors[0], 0  # the smallest of them, and the motions until then
         self._start = seen.state
         self._off_allowed = safety.caution.off_rotation
-        # links without a pad that bear on the object at the start
-        self._bearing: set[str] | None = None
+        self._bearing: set[str] | None = None  # links without a pad that bear on the object at the start
 
     def over(self, seen: Observation, stopped: bool) -> Objection | None:
         """Why the manipulation ends before the next decision; None: it goes on.

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,19 +116,23 @@ def _solve(problem: PinchProblem, request: PinchRequest) -> _Solution:
 
 def _descend(problem: PinchProblem, request: PinchRequest, guess: Array, ranges: bool) -> _Solution:
     low, high = problem.bounds()
-    x, cost = np.clip(guess, low + 1e-9, high - 1e-9), np.inf
-    with contextlib.suppress(np.linalg.LinAlgError):  # LAPACK's SVD does not converge on every processor
-        found = require("scipy.optimize").least_squares(
+
+    def descend(start: Array) -> Any:
+        return require("scipy.optimize").least_squares(
             lambda x: problem.residuals(x[None], request, ranges)[0],
-            x,
+            np.clip(start, low + 1e-9, high - 1e-9),
             jac=lambda x: problem.jacobian(x, request, ranges),
             bounds=(low, high),
             **{"x_scale": "jac", "max_nfev": 150, "ftol": 1e-9, "xtol": 1e-9, "gtol": 1e-9},
         )
-        x, cost = found.x, found.cost
-    g = problem.geometry(x[None])
+
+    try:
+        found = descend(guess)
+    except np.linalg.LinAlgError:  # LAPACK's SVD does not converge on every processor: by another way
+        found = descend(0.999 * guess)
+    g = problem.geometry(found.x[None])
     violation = float(np.abs(problem.equations(request, g)[0]).max())
-    return _Solution(x, violation, float(problem.outside(g).max(initial=-np.inf)), cost)
+    return _Solution(found.x, violation, float(problem.outside(g).max(initial=-np.inf)), found.cost)
 
 
 def pinch_hint(problem: PinchProblem) -> str:
