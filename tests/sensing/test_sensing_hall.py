@@ -208,6 +208,9 @@ def test_pinned_readings_leave_the_right_end_open(rising):
     assert float(closed.q) == pytest.approx(1.5 - 0.121 / 2, abs=0.01)
     assert float(opened.std) == pytest.approx(0.145 / 12**0.5, abs=0.005)
     assert not bool(opened.valid.any() | closed.valid.any())
+    assert opened.within.flatten().tolist() == pytest.approx([0.0, 0.145], abs=0.01)
+    assert closed.within.flatten().tolist() == pytest.approx([1.5 - 0.121, 1.5], abs=0.01)
+    assert bool(calibration.estimate(torch.tensor([120.0])).within.isinf().all())
 
 
 def test_a_curve_that_turns_back_is_refused():
@@ -300,6 +303,23 @@ def test_encoders_stand_in_for_a_stuck_channel(hand, generator, monkeypatch):
     k = hand.joint_names.index("index_2")
     assert float((estimate.q - q)[:, k].square().mean().sqrt()) < 1.2 * DEG
     assert float(estimate.std[:, k].mean()) < 1.2 * DEG
+
+
+def test_a_saturated_channel_holds_what_cables_get_wrong(hand, generator):
+    sensors = HallSensors(hand, seed=1)
+    calibration = calibrated(sensors)
+    k = hand.joint_names.index("middle_2")
+    channel = calibration.joints.index("middle_2")
+    q = random_posture(hand, 1, generator)
+    q[:, k] = 0.0
+    counts = sensors.read(q, generator)
+    counts[:, channel] = 255.0  # the joint is open
+    end = float(calibration.estimate(counts).within[1, 0, channel])
+    cable = hand.actuator_names.index("middle_distal")
+    for off in (0.0, 40.0):  # of the cable [deg]
+        a = encoders(hand, q, generator)
+        a[:, cable] += off * DEG
+        assert float(JointEstimator(hand, calibration)(counts, a).q[0, k]) <= end
 
 
 def test_estimator_refuses_what_does_not_fit(hand, generator):

@@ -130,14 +130,15 @@ class ClosedLoop:
         """
         return follow_to_the_end(self._rehearsal, self.controller, self.plant.observe(), sign, limit)
 
-    def _rehearsal(self, hand: Plant) -> ClosedLoop:
+    def _rehearsal(self, hand: Plant, target: PoseTarget) -> Generator[Step, None, Stop]:
         """On a hand that does what was learned, with a controller that knows the description alone: what it
         gets wrong stands for what no model knows of states that nobody has seen."""
         controller = copy.copy(self.controller)
         controller.pace = copy.deepcopy(controller.pace)
         known = HandKnowledge.of(controller.kinematic.hand, learns=False, adapts=False)
         controller.enhanced, controller.kinematic = None, controller.kinematic.with_figures(known.figures)
-        return ClosedLoop(hand, controller, knowledge=known, safety=self.safety, learn=False, decline=False)
+        loop = ClosedLoop(hand, controller, knowledge=known, safety=self.safety, learn=False, decline=False)
+        return loop.steps(target)
 
     def run(self, target: PoseTarget) -> Manipulation:
         """Drive the object to ``target``.

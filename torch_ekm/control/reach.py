@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
 
 import torch
 
@@ -71,14 +70,8 @@ class Reach:
         return f"{self.angle / _DEG:.1f} deg ({self.ends_by})"
 
 
-class _Loop(Protocol):
-    """What is asked of a :class:`~torch_ekm.control.ClosedLoop`."""
-
-    def steps(self, target: PoseTarget) -> Generator[Step, None, Stop]: ...
-
-
-Rehearsal = Callable[[Plant], _Loop]
-"""The loop on a hand that is not the plant; nothing that it does changes its original."""
+Rehearsal = Callable[[Plant, PoseTarget], Generator[Step, None, Stop]]
+"""Motions of a loop on a hand that is not the plant; nothing that they do changes the loop."""
 
 
 @torch.no_grad()
@@ -103,7 +96,7 @@ def follow_to_the_end(
     idle = set(hand.at_limits())
     path, angles, calm = [start.state], [0.0], None  # states before the first sign of a loss
     farthest = copy.copy(hand)
-    motions = rehearsal(hand).steps(PoseTarget.turned(start.state, about, sign * limit))
+    motions = rehearsal(hand, PoseTarget.turned(start.state, about, sign * limit))
     while True:
         try:
             step = next(motions)

@@ -97,7 +97,7 @@ class Mixture:
 
 
 def _rbf(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearner:
-    """Takes up the dead zone, too: smooth over 15 mm and 15 deg of the state and 8 deg of an actuator."""
+    """Takes up the dead zone, too: smooth over 15 cm and 4.5 rad of the state and 8 deg of an actuator."""
     lengthscale = torch.tensor([15.0] * (d - n_actions) + [4.0] * n_actions, dtype=torch.float64)
     kernel = residual.SquaredExponential(d, lengthscale=lengthscale, variance=4.0)
     return _ON_A_HAND(d, m, **{"kernel": kernel, **options})

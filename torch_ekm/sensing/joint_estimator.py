@@ -33,9 +33,10 @@ class JointEstimate(NamedTuple):
 class JointEstimator:
     r"""``min_q sum_k ((q_k - h_k) / s_k)^2 + |(J_a q + a_0 - a) / s_a|^2 + |C q / s_c|^2``.
 
-    Hall channels know single joints (and nothing where they saturate), encoders know sums of them, rigid
-    couplings know differences: together they cover joints without a channel, and those whose channel
-    is saturated or stuck. A weak prior, uniform over each joint's range, keeps the rest finite.
+    Hall channels know single joints, encoders know sums of them, rigid couplings know differences: together
+    they cover joints without a channel, and those whose channel is saturated or stuck. A saturated channel
+    still knows the range that it does not resolve: q stays within it, whatever cables say that run over
+    other pulleys than described. A weak prior, uniform over each joint's range, keeps the rest finite.
 
     Args:
         hand: joints, actuation Jacobian and couplings; ``C q = 0`` is taken to hold, not just ``C dq = 0``.
@@ -50,9 +51,8 @@ class JointEstimator:
         if unknown:
             raise JointMismatchError(hand.name, (), unknown, hand.joint_names)
         self.hand, self.calibration = hand, calibration
-        self._select = torch.zeros(calibration.n_channels, hand.n_q, dtype=torch.float64)
-        for k, joint in enumerate(calibration.joints):
-            self._select[k, hand.joint_names.index(joint)] = 1.0
+        self._joints = [hand.joint_names.index(joint) for joint in calibration.joints]
+        self._select = torch.eye(hand.n_q, dtype=torch.float64)[self._joints]
         self._J_a = torch.from_numpy(hand.actuation_jacobian.copy())
         self._offset = torch.from_numpy(hand.actuator_offset)
         C = torch.from_numpy(hand.coupling.copy())
@@ -82,4 +82,5 @@ class JointEstimator:
         right = self._middle + (weight * hall.q) @ S + encoder @ self._J_a
         factor = torch.linalg.cholesky(information)
         q = torch.cholesky_solve(right[..., None], factor)[..., 0]
+        q[..., self._joints] = q[..., self._joints].clamp(*hall.within)
         return JointEstimate(q, torch.cholesky_inverse(factor))

@@ -22,6 +22,8 @@ class HallEstimate(NamedTuple):
     """Standard deviations [rad]; of a channel that says nothing, that of a uniform spread over its sweep."""
     valid: Bool[Tensor, "*batch n_channels"]
     """False where the channel is saturated or was stuck when calibrated."""
+    within: Float[Tensor, "2 *batch n_channels"]
+    """Range that a channel leaves open which says no more than that [rad]; of others infinite."""
 
 
 class HallCalibration:
@@ -112,9 +114,11 @@ class HallCalibration:
         slope = (c[1] + r * (2 * c[2] + 3 * r * c[3])) / FULL_SCALE
         std = ((slope * self._noise) ** 2 + self._misfit**2).sqrt()
         blind = (n <= 0, n >= FULL_SCALE, self._stuck.expand_as(n))
+        within = torch.stack([torch.full_like(q, -torch.inf), torch.full_like(q, torch.inf)])
         for pinned, ends in zip(blind, self._blind, strict=True):
             q = torch.where(pinned, ends.mean(-1).expand_as(q), q)
             spread = (ends[:, 1] - ends[:, 0]).abs() / 12**0.5
             # never surer than the last reading that is not saturated
             std = torch.where(pinned, torch.maximum(std, (spread**2 + self._misfit**2).sqrt()), std)
-        return HallEstimate(q, std, ~(blind[0] | blind[1] | blind[2]))
+            within = torch.stack([torch.where(pinned, ends[:, k], within[k]) for k in (0, 1)])
+        return HallEstimate(q, std, ~(blind[0] | blind[1] | blind[2]), within)
