@@ -2,11 +2,13 @@
 
     python benchmarks/as_printed.py --objects box,weighted_box,can,bottle,applier --seeds 1000:1010
 
-"As printed" has what the paper describes and no more: forces from its minimal-force problem alone, no
-fingertip is read; its controller (least motor increments that meet the limited error, within the motors'
-ranges); a plain sparse online GP of [q; p; da] with commanded da. It has no servo inverse, no grip or force
-limits, no pace, no retreat, and no figures of the hand. Grasps, targets, hands and stopping rule are those of
-the other systems. Finished sessions stay in ``--out``: an interrupted run goes on where it stopped.
+"As printed" is the paper's system around this package's J_m (the printed formulas cannot be right): forces
+from the minimal-force problem alone, no fingertip is read; least motor increments that meet the limited error
+within the motors' ranges; a plain sparse online GP of [q; p; da] with commanded da. It has no servo inverse,
+no grip or force limits, no pace, no retreat, no gates on what teaches, and no figures of the hand. "With
+tasks" adds this package's tasks of grip and off-axis motion, on estimated forces. Grasps, targets, hands and
+stopping rule are those of the other systems. Finished sessions stay in ``--out``: an interrupted run goes on
+where it stopped.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -24,9 +26,23 @@ from any_hand import Turns
 
 from torch_ekm._terminal import progress
 from torch_ekm.cli._app import parse_seeds
-from torch_ekm.control import ActuatorLimit, EffortTask, FocusTask, LookAndMoveController, Pace, PaceOptions
-from torch_ekm.control.pace import LimitingFunction, StepBound
-from torch_ekm.control.safety import Caution
+from torch_ekm.control import (
+    DEFAULT_TASKS,
+    ActuatorLimit,
+    Caution,
+    ClosedLoop,
+    EffortTask,
+    FocusTask,
+    Guards,
+    LimitingFunction,
+    LookAndMoveController,
+    Pace,
+    PaceOptions,
+    Safety,
+    Step,
+    StepBound,
+    Task,
+)
 from torch_ekm.experiments.config import Setting, digest
 from torch_ekm.experiments.jobs import run_jobs
 from torch_ekm.experiments.protocols.generalize import TABLE_I, TABLE_II, Generalize
@@ -35,12 +51,14 @@ from torch_ekm.experiments.reporting import statistics as stats
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.model import Linearization
+from torch_ekm.plant import Observation, Plant
 from torch_ekm.simulation import ENGINES, PRESETS, preset
 
 WARM_UP = 3
 CAPACITY = 60  # basis vectors; the paper gives no figure
-#: Nothing is undone, tightened or watched for.
+#: Nothing is undone, tightened, gated or watched for; readings that cannot be are still refused.
 NO_CAUTION = Caution(0, math.inf, 0.0, -math.inf, 0, 0, 0.0, 0.0, 0)
+NO_GUARDS = Guards(gate=math.inf, force_ceiling=math.inf, stuck_command=math.inf, wrong_way=10**6)
 
 
 class PrintedController(LookAndMoveController):
@@ -50,27 +68,47 @@ class PrintedController(LookAndMoveController):
         return self.kinematic.linearize(state)
 
 
+class PrintedLoop(ClosedLoop):
+    """A turn that stalls stays where it is."""
+
+    def _return_to_best(self, seen: Observation, *unused: Any) -> Generator[Step, None, Observation]:
+        yield from ()
+        return seen
+
+
 class PrintedBench(Bench):
     """The system as printed; its gain is this package's, for the paper gives none."""
 
+    tasks: ClassVar[tuple[Task, ...]] = (EffortTask(), FocusTask())
+
     def __init__(self, setting: Setting, object: Any, controller: str, **options: Any) -> None:
-        super().__init__(as_printed(setting), object, controller, **options)
+        super().__init__(as_printed(setting, self.tasks), object, controller, **options)
         self.pace = Pace(self.setting.pace, adapts=False)
 
     def look_and_move(self) -> LookAndMoveController:
         setting, axis = self.setting, self.hand.rotation_axis
         return PrintedController(self._predictor, axis, setting.tasks, setting.limits, self.pace)
 
+    def closed_loop(self, plant: Plant, *, learn: bool = True) -> ClosedLoop:
+        known = {"knowledge": self.knowledge, "safety": self.setting.safety}
+        return PrintedLoop(plant, self.look_and_move(), **known, learn=learn, decline=False)
 
-def as_printed(setting: Setting) -> Setting:
+
+class PrintedBenchWithTasks(PrintedBench):
+    """The same with this package's tasks of grip and off-axis motion."""
+
+    tasks = DEFAULT_TASKS
+
+
+def as_printed(setting: Setting, tasks: tuple[Task, ...]) -> Setting:
     """The same hand without fingertips, and the paper's controller and learner."""
     limiting, bound = LimitingFunction(contact_travel=None), StepBound(least=math.inf)
     return setting.replace(
         plant=setting.parameters.replace(force_sensors=False),
-        tasks=(EffortTask(), FocusTask()),
-        limits=(ActuatorLimit(),),
+        tasks=tasks,
+        limits=(ActuatorLimit(step=math.inf),),
         pace=PaceOptions(limiting=limiting, bound=bound),
-        safety=type(setting.safety)(setting.safety.rule, NO_CAUTION, setting.safety.guards),
+        safety=Safety(setting.safety.rule, NO_CAUTION, NO_GUARDS),
         servo_inverse=False,
         adapts=False,
         learner="rbf",
@@ -86,19 +124,28 @@ class Printed(Generalize):
     bench: ClassVar[type[Bench]] = PrintedBench
 
 
+@dataclass(frozen=True)
+class PrintedWithTasks(Generalize):
+    """The same with this package's tasks."""
+
+    bench: ClassVar[type[Bench]] = PrintedBenchWithTasks
+
+
 #: Name -> protocol, controller, whether fingertips measure.
 SYSTEMS: dict[str, tuple[type[Generalize], str, bool]] = {
     "KM, as printed": (Printed, "KM", False),
     "E-KM, as printed": (Printed, "E-KM", False),
+    "KM, with tasks": (PrintedWithTasks, "KM", False),
+    "E-KM, with tasks": (PrintedWithTasks, "E-KM", False),
     "KM": (Generalize, "KM", True),
     "E-KM": (Generalize, "E-KM", True),
     "E-KM without fingertips": (Generalize, "E-KM", False),
 }
-#: Each E-KM and the KM to which the paper would compare it.
+#: Each E-KM and its KM.
 _BESIDE = {
     "E-KM, as printed": "KM, as printed",
+    "E-KM, with tasks": "KM, with tasks",
     "E-KM": "KM",
-    "E-KM without fingertips": "KM",
 }
 
 
@@ -150,7 +197,7 @@ class Systems:
             Column("motions", ".1f"), Column("first motion errs [deg]", ".2f"),
         ]  # fmt: skip
         note = (
-            f"Of {len(self.of('E-KM').records)} turns each. Mean steady-state error, with 95 % intervals over"
+            f"Of {len(self.of('E-KM').records)} turns. Mean steady-state error, with 95 % intervals over"
             " pairs of object and seed. A lost object counts with the whole angle. Motions of turns that"
             " reached the target. The paper's are means over its five objects."
         )
@@ -191,8 +238,8 @@ class Systems:
             f" {len(self.of(name).records)}"
             for name in SYSTEMS
         )
-        ratios = ", ".join(f"{self._ratio(name):.0f} %" for name in ("E-KM, as printed", "E-KM"))
-        return f"{'; '.join(parts)}; E-KM:KM as printed and here {ratios}"
+        ratios = ", ".join(f"{self._ratio(name):.0f} %" for name in _BESIDE)
+        return f"{'; '.join(parts)}; E-KM:KM as printed, with tasks, and here {ratios}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -214,7 +261,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     base = Setting(preset=given.preset, plant=preset(given.preset), engine=given.engine)
     todo, keys = {}, {}
     for name, seed, item in ((name, seed, item) for seed in seeds for item in objects for name in SYSTEMS):
-        mine = as_printed(base) if SYSTEMS[name][0] is Printed else base
+        bench = SYSTEMS[name][0].bench
+        mine = as_printed(base, bench.tasks) if issubclass(bench, PrintedBench) else base
         job = f"{name.replace(' ', '_').replace(',', '')}_{digest(mine, (item,), angles, WARM_UP)}_{seed}"
         todo[job], keys[job] = (name, base, item, angles, seed), (name, Path(item).stem, seed)
     with progress("running", len(todo)) as advance:

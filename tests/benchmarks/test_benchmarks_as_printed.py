@@ -37,7 +37,7 @@ def test_a_lost_object_counts_with_the_whole_angle() -> None:
     assert rows["E-KM, in the paper"][1:3] == ["0.64", "40"]
     assert rows["E-KM, as printed"][2:5] == ["350", "1", "1"]  # 10.5 of 3 deg
     assert rows["E-KM"][2] == "25"
-    assert "as printed and here 350 %, 25 %" in found.verdict
+    assert "as printed, with tasks, and here 350 %, 100 %, 25 %" in found.verdict
 
 
 def test_the_system_has_what_the_paper_prints_and_no_more() -> None:

@@ -218,6 +218,9 @@ def test_the_pace_grows_where_the_model_is_right_and_shrinks_where_it_is_not() -
     error = torch.tensor([0.5], dtype=torch.float64)  # forces that nobody feels drift: no step beyond pace 1
     assert float(pace.ask(error)[0]) == pytest.approx(trust.largest * pace.options.limiting.step)
     assert float(pace.ask(error, measures=False)[0]) == pytest.approx(pace.options.limiting.step)
+    assert pace.factor == 1.0  # it grows again only where a pad measures
+    for _ in range(50):
+        pace.judge(0.0)
     other = Pace()
     other.load_state_dict(pace.state_dict())
     other.begin(1.0)  # not new
@@ -226,6 +229,13 @@ def test_the_pace_grows_where_the_model_is_right_and_shrinks_where_it_is_not() -
         other = Pace()
         other.begin(last)
         assert other.factor == first
+    slow = Pace(PaceOptions(trust=TrustRegion(start=0.7, largest=1.0)))
+    for last in (2.0, math.nan):
+        slow.begin(last)
+        assert slow.factor == 1.0
+    slow.restart()
+    slow.begin(2.0)  # something went wrong: no new object
+    assert slow.factor == trust.smallest / 2
     pace.restart()
     assert pace.factor == trust.smallest / 2
     pace.judge(9.0)

@@ -159,7 +159,10 @@ class ClosedLoop:
         self._stop.clear()
         self._checked.last = None
         try:
-            return (yield from self._motions(target))
+            stop = yield from self._motions(target)
+            if self.learn and self.controller.pace.adapts:
+                self.knowledge.pace.fill_(self.controller.pace.factor * (stop.reason is StopReason.REACHED))
+            return stop
         except PlantFailedError as failed:
             self.hold()
             error, last = failed.cause, self._checked.last
@@ -187,11 +190,11 @@ class ClosedLoop:
         progress = Progress(self.safety, target, self.controller.focus, seen)
         progress.halt = first.halt
         known = self.controller.enhanced is not None and int(self.knowledge.figures.count) >= _KNOWN
-        self.controller.pace.begin(float(self.knowledge.pace) if known else 0.0)
         if self.decline and known and progress.halt is None and seen.status is not PlantStatus.LOST:
             against = out_of_reach(self._rehearsal, self.controller, seen, target)
             if against:
                 return Stop(StopReason.OUT_OF_REACH, seen, against)
+        self.controller.pace.begin(float(self.knowledge.pace) if known and self.learn else 0.0)
         if progress.halt is None and seen.status is PlantStatus.HELD:
             seen, weak = yield from self._grip_first(seen, progress, watch)
             watch.grip.forget()
@@ -358,7 +361,6 @@ class ClosedLoop:
             self._learn_forces(lin, expected.moved, felt)
         rho = math.inf if fades else self._disagreement(lin, ds, expected, felt)
         self.controller.pace.judge(rho, decision.share)
-        self.knowledge.pace.copy_(self.controller.pace.value)
         self._figures.learn(lin, moved, ds)
         pull = self._figures.pulled(moved)
         nominal = self.controller.kinematic.followed(lin).step(pull)  # g learns what they leave

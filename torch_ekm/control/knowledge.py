@@ -42,7 +42,8 @@ class HandKnowledge(Recorded, nn.Module):
     ) -> None:
         super().__init__()
         self.servo, self.forces, self.figures = servo, forces, figures
-        self.pace = nn.Buffer(torch.tensor(0.0, dtype=torch.float64))  # of the last motion
+        self.pace = nn.Buffer(torch.tensor(0.0, dtype=torch.float64))
+        """p at the end of the last turn, if that reached its target; else 0."""
 
     @classmethod
     def of(cls, hand: HandDescription, *, learns: bool = True, adapts: bool = True) -> HandKnowledge:

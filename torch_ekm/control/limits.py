@@ -89,9 +89,9 @@ class NormalForceLimit:
     f*_i is what :class:`GripForceTask` wants of the finger, which follows from load and friction: no finger
     fades.
 
-    A finger that measures more than ``maximum`` is loosened. One that only the model's estimate puts above
-    it, or joints and springs where they contradict the pads, is pressed no harder: pads that read too little
-    must not make the hand squeeze, nor springs that are not as described make it let go. Where both limits
+    A finger that measures more than ``maximum`` is loosened; where no pad measures, the estimate counts. One
+    that only an estimate beside the pad's puts above it is pressed no harder: pads that read too little must
+    not make the hand squeeze, nor springs that are not as described make it let go. Where both limits
     contradict each other, the upper one holds.
 
     Raises:

@@ -30,7 +30,7 @@ _FORCE_NOISE = 0.5  # [N]
 _FORCE_SHARE = 0.25  # of the force that a finger bears: an error that leaves it its grip
 SLIDES = 2.0  # rho of the twist alone from which the object is thought to slide
 _UNFELT = 1.0  # largest p where no pad measures: forces that nobody sees drift with the way that is made
-_KNOWN = 1.4  # largest p with an object that is new to a hand whose figures are known
+_FOR_NEW = 1.4  # largest p with an object that is new to a hand whose figures are known
 _USED = 0.7  # a motion below this share of what was allowed says nothing for a larger one
 
 
@@ -188,7 +188,7 @@ class TrustRegion:
     """
 
     start: float = 0.7
-    """Pace with an object that is new."""
+    """Pace with an object that is new to a hand of which nothing is known."""
     smallest: float = 0.5
     largest: float = 2.0
 
@@ -254,9 +254,9 @@ class Pace(nn.Module):
         return float(self.value)
 
     def begin(self, last: float) -> None:
-        """A manipulation begins; last: p of the last motion of a hand whose figures are known, or 0."""
-        if self.adapts and not int(self.count):
-            self.value.clamp_(min=min(last, _KNOWN))
+        """Where nothing was judged yet, p is the last one of the hand (0: unknown), start to 1.4."""
+        if self.adapts and not int(self.count) and last > self.factor:
+            self.value.clamp_(min=min(last, _FOR_NEW, self.options.trust.largest))
 
     def ask(
         self, error: Float[Tensor, " n_x"], travel: float = 0.0, measures: bool = True
@@ -266,11 +266,13 @@ class Pace(nn.Module):
         Args:
             error: e, focused error [unit of the focus].
             travel: ``|v(e)|``, see :func:`contact_travel` [m].
-            measures: some pad does; else p counts as at most 1.
+            measures: some pad does; else p falls to 1.
         """
-        limiting, pace = self.options.limiting, min(self.factor, math.inf if measures else _UNFELT)
-        share = min(limiting.gain * limiting.steps(error, travel) / pace, 1.0)
-        return limiting(error, travel, pace), share
+        if not measures:
+            self.value.clamp_(max=_UNFELT)
+        limiting = self.options.limiting
+        share = min(limiting.gain * limiting.steps(error, travel) / self.factor, 1.0)
+        return limiting(error, travel, self.factor), share
 
     def cut(
         self,
@@ -286,8 +288,7 @@ class Pace(nn.Module):
             predicted: increment that the corrected model predicts for ``delta_a``.
             share: of the largest step that was asked for.
         """
-        measures = seen.fingertip_force is not None
-        bound, asked = self.options.bound, share * min(self.factor, math.inf if measures else _UNFELT)
+        bound, asked = self.options.bound, share * self.factor
         phi = bound.share(lin, delta_a, predicted, seen, asked)
         return max(phi, min(1.0, bound.least / max(asked, 1e-9)))
 
@@ -312,6 +313,7 @@ class Pace(nn.Module):
         """Begin again with half the smallest steps: something went wrong, and is near."""
         if self.adapts:
             self.value.fill_(self.options.trust.smallest / 2)
+            self.count += 1
 
     def extra_repr(self) -> str:
         return f"p={self.factor:.3g}"

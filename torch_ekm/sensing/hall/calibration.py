@@ -58,10 +58,6 @@ class HallCalibration:
     def joints(self) -> tuple[str, ...]:
         return tuple(channel.joint for channel in self.channels)
 
-    @property
-    def n_channels(self) -> int:
-        return len(self.channels)
-
     @classmethod
     def fit(
         cls,
@@ -104,8 +100,8 @@ class HallCalibration:
             ShapeError: the last dimension is not the number of channels.
             NonFiniteError: a reading is NaN.
         """
-        if readings.ndim == 0 or readings.shape[-1] != self.n_channels:
-            raise ShapeError("readings", f"(*batch, {self.n_channels})", readings.shape)
+        if readings.ndim == 0 or readings.shape[-1] != len(self.channels):
+            raise ShapeError("readings", f"(*batch, {len(self.channels)})", readings.shape)
         check_finite("readings", readings)
         n = readings.to(torch.float64)
         held = n.clamp(self._low, self._high)  # noise may carry a sound reading past the range of the sweep

@@ -129,7 +129,7 @@ def _descend(problem: PinchProblem, request: PinchRequest, guess: Array, ranges:
     try:
         found = descend(guess)
     except np.linalg.LinAlgError:  # LAPACK's SVD does not converge on every processor: by another way
-        found = descend(0.999 * guess)
+        found = descend(0.999 * guess + 0.0005 * (low + high))
     g = problem.geometry(found.x[None])
     violation = float(np.abs(problem.equations(request, g)[0]).max())
     return _Solution(found.x, violation, float(problem.outside(g).max(initial=-np.inf)), found.cost)
