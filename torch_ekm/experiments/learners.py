@@ -128,7 +128,7 @@ LEARNERS: dict[str, Factory] = {
     "MLP": Kind(residual.ReplayMLP, standardize=False),
     "MLP ensemble": Kind(residual.ReplayMLP, members=3, standardize=False),
     "SOGP default": Kind(residual.SparseOnlineGP, "capacity"),
-    "SOGP plain": Sparse(),  # as in the paper: nothing forgotten, every sample trusted
+    "SOGP plain": Sparse(),  # nothing forgotten, every sample trusted
     "SOGP": Sparse(forgetting_factor=0.99, robust=3.0),
     "SOGP adaptive": Sparse(
         forgetting_factor=0.99, robust=3.0, parts=[residual.CalibrateNoise(), *_LEARNING]
