@@ -210,16 +210,20 @@ class Systems:
 
     def by_object(self) -> Table:
         """Errors of each object, the paper's and here; lost objects in brackets."""
-        rows: list[list[Cell]] = []
-        for item in self.objects:
-            paper = TABLE_II.get(item, (None, None))
-            here = (f"{self.errors(name, item).mean():.2f} ({self.of(name, item).lost})" for name in SYSTEMS)
-            rows.append([item, *paper, *here])
-        columns: list[str | Column] = [
-            "object", Column("KM, paper", ".1f"), Column("E-KM, paper", ".1f"), *SYSTEMS,
-        ]  # fmt: skip
-        note = "Steady-state error [deg], and objects lost."
-        return Table("objects", "Each object", columns, rows, note)
+        rows: list[list[Cell]] = [
+            [
+                f"{name}, in the paper",
+                *(TABLE_II[item][k] if item in TABLE_II else None for item in self.objects),
+            ]
+            for k, name in enumerate(("KM", "E-KM"))
+        ]
+        for name in SYSTEMS:
+            here = (
+                f"{self.errors(name, item).mean():.2f} ({self.of(name, item).lost})" for item in self.objects
+            )
+            rows.append([name, *here])
+        columns: list[str | Column] = ["system", *(Column(item, ".1f") for item in self.objects)]
+        return Table("objects", "Each object", columns, rows, "Steady-state error [deg], and objects lost.")
 
     def ends(self) -> Table:
         """Why the turns ended."""
