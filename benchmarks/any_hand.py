@@ -14,7 +14,7 @@ import argparse
 import itertools
 import math
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -238,6 +238,15 @@ class Survey:
         return report
 
 
+def records_by(keys: Mapping[str, Any], results: Mapping[str, Any]) -> dict[Any, list[TrialRecord]]:
+    """What finished sessions left, under the key of each; trials without a grasp are left out."""
+    turns: dict[Any, list[TrialRecord]] = defaultdict(list)
+    for job, trials in results.items():
+        made = (TrialRecord.from_json(trial) for trial in trials)
+        turns[keys[job]] += [one for one in made if isinstance(one, TrialRecord)]
+    return turns
+
+
 def main() -> None:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
@@ -263,13 +272,9 @@ def main() -> None:
     todo = jobs(found, objects, seeds, given.controllers.split(","), given.engine)
     with progress("running", len(todo)) as advance:
         results = run_jobs(session, todo, given.out, given.jobs, advance)
-    turns: dict[tuple[str, str, str], list[TrialRecord]] = defaultdict(list)
     where = {plant: key for key, plant in found.items()}
-    for name, trials in results.items():
-        plant, _, controller, *_ = todo[name]
-        made = (TrialRecord.from_json(trial) for trial in trials)
-        turns[*where[plant], controller] += [one for one in made if isinstance(one, TrialRecord)]
-    survey = Survey(turns)
+    keys = {name: (*where[plant], controller) for name, (plant, _, controller, *_) in todo.items()}
+    survey = Survey(records_by(keys, results))
     print(survey.report(given.out, given.engine).markdown())
     print(survey.verdict)
 

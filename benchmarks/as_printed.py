@@ -14,15 +14,15 @@ where it stopped.
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
-from collections import defaultdict
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from any_hand import Turns
+from any_hand import Turns, records_by
 
 from torch_ekm._terminal import progress
 from torch_ekm.cli._app import parse_seeds
@@ -41,7 +41,6 @@ from torch_ekm.control import (
     Safety,
     Step,
     StepBound,
-    Task,
 )
 from torch_ekm.experiments.config import Setting, digest
 from torch_ekm.experiments.jobs import run_jobs
@@ -77,13 +76,15 @@ class PrintedLoop(ClosedLoop):
 
 
 class PrintedBench(Bench):
-    """The system as printed; its gain is this package's, for the paper gives none."""
+    """The system as printed; its gain is this package's, for the paper gives none.
 
-    tasks: ClassVar[tuple[Task, ...]] = (EffortTask(), FocusTask())
+    Args:
+        setting: of :func:`as_printed`.
+    """
 
     def __init__(self, setting: Setting, object: Any, controller: str, **options: Any) -> None:
-        super().__init__(as_printed(setting, self.tasks), object, controller, **options)
-        self.pace = Pace(self.setting.pace, adapts=False)
+        super().__init__(setting, object, controller, **options)
+        self.pace = Pace(setting.pace, adapts=False)
 
     def look_and_move(self) -> LookAndMoveController:
         setting, axis = self.setting, self.hand.rotation_axis
@@ -94,18 +95,23 @@ class PrintedBench(Bench):
         return PrintedLoop(plant, self.look_and_move(), **known, learn=learn, decline=False)
 
 
-class PrintedBenchWithTasks(PrintedBench):
-    """The same with this package's tasks of grip and off-axis motion."""
+@dataclass(frozen=True)
+class Printed(Generalize):
+    """The paper's experiment with the paper's system."""
 
-    tasks = DEFAULT_TASKS
+    bench: ClassVar[type[Bench]] = PrintedBench
 
 
-def as_printed(setting: Setting, tasks: tuple[Task, ...]) -> Setting:
+def without_fingertips(setting: Setting) -> Setting:
+    """The same hand, and no pad measures."""
+    return setting.replace(plant=setting.parameters.replace(force_sensors=False))
+
+
+def as_printed(setting: Setting) -> Setting:
     """The same hand without fingertips, and the paper's controller and learner."""
     limiting, bound = LimitingFunction(contact_travel=None), StepBound(least=math.inf)
-    return setting.replace(
-        plant=setting.parameters.replace(force_sensors=False),
-        tasks=tasks,
+    return without_fingertips(setting).replace(
+        tasks=(EffortTask(), FocusTask()),
         limits=(ActuatorLimit(step=math.inf),),
         pace=PaceOptions(limiting=limiting, bound=bound),
         safety=Safety(setting.safety.rule, NO_CAUTION, NO_GUARDS),
@@ -117,29 +123,20 @@ def as_printed(setting: Setting, tasks: tuple[Task, ...]) -> Setting:
     )
 
 
-@dataclass(frozen=True)
-class Printed(Generalize):
-    """The paper's experiment with the paper's system."""
-
-    bench: ClassVar[type[Bench]] = PrintedBench
+def with_tasks(setting: Setting) -> Setting:
+    """As printed, with this package's tasks of grip and off-axis motion."""
+    return as_printed(setting).replace(tasks=DEFAULT_TASKS)
 
 
-@dataclass(frozen=True)
-class PrintedWithTasks(Generalize):
-    """The same with this package's tasks."""
-
-    bench: ClassVar[type[Bench]] = PrintedBenchWithTasks
-
-
-#: Name -> protocol, controller, whether fingertips measure.
-SYSTEMS: dict[str, tuple[type[Generalize], str, bool]] = {
-    "KM, as printed": (Printed, "KM", False),
-    "E-KM, as printed": (Printed, "E-KM", False),
-    "KM, with tasks": (PrintedWithTasks, "KM", False),
-    "E-KM, with tasks": (PrintedWithTasks, "E-KM", False),
-    "KM": (Generalize, "KM", True),
-    "E-KM": (Generalize, "E-KM", True),
-    "E-KM without fingertips": (Generalize, "E-KM", False),
+#: Name -> protocol, controller, what becomes of the setting.
+SYSTEMS: dict[str, tuple[type[Generalize], str, Callable[[Setting], Setting]]] = {
+    "KM, as printed": (Printed, "KM", as_printed),
+    "E-KM, as printed": (Printed, "E-KM", as_printed),
+    "KM, with tasks": (Printed, "KM", with_tasks),
+    "E-KM, with tasks": (Printed, "E-KM", with_tasks),
+    "KM": (Generalize, "KM", Setting.replace),
+    "E-KM": (Generalize, "E-KM", Setting.replace),
+    "E-KM without fingertips": (Generalize, "E-KM", without_fingertips),
 }
 #: Each E-KM and its KM.
 _BESIDE = {
@@ -151,8 +148,7 @@ _BESIDE = {
 
 def session(name: str, setting: Setting, item: str, angles: Any, seed: int) -> list[dict[str, Any]]:
     """Warm-up (E-KM only), then the turns of Table I with one object."""
-    protocol, controller, fingertips = SYSTEMS[name]
-    setting = setting.replace(plant=setting.parameters.replace(force_sensors=fingertips))
+    protocol, controller, _ = SYSTEMS[name]
     made = protocol(setting, (item,), angles, WARM_UP, 0.0, 0.0).session(item, controller, seed)
     return [one.to_json() for one in made if one.kind == "turn"]
 
@@ -164,19 +160,21 @@ class Systems:
         self.turns = turns
         self.objects = list(dict.fromkeys(item for _, item, _ in turns))
 
+    def _pairs(self, name: str, item: str | None) -> list[list[TrialRecord]]:
+        """The turns of each pair of object and seed."""
+        return [one for key, one in self.turns.items() if key[0] == name and item in (None, key[1])]
+
     def of(self, name: str, item: str | None = None) -> Turns:
         """Those of one object, or of all."""
-        found = ((key, records) for key, records in self.turns.items() if key[0] == name)
-        return Turns(tuple(one for key, records in found if item in (None, key[1]) for one in records))
+        return Turns(tuple(itertools.chain.from_iterable(self._pairs(name, item))))
 
     def errors(self, name: str, item: str | None = None) -> np.ndarray:
         """Mean steady-state error of each pair of object and seed [deg]; lost objects count with the whole
         angle."""
-        found = ((key, records) for key, records in self.turns.items() if key[0] == name)
         wrong = (
             [one.angle_deg if one.lost else one.true_error_deg for one in records]
-            for key, records in found
-            if item in (None, key[1]) and records
+            for records in self._pairs(name, item)
+            if records
         )
         return np.array([np.mean(each) for each in wrong])
 
@@ -265,17 +263,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     base = Setting(preset=given.preset, plant=preset(given.preset), engine=given.engine)
     todo, keys = {}, {}
     for name, seed, item in ((name, seed, item) for seed in seeds for item in objects for name in SYSTEMS):
-        bench = SYSTEMS[name][0].bench
-        mine = as_printed(base, bench.tasks) if issubclass(bench, PrintedBench) else base
-        job = f"{name.replace(' ', '_').replace(',', '')}_{digest(mine, (item,), angles, WARM_UP)}_{seed}"
-        todo[job], keys[job] = (name, base, item, angles, seed), (name, Path(item).stem, seed)
+        setting = SYSTEMS[name][2](base)
+        job = f"{name.replace(' ', '_').replace(',', '')}_{digest(setting, (item,), angles, WARM_UP)}_{seed}"
+        todo[job], keys[job] = (name, setting, item, angles, seed), (name, Path(item).stem, seed)
     with progress("running", len(todo)) as advance:
         results = run_jobs(session, todo, given.out, given.jobs, advance)
-    turns: dict[tuple[str, str, int], list[TrialRecord]] = defaultdict(list)
-    for job, trials in results.items():
-        made = (TrialRecord.from_json(trial) for trial in trials)
-        turns[keys[job]] += [one for one in made if isinstance(one, TrialRecord)]
-    systems = Systems(turns)
+    systems = Systems(records_by(keys, results))
     report = Report(
         "The paper's system", f"{systems.verdict}.", [systems.summary(), systems.by_object(), systems.ends()]
     )

@@ -12,13 +12,12 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from any_hand import Turns
+from any_hand import Turns, records_by
 
 from torch_ekm._terminal import progress
 from torch_ekm.cli._app import parse_seeds
@@ -227,10 +226,7 @@ def main() -> None:
                         where[key] = (engine, preset, controller)
     with progress("turning", len(todo)) as advance:
         results = run_jobs(session, todo, given.out, given.jobs, advance)
-    turns: dict[tuple[str, str, str], list[TrialRecord]] = defaultdict(list)
-    for key, trials in results.items():
-        made = (TrialRecord.from_json(trial) for trial in trials)
-        turns[where[key]] += [one for one in made if isinstance(one, TrialRecord)]
+    turns = records_by(where, results)
     probes: dict[tuple[str, str], list[dict[str, float]]] = {}
     with progress("probing", len(objects)) as advance:
         for item in objects:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from any_hand import Turns
+from any_hand import Turns, records_by
 
 from torch_ekm._terminal import progress
 from torch_ekm.cli._app import parse_seeds
@@ -217,11 +217,7 @@ def main() -> None:
             todo[key], where[key] = (setting, given.first, then, seed), (name, seed)
     with progress("running", len(todo)) as advance:
         results = run_jobs(session, todo, given.out, given.jobs, advance)
-    made = {
-        where[key]: [one for one in map(TrialRecord.from_json, trials) if isinstance(one, TrialRecord)]
-        for key, trials in results.items()
-    }
-    comparison = Comparison(made)
+    comparison = Comparison(records_by(where, results))
     print(comparison.report(given.out).markdown())
     print(comparison.verdict)
 

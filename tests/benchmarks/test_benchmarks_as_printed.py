@@ -42,7 +42,7 @@ def test_a_lost_object_counts_with_the_whole_angle() -> None:
 
 def test_the_system_has_what_the_paper_prints_and_no_more() -> None:
     pytest.importorskip("sapien")
-    bench = PrintedBench(Setting(hand="planar_two_finger"), "box", "E-KM")
+    bench = PrintedBench(as_printed.as_printed(Setting(hand="planar_two_finger")), "box", "E-KM")
     start = bench.grasp(3, 0)
     assert start is not None
     done = bench.turn(Trial("box", "turn", "E-KM", 3, 0, 3.0), start)

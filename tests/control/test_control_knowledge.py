@@ -8,7 +8,14 @@ import pytest
 import torch
 from obedient_plant import Obedient
 
-from torch_ekm.control import ClosedLoop, DescribedFigures, HandKnowledge, LookAndMoveController, PoseTarget
+from torch_ekm.control import (
+    ClosedLoop,
+    DescribedFigures,
+    HandKnowledge,
+    LookAndMoveController,
+    PoseTarget,
+    StopReason,
+)
 from torch_ekm.control.force_sensitivity import ForceSensitivity
 from torch_ekm.enhanced import EnhancedModel, save
 from torch_ekm.exceptions import FileFormatError, ParameterError
@@ -44,6 +51,23 @@ def test_a_file_gives_back_the_same_to_the_bit(driven, tmp_path) -> None:
     assert before.keys() == after.keys()
     assert all(torch.equal(before[name], after[name]) for name in before)
     assert float(again.servo.standard_errors.min()) < 0.1 * DEG  # 0.3 before anything was learned
+
+
+def test_the_pace_of_the_last_turn_is_kept_if_it_reached_its_target(held) -> None:
+    seen, axis, model = held
+    controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
+    loop = ClosedLoop(Obedient(model, seen), controller)
+    target = PoseTarget.turned(seen.state, axis, degrees=15)
+    assert float(loop.knowledge.pace) == 0.0
+    assert loop.run(target).reason is StopReason.REACHED
+    assert float(loop.knowledge.pace) == controller.pace.factor > 0
+    kept = float(loop.knowledge.pace)
+    still = ClosedLoop(Obedient(model, seen), controller, knowledge=loop.knowledge, learn=False)
+    still.run(PoseTarget.turned(seen.state, axis, degrees=150))
+    assert float(loop.knowledge.pace) == kept  # it does not learn
+    far = ClosedLoop(Obedient(model, seen), controller, knowledge=loop.knowledge, decline=False)
+    assert far.run(PoseTarget.turned(seen.state, axis, degrees=150)).reason is not StopReason.REACHED
+    assert float(loop.knowledge.pace) == 0.0
 
 
 def test_the_next_loop_goes_on_with_it(held, driven) -> None:

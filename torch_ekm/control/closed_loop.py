@@ -179,8 +179,7 @@ class ClosedLoop:
             raise
 
     def _motions(self, target: PoseTarget) -> Generator[Step, None, Stop]:
-        safety, tolerance = self.safety, self.safety.rule.tolerance
-        watch = Watch(safety.guards, self.controller.kinematic, self._expect, tolerance)
+        watch = Watch(self.safety.guards, self.controller.kinematic, self._expect, self.safety.rule.tolerance)
         first = watch.first(self.plant.observe(), self.plant.observe)
         seen = first.seen
         self.controller.reset()
@@ -375,8 +374,7 @@ class ClosedLoop:
 
     def _slides(self, lin: Linearization, ds: Tensor, expected: Expectation) -> bool:
         """The object moved otherwise than an E-KM predicted: it slides, or turns out of the grip."""
-        learns = self.controller.enhanced is not None
-        return learns and self._disagreement(lin, ds, expected) > SLIDES
+        return self.controller.enhanced is not None and self._disagreement(lin, ds, expected) > SLIDES
 
     def _learn_forces(self, lin: Linearization, moved: Tensor, felt: ForceSurprise) -> None:
         """Pads that touched and measured before and after teach how their forces answer."""

@@ -122,9 +122,9 @@ class ForceSensitivity(Recorded, nn.Module):
         seen = (Du * u).sum(-1).clamp(min=torch.finfo(w.dtype).tiny)[:, None, None]
         forgotten = (1 - _FORGETTING) * Du[:, :, None] * Du[:, None, :] / seen
         self.evidence[known] += (u[:, :, None] * u[:, None, :] - forgotten)[known]
-        self.drift[known] = (_KEPT * self.drift + _TAKEN * r.clamp(-_CLIP * spread, _CLIP * spread))[known]
-        gain = _times(self._covariance, u) / self.variance[:, None]
         bounded = r.clamp(-_CLIP * spread, _CLIP * spread)
+        self.drift[known] = (_KEPT * self.drift + _TAKEN * bounded)[known]
+        gain = _times(self._covariance, u) / self.variance[:, None]
         self.theta[known] += bounded[known, None] * gain[known]
         unexplained = (bounded.square() - doubt).clamp(min=_NOISE_STD**2)
         self.variance[known] += _RECENT * (unexplained - self.variance)[known]

@@ -33,10 +33,9 @@ class JointEstimate(NamedTuple):
 class JointEstimator:
     r"""``min_q sum_k ((q_k - h_k) / s_k)^2 + |(J_a q + a_0 - a) / s_a|^2 + |C q / s_c|^2``.
 
-    Hall channels know single joints, encoders know sums of them, rigid couplings know differences: together
-    they cover joints without a channel, and those whose channel is saturated or stuck. A saturated channel
-    still knows the range that it does not resolve: q stays within it, whatever cables say that run over
-    other pulleys than described. A weak prior, uniform over each joint's range, keeps the rest finite.
+    Hall channels know single joints, encoders sums of them, rigid couplings differences: together they cover
+    joints without a channel, or with one that is saturated or stuck. q stays within the range that such a
+    channel leaves open, whatever cables say. A weak prior, uniform over each joint's range, keeps it finite.
 
     Args:
         hand: joints, actuation Jacobian and couplings; ``C q = 0`` is taken to hold, not just ``C dq = 0``.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,20 +117,22 @@ def _solve(problem: PinchProblem, request: PinchRequest) -> _Solution:
 
 def _descend(problem: PinchProblem, request: PinchRequest, guess: Array, ranges: bool) -> _Solution:
     low, high = problem.bounds()
-
-    def descend(start: Array) -> Any:
-        return require("scipy.optimize").least_squares(
-            lambda x: problem.residuals(x[None], request, ranges)[0],
-            np.clip(start, low + 1e-9, high - 1e-9),
-            jac=lambda x: problem.jacobian(x, request, ranges),
-            bounds=(low, high),
-            **{"x_scale": "jac", "max_nfev": 150, "ftol": 1e-9, "xtol": 1e-9, "gtol": 1e-9},
-        )
-
+    descend = partial(
+        require("scipy.optimize").least_squares,
+        lambda x: problem.residuals(x[None], request, ranges)[0],
+        jac=lambda x: problem.jacobian(x, request, ranges),
+        bounds=(low, high),
+        x_scale="jac",
+        max_nfev=150,
+        ftol=1e-9,
+        xtol=1e-9,
+        gtol=1e-9,
+    )
+    start = np.clip(guess, low + 1e-9, high - 1e-9)
     try:
-        found = descend(guess)
+        found = descend(start)
     except np.linalg.LinAlgError:  # LAPACK's SVD does not converge on every processor: by another way
-        found = descend(0.999 * guess + 0.0005 * (low + high))
+        found = descend(0.999 * start + 0.0005 * (low + high))
     g = problem.geometry(found.x[None])
     violation = float(np.abs(problem.equations(request, g)[0]).max())
     return _Solution(found.x, violation, float(problem.outside(g).max(initial=-np.inf)), found.cost)
