@@ -32,10 +32,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ANGLES = (9.0, 19.0, 27.0)
-MOTIONS = 30  # with the first object
-_FIRST_ANGLES = (14.0, -8.0, 22.0)
-_MOST_TURNS = 12  # with the first object, if turns end early
-_WARM_UP = 1000  # number of the first grasp of the first object
 EARLY = 5  # motions with a new object
 _SHOWN = 25  # of the picture
 #: What an E-KM begins a new object with.
@@ -58,14 +54,7 @@ def session(setting: Setting, first: str, then: Sequence[str], seed: int) -> lis
         bench = Bench(setting, item, "E-KM")
         bench.knowledge = knowledge = bench.knowledge if knowledge is None else knowledge
         if item == first and not records:
-            made = 0
-            for k in range(_MOST_TURNS):
-                if made >= MOTIONS:
-                    break
-                angle = _FIRST_ANGLES[k % len(_FIRST_ANGLES)]
-                one = bench.trial(seed, _WARM_UP + k, angle, "first")
-                made += one.steps if isinstance(one, TrialRecord) else 0
-                records.append(one)
+            records += bench.learn_hand(seed)
         else:
             records += [bench.trial(seed, k, angle) for k, angle in enumerate(ANGLES)]
         bench.close()
@@ -211,9 +200,7 @@ def main() -> None:
     for name, changes in CONTENDERS.items():
         setting = Setting(preset=given.preset, engine=given.engine, sensing=not given.quick, **changes)
         for seed in seeds:
-            key = (
-                f"{object_name(given.first)}_{digest(setting, (given.first, *then), ANGLES, MOTIONS)}_{seed}"
-            )
+            key = f"{object_name(given.first)}_{digest(setting, (given.first, *then), ANGLES)}_{seed}"
             todo[key], where[key] = (setting, given.first, then, seed), (name, seed)
     with progress("running", len(todo)) as advance:
         results = run_jobs(session, todo, given.out, given.jobs, advance)

@@ -12,6 +12,7 @@ pytest.importorskip("new_object", reason="the benchmarks are not part of this in
 import new_object
 from new_object import CONTENDERS, Comparison
 
+from torch_ekm.experiments import runner
 from torch_ekm.experiments.records import TrialRecord
 
 
@@ -52,8 +53,8 @@ def test_first_motions_are_those_of_an_object_and_of_a_turn(tmp_path: Path) -> N
 def test_the_hand_is_kept_and_the_learner_is_not(tmp_path: Path, monkeypatch, capsys) -> None:
     pytest.importorskip("sapien")
     monkeypatch.setattr(new_object, "ANGLES", (4.0,))
-    monkeypatch.setattr(new_object, "MOTIONS", 1)
-    monkeypatch.setattr(new_object, "_FIRST_ANGLES", (4.0,))
+    monkeypatch.setattr(runner, "_MOTIONS", 1)
+    monkeypatch.setattr(runner, "_LEARNS_BY", (4.0,))
     knowledge, learners = [], []
 
     class Noted(new_object.Bench):

@@ -7,14 +7,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from experiments_records import frame, not_grasped
+from experiments_records import frame, not_grasped, turn
 
 from torch_ekm.control import DEFAULT_TASKS, Caution, EffortTask, LimitingFunction, Safety
 from torch_ekm.description.registry import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
+from torch_ekm.experiments import runner
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
 from torch_ekm.experiments.learners import LEARNERS, make_learner
-from torch_ekm.experiments.protocols.generalize import Generalize
+from torch_ekm.experiments.protocols.generalize import Generalize, new_object_table
 from torch_ekm.experiments.protocols.online import Online
 from torch_ekm.experiments.records import NotGrasped, TrialRecord
 from torch_ekm.experiments.runner import Bench
@@ -68,7 +69,7 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
     one, both = (dataclasses.replace(base, objects=o).jobs((0,)) for o in (("box",), ("box", "can")))
     assert set(one) < set(both)  # more objects: what is there is used again
     assert set(dataclasses.replace(base, objects=("box",), controllers=("KM",)).jobs((0,))) < set(one)
-    assert len(both) == 2 * len(CONTROLLERS)
+    assert len(both) == 2 * (len(CONTROLLERS) + 1)
 
 
 def test_a_corrected_object_does_not_take_up_old_results(tmp_path: Path) -> None:
@@ -170,6 +171,44 @@ def test_same_seed_same_session() -> None:
     assert turned.true_error_deg < 1.0
     assert len(turned.poses) == turned.steps + 1
     assert step.poses == ()  # for pictures of turns only
+
+
+def test_a_new_object_begins_with_the_hand_of_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "_MOTIONS", 5)
+    protocol = Generalize(
+        Setting(hand="planar_two_finger", engine="mujoco"), objects=("can",), angles_deg=(4.0,)
+    )
+    name, job = list(protocol.jobs((3,)).items())[-1]
+    assert name.endswith("_new object_3")
+    grasps = []
+
+    class Noted(Bench):
+        def trial(self, *what, **options):
+            grasps.append((self.name, int(self.knowledge.figures.count), self.learner))
+            return super().trial(*what, **options)
+
+    monkeypatch.setattr(Generalize, "bench", Noted)
+    learned = protocol.session(*job)
+    assert [(one.object, one.kind) for one in learned][-1] == ("can", "new object")
+    assert {(one.object, one.kind) for one in learned[:-1]} == {("box", "first")}
+    assert sum(one.steps for one in learned[:-1] if isinstance(one, TrialRecord)) >= 5
+    (_, none, _), *_, (item, known, learner) = grasps
+    assert none == 0
+    assert (item, learner) == ("can", None)  # the object's own learner is empty
+    assert known >= 5
+
+
+def test_objects_with_and_without_warm_up_stand_side_by_side() -> None:
+    kinds = {"turn": (0.1, 0.3), "new object": (0.2, 0.4)}
+    trials = frame(
+        turn("E-KM", seed, kind=kind, true_error_deg=error, true_prediction_ekm_deg=(first, 9.0))
+        for seed in range(2)
+        for kind, (error, first) in kinds.items()
+    )
+    (row, _) = new_object_table(trials).text()
+    assert [cell.split(" ")[0] for cell in row[1:5]] == ["0.10", "0.20", "0.30", "0.40"]
+    assert row[-1] == "0, 0"
+    assert not new_object_table(trials[trials["kind"] == "turn"]).rows
 
 
 def test_what_cannot_be_grasped_is_recorded_not_raised(monkeypatch: pytest.MonkeyPatch) -> None:

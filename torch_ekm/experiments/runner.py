@@ -36,6 +36,11 @@ from .records import NotGrasped, Record, Trial, TrialRecord, true_state
 _DEG = math.pi / 180
 _TRIES = 4  # grasps drawn for one trial before it is given up
 _HOPELESS = 2  # trials without any grasp, after which the object is given up
+# of the turns in which a hand is learned
+_LEARNS_BY = (14.0, -8.0, 22.0)  # [deg] in this order
+_MOTIONS = 30  # at least, unless turns end early
+_MOST_TURNS = 12
+_FIRST_GRASP = 1000  # its number: never one that is tested
 
 
 class Bench:
@@ -109,6 +114,17 @@ class Bench:
         if start is None:
             return NotGrasped(**vars(about), message=self.no_grasp)
         return self.turn(about, start, **options)
+
+    def learn_hand(self, seed: int) -> list[Record]:
+        """Thirty motions with this object, in turns to and fro, for the knowledge of the hand."""
+        records: list[Record] = []
+        motions = 0
+        while motions < _MOTIONS and len(records) < _MOST_TURNS:
+            k = len(records)
+            one = self.trial(seed, _FIRST_GRASP + k, _LEARNS_BY[k % len(_LEARNS_BY)], "first")
+            motions += one.steps if isinstance(one, TrialRecord) else 0
+            records.append(one)
+        return records
 
     def turn(
         self,

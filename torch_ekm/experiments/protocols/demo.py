@@ -38,6 +38,7 @@ class Demo(Generalize):
     blind_deg: float = 0.0
     controllers: tuple[str, ...] = ("KM", "E-KM")
     poses: bool = True
+    new_objects: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -43,6 +43,7 @@ TABLE_II: dict[str, tuple[float, float]] = {
 OTHER_ANGLES = (5.0, 10.0, 15.0, 20.0, 25.0)
 _FIRST_WARM_UP = 1000  # number of the first training grasp: never one that is tested
 _PROBES = 2000  # and of the first grasp for probes
+_NEW = "new object"  # kind of the turns, and name of the sessions
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,8 @@ class Generalize(Protocol):
     """Several objects, each turned by the angles of Table I, every time from a new grasp.
 
     A session is one object with one seed. Each E-KM begins it empty and has ``warm_up`` turns, on grasps
-    that are not tested, before it is measured; it goes on learning while it is.
+    that are not tested, before it is measured; it goes on learning while it is. With ``new_objects`` an E-KM
+    has none, but a hand that has learned itself with another object.
 
     Raises:
         ParameterError: no object, or an angle that is no rotation.
@@ -70,6 +72,9 @@ class Generalize(Protocol):
     controllers: tuple[str, ...] = CONTROLLERS
     poses: bool = False
     """Keep the true poses of every motion, for pictures."""
+    new_objects: bool = True
+    """Each object, too, as one that the hand has never held, after thirty motions with the box; the box
+    itself after the can."""
 
     bench: ClassVar[type[Bench]] = Bench
 
@@ -90,22 +95,25 @@ class Generalize(Protocol):
     def quick(self) -> Self:
         """The same with two objects, two turns and one probe."""
         small = {"angles_deg": (5.0, 9.0), "warm_up": 1, "long_step_deg": 3.0, "blind_deg": 0.0}
-        return dataclasses.replace(self, objects=("box", "can"), **small)
+        return dataclasses.replace(self, objects=("box", "can"), new_objects=False, **small)
 
     def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[str, str, int]]:
         """One for each seed, object and controller."""
         # a job does not depend on which others there are
-        alone = {**vars(self), "objects": ("any",), "controllers": CONTROLLERS}
+        alone = {**vars(self), "objects": ("any",), "controllers": CONTROLLERS, "new_objects": True}
         own = {item: digest(self.setting, (item,), alone, self.angles_of(item)) for item in self.objects}
+        contenders = (*self.controllers, *([_NEW] if self.new_objects else []))
         return {
             f"generalize_{own[item]}_{object_name(item)}_{name}_{seed}": (item, name, seed)
             for seed in seeds
             for item in self.objects
-            for name in self.controllers
+            for name in contenders
         }
 
     def session(self, object: str, controller: str, seed: int) -> list[Record]:
         """Warm-up (E-KM only), all angles, then the probes, with one object and one seed."""
+        if controller == _NEW:
+            return self._new_object(object, seed)
         bench = self.bench(self.setting.hardware_instance(seed), object, controller)
         turn = partial(bench.trial, seed)
         angles = self.angles_of(object)
@@ -118,6 +126,18 @@ class Generalize(Protocol):
         if self.blind_deg:
             angle = max(middle, self.blind_deg + 3)
             records.append(turn(_PROBES + 10, angle, "camera off", learn=False, blind_deg=self.blind_deg))
+        bench.close()
+        return records
+
+    def _new_object(self, object: str, seed: int) -> list[Record]:
+        """All angles with an object that a hand that knows itself has never held."""
+        setting = self.setting.hardware_instance(seed)
+        other = self.bench(setting, "can" if object == "box" else "box", "E-KM")
+        records = other.learn_hand(seed)
+        other.close()
+        bench = self.bench(setting, object, "E-KM")
+        bench.knowledge = other.knowledge
+        records += [bench.trial(seed, k, angle, _NEW) for k, angle in enumerate(self.angles_of(object))]
         bench.close()
         return records
 
@@ -135,6 +155,7 @@ class Generalize(Protocol):
             tables.reason_table(trials),
             object_table(trials),
             ends_table(trials),
+            new_object_table(trials),
             tables.controller_table(trials),
             tables.motion_table(trials),
             tables.comparison_table(trials),
@@ -211,6 +232,27 @@ def ends_table(trials: DataFrame) -> Table:
         rows.append([item, *(f"{lost}, {missed}" for lost, missed in ended.to_numpy())])
     columns = ["object", *(f"{name} lost, not reached" for name in names)]
     return Table("ends", "Objects lost, and turns that did not reach the target", columns, rows)
+
+
+def new_object_table(trials: DataFrame) -> Table:
+    """The E-KM after its warm-up, and without one on a hand that knows itself from another object."""
+    figures = ("error_deg", "first_motion", "motions")
+    rows: list[list[Cell]] = []
+    mine = select(trials, controller="E-KM")
+    first = mine["true_prediction_ekm_deg"].map(lambda errors: errors[0] if len(errors) else np.nan)
+    for item, chosen in tables.by_object(mine.assign(first_motion=first)).items():
+        kinds = [select(chosen, kind=kind) for kind in ("turn", _NEW)]
+        if all(map(len, kinds)):
+            cells = (stats.estimate(one, name) for name in figures for one in kinds)
+            rows.append([item, *cells, f"{kinds[1]['lost'].sum()}, {kinds[1]['not_reached'].sum()}"])
+    columns: list[Column | str] = ["object", "error [deg]", "new [deg]"]
+    columns += ["first motion [deg]", "new: first motion [deg]"]
+    columns += [Column("motions", ".1f"), Column("new: motions", ".1f"), "new: lost, not reached"]
+    note = (
+        "The E-KM after its warm-up with each object, and without one (new), where the hand has made thirty "
+        "motions with another object. First motion: error of its prediction, by the truth."
+    )
+    return Table("new_objects", "Objects that the hand has never held", columns, rows, note)
 
 
 def probe_table(trials: DataFrame) -> Table:
