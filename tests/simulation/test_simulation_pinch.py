@@ -14,9 +14,9 @@ from torch_ekm.contact.detector import ContactDetector
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics import HandKinematics
-from torch_ekm.simulation import PlantConfig, PlantParameters
+from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
 from torch_ekm.simulation.grasp_planning import pinch
-from torch_ekm.simulation.grasp_planning.pinch import pinch_problem, plan_pinch
+from torch_ekm.simulation.grasp_planning.pinch import opposing_pads, pinch_problem, plan_pinch
 from torch_ekm.simulation.grasp_planning.pinch_problem import PinchRequest
 from torch_ekm.simulation.mechanism.assembly import make_transmission
 
@@ -153,3 +153,31 @@ def test_a_descent_in_which_lapack_fails_begins_again(monkeypatch):
     plan = plan_pinch(problem, PinchRequest())
     assert len(calls) > 1
     assert len(plan.pads) == 3
+
+
+def test_the_opposing_pad_is_found_by_directions_not_by_order():
+    hand = load_hand("icub_right")
+    thumb, index, middle, *_ = (dataclasses.replace(pad, name=f"pad {k}") for k, pad in enumerate(hand.pads))
+    turned = dataclasses.replace(hand, pads=(index, thumb, middle))
+    assert opposing_pads(turned, PlantConfig()) == ("pad 0", ("pad 1", "pad 2"))
+
+
+def test_an_object_that_no_pinch_holds_is_refused_once(tmp_path, monkeypatch):
+    (tmp_path / "bead.urdf").write_text(
+        '<robot name="bead"><link name="bead"><inertial><mass value="0.003"/>'
+        '<inertia ixx="1e-8" ixy="0" ixz="0" iyy="1e-8" iyz="0" izz="1e-8"/></inertial><collision>'
+        '<geometry><box size="0.004 0.004 0.004"/></geometry></collision></link></robot>'
+    )
+    (tmp_path / "bead.object.toml").write_text(
+        '[object]\nname = "bead"\nfriction = 0.9\ngrasp_width = 0.004\n'
+    )
+    monkeypatch.setattr(pinch, "_GUESSES", 1)  # the others fail too
+    plant = SimulatedHand("icub_right", str(tmp_path / "bead.urdf"), engine="mujoco")
+    descents, descend = [], pinch._descend
+    monkeypatch.setattr(pinch, "_descend", lambda *what, **how: descents.append(1) or descend(*what, **how))
+    with pytest.raises(EquilibriumError, match="too small: 4 mm, for pads 'index' and 'middle'"):
+        plant.reset(0)
+    assert (often := len(descents)) > 0
+    with pytest.raises(EquilibriumError, match="too small"):
+        plant.reset(1)
+    assert len(descents) == often

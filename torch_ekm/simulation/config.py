@@ -24,7 +24,8 @@ class PlantConfig:
     pinch_force: float | None = None
     """Normal force of the thumb in the planned grasp [N]; None: the hand's."""
     thumb: str | None = None
-    """Pad that opposes the others; None: the one whose name begins with "thumb", else the first."""
+    """Pad that opposes the others; None: the one whose name begins with "thumb", else the one that faces the
+    others best while the hand closes."""
     fingers: tuple[str, ...] | None = None
     """Opposing pads; None: index and middle where there are such, else all others."""
     along: tuple[float, float, float] | None = None

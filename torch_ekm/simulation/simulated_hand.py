@@ -15,7 +15,7 @@ from ..kinematics import GraspState
 from ..plant import Observation, PlantStatus, Stamps, Truth
 from ..typing import Array, Float, Tensor
 from .config import PlantConfig
-from .grasp_planning.pinch import PinchPlan, pinch_hint, pinch_problem, plan_pinch, turning_axis
+from .grasp_planning.pinch import PinchPlan, exists, pinch_hint, pinch_problem, plan_pinch, turning_axis
 from .grasp_planning.pinch_problem import PinchRequest
 from .mechanism.assembly import true_hand, true_object
 from .parameters import PlantParameters
@@ -98,6 +98,7 @@ class SimulatedHand:
         self._generator = np.random.default_rng(0)
         self._rig: Rig | None = None
         self._plan: PinchPlan | None = None
+        self._ungraspable: EquilibriumError | None = None
 
     # -- the plant contract -------------------------------------------------------------------------
 
@@ -119,14 +120,16 @@ class SimulatedHand:
                 self.engine,
                 self._native,
             )
+        if self._ungraspable is not None:
+            raise self._ungraspable
         unplanned = 0
         for _ in range(_ATTEMPTS):
             request = self._request()
             try:
                 plan = plan_pinch(self._problem, request)
-            except EquilibriumError:
+            except EquilibriumError as refused:
                 unplanned += 1
-                if unplanned == 2:
+                if unplanned == 2 or not self._graspable(request, refused):
                     raise
                 continue
             self._plan = plan
@@ -290,10 +293,16 @@ class SimulatedHand:
 
     def _adopt(self, parameters: PlantParameters) -> None:
         self._problem = pinch_problem(self.hand, self.object, self.config, parameters)  # may refuse: first
-        self.parameters = parameters
+        self.parameters, self._ungraspable = parameters, None
         self._sensors.set_parameters(parameters)
         if self._rig is not None:
             self._rig.change(parameters)
+
+    def _graspable(self, request: PinchRequest, refused: EquilibriumError) -> bool:
+        """Some pinch is known, or the centred one exists; what has none is refused from then on."""
+        if self._plan is None and not exists(self._problem, PinchRequest(request.force)):
+            self._ungraspable = refused
+        return self._ungraspable is None
 
     def _request(self) -> PinchRequest:
         """Where to grasp."""

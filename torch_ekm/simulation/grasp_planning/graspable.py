@@ -44,10 +44,14 @@ def object_axes(obj: ObjectDescription) -> Array:
     first /= np.linalg.norm(first)
     extents = {}
     for axis in (first, np.cross(grasp, first)):
-        reach = [_half_extent(shape, axis) for shape in obj.shapes]
-        extents[max(reach)] = axis
+        extents[half_extent(obj, axis)] = axis
     long_axis = extents[max(extents)]
     return np.asarray(np.stack([long_axis, grasp, np.cross(long_axis, grasp)], axis=1), dtype=np.float64)
+
+
+def half_extent(obj: ObjectDescription, axis: Array) -> float:
+    """How far the object reaches from its origin along a unit vector, in its frame [m]."""
+    return max(_half_extent(shape, axis) for shape in obj.shapes)
 
 
 def _half_extent(shape: Shape, axis: Array) -> float:

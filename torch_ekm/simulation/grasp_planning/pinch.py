@@ -9,24 +9,29 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ..._extras import require
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import EquilibriumError, ParameterError
+from ...kinematics import HandKinematics
 from ...typing import Array
 from ..config import PlantConfig
 from ..mechanism.assembly import make_transmission, true_object
 from ..parameters import PlantParameters
-from .pinch_problem import PinchProblem, PinchRequest
+from .graspable import half_extent
+from .pinch_problem import PinchGeometry, PinchProblem, PinchRequest
 from .requirements import require_two_pads_and_limits, unmet
 
 _FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
 _POSTURES = 4096  # random ones, of which the best are first guesses
 _GUESSES = 5  # first guesses that are tried before giving up
 _STIFF_STEP = 0.002  # [s]; at 4 ms a hand with rigid actuators moves by 7 to 55 % another way
+_CLOSING_POSTURES = 9  # from open to closed, in which pads are asked which one opposes the others
 _WIDER = np.pi / 4  # [rad] by which limits are moved to see which ones are in the way
 _GOOD_COST = 20.0  # half a sum of squares; the wishes of a good pinch cost about 0.3
+_INSIDE = 0.5e-3  # [m] of a link in the object
 _BAD_COST = 100.0  # pads beside the object, or hand and object in one another
 
 
@@ -60,6 +65,10 @@ class _Solution(NamedTuple):
         return self.violation > 1, self.outside > 0, self.cost
 
     @property
+    def holds(self) -> bool:
+        return self.violation <= 1 and self.outside <= 0 and self.cost <= _BAD_COST
+
+    @property
     def good(self) -> bool:
         return self.violation < 0.2 and self.outside <= 0 and self.cost < _GOOD_COST
 
@@ -73,14 +82,14 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
     found = _solve(problem, request)
     g = problem.geometry(found.x[None])
     motor = problem.motors(g)[0]
-    if found.violation > 1.0 or found.outside > 0 or found.cost > _BAD_COST:
+    if not found.holds:
         raise EquilibriumError(
             "pinch planner",
             f"no posture within the limits holds '{problem.obj.name}' with {request.force:g} N",
             pinch_hint(problem)
             or _limits_hint(problem, request)
             or _range_hint(problem, motor)
-            or "the object may be too wide, or out of reach",
+            or _size_hint(problem, g),
         )
     if np.abs(g.facing).min() < _FACING:
         raise EquilibriumError(
@@ -100,6 +109,11 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
         normals=g.normal[0],
         pads=tuple(pad.name for pad in problem.pads),
     )
+
+
+def exists(problem: PinchProblem, request: PinchRequest) -> bool:
+    """Whether some posture holds the object as wanted."""
+    return _solve(problem, request).holds
 
 
 def _solve(problem: PinchProblem, request: PinchRequest) -> _Solution:
@@ -172,6 +186,17 @@ def _range_hint(problem: PinchProblem, motor: Array) -> str:
     return f"the best takes actuator {beyond}: {remedy}" if beyond else ""
 
 
+def _size_hint(problem: PinchProblem, g: PinchGeometry) -> str:
+    """What is wrong with the object's size, by the best posture."""
+    if (inside := -float(g.clearance.min())) > _INSIDE:
+        return f"it is too wide: some link would be {1e3 * inside:.0f} mm inside it"
+    length, pads = 2 * half_extent(problem.obj, problem.axes[:, 0]), problem.pads[1:]
+    if len(pads) > 1 and length < 2 * max(pad.radius for pad in pads):
+        names = " and ".join(f"'{pad.name}'" for pad in pads)
+        return f"it is too small: {1e3 * length:.0f} mm, for pads {names} side by side"
+    return "it may be too wide, or out of reach"
+
+
 def _places(names: Sequence[str], at: Array, low: Array, high: Array, chosen: NDArray[np.bool_]) -> str:
     """``'left' (0 to 90 deg) at 97 deg and ...`` of those chosen; all angles [rad]."""
     at, low, high = np.degrees([at, low, high])
@@ -223,12 +248,36 @@ def pinch_problem(
 def opposing_pads(hand: HandDescription, config: PlantConfig) -> tuple[str, tuple[str, ...]]:
     """Names of the pad that opposes the others, and of these."""
     names = [pad.name for pad in hand.pads]
-    thumb = config.thumb or next((name for name in names if name.startswith("thumb")), names[0])
+    named = config.thumb or next((name for name in names if name.startswith("thumb")), None)
+    thumb = named or names[_most_opposed(hand)]
     fingers = config.fingers
     if fingers is None:
         chosen = tuple(name for name in names if name.startswith(("index", "middle")))
         fingers = chosen or tuple(name for name in names if name != thumb)
     return thumb, fingers
+
+
+def _most_opposed(hand: HandDescription) -> int:
+    """The pad that faces the others best while the hand closes: ``max min_i`` of the pads' cosines."""
+    if len(hand.pads) < 3:
+        return 0
+    kinematics, closing = HandKinematics(hand), np.linspace(0.0, 1.0, _CLOSING_POSTURES)[:, None]
+    low, high = hand.joint_lower, hand.joint_upper
+    ranged = np.isfinite(high - low)
+    q = np.where(ranged, low, hand.spring_rest) + closing * np.where(ranged, high - low, 0.0)
+    poses = kinematics(torch.from_numpy(q))
+    T = np.stack([poses.of(pad.link).numpy() for pad in hand.pads], axis=1)
+    tips = T[..., :3, :3] @ np.array([pad.end for pad in hand.pads])[..., None]
+    tips = tips[..., 0] + T[..., :3, 3]
+    directions = (T[..., :3, :3] @ np.array([pad.direction for pad in hand.pads])[..., None])[..., 0]
+    scores = []
+    for one in range(len(hand.pads)):
+        others = np.arange(len(hand.pads)) != one
+        across = tips[:, others].mean(axis=1) - tips[:, one]
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        facing = np.einsum("bci,bi->bc", directions, across) * np.where(others, -1.0, 1.0)
+        scores.append(facing.min(axis=1).max())
+    return int(np.argmax(scores))
 
 
 def turning_axis(hand: HandDescription, config: PlantConfig) -> Array:

@@ -119,12 +119,13 @@ class PinchProblem:
         links, self._ball, self._ball_radius = obstacles(hand, self.pads)
         self._ball_link = [self.kinematics.link_index(name) for name in links]
         self._prepare_mechanism()
-        self._axes = object_axes(obj)
+        self.axes = object_axes(obj)
+        """Of the object, as columns: long axis, grasp axis, their product."""
         self._preferred = self._half_bent()
         self.towards = self._direction_of_grasp()
         third = np.cross(self.along, self.towards)
         self._third = third
-        self._nominal = np.column_stack([self.along, self.towards, third]) @ self._axes.T
+        self._nominal = np.column_stack([self.along, self.towards, third]) @ self.axes.T
 
     def _prepare_mechanism(self) -> None:
         hand, J_a = self.hand, self.transmission.J_a
@@ -230,7 +231,7 @@ class PinchProblem:
             normal=n[place],
             point=point[place],
             local=local[place],
-            facing=(normal @ self._axes[:, 1])[place],
+            facing=(normal @ self.axes[:, 1])[place],
             pad_axis=np.einsum("bcij,cj->bci", turn, self._axis)[place],
             pad_direction=np.einsum("bcij,cj->bci", turn, self._palmar)[place],
             clearance=(clearance - self._ball_radius)[place],
@@ -264,13 +265,13 @@ class PinchProblem:
         share = (f_n[:, 1:] - f_n[:, :1] / max(1, len(self.pads) - 1)) / 1.0
         cap = np.maximum(0.0, 0.3 + np.einsum("bci,bci->bc", g.normal, g.pad_axis)) / 0.1
         pad = np.maximum(0.0, 0.3 + np.einsum("bci,bci->bc", g.normal, g.pad_direction)) / 0.1
-        along, across = g.local @ self._axes[:, 0], g.local @ self._axes[:, 2]
+        along, across = g.local @ self.axes[:, 0], g.local @ self.axes[:, 2]
         place = [
             (part - wanted) / 2e-3
             for at, wanted in ((along, request.along), (across, request.across))
             for part in (at[:, 0], at[:, 1:].mean(axis=1))
         ]
-        long_axis = g.rotation @ self._axes[:, 0]
+        long_axis = g.rotation @ self.axes[:, 0]
         wish = self._tilted(request)
         tilt = (long_axis - wish) / 0.1
         facing = np.concatenate([-g.facing[:, :1], g.facing[:, 1:]], axis=1)
