@@ -151,8 +151,9 @@ def test_a_step_is_cut_in_proportion_to_what_is_predicted_to_go_wrong(held) -> N
     carried[-6:] = 10e-3 * focus.off_matrix[focus.off_translation][0]
     assert bound.share(lin, still, carried, at) == pytest.approx(0.25)
     force = float(at.normal_force(lin).max())  # type: ignore[union-attr]
-    at = dataclasses.replace(at, grip=2 * force)
-    assert bound.share(lin, still, predicted, at) == pytest.approx(0.25)
+    grips = [dataclasses.replace(at, grip=force / part) for part in (1.2, 0.75, 0.65, 0.55, 0.3)]
+    assert [bound.grip_share(lin, one) for one in grips] == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0])
+    assert bound.grip_share(lin, at) == 1.0  # nothing is asked of it
     at = dataclasses.replace(at, grip=6.0)
     # the sum of three fingers is right, but one of the two that share a side bears half of its part
     felt = torch.tensor([6.0, 4.5, 1.5], dtype=torch.float64)
@@ -172,6 +173,17 @@ def test_a_step_is_cut_in_proportion_to_what_is_predicted_to_go_wrong(held) -> N
     heavier = [dataclasses.replace(at, grip=None, weight=weight) for weight in (0.3, 3.0)]
     shares = [bound.share(lin, delta, predicted, one) for one in heavier]
     assert 0 < shares[1] < shares[0] < 1
+
+
+def test_a_grip_that_is_too_weak_is_tightened_and_not_turned(held) -> None:
+    plant, model, seen = held
+    target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0)
+    felt = torch.tensor([2.6, 1.3, 1.3, 0.0, 0.0], dtype=torch.float64)
+    decision = LookAndMoveController(model, plant.rotation_axis).decide(seen.state, seen.a, target, felt)
+    assert decision.share == 0.0
+    assert float(decision.desired.abs().max()) == 0.0
+    change = decision.linearization.normal_force_sensitivity @ decision.delta_a
+    assert float(change[0]) > 0.3  # [N]
 
 
 def test_the_bound_shortens_the_step_that_is_made(held) -> None:

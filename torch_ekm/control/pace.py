@@ -29,6 +29,7 @@ _ROTATION_NOISE = 0.3 * _DEG  # [rad]
 _FORCE_NOISE = 0.5  # [N]
 _FORCE_SHARE = 0.25  # of the force that a finger bears: an error that leaves it its grip
 SLIDES = 2.0  # rho of the twist alone from which the object is thought to slide
+_WEAK, _FIRM = 0.55, 0.75  # of the wanted grip: with which nothing is turned, and with which steps are whole
 _UNFELT = 1.0  # largest p where no pad measures: forces that nobody sees drift with the way that is made
 _FOR_NEW = 1.4  # largest p with an object that is new to a hand whose figures are known
 _USED = 0.7  # a motion below this share of what was allowed says nothing for a larger one
@@ -81,16 +82,17 @@ def contact_travel(twist: Float[Tensor, " 6"], lever: Float[Tensor, "n_c 3"]) ->
 @dataclass(frozen=True)
 class StepBound:
     """``phi = min(1, off_rotation/|w_off|, off_travel/|v_off|, (m + creep mu f/W)/(m - m_after),
-    (f/f_wanted)^2, max(1/p, (f_i/(even f_mean))^2))``: the share of a step that is made.
+    max(1/p, (f_i/(even f_mean))^2))``: the share of a step that is made.
 
     w_off and v_off are the predicted rotation and translation off the focus; m_after the predicted friction
     margins. A contact that slides holds no weight W across its way: the heavier the object is for its grip,
-    the less may be missing. A grip f that falls short of the wanted one is tightened first. The fingers that
+    the less may be missing. The fingers that
     oppose the strongest one may bear enough together while one of them lets go: steps p above those of
     pace 1, which change the forces faster than they are corrected, ask for a force f_i of each that is near
     the mean f_mean of them.
 
-    A step is not cut below ``least`` of the largest one at pace 1: standing still turns nothing.
+    A step is not cut below ``least`` of the largest one at pace 1: standing still turns nothing. But a grip f
+    is tightened first: below 0.75 of the wanted one steps become smaller, and at 0.55 of it there are none.
     """
 
     off_rotation: float = 1.5 * _DEG
@@ -101,8 +103,8 @@ class StepBound:
     """Margin that may be missing where friction and weight are equal [N]."""
     even: float = 0.85
     """Of the mean of the fingers that oppose the strongest one, what each of them should bear."""
-    least: float = 0.35
-    """Infinite: steps are never cut."""
+    least: float = 0.7
+    """Infinite: steps are cut by the grip alone."""
 
     def __post_init__(self) -> None:
         for name in ("off_rotation", "off_travel", "creep", "even", "least"):
@@ -134,7 +136,6 @@ class StepBound:
         force = float(f_n.max())
         if seen.grip:
             others = np.delete(f_n, f_n.argmax())
-            phi = min(phi, max(force / seen.grip, 0.0) ** 2)
             if len(others):
                 even = max(float(others.min()), 0.0) / max(self.even * float(others.mean()), 1e-9)
                 phi = min(phi, max(1 / max(asked, 1.0), even**2))
@@ -146,6 +147,14 @@ class StepBound:
             allowed = (before[missing] + spare) / (before[missing] - after[missing])
             phi = min(phi, float(allowed.clamp(0.0, 1.0).min()))
         return phi
+
+    def grip_share(self, lin: Linearization, seen: Situation) -> float:
+        """``clip((f/f_wanted - 0.55) / 0.2, 0, 1)``: the share of a step that a grip bears."""
+        f_n = seen.normal_force(lin)
+        if f_n is None or not seen.grip:
+            return 1.0
+        held = float(f_n.max()) / seen.grip
+        return min(max((held - _WEAK) / (_FIRM - _WEAK), 0.0), 1.0)
 
 
 class ForceSurprise(NamedTuple):
@@ -290,7 +299,8 @@ class Pace(nn.Module):
         """
         bound, asked = self.options.bound, share * self.factor
         phi = bound.share(lin, delta_a, predicted, seen, asked)
-        return max(phi, min(1.0, bound.least / max(asked, 1e-9)))
+        phi = max(phi, min(1.0, bound.least / max(asked, 1e-9)))
+        return min(phi, bound.grip_share(lin, seen))
 
     def judge(self, disagreement: float, share: float = 1.0) -> None:
         """Learn from one motion.

@@ -50,7 +50,8 @@ class Setting:
     servo_inverse: bool = True
     """The E-KM commands through one; without it the dead zone is learned together with the hand."""
     adapts: bool = True
-    """f of the E-KM follows the figures of the hand as they are learned; else its description."""
+    """f of the E-KM follows the figures of the hand as they are learned; else, and where no fingertip
+    measures, its description."""
     learner: str = DEFAULT_LEARNER
     learner_options: Mapping[str, Any] = field(default_factory=dict)
     capacity: int = 60
@@ -83,6 +84,12 @@ class Setting:
     def parameters(self) -> PlantParameters:
         """Figures of the simulated plant: ``plant``, or else those of the preset."""
         return preset(self.preset) if self.plant is None else self.plant
+
+    @property
+    def follows(self) -> bool:
+        """Whether f of the E-KM follows the figures of the hand. Motions of other figures than those of the
+        forces let a grip slide that nobody feels."""
+        return self.adapts and self.parameters.force_sensors
 
     def hardware_instance(self, seed: int) -> Setting:
         """The same with another instance of the hand (signs and sizes of its constant errors)."""

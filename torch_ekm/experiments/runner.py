@@ -67,7 +67,7 @@ class Bench:
         else:
             self.plant = FramesAtRest(self.plant, setting.frames)
         inverse = controller == "KM+S" or (self.learns and setting.servo_inverse)
-        adapts = self.learns and setting.adapts
+        adapts = self.learns and setting.follows
         self.knowledge = HandKnowledge.of(self.hand.hand, learns=inverse, adapts=adapts)
         """Of the hand; it stays when the object changes."""
         self.pace = Pace(setting.pace, adapts=self.learns)
@@ -218,7 +218,7 @@ class Bench:
         if self.learner is None:
             sizes = self.encoding.n_features, self.model.hand.n_a, setting.capacity
             options = dict(setting.learner_options)
-            if setting.adapts and setting.learner == DEFAULT_LEARNER:
+            if setting.follows and setting.learner == DEFAULT_LEARNER:
                 options = {"action_variance": SMALL_ACTION_VARIANCE, **options}
             self.learner = make_learner(setting.learner, *sizes, **options)
         self.enhanced = EnhancedModel.for_grasp(
