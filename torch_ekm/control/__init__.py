@@ -6,7 +6,7 @@ from ..enhanced.hand_figures import DescribedFigures, HandFigures
 from .closed_loop import ClosedLoop
 from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
 from .decision import Decision, StopReason
-from .focus import FocusedPose, PoseTarget
+from .focus import Direction, FocusedPose, PoseTarget
 from .force_sensitivity import ForceSensitivity
 from .knowledge import HandKnowledge
 from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
@@ -27,6 +27,7 @@ __all__ = [
     "Caution",
     "ClosedLoop",
     "Decision",
+    "Direction",
     "DescribedFigures",
     "EffortTask",
     "Equality",

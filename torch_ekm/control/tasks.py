@@ -27,15 +27,19 @@ class Task(Protocol):
 
 @dataclass(frozen=True)
 class FocusTask:
-    """``M_c E_p (f + g)(s, u) + sl = dx_d``: the step meets the limited error if it can, else comes as near
-    as it can (exact l1 slack)."""
+    """``D (M_c E_p (f + g)(s, u) - dx_d) + sl = 0``: the step meets the limited error if it can, else comes as
+    near as it can (exact l1 slack). D is the ``tolerance_scale`` of the :class:`FocusedPose`."""
 
     penalty: float = 1e3
-    """rho, per degree of the focused rotation that is left unmet."""
+    """rho, per degree of a focused rotation that is left unmet; times the weight of a direction."""
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Equality:
-        M, n_q = seen.focus.matrix, model.kinematic.n_q
-        return Equality(M @ model.jacobian[n_q:], seen.desired - M @ model.offset[n_q:], self.penalty)
+        focus, n_q = seen.focus, model.kinematic.n_q
+        M, scale = focus.matrix, focus.tolerance_scale
+        left = seen.desired - M @ model.offset[n_q:]
+        return Equality(
+            scale[:, None] * (M @ model.jacobian[n_q:]), scale * left, self.penalty * focus.weight
+        )
 
 
 @dataclass(frozen=True)
