@@ -14,7 +14,7 @@ from .manipulation import Manipulation, Step, Stop
 from .model_hand import ModelHand
 from .pace import LimitingFunction, Pace, PaceOptions, StepBound, TrustRegion
 from .qp import Bounds, Equality, Inequality, Squares
-from .reach import Reach, ReachEnd
+from .reach import Reach, Reachability, ReachEnd
 from .safety import Caution, Guards, Safety, StoppingRule
 from .situation import LinearizedModel, Situation
 from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
@@ -52,6 +52,7 @@ __all__ = [
     "PaceOptions",
     "PoseTarget",
     "Reach",
+    "Reachability",
     "ReachEnd",
     "Safety",
     "Situation",

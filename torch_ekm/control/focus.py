@@ -56,8 +56,7 @@ class PoseTarget:
     def moved(
         cls, start: GraspState | PoseTarget, axis: Float[Tensor, " 3"], *, millimetres: float
     ) -> PoseTarget:
-        """The pose of ``start`` shifted along ``axis`` (hand frame). Of a target that is
-        :meth:`turned`: both.
+        """The pose of ``start`` shifted along ``axis`` (hand frame); of a :meth:`turned` target: both.
 
         Raises:
             NonFiniteError: the distance is NaN or infinite.
@@ -104,7 +103,7 @@ class Direction:
         return torch.cat([none, axis] if self.unit == "deg" else [axis, none])
 
     def scale(self, figure: str) -> float:
-        """Turn that counts as much as a unit of this direction, by its "tolerance" or "step" [rad/rad, rad/m]."""
+        """Turn that counts as much as 1 rad or 1 m of this direction, by its "tolerance" or "step" [rad]."""
         usual, own = _USUAL[figure], getattr(self, figure)
         return usual["deg"] * _SI["deg"] / ((usual[self.unit] if own is None else own) * _SI[self.unit])
 
@@ -119,42 +118,39 @@ class FocusedPose:
     ``matrix`` (M_c, ``(n_x, 6)``) selects what the controller must reach; ``off_matrix``
     spans the rest, which it should keep small; ``off_translation`` marks its translations.
 
-    Errors in different units are compared as turns that count as much: those that miss their tolerance as
-    far, or ask for as many steps::
+    Errors in different units are compared as turns that count as much, by their tolerance or by their step::
 
         tolerance_scale_i = 0.25 deg / tolerance_i,    step_scale_i = 2.5 deg / step_i
-
-    With the tolerances and steps that are usual, an error of a rotation is what it is.
 
     Args:
         directions: perpendicular to each other; or M_c with orthonormal rows, each a turn or a shift.
 
     Raises:
         ShapeError: M_c is not ``(n_x, 6)``.
-        ParameterError: a direction is named twice, is not perpendicular to another, or both turns and shifts.
+        ParameterError: a direction is named twice, is not perpendicular to another, or turns and shifts.
     """
 
     def __init__(self, directions: Sequence[Direction] | Float[Tensor, "n_x 6"]) -> None:
         if isinstance(directions, torch.Tensor):
-            matrix = directions
-            if matrix.ndim != 2 or matrix.shape[1] != 6:
-                raise ShapeError("matrix", "(n_x, 6)", matrix.shape)
-            turns, shifts = matrix[:, 3:].abs().sum(-1) > 1e-9, matrix[:, :3].abs().sum(-1) > 1e-9
-            if bool((turns & shifts).any()):
-                raise ParameterError("matrix", matrix.tolist(), "rows that turn or shift: else they have no unit")
-            parts = zip(matrix, turns.tolist(), strict=True)
-            directions = [Direction(row[3:], "deg") if t else Direction(row[:3], "mm") for row, t in parts]
-        elif directions:
-            matrix = torch.stack([one.row for one in directions])
+            given = directions
+            if given.ndim != 2 or given.shape[1] != 6:
+                raise ShapeError("matrix", "(n_x, 6)", given.shape)
+            shifts = zip(given, (given[:, :3].abs().sum(-1) > 1e-9).tolist(), strict=True)
+            directions = [Direction(row[:3], "mm") if s else Direction(row[3:], "deg") for row, s in shifts]
         else:
+            given = None
+        self.directions = tuple(directions)
+        if not self.directions:
             raise ParameterError("directions", directions, "one to six of them")
+        matrix = self.matrix = torch.stack([one.row for one in self.directions])
         gram = matrix @ matrix.mT - torch.eye(len(matrix), dtype=matrix.dtype)
-        if bool((gram.tril(-1).abs() > 1 - 1e-9).any()):
-            i, k = (gram.tril(-1).abs() > 1 - 1e-9).nonzero()[0].tolist()
-            raise ParameterError("directions", f"{directions[i]}, {directions[k]}", "named once each")
-        if not torch.allclose(gram, torch.zeros_like(gram), atol=1e-9):
-            raise ParameterError("matrix", "M_c", "a matrix with orthonormal rows (M_c M_c^T = I)")
-        self.matrix, self.directions = matrix, tuple(directions)
+        twice = (gram.tril(-1).abs() > 1 - 1e-9).nonzero().tolist()
+        if twice:
+            raise ParameterError("directions", [str(self.directions[k]) for k in twice[0]], "named once each")
+        given = matrix if given is None else given
+        if not (bool((gram.abs() < 1e-9).all()) and torch.allclose(given, matrix, rtol=0, atol=1e-9)):
+            valid = "orthonormal rows (M_c M_c^T = I), each of which turns or shifts"
+            raise ParameterError("matrix", given.tolist(), valid)
         self.tolerance_scale = matrix.new_tensor([one.scale("tolerance") for one in self.directions])
         self.step_scale = matrix.new_tensor([one.scale("step") for one in self.directions])
         self.weight = matrix.new_tensor([one.weight for one in self.directions])
@@ -168,7 +164,7 @@ class FocusedPose:
         return cls([Direction(axis, "deg")])
 
     def error(self, target: PoseTarget, state: GraspState) -> float:
-        """``|e| = max_i tolerance_scale_i |e_i|``, e focused of the twist from the state to the target [rad]."""
+        """``|e| = max_i tolerance_scale_i |e_i|`` [rad], ``e = M_c`` times the twist from state to target."""
         return float((self.tolerance_scale * (self.matrix @ target.error(state))).abs().max())
 
     def off_rotation(self, increment: Float[Tensor, " n_s"]) -> float:

@@ -1,30 +1,39 @@
-"""How far a grasp can be turned, and what ends it, before anything moves."""
+"""What a grasp can reach, how far it can be turned, and what ends it, before anything moves."""
 
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from enum import Enum
 
+import numpy as np
 import torch
 
-from ..exceptions import GraspError, ParameterError
+from ..exceptions import GraspError, ParameterError, SolverError
 from ..kinematics import GraspState
 from ..model import Linearization
 from ..plant import Observation, Plant
 from ..typing import Float, Tensor
 from .controller import LookAndMoveController
 from .decision import StopReason
-from .focus import FocusedPose, PoseTarget
+from .focus import Direction, FocusedPose, PoseTarget
+from .limits import ActuatorLimit
 from .manipulation import Step, Stop
 from .model_hand import ModelHand
+from .qp import as_array, build_qp
+from .safety.safety import Caution
+from .situation import LinearizedModel, Situation
+from .tasks import EffortTask, FocusTask, OffAxisTask
 
 _DEG = math.pi / 180
 _BEARS = 0.01  # [N m] of a stop that ends a turn
 _ASKED = 25 * _DEG  # [rad] the model is asked about turns as far as this
 _BEYOND = 5 * _DEG  # [rad] beyond the predicted reach a target is declined; two of three ends are as near
+_WEAK = 0.08  # gain below which motors do not hold a direction: the grasps that reach their targets have .19
+_LEFT = 0.2  # of an error that the motors leave at the ends of their ranges, to decline it
 
 
 class ReachEnd(Enum):
@@ -120,18 +129,85 @@ def follow_to_the_end(
     return Reach(angles[-1], end, what, message, tuple(path), tuple(angles), until[-1])
 
 
+@dataclass(frozen=True)
+class Reachability:
+    """What J_m says of a target::
+
+        D M_c E_p J_m = U diag(gains) V^T,    e = M_c E_p J_m u + left,    a_min <= a + u <= a_max
+
+    D counts 0.8 mm of a shift as 1 deg of a turn.
+    """
+
+    gains: Float[Tensor, " n_x"]
+    """Turn of the object for a turn of the motors, the largest first: they tell rank and conditioning."""
+    left: float = 0.0
+    """Share of e that motors at the ends of their ranges leave; this and ``off_rotation``: 0 for a turn about
+    one axis, which :class:`Reach` follows step by step."""
+    off_rotation: float = 0.0
+    """Rotation off the focus on the way [rad]."""
+    reason: str = ""
+    """Why the target is not reachable; empty: it is."""
+
+
+@torch.no_grad()
+def reachability(
+    controller: LookAndMoveController, caution: Caution, seen: Observation, target: PoseTarget
+) -> Reachability:
+    """See :meth:`~torch_ekm.control.ClosedLoop.reachability`."""
+    focus, error = controller.focus, target.error(seen.state)
+    lin = controller.kinematic.linearize(seen.state, fingertip_force=seen.fingertip_force)
+    model, asked = LinearizedModel.about(torch.zeros_like(seen.a), lin), focus.matrix @ error
+    whole = Situation(controller.kinematic.hand, focus, seen.state, seen.a, None, error, asked)
+    limits = (limit for limit in controller.limits if isinstance(limit, ActuatorLimit))
+    within = dataclasses.replace(next(limits, ActuatorLimit()), step=math.inf).rows(model, whole)
+    moves = torch.from_numpy(as_array(within.lower) < as_array(within.upper))
+    D = asked.new_tensor([[Direction(one.axis, one.unit).scale("step")] for one in focus.directions])
+    U, found, _ = torch.linalg.svd(D * (focus.matrix @ lin.object_jacobian)[:, moves])
+    gains = torch.cat([found, found.new_zeros(len(asked) - len(found))])
+    if gains[-1] < _WEAK:
+        parts = sorted(zip(U[:, -1].abs().tolist(), map(str, focus.directions), strict=True), reverse=True)
+        weak = " with ".join(name for share, name in parts if share > 0.3)
+        reason = (
+            f"the motors hold {int((gains >= _WEAK).sum())} of the {len(gains)} directions of the focus: "
+            f"{gains[-1]:.2f} deg for a degree of theirs is too little of {weak}. Leave a direction out"
+        )
+        return Reachability(gains, reason=reason)
+    if [one.unit for one in focus.directions] == ["deg"]:
+        return Reachability(gains)
+    tasks = (task.rows(model, whole) for task in (EffortTask(), OffAxisTask(), FocusTask()))
+    solution, reason = build_qp(len(seen.a), [*tasks, within]).solve(), ""
+    left = float(np.abs(solution.slack).max()) / max(focus.error(target, seen.state), 1e-9)
+    off = focus.off_rotation(lin.object_jacobian @ torch.from_numpy(solution.u))
+    if left > _LEFT:
+        reason = f"motors at the ends of their ranges leave {100 * left:.0f} % of the way. Ask for less"
+    elif off > caution.off_rotation + caution.off_further:
+        reason = f"the object turns {off / _DEG:.0f} deg off the focus on the way. Ask for less"
+    return Reachability(gains, left, off, reason)
+
+
 def out_of_reach(
-    rehearsal: Rehearsal, controller: LookAndMoveController, seen: Observation, target: PoseTarget
+    rehearsal: Rehearsal | None,
+    controller: LookAndMoveController,
+    caution: Caution,
+    seen: Observation,
+    target: PoseTarget,
 ) -> str:
-    """Why a target is declined; empty: it is not, or the focus is no rotation about one axis."""
+    """Why a target is declined; empty: it is not.
+
+    Args:
+        rehearsal: tries turns about one axis that ask for much; None: they are not.
+    """
     try:
+        against = reachability(controller, caution, seen, target).reason
+        if against or rehearsal is None:
+            return against
         about = _axis_of(controller.focus)
         asked = float(about @ target.error(seen.state)[3:])
         if abs(asked) < _ASKED:
             return ""
         sign = 1 if asked >= 0 else -1
         reach = follow_to_the_end(rehearsal, controller, seen, sign, min(abs(asked), 170 * _DEG))
-    except (ParameterError, GraspError):  # the loop will say so itself
+    except (ParameterError, GraspError, SolverError):  # the loop will say so itself
         return ""
     if reach.end is ReachEnd.NOTHING or abs(asked) <= abs(reach.angle) + _BEYOND:
         return ""
@@ -165,7 +241,7 @@ def _axis_of(focus: FocusedPose) -> Float[Tensor, " 3"]:
     Raises:
         ParameterError: the focus is something else.
     """
-    if focus.matrix.shape[0] != 1 or bool((focus.matrix[:, :3].abs() > 1e-9).any()):
+    if [one.unit for one in focus.directions] != ["deg"]:
         raise ParameterError("focus", focus.matrix.tolist(), "a rotation about one axis")
     return focus.matrix[0, 3:]
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
+from ..exceptions import ParameterError, ShapeError
 from .pace import contact_travel
 from .qp import DEGREE, Equality, Squares, as_array
 from .situation import LinearizedModel, Situation, grip_shares
@@ -27,7 +29,7 @@ class Task(Protocol):
 
 @dataclass(frozen=True)
 class FocusTask:
-    """``D (M_c E_p (f + g)(s, u) - dx_d) + sl = 0``: the step meets the limited error if it can, else comes as
+    """``D M_c E_p (f + g)(s, u) + sl = D dx_d``: the step meets the limited error if it can, else comes as
     near as it can (exact l1 slack). D is the ``tolerance_scale`` of the :class:`FocusedPose`."""
 
     penalty: float = 1e3
@@ -115,11 +117,26 @@ class GripForceTask:
 
 @dataclass(frozen=True)
 class EffortTask:
-    """``w |u|^2``: of the steps that do as well, the smallest. It makes the best step unique."""
+    """``u^T W u``: of the steps that do as well, the smallest. It makes the best step unique.
 
-    weight: float = 1e-2
-    """w, per deg^2 of an actuator."""
+    Raises:
+        ParameterError: W is not positive definite.
+        ShapeError: it is not ``(n_a, n_a)``, as rows are asked for.
+    """
+
+    weight: float | Sequence[Sequence[float]] = 1e-2
+    """W of the E-KM paper ``(n_a, n_a)``, or the number on its diagonal, per deg^2 of an actuator."""
+
+    def __post_init__(self) -> None:
+        W = np.atleast_2d(np.asarray(self.weight, float))
+        symmetric = W.shape == W.T.shape and np.isfinite(W).all() and np.allclose(W, W.T)
+        if not (symmetric and np.linalg.eigvalsh(W)[0] > 0):
+            raise ParameterError("weight", self.weight, "a positive number, or a positive definite matrix")
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Squares:
-        n_a = len(seen.a)
-        return Squares(np.eye(n_a), np.zeros(n_a), self.weight, DEGREE)
+        n_a, W = len(seen.a), np.asarray(self.weight, float)
+        if W.ndim == 0:
+            return Squares(np.eye(n_a), np.zeros(n_a), W, DEGREE)
+        if len(W) != n_a:
+            raise ShapeError("weight", f"({n_a}, {n_a})", W.shape)
+        return Squares(as_array(np.linalg.cholesky(W).T), np.zeros(n_a), 1.0, DEGREE)
