@@ -276,7 +276,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     objects, seeds, groups = given.objects.split(","), given.seeds, list(TARGETS)
     if given.quick:
-        objects, seeds, groups = objects[:1], seeds[:1], ["shift 6 mm", "whole pose"]
+        objects, seeds, groups = objects[:1], seeds[:1], ["shift 3 mm", "whole pose"]
     setting = Setting(preset=given.preset, plant=preset(given.preset), engine=given.engine, frames=FRAMES)
     figures = WARM_UP, STRICTER, {group: TARGETS[group] for group in groups}
     todo = {

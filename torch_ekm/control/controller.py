@@ -231,7 +231,7 @@ class LookAndMoveController:
         return Decision(zero, status, self._ask(focused)[0], still, still, message=str(failure))
 
     def _ask(self, focused: Tensor, travel: float = 0.0, measures: bool = True) -> tuple[Tensor, float]:
-        """dx_d and its share of the largest step; the pace knows nothing but turns."""
+        """dx_d and its share of the largest step; the pace counts in turns."""
         scale = self.focus.step_scale
         desired, share = self.pace.ask(scale * focused, travel, measures)
         return desired / scale, share

@@ -131,18 +131,13 @@ def follow_to_the_end(
 
 @dataclass(frozen=True)
 class Reachability:
-    """What J_m says of a target::
-
-        D M_c E_p J_m = U diag(gains) V^T,    e = M_c E_p J_m u + left,    a_min <= a + u <= a_max
-
-    D counts 0.8 mm of a shift as 1 deg of a turn.
-    """
+    """``D M_c E_p J_m = U diag(gains) V^T``: what J_m says of a target; D counts 0.8 mm as 1 deg."""
 
     gains: Float[Tensor, " n_x"]
     """Turn of the object for a turn of the motors, the largest first: they tell rank and conditioning."""
     left: float = 0.0
-    """Share of e that motors at the ends of their ranges leave; this and ``off_rotation``: 0 for a turn about
-    one axis, which :class:`Reach` follows step by step."""
+    """Share of ``|e|`` that motors at the ends of their ranges leave. This and what follows: 0 for a turn
+    about one axis, which :class:`Reach` follows step by step."""
     off_rotation: float = 0.0
     """Rotation off the focus on the way [rad]."""
     reason: str = ""
