@@ -53,6 +53,15 @@ _FIRST_WARM_UP = 1000  # number of the first training grasp: never one that is t
 _SI = {"deg": np.pi / 180, "mm": 1e-3}
 
 
+#: How the message of a declined target begins -> what it was declined for.
+DECLINED = {
+    "the motors hold": "the motors do not hold all directions: rank or gain of the focused rows of J_m",
+    "motors at": "the motors' ranges",
+    "the object turns": "the object would turn more than 12 deg off the focus",
+    "the model leaves": "tried on the model, it ends before the target",
+}
+
+
 class Part(NamedTuple):
     """What is asked of one direction."""
 
@@ -75,6 +84,7 @@ def _targets() -> dict[str, dict[str, tuple[Part, ...]]]:
                 "the same, no other shift": tuple(Part("mm", x, 3.0 * sign * (x == axis)) for x in "abc"),
                 "turn 8 deg about a, shift 3 mm": (Part("deg", "a", 8.0), shift),
                 "shift 6 mm": (Part("mm", axis, 6.0 * sign),),
+                "shift 12 mm": (Part("mm", axis, 12.0 * sign),),
             }
             for group, parts in one.items():
                 groups.setdefault(group, {})[name] = parts
@@ -118,6 +128,12 @@ class Trial:
     @property
     def near(self) -> bool:
         return not self.declined and self.size <= 1
+
+
+def _why(trial: Trial) -> str:
+    """The message, or the kind of it."""
+    kinds = (kind for start, kind in DECLINED.items() if trial.message.startswith(start))
+    return next(kinds, trial.message)
 
 
 def axes_of(bench: Bench) -> dict[str, Tensor]:
@@ -223,13 +239,12 @@ class Outcome:
         return float(np.mean(motions)) if motions else None
 
     def ends(self) -> Table:
-        """Why targets were declined, and how those ended that were not reached, in words without figures."""
+        """Why targets were declined, and how those ended that came no nearer."""
         rows: list[list[Cell]] = []
         for group in self.groups:
-            missed = [one for one in self._of(group) if not one.near]
-            ends = Counter((one.name, one.reason, one.message.split(":")[0]) for one in missed)
-            rows += [[group, name, reason, n, message] for (name, reason, message), n in ends.items()]
-        columns: list[str | Column] = ["target", "direction", "end", "times", "why"]
+            ends = Counter((one.reason, _why(one)) for one in self._of(group) if not one.near)
+            rows += [[group, reason, n, why] for (reason, why), n in ends.most_common()]
+        columns: list[str | Column] = ["target", "end", "times", "why"]
         return Table("ends", "Declined, or not within", columns, rows)
 
     def picture(self) -> Figure:

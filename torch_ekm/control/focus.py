@@ -72,8 +72,7 @@ class Direction:
     """A direction of a focused pose: turns about an axis of the hand frame, or shifts along it.
 
     Raises:
-        UnknownNameError: the unit is missing, or another one.
-        ParameterError: an axis of no length, or a figure that is not above 0.
+        UnknownNameError, ParameterError: the unit is missing; no length of the axis, a figure not above 0.
     """
 
     axis: Float[Tensor, " 3"]
@@ -131,14 +130,12 @@ class FocusedPose:
     """
 
     def __init__(self, directions: Sequence[Direction] | Float[Tensor, "n_x 6"]) -> None:
+        given = directions
         if isinstance(directions, torch.Tensor):
-            given = directions
-            if given.ndim != 2 or given.shape[1] != 6:
-                raise ShapeError("matrix", "(n_x, 6)", given.shape)
-            shifts = zip(given, (given[:, :3].abs().sum(-1) > 1e-9).tolist(), strict=True)
+            if directions.ndim != 2 or directions.shape[1] != 6:
+                raise ShapeError("matrix", "(n_x, 6)", directions.shape)
+            shifts = zip(directions, (directions[:, :3].abs().sum(-1) > 1e-9).tolist(), strict=True)
             directions = [Direction(row[:3], "mm") if s else Direction(row[3:], "deg") for row, s in shifts]
-        else:
-            given = None
         self.directions = tuple(directions)
         if not self.directions:
             raise ParameterError("directions", directions, "one to six of them")
@@ -147,10 +144,10 @@ class FocusedPose:
         twice = (gram.tril(-1).abs() > 1 - 1e-9).nonzero().tolist()
         if twice:
             raise ParameterError("directions", [str(self.directions[k]) for k in twice[0]], "named once each")
-        given = matrix if given is None else given
-        if not (bool((gram.abs() < 1e-9).all()) and torch.allclose(given, matrix, rtol=0, atol=1e-9)):
+        same = not isinstance(given, torch.Tensor) or torch.allclose(given, matrix, rtol=0, atol=1e-9)
+        if not (same and bool((gram.abs() < 1e-9).all())):
             valid = "orthonormal rows (M_c M_c^T = I), each of which turns or shifts"
-            raise ParameterError("matrix", given.tolist(), valid)
+            raise ParameterError("matrix", matrix.tolist(), valid)
         self.tolerance_scale = matrix.new_tensor([one.scale("tolerance") for one in self.directions])
         self.step_scale = matrix.new_tensor([one.scale("step") for one in self.directions])
         self.weight = matrix.new_tensor([one.weight for one in self.directions])

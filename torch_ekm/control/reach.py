@@ -19,7 +19,7 @@ from ..plant import Observation, Plant
 from ..typing import Float, Tensor
 from .controller import LookAndMoveController
 from .decision import StopReason
-from .focus import Direction, FocusedPose, PoseTarget
+from .focus import FocusedPose, PoseTarget
 from .limits import ActuatorLimit
 from .manipulation import Step, Stop
 from .model_hand import ModelHand
@@ -32,7 +32,11 @@ _DEG = math.pi / 180
 _BEARS = 0.01  # [N m] of a stop that ends a turn
 _ASKED = 25 * _DEG  # [rad] the model is asked about turns as far as this
 _BEYOND = 5 * _DEG  # [rad] beyond the predicted reach a target is declined; two of three ends are as near
-_WEAK = 0.08  # gain below which motors do not hold a direction: the grasps that reach their targets have .19
+_WEAK = (
+    0.035  # of the largest gain of all six directions: motors do not hold one; those that they do have .07
+)
+_FAR = 10 * _DEG  # [rad], as steps count, from which a target of other directions is tried on the model
+_SHORT = 1 * _DEG  # [rad] before it, as tolerances count, that end it; those that are reached end .5 off
 _LEFT = 0.2  # of an error that the motors leave at the ends of their ranges, to decline it
 
 
@@ -96,11 +100,9 @@ def follow_to_the_end(
         raise ParameterError("sign", sign, "1 or -1")
     if not 0 < limit <= 170 * _DEG:
         raise ParameterError("limit", limit, "above 0 and at most 170 deg [rad]")
-    about, f = _axis_of(controller.focus), controller.kinematic
-    predictor = f if controller.enhanced is None else controller.enhanced
-    hand = ModelHand(predictor, seen.state, seen.a, seen.fingertip_force)
+    about, hand = _axis_of(controller.focus), _model_hand(controller, seen)
     if hand.linearization is None:
-        f.linearize(seen.state)  # raises, and says why
+        controller.kinematic.linearize(seen.state)  # raises, and says why
     start = hand.observe()
     idle = set(hand.at_limits())
     path, angles, calm = [start.state], [0.0], None  # states before the first sign of a loss
@@ -131,15 +133,10 @@ def follow_to_the_end(
 
 @dataclass(frozen=True)
 class Reachability:
-    """``D M_c E_p J_m = U diag(gains) V^T``: what J_m says of a target; D counts 0.8 mm as 1 deg."""
+    """``M_c D E_p J_m = U diag(gains) V^T``: what J_m says of a target; D counts 0.8 mm as 1 deg."""
 
     gains: Float[Tensor, " n_x"]
     """Turn of the object for a turn of the motors, the largest first: they tell rank and conditioning."""
-    left: float = 0.0
-    """Share of ``|e|`` that motors at the ends of their ranges leave. This and what follows: 0 for a turn
-    about one axis, which :class:`Reach` follows step by step."""
-    off_rotation: float = 0.0
-    """Rotation off the focus on the way [rad]."""
     reason: str = ""
     """Why the target is not reachable; empty: it is."""
 
@@ -156,18 +153,16 @@ def reachability(
     limits = (limit for limit in controller.limits if isinstance(limit, ActuatorLimit))
     within = dataclasses.replace(next(limits, ActuatorLimit()), step=math.inf).rows(model, whole)
     moves = torch.from_numpy(as_array(within.lower) < as_array(within.upper))
-    D = asked.new_tensor([[Direction(one.axis, one.unit).scale("step")] for one in focus.directions])
-    U, found, _ = torch.linalg.svd(D * (focus.matrix @ lin.object_jacobian)[:, moves])
+    scaled = asked.new_tensor([[1250 * _DEG]] * 3 + [[1.0]] * 3) * lin.object_jacobian[:, moves]
+    U, found, _ = torch.linalg.svd(focus.matrix @ scaled)
     gains = torch.cat([found, found.new_zeros(len(asked) - len(found))])
-    if gains[-1] < _WEAK:
+    least = _WEAK * torch.linalg.matrix_norm(scaled, 2)
+    if gains[-1] < least:
         parts = sorted(zip(U[:, -1].abs().tolist(), map(str, focus.directions), strict=True), reverse=True)
         weak = " with ".join(name for share, name in parts if share > 0.3)
-        reason = (
-            f"the motors hold {int((gains >= _WEAK).sum())} of the {len(gains)} directions of the focus: "
-            f"{gains[-1]:.2f} deg for a degree of theirs is too little of {weak}. Leave a direction out"
-        )
-        return Reachability(gains, reason=reason)
-    if [one.unit for one in focus.directions] == ["deg"]:
+        held = f"{int((gains >= least).sum())} of the {len(gains)} directions of the focus"
+        return Reachability(gains, f"the motors hold {held}, and too little of {weak}: leave a direction out")
+    if _is_turn(focus):  # followed step by step where it is long
         return Reachability(gains)
     tasks = (task.rows(model, whole) for task in (EffortTask(), OffAxisTask(), FocusTask()))
     solution, reason = build_qp(len(seen.a), [*tasks, within]).solve(), ""
@@ -177,7 +172,7 @@ def reachability(
         reason = f"motors at the ends of their ranges leave {100 * left:.0f} % of the way. Ask for less"
     elif off > caution.off_rotation + caution.off_further:
         reason = f"the object turns {off / _DEG:.0f} deg off the focus on the way. Ask for less"
-    return Reachability(gains, left, off, reason)
+    return Reachability(gains, reason)
 
 
 def out_of_reach(
@@ -187,17 +182,22 @@ def out_of_reach(
     seen: Observation,
     target: PoseTarget,
 ) -> str:
-    """Why a target is declined; empty: it is not.
-
-    Args:
-        rehearsal: tries turns about one axis that ask for much; None: they are not.
-    """
+    """Why a target is declined; empty: it is not. Far ones are tried where there is a rehearsal."""
+    focus, error = controller.focus, target.error(seen.state)
     try:
         against = reachability(controller, caution, seen, target).reason
         if against or rehearsal is None:
             return against
-        about = _axis_of(controller.focus)
-        asked = float(about @ target.error(seen.state)[3:])
+        if not _is_turn(focus):
+            if torch.linalg.vector_norm(focus.step_scale * (focus.matrix @ error)) < _FAR:
+                return ""
+            hand = _model_hand(controller, seen)
+            list(rehearsal(hand, target))  # leaves the hand where the motions end
+            left, asked = focus.error(target, hand.state), focus.error(target, seen.state)
+            short = f"the model leaves {left / asked:.0%} of the way: {hand.failure or 'it comes no nearer'}"
+            return short if left > _SHORT else ""
+        about = _axis_of(focus)
+        asked = float(about @ error[3:])
         if abs(asked) < _ASKED:
             return ""
         sign = 1 if asked >= 0 else -1
@@ -236,9 +236,18 @@ def _axis_of(focus: FocusedPose) -> Float[Tensor, " 3"]:
     Raises:
         ParameterError: the focus is something else.
     """
-    if [one.unit for one in focus.directions] != ["deg"]:
+    if not _is_turn(focus):
         raise ParameterError("focus", focus.matrix.tolist(), "a rotation about one axis")
     return focus.matrix[0, 3:]
+
+
+def _is_turn(focus: FocusedPose) -> bool:
+    return [one.unit for one in focus.directions] == ["deg"]
+
+
+def _model_hand(controller: LookAndMoveController, seen: Observation) -> ModelHand:
+    model = controller.kinematic if controller.enhanced is None else controller.enhanced
+    return ModelHand(model, seen.state, seen.a, seen.fingertip_force)
 
 
 def _end(stop: Stop, hand: ModelHand, at: _Standing) -> tuple[ReachEnd, tuple[str, ...], str]:

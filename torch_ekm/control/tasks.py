@@ -39,9 +39,8 @@ class FocusTask:
         focus, n_q = seen.focus, model.kinematic.n_q
         M, scale = focus.matrix, focus.tolerance_scale
         left = seen.desired - M @ model.offset[n_q:]
-        return Equality(
-            scale[:, None] * (M @ model.jacobian[n_q:]), scale * left, self.penalty * focus.weight
-        )
+        A = scale[:, None] * (M @ model.jacobian[n_q:])
+        return Equality(A, scale * left, self.penalty * focus.weight)
 
 
 @dataclass(frozen=True)
@@ -120,8 +119,7 @@ class EffortTask:
     """``u^T W u``: of the steps that do as well, the smallest. It makes the best step unique.
 
     Raises:
-        ParameterError: W is not positive definite.
-        ShapeError: it is not ``(n_a, n_a)``, as rows are asked for.
+        ParameterError, ShapeError: W is not positive definite, or, as rows are asked for, not ``(n_a, n_a)``.
     """
 
     weight: float | Sequence[Sequence[float]] = 1e-2
