@@ -57,8 +57,8 @@ class ClosedLoop:
         safety: when it looks again, goes back, stops and gives up.
         learn: False leaves the learner as it is.
         decline: a target out of :meth:`reachability` ends as out of reach before anything moves. So does,
-            once an enhanced model knows the hand's figures from 15 motions, a turn of 25 deg or more that lies
-            5 deg beyond :meth:`reach`, or another target of 4 steps that the model misses. False: it is tried.
+            once an enhanced model knows the hand's figures from 15 motions, a turn of 25 deg or more that is
+            5 deg beyond :meth:`reach`, or another target of 4 steps that the model misses. False: tried.
 
     Raises:
         ParameterError: the knowledge is of another hand.
