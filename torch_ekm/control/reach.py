@@ -32,9 +32,7 @@ _DEG = math.pi / 180
 _BEARS = 0.01  # [N m] of a stop that ends a turn
 _ASKED = 25 * _DEG  # [rad] the model is asked about turns as far as this
 _BEYOND = 5 * _DEG  # [rad] beyond the predicted reach a target is declined; two of three ends are as near
-_WEAK = (
-    0.035  # of the largest gain of all six directions: motors do not hold one; those that they do have .07
-)
+_WEAK = 0.035  # of the largest gain: a direction that motors do not hold; those that they hold have .07
 _FAR = 10 * _DEG  # [rad], as steps count, from which a target of other directions is tried on the model
 _SHORT = 1 * _DEG  # [rad] before it, as tolerances count, that end it; those that are reached end .5 off
 _LEFT = 0.2  # of an error that the motors leave at the ends of their ranges, to decline it
