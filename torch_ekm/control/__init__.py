@@ -6,7 +6,7 @@ from ..enhanced.hand_figures import DescribedFigures, HandFigures
 from .closed_loop import ClosedLoop
 from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
 from .decision import Decision, StopReason
-from .focus import FocusedPose, PoseTarget
+from .focus import Direction, FocusedPose, PoseTarget
 from .force_sensitivity import ForceSensitivity
 from .knowledge import HandKnowledge
 from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
@@ -14,7 +14,7 @@ from .manipulation import Manipulation, Step, Stop
 from .model_hand import ModelHand
 from .pace import LimitingFunction, Pace, PaceOptions, StepBound, TrustRegion
 from .qp import Bounds, Equality, Inequality, Squares
-from .reach import Reach, ReachEnd
+from .reach import Reach, Reachability, ReachEnd
 from .safety import Caution, Guards, Safety, StoppingRule
 from .situation import LinearizedModel, Situation
 from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
@@ -27,6 +27,7 @@ __all__ = [
     "Caution",
     "ClosedLoop",
     "Decision",
+    "Direction",
     "DescribedFigures",
     "EffortTask",
     "Equality",
@@ -51,6 +52,7 @@ __all__ = [
     "PaceOptions",
     "PoseTarget",
     "Reach",
+    "Reachability",
     "ReachEnd",
     "Safety",
     "Situation",

@@ -23,7 +23,7 @@ from .focus import PoseTarget
 from .knowledge import HandKnowledge
 from .manipulation import Manipulation, Step, Stop
 from .pace import SLIDES, ForceSurprise
-from .reach import Reach, follow_to_the_end, out_of_reach
+from .reach import Reach, Reachability, follow_to_the_end, out_of_reach, reachability
 from .safety import Safety
 from .safety.checked_plant import CheckedPlant, PlantFailedError
 from .safety.progress import Progress
@@ -56,9 +56,9 @@ class ClosedLoop:
             learned of the servos if the controller's model is no enhanced one.
         safety: when it looks again, goes back, stops and gives up.
         learn: False leaves the learner as it is.
-        decline: once an enhanced model knows the hand's figures from 15 motions, a target of 25 deg or more
-            that lies 5 deg beyond :meth:`reach` ends the manipulation as out of reach before anything moves.
-            False: it is tried all the same.
+        decline: a target out of :meth:`reachability` ends as out of reach before anything moves. So does,
+            once an enhanced model knows the hand's figures from 15 motions, a turn of 25 deg or more that is
+            5 deg beyond :meth:`reach`, or another target of 4 steps that the model misses. False: tried.
 
     Raises:
         ParameterError: the knowledge is of another hand.
@@ -130,6 +130,15 @@ class ClosedLoop:
         """
         return follow_to_the_end(self._rehearsal, self.controller, self.plant.observe(), sign, limit)
 
+    def reachability(self, target: PoseTarget) -> Reachability:
+        """Whether the motors can bring the object to ``target``: rank and conditioning of the focused rows of
+        J_m, ranges of the motors, rotation off the focus. To first order: it knows no slip and no link.
+
+        Raises:
+            GraspError: the model refuses the grasp as it is.
+        """
+        return reachability(self.controller, self.safety.caution, self.plant.observe(), target)
+
     def _rehearsal(self, hand: Plant, target: PoseTarget) -> Generator[Step, None, Stop]:
         """On a hand that does what was learned, with a controller that knows the description alone: what it
         gets wrong stands for what no model knows of states that nobody has seen."""
@@ -189,8 +198,9 @@ class ClosedLoop:
         progress = Progress(self.safety, target, self.controller.focus, seen)
         progress.halt = first.halt
         known = self.controller.enhanced is not None and int(self.knowledge.figures.count) >= _KNOWN
-        if self.decline and known and progress.halt is None and seen.status is not PlantStatus.LOST:
-            against = out_of_reach(self._rehearsal, self.controller, seen, target)
+        if self.decline and progress.halt is None and seen.status is not PlantStatus.LOST:
+            rehearsal = self._rehearsal if known else None
+            against = out_of_reach(rehearsal, self.controller, self.safety.caution, seen, target)
             if against:
                 return Stop(StopReason.OUT_OF_REACH, seen, against)
         self.controller.pace.begin(float(self.knowledge.pace) if known and self.learn else 0.0)

@@ -185,7 +185,7 @@ class LookAndMoveController:
             return self._none(StopReason.OBJECT_LOST if lost else StopReason.UNSTABLE_GRASP, failure, focused)
 
         travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
-        desired, share = self.pace.ask(focused, travel, fingertip_force is not None)
+        desired, share = self._ask(focused, travel, fingertip_force is not None)
         alone = None if fingertip_force is None else self._joint_force(lin)
         seen = Situation(
             hand, self.focus, state, a, fingertip_force, error, desired, alone, self._weight, self.tighter
@@ -206,7 +206,8 @@ class LookAndMoveController:
             return self._none(StopReason.UNSTABLE_GRASP, failure, focused)
         nominal = lin.described_jacobian @ da
         slack = float(np.abs(solution.slack).max(initial=0.0))
-        limited = slack > 0.05 * float(desired.abs().max()) and self._at_limit(a, da, problem)
+        asked = float((self.focus.tolerance_scale * desired).abs().max())
+        limited = slack > 0.05 * asked and self._at_limit(a, da, problem)
         grip = self._grip(lin, seen)
         return Decision(
             da, StopReason.RUNNING, desired, predicted, nominal, share, limited, slack, lin, grip=grip
@@ -227,7 +228,13 @@ class LookAndMoveController:
         """No motion, and why."""
         hand = self.kinematic.hand
         zero, still = focused.new_zeros(hand.n_a), focused.new_zeros(hand.n_q + 6)
-        return Decision(zero, status, self.pace.ask(focused)[0], still, still, message=str(failure))
+        return Decision(zero, status, self._ask(focused)[0], still, still, message=str(failure))
+
+    def _ask(self, focused: Tensor, travel: float = 0.0, measures: bool = True) -> tuple[Tensor, float]:
+        """dx_d and its share of the largest step; the pace counts in turns."""
+        scale = self.focus.step_scale
+        desired, share = self.pace.ask(scale * focused, travel, measures)
+        return desired / scale, share
 
     def _solve(
         self, lin: Linearization, seen: Situation

@@ -68,7 +68,7 @@ class Decision:
     status: StopReason
     """RUNNING, or why no increment can be given."""
     desired: Float[Tensor, " n_x"]
-    """dx_d, the limited error of the focused pose."""
+    """dx_d, the limited error of the focused pose [rad, m]."""
     predicted: Float[Tensor, " n_s"]
     """(f + g)(s, da)."""
     nominal: Float[Tensor, " n_s"]
@@ -78,7 +78,7 @@ class Decision:
     limited: bool = False
     """The step could not be met in full because actuators stand at their limits."""
     slack: float = 0.0
-    """Largest focused error that the step leaves unmet [unit of the focus]."""
+    """Largest focused error that the step leaves unmet, as a turn [rad]."""
     linearization: Linearization | None = None
     """The kinematic model at the state; None where it has none."""
     message: str = ""

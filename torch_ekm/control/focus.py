@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 
-from ..exceptions import NonFiniteError, ParameterError, ShapeError
+from ..exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
 from ..kinematics.grasp_state import GraspState
 from ..kinematics.null_space import null_space
 from ..kinematics.se3 import exp, log
 from ..typing import Float, Tensor
+
+_SI = {"deg": math.pi / 180, "mm": 1e-3}
+_USUAL = {"tolerance": {"deg": 0.25, "mm": 0.2}, "step": {"deg": 2.5, "mm": 2.0}}  # what counts alike
 
 
 @dataclass(frozen=True)
@@ -28,13 +32,13 @@ class PoseTarget:
     @classmethod
     def turned(
         cls,
-        state: GraspState,
+        start: GraspState | PoseTarget,
         axis: Float[Tensor, " 3"],
         angle: float | None = None,
         *,
         degrees: float | None = None,
     ) -> PoseTarget:
-        """The pose of ``state`` turned by ``angle`` [rad] or ``degrees`` about ``axis`` through its point o.
+        """The pose of ``start`` turned by ``angle`` [rad] or ``degrees`` about ``axis`` through its point o.
 
         Raises:
             ParameterError: both angles are given, or none.
@@ -46,26 +50,107 @@ class PoseTarget:
         if not torch.isfinite(torch.as_tensor(angle)):
             raise NonFiniteError("angle")
         axis = axis / torch.linalg.vector_norm(axis)
-        return cls(state.position, exp(axis * angle) @ state.rotation)
+        return cls(start.position, exp(axis * angle) @ start.rotation)
+
+    @classmethod
+    def moved(
+        cls, start: GraspState | PoseTarget, axis: Float[Tensor, " 3"], *, millimetres: float
+    ) -> PoseTarget:
+        """The pose of ``start`` shifted along ``axis`` (hand frame); of a :meth:`turned` target: both.
+
+        Raises:
+            NonFiniteError: the distance is NaN or infinite.
+        """
+        if not math.isfinite(millimetres):
+            raise NonFiniteError("millimetres")
+        axis = axis / torch.linalg.vector_norm(axis)
+        return cls(start.position + 1e-3 * millimetres * axis, start.rotation)
+
+
+@dataclass(frozen=True, eq=False)
+class Direction:
+    """A direction of a focused pose: turns about an axis of the hand frame, or shifts along it.
+
+    Raises:
+        UnknownNameError, ParameterError: the unit is missing; no length of the axis, a figure not above 0.
+    """
+
+    axis: Float[Tensor, " 3"]
+    unit: str = ""
+    """"deg": it turns about the axis; "mm": it shifts along it. Tolerance and step have this unit."""
+    tolerance: float | None = None
+    """None: 0.25 deg or 0.2 mm."""
+    step: float | None = None
+    """Largest of a motion at pace 1; None: 2.5 deg or 2 mm."""
+    weight: float = 1.0
+    """Of what a step leaves unmet, beside the other directions."""
+
+    def __post_init__(self) -> None:
+        if self.unit not in _SI:
+            raise UnknownNameError("unit", self.unit, _SI)
+        if not torch.linalg.vector_norm(self.axis) > 1e-9:
+            raise ParameterError("axis", self.axis.tolist(), "a vector of non-zero length")
+        for name in ("tolerance", "step", "weight"):
+            figure = getattr(self, name)
+            if figure is not None and not 0 < figure < math.inf:
+                raise ParameterError(name, figure, "greater than 0")
+
+    @property
+    def row(self) -> Float[Tensor, " 6"]:
+        """Of M_c."""
+        axis, none = self.axis / torch.linalg.vector_norm(self.axis), torch.zeros_like(self.axis)
+        return torch.cat([none, axis] if self.unit == "deg" else [axis, none])
+
+    def scale(self, figure: str) -> float:
+        """Turn that counts as much as 1 rad or 1 m of this direction, by its "tolerance" or "step" [rad]."""
+        usual, own = _USUAL[figure], getattr(self, figure)
+        return usual["deg"] * _SI["deg"] / ((usual[self.unit] if own is None else own) * _SI[self.unit])
+
+    def __str__(self) -> str:
+        verb = "turn about" if self.unit == "deg" else "shift along"
+        return f"{verb} ({', '.join(f'{x:.2g}' for x in self.axis.tolist())})"
 
 
 class FocusedPose:
-    """``x = M_c xi`` with ``xi`` a twist ``(v; w)`` of the object (hand axes).
+    """``x = M_c xi`` with ``xi`` a twist ``(v; w)`` of the object (hand axes), in one to six directions.
 
     ``matrix`` (M_c, ``(n_x, 6)``) selects what the controller must reach; ``off_matrix``
     spans the rest, which it should keep small; ``off_translation`` marks its translations.
 
+    Errors in different units are compared as turns that count as much, by their tolerance or by their step::
+
+        tolerance_scale_i = 0.25 deg / tolerance_i,    step_scale_i = 2.5 deg / step_i
+
     Args:
-        matrix: M_c with orthonormal rows.
+        directions: perpendicular to each other; or M_c with orthonormal rows, each a turn or a shift.
+
+    Raises:
+        ShapeError: M_c is not ``(n_x, 6)``.
+        ParameterError: a direction is named twice, is not perpendicular to another, or turns and shifts.
     """
 
-    def __init__(self, matrix: Float[Tensor, "n_x 6"]) -> None:
-        if matrix.ndim != 2 or matrix.shape[1] != 6:
-            raise ShapeError("matrix", "(n_x, 6)", matrix.shape)
-        gram = matrix @ matrix.mT
-        if not torch.allclose(gram, torch.eye(len(matrix), dtype=matrix.dtype), atol=1e-9):
-            raise ParameterError("matrix", "M_c", "a matrix with orthonormal rows (M_c M_c^T = I)")
-        self.matrix = matrix
+    def __init__(self, directions: Sequence[Direction] | Float[Tensor, "n_x 6"]) -> None:
+        given = directions
+        if isinstance(directions, torch.Tensor):
+            if directions.ndim != 2 or directions.shape[1] != 6:
+                raise ShapeError("matrix", "(n_x, 6)", directions.shape)
+            shifts = zip(directions, (directions[:, :3].abs().sum(-1) > 1e-9).tolist(), strict=True)
+            directions = [Direction(row[:3], "mm") if s else Direction(row[3:], "deg") for row, s in shifts]
+        self.directions = tuple(directions)
+        if not self.directions:
+            raise ParameterError("directions", directions, "one to six of them")
+        matrix = self.matrix = torch.stack([one.row for one in self.directions])
+        gram = matrix @ matrix.mT - torch.eye(len(matrix), dtype=matrix.dtype)
+        twice = (gram.tril(-1).abs() > 1 - 1e-9).nonzero().tolist()
+        if twice:
+            raise ParameterError("directions", [str(self.directions[k]) for k in twice[0]], "named once each")
+        same = not isinstance(given, torch.Tensor) or torch.allclose(given, matrix, rtol=0, atol=1e-9)
+        if not (same and bool((gram.abs() < 1e-9).all())):
+            valid = "orthonormal rows (M_c M_c^T = I), each of which turns or shifts"
+            raise ParameterError("matrix", matrix.tolist(), valid)
+        self.tolerance_scale = matrix.new_tensor([one.scale("tolerance") for one in self.directions])
+        self.step_scale = matrix.new_tensor([one.scale("step") for one in self.directions])
+        self.weight = matrix.new_tensor([one.weight for one in self.directions])
         # translation and rotation rows are completed apart: they have different units
         self.off_matrix = torch.cat([_complement(matrix, slice(0, 3)), _complement(matrix, slice(3, 6))])
         self.off_translation = self.off_matrix[:, :3].abs().sum(-1) > 0
@@ -73,14 +158,11 @@ class FocusedPose:
     @classmethod
     def rotation_about(cls, axis: Float[Tensor, " 3"]) -> FocusedPose:
         """The rotation about one axis (hand frame), as in all experiments of the paper."""
-        norm = torch.linalg.vector_norm(axis)
-        if not norm > 1e-9:
-            raise ParameterError("axis", axis.tolist(), "a vector of non-zero length")
-        return cls(torch.cat([torch.zeros(3, dtype=axis.dtype), axis / norm])[None])
+        return cls([Direction(axis, "deg")])
 
     def error(self, target: PoseTarget, state: GraspState) -> float:
-        """``|M_c e|``, e the twist from the state to the target [unit of the focus]."""
-        return float(torch.linalg.vector_norm(self.matrix @ target.error(state)))
+        """``|e| = max_i tolerance_scale_i |e_i|`` [rad], ``e = M_c`` times the twist from state to target."""
+        return float((self.tolerance_scale * (self.matrix @ target.error(state))).abs().max())
 
     def off_rotation(self, increment: Float[Tensor, " n_s"]) -> float:
         """Rotation off the focus in an increment [rad]."""

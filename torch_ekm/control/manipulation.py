@@ -57,7 +57,7 @@ class Manipulation:
 
     @property
     def errors(self) -> list[float]:
-        """``|e|`` before each motion and at the end, as measured [unit of the focus]; the last is the
+        """``|e|`` before each motion and at the end, as measured and as a turn [rad]; the last is the
         steady-state error of a controller that came to rest."""
         seen = [*(step.before for step in self.steps), self.stop.final]
         return [self.focus.error(self.target, o.state) for o in seen]

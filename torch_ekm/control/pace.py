@@ -48,7 +48,7 @@ class LimitingFunction:
     """Share of a small focused error that one step asks for. A model that is right meets all of it,
     camera noise included; below 1 the loop averages the noise over some steps."""
     step: float = 2.5 * _DEG
-    """At most this much of the focused error is asked for in one step [unit of the focus]."""
+    """At most this much of the focused error is asked for [rad]; at 2.5 deg each direction's own step."""
     contact_travel: float | None = 1.2e-3
     """And no contact is asked to move farther than this [m]: a wide object turns in smaller steps.
     None: no such limit."""
@@ -273,7 +273,7 @@ class Pace(nn.Module):
         """dx_d, and which share of the largest step at this pace it is.
 
         Args:
-            error: e, focused error [unit of the focus].
+            error: e, focused error as turns that ask for as many steps [rad].
             travel: ``|v(e)|``, see :func:`contact_travel` [m].
             measures: some pad does; else p falls to 1.
         """

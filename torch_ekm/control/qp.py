@@ -33,7 +33,7 @@ class Equality(NamedTuple):
 
     A: Numbers
     b: Numbers
-    penalty: float = 1e3
+    penalty: Numbers = 1e3
 
 
 class Inequality(NamedTuple):
@@ -136,7 +136,7 @@ def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
             q -= twice @ (weight[:, 0] * b)
         elif isinstance(row, Equality):
             d = as_array(row.b) / DEGREE
-            reached.append((as_array(row.A), d, np.full(len(d), row.penalty)))
+            reached.append((as_array(row.A), d, np.full(len(d), as_array(row.penalty))))
         elif isinstance(row, Inequality):
             h = as_array(row.h) / row.unit
             kept.append((as_array(row.C) * (DEGREE / row.unit), h, np.full(len(h), row.penalty)))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
+from ..exceptions import ParameterError, ShapeError
 from .pace import contact_travel
 from .qp import DEGREE, Equality, Squares, as_array
 from .situation import LinearizedModel, Situation, grip_shares
@@ -27,15 +29,18 @@ class Task(Protocol):
 
 @dataclass(frozen=True)
 class FocusTask:
-    """``M_c E_p (f + g)(s, u) + sl = dx_d``: the step meets the limited error if it can, else comes as near
-    as it can (exact l1 slack)."""
+    """``D M_c E_p (f + g)(s, u) + sl = D dx_d``: the step meets the limited error if it can, else comes as
+    near as it can (exact l1 slack). D is the ``tolerance_scale`` of the :class:`FocusedPose`."""
 
     penalty: float = 1e3
-    """rho, per degree of the focused rotation that is left unmet."""
+    """rho, per degree of a focused rotation that is left unmet; times the weight of a direction."""
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Equality:
-        M, n_q = seen.focus.matrix, model.kinematic.n_q
-        return Equality(M @ model.jacobian[n_q:], seen.desired - M @ model.offset[n_q:], self.penalty)
+        focus, n_q = seen.focus, model.kinematic.n_q
+        M, scale = focus.matrix, focus.tolerance_scale
+        left = seen.desired - M @ model.offset[n_q:]
+        A = scale[:, None] * (M @ model.jacobian[n_q:])
+        return Equality(A, scale * left, self.penalty * focus.weight)
 
 
 @dataclass(frozen=True)
@@ -111,11 +116,25 @@ class GripForceTask:
 
 @dataclass(frozen=True)
 class EffortTask:
-    """``w |u|^2``: of the steps that do as well, the smallest. It makes the best step unique."""
+    """``u^T W u``: of the steps that do as well, the smallest. It makes the best step unique.
 
-    weight: float = 1e-2
-    """w, per deg^2 of an actuator."""
+    Raises:
+        ParameterError, ShapeError: W is not positive definite, or, as rows are asked for, not ``(n_a, n_a)``.
+    """
+
+    weight: float | Sequence[Sequence[float]] = 1e-2
+    """W of the E-KM paper ``(n_a, n_a)``, or the number on its diagonal, per deg^2 of an actuator."""
+
+    def __post_init__(self) -> None:
+        W = np.atleast_2d(np.asarray(self.weight, float))
+        symmetric = W.shape == W.T.shape and np.isfinite(W).all() and np.allclose(W, W.T)
+        if not (symmetric and np.linalg.eigvalsh(W)[0] > 0):
+            raise ParameterError("weight", self.weight, "a positive number, or a positive definite matrix")
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Squares:
-        n_a = len(seen.a)
-        return Squares(np.eye(n_a), np.zeros(n_a), self.weight, DEGREE)
+        n_a, W = len(seen.a), np.asarray(self.weight, float)
+        if W.ndim == 0:
+            return Squares(np.eye(n_a), np.zeros(n_a), W, DEGREE)
+        if len(W) != n_a:
+            raise ShapeError("weight", f"({n_a}, {n_a})", W.shape)
+        return Squares(as_array(np.linalg.cholesky(W).T), np.zeros(n_a), 1.0, DEGREE)

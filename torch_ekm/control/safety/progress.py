@@ -36,7 +36,7 @@ class Progress:
     def __init__(self, safety: Safety, target: PoseTarget, focus: FocusedPose, seen: Observation) -> None:
         self.safety, self.target, self.focus = safety, target, focus
         self.errors = [focus.error(target, seen.state)]
-        """|e| before each motion and after the last [unit of the focus]."""
+        """|e| before each motion and after the last, as a turn [rad]."""
         self.way: list[Tensor] = []
         """What the encoders did [rad], motion by motion, without what was undone."""
         self._best = self.errors[0], 0  # the smallest of them, and the motions until then

@@ -40,11 +40,11 @@ class StoppingRule:
     """
 
     tolerance: float = 0.25 * _DEG
-    """[unit of the focused pose: rad for a rotation]"""
+    """[rad], see :class:`~torch_ekm.control.FocusedPose`; at 0.25 deg each direction has its own."""
     settle_steps: int = 2
     stall_window: int = 12
     stall_progress: float = 0.1 * _DEG
-    """[same unit]"""
+    """[rad], likewise"""
     max_steps: int = 60
     off_limit: float = 30 * _DEG
 

@@ -47,7 +47,7 @@ class Watch:
         guards: limits.
         model: f, with the hand.
         expect: f + g of what the encoders did, from where the model was linearized.
-        tolerance: of the target [unit of the focus]; errors that grow by more are no noise.
+        tolerance: of the target [rad]; errors that grow by more are no noise.
     """
 
     def __init__(

@@ -1,0 +1,256 @@
+"""A focused pose of several directions with units: errors, steps, weights, and what is reachable."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm.control import (
+    ActuatorLimit,
+    ClosedLoop,
+    Direction,
+    EffortTask,
+    FocusedPose,
+    FocusTask,
+    LimitingFunction,
+    LookAndMoveController,
+    Pace,
+    PaceOptions,
+    PoseTarget,
+    Safety,
+    Situation,
+    StepBound,
+    StoppingRule,
+    StopReason,
+)
+from torch_ekm.enhanced import EnhancedModel
+from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
+from torch_ekm.kinematics import GraspState
+from torch_ekm.kinematics.se3 import exp
+from torch_ekm.model import KinematicModel
+from torch_ekm.plant import PlantStatus
+from torch_ekm.simulation import SimulatedHand
+
+DEG = math.pi / 180
+X, Y, Z = torch.eye(3, dtype=torch.float64)
+HERE = GraspState(torch.zeros(4, dtype=torch.float64), 0.1 * X, exp(0.3 * Y))
+TURN_AND_SHIFT = FocusedPose([Direction(Z, "deg"), Direction(X, "mm")])
+SIX = [Direction(axis, unit) for unit in ("deg", "mm") for axis in (X, Y, Z)]
+
+
+def target(degrees: float = 0.0, millimetres: float = 0.0) -> PoseTarget:
+    return PoseTarget.moved(PoseTarget.turned(HERE, Z, degrees=degrees), X, millimetres=millimetres)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("make", "error", "text"),
+    [
+        (lambda: Direction(X), UnknownNameError, "unknown unit ''; valid are: deg, mm"),
+        (lambda: Direction(X, "rad"), UnknownNameError, "unit 'rad'"),
+        (lambda: Direction(0 * X, "mm"), ParameterError, "non-zero"),
+        (lambda: Direction(X, "mm", tolerance=0.0), ParameterError, "tolerance"),
+        (lambda: Direction(X, "mm", step=math.nan), ParameterError, "step"),
+        (lambda: Direction(X, "mm", weight=-1.0), ParameterError, "weight"),
+        (lambda: FocusedPose([Direction(X, "mm"), Direction(-2 * X, "mm")]), ParameterError, "named once"),
+        (lambda: FocusedPose([Direction(X, "mm"), Direction(X + Y, "mm")]), ParameterError, "orthonormal"),
+        (lambda: FocusedPose([]), ParameterError, "one to six"),
+        (lambda: FocusedPose(torch.ones(1, 6) / 6**0.5), ParameterError, "turns or shifts"),
+        (lambda: PoseTarget.moved(HERE, X, millimetres=math.inf), NonFiniteError, "millimetres"),
+        (lambda: EffortTask(0.0), ParameterError, "positive"),
+        (lambda: EffortTask(((1.0, 2.0), (2.0, 1.0))), ParameterError, "positive definite"),
+        (lambda: EffortTask(((1.0, 0.0),)), ParameterError, "positive definite"),
+    ],
+)
+def test_bad_input_is_refused(make, error, text: str) -> None:
+    with pytest.raises(error, match=text):
+        make()
+
+
+def test_a_turn_and_a_shift_are_named_by_their_units() -> None:
+    assert FocusedPose([Direction(X, "deg"), Direction(X, "mm")]).matrix.shape == (2, 6)
+    by_matrix = FocusedPose(torch.eye(6, dtype=torch.float64)[[0, 5]])
+    assert [str(one) for one in by_matrix.directions] == ["shift along (1, 0, 0)", "turn about (0, 0, 1)"]
+    assert len(FocusedPose(SIX).off_matrix) == 0
+
+
+def test_errors_of_both_units_count_by_their_tolerance() -> None:
+    """No metres are added to radians: 0.2 mm miss the target as far as 0.25 deg do."""
+    error = TURN_AND_SHIFT.error
+    assert error(target(degrees=0.25), HERE) == pytest.approx(0.25 * DEG)
+    assert error(target(millimetres=0.2), HERE) == pytest.approx(0.25 * DEG)
+    assert error(target(1.0, 0.2), HERE) == pytest.approx(1.0 * DEG)
+    assert error(target(1.0, -1.6), HERE) == pytest.approx(2.0 * DEG)
+    fine = FocusedPose([Direction(Z, "deg", tolerance=0.5), Direction(X, "mm", tolerance=0.05)])
+    assert fine.error(target(degrees=0.5), HERE) == pytest.approx(0.25 * DEG)
+    assert fine.error(target(millimetres=0.05), HERE) == pytest.approx(0.25 * DEG)
+
+
+def test_a_rotation_about_one_axis_counts_as_it_is() -> None:
+    """Bit for bit: what was published with it holds."""
+    focus, turned = FocusedPose.rotation_about(3 * Z), target(degrees=7.3)
+    assert focus.error(turned, HERE) == abs(float(Z @ turned.error(HERE)[3:]))
+    for scale in (focus.tolerance_scale, focus.step_scale, focus.weight):
+        assert scale.tolist() == [1.0]
+
+
+def controller(grasp, directions, tasks=None, **limiting) -> LookAndMoveController:
+    options = PaceOptions(LimitingFunction(contact_travel=None, **limiting), StepBound(least=math.inf))
+    return LookAndMoveController(grasp[1], FocusedPose(directions), tasks, pace=Pace(options, adapts=False))
+
+
+def test_a_step_of_both_keeps_its_direction_and_is_limited_by_each(grasp) -> None:
+    plant, _, seen, state = grasp
+    axis, along = plant.rotation_axis, torch.linalg.cross(plant.rotation_axis, X)
+    both = PoseTarget.moved(PoseTarget.turned(state, axis, degrees=3), along, millimetres=4)
+    for step, share in ((None, 1 / math.hypot(3 / 2.5, 4 / 2)), (0.5, 1 / math.hypot(3 / 2.5, 4 / 0.5))):
+        chosen = controller(grasp, [Direction(axis, "deg"), Direction(along, "mm", step=step)])
+        decision = chosen.decide(state, seen.a, both, seen.fingertip_force)
+        asked = torch.tensor([3 * DEG, 4e-3], dtype=torch.float64)
+        torch.testing.assert_close(decision.desired, share * asked, rtol=1e-6, atol=0)
+        came = chosen.focus.matrix @ decision.predicted[-6:]
+        torch.testing.assert_close(came, decision.desired, rtol=1e-4, atol=1e-9)
+
+
+def test_what_cannot_be_met_is_left_where_it_weighs_least(grasp) -> None:
+    plant, _, seen, state = grasp
+    # the motors may hardly move: a turn and a shift compete
+    axis, along = plant.rotation_axis, torch.linalg.cross(plant.rotation_axis, X)
+    both = PoseTarget.moved(PoseTarget.turned(state, axis, degrees=3), along, millimetres=3)
+    left = []
+    for weights in ((1.0, 1e-2), (1e-2, 1.0)):
+        figures = zip((axis, along), ("deg", "mm"), weights, strict=True)
+        chosen = controller(
+            grasp, [Direction(x, unit, weight=w) for x, unit, w in figures], (EffortTask(), FocusTask())
+        )
+        chosen.limits = (ActuatorLimit(step=1.5 * DEG),)
+        decision = chosen.decide(state, seen.a, both, seen.fingertip_force)
+        missing = decision.desired - chosen.focus.matrix @ decision.predicted[-6:]
+        left.append(missing.abs() / torch.tensor([DEG, 0.8e-3], dtype=torch.float64))
+        assert decision.slack == pytest.approx(float(left[-1].max()) * DEG, rel=1e-3)
+    assert left[0][0] < 0.8 * left[1][0]
+    assert left[1][1] < 0.8 * left[0][1]
+
+
+def test_the_effort_takes_a_matrix(grasp) -> None:
+    plant, _, seen, state = grasp
+    there = PoseTarget.turned(state, plant.rotation_axis, degrees=2)
+    axis, n_a = [Direction(plant.rotation_axis, "deg")], plant.hand.n_a
+
+    def increment(weight) -> torch.Tensor:
+        chosen = controller(grasp, axis, (EffortTask(weight), FocusTask()))
+        return chosen.decide(state, seen.a, there, seen.fingertip_force).delta_a
+
+    same, heavy = 1e-2 * np.eye(n_a), 1e-2 * np.eye(n_a)
+    torch.testing.assert_close(
+        increment(1e-2), increment(tuple(map(tuple, same.tolist()))), rtol=1e-5, atol=1e-9
+    )
+    busiest = int(increment(1e-2).abs().argmax())
+    heavy[busiest, busiest] *= 1e4
+    assert float(increment(tuple(map(tuple, heavy.tolist())))[busiest].abs()) < 1e-3 * DEG
+    with pytest.raises(ShapeError, match=f"\\({n_a}, {n_a}\\)"):
+        increment(((1.0, 0.0), (0.0, 1.0)))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_the_effort_is_the_quadratic_form_of_its_matrix(grasp) -> None:
+    _, model, seen, state = grasp
+    n_a = len(seen.a)
+    root = np.random.default_rng(0).normal(size=(n_a, n_a))
+    W, zero = root @ root.T + np.eye(n_a), torch.zeros(6, dtype=torch.float64)
+    whole = Situation(model.hand, TURN_AND_SHIFT, state, seen.a, None, zero, zero[:2])
+    rows = EffortTask(W.tolist()).rows(None, whole)
+    np.testing.assert_allclose(rows.A.T @ rows.A, W)
+    assert rows.weight == 1.0
+
+
+@pytest.fixture(scope="module")
+def tin() -> tuple[SimulatedHand, KinematicModel]:
+    plant = SimulatedHand("icub_right", "box", preset="none")
+    plant.reset(3)
+    return plant, KinematicModel(plant.hand, plant.object)
+
+
+def loop_of(tin, directions) -> ClosedLoop:
+    plant, model = tin
+    safety = Safety(rule=StoppingRule(max_steps=25))
+    return ClosedLoop(plant, LookAndMoveController(model, FocusedPose(directions)), safety=safety)
+
+
+def test_what_the_motors_do_not_hold_is_declined_with_the_reason(tin) -> None:
+    plant, _ = tin
+    start = plant.reset(3).state
+    loop, there = loop_of(tin, SIX), PoseTarget.turned(start, plant.rotation_axis, degrees=3)
+    told = loop.reachability(there)
+    assert told.gains.tolist() == sorted(told.gains.tolist(), reverse=True)
+    assert told.gains[-1] < 1e-9 < 0.1 < told.gains[-2]  # rank 5
+    done = loop.run(there)
+    assert done.reason is StopReason.OUT_OF_REACH
+    assert not done.steps
+    assert done.stop.message == told.reason
+    assert "5 of the 6 directions" in told.reason
+    assert "shift along" in told.reason
+    loop.decline = False
+    assert next(loop.steps(there)).decision.status is StopReason.RUNNING
+
+
+def test_what_is_too_far_is_declined_with_the_reason(tin) -> None:
+    plant, _ = tin
+    start = plant.reset(3).state
+    a = plant.rotation_axis
+    tilted = loop_of(tin, [Direction(a, "mm")]).reachability(PoseTarget.moved(start, a, millimetres=8))
+    assert "deg off the focus" in tilted.reason
+    across = torch.linalg.cross(a, X)
+    far = loop_of(tin, [Direction(across, "mm")]).reachability(
+        PoseTarget.moved(start, across, millimetres=200)
+    )
+    assert "ends of their ranges" in far.reason
+
+
+def test_what_is_far_is_tried_on_the_model_first(tin) -> None:
+    """Once the hand is known: a link comes to bear, which J_m does not tell."""
+    plant, model = tin
+    start = plant.reset(3).state
+    points, a = torch.as_tensor(plant.plan.points), plant.rotation_axis
+    b = points[1:].mean(0) - points[0]
+    b = b - a * (a @ b)
+    chosen = LookAndMoveController(EnhancedModel.for_grasp(model, start), FocusedPose([Direction(b, "mm")]))
+    loop = ClosedLoop(plant, chosen, learn=False)
+    far, near = (PoseTarget.moved(start, b, millimetres=distance) for distance in (15, -9))
+    assert not loop.reachability(far).reason
+    assert next(loop.steps(far)).after.status is PlantStatus.HELD
+    loop.knowledge.figures.count.fill_(15)
+    plant.reset(3)
+    done = loop.run(far)
+    assert done.reason is StopReason.OUT_OF_REACH
+    assert not done.steps
+    assert "% of the way" in done.stop.message
+    assert loop.run(near).reason is StopReason.REACHED
+
+
+@pytest.mark.parametrize("asked", ["shift", "turn about another axis", "turn with shift"])
+def test_what_is_called_reachable_is_reached(tin, asked: str) -> None:
+    plant, _ = tin
+    start = plant.reset(3).state
+    a = plant.rotation_axis
+    across = torch.linalg.cross(a, X) / torch.linalg.vector_norm(torch.linalg.cross(a, X))
+    there = {
+        "shift": PoseTarget.moved(start, across, millimetres=3),
+        "turn about another axis": PoseTarget.turned(start, across, degrees=5),
+        "turn with shift": PoseTarget.moved(PoseTarget.turned(start, a, degrees=5), across, millimetres=2),
+    }[asked]
+    directions = {
+        "shift": [Direction(across, "mm")],
+        "turn about another axis": [Direction(across, "deg")],
+        "turn with shift": [Direction(a, "deg"), Direction(across, "mm")],
+    }[asked]
+    loop = loop_of(tin, directions)
+    assert not loop.reachability(there).reason
+    done = loop.run(there)
+    assert done.reason is StopReason.REACHED
+    wrong = done.focus.matrix @ there.error(done.stop.final.truth.state)
+    for one, error in zip(directions, wrong.abs().tolist(), strict=True):
+        assert error < (0.3 * DEG if one.unit == "deg" else 0.25e-3)
