@@ -1,0 +1,65 @@
+"""Commands that move a real hand, or say how it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from .._terminal import console, say
+from ._app import app, needs
+
+from typer import Option  # isort: skip
+
+Wired = Annotated[Path, Option("--plant", metavar="TOML", help="The hand's wiring file.")]
+
+
+@app.command()
+@needs("robot")
+def slack(
+    plant: Wired,
+    write: Annotated[bool, Option(help="Write the zeros into the wiring file.")] = False,
+) -> None:
+    """Find where each tendon of a real hand is taut: its motor's zero.
+
+    Each motor closes by 1 deg at a time until its load rises, and goes back. Begin with slack tendons and an
+    empty hand.
+    """
+    from ..drivers import open_driver
+    from ..inspection.slack import find_slack, write_zeros
+
+    with open_driver(plant) as driver, console.status("closing") as status:
+        found = find_slack(driver, on_step=lambda text: status.update(text))
+    for one in found:
+        line = driver.wiring.line("motors", one.motor, "zero")
+        say(f"{plant}:{line}: {one.motor}: zero = {one.zero:.6g}  # +-{one.std:.2g}")
+    if write:
+        write_zeros(driver.wiring, found)
+        say(f"Written:   {plant.resolve()}")
+
+
+@app.command(name="identify-servo")
+@needs("robot")
+def identify_servo(
+    plant: Wired,
+    out: Annotated[
+        Path | None,
+        Option(metavar="EKM", help="Write dead zones and biases, for a closed loop."),
+    ] = None,
+) -> None:
+    """Find dead zone, bias and play of each motor of a real hand, by motions of 0.4 to 2 deg.
+
+    Takes some 10 s for each motor; the empty hand does best. No model of the hand is needed. Play shows at
+    joint sensors only; its lines are for the hand's transmission file.
+    """
+    from ..control import HandKnowledge
+    from ..drivers import open_driver
+    from ..inspection.identify_servo import identify_servo as identify
+
+    with open_driver(plant) as driver, console.status("swinging the motors") as status:
+        found = identify(driver, on_motion=lambda text: status.update(text))
+        knowledge = HandKnowledge.of(driver.hand)
+    say(found)
+    if out is not None:
+        knowledge.servo = found.servo
+        knowledge.save(out)
+        say(f"Written:   {out.resolve()}")
