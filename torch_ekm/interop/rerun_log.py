@@ -13,42 +13,7 @@ from .._files import make_folder
 from ..exceptions import ParameterError
 from ..plant import Trajectory, TrialLog
 
-_rr = require("rerun")
 _MOST = 64  # numbers of a row that are drawn as curves; more is a picture or a tensor
-
-
-def _write_trial(trajectory: Trajectory, path: Path) -> Path:
-    if path.exists():
-        raise ParameterError("file", str(path), "a file that does not exist yet")
-    arrays = trajectory.arrays()
-    recording: Any = _rr.RecordingStream("torch_ekm", recording_id=path.stem)
-    recording.save(path)
-    about = json.dumps({"seed": trajectory.seed, "about": trajectory.about}, indent=1)
-    recording.log("about", _rr.TextDocument(about), static=True)
-    times = arrays.pop("time")
-    words = {"status": arrays.pop("status"), "events": arrays.pop("events")}
-    if len(times):
-        pose = _rr.Transform3D.columns(translation=arrays["position"], mat3x3=arrays["rotation"])
-        recording.send_columns("object", [_rr.TimeColumn("time", duration=times)], pose)
-    for k, time in enumerate(times.tolist()):
-        recording.set_time("time", duration=time)
-        for place, rows in words.items():
-            recording.log(place, _rr.TextLog(rows[k].decode()))
-    for place, array in arrays.items():
-        at = times[: len(array)]  # a command has the time of the observation before it
-        if not len(at):
-            continue
-        flat = array.reshape(len(array), -1)
-        if flat.shape[1] <= _MOST:
-            curves = _rr.Scalars.columns(scalars=flat.astype(np.float64))
-            recording.send_columns(place, [_rr.TimeColumn("time", duration=at)], curves)
-            continue
-        for time, row in zip(at.tolist(), array, strict=True):
-            recording.set_time("time", duration=time)
-            picture = row.dtype == np.uint8 and (row.ndim == 2 or (row.ndim == 3 and row.shape[2] == 3))
-            recording.log(place, _rr.Image(row) if picture else _rr.Tensor(row))
-    recording.disconnect()
-    return path
 
 
 def log_to_rerun(log: TrialLog, folder: str | Path) -> list[Path]:
@@ -65,3 +30,38 @@ def log_to_rerun(log: TrialLog, folder: str | Path) -> list[Path]:
     folder = Path(folder)
     make_folder(folder)
     return [_write_trial(log.read(trial), folder / f"trial_{trial:06d}.rrd") for trial in log.trials]
+
+
+def _write_trial(trajectory: Trajectory, path: Path) -> Path:
+    if path.exists():
+        raise ParameterError("file", str(path), "a file that does not exist yet")
+    rr, arrays = require("rerun"), trajectory.arrays()
+    recording: Any = rr.RecordingStream("torch_ekm", recording_id=path.stem)
+    recording.save(path)
+    about = json.dumps({"seed": trajectory.seed, "about": trajectory.about}, indent=1)
+    recording.log("about", rr.TextDocument(about), static=True)
+    times = arrays.pop("time")
+
+    def columns(place: str, values: Any, n: int) -> None:
+        recording.send_columns(place, [rr.TimeColumn("time", duration=times[:n])], values)
+
+    if len(times):
+        pose = rr.Transform3D.columns(translation=arrays["position"], mat3x3=arrays["rotation"])
+        columns("object", pose, len(times))
+    for place, array in arrays.items():
+        if len(array) and array.dtype.kind != "S" and array[0].size <= _MOST:
+            curves = array.reshape(len(array), -1).astype(np.float64)
+            columns(place, rr.Scalars.columns(scalars=curves), len(array))
+            continue
+        for time, row in zip(times.tolist(), array, strict=False):
+            recording.set_time("time", duration=time)
+            recording.log(place, _drawn(rr, row))
+    recording.disconnect()
+    return path
+
+
+def _drawn(rr: Any, row: Any) -> Any:
+    if isinstance(row, bytes):
+        return rr.TextLog(row.decode())
+    picture = row.dtype == np.uint8 and (row.ndim == 2 or (row.ndim == 3 and row.shape[2] == 3))
+    return rr.Image(row) if picture else rr.Tensor(row)
