@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from .._terminal import console, say
+from .._terminal import console, print_table, say
+from ..exceptions import ParameterError
 from ._app import app, needs
 
-from typer import Option  # isort: skip
+import typer  # isort: skip
+from typer import Argument, Option  # isort: skip
 
 Wired = Annotated[Path, Option("--plant", metavar="TOML", help="The hand's wiring file.")]
 
@@ -63,3 +65,36 @@ def identify_servo(
         knowledge.servo = found.servo
         knowledge.save(out)
         say(f"Written:   {out.resolve()}")
+
+
+@app.command()
+@needs("sim")
+def health(
+    logs: Annotated[list[Path], Argument(metavar="LOG...", help="Folders of logs of one hand, in order.")],
+    hand: Annotated[str, Option(help="The hand; else the one that the first log names.")] = "",
+    knowledge: Annotated[
+        Path | None, Option(metavar="EKM", help="What a closed loop learned of this hand: its changes, too.")
+    ] = None,
+) -> None:
+    """Say which actuator of a hand changed, by how much and since when.
+
+    Read from ordinary motions in its trial logs: what tendons pass on, dead zones and biases of the servos.
+    Ends with 1 if something changed, with 0 if not.
+    """
+    from ..control import HandKnowledge
+    from ..description import load_hand
+    from ..inspection.health import HealthChange, hand_health
+    from ..plant import TrialLog
+
+    opened = [TrialLog.open(log) for log in logs]
+    name = hand or opened[0].configuration.get("hand")
+    if not name:
+        raise ParameterError("hand", name, "--hand NAME: the log names none")
+    found = hand_health(load_hand(name), ((k, log.read(k)) for log in opened for k in log.trials))
+    if found:
+        print_table(HealthChange._fields, found, str(name))
+    for one in HandKnowledge.load(knowledge).figures.changes if knowledge else ():
+        say(f"{one.name}: changed after {one.motion} motions, to {one.factor:.2f} times its value")
+    if found:
+        raise typer.Exit(1)
+    say("No actuator changed.")
