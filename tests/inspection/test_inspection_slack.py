@@ -114,7 +114,7 @@ def test_slack_names_what_keeps_it_from_finding_a_zero(bus, tmp_path) -> None:
             find_slack(plant)
         assert plant.wiring is given
         with pytest.raises(DescriptionError, match=r"no \[\[motors\]\] table of 'thumb'"):
-            write_zeros(given, [Taut("thumb", 1.0, 0.1, 0.2)])
+            write_zeros(given, [Taut("thumb", 1.0, 0.1)])
 
 
 def _ranges(wiring: Wiring, upper: float) -> Wiring:
@@ -168,13 +168,13 @@ def test_joint_sensors_tell_the_play(tmp_path) -> None:
         ("left_0", "left_1", "right_0", "right_1"))]  # fmt: skip
     path.write_text(TEXT + "".join(joints))
     told: list[str] = []
-    found = identify_servo(WithJoints(path, (2.0 * DEG, 0.5 * DEG)), on_motion=told.append)
+    found = identify_servo(WithJoints(path, (2.0 * DEG, 0.5 * DEG)), told.append)
     for play, width in zip(found.play, (2.0, 0.5), strict=True):
         assert play is not None
-        assert play.value / DEG == pytest.approx(width, abs=0.15)
-        assert play.std / DEG < 0.15
+        assert play[0] / DEG == pytest.approx(width, abs=0.15)
+        assert play[1] / DEG < 0.15
     assert found.servo.dead_zone.tolist() == pytest.approx([0, 0], abs=0.01 * DEG)
-    assert len(told) == 2
+    assert told == ["left", "right"]
     assert 'name = "left"\nbacklash_deg = ' in str(found)
 
 

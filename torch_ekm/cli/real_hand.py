@@ -30,7 +30,7 @@ def slack(
     from ..inspection.slack import find_slack, write_zeros
 
     with open_driver(plant) as driver, console.status("closing") as status:
-        found = find_slack(driver, on_step=lambda text: status.update(text))
+        found = find_slack(driver, status.update)
     for one in found:
         line = driver.wiring.line("motors", one.motor, "zero")
         say(f"{plant}:{line}: {one.motor}: zero = {one.zero:.6g}  # +-{one.std:.2g}")
@@ -58,7 +58,7 @@ def identify_servo(
     from ..inspection.identify_servo import identify_servo as identify
 
     with open_driver(plant) as driver, console.status("swinging the motors") as status:
-        found = identify(driver, on_motion=lambda text: status.update(text))
+        found = identify(driver, status.update)
         knowledge = HandKnowledge.of(driver.hand)
     say(found)
     if out is not None:
@@ -73,7 +73,7 @@ def health(
     logs: Annotated[list[Path], Argument(metavar="LOG...", help="Folders of logs of one hand, in order.")],
     hand: Annotated[str, Option(help="The hand; else the one that the first log names.")] = "",
     knowledge: Annotated[
-        Path | None, Option(metavar="EKM", help="What a closed loop learned of this hand: its changes, too.")
+        Path | None, Option(metavar="EKM", help="What a closed loop has learned: its figures.")
     ] = None,
 ) -> None:
     """Say which actuator of a hand changed, by how much and since when.
@@ -93,8 +93,8 @@ def health(
     found = hand_health(load_hand(name), ((k, log.read(k)) for log in opened for k in log.trials))
     if found:
         print_table(HealthChange._fields, found, str(name))
-    for one in HandKnowledge.load(knowledge).figures.changes if knowledge else ():
-        say(f"{one.name}: changed after {one.motion} motions, to {one.factor:.2f} times its value")
+    if knowledge is not None:
+        say(HandKnowledge.load(knowledge).figures)
     if found:
         raise typer.Exit(1)
     say("No actuator changed.")

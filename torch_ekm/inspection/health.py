@@ -77,8 +77,7 @@ def hand_health(hand: HandDescription, trials: Iterable[tuple[int, Trajectory]])
 def _motions(
     hand: HandDescription, trials: Iterable[tuple[int, Trajectory]]
 ) -> Iterator[tuple[tuple[int, int], bool, dict[tuple[str, str], tuple[Array, float, bool]]]]:
-    """(trial, motion); whether the object was lost in it; of the tendons and servos that it tells of x, y, and
-    whether the motor stood."""
+    """(trial, motion); whether the object was lost; of tendons and servos x, y, whether the motor stood."""
     low, high = hand.actuator_lower + _DEG, hand.actuator_upper - _DEG
     for trial, log in trials:
         if not log.commands:
