@@ -218,12 +218,13 @@ class ClosedLoop:
                 if progress.lost(seen):
                     return Stop(StopReason.OBJECT_LOST, seen, sign)
                 if not clear or progress.alarms > self.safety.caution.retreats:
-                    return Stop(StopReason.GIVEN_UP, seen, sign)
+                    return Stop(StopReason.GIVEN_UP, seen, sign + progress.surprise + watch.suspects(seen))
                 self.controller.tighter += self.safety.caution.tighten
                 self.controller.pace.restart()
                 continue
             if decision.status is not StopReason.RUNNING:
-                return Stop(decision.status, seen, decision.message)
+                suspects = progress.surprise + watch.suspects(seen)
+                return Stop(decision.status, seen, decision.message + suspects)
             progress.halt = watch.command(decision, seen)
             if progress.halt is not None:
                 continue

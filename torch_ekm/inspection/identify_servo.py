@@ -58,7 +58,7 @@ def identify_servo(
 
 
 def nearest_column(grid: Array, X: Array, y: Array) -> tuple[float, float, float]:
-    """``min_k |y - c - g X[:, k]|^2``: the grid's value there, its standard deviation, the share of y left."""
+    """``min_k |y - c - g X[:, k]|^2``: the grid's value there, its standard deviation, share of y left."""
     X, y = X - X.mean(0), y - y.mean()
     squares = y @ y - np.square(y @ X) / np.maximum(np.square(X).sum(0), 1e-300)
     least = squares.min()
@@ -67,7 +67,7 @@ def nearest_column(grid: Array, X: Array, y: Array) -> tuple[float, float, float
 
 
 def _swing(driver: HandDriver, i: int, servo: ServoModel) -> tuple[Array, Array]:
-    """Encoder ``(n + 1,)`` and sensed joints ``(n + 1, n_h)`` of a motor that swings [rad]; the servo learns."""
+    """Encoder ``(n + 1,)``, sensed joints ``(n + 1, n_h)`` of a motor that swings [rad]; the servo learns."""
     channel, name, seen = driver.wiring.motors[i], servo.names[i], [driver.observe()]
     only = torch.arange(len(servo.names)) == i
     start, largest = float(seen[0].a[i]), max(_SIZES)
