@@ -71,3 +71,18 @@ def test_a_reading_that_is_one_joint_short_ends_the_loop_with_its_name(held) -> 
     assert done.reason is Reason.PLANT_FAILED
     assert "Observation.q must have shape (20,), got (19,)" in done.stop.message
     assert len(done.steps) == 1
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_fingertips_that_read_half_are_told(held, scale) -> None:
+    """Nothing ends: it may be the springs. The grip is too hard by as much."""
+
+    def scaled(plant: Obedient, seen: Observation) -> Observation:
+        return dataclasses.replace(seen, fingertip_force=scale * seen.fingertip_force)
+
+    done = run(held, scaled, since=0)
+    assert done.reason is Reason.REACHED
+    told = [k for k, step in enumerate(done.steps) if "where joints and springs speak for" in step.note]
+    assert told == ([] if scale == 1 else [0])
+    if told:
+        assert "look after their scale" in done.steps[0].note

@@ -329,7 +329,7 @@ class ClosedLoop:
         seconds += time.perf_counter() - began
         if turns:
             progress.add(after, blind=watch.blind > 0)
-            if verdict.note and expected is not None and not (watch.blind or watch.slid):
+            if watch.gated and expected is not None and not (watch.blind or watch.slid):
                 off = torch.linalg.vector_norm((increment - expected.increment)[-3:])
                 progress.leapt(float(off), verdict.note)
             if progress.halt is None:
