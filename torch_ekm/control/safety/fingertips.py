@@ -96,8 +96,8 @@ class FingertipWatch:
         faulty = [f"fingertip '{self.pads[i]}' {problem}" for i, problem in sorted(faults.items())]
         if len(faults) > self.guards.faulty_pads:
             message = (
-                f"{'; '.join(faulty)} (Guards.faulty_pads is {self.guards.faulty_pads}): look after range "
-                "and cable of the fingertips, or of the joints' sensors if several fingertips disagree with them"
+                f"{'; '.join(faulty)} (Guards.faulty_pads is {self.guards.faulty_pads}): look after "
+                "range and cable of the fingertips, or of the joints' sensors if several fingertips disagree with them"
             )
             return Fingertips(force, halt=Objection(StopReason.FINGERTIP_FAULT, message))
         faulty += [
