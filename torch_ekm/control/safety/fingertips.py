@@ -95,9 +95,10 @@ class FingertipWatch:
                 return Fingertips(force, halt=self._too_hard(self.pads[i], float(force[i]), "as measured"))
         faulty = [f"fingertip '{self.pads[i]}' {problem}" for i, problem in sorted(faults.items())]
         if len(faults) > self.guards.faulty_pads:
+            said = "; ".join(faulty)
             message = (
-                f"{'; '.join(faulty)} (Guards.faulty_pads is {self.guards.faulty_pads}): look after "
-                "range and cable of the fingertips, or of the joints' sensors if several fingertips disagree with them"
+                f"{said} (Guards.faulty_pads is {self.guards.faulty_pads}): look after range "
+                "and cable of the fingertips, or of the joints' sensors if several fingertips disagree"
             )
             return Fingertips(force, halt=Objection(StopReason.FINGERTIP_FAULT, message))
         faulty += [
