@@ -13,13 +13,13 @@ import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
 
 Wired = Annotated[Path, Option("--plant", metavar="TOML", help="The hand's wiring file.")]
+Learned = Annotated[Path | None, Option(metavar="EKM", help="File of what a closed loop knows of the hand.")]
 
 
 @app.command()
 @needs("robot")
 def slack(
-    plant: Wired,
-    write: Annotated[bool, Option(help="Write the zeros into the wiring file.")] = False,
+    plant: Wired, write: Annotated[bool, Option(help="Write the zeros into the wiring file.")] = False
 ) -> None:
     """Find where each tendon of a real hand is taut: its motor's zero.
 
@@ -41,17 +41,12 @@ def slack(
 
 @app.command(name="identify-servo")
 @needs("robot")
-def identify_servo(
-    plant: Wired,
-    out: Annotated[
-        Path | None,
-        Option(metavar="EKM", help="Write dead zones and biases, for a closed loop."),
-    ] = None,
-) -> None:
+def identify_servo(plant: Wired, out: Learned = None) -> None:
     """Find dead zone, bias and play of each motor of a real hand, by motions of 0.4 to 2 deg.
 
     Takes some 10 s for each motor; the empty hand does best. No model of the hand is needed. Play shows at
-    joint sensors only; its lines are for the hand's transmission file.
+    joint sensors only; its lines are for the hand's transmission file. With --out: dead zones and biases, for
+    a closed loop to begin with.
     """
     from ..control import HandKnowledge
     from ..drivers import open_driver
@@ -72,14 +67,12 @@ def identify_servo(
 def health(
     logs: Annotated[list[Path], Argument(metavar="LOG...", help="Folders of logs of one hand, in order.")],
     hand: Annotated[str, Option(help="The hand; else the one that the first log names.")] = "",
-    knowledge: Annotated[
-        Path | None, Option(metavar="EKM", help="What a closed loop has learned: its figures.")
-    ] = None,
+    knowledge: Learned = None,
 ) -> None:
     """Say which actuator of a hand changed, by how much and since when.
 
     Read from ordinary motions in its trial logs: what tendons pass on, dead zones and biases of the servos.
-    Ends with 1 if something changed, with 0 if not.
+    With --knowledge: also the figures that a closed loop learned. Ends with 1 if something changed.
     """
     from ..control import HandKnowledge
     from ..description import load_hand

@@ -70,7 +70,7 @@ def hand_health(hand: HandDescription, trials: Iterable[tuple[int, Trajectory]])
                 after.learn(x, y)
             changes.append((name, worst, after))
             for watch in watches.values():  # what one gives way to shows at others
-                watch.sum, watch.misfits = 0.0, watch.misfits if watch is worst else []
+                watch.sum, watch.misfits = 0.0, []
     return [HealthChange(name, old.part, *old.misfits[0][0], old.against(new)) for name, old, new in changes]
 
 
@@ -82,7 +82,7 @@ def _motions(
     for trial, log in trials:
         if not log.commands:
             continue
-        q, a = (np.stack([getattr(one, name).numpy() for one in log.observations]) for name in "qa")
+        a, q = (np.stack([getattr(one, name).numpy() for one in log.observations]) for name in "aq")
         if (q.shape[1], a.shape[1]) != (hand.n_q, hand.n_a):
             valid = f"that of '{hand.name}', with {hand.n_q} joints and {hand.n_a} actuators"
             raise ParameterError(f"trial {trial}", f"{q.shape[1]} joints, {a.shape[1]} actuators", valid)
@@ -125,14 +125,13 @@ class _Watch:
     def see(self, at: tuple[int, int], x: Array, y: float, stood: bool, excused: float) -> None:
         """Judge a motion and learn from it; errors up to ``excused`` are none."""
         error = self.error(x, y)
-        if self.part == "servo" and stood and error < 0:
-            return  # within the dead zone
+        if not math.isfinite(error) or (self.part == "servo" and stood and error < 0):
+            return  # nothing was read; within the dead zone
         spread = 1 + float(x @ self.P @ x)
         z2 = max(0.0, abs(error) - excused) ** 2 / (self.squares / self.weight * spread)
         if self.count >= _BASELINE:
-            more = z2 / 2 - _DRIFT
-            self.sum = max(0.0, self.sum + more)
-            before = [] if more > _ALARM else self.misfits  # this motion alone is enough
+            before = [] if z2 / 2 - _DRIFT > _ALARM else self.misfits  # this motion alone is enough
+            self.sum = max(0.0, self.sum + z2 / 2 - _DRIFT)
             self.misfits = [*before, (at, x, y)] if self.sum else []
         if not excused and (self.count < _BASELINE or z2 < _OUTLIER**2):
             self.learn(x, y)
@@ -142,11 +141,8 @@ class _Watch:
         was, now = self.theta, new.theta
         std = np.sqrt(new.squares / new.weight * np.diag(new.P))
         if self.part == "servo":
-            (d, b), (d_was, b_was), (d_std, b_std) = np.stack([now, was, std]) / _DEG
-            return (
-                f"dead zone {d:.2f} +-{d_std:.2f} deg, was {d_was:.2f}; "
-                f"bias {b:.2f} +-{b_std:.2f} deg, was {b_was:.2f}"
-            )
+            both = zip(("dead zone", "bias"), now / _DEG, std / _DEG, was / _DEG, strict=True)
+            return "; ".join(f"{name} {x:.2f} +-{s:.2f} deg, was {y:.2f}" for name, x, s, y in both)
         gave = self.error(*self.misfits[0][1:]) / _DEG
         gone = abs(gave) > _GAVE or now[0] < was[0] / 2
         word = ": broken, slipped, or off its pulley" if gone else ""
