@@ -18,7 +18,7 @@ from torch_ekm.control import (
 )
 from torch_ekm.control.force_sensitivity import ForceSensitivity
 from torch_ekm.enhanced import EnhancedModel, save
-from torch_ekm.exceptions import FileFormatError, ParameterError
+from torch_ekm.exceptions import FileFormatError, ParameterError, StateMismatchError
 from torch_ekm.kinematics import ServoModel
 from torch_ekm.kinematics.servo_model import IdealServos
 from torch_ekm.model import KinematicModel
@@ -105,3 +105,16 @@ def test_knowledge_of_another_hand_and_another_file_are_refused(held, driven, tm
     save(SparseOnlineGP(2, 1), tmp_path / "learner.ekm")
     with pytest.raises(FileFormatError, match="holds a SparseOnlineGP, no HandKnowledge"):
         HandKnowledge.load(tmp_path / "learner.ekm")
+
+
+@pytest.mark.parametrize("spoilt", [math.nan, math.inf])
+def test_a_state_with_nan_is_refused_and_nothing_is_changed(driven, spoilt) -> None:
+    knowledge = HandKnowledge.of(driven.controller.kinematic.hand)
+    before = {name: value.clone() for name, value in knowledge.state_dict().items()}
+    state = {name: value.clone() for name, value in driven.knowledge.state_dict().items()}
+    state["figures.mean"][0] = spoilt
+    with pytest.raises(StateMismatchError, match=r"figures\.mean"):
+        knowledge.load_state_dict(state)
+    assert all(torch.equal(before[name], value) for name, value in knowledge.state_dict().items())
+    knowledge.load_state_dict(driven.knowledge.state_dict())
+    assert torch.equal(knowledge.figures.mean, driven.knowledge.figures.mean)

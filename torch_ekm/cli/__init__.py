@@ -9,6 +9,7 @@ from ..exceptions import EKMError
 from . import describe as describe
 from . import experiments as experiments
 from . import logs as logs
+from . import real_hand as real_hand
 from ._app import app
 
 import typer  # isort: skip

@@ -228,12 +228,13 @@ class ClosedLoop:
                 if progress.lost(seen):
                     return Stop(StopReason.OBJECT_LOST, seen, sign)
                 if not clear or progress.alarms > self.safety.caution.retreats:
-                    return Stop(StopReason.GIVEN_UP, seen, sign)
+                    return Stop(StopReason.GIVEN_UP, seen, sign + progress.surprise + watch.suspects(seen))
                 self.controller.tighter += self.safety.caution.tighten
                 self.controller.pace.restart()
                 continue
             if decision.status is not StopReason.RUNNING:
-                return Stop(decision.status, seen, decision.message)
+                suspects = progress.surprise + watch.suspects(seen)
+                return Stop(decision.status, seen, decision.message + suspects)
             progress.halt = watch.command(decision, seen)
             if progress.halt is not None:
                 continue
@@ -338,7 +339,7 @@ class ClosedLoop:
         seconds += time.perf_counter() - began
         if turns:
             progress.add(after, blind=watch.blind > 0)
-            if verdict.note and expected is not None and not (watch.blind or watch.slid):
+            if watch.gated and expected is not None and not (watch.blind or watch.slid):
                 off = torch.linalg.vector_norm((increment - expected.increment)[-3:])
                 progress.leapt(float(off), verdict.note)
             if progress.halt is None:

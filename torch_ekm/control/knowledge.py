@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import nn
 
-from .._recorded import Recorded, describe
+from .._recorded import Recorded, check_state, describe
 from ..description import HandDescription
 from ..enhanced.hand_figures import DescribedFigures, HandFigures
 from ..exceptions import FileFormatError, ParameterError
@@ -72,6 +74,18 @@ class HandKnowledge(Recorded, nn.Module):
             valid = f"that of a hand with {len(hand.pads)} pads and {hand.n_a} actuators"
             raise ParameterError("knowledge", f"of {shape[0]} pads and {shape[1]} actuators", valid)
         self.figures.check(hand)
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:
+        """See ``torch.nn.Module``; all or nothing.
+
+        Raises:
+            StateMismatchError: the state is of another hand, or holds NaN. Nothing was changed.
+        """
+        if strict:
+            check_state(self, state_dict)
+        return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write all of it; the file appears whole or not at all.

@@ -145,7 +145,11 @@ class HandDriver(ABC):
             fingertip_force=force.clamp(min=0.0) if len(force) else None,
             time=now,
             status=PlantStatus.NOT_SEEN,
-            info={"load": tuple(reading.load), "sensed": tuple(one.name for one in self.wiring.joints)},
+            info={
+                "load": tuple(reading.load),
+                "sensed": tuple(one.name for one in self.wiring.joints),
+                "joints": self._values(self.wiring.joints, reading.joints).tolist(),
+            },
             stamps=stamps._replace(pose=now),
         )
 

@@ -149,7 +149,10 @@ class Ros2Plant(HandDriver):
         if self.wiring.fingertips:
             array, force_taken = self._first("fingertips", "no fingertips are received")
             force = self._forces(array.data)
-        return BusReading(motors, taken, moving, joints, taken if joints else math.inf, force, force_taken)
+        told = len(message.effort) == len(message.name)
+        load = [float(message.effort[at[one.id]]) for one in self.wiring.motors] if told else []
+        joints_taken = taken if joints else math.inf
+        return BusReading(motors, taken, moving, joints, joints_taken, force, force_taken, load)
 
     def _forces(self, data: Sequence[float]) -> list[float]:
         found = []

@@ -1,4 +1,4 @@
-"""Both ways between learners and other libraries: river, CasADi, ROS.
+"""Both ways between learners and other libraries: river, CasADi, ROS, rerun, LeRobot.
 
 Learners of this package in their interfaces, and theirs as a :class:`~torch_ekm.ResidualLearner` (extra
 ``peers``). What needs another library is imported when it is first asked for, by its name here; a missing
@@ -16,12 +16,16 @@ from .river_residual import RiverResidual
 if TYPE_CHECKING:
     from .bags import read_bag
     from .casadi_residual import CasadiResidual as to_casadi  # noqa: N813
+    from .lerobot_dataset import log_to_lerobot
     from .mcap_log import log_to_mcap
+    from .rerun_log import log_to_rerun
     from .river_regressor import RiverRegressor as as_river  # noqa: N813
 
 _ASKED_FOR = {
     "as_river": ("river_regressor", "RiverRegressor"),
+    "log_to_lerobot": ("lerobot_dataset", "log_to_lerobot"),
     "log_to_mcap": ("mcap_log", "log_to_mcap"),
+    "log_to_rerun": ("rerun_log", "log_to_rerun"),
     "read_bag": ("bags", "read_bag"),
     "to_casadi": ("casadi_residual", "CasadiResidual"),
 }
@@ -38,7 +42,9 @@ __all__ = [
     "OnlineRegressor",
     "RiverResidual",
     "as_river",
+    "log_to_lerobot",
     "log_to_mcap",
+    "log_to_rerun",
     "read_bag",
     "to_casadi",
 ]

@@ -13,7 +13,7 @@ from .motors import HandMotors, Motors
 _HEADER = b"\xff\xff\xfd\x00"
 _PING, _READ, _WRITE, _SYNC_READ, _SYNC_WRITE, _STATUS = 0x01, 0x02, 0x03, 0x82, 0x83, 0x55
 _BROADCAST, _ACCESS, _ALERT = 0xFE, 7, 0x80
-_GOAL, _POSITION, _MOVING, _HARDWARE, _WATCHDOG = 116, 132, 122, 70, 98
+_GOAL, _POSITION, _LOAD, _MOVING, _HARDWARE, _WATCHDOG = 116, 132, 126, 122, 70, 98
 _SIZE = 147  # bytes of the control table that are kept
 _OUT = 255  # a watchdog that has run out
 
@@ -39,6 +39,8 @@ class DynamixelBus:
         """What becomes of each answer on its way: noise, for tests."""
         self.silent: set[int] = set()
         """Servos that do not answer."""
+        self.currents: Callable[[Sequence[float]], Sequence[float]] | None = None
+        """What each motor draws at its position [2.69 mA]."""
         self.goals: list[list[float]] = []
         """Every goal that was taken [ticks]."""
         self._asked = time.monotonic()
@@ -110,7 +112,10 @@ class DynamixelBus:
             return b""
         table, k = self.tables[servo], self.ids.index(servo)
         table[_MOVING] = self.motors.moving
-        table[_POSITION : _POSITION + 4] = round(self.motors.now()[k]).to_bytes(4, "little", signed=True)
+        now = self.motors.now()
+        table[_POSITION : _POSITION + 4] = round(now[k]).to_bytes(4, "little", signed=True)
+        if self.currents is not None:
+            table[_LOAD : _LOAD + 2] = round(self.currents(now)[k]).to_bytes(2, "little", signed=True)
         return bytes(table[address : address + size])
 
     def _write(self, address: int, values: dict[int, bytes]) -> bool:

@@ -20,6 +20,7 @@ _HOLDS = 1.0  # [N] by two pads: an object is between them
 _PRESSED = 3.0  # [N] by the model: a pad that reads nothing then is dead
 _SURPRISE = 3.0  # [N] above the model: joints and springs are asked
 _JOINT_STD = 0.75  # [N] of a normal force by joints and springs alone
+_SCALE = 1.75  # between all fingertips and joints and springs: used hands come to 1.5
 _JOINT_SHARE = 0.25  # and as a share of it: springs are not as described
 
 
@@ -44,7 +45,7 @@ class FingertipWatch:
         self.guards, self.model = guards, model
         self.pads = [pad.name for pad in model.hand.pads]
         self.least = model.options.forces.normal_std
-        self._last: Tensor | None = None
+        self._last: Tensor | None = None  # before the first motion
         self._repeats = torch.zeros(len(self.pads), dtype=torch.long)
         self._way = torch.zeros(len(self.pads), dtype=torch.float64)
 
@@ -76,6 +77,7 @@ class FingertipWatch:
         if dated and not (taken > before.time and abs(seen.time - taken) <= self.guards.max_age.fingertips):
             note = f"the fingertips were read at {taken:.3f} s: the model's estimate stands in"
             return Fingertips(None, note)
+        notes = [] if self._last is not None else self._scale(seen, force)
         repeats = self._frozen(force, float((seen.a - before.a).abs().max()))
         lin = decision.linearization
         expected = {} if lin is None else self._normal(lin)
@@ -91,14 +93,15 @@ class FingertipWatch:
                 faults[i] = f"reads {float(force[i]):.2f} N where joints and springs speak for {other:.2f} N"
             elif force[i] > ceiling:
                 return Fingertips(force, halt=self._too_hard(self.pads[i], float(force[i]), "as measured"))
-        notes = [f"fingertip '{self.pads[i]}' {problem}" for i, problem in sorted(faults.items())]
+        faulty = [f"fingertip '{self.pads[i]}' {problem}" for i, problem in sorted(faults.items())]
         if len(faults) > self.guards.faulty_pads:
+            said = "; ".join(faulty)
             message = (
-                f"{'; '.join(notes)} (Guards.faulty_pads is {self.guards.faulty_pads}): look after range and "
-                "cable of the fingertips, or of the joints' sensors if several fingertips disagree with them"
+                f"{said} (Guards.faulty_pads is {self.guards.faulty_pads}): look after range "
+                "and cable of the fingertips, or of the joints' sensors if several fingertips disagree"
             )
             return Fingertips(force, halt=Objection(StopReason.FINGERTIP_FAULT, message))
-        notes += [
+        faulty += [
             f"fingertip '{self.pads[i]}' reads {float(force[i]):.2f} N where the model has {other:.2f} N"
             for i, other in expected.items()
             if other > _PRESSED and force[i] < self.least
@@ -106,7 +109,17 @@ class FingertipWatch:
         if faults:
             force = force.clone()
             force[list(faults)] = 0.0
-        return Fingertips(force, f"{'; '.join(notes)}: the model's estimate stands in" if notes else "")
+        notes += [f"{'; '.join(faulty)}: the model's estimate stands in"] if faulty else []
+        return Fingertips(force, "; ".join(notes))
+
+    def _scale(self, seen: Observation, force: Tensor) -> list[str]:
+        """All fingertips together read much more or less than joints and springs speak for."""
+        alone = {i: other for i, other in self._by_joints(seen).items() if force[i] > self.least}
+        felt, other = float(force[list(alone)].sum()), sum(alone.values())
+        if len(alone) < 2 or felt / _SCALE < other < felt * _SCALE:
+            return []
+        mend = "look after their scale, or the description's springs"
+        return [f"the fingertips read {felt:.1f} N where joints and springs speak for {other:.1f} N: {mend}"]
 
     def _frozen(self, force: Tensor, moved: float) -> list[int]:
         """Pads that read the same again and again while the encoders move."""

@@ -30,6 +30,8 @@ class Progress:
     """The last step was cut short by an actuator's limit."""
     leap = ""
     """The largest turn of the object that no motion explains, of those that were believed."""
+    surprise = ""
+    """The first reading that was believed though no motion explains it."""
     alarms = 0
     """How often a sign of a loss was heeded."""
 
@@ -99,10 +101,12 @@ class Progress:
 
     def leapt(self, off: float, note: str) -> None:
         """The object has turned by ``off`` [rad] more than predicted, and what a guard says of it."""
+        found = f"in motion {len(self.errors) - 1} {note}"
+        self.surprise = self.surprise or f"; {found}: if the object did not slide, look after that sensor"
         if off > _LEAP and not self.leap:
             self.leap = (
-                f"in motion {len(self.errors) - 1} {note}: if the camera was moved, or took one marker for "
-                "another, the target is off by as much"
+                f"{found}: if the camera was moved, or took one marker for another, the target is off by as "
+                "much"
             )
 
     def come(self, after: Observation, moved: Tensor) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
+from ...exceptions import GraspError
 from ...plant import Observation, PlantStatus
 from ...typing import Tensor
 from ..decision import Decision, Expectation, StopReason
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
 _DEG = math.pi / 180
 _STILL = 0.05 * _DEG  # an encoder that moves less stands
+_STRETCH = 12 * _DEG  # tendons stretch by less
 _ASKED = 0.5 * _DEG  # a smaller command to a motor that was stuck before does not show whether it still is
 
 
@@ -181,6 +184,26 @@ class Watch:
             "'torch-ekm check --plant'"
         )
         return Objection(StopReason.WRONG_WAY, message)
+
+    def suspects(self, seen: Observation) -> str:
+        """Which sensors contradict each other where the model refuses a state."""
+        hand, found = self.hand, ""
+        off = seen.a.numpy() - hand.actuator_offset - hand.actuation_jacobian @ seen.q.numpy()
+        i = int(abs(off).argmax())
+        if abs(off[i]) > _STRETCH:
+            joints = zip(hand.joint_names, hand.actuation_jacobian[i], strict=True)
+            names = ", ".join(name for name, arm in joints if arm)
+            found = f"; encoder '{hand.actuator_names[i]}' and its joints ({names}) differ by {deg(off[i])}"
+        force = seen.fingertip_force
+        with contextlib.suppress(GraspError):
+            touching = self.fingertips.model.touching(seen.state).finger
+            pressed = (
+                [] if force is None else [pad.name for pad, f in zip(hand.pads, force, strict=True) if f > 1]
+            )
+            away = ", ".join(name for name in pressed if name not in touching)
+            if away:
+                found += f"; fingertips press ({away}) where pose and joints have them off the object"
+        return found and f"{found}: look after these sensors, and the pose"
 
     def forget(self) -> None:
         """Signs of a loss are heeded: the hand goes back."""

@@ -1,0 +1,88 @@
+"""Where the model refuses a state, the sensors that contradict each other are named."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+from obedient_plant import Fault, Obedient
+
+from torch_ekm.control import (
+    ClosedLoop,
+    LookAndMoveController,
+    Manipulation,
+    PoseTarget,
+    Safety,
+    StoppingRule,
+)
+from torch_ekm.control import StopReason as Reason
+from torch_ekm.enhanced import EnhancedModel
+from torch_ekm.model import KinematicModel
+from torch_ekm.plant import Observation
+from torch_ekm.simulation import SimulatedHand
+
+DEG = math.pi / 180
+
+
+@pytest.fixture(scope="module")
+def held():
+    plant = SimulatedHand("icub_right", "box")
+    seen = plant.reset(seed=4)
+    return seen, plant.rotation_axis, KinematicModel(plant.hand, plant.object)
+
+
+def run(held, fault: Fault, since: int) -> Manipulation:
+    seen, axis, model = held
+    controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
+    safety = Safety(rule=StoppingRule(max_steps=25))
+    loop = ClosedLoop(Obedient(model, seen, fault, since=since), controller, safety=safety)
+    return loop.run(PoseTarget.turned(seen.state, axis, degrees=12))
+
+
+def more(field: str, place: int, size: float) -> Fault:
+    def change(plant: Obedient, seen: Observation) -> Observation:
+        value = getattr(seen, field).clone()
+        value[place] += size
+        return dataclasses.replace(seen, **{field: value})
+
+    return change
+
+
+OFF = {  # 5 mm, 17 deg: less than what is called a jump
+    "pose": (more("position", 0, 0.005), "the object went along x", "fingertips press (thumb)"),
+    "joint": (more("q", 6, -17 * DEG), "joint 'index_2' turned", "'index_distal' and its joints (index_2,"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("sensor", OFF)
+@pytest.mark.parametrize("since", [0, 2])
+def test_a_sensor_that_is_off_is_named(held, sensor, since) -> None:
+    fault, went, contradicts = OFF[sensor]
+    done = run(held, fault, since)
+    assert done.reason is (Reason.GIVEN_UP if since else Reason.UNSTABLE_GRASP)
+    assert contradicts in done.stop.message
+    assert "look after these sensors" in done.stop.message
+    assert (went in done.stop.message) is (since > 0)
+
+
+def test_a_reading_that_is_one_joint_short_ends_the_loop_with_its_name(held) -> None:
+    done = run(held, lambda plant, seen: dataclasses.replace(seen, q=seen.q[:-1]), since=2)
+    assert done.reason is Reason.PLANT_FAILED
+    assert "Observation.q must have shape (20,), got (19,)" in done.stop.message
+    assert len(done.steps) == 1
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_fingertips_that_read_half_are_told(held, scale) -> None:
+    """Nothing ends: it may be the springs. The grip is too hard by as much."""
+
+    def scaled(plant: Obedient, seen: Observation) -> Observation:
+        return dataclasses.replace(seen, fingertip_force=scale * seen.fingertip_force)
+
+    done = run(held, scaled, since=0)
+    assert done.reason is Reason.REACHED
+    told = [k for k, step in enumerate(done.steps) if "where joints and springs speak for" in step.note]
+    assert told == ([] if scale == 1 else [0])
+    if told:
+        assert "look after their scale" in done.steps[0].note

@@ -1,0 +1,147 @@
+"""Which actuator changed, from motions that are made up; benchmarks/hand_health.py has simulated ones."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torch_ekm.description import load_hand
+from torch_ekm.exceptions import ParameterError
+from torch_ekm.inspection.health import hand_health
+from torch_ekm.kinematics import ActuationMap
+from torch_ekm.plant import Observation, PlantStatus, Trajectory, TrialLog
+
+DEG = math.pi / 180
+HAND = load_hand("yale_t42")
+
+
+class Made:
+    """Motions of a T42: what tendons pass on, how far joints go by themselves, and dead zones, as set."""
+
+    def __init__(self, seed: int) -> None:
+        self.draw, self.map = np.random.default_rng(seed), ActuationMap(HAND)
+        self.gain, self.dead = np.array([0.6, 0.7]), np.array([1.0, 1.0]) * DEG
+        self.a = np.array([0.9, 0.8])
+        self.x = self.a.copy()
+        self.log = Trajectory(seed, [], [self.look()])
+
+    def look(self, status: PlantStatus = PlantStatus.HELD) -> Observation:
+        q = self.map.joints(torch.from_numpy(self.x)) + torch.from_numpy(self.draw.normal(0, 0.3 * DEG, 4))
+        return Observation(q, torch.from_numpy(self.a.copy()), torch.zeros(3).double(), torch.eye(3).double(),
+                           None, status=status)  # fmt: skip
+
+    def move(self, n: int = 1, gave: tuple = (0.0, 0.0), status: PlantStatus = PlantStatus.HELD) -> None:
+        for _ in range(n):
+            v = self.draw.normal(0, 2.5 * DEG, 2) - 0.3 * (self.a - [0.9, 0.8])
+            error = v + self.draw.normal(0, 0.05 * DEG, 2)
+            w = error - np.clip(error, -self.dead, self.dead)
+            self.a, self.x = self.a + w, self.x + self.gain * w + np.array(gave) * DEG
+            self.log.commands.append(torch.from_numpy(v))
+            self.log.observations.append(self.look(status))
+
+
+def test_healthy_hands_are_left_alone() -> None:
+    changes = []
+    for seed in range(4):
+        made = Made(seed)
+        made.move(250)
+        changes += hand_health(HAND, [(0, made.log)])
+    assert changes == []
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_tendon_that_breaks_is_named_at_once(seed: int) -> None:
+    made, motor = Made(seed), seed % 2
+    made.move(30)
+    made.gain[motor] = 0.0
+    made.move(gave=(-30.0 * (motor == 0), -30.0 * (motor == 1)))
+    made.move(14)
+    made.log.observations[5].q[:] = math.nan  # sensors that were silent once
+    (change,) = hand_health(HAND, [(7, made.log)])
+    assert change[:4] == (("left", "right")[motor], "tendon", 7, 30)
+    went = re.match(r"its joints went (-\d+\.\d) deg by themselves", change.found)
+    assert went is not None
+    assert float(went[1]) == pytest.approx(-30, abs=5)
+    assert change.found.endswith("broken, slipped, or off its pulley")
+
+
+def test_a_tendon_that_lets_go_unloaded_shows_by_what_it_passes_on() -> None:
+    made = Made(0)
+    made.move(40)
+    made.gain[1] = 0.0
+    made.move(40)
+    (change,) = hand_health(HAND, [(0, made.log)])
+    assert (change.actuator, change.part) == ("right", "tendon")
+    assert 38 <= change.motion <= 45
+    assert re.search(r"passes on -?0.0\d .* was 0.[567]", change.found)
+
+
+def test_a_dead_zone_that_grew() -> None:
+    made = Made(3)
+    made.move(40)
+    made.dead[0] = 2.0 * DEG
+    later = Made(4)
+    later.dead[0] = 2.0 * DEG
+    later.move(40)
+    (change,) = hand_health(HAND, [(3, made.log), (4, later.log)])
+    assert change[:3] == ("left", "servo", 4)
+    assert change.motion <= 4
+    assert change.found.startswith(("dead zone 1.9", "dead zone 2.0"))
+    assert "was 1.0" in change.found or "was 0.9" in change.found
+
+
+def test_tendons_that_give_way_when_the_object_is_lost_are_no_change() -> None:
+    made = Made(0)
+    made.move(30)
+    made.move(gave=(11.0, 9.0), status=PlantStatus.LOST)
+    made.move(10, status=PlantStatus.LOST)
+    assert hand_health(HAND, [(0, made.log)]) == []
+    made = Made(0)
+    made.move(30)
+    made.move(gave=(-45.0, 9.0), status=PlantStatus.LOST)
+    assert [one.actuator for one in hand_health(HAND, [(0, made.log)])] == ["left"]
+
+
+def test_a_log_of_another_hand_is_refused() -> None:
+    made = Made(0)
+    made.move(2)
+    with pytest.raises(ParameterError, match=r"trial 5.*4 joints, 2 actuators.*'icub_right'"):
+        hand_health(load_hand("icub_right"), [(5, made.log)])
+
+
+def test_the_command_reads_logs(tmp_path: Path, monkeypatch, capsys) -> None:
+    pytest.importorskip("h5py", reason="extra 'sim'")
+    pytest.importorskip("typer", reason="extra 'plots'")
+    from torch_ekm.cli import main
+
+    def run(*arguments: str) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["torch-ekm", "health", *arguments])
+        with pytest.raises(SystemExit) as end:
+            main()
+        said = capsys.readouterr()
+        return end.value.code, said.out + said.err
+
+    made, logs = Made(1), [str(tmp_path / "a"), str(tmp_path / "b")]
+    made.move(30)
+    with TrialLog(logs[0], {"hand": "yale_t42"}) as log:
+        log.write(0, made.log, {})
+        log.write(1, Trajectory(1), {})
+    assert run(logs[0]) == (0, "No actuator changed.\n")
+    later = Made(2)
+    later.move(5)
+    later.move(gave=(0.0, 25.0))
+    with TrialLog(logs[1], {}) as log:
+        log.write(6, later.log, {})
+    code, said = run(*logs)
+    assert code == 1
+    assert "right" in said
+    assert "tendon" in said
+    code, said = run(logs[1])
+    assert code == 1
+    assert "--hand NAME" in said

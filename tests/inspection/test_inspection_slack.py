@@ -1,0 +1,188 @@
+"""Zeros of the tendons, and the figures of the servos, over the emulated bus."""
+
+from __future__ import annotations
+
+import math
+import random
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("dynamixel_sdk")
+pytest.importorskip("typer")
+
+from torch_ekm.cli import main
+from torch_ekm.control import HandKnowledge
+from torch_ekm.drivers import BusReading, DynamixelPlant, HandDriver, Wiring
+from torch_ekm.exceptions import DescriptionError, DeviceError
+from torch_ekm.inspection.identify_servo import identify_servo
+from torch_ekm.inspection.slack import Taut, find_slack, write_zeros
+from torch_ekm.kinematics import Play
+from torch_ekm.testing import DynamixelBus, Motors
+
+DEG = math.pi / 180
+TICKS = 4096 / (2 * math.pi)
+TEXT = """\
+[hand]
+driver = "dynamixel"
+description = "yale_t42"
+[bus]
+port = "PORT"
+baud = 1000000
+[[motors]]
+name = "left"
+id = 1
+zero = 300   # as guessed
+[[motors]]
+name = "right"
+id = 2
+sign = -1
+[limits]
+rate_deg = 600
+still_for = 0.01
+"""
+TAUT = (1300.0, 2700.0)  # ticks
+
+
+class Sticky(Motors):
+    """Motors with a dead zone and a bias [ticks]."""
+
+    def __init__(self, start: Sequence[float], dead: float, bias: float) -> None:
+        super().__init__(start, 40000.0)
+        self.dead, self.bias = dead, bias
+
+    def send(self, goal: Sequence[float]) -> None:
+        now = self.now()
+        way = [to - at + (self.bias if to != at else 0) for to, at in zip(goal, now, strict=True)]
+        super().send([at + x - min(max(x, -self.dead), self.dead) for at, x in zip(now, way, strict=True)])
+
+
+@pytest.fixture
+def bus():
+    with DynamixelBus([1, 2], Motors([1150.0, 2850.0], 40000.0)) as bus:
+        noise = random.Random(0)
+        bus.currents = lambda ticks: [
+            sign * (7 + 0.4 * max(0.0, sign * (at - taut))) + noise.uniform(-1, 1)
+            for at, taut, sign in zip(ticks, TAUT, (1, -1), strict=True)
+        ]
+        yield bus
+
+
+def wired(bus: DynamixelBus, folder: Path) -> Path:
+    path = folder / "hand.toml"
+    path.write_text(TEXT.replace("PORT", bus.port))
+    return path
+
+
+def run(monkeypatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["torch-ekm", *arguments])
+    with pytest.raises(SystemExit) as end:
+        main()
+    return end.value.code
+
+
+def test_slack_finds_the_zeros_and_writes_them(bus, tmp_path, monkeypatch, capsys) -> None:
+    path = wired(bus, tmp_path)
+    assert run(monkeypatch, "slack", "--plant", str(path), "--write") == 0
+    with DynamixelPlant(path) as plant:
+        zeros = [one.zero for one in plant.wiring.motors]
+    assert zeros == pytest.approx(TAUT, abs=4)  # ticks of 0.09 deg
+    text = path.read_text()
+    assert "# as guessed" in text
+    assert text.splitlines()[-len(TEXT.splitlines()[10:]) :].count("[limits]") == 1
+    assert f"{path}:10: left: zero = " in capsys.readouterr().out
+    assert bus.motors.now() == pytest.approx([1150.0, 2850.0], abs=2)  # each went back
+    farthest = [max(goal[0] for goal in bus.goals), min(goal[1] for goal in bus.goals)]
+    assert farthest == pytest.approx(TAUT, abs=12 * DEG * TICKS)
+
+
+def test_slack_names_what_keeps_it_from_finding_a_zero(bus, tmp_path) -> None:
+    with DynamixelPlant(wired(bus, tmp_path)) as plant:
+        given = plant.wiring
+        taut, bus.currents = bus.currents, lambda ticks: [0.0, 0.0]
+        plant.wiring = _ranges(given, 12 * DEG)
+        with pytest.raises(DeviceError, match=r"motor 'left': closed by all of its range"):
+            find_slack(plant)
+        bus.currents, bus.motors = taut, Motors([1310.0, 2850.0], 40000.0)
+        plant.wiring = given
+        with pytest.raises(DeviceError, match=r"motor 'left': its load rises from the start"):
+            find_slack(plant)
+        assert plant.wiring is given
+        with pytest.raises(DescriptionError, match=r"no \[\[motors\]\] table of 'thumb'"):
+            write_zeros(given, [Taut("thumb", 1.0, 0.1)])
+
+
+def _ranges(wiring: Wiring, upper: float) -> Wiring:
+    """From where the motors stand to ``upper`` [rad]."""
+    at = zip(wiring.motors, (1150.0, 2850.0), strict=True)
+    return replace(wiring, motors=tuple(replace(one, zero=x, lower=0.0, upper=upper) for one, x in at))
+
+
+def test_identify_servo_over_the_bus(bus, tmp_path, monkeypatch, capsys) -> None:
+    bus.motors = Sticky([1150.0, 2850.0], dead=8.0, bias=3.0)
+    path, out = wired(bus, tmp_path), tmp_path / "hand.ekm"
+    path.write_text(path.read_text().replace("sign = -1", "sign = -1\nzero = 2700"))
+    assert run(monkeypatch, "identify-servo", "--plant", str(path), "--out", str(out)) == 0
+    servo = HandKnowledge.load(out).servo
+    assert servo.dead_zone.tolist() == pytest.approx([8 / TICKS] * 2, abs=0.06 * DEG)
+    assert servo.bias.tolist() == pytest.approx([3 / TICKS, -3 / TICKS], abs=0.06 * DEG)
+    said = capsys.readouterr().out
+    assert "left: d=0.7" in said
+    assert "no joint sensor tells its play" in said
+
+
+class WithJoints(HandDriver):
+    """A T42 on a bench with play between motors and joints."""
+
+    def __init__(self, path: Path, play: tuple[float, float]) -> None:
+        super().__init__(Wiring.read(path, "dynamixel", TICKS, ("port", "baud")))
+        self.a = torch.tensor([0.9, 0.7], dtype=torch.float64)
+        self.play, self.draw = Play(torch.tensor(play, dtype=torch.float64)), random.Random(1)
+        self.x, self.state = self.a.clone(), self.play.at(torch.zeros(2).double())
+
+    def _read(self) -> BusReading:
+        now = time.monotonic()
+        q = [0.7 * self.x[0], 0.6 * self.x[0], 0.9 * self.x[1], 0.4 * self.x[1]]
+        joints = [float(x) + self.draw.gauss(0, 0.1 * DEG) for x in q]
+        motors = [one.bus(float(x)) for one, x in zip(self.wiring.motors, self.a, strict=True)]
+        return BusReading(motors, now, joints=joints, joints_taken=now)
+
+    def _write(self, goal: Sequence[float], seconds: float) -> None:
+        wanted = [one.value(x) for one, x in zip(self.wiring.motors, goal, strict=True)]
+        moved = torch.tensor(wanted, dtype=torch.float64) - self.a
+        pulled, self.state = self.play.advance(self.state, moved)
+        self.x, self.a = self.x + pulled, self.a + moved
+
+    def _release(self) -> None:
+        pass
+
+
+def test_joint_sensors_tell_the_play(tmp_path) -> None:
+    path = tmp_path / "hand.toml"
+    joints = [f'[[joints]]\nname = "{name}"\nid = {k}\nper_rad = 1\n' for k, name in enumerate(
+        ("left_0", "left_1", "right_0", "right_1"))]  # fmt: skip
+    path.write_text(TEXT + "".join(joints))
+    told: list[str] = []
+    found = identify_servo(WithJoints(path, (2.0 * DEG, 0.5 * DEG)), told.append)
+    for play, width in zip(found.play, (2.0, 0.5), strict=True):
+        assert play is not None
+        assert play[0] / DEG == pytest.approx(width, abs=0.15)
+        assert play[1] / DEG < 0.15
+    assert found.servo.dead_zone.tolist() == pytest.approx([0, 0], abs=0.01 * DEG)
+    assert told == ["left", "right"]
+    assert 'name = "left"\nbacklash_deg = ' in str(found)
+
+
+def test_a_motor_that_stands_still_is_named(bus, tmp_path) -> None:
+    bus.motors = Sticky([1150.0, 2850.0], dead=4000.0, bias=0.0)
+    with DynamixelPlant(wired(bus, tmp_path)) as plant:
+        plant.wiring = _ranges(plant.wiring, 3.0)
+        with pytest.raises(DeviceError, match=r"motor 'left': does not move by commands of 2 deg"):
+            identify_servo(plant)
+        with pytest.raises(DeviceError, match=r"motor 'left': does not move, and its load does not rise"):
+            find_slack(plant)

@@ -1,0 +1,93 @@
+"""Commands that move a real hand, or say how it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from .._terminal import console, print_table, say
+from ..exceptions import ParameterError
+from ._app import app, needs
+
+import typer  # isort: skip
+from typer import Argument, Option  # isort: skip
+
+Wired = Annotated[Path, Option("--plant", metavar="TOML", help="The hand's wiring file.")]
+Learned = Annotated[Path | None, Option(metavar="EKM", help="File of what a closed loop knows of the hand.")]
+
+
+@app.command()
+@needs("robot")
+def slack(
+    plant: Wired, write: Annotated[bool, Option(help="Write the zeros into the wiring file.")] = False
+) -> None:
+    """Find where each tendon of a real hand is taut: its motor's zero.
+
+    Each motor closes by 1 deg at a time until its load rises, and goes back. Begin with slack tendons and an
+    empty hand.
+    """
+    from ..drivers import open_driver
+    from ..inspection.slack import find_slack, write_zeros
+
+    with open_driver(plant) as driver, console.status("closing") as status:
+        found = find_slack(driver, status.update)
+    for one in found:
+        line = driver.wiring.line("motors", one.motor, "zero")
+        say(f"{plant}:{line}: {one.motor}: zero = {one.zero:.6g}  # +-{one.std:.2g}")
+    if write:
+        write_zeros(driver.wiring, found)
+        say(f"Written:   {plant.resolve()}")
+
+
+@app.command(name="identify-servo")
+@needs("robot")
+def identify_servo(plant: Wired, out: Learned = None) -> None:
+    """Find dead zone, bias and play of each motor of a real hand, by motions of 0.4 to 2 deg.
+
+    Takes some 10 s for each motor; the empty hand does best. No model of the hand is needed. Play shows at
+    joint sensors only; its lines are for the hand's transmission file. With --out: dead zones and biases, for
+    a closed loop to begin with.
+    """
+    from ..control import HandKnowledge
+    from ..drivers import open_driver
+    from ..inspection.identify_servo import identify_servo as identify
+
+    with open_driver(plant) as driver, console.status("swinging the motors") as status:
+        found = identify(driver, status.update)
+        knowledge = HandKnowledge.of(driver.hand)
+    say(found)
+    if out is not None:
+        knowledge.servo = found.servo
+        knowledge.save(out)
+        say(f"Written:   {out.resolve()}")
+
+
+@app.command()
+@needs("sim")
+def health(
+    logs: Annotated[list[Path], Argument(metavar="LOG...", help="Folders of logs of one hand, in order.")],
+    hand: Annotated[str, Option(help="The hand; else the one that the first log names.")] = "",
+    knowledge: Learned = None,
+) -> None:
+    """Say which actuator of a hand changed, by how much and since when.
+
+    Read from ordinary motions in its trial logs: what tendons pass on, dead zones and biases of the servos.
+    With --knowledge: also the figures that a closed loop learned. Ends with 1 if something changed.
+    """
+    from ..control import HandKnowledge
+    from ..description import load_hand
+    from ..inspection.health import HealthChange, hand_health
+    from ..plant import TrialLog
+
+    opened = [TrialLog.open(log) for log in logs]
+    name = hand or opened[0].configuration.get("hand")
+    if not name:
+        raise ParameterError("hand", name, "--hand NAME: the log names none")
+    found = hand_health(load_hand(name), ((k, log.read(k)) for log in opened for k in log.trials))
+    if found:
+        print_table(HealthChange._fields, found, str(name))
+    if knowledge is not None:
+        say(HandKnowledge.load(knowledge).figures)
+    if found:
+        raise typer.Exit(1)
+    say("No actuator changed.")

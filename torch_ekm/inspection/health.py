@@ -1,0 +1,150 @@
+"""Which actuator of a hand changed, by how much and since when: from the motions in its logs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from ..description import HandDescription
+from ..exceptions import ParameterError
+from ..kinematics import ServoModel
+from ..plant import PlantStatus, Trajectory
+from ..typing import Array
+
+_DEG = math.pi / 180
+_BASELINE = 12  # motions before an actuator is judged
+_DRIFT, _ALARM = 1.5, 18.0  # of the sum of z^2 / 2: taken off at each motion; what is a change
+_OUTLIER = 4.0  # z of motions that nothing is learned from
+_GAVE = 5.0  # [deg] a tendon that gives more in one motion does not hold
+_WORTH = 5.0  # motions: the first guess of the noise
+_PRIORS = {  # before the first motion: figures, their standard deviations, that of the noise [rad]
+    "tendon": ((0.7,), (0.4,), 0.7 * _DEG),
+    "servo": ((0.0, 0.0), (1.5 * _DEG, 0.5 * _DEG), 0.15 * _DEG),
+}
+
+
+class HealthChange(NamedTuple):
+    """An actuator that is not what it was."""
+
+    actuator: str
+    part: str
+    """"tendon" or "servo"."""
+    trial: int
+    motion: int
+    """The first with the change, counted in its trial from 0."""
+    found: str
+    """By how much."""
+
+
+def hand_health(hand: HandDescription, trials: Iterable[tuple[int, Trajectory]]) -> list[HealthChange]:
+    """``J_a dq = g da`` of each tendon, ``|v| - |w| = d - sign(v) b`` of each servo: learned, and watched.
+
+    Any motions will do, with the joints measured. What does not fit is summed up (CUSUM: Page, Continuous
+    Inspection Schemes, 1954); the actuator with the largest sum has changed when that is too large. When the
+    object is lost all tendons give way: of this motion only what exceeds twice any other's counts. The first
+    12 motions of an actuator, and those after a change, are its baseline.
+
+    Args:
+        hand: its description.
+        trials: number and log, in order.
+
+    Raises:
+        ParameterError: a log is of another hand.
+    """
+    names = hand.actuator_names
+    watches = {(name, part): _Watch(part) for name in names for part in _PRIORS}
+    changes: list[tuple[str, _Watch, _Watch]] = []
+    for at, lost, motion in _motions(hand, trials):
+        off = [abs(watches[name, "tendon"].error(*motion[name, "tendon"][:2])) for name in names]
+        for (name, part), (x, y, stood) in motion.items():
+            others = [one for one, other in zip(off, names, strict=True) if other != name]
+            excused = 2 * max(others, default=0.0) if lost and part == "tendon" else 0.0
+            watches[name, part].see(at, x, y, stood, excused)
+        (name, part), worst = max(watches.items(), key=lambda one: one[1].sum)
+        if worst.sum > _ALARM:
+            watches[name, part] = after = _Watch(part)
+            for _, x, y in worst.misfits[part == "tendon" :]:  # the first motion is that of the break
+                after.learn(x, y)
+            changes.append((name, worst, after))
+            for watch in watches.values():  # what one gives way to shows at others
+                watch.sum, watch.misfits = 0.0, []
+    return [HealthChange(name, old.part, *old.misfits[0][0], old.against(new)) for name, old, new in changes]
+
+
+def _motions(
+    hand: HandDescription, trials: Iterable[tuple[int, Trajectory]]
+) -> Iterator[tuple[tuple[int, int], bool, dict[tuple[str, str], tuple[Array, float, bool]]]]:
+    """(trial, motion); whether the object was lost; of tendons and servos x, y, whether the motor stood."""
+    low, high = hand.actuator_lower + _DEG, hand.actuator_upper - _DEG
+    for trial, log in trials:
+        if not log.commands:
+            continue
+        a, q = (np.stack([getattr(one, name).numpy() for one in log.observations]) for name in "aq")
+        if (q.shape[1], a.shape[1]) != (hand.n_q, hand.n_a):
+            valid = f"that of '{hand.name}', with {hand.n_q} joints and {hand.n_a} actuators"
+            raise ParameterError(f"trial {trial}", f"{q.shape[1]} joints, {a.shape[1]} actuators", valid)
+        v, w = np.stack([one.numpy() for one in log.commands]), np.diff(a, axis=0)
+        pulled, s = np.diff(q, axis=0) @ hand.actuation_jacobian.T, np.sign(v)
+        told = (np.abs(v) > ServoModel.resolution) & (a[1:] > low) & (a[1:] < high)
+        held = [one.status is not PlantStatus.LOST for one in log.observations]
+        for k in range(len(v)):
+            motion = {}
+            for i, name in enumerate(hand.actuator_names):
+                stood = bool(abs(w[k, i]) <= ServoModel.moved_from)
+                motion[name, "tendon"] = w[k, [i]], float(pulled[k, i]), stood
+                if told[k, i]:
+                    x = np.array([1.0, -s[k, i]])
+                    motion[name, "servo"] = x, float(s[k, i] * (v[k, i] - w[k, i])), stood
+            yield (trial, k), held[k] and not held[k + 1], motion
+
+
+class _Watch:
+    """``y = theta.x + noise`` by recursive least squares, and the sum of what does not fit."""
+
+    def __init__(self, part: str) -> None:
+        theta, std, noise = _PRIORS[part]
+        self.part, self.theta, self.P = part, np.array(theta), np.diag(np.square(std)) / noise**2
+        self.count, self.weight, self.squares = 0, _WORTH, _WORTH * noise**2
+        self.sum = 0.0
+        self.misfits: list[tuple[tuple[int, int], Array, float]] = []
+        """Motions since the sum was 0."""
+
+    def error(self, x: Array, y: float) -> float:
+        return y - float(self.theta @ x)
+
+    def learn(self, x: Array, y: float) -> None:
+        Px, error = self.P @ x, self.error(x, y)
+        spread, noise = 1 + float(x @ Px), self.squares / self.weight
+        self.theta, self.P = self.theta + Px * (error / spread), self.P - np.outer(Px, Px) / spread
+        self.weight, self.squares = self.weight + 1, self.squares + min(error**2 / spread, 9 * noise)
+        self.count += 1
+
+    def see(self, at: tuple[int, int], x: Array, y: float, stood: bool, excused: float) -> None:
+        """Judge a motion and learn from it; errors up to ``excused`` are none."""
+        error = self.error(x, y)
+        if not math.isfinite(error) or (self.part == "servo" and stood and error < 0):
+            return  # nothing was read; within the dead zone
+        spread = 1 + float(x @ self.P @ x)
+        z2 = max(0.0, abs(error) - excused) ** 2 / (self.squares / self.weight * spread)
+        if self.count >= _BASELINE:
+            before = [] if z2 / 2 - _DRIFT > _ALARM else self.misfits  # this motion alone is enough
+            self.sum = max(0.0, self.sum + z2 / 2 - _DRIFT)
+            self.misfits = [*before, (at, x, y)] if self.sum else []
+        if not excused and (self.count < _BASELINE or z2 < _OUTLIER**2):
+            self.learn(x, y)
+
+    def against(self, new: _Watch) -> str:
+        """What changed, in words."""
+        was, now = self.theta, new.theta
+        std = np.sqrt(new.squares / new.weight * np.diag(new.P))
+        if self.part == "servo":
+            both = zip(("dead zone", "bias"), now / _DEG, std / _DEG, was / _DEG, strict=True)
+            return "; ".join(f"{name} {x:.2f} +-{s:.2f} deg, was {y:.2f}" for name, x, s, y in both)
+        gave = self.error(*self.misfits[0][1:]) / _DEG
+        gone = abs(gave) > _GAVE or now[0] < was[0] / 2
+        word = ": broken, slipped, or off its pulley" if gone else ""
+        share = f"{now[0]:.2f} +-{std[0]:.2f} of its motor's motions, was {was[0]:.2f}"
+        return f"its joints went {gave:.1f} deg by themselves; it passes on {share}{word}"
