@@ -15,10 +15,15 @@ from torch import Tensor as Tensor
 Array = NDArray[np.float64]
 
 if TYPE_CHECKING:
+    from typing import Any
+
+    #: A tensor or a numpy array, see ``torch_ekm._arrays``: what both can do has no type of its own.
+    AnyArray = Any
     from jaxtyping import Bool as Bool
     from jaxtyping import Float as Float
     from jaxtyping import Int as Int
 else:
+    AnyArray = Tensor | np.ndarray
     try:
         from jaxtyping import Bool, Float, Int
     except ModuleNotFoundError:
@@ -29,4 +34,4 @@ else:
 
         Bool = Float = Int = _Inert
 
-__all__ = ["Array", "Bool", "Float", "Int", "Tensor"]
+__all__ = ["AnyArray", "Array", "Bool", "Float", "Int", "Tensor"]

@@ -209,7 +209,7 @@ def test_motors_do_what_the_tendons_shall_do_and_the_play_on_top(held) -> None:
     figures.begin(a)  # where the last motion ended
     assert figures._play is stands
     figures.begin(a + 0.1)  # another grasp
-    assert float(figures._play.position.abs().max()) == 0
+    assert float(abs(figures._play.position).max()) == 0
 
 
 def test_play_is_found_from_motions_that_reverse(held) -> None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import torch
-
-from ..kinematics.se3 import hat
-from ..typing import Bool, Float, Tensor
+from .._arrays import like, namespace
+from ..kinematics.se3 import cross, hat
+from ..typing import AnyArray, Bool, Float
 from .contact_model import ContactModel, contact_models, selected_rows
 from .contact_set import ContactSet
 
@@ -22,17 +21,17 @@ class ContactKinematics:
 
     contacts: ContactSet
     models: tuple[ContactModel, ...]
-    frame: Float[Tensor, "*batch n_c 3 3"]
+    frame: Float[AnyArray, "*batch n_c 3 3"]
     """C_i: columns ``n_in = -n``, ``t1``, ``t2``."""
-    lever: Float[Tensor, "*batch n_c 3"]
+    lever: Float[AnyArray, "*batch n_c 3"]
     """r_i = x_i - o [m]."""
-    axis: Float[Tensor, "*batch n_q 3"]
+    axis: Float[AnyArray, "*batch n_q 3"]
     """z_j, unit vectors along the joint axes, hand frame."""
-    point_jacobian: Float[Tensor, "*batch n_c 3 n_q"]
+    point_jacobian: Float[AnyArray, "*batch n_c 3 n_q"]
     """Velocity of the finger's material point at x_i [m/rad]."""
-    spin_jacobian: Float[Tensor, "*batch n_c 3 n_q"]
+    spin_jacobian: Float[AnyArray, "*batch n_c 3 n_q"]
     """Angular velocity of the finger link."""
-    mobility: Float[Tensor, "*batch n_c 3 3"]
+    mobility: Float[AnyArray, "*batch n_c 3 3"]
     """(K_f + K_o)^+ in the tangent plane [m]: how far a contact point runs per radian of rolling."""
 
     @cached_property
@@ -46,81 +45,83 @@ class ContactKinematics:
         return [place for place, row in enumerate(self.rows) if row % 6 == 0]
 
     @cached_property
-    def row_index(self) -> Tensor:
-        """:attr:`rows` as an index tensor on the device of the contacts."""
-        return torch.tensor(self.rows, dtype=torch.int64, device=self.frame.device)
+    def row_index(self) -> AnyArray:
+        """:attr:`rows` as an index on the device of the contacts."""
+        return namespace(self.frame).asarray(self.rows, device=self.frame.device)
 
     @cached_property
-    def normal_hat(self) -> Float[Tensor, "*batch n_c 3 3"]:
+    def normal_hat(self) -> Float[AnyArray, "*batch n_c 3 3"]:
         """``[n_i]x``, the cross-product matrix of each outward normal."""
         return hat(self.contacts.normal)
 
     @cached_property
-    def roll(self) -> Float[Tensor, "*batch n_c 3 3"]:
+    def roll(self) -> Float[AnyArray, "*batch n_c 3 3"]:
         """``M_i [n_i]x``: the contact point runs ``-M_i [n_i]x w_rel``."""
         return self.mobility @ self.normal_hat
 
     @cached_property
-    def relative_spin(self) -> Float[Tensor, "*batch n_c 3 n_s"]:
+    def relative_spin(self) -> Float[AnyArray, "*batch n_c 3 n_s"]:
         """Omega_i ds = w_finger - w_object: ``[J_w,i, 0, -I]``."""
         J_w = self.spin_jacobian
-        tail = torch.zeros(*J_w.shape[:-1], 6, dtype=J_w.dtype, device=J_w.device)
-        tail[..., 3:] = -torch.eye(3, dtype=J_w.dtype, device=J_w.device)
-        return torch.cat([J_w, tail], dim=-1)
+        xp, kind = namespace(J_w), {"dtype": J_w.dtype, "device": J_w.device}
+        tail = xp.zeros((*J_w.shape[:-1], 6), **kind)
+        tail[..., 3:] = -xp.eye(3, **kind)
+        return xp.concat([J_w, tail], -1)
 
 
 def contact_frames(
-    normal: Float[Tensor, "*batch n_c 3"], plane: Float[Tensor, " 3"] | None = None
-) -> Float[Tensor, "*batch n_c 3 3"]:
+    normal: Float[AnyArray, "*batch n_c 3"], plane: Float[AnyArray, " 3"] | None = None
+) -> Float[AnyArray, "*batch n_c 3 3"]:
     """``C_i = [n_in, t1, t2]``, right-handed, ``n_in = -n``.
 
     Without ``plane`` the tangents come from the branch-free construction of Duff et al.,
     Building an Orthonormal Basis, Revisited (JCGT 2017). With the normal of a plane of motion
     ``t1`` lies in the plane: ``t1 = plane x n_in``.
     """
-    n_in = -normal
+    n_in, xp = -normal, namespace(normal)
     if plane is not None:
-        t1 = torch.linalg.cross(plane.expand_as(n_in), n_in)
-        t1 = t1 / torch.linalg.vector_norm(t1, dim=-1, keepdim=True).clamp_min(1e-12)
-        return torch.stack([n_in, t1, torch.linalg.cross(n_in, t1)], dim=-1)
+        t1 = cross(like(plane, n_in) + 0 * n_in, n_in)
+        t1 = t1 / xp.sqrt((t1 * t1).sum(-1))[..., None].clip(1e-12)
+        return xp.stack([n_in, t1, cross(n_in, t1)], -1)
     # a reflection takes -+e_z to n_in, and e_x and e_y to the tangents
-    eye = torch.eye(3, dtype=n_in.dtype, device=n_in.device)
-    sign = torch.copysign(torch.ones_like(n_in[..., 2:]), n_in[..., 2:])
+    eye = xp.eye(3, dtype=n_in.dtype, device=n_in.device)
+    sign = xp.copysign(xp.ones_like(n_in[..., 2:]), n_in[..., 2:])
     across = n_in[..., :2] / (1 + sign * n_in[..., 2:])
     tangent = eye[:, :2] - (n_in + sign * eye[2])[..., None] * across[..., None, :]
-    t1, t2 = tangent.split(1, dim=-1)
-    return torch.cat([n_in[..., None], t1, sign[..., None] * t2], dim=-1)
+    return xp.concat([n_in[..., None], tangent[..., :1], sign[..., None] * tangent[..., 1:]], -1)
 
 
-def rolling_mobility(contacts: ContactSet) -> Float[Tensor, "*batch n_c 3 3"]:
+def rolling_mobility(contacts: ContactSet) -> Float[AnyArray, "*batch n_c 3 3"]:
     """``(K_f + K_o)^+`` in the tangent plane [m]; 0 where pinned or along directions in which both are flat.
 
     In closed form, with the plane's projection P: ``(tr(K) P - K) / det(K)`` for rank two,
     ``K / tr(K)^2`` for rank one (a cylinder on a plane), 0 for rank nought.
     """
-    n = contacts.normal
-    P = torch.eye(3, dtype=n.dtype, device=n.device) - n[..., None] * n[..., None, :]
+    n, xp = contacts.normal, namespace(contacts.normal)
+    kind = {"dtype": n.dtype, "device": n.device}
+    P = xp.eye(3, **kind) - n[..., None] * n[..., None, :]
     K = P @ (contacts.finger_curvature + contacts.object_curvature) @ P
-    trace, square = K.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None], (K * K).sum((-2, -1), keepdim=True)
+    trace = (K[..., 0, 0] + K[..., 1, 1] + K[..., 2, 2])[..., None, None]
+    square = (K * K).sum((-2, -1))[..., None, None]
     det = 0.5 * (trace * trace - square)
-    small = 0.5 * (trace - (2 * square - trace * trace).clamp_min(0).sqrt())  # the smaller eigenvalue
+    small = 0.5 * (trace - xp.sqrt((2 * square - trace * trace).clip(0)))  # the smaller eigenvalue
     # 1 in place of a divisor that is not used: no NaN in a gradient
     full = small > FLAT
-    inverse = (trace * P - K) / torch.where(full, det, 1.0)
-    m = torch.where(full, inverse, K / torch.where(trace > FLAT, trace, torch.inf).square())
+    inverse = (trace * P - K) / xp.where(full, det, 1.0)
+    m = xp.where(full, inverse, K / xp.where(trace > FLAT, trace, xp.inf) ** 2)
     if any(contacts.pinned):
-        m = m * torch.tensor([not p for p in contacts.pinned], dtype=m.dtype, device=m.device)[:, None, None]
+        m = m * xp.asarray([float(not p) for p in contacts.pinned], **kind)[:, None, None]
     return m
 
 
 def contact_kinematics(
     contacts: ContactSet,
-    position: Float[Tensor, "*batch 3"],
-    axis: Float[Tensor, "*batch n_q 3"],
-    origin: Float[Tensor, "*batch n_q 3"],
-    upstream: Bool[Tensor, "n_c n_q"],
+    position: Float[AnyArray, "*batch 3"],
+    axis: Float[AnyArray, "*batch n_q 3"],
+    origin: Float[AnyArray, "*batch n_q 3"],
+    upstream: Bool[AnyArray, "n_c n_q"],
     *,
-    plane: Float[Tensor, " 3"] | None = None,
+    plane: Float[AnyArray, " 3"] | None = None,
     rolling: bool = True,
 ) -> ContactKinematics:
     """Velocity of the contact points: ``J_v[:, j] = z_j x (x_i - o_j)``, ``J_w[:, j] = z_j``.
@@ -135,10 +136,9 @@ def contact_kinematics(
         rolling: False treats every contact as pinned (for comparison).
     """
     frame = contact_frames(contacts.normal, plane)
-    mask = upstream.to(axis.dtype)[..., None]
-    spin = axis[..., None, :, :] * mask
+    spin = axis[..., None, :, :] * upstream[..., None]
     arm = contacts.point[..., :, None, :] - origin[..., None, :, :]
-    velocity = torch.linalg.cross(spin, arm)
+    velocity = cross(spin, arm)
     return ContactKinematics(
         contacts=contacts,
         models=contact_models(contacts, planar=plane is not None),
@@ -147,36 +147,36 @@ def contact_kinematics(
         axis=axis,
         point_jacobian=velocity.mT,
         spin_jacobian=spin.mT,
-        mobility=rolling_mobility(contacts) if rolling else torch.zeros_like(frame),
+        mobility=rolling_mobility(contacts) if rolling else 0 * frame,
     )
 
 
-def full_hand_jacobian(kin: ContactKinematics) -> Float[Tensor, "*batch rows n_q"]:
+def full_hand_jacobian(kin: ContactKinematics) -> Float[AnyArray, "*batch rows n_q"]:
     """``J~_h``: rows ``blkdiag(C_i, C_i)^T [J_v,i; J_w,i]``, stacked over the contacts."""
-    C_t = kin.frame.mT
-    rows = torch.cat([C_t @ kin.point_jacobian, C_t @ kin.spin_jacobian], dim=-2)
-    return rows.flatten(-3, -2)
+    C_t, xp = kin.frame.mT, namespace(kin.frame)
+    rows = xp.concat([C_t @ kin.point_jacobian, C_t @ kin.spin_jacobian], -2)
+    return rows.reshape(*rows.shape[:-3], -1, rows.shape[-1])
 
 
-def full_grasp_matrix(kin: ContactKinematics) -> Float[Tensor, "*batch 6 rows"]:
+def full_grasp_matrix(kin: ContactKinematics) -> Float[AnyArray, "*batch 6 rows"]:
     """``G~``: blocks ``[C_i, 0; [r_i]x C_i, C_i]``; maps contact forces to the wrench about ``o``."""
-    C = kin.frame
+    C, xp = kin.frame, namespace(kin.frame)
     moment = hat(kin.lever) @ C
-    top = torch.cat([C, torch.zeros_like(C)], dim=-1)
-    bottom = torch.cat([moment, C], dim=-1)
-    return torch.cat([top, bottom], dim=-2).movedim(-3, -2).flatten(-2)
+    top, bottom = xp.concat([C, 0 * C], -1), xp.concat([moment, C], -1)
+    blocks = xp.swapaxes(xp.concat([top, bottom], -2), -3, -2)
+    return blocks.reshape(*blocks.shape[:-2], -1)
 
 
-def hand_jacobian(kin: ContactKinematics) -> Float[Tensor, "*batch n_h n_q"]:
+def hand_jacobian(kin: ContactKinematics) -> Float[AnyArray, "*batch n_h n_q"]:
     """``J_h = H J~_h``: joint velocities to those contact velocities that the models transmit [m/rad]."""
-    return full_hand_jacobian(kin).index_select(-2, kin.row_index)
+    return full_hand_jacobian(kin)[..., kin.row_index, :]
 
 
-def grasp_matrix(kin: ContactKinematics) -> Float[Tensor, "*batch 6 n_h"]:
+def grasp_matrix(kin: ContactKinematics) -> Float[AnyArray, "*batch 6 n_h"]:
     """``G = G~ H^T``: contact forces ``mu`` [N, N m] to the wrench on the object about ``o`` [N, N m]."""
-    return full_grasp_matrix(kin).index_select(-1, kin.row_index)
+    return full_grasp_matrix(kin)[..., kin.row_index]
 
 
-def constraint_matrix(kin: ContactKinematics) -> Float[Tensor, "*batch n_h n_s"]:
+def constraint_matrix(kin: ContactKinematics) -> Float[AnyArray, "*batch n_h n_s"]:
     """``A = [J_h, -G^T]``: contacts stick, ``A ds = 0``."""
-    return torch.cat([hand_jacobian(kin), -grasp_matrix(kin).mT], dim=-1)
+    return namespace(kin.frame).concat([hand_jacobian(kin), -grasp_matrix(kin).mT], -1)

@@ -196,12 +196,13 @@ class LookAndMoveController:
         grips = (task.wanted(lin, seen) for task in self.tasks if isinstance(task, GripForceTask))
         seen = dataclasses.replace(seen, grip=next(grips, None))
         try:
-            da, predicted, problem, solution = self._solve(lin, seen)
+            start = LinearizedModel.about(a.new_zeros(hand.n_a), lin, self.enhanced)
+            da, predicted, problem, solution = self._solve(lin, seen, start)
             phi = self.pace.cut(lin, da, predicted, seen, share)
             if phi < 1:
                 desired, share = phi * desired, phi * share
                 seen = dataclasses.replace(seen, desired=desired)
-                da, predicted, problem, solution = self._solve(lin, seen)
+                da, predicted, problem, solution = self._solve(lin, seen, start)
         except SolverError as failure:  # it cannot be infeasible, as all rows have slack
             return self._none(StopReason.UNSTABLE_GRASP, failure, focused)
         nominal = lin.described_jacobian @ da
@@ -237,13 +238,14 @@ class LookAndMoveController:
         return desired / scale, share
 
     def _solve(
-        self, lin: Linearization, seen: Situation
+        self, lin: Linearization, seen: Situation, start: LinearizedModel
     ) -> tuple[Tensor, Tensor, ControlProblem, ControlSolution]:
         """The best increment, what the model predicts of it, and the last program with its solution."""
-        enhanced, da = self.enhanced, seen.a.new_zeros(len(seen.a))
+        enhanced, da, model = self.enhanced, seen.a.new_zeros(len(seen.a)), start
         linear = enhanced is None or enhanced.affine
-        for _ in range(1 if linear else _ITERATIONS):
-            model = LinearizedModel.about(da, lin, enhanced)
+        for iteration in range(1 if linear else _ITERATIONS):
+            if iteration:
+                model = LinearizedModel.about(da, lin, enhanced)
             problem = build_qp(len(da), [part.rows(model, seen) for part in (*self.tasks, *self.limits)])
             solution = problem.solve()
             best = torch.as_tensor(solution.u, dtype=da.dtype)

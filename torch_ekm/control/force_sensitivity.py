@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 
 from .._checks import check_finite, check_shape
 from .._recorded import Recorded
-from ..typing import Float, Tensor
+from ..typing import Array, Float, Tensor
 
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
 _NOISE_STD = 0.25  # [N] of a change of force that c and B do not explain, at least
@@ -74,14 +76,6 @@ class ForceSensitivity(Recorded, nn.Module):
         """A new grasp: nothing drifts yet."""
         self.drift.zero_()
 
-    @property
-    def _covariance(self) -> Tensor:
-        """P of each pad."""
-        n = self.theta.shape[-1]
-        return torch.linalg.inv(
-            self.evidence / self.variance[:, None, None] + torch.eye(n, dtype=torch.float64)
-        )
-
     @torch.no_grad()
     def update(
         self,
@@ -109,34 +103,34 @@ class ForceSensitivity(Recorded, nn.Module):
             check_shape(name, value, shape)
         check_finite("moved", moved)
         check_finite("described", described)
-        w = moved.to(self.theta)
-        said = described.to(w) @ w
-        u = torch.cat([said[:, None], _PRIOR_STD * w.expand(n_pads, n_a)], dim=-1)
-        r = change.to(w) - said - (u * self.theta).sum(-1)
-        known = ~r.isnan()
-        if not bool(known.any()) or not bool(w.any()):
-            return r
-        doubt = _quadratic(self._covariance, u)  # u' P u
-        spread = (self.variance + doubt).sqrt()
-        Du = _times(self.evidence, u)
-        seen = (Du * u).sum(-1).clamp(min=torch.finfo(w.dtype).tiny)[:, None, None]
+        w, df, S = (x.detach().double().numpy() for x in (moved, change, described))
+        buffers = self.theta, self.evidence, self.variance, self.drift
+        theta, D, variance, drift = (buffer.numpy() for buffer in buffers)  # their own memory
+        said = S @ w
+        u = np.concatenate([said[:, None], np.tile(_PRIOR_STD * w, (n_pads, 1))], axis=-1)
+        r = df - said - (u * theta).sum(-1)
+        known = ~np.isnan(r)
+        if not known.any() or not w.any():
+            return torch.from_numpy(r)
+        doubt = (_gain(D, variance, u) * u).sum(-1)  # u' P u
+        spread = np.sqrt(variance + doubt)
+        Du = (D @ u[..., None])[..., 0]
+        seen = np.maximum((Du * u).sum(-1), np.finfo(float).tiny)[:, None, None]
         forgotten = (1 - _FORGETTING) * Du[:, :, None] * Du[:, None, :] / seen
-        self.evidence[known] += (u[:, :, None] * u[:, None, :] - forgotten)[known]
-        bounded = r.clamp(-_CLIP * spread, _CLIP * spread)
-        self.drift[known] = (_KEPT * self.drift + _TAKEN * bounded)[known]
-        gain = _times(self._covariance, u) / self.variance[:, None]
-        self.theta[known] += bounded[known, None] * gain[known]
-        unexplained = (bounded.square() - doubt).clamp(min=_NOISE_STD**2)
-        self.variance[known] += _RECENT * (unexplained - self.variance)[known]
-        return r
+        D[known] += (u[:, :, None] * u[:, None, :] - forgotten)[known]
+        bounded = np.clip(r, -_CLIP * spread, _CLIP * spread)
+        drift[known] = (_KEPT * drift + _TAKEN * bounded)[known]
+        gain = _gain(D, variance, u) / variance[:, None]
+        theta[known] += bounded[known, None] * gain[known]
+        unexplained = np.maximum(bounded**2 - doubt, _NOISE_STD**2)
+        variance[known] += _RECENT * (unexplained - variance)[known]
+        return torch.from_numpy(r)
 
     def extra_repr(self) -> str:
         return f"pads={len(self.theta)}, largest={float(self.correction.abs().max()):.3g} N/rad"
 
 
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix @ vector[..., None])[..., 0]
-
-
-def _quadratic(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (_times(matrix, vector) * vector).sum(-1)
+def _gain(D: Array, variance: Array, u: Array) -> Any:
+    """``P u`` of each pad."""
+    information = D / variance[:, None, None] + np.eye(u.shape[-1])
+    return np.linalg.solve(information, u[..., None])[..., 0]

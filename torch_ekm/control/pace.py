@@ -11,6 +11,7 @@ import torch
 from torch import nn
 
 from ..exceptions import ParameterError
+from ..kinematics.se3 import hat
 from ..typing import Float, Tensor
 from .situation import Situation
 
@@ -74,9 +75,9 @@ class LimitingFunction:
 
 def contact_travel(twist: Float[Tensor, " 6"], lever: Float[Tensor, "n_c 3"]) -> float:
     """``max_i |v + w x l_i|`` of contacts at l from the object's point o [m]."""
-    v, w = twist.split(3)
-    carried = v + torch.linalg.cross(w.expand_as(lever), lever)
-    return float(torch.linalg.vector_norm(carried, dim=-1).max())
+    v, w = twist.numpy().reshape(2, 3)
+    carried = v + lever.numpy() @ hat(w).T
+    return math.sqrt((carried * carried).sum(-1).max())
 
 
 @dataclass(frozen=True)
@@ -125,10 +126,9 @@ class StepBound:
             predicted: increment that the corrected model predicts for ``delta_a``.
             asked: p, size of the step in units of the largest at pace 1.
         """
-        focus = seen.focus
-        off = focus.off_matrix @ predicted[-6:]
-        rotation = float(torch.linalg.vector_norm(off[~focus.off_translation]))
-        travel = float(torch.linalg.vector_norm(off[focus.off_translation]))
+        off = (seen.focus.off_matrix @ predicted[-6:]).numpy()
+        translation = seen.focus.off_translation.numpy()
+        rotation, travel = (math.sqrt(part @ part) for part in (off[~translation], off[translation]))
         phi = min(1.0, self.off_rotation / max(rotation, 1e-12), self.off_travel / max(travel, 1e-12))
         f_n = seen.normal_force(lin)
         if f_n is None or not lin.forces.solved:
@@ -141,11 +141,11 @@ class StepBound:
                 phi = min(phi, max(1 / max(asked, 1.0), even**2))
         friction = float(lin.contacts.friction.mean()) * force
         spare = self.creep * friction / max(seen.weight, 1e-3)
-        before, after = lin.margins, lin.margins_after(delta_a)
+        before, after = lin.margins.numpy(), lin.margins_after(delta_a).numpy()
         missing = after < -spare
-        if bool(missing.any()):
+        if missing.any():
             allowed = (before[missing] + spare) / (before[missing] - after[missing])
-            phi = min(phi, float(allowed.clamp(0.0, 1.0).min()))
+            phi = min(phi, float(np.clip(allowed, 0.0, 1.0).min()))
         return phi
 
     def grip_share(self, lin: Linearization, seen: Situation) -> float:
@@ -220,12 +220,14 @@ class TrustRegion:
             lever: of the contacts about the object's point, root mean square [m].
             forces: of the contacts; None: unknown.
         """
-        unit = predicted.new_tensor([lever] * 3 + [1.0] * 3)
-        size = torch.linalg.vector_norm(predicted / unit)
-        noise = predicted.new_tensor([_TRANSLATION_NOISE] * 3 + [_ROTATION_NOISE] * 3)
-        z = (came - predicted).square() / (noise.square() + (_RELATIVE * size * unit).square())
-        fingers = z.new_zeros(0) if forces is None else forces.z[~forces.z.isnan()].square()
-        return float(torch.cat([torch.cat([z, fingers]).mean()[None], fingers]).max().sqrt())
+        unit = np.array([lever] * 3 + [1.0] * 3)
+        noise = np.array([_TRANSLATION_NOISE] * 3 + [_ROTATION_NOISE] * 3)
+        said, off = predicted.numpy(), (came - predicted).numpy()
+        size = np.linalg.norm(said / unit)
+        z = off**2 / (noise**2 + (_RELATIVE * size * unit) ** 2)
+        fingers = np.zeros(0) if forces is None else forces.z.numpy() ** 2
+        fingers = fingers[~np.isnan(fingers)]
+        return math.sqrt(max(np.concatenate([z, fingers]).mean(), fingers.max(initial=0.0)))
 
 
 @dataclass(frozen=True)

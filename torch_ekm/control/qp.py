@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import pi
@@ -10,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._extras import require
+from ..contact.forces.active_set import EqualityProgram, solve_by_active_set
 from ..exceptions import ParameterError, SolverError
 from ..typing import Array, Tensor
 
@@ -57,7 +59,7 @@ Rows = Squares | Equality | Inequality | Bounds
 
 @dataclass(frozen=True)
 class ControlSolution:
-    """The best increment, certified by the residuals of its program."""
+    """The best increment."""
 
     u: Array
     """[rad]"""
@@ -65,15 +67,11 @@ class ControlSolution:
     """``b - A u``: what of the equalities could not be met, in their unit."""
     violation: float
     """Largest violation of an inequality, in its unit."""
-    primal_residual: float
-    dual_residual: float
 
 
 @dataclass(frozen=True)
 class ControlProblem:
-    """The ``qpsolvers.Problem`` over ``z = [u; sl+; sl-; t]``, u in degrees, rows in their units.
-
-    ::
+    """The program of one step, u in degrees, rows in their units::
 
         min_u,sl,t   1/2 u^T P u + q.u + rho |sl|_1 + rho_t |t|_1
         s.t.         A u + sl = b
@@ -85,32 +83,66 @@ class ControlProblem:
     as long as ``lower <= upper``.
     """
 
-    qp: Any
-    n_u: int
+    P: Array
+    q: Array
+    equality: tuple[Array, Array, Array]
+    """A, b and rho."""
+    inequality: tuple[Array, Array, Array]
+    """C, h and rho_t."""
+    bounds: tuple[Array, Array]
+    """lower and upper [deg]."""
 
     @property
-    def bounds(self) -> tuple[Array, Array]:
-        """(lower, upper) of u in degrees."""
-        return self.qp.lb[: self.n_u], self.qp.ub[: self.n_u]
+    def qp(self) -> Any:
+        """The same with its slacks, a ``qpsolvers.Problem`` over ``z = [u; sl+; sl-; t]``."""
+        (A, b, rho), (C, h, rho_t), (lower, upper) = self.equality, self.inequality, self.bounds
+        n_e, n_t = len(b), len(h)
+        slacks = 2 * n_e + n_t
+        A = np.hstack([A, np.eye(n_e), -np.eye(n_e), np.zeros((n_e, n_t))])
+        G = np.hstack([C, np.zeros((n_t, 2 * n_e)), -np.eye(n_t)])
+        return require("qpsolvers").Problem(
+            np.pad(self.P, (0, slacks)),
+            np.concatenate([self.q, rho, rho, rho_t]),
+            *((G, h) if n_t else (None, None)),
+            *((A, b) if n_e else (None, None)),
+            np.pad(lower, (0, slacks)),
+            np.pad(upper, (0, slacks), constant_values=np.inf),
+        )
 
     def solve(self) -> ControlSolution:
-        """The best u, by the open-source solver PIQP.
+        """The best u: by an active set where all rows can be met, else by the open-source solver PIQP.
 
         Raises:
             SolverError: the solver did not find a solution, or is not installed.
         """
-        qpsolvers, qp, n_u = require("qpsolvers"), self.qp, self.n_u
+        (A, b, _), (C, h, _) = self.equality, self.inequality
+        u = self._without_slack()
+        u = np.clip(self._by_piqp() if u is None else u, *self.bounds)
+        broken = float(np.max(C @ u - h, initial=0.0))
+        return ControlSolution(u * DEGREE, (b - A @ u) * DEGREE, broken)
+
+    def _without_slack(self) -> Array | None:
+        """u, where no multiplier is above its penalty: the slacks are then 0."""
+        (A, b, rho), eye = self.equality, np.eye(len(self.q))
+        lower, upper = (np.isfinite(bound) for bound in self.bounds)
+        G = np.concatenate([self.inequality[0], -eye[lower], eye[upper]])
+        h = np.concatenate([self.inequality[1], -self.bounds[0][lower], self.bounds[1][upper]])
+        penalty = np.concatenate([self.inequality[2], np.full(len(h) - len(self.inequality[1]), np.inf)])
+        with contextlib.suppress(np.linalg.LinAlgError):  # rows that depend on each other
+            found = solve_by_active_set(EqualityProgram(self.P, self.q, A, b), G, h, [])
+            if found is not None and (found.inequality <= penalty[found.active]).all():
+                return found.x if (abs(found.equality) <= rho).all() else None
+        return None
+
+    def _by_piqp(self) -> Array:
+        qpsolvers = require("qpsolvers")
         try:
-            solution = qpsolvers.solve_problem(qp, solver="piqp")
+            solution = qpsolvers.solve_problem(self.qp, solver="piqp")
         except Exception as error:  # back ends raise types of their own
             raise SolverError("piqp", f"{type(error).__name__}: {error}") from error
         if not solution.found or solution.x is None:
             raise SolverError("piqp", "no solution found", "bounds may be far out of scale")
-        u = np.clip(solution.x[:n_u], *self.bounds)
-        slack = np.zeros(0) if qp.A is None else (qp.b - qp.A[:, :n_u] @ u) * DEGREE
-        broken = np.zeros(0) if qp.G is None else qp.G[:, :n_u] @ u - qp.h
-        residuals = float(solution.primal_residual()), float(solution.dual_residual())
-        return ControlSolution(u * DEGREE, slack, float(np.max(broken, initial=0.0)), *residuals)
+        return solution.x[: len(self.q)]
 
 
 def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
@@ -153,19 +185,7 @@ def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
     for name, value in (("cost", P), ("cost", q), ("equality", E), ("equality", d), ("rows", C), ("rows", h)):
         if not np.isfinite(value).all():
             raise ParameterError(name, "NaN or infinity", "finite")
-    n_e, n_t = len(d), len(h)
-    slacks = 2 * n_e + n_t
-    A = np.hstack([E, np.eye(n_e), -np.eye(n_e), np.zeros((n_e, n_t))])
-    G = np.hstack([C, np.zeros((n_t, 2 * n_e)), -np.eye(n_t)])
-    qp = require("qpsolvers").Problem(
-        np.pad(P, (0, slacks)),
-        np.concatenate([q, rho, rho, rho_t]),
-        *((G, h) if n_t else (None, None)),
-        *((A, d) if n_e else (None, None)),
-        np.pad(lower, (0, slacks)),
-        np.pad(upper, (0, slacks), constant_values=np.inf),
-    )
-    return ControlProblem(qp, n_u)
+    return ControlProblem(P, q, (E, d, rho), (C, h, rho_t), (lower, upper))
 
 
 def as_array(x: Numbers) -> Array:

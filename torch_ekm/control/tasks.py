@@ -107,9 +107,9 @@ class GripForceTask:
         if self.force is not None:
             return min(self.force + seen.tighter, max(self.force, self.most))
         contacts = kinematic.contacts
-        mu = max(float(contacts.friction.mean()), 1e-3)
-        turning = seen.focus.matrix[seen.focus.matrix[:, 3:].abs().sum(-1) > 0]
-        lever = max((contact_travel(row, contacts.point - seen.state.position) for row in turning), default=0)
+        mu, arms = max(float(contacts.friction.mean()), 1e-3), contacts.point - seen.state.position
+        turning = (row for row in seen.focus.matrix if bool(row[3:].any()))
+        lever = max((contact_travel(row, arms) for row in turning), default=0)
         force = self.safety / mu * (seen.weight / 2 + self.turning_load * lever)
         return min(max(force, self.least) + seen.tighter, self.most)
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -19,7 +20,7 @@ from ..model import Linearization
 from ..model.calibration.parameters import PRIORS, Parameter, Unknowns
 from ..model.motion_equations import Motion, MotionEquations
 from ..model.reduction import Drives
-from ..typing import Float, Tensor
+from ..typing import Array, Float, Tensor
 from .parameter_filter import FilterReport, ParameterFilter
 
 KINDS = ("springs", "moment_arms", "stiffness", "backlash")
@@ -128,17 +129,18 @@ class HandFigures(ParameterFilter):
         start = [_PLAY * (not one.logarithmic and one.nominal == 0) for one in found]
         lower, upper = [one.lowest for one in found], [_FURTHEST] * len(found)
         super().__init__([one.label for one in found], start, scale[:, None] * prior * scale, lower, upper)
-        self._is_play, self._unit = play, Play(torch.full((int(play.sum()),), 2.0).double())
+        self._is_play, self._unit = play.numpy(), Play(torch.full((int(play.sum()),), 2.0).double())
         self._play: PlayState | None = None  # in units of half the widths
         self._a = torch.empty(0)  # encoders at the last commit
-        self.hand, self._entries, self._kind = hand, tuple(found), kind
-        self._described = torch.tensor([one.nominal for one in found], dtype=torch.float64)
-        self._prior_std = torch.tensor([one.prior for one in found], dtype=torch.float64)
+        self.hand, self._entries, self._kind = hand, tuple(found), kind.numpy()
+        self._described = np.array([one.nominal for one in found])
+        self._prior_std = np.array([one.prior for one in found])
         self._solved: tuple[MotionEquations, Tensor, Motion | None] | None = None
         self._at = [  # where the figures of each kind stand in its array
-            tuple(map(torch.tensor, zip(*(one.index for one in found if one.kind == name), strict=True)))
+            tuple(map(np.array, zip(*(one.index for one in found if one.kind == name), strict=True)))
             for name in KINDS
         ]
+        self._index = [tuple(map(torch.from_numpy, at)) for at in self._at]  # the same for torch
 
     @classmethod
     def of(cls, hand: HandDescription) -> HandFigures:
@@ -170,8 +172,12 @@ class HandFigures(ParameterFilter):
     @property
     def factors(self) -> Float[Tensor, " n"]:
         """Of the described figures; of a backlash its width [rad]."""
-        step = self._prior_std * self.mean
-        return torch.where(self._is_play, self._described + step, step.exp())
+        return torch.from_numpy(self._factors)
+
+    @property
+    def _factors(self) -> Array:
+        step = self._prior_std * self.mean.numpy()
+        return np.where(self._is_play, self._described + step, np.exp(step))
 
     @property
     def width(self) -> Float[Tensor, " n"]:
@@ -182,7 +188,8 @@ class HandFigures(ParameterFilter):
         """The next motion begins at these encoders [rad]. Unless the last one ended there the play may stand
         anywhere."""
         if self._a.shape != a.shape or float((a - self._a).abs().max()) > _SAME:
-            self._play = self._unit.unknown() if len(self.width) else None
+            anywhere = PlayState(*(end.numpy() for end in self._unit.unknown()))
+            self._play = anywhere if len(self.width) else None
 
     def commit(self, moved: Float[Tensor, " n_a"], a: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
         """The motors have moved so, and stand at a [rad]; what the tendons did."""
@@ -198,20 +205,24 @@ class HandFigures(ParameterFilter):
         """What the motors are to do, so that the tendons do this [rad]."""
         if self._play is None:
             return pull
-        wanted = pull[self._at[-1]]
-        lost = 0.5 * self.width * (self._play.position + wanted.sign())
-        return pull.index_put(self._at[-1], wanted + lost * (wanted.abs() > _SAME))
+        motors = pull.double().numpy().copy()
+        wanted = motors[self._at[-1]]
+        lost = 0.5 * self._factors[self._is_play] * (self._play.position + np.sign(wanted))
+        motors[self._at[-1]] += lost * (abs(wanted) > _SAME)
+        return torch.from_numpy(motors)
 
-    def _pull(self, moved: Tensor) -> tuple[Tensor, Tensor, PlayState | None]:
+    def _pull(self, moved: Tensor) -> tuple[Tensor, Array, PlayState | None]:
         """What the tendons do, its derivative by the width of each play, and where the plays stand after it,
         in units of half their widths."""
-        at, half = self._at[-1], (0.5 * self.width).clamp(min=1e-9)
+        at, half = self._at[-1], np.maximum(0.5 * self._factors[self._is_play], 1e-9)
         if self._play is None:
-            return moved, torch.zeros_like(half), None
-        w = moved[at] / half
+            return moved, np.zeros_like(half), None
+        pull = moved.double().numpy().copy()
+        w = pull[at] / half
         pulled, after = self._unit.advance(self._play, w)
-        at_end = 0.5 * ((after.low.abs() == 1).to(w) + (after.high.abs() == 1).to(w))
-        return moved.to(half).index_put(at, half * pulled), 0.5 * (pulled - at_end * w), after
+        at_end = 0.5 * ((abs(after.low) == 1) + 1.0 * (abs(after.high) == 1))
+        pull[at] = half * pulled
+        return torch.from_numpy(pull), 0.5 * (pulled - at_end * w), after
 
     def solve(self, equations: MotionEquations) -> Motion | None:
         """J_m with the present figures; None where the grasp would buckle with them."""
@@ -228,16 +239,20 @@ class HandFigures(ParameterFilter):
 
     def present(self, described: Drives) -> tuple[Float[Tensor, " n_q"], Drives]:
         """Change of the springs against the description [N m/rad] and the drives, both as known now."""
-        values = (self._described * self.factors).to(described.actuation)
-        springs, arms, stiffness, _ = (values[self._kind == k] for k in range(len(KINDS)))
-        J_a = described.actuation.index_put(self._at[1], arms) if len(arms) else described.actuation
-        K_a = described.stiffness
+        J_a, K_a = described
+        now = self._described * self._factors
+        change, arms, stiffness = (
+            torch.from_numpy(values[self._kind == k]).to(J_a)
+            for k, values in enumerate((now - self._described, now, now))
+        )
+        springs = J_a.new_zeros(J_a.shape[-1])
+        if len(change):
+            springs = springs.index_put(self._index[0], change)
+        if len(arms):
+            J_a = J_a.index_put(self._index[1], arms)
         if len(stiffness):  # a model without compliance keeps its actuators rigid
-            K_a = K_a.where(K_a.isinf(), K_a.index_put(self._at[2], stiffness))
-        change = J_a.new_zeros(J_a.shape[-1])
-        if len(springs):
-            change[self._at[0]] = springs - self._described[self._kind == 0].to(change)
-        return change, Drives(J_a, K_a)
+            K_a = K_a.where(K_a.isinf(), K_a.index_put(self._index[2], stiffness))
+        return springs, Drives(J_a, K_a)
 
     @torch.no_grad()
     def learn(
@@ -270,22 +285,24 @@ class HandFigures(ParameterFilter):
         pull = pull.to(motion.jacobian)
         joints = lin.equations.moving.nonzero()[:, 0].tolist()
         rows = [*joints, *range(n_q, n_q + 6)]
-        predicted = (motion.jacobian @ pull)[rows]
-        noise = _noise(predicted, len(joints), lin)
-        against = float((increment[rows] * predicted / noise).sum())
-        if against < -0.5 * float((predicted.square() / noise).sum()):
-            return None  # figures do not turn a motion round: a sign is wrong, or a contact slid
         derivatives = (*motion.derivative(pull, rows), motion.jacobian[rows])
+        J, w, ds, *derivatives = (
+            x.double().numpy() for x in (motion.jacobian, pull, increment, *derivatives)
+        )
+        predicted, came = J[rows] @ w, ds[rows]
+        noise = _noise(predicted, len(joints), float(lin.lever))
+        if (came * predicted / noise).sum() < -0.5 * (predicted**2 / noise).sum():
+            return None  # figures do not turn a motion round: a sign is wrong, or a contact slid
         parts = zip(derivatives, self._at, strict=True)
-        phi = torch.cat([part[(slice(None), *at)].double() for part, at in parts if len(at)], dim=-1)
+        phi = np.concatenate([part[:, *at] for part, at in parts if len(at)], axis=-1)
         phi[:, self._is_play] *= by_width
-        slope = self._prior_std * torch.where(self._is_play, 1.0, self._described * self.factors)
-        return self.update(increment[rows] - predicted, phi * slope, noise)
+        slope = self._prior_std * np.where(self._is_play, 1.0, self._described * self._factors)
+        return self.update(*map(torch.from_numpy, (came - predicted, phi * slope, noise)))
 
     @property
     def figures(self) -> tuple[Figure, ...]:
         """Each figure against its description."""
-        std = self._prior_std * self.stddev * torch.where(self._is_play, 1.0, self.factors)
+        std = self._prior_std * self.stddev.numpy() * np.where(self._is_play, 1.0, self._factors)
         columns = self.names, self.factors.tolist(), std.tolist(), self._told.tolist()
         return tuple(Figure(*row) for row in zip(*columns, strict=True))
 
@@ -295,7 +312,7 @@ class HandFigures(ParameterFilter):
         variance = self.covariance.diagonal()
         told = torch.zeros(len(self), dtype=torch.bool)
         for k in range(len(KINDS)):
-            own = self._kind == k
+            own = torch.from_numpy(self._kind == k)
             n = int(own.sum())
             if n:
                 common = (self.covariance[own][:, own].sum() - variance[own].sum()) / max(n * (n - 1), 1)
@@ -310,10 +327,10 @@ class HandFigures(ParameterFilter):
             return ()
         step = self.mean - self.before
         z = step / (self.covariance.diagonal() + self.before_covariance.diagonal()).sqrt()
-        factor, at = (self._prior_std * step).exp(), int(self.changed_at)
+        factor, at = np.exp(self._prior_std * step.numpy()), int(self.changed_at)
         found = [
             Change(self.names[i], at, float(factor[i]), float(z[i]))
-            for i in ((z.abs() > 2) & ~self._is_play).nonzero()[:, 0].tolist()
+            for i in ((z.abs() > 2) & torch.from_numpy(~self._is_play)).nonzero()[:, 0].tolist()
         ]
         return tuple(sorted(found, key=lambda one: -abs(one.z)))
 
@@ -344,11 +361,11 @@ def _digest(figures: Mapping[str, float]) -> str:
     return hashlib.sha256(repr(sorted(figures.items())).encode()).hexdigest()[:8]
 
 
-def _noise(predicted: Tensor, n_joints: int, lin: Linearization) -> Tensor:
+def _noise(predicted: Array, n_joints: int, lever: float) -> Any:
     """R: sensors, and a share of the motion."""
     dq, twist = predicted[:n_joints], predicted[n_joints:]
-    unit = predicted.new_tensor([float(lin.lever)] * 3 + [1.0] * 3)
-    std = predicted.new_tensor([_POSITION_STD] * 3 + [_ROTATION_STD] * 3)
-    size = _RELATIVE * torch.linalg.vector_norm(twist / unit)
-    of_joints = _JOINT_STD**2 + (_RELATIVE * torch.linalg.vector_norm(dq)) ** 2
-    return torch.cat([of_joints.expand(n_joints), std.square() + (size * unit).square()])
+    unit = np.array([lever] * 3 + [1.0] * 3)
+    std = np.array([_POSITION_STD] * 3 + [_ROTATION_STD] * 3)
+    size = _RELATIVE * np.linalg.norm(twist / unit)
+    of_joints = _JOINT_STD**2 + (_RELATIVE * np.linalg.norm(dq)) ** 2
+    return np.concatenate([np.full(n_joints, of_joints), std**2 + (size * unit) ** 2])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -139,11 +140,13 @@ class ParameterFilter(Recorded, nn.Module):
             check_finite(name, value)
         if not bool((noise > 0).all()):
             raise ParameterError("noise", noise.tolist(), "positive variances")
-        r, phi, R = (value.to(self.mean) for value in (residual, derivative, noise))
-        P = (1 - _DRIFT) * self.covariance + _DRIFT * self.prior
-        mean = self.start + (1 - _DRIFT) ** 0.5 * (self.mean - self.start)
-        S = phi @ P @ phi.mT + torch.diag(R)
-        surprise = float(r @ torch.linalg.solve(S, r)) / n_r
+        figures = residual, derivative, noise, self.covariance, self.prior, self.mean, self.start
+        r, phi, R, P, P_0, m, m_0 = (value.detach().double().cpu().numpy() for value in figures)
+        lower, upper = (bound.cpu().numpy() for bound in (self.lower, self.upper))
+        P = (1 - _DRIFT) * P + _DRIFT * P_0
+        mean = m_0 + (1 - _DRIFT) ** 0.5 * (m - m_0)
+        of_prediction = phi @ P @ phi.T
+        surprise = float(r @ np.linalg.solve(of_prediction + np.diag(R), r)) / n_r
         most = _SURPRISE * max(1.0, float(self.usual))
         self.usual += _RECENT * (min(surprise, most) - self.usual)
         self.surprises.copy_(self.surprises + 1 if surprise > most else torch.zeros_like(self.surprises))
@@ -153,17 +156,17 @@ class ParameterFilter(Recorded, nn.Module):
             self.before_covariance.copy_(self.covariance)
             self.changed_at.copy_(self.count)
             self.surprises.zero_()
-            P = self.prior
+            P, of_prediction = P_0, phi @ P_0 @ phi.T
         weight = min(1.0, most / surprise) if surprise > 0 else 1.0
-        S = phi @ P @ phi.mT + torch.diag(R / weight)
-        K = torch.linalg.solve(S, phi @ P).mT
-        wanted = mean + K @ (r + phi @ (self.mean - mean))
-        self.mean.copy_(wanted.clamp(self.lower, self.upper))
-        left = torch.eye(n, dtype=P.dtype) - K @ phi
-        P = left @ P @ left.mT + (K * (R / weight)) @ K.mT
-        self.covariance.copy_(0.5 * (P + P.mT))
+        K = np.linalg.solve(of_prediction + np.diag(R / weight), phi @ P).T
+        wanted = mean + K @ (r + phi @ (m - mean))
+        mean = np.clip(wanted, lower, upper)
+        left = np.eye(n) - K @ phi
+        P = left @ P @ left.T + (K * (R / weight)) @ K.T
+        self.mean.copy_(torch.from_numpy(mean))
+        self.covariance.copy_(torch.from_numpy(0.5 * (P + P.T)))
         self.count += 1
-        bounded = tuple(name for name, out in zip(self.names, wanted != self.mean, strict=True) if out)
+        bounded = tuple(self.names[i] for i in np.flatnonzero(wanted != mean))
         return FilterReport(surprise, weight, opened, bounded)
 
     def state_problems(self, state: dict[str, Tensor]) -> list[str]:

@@ -6,14 +6,16 @@ increment in hand-frame axes. Rotation vectors are never added.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 
+from .._arrays import is_plain
 from .._checks import check_finite
 from ..exceptions import ParameterError, ShapeError
 from ..typing import Float, Tensor
-from .se3 import exp, log
+from .se3 import cross, exp, log
 from .tensors import as_tensors
 
 _ROUNDED = 1e-4
@@ -47,7 +49,8 @@ class GraspState:
             raise ShapeError("position", f"{(*batch, 3)} to go with q", self.position.shape)
         if self.rotation.shape != (*batch, 3, 3):
             raise ShapeError("rotation", f"{(*batch, 3, 3)} to go with q", self.rotation.shape)
-        if not bool(torch.isfinite(torch.cat([getattr(self, name).flatten() for name in given])).all()):
+        total = self.q.sum() + self.position.sum() + self.rotation.sum()  # an infinity or a NaN is in it
+        if not math.isfinite(total):
             for name in given:
                 check_finite(name, getattr(self, name))
         _check_rotation(self.rotation)
@@ -78,10 +81,10 @@ class GraspState:
 
 def _check_rotation(R: Tensor) -> None:
     """``cof R = R``: every column is the cross product of the other two, which holds for rotations only."""
-    x, y, z = R.detach().unbind(-1)
-    cofactors = torch.linalg.cross(torch.stack([y, z, x], -1), torch.stack([z, x, y], -1), dim=-2)
-    off = (cofactors - R.detach()).abs()
-    if bool((off > _ROUNDED).any()):
+    rows = R.detach().numpy() if is_plain(R.detach()) else R.detach()
+    y_z_x, z_x_y = (rows.mT[..., order, :] for order in ([1, 2, 0], [2, 0, 1]))  # columns of R
+    off = abs(cross(y_z_x, z_x_y) - rows.mT).max()
+    if float(off) > _ROUNDED:
         what = "a reflection" if bool((torch.linalg.det(R) < 0).any()) else "scaled or sheared"
-        valid = f"a rotation matrix, R^T R = I and det R = 1 (it is {what}, off by {float(off.max()):.2g})"
+        valid = f"a rotation matrix, R^T R = I and det R = 1 (it is {what}, off by {float(off):.2g})"
         raise ParameterError("rotation", R.tolist() if R.dim() == 2 else tuple(R.shape), valid)

@@ -6,19 +6,20 @@ from typing import NamedTuple
 
 import torch
 
+from .._arrays import like, namespace
 from ..description import HandDescription
 from ..exceptions import ParameterError, ShapeError
-from ..typing import Float, Tensor
+from ..typing import AnyArray, Float, Tensor
 
 
 class PlayState(NamedTuple):
     """Bounds of ``z = x - m``, where the output x stands within the play of the motor at m [rad]."""
 
-    low: Float[Tensor, "*batch n_a"]
-    high: Float[Tensor, "*batch n_a"]
+    low: Float[AnyArray, "*batch n_a"]
+    high: Float[AnyArray, "*batch n_a"]
 
     @property
-    def position(self) -> Float[Tensor, "*batch n_a"]:
+    def position(self) -> Float[AnyArray, "*batch n_a"]:
         """z, the middle of the bounds [rad]."""
         return 0.5 * (self.low + self.high)
 
@@ -52,14 +53,15 @@ class Play:
         """The state after an unknown history: anywhere within the play [rad]."""
         return PlayState(-0.5 * self.width, 0.5 * self.width)
 
-    def at(self, position: Float[Tensor, "*batch n_a"]) -> PlayState:
+    def at(self, position: Float[AnyArray, "*batch n_a"]) -> PlayState:
         """A known position z, brought into the play: 0 is its middle [rad]."""
-        z = torch.minimum(torch.maximum(position, -0.5 * self.width), 0.5 * self.width)
+        xp, half = namespace(position), 0.5 * like(self.width, position)
+        z = xp.minimum(xp.maximum(position, -half), half)
         return PlayState(z, z)
 
     def advance(
-        self, state: PlayState, delta_a: Float[Tensor, "*batch n_a"]
-    ) -> tuple[Float[Tensor, "*batch n_a"], PlayState]:
+        self, state: PlayState, delta_a: Float[AnyArray, "*batch n_a"]
+    ) -> tuple[Float[AnyArray, "*batch n_a"], PlayState]:
         """What the tendons move by when the motors move by ``delta_a``, and the play afterwards [rad].
 
         Of an unknown start: the middle of what is possible.
@@ -71,7 +73,7 @@ class Play:
         after = PlayState(self.at(state.low - delta_a).low, self.at(state.high - delta_a).low)
         return delta_a + after.position - state.position, after
 
-    def _check(self, increment: Tensor) -> None:
+    def _check(self, increment: AnyArray) -> None:
         if increment.shape[-1:] != self.width.shape[-1:]:
             expected = f"(*batch, {self.width.shape[-1]})"
             raise ShapeError("delta_a", expected, increment.shape, "one entry per actuator")

@@ -7,10 +7,14 @@ rotation increments are ``dphi = Log(R+ R^T)``, so ``R+ = exp([dphi]x) R``.
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import torch
 
-from ..typing import Float, Tensor
+from .._arrays import is_plain, namespace
+from ..typing import AnyArray, Float, Tensor
+
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
 @lru_cache
@@ -23,51 +27,69 @@ def _generators(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "3 9"
         return E.flatten(1)
 
 
-def hat(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+_ROWS = _generators(torch.float64, torch.device("cpu")).numpy()
+
+
+def hat(v: Float[AnyArray, "*batch 3"]) -> Float[Any, "*batch 3 3"]:
     """Skew matrix ``[v]x`` with ``[v]x w = v x w``."""
-    return (v @ _generators(v.dtype, v.device)).unflatten(-1, (3, 3))
+    rows = _generators(v.dtype, v.device) if isinstance(v, Tensor) else _ROWS
+    return (v @ rows).reshape(*v.shape, 3)
 
 
-def exp(phi: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+def cross(v: Float[AnyArray, "*#batch 3"], w: Float[AnyArray, "*#batch 3"]) -> Any:
+    """``v x w``."""
+    if isinstance(v, Tensor):
+        return torch.linalg.cross(v, w)
+    return v[..., _NEXT] * w[..., _LAST] - v[..., _LAST] * w[..., _NEXT]
+
+
+def exp(phi: Float[AnyArray, "*batch 3"]) -> Float[Any, "*batch 3 3"]:
     """Rodrigues: ``exp([phi]x) = I + sin t/t [phi]x + (1 - cos t)/t^2 [phi]x^2``, ``t = |phi|`` [rad].
 
     Smooth at 0 (series for small angles), so it can be differentiated there.
     """
+    if isinstance(phi, Tensor) and is_plain(phi):
+        return torch.from_numpy(exp(phi.numpy()))
+    xp = namespace(phi)
     square = (phi * phi).sum(-1)
     small = square < 1e-8
-    safe = torch.where(small, torch.ones_like(square), square)
-    t = safe.sqrt()
-    a = torch.where(small, 1 - square / 6, torch.sin(t) / t)
-    b = torch.where(small, 0.5 - square / 24, (1 - torch.cos(t)) / safe)
+    safe = xp.where(small, 1.0, square)
+    t = xp.sqrt(safe)
+    a = xp.where(small, 1 - square / 6, xp.sin(t) / t)
+    b = xp.where(small, 0.5 - square / 24, (1 - xp.cos(t)) / safe)
     skew = hat(phi)
-    eye = torch.eye(3, dtype=phi.dtype, device=phi.device)
+    eye = xp.eye(3, dtype=phi.dtype, device=phi.device)
     return eye + a[..., None, None] * skew + b[..., None, None] * (skew @ skew)
 
 
-def log(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+def log(rotation: Float[AnyArray, "*batch 3 3"]) -> Float[Any, "*batch 3"]:
     """Inverse of :func:`exp` for angles below pi: the vector ``phi`` [rad] with ``exp([phi]x) = R``.
 
     At a half turn the axis is defined up to its sign; either is returned.
     """
-    w = torch.stack(
+    if isinstance(rotation, Tensor) and is_plain(rotation):
+        return torch.from_numpy(log(rotation.numpy()))
+    xp = namespace(rotation)
+    w = xp.stack(
         [
             rotation[..., 2, 1] - rotation[..., 1, 2],
             rotation[..., 0, 2] - rotation[..., 2, 0],
             rotation[..., 1, 0] - rotation[..., 0, 1],
         ],
-        dim=-1,
+        -1,
     )
     sine2 = (w * w).sum(-1) / 4  # sin^2 t
-    trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
+    trace = rotation[..., 0, 0] + rotation[..., 1, 1] + rotation[..., 2, 2]
     cosine = (trace - 1) / 2
     small = sine2 < 1e-10
-    sine = torch.where(small, torch.ones_like(sine2), sine2).sqrt()
-    t = torch.atan2(sine, cosine)
-    factor = torch.where(small, 0.5 + sine2 / 12, t / (2 * sine))
+    sine = xp.sqrt(xp.where(small, 1.0, sine2))
+    t = xp.atan2(sine, cosine)
+    factor = xp.where(small, 0.5 + sine2 / 12, t / (2 * sine))
     result = factor[..., None] * w
     half_turn = small & (cosine < 0)
     if bool(half_turn.any()):
-        result = torch.where(half_turn[..., None], _log_near_half_turn(rotation), result)
+        near = _log_near_half_turn(torch.as_tensor(rotation))
+        result = xp.where(half_turn[..., None], near if xp is torch else near.numpy(), result)
     return result
 
 

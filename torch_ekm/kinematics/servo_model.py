@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from types import SimpleNamespace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from .._checks import check_finite, check_shape
 from .._recorded import Recorded
-from ..typing import Bool, Float, Tensor
+from ..typing import Array, Bool, Float, Tensor
 
+Mask = NDArray[np.bool_]
 _DEG = math.pi / 180
 _PRIOR_STD = (1.0 * _DEG, 0.3 * _DEG)  # [rad] of d and b before the first motion
 _NOISE_STD = 0.1 * _DEG  # [rad] of a servo's error from motion to motion, a first guess worth ten motions
@@ -132,72 +136,66 @@ class ServoModel(Recorded, nn.Module):
         for name, value in (("command", command), ("moved", moved)):
             check_shape(name, value, self.stuck.shape)
             check_finite(name, value)
-        free = torch.ones_like(self.stuck) if free is None else free
-        v, w = command.double(), moved.double()
-        went = free & (w.abs() > self.moved_from)
-        stood = free & ~went & (v.abs() > self.resolution) & ~self.stuck
-        self.failures[went], self.stuck[went] = 0, False
-        first = stood & (self.failures == 0)
-        self.before[first] = self.estimate[first]
-        self.before_covariance[first] = self.covariance[first]
-        self.failures[stood] += 1
-        self._regress(v, w, went)
-        self._censored(v, stood)
-        lost = stood & (self.dead_zone > self.largest)
-        self.stuck |= lost
-        self.estimate[lost], self.covariance[lost] = self.before[lost], self.before_covariance[lost]
+        v, w = command.detach().double().numpy(), moved.detach().double().numpy()
+        # the buffers' own memory: small torch operations cost ten times as much
+        at = SimpleNamespace(**{name: buffer.numpy() for name, buffer in self.named_buffers()})
+        went = (abs(w) > self.moved_from) & (True if free is None else free.numpy())
+        stood = ~went & (abs(v) > self.resolution) & ~at.stuck & (True if free is None else free.numpy())
+        at.failures[went], at.stuck[went] = 0, False
+        first = stood & (at.failures == 0)
+        at.before[first] = at.estimate[first]
+        at.before_covariance[first] = at.covariance[first]
+        at.failures[stood] += 1
+        if went.any():
+            self._regress(at, v, w, went)
+        if stood.any():
+            self._censored(at, v, stood)
+        lost = stood & (at.estimate[:, 0] > self.largest)
+        at.stuck[lost] = True
+        at.estimate[lost], at.covariance[lost] = at.before[lost], at.before_covariance[lost]
 
-    def _regress(self, v: Tensor, w: Tensor, went: Tensor) -> None:
+    def _regress(self, at: SimpleNamespace, v: Array, w: Array, went: Mask) -> None:
         """``v - w = x.theta + noise``, ``x = [sign(w), -1]``, of the servos that moved."""
-        if not bool(went.any()):
-            return
-        x = torch.stack([w[went].sign(), -torch.ones_like(w[went])], dim=-1)
-        noise = self.noise_std[went].square()
-        error = v[went] - w[went] - (x * self.estimate[went]).sum(-1)
-        Px, spread = self._spread(x, went)
-        surprising = error.square() > 16 * noise * spread
-        self._open(surprising, went)
-        Px, spread = self._spread(x, went)
-        self.estimate[went] += Px * (error / spread)[:, None]
-        P = self.covariance[went] - Px[..., None] * Px[:, None, :] / spread[:, None, None]
+        x = np.stack([np.sign(w[went]), np.full(went.sum(), -1.0)], axis=-1)
+        noise = at.squares[went] / at.weight[went]
+        error = v[went] - w[went] - (x * at.estimate[went]).sum(-1)
+        Px, spread = _spread(at, x, went)
+        self._open(at, error**2 > 16 * noise * spread, went)
+        Px, spread = _spread(at, x, went)
+        at.estimate[went] += Px * (error / spread)[:, None]
+        P = at.covariance[went] - Px[..., None] * Px[:, None, :] / spread[:, None, None]
         faded = P / _FORGETTING  # never less sure than at the start: no blow-up without excitation
-        small = (faded.diagonal(dim1=-2, dim2=-1) <= self._prior.diagonal()).all(-1)
-        self.covariance[went] = torch.where(small[:, None, None], faded, P)
+        small = (faded[:, [0, 1], [0, 1]] <= self._prior.diagonal().numpy()).all(-1)
+        at.covariance[went] = np.where(small[:, None, None], faded, P)
         # bounded: a servo that has become another one is not a noisy one
-        square = (error.square() / spread).clamp(max=16 * noise)
-        self.weight[went] = _FORGETTING * self.weight[went] + 1
-        self.squares[went] = _FORGETTING * self.squares[went] + square
+        square = np.minimum(error**2 / spread, 16 * noise)
+        at.weight[went] = _FORGETTING * at.weight[went] + 1
+        at.squares[went] = _FORGETTING * at.squares[went] + square
 
-    def _censored(self, v: Tensor, stood: Tensor) -> None:
+    def _censored(self, at: SimpleNamespace, v: Array, stood: Mask) -> None:
         """``x.theta + noise > |v|``, ``x = [1, -sign(v)]``, of the servos that stood: moments of the
         truncated normal."""
-        if not bool(stood.any()):
-            return
-        x = torch.stack([torch.ones_like(v[stood]), -v[stood].sign()], dim=-1)
-        noise = self.noise_std[stood].square()
+        x = np.stack([np.ones(stood.sum()), -np.sign(v[stood])], axis=-1)
+        noise = at.squares[stood] / at.weight[stood]
 
-        def excess(spread: Tensor) -> Tensor:
-            return ((x * self.estimate[stood]).sum(-1) - v[stood].abs()) / (noise * spread).sqrt()
+        def excess(spread: Array) -> Array:
+            return ((x * at.estimate[stood]).sum(-1) - abs(v[stood])) / np.sqrt(noise * spread)
 
-        Px, spread = self._spread(x, stood)
-        self._open(excess(spread) < -4, stood)
-        Px, spread = self._spread(x, stood)
+        Px, spread = _spread(at, x, stood)
+        self._open(at, excess(spread) < -4, stood)
+        Px, spread = _spread(at, x, stood)
         z = excess(spread)
-        hazard = torch.exp(-0.5 * z.square() - torch.special.log_ndtr(z)) / math.sqrt(2 * math.pi)
-        self.estimate[stood] += Px * (hazard * (noise / spread).sqrt())[:, None]
-        shrink = (hazard * (hazard + z)).clamp(0, 1) / spread
-        self.covariance[stood] -= Px[..., None] * Px[:, None, :] * shrink[:, None, None]
+        beyond = torch.special.log_ndtr(torch.from_numpy(z)).numpy()
+        hazard = np.exp(-0.5 * z**2 - beyond) / math.sqrt(2 * math.pi)
+        at.estimate[stood] += Px * (hazard * np.sqrt(noise / spread))[:, None]
+        shrink = np.clip(hazard * (hazard + z), 0, 1) / spread
+        at.covariance[stood] -= Px[..., None] * Px[:, None, :] * shrink[:, None, None]
 
-    def _spread(self, x: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
-        """``P x`` and ``1 + x^T P x``: covariances in units of the noise's variance."""
-        Px = (self.covariance[which] @ x[..., None])[..., 0]
-        return Px, 1 + (x * Px).sum(-1)
-
-    def _open(self, surprising: Tensor, which: Tensor) -> None:
+    def _open(self, at: SimpleNamespace, surprising: Mask, which: Mask) -> None:
         """The second surprise in succession: it is another servo, its old estimate is no evidence."""
-        again = surprising & (self.surprises[which] > 0)
-        self.covariance[which] = torch.where(again[:, None, None], self._prior, self.covariance[which])
-        self.surprises[which] = (surprising & ~again).long()
+        again = surprising & (at.surprises[which] > 0)
+        at.covariance[which] = np.where(again[:, None, None], self._prior.numpy(), at.covariance[which])
+        at.surprises[which] = surprising & ~again
 
     def extra_repr(self) -> str:
         d, b = (torch.stack([self.dead_zone, self.bias]) / _DEG).tolist()
@@ -206,3 +204,9 @@ class ServoModel(Recorded, nn.Module):
             f"{name}: d={d[i]:.2f}±{sd[i]:.2f} b={b[i]:.2f}±{sb[i]:.2f} deg{' (stuck)' * bool(self.stuck[i])}"
             for i, name in enumerate(self.names)
         )
+
+
+def _spread(at: SimpleNamespace, x: Array, which: Mask) -> tuple[Array, Array]:
+    """``P x`` and ``1 + x^T P x``: covariances in units of the noise's variance."""
+    Px = (at.covariance[which] @ x[..., None])[..., 0]
+    return Px, 1 + (x * Px).sum(-1)

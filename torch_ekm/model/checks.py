@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 
+from .._arrays import like, namespace
 from ..contact.contact_set import ContactSet
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError, ParameterError, PenetrationError, ShapeError, UnknownNameError
 from ..kinematics.grasp_state import GraspState
 from ..kinematics.tensors import as_tensors
-from ..typing import Float, Tensor
+from ..typing import AnyArray, Float, Tensor
 
 _LOWEST = -0.9
 """Readings below this [N] are no noise about zero: three standard deviations of a fingertip sensor."""
@@ -42,30 +44,34 @@ def check_state(
 
 
 def check_contacts(
-    state: GraspState, contacts: ContactSet, link_names: tuple[str, ...], max_overlap: float
+    state: GraspState, contacts: ContactSet, link_names: tuple[str, ...], max_overlap: float, detected: bool
 ) -> None:
-    """Some contact, finite, on links that exist, the bodies overlapping by at most ``max_overlap`` [m]."""
+    """Some contact, finite (unless ``detected`` by the package's own detector), on links that exist, the
+    bodies overlapping by at most ``max_overlap`` [m]."""
     if contacts.n_c == 0:
         raise NoContactError("no finger touches the object, so no actuator can move it")
     if contacts.batch_shape != state.q.shape[:-1]:
         raise ShapeError("contacts.gap", f"{(*state.q.shape[:-1], contacts.n_c)}", contacts.gap.shape)
-    contacts.check()
+    if not detected:
+        contacts.check()
     for name in contacts.link:
         if name not in link_names:
             raise UnknownNameError("link", name, link_names)
     gap = contacts.gap.detach()
-    deepest = float(gap.amin())
+    deepest = float(gap.min())
     if deepest < -max_overlap:
         which = contacts.finger[int(gap.reshape(-1, contacts.n_c).amin(0).argmin())]
         raise PenetrationError(which, -deepest, max_overlap)
 
 
 def at_pads(
-    hand: HandDescription, contacts: ContactSet, fingertip_force: Float[Tensor, "*batch n_pads"]
-) -> dict[str, Float[Tensor, "*batch"]]:
-    """What the pads measure, by name [N]; NaN of links that touch and are no pads."""
-    (fingertip_force,) = as_tensors(fingertip_force=fingertip_force)
-    if bool(((fingertip_force < _LOWEST) | torch.isinf(fingertip_force)).any()):
+    hand: HandDescription, contacts: ContactSet, fingertip_force: Float[Tensor, "*batch n_pads"], q: AnyArray
+) -> dict[str, Any]:
+    """What the pads measure, by name ``(*batch)`` [N], tensors or arrays as ``q`` is; NaN of links that touch
+    and are no pads."""
+    (given,) = as_tensors(fingertip_force=fingertip_force)
+    fingertip_force, xp = like(given, q), namespace(q)
+    if bool(((fingertip_force < _LOWEST) | xp.isinf(fingertip_force)).any()):
         valid = f"finite or NaN, and above {_LOWEST} N: a pad cannot pull (is its zero or its sign wrong?)"
         raise ParameterError("fingertip_force", fingertip_force.tolist(), valid)
     pads = [pad.name for pad in hand.pads]
@@ -73,11 +79,11 @@ def at_pads(
         raise ShapeError(
             "fingertip_force", f"(*batch, {len(pads)})", fingertip_force.shape, f"pads: {', '.join(pads)}"
         )
-    measured = dict(zip(pads, fingertip_force.unbind(-1), strict=True))
+    measured = {name: fingertip_force[..., i] for i, name in enumerate(pads)}
     for name, link in zip(contacts.finger, contacts.link, strict=True):
         if name not in pads and name != link:
             raise UnknownNameError("pad", name, pads)
-        measured.setdefault(name, torch.full_like(fingertip_force[..., 0], torch.nan))
+        measured.setdefault(name, xp.full_like(fingertip_force[..., 0], xp.nan))
     return measured
 
 

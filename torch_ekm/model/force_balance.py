@@ -5,20 +5,22 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from .._arrays import like, namespace
 from ..contact.contact_kinematics import ContactKinematics
 from ..contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
 from ..contact.forces.balance import BalanceEquations, ForceSolution, ForceStatus
 from ..contact.forces.friction import friction_cones, margins
 from ..contact.forces.solve import contact_forces
 from ..description.hand import HandDescription
-from ..typing import Array, Bool, Float, Tensor
+from ..typing import AnyArray, Array, Bool, Float, Tensor
 from .gradients import differentiable_forces
-from .grasp_forces import ExpectedForces, ForcePrior, GraspForces, friction_use, margin_std
+from .grasp_forces import ExpectedForces, ForcePrior, GraspForces, as_states, friction_use, margin_std
 from .options import ModelOptions
 from .reduction import Reduction
 
@@ -33,12 +35,12 @@ _STOP_TORQUE = 0.01  # [N m] above which a stop holds its joint; below, the join
 class Statics:
     """A state, or a batch, as its equilibrium ``V_s + A^T mu + B^T lam = 0`` sees it."""
 
-    q: Float[Tensor, "*batch n_q"]
+    q: Float[AnyArray, "*batch n_q"]
     """Joint angles [rad]."""
     kin: ContactKinematics
-    A: Float[Tensor, "*batch n_h n_s"]
+    A: Float[AnyArray, "*batch n_h n_s"]
     """Constraint matrix of the contacts."""
-    V_s: Float[Tensor, "*batch n_s"]
+    V_s: Float[AnyArray, "*batch n_s"]
     """Gradient of the potential energy [N m, N]."""
     locked: list[int]
     """Joints that stick, by index."""
@@ -48,7 +50,7 @@ class Statics:
 class KnownForces:
     """What sensors and the step before say of the forces; None: nothing."""
 
-    normal: Float[Tensor, "*batch n_c"] | None = None
+    normal: Float[AnyArray, "*batch n_c"] | None = None
     """Measured normal forces [N], NaN where there is no sensor."""
     expected: ExpectedForces | None = None
     """Prediction from the state before."""
@@ -91,11 +93,11 @@ class ForceBalance:
         return (self.reduction.actuation.detach().double().cpu().numpy() @ self.joint_basis).T
 
     def held_by_stops(
-        self, q: Float[Tensor, "*batch n_q"], torque: Float[Tensor, "*batch n_q"]
-    ) -> Bool[Tensor, "*batch n_q"]:
+        self, q: Float[AnyArray, "*batch n_q"], torque: Float[AnyArray, "*batch n_q"]
+    ) -> Bool[AnyArray, "*batch n_q"]:
         """Joints near a stop that bears more than the threshold."""
-        low, high = (torch.as_tensor(stop, device=q.device) for stop in (self.low, self.high))
-        return (torque.abs() > _STOP_TORQUE) & ((q <= low) | (q >= high))
+        low, high = (namespace(q).asarray(stop, device=q.device) for stop in (self.low, self.high))
+        return (abs(torque) > _STOP_TORQUE) & ((q <= low) | (q >= high))
 
     def slack(self, forces: GraspForces) -> Bool[Tensor, "*batch n_a"]:
         """Tendons that pull with no more than ``slack_tension``, where forces were found."""
@@ -112,12 +114,11 @@ class ForceBalance:
         """Solve every state; where there is no answer use the forces of ``known.last`` or zeros."""
         q, kin, options = at.q, at.kin, self.options.forces
         batch, n_q = q.shape[:-1], q.shape[-1]
-
-        def rows(x: Tensor) -> Array:
-            return x.detach().reshape(-1, *x.shape[len(batch) :]).double().cpu().numpy()
-
-        states = zip(*(rows(x) for x in (q, at.A, at.V_s[..., :n_q], at.V_s[..., n_q:])), strict=True)
-        measured = None if known.normal is None else rows(known.normal)
+        A, V_s = as_states(at.A, 2), as_states(at.V_s, 1)
+        Z_p, Z = self.pose_basis, self.joint_basis
+        object_matrix, hand_matrix = -Z_p.T @ A[:, :, n_q:].mT, Z.T @ A[:, :, :n_q].mT
+        object_load, hand_load = V_s[:, n_q:] @ Z_p, V_s[:, :n_q] @ Z
+        measured = None if known.normal is None else as_states(known.normal, 1)
         estimating = measured is not None or known.expected is not None
         prior = ForcePrior(kin, known.expected, options) if estimating else None
         cones = friction_cones(
@@ -125,15 +126,16 @@ class ForceBalance:
         )
         spins = tuple(place for place, row in enumerate(kin.rows) if row % 6 >= 3)
         actuation = self._arms()
-        table, problems = [], []
-        for k, (q_k, A_k, V_q_k, V_p_k) in enumerate(states):
+        table: list[tuple] = []
+        problems: list[tuple[BalanceEquations, ForceSolution]] = []
+        for k, q_k in enumerate(as_states(q, 1)):
             joints, lower, upper = self._bounded(q_k, at.locked)
             eq = BalanceEquations(
-                object_matrix=-self.pose_basis.T @ A_k[:, n_q:].T,
-                object_load=self.pose_basis.T @ V_p_k,
-                hand_matrix=self.joint_basis.T @ A_k[:, :n_q].T,
+                object_matrix=object_matrix[k],
+                object_load=object_load[k],
+                hand_matrix=hand_matrix[k],
                 actuator_matrix=actuation,
-                hand_load=self.joint_basis.T @ V_q_k,
+                hand_load=hand_load[k],
                 cones=cones,
                 moment_rows=self.moment_rows,
                 tendon=self.tendon,
@@ -143,10 +145,10 @@ class ForceBalance:
                 bound_upper=upper,
                 weight=self.weight,
                 measured_normal=None if measured is None else measured[k],
+                expected=None if prior is None else prior.mean[k],
+                expected_covariance=None if prior is None else prior.covariance[k],
             )
-            if prior is not None:
-                eq = prior.into(eq, k)
-            solution = contact_forces(eq, options)
+            solution = contact_forces(eq, options, problems[-1][1].active if problems else ())
             mu, lam = solution.mu, solution.lam
             residual, torque = np.zeros(n_q), np.zeros(n_q)
             if solution.status is ForceStatus.SOLVED:
@@ -154,27 +156,31 @@ class ForceBalance:
                 np.add.at(torque, joints, solution.bound)
             elif known.last is not None:
                 last = (known.last.mu, known.last.lam)
-                mu, lam = (rows(x.expand(*batch, -1))[k] for x in last)
+                mu, lam = (as_states(x.expand(*batch, -1), 1)[k] for x in last)
             else:
                 mu, lam = np.zeros_like(mu), np.zeros_like(lam)
             table.append((mu, lam, residual, torque, *margins(cones, mu), [solution.violation]))
             problems.append((eq, solution))
 
         names = ("mu", "lam", "residual", "stop_torque", "margin", "relative_margin", "violation")
-        sizes = [len(part) for part in table[0]]
-        stacked = torch.from_numpy(np.stack([np.concatenate(row) for row in table])).to(q)
-        parts = dict(zip(names, stacked.reshape(*batch, -1).split(sizes, dim=-1), strict=True))
+        ends = np.cumsum([len(part) for part in table[0]])[:-1]
+        stacked = np.stack([np.concatenate(row) for row in table]).reshape(*batch, -1)
+        parts: dict[str, Any] = dict(zip(names, np.split(stacked, ends, axis=-1), strict=True))
+        if isinstance(q, Tensor):
+            parts = {name: torch.from_numpy(value).to(q) for name, value in parts.items()}
         parts["violation"] = parts["violation"][..., 0]
         inputs = (at.A, at.V_s, self.reduction.actuation)
-        if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
+        if isinstance(q, Tensor) and torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
             moving = self._with_graph(problems, at, *(parts[name] for name in names[:3]))
             parts.update(zip(names, moving, strict=False))
         status = tuple(solution.status for _, solution in problems)
         forces = pack_forces(kin, **parts, status=status)
         if prior is None or not forces.solved:
             return forces
-        sure = [prior.stacked(solution.covariance, k) for k, (_, solution) in enumerate(problems)]
-        return with_covariance(kin.contacts, forces, torch.from_numpy(np.stack(sure)).to(q))
+        sure = prior.stacked(np.array([solution.covariance for _, solution in problems]))
+        sure = sure.reshape(*batch, *sure.shape[-2:])
+        sure = torch.from_numpy(sure).to(q) if isinstance(q, Tensor) else sure
+        return with_covariance(kin.contacts, forces, sure)
 
     def _with_graph(
         self,
@@ -215,18 +221,22 @@ class ForceBalance:
         return joints, lower[joints], upper[joints]
 
 
-def pack_forces(kin: ContactKinematics, mu: Tensor, lam: Tensor, **rest) -> GraspForces:
+def pack_forces(kin: ContactKinematics, mu: AnyArray, lam: AnyArray, **rest) -> GraspForces:
     """Forces in hand axes from components in contact frames."""
-    n_c = kin.contacts.n_c
-    full = mu.new_zeros(*mu.shape[:-1], 6 * n_c).index_copy(-1, kin.row_index, mu).unflatten(-1, (n_c, 6))
-    spin = full[..., 3]
+    n_c, batch = kin.contacts.n_c, mu.shape[:-1]
+    full = namespace(mu).zeros((*batch, 6 * n_c), dtype=mu.dtype, device=mu.device)
+    full[..., kin.row_index] = mu
+    full = full.reshape(*batch, n_c, 6)
     force = (kin.frame @ full[..., :3, None])[..., 0]
-    return GraspForces(mu=mu, lam=lam, force=force, spin_moment=spin, normal=full[..., 0], **rest)
+    parts = {"mu": mu, "lam": lam, "force": force, "spin_moment": full[..., 3], "normal": full[..., 0]}
+    status, parts = rest.pop("status"), parts | rest
+    return GraspForces(**{name: torch.as_tensor(part) for name, part in parts.items()}, status=status)
 
 
-def with_covariance(contacts: ContactSet, forces: GraspForces, covariance: Tensor) -> GraspForces:
-    """The forces with how sure they are; ``covariance`` of the stack, one for each state ``(-1, m, m)``."""
-    covariance = covariance.reshape(*forces.normal.shape[:-1], *covariance.shape[-2:])
-    normal, _, gradient = friction_use(contacts, forces.force, forces.spin_moment, contacts.normal)
+def with_covariance(contacts: ContactSet, forces: GraspForces, covariance: AnyArray) -> GraspForces:
+    """The forces with how sure they are; ``covariance`` of the stack."""
+    force, spin = like(forces.force, covariance), like(forces.spin_moment, covariance)
+    normal, _, gradient = friction_use(contacts, force, spin, contacts.normal)
     std = margin_std(contacts, normal, gradient, covariance)
-    return dataclasses.replace(forces, covariance=covariance, margin_std=std)
+    known = {"covariance": torch.as_tensor(covariance), "margin_std": torch.as_tensor(std)}
+    return dataclasses.replace(forces, **known)

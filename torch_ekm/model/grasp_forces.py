@@ -6,18 +6,18 @@ Contact forces are stacked as ``[f_1; m_1; f_2; m_2; ..]``, f_i in hand axes [N]
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import torch
 
+from .._arrays import namespace, norm
 from ..contact.contact_kinematics import ContactKinematics
 from ..contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
-from ..contact.forces.balance import BalanceEquations, ForceStatus
+from ..contact.forces.balance import ForceStatus
 from ..contact.forces.options import ForceOptions
 from ..exceptions import ShapeError
-from ..typing import Array, Float, Tensor
+from ..typing import AnyArray, Array, Float, Tensor
 
 _ANY_FORCE = 10.0  # [N] standard deviation of a normal force of which nothing is known
 _DRIFT_STD = 0.15  # [N] of a contact force's drift from its prediction at every motion, per axis
@@ -86,62 +86,65 @@ class ExpectedForces:
 
 
 def friction_use(
-    contacts: ContactSet, force: Tensor, spin: Tensor, normal: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+    contacts: ContactSet, force: AnyArray, spin: AnyArray, normal: AnyArray
+) -> tuple[Any, Any, Any]:
     """``f_n``, ``mu_s f_n - |u|`` [N] and the margin's gradient ``(*batch, n_c, 4)`` in ``[f; m]``.
 
     Args:
         normal: outward normals of the object.
     """
-    n_in, mu_s = -normal, contacts.friction
+    n_in, mu_s, gamma, xp = -normal, contacts.friction, contacts.torsional_friction, namespace(force)
     f_n = (force * n_in).sum(-1)
     f_t = force - f_n[..., None] * n_in
-    scale = mu_s / contacts.torsional_friction.clamp_min(1e-9) * (contacts.torsional_friction > 0)
-    u = torch.cat([f_t, (scale * spin)[..., None]], dim=-1)
-    size = torch.linalg.vector_norm(u, dim=-1)
-    direction = u / size.clamp_min(1e-9)[..., None]
-    gradient = torch.cat(
-        [mu_s[:, None] * n_in - direction[..., :3], -(scale * direction[..., 3])[..., None]], dim=-1
-    )
+    scale = mu_s / gamma.clip(1e-9) * (gamma > 0)
+    u = xp.concat([f_t, (scale * spin)[..., None]], -1)
+    size = norm(u)
+    direction = u / size.clip(1e-9)[..., None]
+    across = -(scale * direction[..., 3])[..., None]
+    gradient = xp.concat([mu_s[:, None] * n_in - direction[..., :3], across], -1)
     return f_n, mu_s * f_n - size, gradient
 
 
 def margin_std(
-    contacts: ContactSet, normal_force: Tensor, gradient: Tensor, covariance: Tensor
-) -> Float[Tensor, "*batch n_c"]:
+    contacts: ContactSet, normal_force: AnyArray, gradient: AnyArray, covariance: AnyArray
+) -> Float[Any, "*batch n_c"]:
     """``sqrt(g^T Sigma g + (s mu_s f_n)^2)``, g the margin's gradient, s of the friction coefficient [N]."""
-    blocks = covariance.unflatten(-1, (-1, 4)).unflatten(-3, (-1, 4))
-    own = torch.einsum("...ijik->...ijk", blocks)
+    xp, n_c = namespace(covariance), contacts.n_c
+    blocks = covariance.reshape(*covariance.shape[:-2], n_c, 4, n_c, 4)
+    own = xp.moveaxis(xp.diagonal(blocks, 0, -4, -2), -1, -3)
     variance = (gradient[..., None, :] @ own @ gradient[..., None])[..., 0, 0]
-    return (variance.clamp_min(0.0) + (_FRICTION_STD * contacts.friction * normal_force) ** 2).sqrt()
+    return xp.sqrt(variance.clip(0.0) + (_FRICTION_STD * contacts.friction * normal_force) ** 2)
 
 
 def start_covariance(
-    normal: Float[Tensor, "*batch n_c 3"], options: ForceOptions
-) -> Float[Tensor, "*batch m m"]:
+    normal: Float[AnyArray, "*batch n_c 3"], options: ForceOptions
+) -> Float[Any, "*batch m m"]:
     """``start_std^2`` across the normals, any force along them; ``(start_std L)^2`` for spin moments."""
-    eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
+    xp, (*batch, n_c, _) = namespace(normal), normal.shape
+    kind = {"dtype": normal.dtype, "device": normal.device}
     along = normal[..., None] * normal[..., None, :]
-    blocks = normal.new_zeros(*normal.shape[:-1], 4, 4)
-    blocks[..., :3, :3] = options.start_std**2 * (eye - along) + _ANY_FORCE**2 * along
+    blocks = xp.zeros((*batch, n_c, 4, 4), **kind)
+    blocks[..., :3, :3] = options.start_std**2 * (xp.eye(3, **kind) - along) + _ANY_FORCE**2 * along
     blocks[..., 3, 3] = (options.start_std * CHARACTERISTIC_LENGTH) ** 2
-    m = 4 * normal.shape[-2]
-    spread = torch.eye(normal.shape[-2], dtype=normal.dtype, device=normal.device)
-    return torch.einsum("...iab,ij->...iajb", blocks, spread).reshape(*normal.shape[:-2], m, m)
+    spread = blocks[..., :, :, None, :] * xp.eye(n_c, **kind)[:, None, :, None]
+    return spread.reshape(*batch, 4 * n_c, 4 * n_c)
 
 
-def drift(df: Float[Tensor, "*batch n_c 3"], dspin: Tensor) -> Float[Tensor, "*batch m"]:
+def drift(df: Float[AnyArray, "*batch n_c 3"], dspin: AnyArray) -> Float[Any, "*batch m"]:
     """Variance that an increment adds: ``sigma_d^2 + (sigma_c |df_i|)^2``, moments likewise."""
-    change = torch.cat([df.norm(dim=-1, keepdim=True).expand_as(df), dspin[..., None]], dim=-1)
-    one = torch.tensor([1.0, 1.0, 1.0, CHARACTERISTIC_LENGTH], dtype=df.dtype, device=df.device)
-    least = (_DRIFT_STD * one).expand(*df.shape[:-1], 4).flatten(-2)
-    return least.square() + (_CHANGE_STD * change.flatten(-2)).square()
+    xp = namespace(df)
+    one = xp.asarray([1.0, 1.0, 1.0, CHARACTERISTIC_LENGTH], dtype=df.dtype, device=df.device)
+    of_force = (df * df).sum(-1)[..., None]
+    change2 = xp.concat([of_force, of_force, of_force, dspin[..., None] ** 2], -1)
+    variance = (_DRIFT_STD * one) ** 2 + _CHANGE_STD**2 * change2
+    return variance.reshape(*df.shape[:-2], -1)
 
 
 class ForcePrior:
     """``N(x^, Sigma)`` of the stacked contact forces, read in the contact frames of the present state.
 
     Contacts that were not expected begin at 0, with ``start_std`` across the normal and any force along it.
+    All in numpy, a list of states.
 
     Args:
         kin: the contacts.
@@ -156,47 +159,41 @@ class ForcePrior:
         self, kin: ContactKinematics, expected: ExpectedForces | None, options: ForceOptions
     ) -> None:
         contacts = kin.contacts
-        batch, n_c = contacts.batch_shape, contacts.n_c
-        mean = contacts.point.new_zeros(*batch, n_c, 4)
-        covariance = start_covariance(contacts.normal, options)
+        batch, n_c = contacts.gap.shape[:-1], contacts.n_c
+        frame, normal = as_states(kin.frame, 3), as_states(contacts.normal, 2)
+        n = len(frame)
+        mean, covariance = np.zeros((n, n_c, 4)), start_covariance(normal, options)
         if expected is not None:
             if expected.force.shape[:-2] not in (batch, ()):
                 raise ShapeError("expected.force", f"{(*batch, n_c, 3)}", expected.force.shape)
             both = [name for name in contacts.finger if name in expected.finger]
             now, then = ([names.index(f) for f in both] for names in (contacts.finger, expected.finger))
-            mean[..., now, :3] = expected.force[..., then, :]
-            mean[..., now, 3] = expected.spin_moment[..., then]
+            mean[:, now, :3] = as_states(expected.force, 2)[:, then]
+            mean[:, now, 3] = as_states(expected.spin_moment, 1)[:, then]
             row, column = _stacked(now), _stacked(then)
-            covariance[..., row[:, None], row] = expected.covariance[..., column[:, None], column]
-        self._rows = np.array(kin.rows)
-        m = 4 * n_c
-        self._mean, self._covariance, self._frame = (
-            x.detach().reshape(-1, *shape).double().cpu().numpy()
-            for x, shape in ((mean, (m,)), (covariance, (m, m)), (kin.frame, (n_c, 3, 3)))
-        )
+            covariance[:, row[:, None], row] = as_states(expected.covariance, 2)[:, column[:, None], column]
+        # T with mu = T x, orthonormal rows
+        contact, component = np.divmod(np.array(kin.rows), 6)
+        self._T = np.zeros((n, len(contact), n_c, 4))
+        force = np.flatnonzero(component < 3)
+        self._T[:, force, contact[force], :3] = frame[:, contact[force], :, component[force]].swapaxes(0, 1)
+        spin = np.flatnonzero(component >= 3)
+        self._T[:, spin, contact[spin], 3] = 1.0
+        self._T = self._T.reshape(n, len(contact), -1)
+        self.mean: Array = (self._T @ mean.reshape(n, -1, 1))[..., 0]
+        """Of ``mu``, state by state."""
+        self.covariance: Array = self._T @ covariance @ self._T.mT
+        """Of ``mu``, state by state."""
 
-    def into(self, eq: BalanceEquations, k: int) -> BalanceEquations:
-        """The balance of state k with its expected forces."""
-        T = self._selection(k)
-        return dataclasses.replace(
-            eq,
-            expected=T @ self._mean[k],
-            expected_covariance=T @ self._covariance[k] @ T.T,
-        )
+    def stacked(self, covariance: Array) -> Array:
+        """Covariances of ``mu``, state by state, as those of the stack."""
+        return self._T.mT @ covariance @ self._T
 
-    def stacked(self, covariance: Array, k: int) -> Array:
-        """A covariance of ``mu`` as one of the stack."""
-        T = self._selection(k)
-        return T.T @ covariance @ T
 
-    def _selection(self, k: int) -> Array:
-        """T with ``mu = T x``, orthonormal rows."""
-        contact, component = np.divmod(self._rows, 6)
-        T = np.zeros((len(contact), self._frame.shape[1], 4))
-        force = component < 3
-        T[force, contact[force], :3] = self._frame[k, contact[force], :, component[force]]
-        T[~force, contact[~force], 3] = 1.0
-        return T.reshape(len(contact), -1)
+def as_states(x: AnyArray, dims: int) -> Array:
+    """A list of states in numpy: the batch of ``x`` flattened, ``dims`` axes of each state left."""
+    x = x.detach().double().cpu().numpy() if isinstance(x, Tensor) else x
+    return x.reshape(-1, *x.shape[x.ndim - dims :])
 
 
 def _stacked(contacts: list[int]) -> np.ndarray:

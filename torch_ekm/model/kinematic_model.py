@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
+from .._arrays import in_numpy, is_plain, like, namespace
 from ..contact.contact_kinematics import ContactKinematics, constraint_matrix, contact_kinematics
 from ..contact.contact_set import ContactSet, Detector
 from ..contact.detector import ContactDetector
@@ -16,7 +17,7 @@ from ..exceptions import NoContactError
 from ..kinematics.grasp_state import GraspState
 from ..kinematics.hand_kinematics import HandKinematics
 from ..kinematics.link_poses import Kinematics, LinkPoses
-from ..typing import Bool, Float, Tensor
+from ..typing import AnyArray, Bool, Float, Tensor
 from .checks import at_pads, check_contacts, check_inertia, check_state, joint_index
 from .force_balance import ForceBalance, KnownForces, Statics
 from .gradients import following, only_if_asked
@@ -226,7 +227,8 @@ class KinematicModel(nn.Module):
 
     def moving(self, contacts: ContactSet) -> Bool[Tensor, " n_q"]:
         """Joints that move a contact."""
-        return self.kinematics.upstream[[self.link_names.index(name) for name in contacts.link]].any(0)
+        links = [self.link_names.index(name) for name in contacts.link]
+        return torch.from_numpy(self.kinematics.upstream.numpy()[links].any(0))
 
     def contact_kinematics(
         self,
@@ -240,10 +242,11 @@ class KinematicModel(nn.Module):
         found = self.kinematics(state.q) if poses is None else poses
         axis, origin = self.kinematics.joint_axes(found)
         links = [self.link_names.index(name) for name in contacts.link]
-        upstream = self.kinematics.upstream[links]
+        parts = axis, origin, self.kinematics.upstream
+        axis, origin, upstream = (like(part, contacts.point) for part in parts)
         rolling = self.options.rolling if rolling is None else rolling
         return contact_kinematics(
-            contacts, state.position, axis, origin, upstream, plane=self.plane, rolling=rolling
+            contacts, state.position, axis, origin, upstream[links], plane=self.plane, rolling=rolling
         )
 
     @only_if_asked
@@ -290,15 +293,19 @@ class KinematicModel(nn.Module):
         """
         check_state(self.hand, state, contacts, self.weight.dtype)
         poses = self.kinematics(state.q)
+        detected = contacts is None and isinstance(self.detector, ContactDetector)
         contacts = self._detect(state, poses) if contacts is None else contacts
-        check_contacts(state, contacts, self.link_names, self.options.max_overlap)
-        kin = self.contact_kinematics(state, contacts, poses=poses)
+        check_contacts(state, contacts, self.link_names, self.options.max_overlap, detected)
+        # the same equations, for one state without a derivative in numpy
+        plain = state.q.dim() == 1 and not torch.is_grad_enabled() and is_plain(state.q, contacts.gap)
+        at = in_numpy(state) if plain else state
+        kin = self.contact_kinematics(at, in_numpy(contacts) if plain else contacts, poses=poses)
         A = constraint_matrix(kin)
-        V_s, V_ss = self.potential(state)
+        V_s, V_ss = self.potential(at)
         lock = [joint_index(self.hand, name) for name in locked]
         last, measured = None, None
         if fingertip_force is not None:
-            measured = at_pads(self.hand, contacts, fingertip_force)
+            measured = at_pads(self.hand, contacts, fingertip_force, at.q)
         if forces is None:
             if (
                 previous is not None
@@ -306,25 +313,30 @@ class KinematicModel(nn.Module):
                 and previous.contacts.finger == contacts.finger
             ):
                 last = previous.forces
-            touch = None if measured is None else torch.stack([measured[f] for f in contacts.finger], dim=-1)
+            readings = None if measured is None else [measured[finger] for finger in contacts.finger]
+            touch = None if readings is None else namespace(at.q).stack(readings, -1)
             known = KnownForces(touch, expected, last)
-            forces = self.balance(Statics(state.q, kin, A, V_s, lock), known)
+            forces = self.balance(Statics(at.q, kin, A, V_s, lock), known)
 
         o = self.options
         if on_unstable is not None and on_unstable != o.on_unstable:
             o = dataclasses.replace(o, on_unstable=on_unstable)
-        D = self.load_stiffness(kin, forces.force, forces.spin_moment) + V_ss
-        held = self.balance.held_by_stops(state.q, forces.stop_torque)
+        f = in_numpy(forces) if plain else forces
+        D = self.load_stiffness(kin, f.force, f.spin_moment) + V_ss
+        held = self.balance.held_by_stops(at.q, f.stop_torque)
         held[..., lock] = True
-        slack = self.balance.slack(forces)
-        J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held, slack, o.on_unstable)
+        slack = like(self.balance.slack(forces), at.q)
+        solved = self.reduction.solve(D, A, kin.rows, held, slack, o.on_unstable)
+        J, dmu, dlam, stability, space = solved
+        df, dn = force_change(kin, dmu), normal_motion(kin, J)
+        normal = normal_sensitivity(kin, f, df, dn)
+        margin = margin_sensitivity(kin, f, dmu, df, dn, normal)
+        tensors = map(torch.as_tensor, (J, dmu, dlam, normal, margin, df, dn, held, stability, D, A, slack))
+        J, dmu, dlam, normal, margin, df, dn, held, stability, D, A, slack = tensors
         equations = None
         if held.dim() == 1:
-            equations = MotionEquations(
-                self.reduction, D, A, tuple(kin.rows), held, slack, self.moving(contacts)
-            )
-        df, dn = force_change(kin, dmu), normal_motion(kin, J)
-        normal = normal_sensitivity(kin, forces, df, dn)
+            space, moving = space if plain else None, self.moving(contacts)
+            equations = MotionEquations(self.reduction, D, A, tuple(kin.rows), held, slack, moving, space)
         found = Linearization(
             state=state,
             contacts=contacts,
@@ -333,7 +345,7 @@ class KinematicModel(nn.Module):
             contact_force_sensitivity=dmu,
             actuator_force_sensitivity=dlam,
             normal_force_sensitivity=normal,
-            margin_sensitivity=margin_sensitivity(kin, forces, dmu, df, dn, normal),
+            margin_sensitivity=margin,
             force_vector_sensitivity=df,
             normal_motion=dn,
             normal_rows=tuple(kin.normal_rows),
@@ -357,21 +369,23 @@ class KinematicModel(nn.Module):
     def load_stiffness(
         self,
         kin: ContactKinematics,
-        force: Float[Tensor, "*batch n_c 3"],
-        spin_moment: Float[Tensor, "*batch n_c"],
-    ) -> Float[Tensor, "*batch n_s n_s"]:
+        force: Float[AnyArray, "*batch n_c 3"],
+        spin_moment: Float[AnyArray, "*batch n_c"],
+    ) -> Float[AnyArray, "*batch n_s n_s"]:
         """``dF/ds`` at constant contact forces: lever arms of hand and object, rolling, soft-finger spin."""
         return geometric_stiffness(kin, force, spin_moment, self.precedes)
 
     def potential(
         self, state: GraspState
-    ) -> tuple[Float[Tensor, "*batch n_s"], Float[Tensor, "*batch n_s n_s"]]:
+    ) -> tuple[Float[AnyArray, "*batch n_s"], Float[AnyArray, "*batch n_s n_s"]]:
         """``V_s`` [N m, N] and ``V_ss`` of springs and the object's weight."""
         n_q = self.hand.n_q
-        com_lever = (state.rotation @ self.com[:, None])[..., 0]
-        V_q = spring_torque(state.q, self.spring_stiffness, self.spring_rest)
-        V_ss = state.q.new_zeros(*state.q.shape[:-1], n_q + 6, n_q + 6)
-        V_ss[..., :n_q, :n_q] = torch.diag(self.spring_stiffness)
-        V_ss[..., n_q:, n_q:] = gravity_hessian(self.weight, com_lever)
-        V_p = gravity_gradient(self.weight, com_lever)
-        return torch.cat([V_q, V_p], dim=-1), V_ss
+        q, xp = state.q, namespace(state.q)
+        buffers = self.com, self.spring_stiffness, self.spring_rest, self.weight
+        com, springs, rest, weight = (like(buffer, q) for buffer in buffers)
+        com_lever = (state.rotation @ com[:, None])[..., 0]
+        V_ss = xp.zeros((*q.shape[:-1], n_q + 6, n_q + 6), dtype=q.dtype, device=q.device)
+        V_ss[..., :n_q, :n_q] = xp.diag(springs)
+        V_ss[..., n_q:, n_q:] = gravity_hessian(weight, com_lever)
+        V_s = [spring_torque(q, springs, rest), gravity_gradient(weight, com_lever)]
+        return xp.concat(V_s, -1), V_ss

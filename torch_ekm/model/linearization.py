@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from functools import cached_property
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 
+from .._arrays import in_numpy, in_torch, is_plain, like, namespace, norm, of_fields
 from .._checks import check_finite
 from ..contact.contact_set import ContactSet
 from ..exceptions import ShapeError
 from ..kinematics.grasp_state import GraspState
 from ..kinematics.tensors import as_tensors
-from ..typing import Bool, Float, Tensor
+from ..typing import AnyArray, Bool, Float, Tensor
 from .grasp_forces import ExpectedForces, GraspForces, drift, friction_use, margin_std, start_covariance
 from .motion_equations import Motion, MotionEquations
 from .options import ModelOptions
@@ -67,6 +69,13 @@ class Linearization:
         """The kind of the worst doubt, or OK."""
         return self.doubts[0].kind if self.doubts else ModelStatus.OK
 
+    @cached_property
+    def _arrays(self) -> Linearization:
+        """The same in numpy, without derivatives."""
+        fields = vars(in_numpy(self))
+        fields |= {"forces": in_numpy(self.forces), "contacts": in_numpy(self.contacts)}
+        return of_fields(Linearization, **fields)
+
     @property
     def n_q(self) -> int:
         return self.state.q.shape[-1]
@@ -86,10 +95,11 @@ class Linearization:
         """J_m of the hand as described."""
         return self.manipulation_jacobian if self.described is None else self.described
 
-    @property
+    @cached_property
     def lever(self) -> Float[Tensor, "*batch"]:
         """Distance of the contacts from the object's point, root mean square [m]."""
-        return (self.contacts.point - self.state.position[..., None, :]).square().sum(-1).mean(-1).sqrt()
+        arms = self.contacts.point - self.state.position[..., None, :]
+        return (arms * arms).sum(-1).mean(-1).sqrt()
 
     @property
     def margins(self) -> Float[Tensor, "*batch n_c"]:
@@ -134,22 +144,38 @@ class Linearization:
             NonFiniteError: an entry is NaN or infinite.
         """
         da = self._increment(delta_a)
-        dmu = _times(self.contact_force_sensitivity, da)
+        at = self._where(da)
+        return in_torch(at._after(like(da, at.manipulation_jacobian)))
+
+    def _where(self, da: Tensor) -> Linearization:
+        """This, or where it suffices its arrays."""
+        one = da.dim() == 1 and self.manipulation_jacobian.dim() == 2
+        plain = one and is_plain(da, self.manipulation_jacobian, self.forces.force)
+        return self._arrays if plain else self
+
+    def _moved(self, da: AnyArray) -> tuple[Any, Any, Any, Any, Any]:
+        """Forces, spin moments and normals after an increment, and the changes of the first two."""
+        dmu, xp = _times(self.contact_force_sensitivity, da), namespace(da)
         ends = (*self.normal_rows[1:], dmu.shape[-1])
-        dspin = dmu.new_zeros(*dmu.shape[:-1], self.contacts.n_c)
+        dspin = xp.zeros((*dmu.shape[:-1], self.contacts.n_c), dtype=dmu.dtype, device=dmu.device)
         for i, (row, end) in enumerate(zip(self.normal_rows, ends, strict=True)):
             if end - row == 4:  # a soft finger
                 dspin[..., i] = dmu[..., row + 3]
         df = _times(self.force_vector_sensitivity, da[..., None, :])
-        force, spin = self.forces.force + df, self.forces.spin_moment + dspin
         normal = self.contacts.normal + _times(self.normal_motion, da[..., None, :])
-        normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+        normal = normal / norm(normal)[..., None]
+        return self.forces.force + df, self.forces.spin_moment + dspin, normal, df, dspin
+
+    def _after(self, da: AnyArray) -> ExpectedForces:
+        force, spin, normal, df, dspin = self._moved(da)
         f_n, margin, gradient = friction_use(self.contacts, force, spin, normal)
         covariance = self.forces.covariance
         if covariance is None:
             covariance = start_covariance(self.contacts.normal, self.options.forces)
-        covariance = covariance + torch.diag_embed(drift(df, dspin))
-        return ExpectedForces(
+        eye = namespace(da).eye(covariance.shape[-1], dtype=da.dtype, device=da.device)
+        covariance = covariance + drift(df, dspin)[..., None] * eye
+        return of_fields(
+            ExpectedForces,
             finger=self.contacts.finger,
             force=force,
             spin_moment=spin,
@@ -169,7 +195,10 @@ class Linearization:
             ShapeError: ``delta_a`` does not have one entry per actuator.
             NonFiniteError: an entry is NaN or infinite.
         """
-        return self.forces_after(delta_a).margin
+        da = self._increment(delta_a)
+        at = self._where(da)
+        force, spin, normal, *_ = at._moved(like(da, at.manipulation_jacobian))
+        return torch.as_tensor(friction_use(at.contacts, force, spin, normal)[1])
 
     def _increment(self, delta_a: Tensor) -> Tensor:
         delta_a = as_tensors(delta_a=delta_a)[0].to(self.manipulation_jacobian)
@@ -202,5 +231,5 @@ class FollowedFigures(Protocol):
         """Learn from one motion."""
 
 
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+def _times(matrix: Any, vector: Any) -> Any:
     return (matrix @ vector[..., None])[..., 0]

@@ -13,11 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 
+from .._arrays import namespace, norm
 from ..exceptions import SingularGraspError, UnstableGraspError
-from ..typing import Float, Tensor
+from ..typing import AnyArray, Float, Tensor
 
 _RANK = 1e-8  # singular values of E below this share of the largest are zero
 _STIFFNESS = 1e-9  # eigenvalues of N^T D N within this share of |D| are zero
@@ -27,20 +30,33 @@ _STIFFNESS = 1e-9  # eigenvalues of N^T D N within this share of |D| are zero
 class KKTSolution:
     """Motion and reactions per unit motion of each actuator."""
 
-    motion: Float[Tensor, "*batch n n_a"]
+    motion: Float[AnyArray, "*batch n n_a"]
     """J: ds = J da."""
-    reaction: Float[Tensor, "*batch m n_a"]
+    reaction: Float[AnyArray, "*batch m n_a"]
     """dnu/da, multipliers of the rows of E."""
-    stability: Float[Tensor, "*batch"]
+    stability: Float[AnyArray, "*batch"] | np.float64
     """Smallest eigenvalue of sym(N^T D N), the stiffness with the actuators locked; inf if N is empty."""
+    pinv: Float[AnyArray, "*batch n m"]
+    """E^+."""
+    null: Float[AnyArray, "*batch n n_free"]
+    """N."""
+
+    def adjoint(self, D: Float[AnyArray, "n n"], F: Float[AnyArray, "n k"]) -> tuple[AnyArray, AnyArray]:
+        """y and nu of ``D^T y + E^T nu = F``, ``E y = 0``, on the null space that is known."""
+        N = self.null
+        y = 0 * F
+        if N.shape[-1]:
+            y = N @ namespace(N).linalg.solve((N.mT @ D @ N).mT, N.mT @ F)
+        return y, -(self.pinv.mT @ (D.mT @ y - F))
 
 
 def two_stage(
-    D: Float[Tensor, "*batch n n"],
-    E: Float[Tensor, "*batch m n"],
-    R: Float[Tensor, "... m n_a"],
-    F: Float[Tensor, "... n n_a"] | None = None,
+    D: Float[AnyArray, "*batch n n"],
+    E: Float[AnyArray, "*batch m n"],
+    R: Float[AnyArray, "... m n_a"],
+    F: Float[AnyArray, "... n n_a"] | None = None,
     *,
+    space: tuple[AnyArray, AnyArray] | None = None,
     on_unstable: str = "raise",
     actuators: Sequence[str] = (),
 ) -> KKTSolution:
@@ -54,6 +70,7 @@ def two_stage(
         E: rows that hold exactly.
         R: how fast each row is driven by each actuator; one for all states, or one for each.
         F: generalised forces of compliant actuators, per unit of da; one for all states, or one for each.
+        space: ``E^+`` and N, where they are known.
         on_unstable: "raise", or "flag" (return the formal answer; read ``stability``).
         actuators: their names, for messages.
 
@@ -62,31 +79,32 @@ def two_stage(
             contradict each other; the direction comes along. Whatever ``on_unstable`` says.
         UnstableGraspError: N^T D N has a negative eigenvalue: the grasp buckles.
     """
-    if D.requires_grad or E.requires_grad:
+    if isinstance(D, Tensor) and (D.requires_grad or E.requires_grad):
         return _differentiable(D, E, R, F, on_unstable)
-    eps = torch.finfo(D.dtype).eps
+    xp = namespace(D)
+    eps = xp.finfo(D.dtype).eps
     rank_tolerance, stiffness_tolerance = max(_RANK, 10 * eps), max(_STIFFNESS, 10 * eps)
-    pinv, N = _range_and_null(E, rank_tolerance)
+    pinv, N = _range_and_null(E, rank_tolerance) if space is None else space
     P = pinv @ R
-    lost = (E @ P - R).detach()
-    if lost.numel() and float(lost.abs().max()) > 10 * eps**0.5 * float(R.detach().abs().max()):
-        _raise_contradiction(lost, P, actuators)
+    lost = E @ P - R
+    if 0 not in lost.shape and _largest(lost) > 10 * eps**0.5 * _largest(R):
+        _raise_contradiction(torch.as_tensor(lost).detach(), torch.as_tensor(P), actuators)
     load = D @ P if F is None else D @ P - F
-    stability = torch.full(D.shape[:-2], torch.inf, dtype=D.dtype, device=D.device)
+    stability = xp.full(D.shape[:-2], xp.inf, dtype=D.dtype, device=D.device)
     J = P
     if N.shape[-1]:
         K = N.mT @ D @ N
-        values = torch.linalg.eigvalsh(0.5 * (K + K.mT))
+        values = xp.linalg.eigvalsh(0.5 * (K + K.mT))
         stability = values[..., 0]
-        size = torch.linalg.matrix_norm(D)
-        if bool((stability <= stiffness_tolerance * size).any()):
-            _judge(K, N, stability, stiffness_tolerance * size, on_unstable)
-        J = P - N @ torch.linalg.solve(K, N.mT @ load)
+        tolerance = stiffness_tolerance * _size(D)
+        if bool((stability <= tolerance).any()):
+            _judge(*map(torch.as_tensor, (K, N, stability, tolerance)), on_unstable=on_unstable)
+        J = P - N @ xp.linalg.solve(K, N.mT @ load)
     unbalanced = D @ J if F is None else D @ J - F
-    return KKTSolution(J, -(pinv.mT @ unbalanced), stability)
+    return KKTSolution(J, -(pinv.mT @ unbalanced), stability, pinv, N)
 
 
-def _differentiable(D: Tensor, E: Tensor, R: Tensor, F: Tensor | None, on_unstable: str) -> KKTSolution:
+def _differentiable(D: Any, E: Any, R: Any, F: Any, on_unstable: str) -> KKTSolution:
     """The same, with the derivative by the implicit function theorem: that of a null space is not defined.
 
     A second solve has the residual of both equations on its right-hand side, which is 0 and has a derivative.
@@ -97,34 +115,41 @@ def _differentiable(D: Tensor, E: Tensor, R: Tensor, F: Tensor | None, on_unstab
     J, nu = at.motion, at.reaction
     moved, loaded = R - E @ J, load - D @ J - E.mT @ nu
     change = two_stage(D0, E0, moved - moved.detach(), loaded - loaded.detach(), on_unstable="flag")
-    return KKTSolution(J + change.motion, nu + change.reaction, at.stability)
+    return KKTSolution(J + change.motion, nu + change.reaction, at.stability, at.pinv, at.null)
 
 
-def _range_and_null(E: Tensor, rank_tolerance: float) -> tuple[Tensor, Tensor]:
+def _range_and_null(E: AnyArray, rank_tolerance: float) -> tuple[Any, Any]:
     """``E^+`` and an orthonormal null-space basis; QR where E has full row rank, else SVD."""
-    m, n = E.shape[-2:]
+    (m, n), xp = E.shape[-2:], namespace(E)
     if m == 0:
-        eye = torch.eye(n, dtype=E.dtype, device=E.device).expand(*E.shape[:-2], n, n)
-        return E.mT, eye
+        eye = xp.eye(n, dtype=E.dtype, device=E.device)
+        return E.mT, xp.broadcast_to(eye, (*E.shape[:-2], n, n))
     if m <= n:
-        Q, upper = torch.linalg.qr(E.mT, mode="complete")
+        Q, upper = xp.linalg.qr(E.mT, mode="complete")
         triangle = upper[..., :m, :]
-        diagonal = triangle.diagonal(dim1=-2, dim2=-1).abs()
-        if bool((diagonal.amin(-1) > rank_tolerance * diagonal.amax(-1)).all()):
-            inverse = torch.linalg.solve_triangular(
-                triangle, torch.eye(m, dtype=E.dtype, device=E.device).expand(triangle.shape), upper=True
-            )
+        diagonal = abs(xp.diagonal(triangle, 0, -2, -1))
+        if bool((xp.amin(diagonal, -1) > rank_tolerance * xp.amax(diagonal, -1)).all()):
+            inverse = xp.linalg.inv(triangle)
             # |T^-1|_F |T|_F bounds the condition number from above
-            cond = torch.linalg.matrix_norm(inverse) * torch.linalg.matrix_norm(triangle)
+            cond = _size(inverse) * _size(triangle)
             if bool((cond < 1 / rank_tolerance).all()):
                 return Q[..., :m] @ inverse.mT, Q[..., m:]
-    U, sigma, Vh = torch.linalg.svd(E, full_matrices=True)
-    rank = (sigma > rank_tolerance * sigma[..., :1].clamp_min(1e-300)).sum(-1)
+    U, sigma, Vh = xp.linalg.svd(E, full_matrices=True)
+    rank = (sigma > rank_tolerance * sigma[..., :1].clip(1e-300)).sum(-1)
     r = int(rank.max())
     if int(rank.min()) != r:
         raise SingularGraspError("the states of a batch have constraints of different rank: treat them apart")
     pinv = (Vh[..., :r, :].mT / sigma[..., None, :r]) @ U[..., :r].mT
     return pinv, Vh[..., r:, :].mT
+
+
+def _size(matrix: AnyArray) -> Any:
+    """Frobenius norm."""
+    return norm(matrix.reshape(*matrix.shape[:-2], -1))
+
+
+def _largest(x: AnyArray) -> float:
+    return float(abs(x.detach() if isinstance(x, Tensor) else x).max())
 
 
 def _raise_contradiction(lost: Tensor, P: Tensor, actuators: Sequence[str]) -> None:
@@ -139,7 +164,7 @@ def _raise_contradiction(lost: Tensor, P: Tensor, actuators: Sequence[str]) -> N
     )
 
 
-def _judge(K: Tensor, N: Tensor, stability: Tensor, tolerance: Tensor, on_unstable: str) -> None:
+def _judge(K: Tensor, N: Tensor, stability: Tensor, tolerance: Tensor, *, on_unstable: str) -> None:
     """Name the worst direction of the worst state of a batch."""
     flat_K, flat_N = K.reshape(-1, *K.shape[-2:]), N.reshape(-1, *N.shape[-2:])
     spare = torch.linalg.svdvals(flat_K)[:, -1] - tolerance.reshape(-1)

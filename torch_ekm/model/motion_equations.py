@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import torch
 
-from ..typing import Bool, Float, Tensor
+from .._arrays import is_plain, like
+from ..typing import AnyArray, Bool, Float, Tensor
 from .manipulation import two_stage
 from .reduction import Drives, Reduction
 
@@ -41,6 +42,8 @@ class MotionEquations:
     slack: Bool[Tensor, " n_a"]
     moving: Bool[Tensor, " n_q"]
     """Joints of the fingers that touch."""
+    space: tuple[AnyArray, AnyArray] | None = None
+    """``E^+`` and N of the constraints, in arrays, where they are the same for all figures."""
 
     def solve(self, springs: Float[Tensor, " n_q"], drives: Drives) -> Motion:
         """J_m with other figures.
@@ -55,7 +58,7 @@ class MotionEquations:
         """
         n_q = len(springs)
         D = self.stiffness.clone()
-        D[:n_q, :n_q] += torch.diag(springs)
+        D.diagonal()[:n_q] += springs
         return Motion(self, D, drives)
 
 
@@ -63,11 +66,15 @@ class Motion:
     """``ds = J_m w`` of one state and one set of figures, and its derivative by the figures."""
 
     def __init__(self, of: MotionEquations, D: Tensor, drives: Drives) -> None:
-        reduction = of.reduction
-        self.drives, self._S, self._n_h = drives, reduction.scaled_basis, len(of.rows)
-        self._system = system = reduction.reduced(D, of.constraints, list(of.rows), of.held, of.slack, drives)
-        self._step = two_stage(system.D, system.E, system.R, system.F, actuators=reduction.actuators)
-        self.jacobian: Float[Tensor, "n_s n_a"] = self._S @ self._step.motion
+        reduction, self._n_h = of.reduction, len(of.rows)
+        plain = is_plain(D, of.constraints, *drives)
+        given = (D, of.constraints, of.held, of.slack, *drives)
+        stiffness, A, held, slack, J_a, K_a = (x.numpy() if plain else x for x in given)
+        self._S, self._drives = like(reduction.scaled_basis, stiffness), Drives(J_a, K_a)
+        self._system = system = reduction.reduced(stiffness, A, list(of.rows), held, slack, self._drives)
+        known = {"space": of.space if plain else None, "actuators": reduction.actuators}
+        self._step = two_stage(system.D, system.E, system.R, system.F, **known)
+        self.jacobian: Float[Tensor, "n_s n_a"] = torch.as_tensor(self._S @ self._step.motion)
         """J_m."""
 
     def derivative(self, moved: Float[Tensor, " n_a"], rows: list[int]) -> FigureDerivative:
@@ -83,19 +90,19 @@ class Motion:
             rows: c, indices into ds.
         """
         system, S, n_h = self._system, self._S, self._n_h
-        R = system.R.new_zeros(len(system.E), len(rows))
-        adjoint = two_stage(system.D.mT.contiguous(), system.E, R, S[rows].mT.contiguous())
-        J_a, K_a = self.drives
-        n_a, n_q = J_a.shape
-        ds = (S @ (self._step.motion @ moved))[:n_q]
-        dlam = system.actuator_force(self._step, n_h) @ moved
-        y = (S[:n_q] @ adjoint.motion).mT  # (n_r, n_q)
-        pull = y.new_zeros(len(rows), n_a)  # what a row answers to a change of each tendon's length
-        stiffness = y.new_zeros(len(rows), n_a)
-        soft, rigid = system.soft, system.rigid
+        motion, reaction = self._step.adjoint(system.D, S[rows].mT)
+        J_a, K_a = self._drives
+        n_q = J_a.shape[1]
+        w = like(moved, S)
+        ds = (S @ (self._step.motion @ w))[:n_q]
+        dlam = system.actuator_force(self._step, n_h) @ w
+        y = (S[:n_q] @ motion).mT  # (n_r, n_q)
         along = y @ J_a.mT
+        pull = 0 * along  # what a row answers to a change of each tendon's length
+        stiffness = 0 * along
+        soft, rigid = system.soft, system.rigid
         pull[:, soft] = along[:, soft] * K_a[soft]
-        pull[:, rigid] = (adjoint.reaction[n_h : n_h + len(rigid)] / system.arm).mT
+        pull[:, rigid] = (reaction[n_h : n_h + len(rigid)] / system.arm).mT
         stiffness[:, soft] = -along[:, soft] * (dlam[soft] / K_a[soft])
         arms = -(dlam[:, None] * y[:, None, :] + pull[..., None] * ds)
-        return FigureDerivative(-y * ds, arms, stiffness)
+        return FigureDerivative(*map(torch.as_tensor, (-y * ds, arms, stiffness)))

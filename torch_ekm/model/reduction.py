@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import nn
 
+from .._arrays import like, namespace
 from ..contact.contact_set import CHARACTERISTIC_LENGTH
 from ..description.hand import HandDescription
 from ..exceptions import SingularGraspError, UnstableGraspError
 from ..kinematics.null_space import null_space
-from ..typing import Bool, Float, Tensor
+from ..typing import AnyArray, Bool, Float, Tensor
 from .manipulation import KKTSolution, two_stage
 from .options import ModelOptions
 
@@ -19,22 +21,24 @@ from .options import ModelOptions
 class GraspResponse(NamedTuple):
     """How the grasp answers to a unit motion of each actuator."""
 
-    motion: Float[Tensor, "*batch n_s n_a"]
+    motion: Float[AnyArray, "*batch n_s n_a"]
     """J_m."""
-    contact_force: Float[Tensor, "*batch n_h n_a"]
+    contact_force: Float[AnyArray, "*batch n_h n_a"]
     """dmu/da."""
-    actuator_force: Float[Tensor, "*batch n_a n_a"]
+    actuator_force: Float[AnyArray, "*batch n_a n_a"]
     """dlam/da."""
-    stability: Float[Tensor, "*batch"]
+    stability: Float[AnyArray, "*batch"] | np.float64
     """Smallest eigenvalue of the stiffness with the actuators locked."""
+    space: tuple[AnyArray, AnyArray] | None = None
+    """``E^+`` and its null space, where they hold for all moment arms: no actuator is rigid."""
 
 
 class Drives(NamedTuple):
     """How the actuators drive the joints."""
 
-    actuation: Float[Tensor, "n_a n_q"]
+    actuation: Float[AnyArray, "n_a n_q"]
     """J_a: moment arms [rad/rad]."""
-    stiffness: Float[Tensor, " n_a"]
+    stiffness: Float[AnyArray, " n_a"]
     """K_a [N m/rad]; infinite: rigid."""
 
 
@@ -82,11 +86,11 @@ class Reduction(nn.Module):
 
     def solve(
         self,
-        D: Float[Tensor, "*batch n_s n_s"],
-        A: Float[Tensor, "*batch n_h n_s"],
+        D: Float[AnyArray, "*batch n_s n_s"],
+        A: Float[AnyArray, "*batch n_h n_s"],
         rows: list[int],
-        held: Bool[Tensor, "*batch n_q"],
-        slack: Bool[Tensor, "*batch n_a"],
+        held: Bool[AnyArray, "*batch n_q"],
+        slack: Bool[AnyArray, "*batch n_a"],
         on_unstable: str,
     ) -> GraspResponse:
         """J_m, dmu/da and dlam/da in full coordinates; states that differ in what is held are grouped.
@@ -103,7 +107,7 @@ class Reduction(nn.Module):
             slack: tendons that pull nothing.
             on_unstable: "raise" or "flag", as the option of this name.
         """
-        if held.dim() == 1:
+        if held.ndim == 1:
             return self._solve(D, A, rows, held, slack, on_unstable)
         n_q = held.shape[-1]
         pattern = torch.cat([held, slack], dim=-1).reshape(-1, n_q + slack.shape[-1])
@@ -114,11 +118,12 @@ class Reduction(nn.Module):
         parts: list[Tensor] = []
         for unique in torch.unique(pattern, dim=0):
             at = (pattern == unique).all(-1)
-            group = self._solve(flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable)
+            group = self._solve(flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable)[:4]
             parts = parts or [part.new_empty(len(pattern), *part.shape[1:]) for part in group]
             for whole, part in zip(parts, group, strict=True):
                 whole[at] = part
-        return GraspResponse(*(part.reshape(*batch, *part.shape[1:]) for part in parts))
+        motion, contact, actuator, stability = (part.reshape(*batch, *part.shape[1:]) for part in parts)
+        return GraspResponse(motion, contact, actuator, stability)
 
     @property
     def drives(self) -> Drives:
@@ -126,7 +131,7 @@ class Reduction(nn.Module):
         return Drives(self.actuation, self.stiffness)
 
     def reduced(
-        self, D: Tensor, A: Tensor, rows: list[int], held: Tensor, slack: Tensor, drives: Drives | None = None
+        self, D: Any, A: Any, rows: list[int], held: Any, slack: Any, drives: Drives | None = None
     ) -> ReducedStep:
         """The equations in permitted coordinates z, scaled, of states in which the same joints are held.
 
@@ -134,82 +139,83 @@ class Reduction(nn.Module):
             D, A, rows, held, slack: as in :meth:`solve`; held and slack of one state.
             drives: in place of the description's.
         """
-        J_a, K_a = self.drives if drives is None else drives
+        J_a, K_a = (like(part, D) for part in self.drives) if drives is None else drives
         n_a, n_q = J_a.shape
-        n_h, L, S = len(rows), CHARACTERISTIC_LENGTH, self.scaled_basis
+        n_h, L, S, xp = len(rows), CHARACTERISTIC_LENGTH, like(self.scaled_basis, D), namespace(D)
         D = _left(S, D @ S)
-        row_scale = torch.tensor(
-            [1 / L if row % 6 < 3 else 1.0 for row in rows], dtype=D.dtype, device=D.device
-        )
+        kind = {"dtype": D.dtype, "device": D.device}
+        row_scale = xp.asarray([1 / L if row % 6 < 3 else 1.0 for row in rows], **kind)
         A = row_scale[:, None] * (A @ S)
         B = J_a @ S[:n_q]
-        finite = torch.isfinite(K_a)
-        taut = ~slack
-        rigid, soft = (taut & ~finite).nonzero()[:, 0], (taut & finite).nonzero()[:, 0]
-        eye = torch.eye(n_a, dtype=D.dtype, device=D.device)
+        finite, taut = xp.isfinite(K_a), ~slack
+        rigid, soft = (xp.where(which)[0] for which in (taut & ~finite, taut & finite))
+        eye = xp.eye(n_a, **kind)
         F = None
         if len(soft):
             K_B = K_a[soft, None] * B[soft]
             D = D + B[soft].mT @ K_B
             F = K_B.mT @ eye[soft]
         batch = D.shape[:-2]
-        arm = torch.linalg.vector_norm(B[rigid], dim=-1, keepdim=True).clamp_min(1e-12)
-        fixed = [B[rigid] / arm, S[:n_q][held]]
-        E = torch.cat([A, *(part.expand(*batch, *part.shape) for part in fixed if len(part))], dim=-2)
-        R = D.new_zeros(E.shape[-2], n_a)
+        arm = xp.sqrt((B[rigid] ** 2).sum(-1)).clip(1e-12)[:, None]
+        fixed = [part for part in (B[rigid] / arm, S[:n_q][held]) if len(part)]
+        E = xp.concat([A, *(xp.broadcast_to(part, (*batch, *part.shape)) for part in fixed)], -2)
+        R = xp.zeros((E.shape[-2], n_a), **kind)
         R[n_h : n_h + len(rigid)] = eye[rigid] / arm
         return ReducedStep(D, E, R, F, row_scale, B, K_a, rigid, soft, arm)
 
     def _solve(
-        self, D: Tensor, A: Tensor, rows: list[int], held: Tensor, slack: Tensor, on_unstable: str
+        self, D: AnyArray, A: AnyArray, rows: list[int], held: AnyArray, slack: AnyArray, on_unstable: str
     ) -> GraspResponse:
-        system, S, n_h = self.reduced(D, A, rows, held, slack), self.scaled_basis, len(rows)
+        system, n_h = self.reduced(D, A, rows, held, slack), len(rows)
         try:
             step = two_stage(
                 system.D, system.E, system.R, system.F, on_unstable=on_unstable, actuators=self.actuators
             )
         except (SingularGraspError, UnstableGraspError) as error:
             if error.direction is not None:  # into state coordinates
-                direction = S @ error.direction
+                direction = self.scaled_basis @ error.direction
                 error.direction = direction / torch.linalg.vector_norm(direction).clamp_min(1e-300)
             raise
         dlam = system.actuator_force(step, n_h)
         dmu = system.row_scale[:, None] * step.reaction[..., :n_h, :]
-        return GraspResponse(_left(S.mT, step.motion), dmu, dlam, step.stability)
+        S = like(self.scaled_basis, dmu)
+        space = None if len(system.rigid) else (step.pinv, step.null)
+        return GraspResponse(_left(S.mT, step.motion), dmu, dlam, step.stability, space)
 
 
 class ReducedStep(NamedTuple):
     """``D dz + E^T dnu = F da``, ``E dz = R da`` in permitted, scaled coordinates."""
 
-    D: Float[Tensor, "*batch n_z n_z"]
+    D: Float[AnyArray, "*batch n_z n_z"]
     """Compliant actuators included."""
-    E: Float[Tensor, "*batch m n_z"]
+    E: Float[AnyArray, "*batch m n_z"]
     """Rows: contacts, rigid actuators in units of their arm, held joints."""
-    R: Float[Tensor, "m n_a"]
-    F: Float[Tensor, "n_z n_a"] | None
-    row_scale: Float[Tensor, " n_h"]
-    B: Float[Tensor, "n_a n_z"]
-    stiffness: Float[Tensor, " n_a"]
-    rigid: Tensor
+    R: Float[AnyArray, "m n_a"]
+    F: Float[AnyArray, "n_z n_a"] | None
+    row_scale: Float[AnyArray, " n_h"]
+    B: Float[AnyArray, "n_a n_z"]
+    stiffness: Float[AnyArray, " n_a"]
+    rigid: AnyArray
     """Taut actuators without compliance."""
-    soft: Tensor
+    soft: AnyArray
     """Taut actuators with it."""
-    arm: Float[Tensor, "n_rigid 1"]
+    arm: Float[AnyArray, "n_rigid 1"]
     """Norm of the rows of B of the rigid ones."""
 
-    def actuator_force(self, step: KKTSolution, n_h: int) -> Float[Tensor, "*batch n_a n_a"]:
+    def actuator_force(self, step: KKTSolution, n_h: int) -> Float[AnyArray, "*batch n_a n_a"]:
         """dlam/da of a solution; 0 of slack tendons."""
-        n_a, J = len(self.B), step.motion
-        dlam = J.new_zeros(*J.shape[:-2], n_a, n_a)
+        n_a, J, xp = len(self.B), step.motion, namespace(step.motion)
+        kind = {"dtype": J.dtype, "device": J.device}
+        dlam = xp.zeros((*J.shape[:-2], n_a, n_a), **kind)
         rigid, soft = self.rigid, self.soft
         dlam[..., rigid, :] = step.reaction[..., n_h : n_h + len(rigid), :] / self.arm
         if len(soft):
-            eye = torch.eye(n_a, dtype=J.dtype, device=J.device)
+            eye = xp.eye(n_a, **kind)
             dlam[..., soft, :] = self.stiffness[soft, None] * (_left(self.B[soft].mT, J) - eye[soft])
         return dlam
 
 
-def _left(S: Tensor, X: Tensor) -> Tensor:
+def _left(S: AnyArray, X: AnyArray) -> Any:
     """``S^T X`` as one large product: torch folds a batch only into the left factor."""
     return (X.mT @ S).mT
 

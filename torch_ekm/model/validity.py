@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
-import torch
+import numpy as np
 
+from .._arrays import norm
 from ..contact.contact_set import LINK_MARGIN, ContactSet
 from ..typing import Float, Tensor
-from .grasp_forces import GraspForces
+from .grasp_forces import GraspForces, as_states
 from .options import ModelOptions
 
 SIGMA = 3.0
@@ -66,7 +68,7 @@ def find_doubts(
     forces: GraspForces,
     stability: Float[Tensor, "*batch"],
     reused: bool,
-    measured: dict[str, Float[Tensor, "*batch"]] | None = None,
+    measured: dict[str, Any] | None = None,
     before: tuple[str, ...] = (),
 ) -> tuple[Doubt, ...]:
     """All that can be said against a state, worst kind first.
@@ -113,12 +115,12 @@ def _of_missing_forces(forces: GraspForces, reused: bool) -> Doubt:
 
 def _of_torque(joint_names: Sequence[str], forces: GraspForces, options: ModelOptions) -> list[Doubt]:
     std = options.forces.torque_std
-    residual = forces.residual.detach().reshape(-1, len(joint_names))
-    size = torch.linalg.vector_norm(residual, dim=-1)
+    residual = as_states(forces.residual, 1)
+    size = norm(residual)
     value = float(size.max())
     if value <= SIGMA * std:
         return []
-    joint = joint_names[int(residual[int(size.argmax())].abs().argmax())]
+    joint = joint_names[int(abs(residual[int(size.argmax())]).argmax())]
     message = (
         f"springs, weight and contacts leave joint torques of {value:.3f} N m unexplained ({value / std:.0f} "
         f"standard deviations), most at '{joint}': the object's mass, a spring, its rest angle or the "
@@ -128,10 +130,10 @@ def _of_torque(joint_names: Sequence[str], forces: GraspForces, options: ModelOp
 
 
 def _of_friction(contacts: ContactSet, forces: GraspForces) -> list[Doubt]:
-    least = forces.relative_margin.detach().reshape(-1, contacts.n_c).amin(0)
+    least = as_states(forces.relative_margin, 1).min(0)
     if float(least.min()) > AT_LIMIT:
         return []
-    margin = forces.margin.detach().reshape(-1, contacts.n_c).amin(0)
+    margin = as_states(forces.margin, 1).min(0)
     doubts = []
     for i, pad in enumerate(contacts.finger):
         if float(least[i]) <= AT_LIMIT and float(contacts.friction[i]) > 0:
@@ -145,14 +147,15 @@ def _of_friction(contacts: ContactSet, forces: GraspForces) -> list[Doubt]:
 
 
 def _of_sensors(
-    contacts: ContactSet, forces: GraspForces, measured: dict[str, Tensor], options: ModelOptions
+    contacts: ContactSet, forces: GraspForces, measured: dict[str, Any], options: ModelOptions
 ) -> list[Doubt]:
     doubts, limit = [], SIGMA * options.forces.normal_std
+    normal = as_states(forces.normal, 1)
     for i, pad in enumerate(contacts.finger):
         if pad not in measured:
             continue
-        miss = (measured[pad] - forces.normal[..., i]).detach().abs().nan_to_num(0.0)
-        value = float(miss.max())
+        miss = abs(as_states(measured[pad], 0) - normal[:, i])
+        value = float(np.nan_to_num(miss).max())
         if value > limit:
             message = (
                 f"pad '{pad}' measures a normal force {value:.2f} N off the one that balances object and "
@@ -179,7 +182,7 @@ def _of_links(contacts: ContactSet) -> list[Doubt]:
 
 
 def _of_dropped_contacts(
-    contacts: ContactSet, measured: dict[str, Tensor], before: tuple[str, ...], options: ModelOptions
+    contacts: ContactSet, measured: dict[str, Any], before: tuple[str, ...], options: ModelOptions
 ) -> list[Doubt]:
     doubts, margin = [], options.contact_margin
     for near in contacts.near_misses:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
 from typing import Any, NamedTuple
 
 from .._checks import check_finite
@@ -107,7 +108,7 @@ class Observation:
         """Whether the driver gave ``time`` or ``stamps``."""
         return self.time != 0.0 or self.stamps is not None
 
-    @property
+    @cached_property
     def state(self) -> GraspState:
         """Joint angles and object pose, as measured."""
         return GraspState(self.q, self.position, self.rotation)

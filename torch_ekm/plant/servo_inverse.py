@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import torch
@@ -57,7 +56,8 @@ class ServoInverse(PlantWrapper):
         seen = self.observe() if self._seen is None else self._seen
         v = self._within_range(seen.a, self.servo.command(delta_a))
         after = super().command(v)
-        self._motion = seen.a, v, copy.deepcopy(dict(self.servo.named_buffers()))
+        before = {name: value.clone() for name, value in self.servo.named_buffers()}
+        self._motion = seen.a, v, before
         self._learn(after)
         return after
 

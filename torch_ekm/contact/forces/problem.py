@@ -28,13 +28,6 @@ class ForceCost(NamedTuple):
     load: Array
     scale: Array
 
-    def solve(self) -> Array:
-        """``[mu; lam; tau]`` [N, N m] of least cost under the object balance, without inequalities."""
-        n, m = len(self.q), len(self.load)
-        kkt = np.zeros((n + m, n + m))
-        kkt[:n, :n], kkt[:n, n:], kkt[n:, :n] = self.P, self.balance.T, self.balance
-        return self.scale * np.linalg.solve(kkt, np.concatenate([-self.q, self.load]))[:n]
-
     def covariance(self, n_h: int) -> Array:
         """``N (N^T P N)^-1 N^T`` of ``mu``, N the null space of the balance: P read as information."""
         _, sigma, Vh = np.linalg.svd(self.balance)

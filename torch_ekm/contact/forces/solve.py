@@ -1,12 +1,16 @@
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import math
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..._extras import require
 from ...typing import Array
+from .active_set import EqualityProgram, solve_by_active_set
 from .balance import BalanceEquations, ForceSolution, ForceStatus
 from .friction import cutting_planes
 from .options import ForceOptions
@@ -16,7 +20,9 @@ _TOLERANCE = 2e-7  # [N] largest friction violation left by the cutting planes
 _MAX_CUTS = 30
 
 
-def contact_forces(eq: BalanceEquations, options: ForceOptions | None = None) -> ForceSolution:
+def contact_forces(
+    eq: BalanceEquations, options: ForceOptions | None = None, start: Sequence[int] = ()
+) -> ForceSolution:
     """Forces that balance the object exactly and the joints as well as possible.
 
     The object balance is hard (mass and contact geometry are known best), the joint balance soft:
@@ -24,20 +30,37 @@ def contact_forces(eq: BalanceEquations, options: ForceOptions | None = None) ->
     planes.
 
     Never raises for an impossible grasp: read ``status`` and ``violation``.
+
+    Args:
+        start: ``active`` of a problem like this one; the answer does not depend on it.
     """
     options = options or ForceOptions()
     n_h = eq.object_matrix.shape[1]
     cost, cuts = force_cost(eq, options), np.zeros((0, n_h))
     covariance = None if eq.expected_covariance is None else cost.covariance(n_h)
-    inside = _inside(eq, cost)
-    if inside is not None:
-        return _unpack(eq, inside, 0, covariance)
+    program = None
+    with contextlib.suppress(np.linalg.LinAlgError):  # redundant rows, as of two point contacts
+        program = EqualityProgram(cost.P, cost.q, cost.balance, cost.load)
+        if _keeps_all(eq, cost.scale * program.x):  # it is then the optimum
+            return _unpack(eq, cost.scale * program.x, 0, covariance)
     problem = force_problem(eq, cost, cuts)
+    bounds = [(-np.eye(len(cost.q)), -problem.lb), (np.eye(len(cost.q)), problem.ub)]
+    sides = [(rows[np.isfinite(most)], most[np.isfinite(most)]) for rows, most in bounds]
+    limits, most = (np.concatenate(part) for part in zip(*sides, strict=True))
+    first = None
+    active = [row for row in start if row < len(most) + len(problem.h)]
     for solves in range(1, _MAX_CUTS + 1):
-        solution = _solve(problem)
-        if not solution.found:
-            return _classify_failure(eq, cost, cuts, solves)
-        unknowns = cost.scale * solution.x
+        G, h = np.concatenate([limits, problem.G]), np.concatenate([most, problem.h])
+        optimum = None if program is None else solve_by_active_set(program, G, h, active)
+        if optimum is None:
+            solution = _solve(problem)
+            if not solution.found:
+                return _classify_failure(eq, cost, cuts, solves)
+            x, active = solution.x, []
+        else:
+            x, active = optimum.x, optimum.active
+        first = tuple(active) if first is None else first
+        unknowns = cost.scale * x
         new = cutting_planes(eq.cones, unknowns[:n_h], _TOLERANCE)
         if not len(new):
             break
@@ -45,20 +68,16 @@ def contact_forces(eq: BalanceEquations, options: ForceOptions | None = None) ->
         rows = np.zeros((len(new), len(cost.scale)))
         rows[:, :n_h] = new * cost.scale[:n_h]
         problem.G, problem.h = np.concatenate([problem.G, rows]), np.append(problem.h, np.zeros(len(new)))
-    return _unpack(eq, unknowns, solves, covariance)
+    return dataclasses.replace(_unpack(eq, unknowns, solves, covariance), active=first)
 
 
-def _inside(eq: BalanceEquations, cost: ForceCost) -> Array | None:
-    """The answer without inequalities where it keeps them all, as it mostly does; it is then the optimum."""
+def _keeps_all(eq: BalanceEquations, unknowns: Array) -> bool:
+    """Whether the answer without inequalities keeps them, as it mostly does."""
     n_h, n_a = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1]
-    try:
-        unknowns = cost.solve()
-    except np.linalg.LinAlgError:  # redundant rows of the balance, as of two point contacts
-        return None
     mu, lam, bound = np.split(unknowns, [n_h, n_h + n_a])
     normal = mu[[cone.start for cone in eq.cones]]
     unbalanced = (eq.object_matrix @ mu - eq.object_load) * eq.row_scale
-    kept = (
+    return bool(
         all(cone.slack(mu) >= 0 for cone in eq.cones)
         and (normal >= 0).all()
         and (normal <= MAX_NORMAL).all()
@@ -67,7 +86,6 @@ def _inside(eq: BalanceEquations, cost: ForceCost) -> Array | None:
         and (bound <= eq.bound_upper).all()
         and np.abs(unbalanced).max() < _TOLERANCE
     )
-    return unknowns if kept else None
 
 
 def _solve(problem):

@@ -43,6 +43,7 @@ class Progress:
         """What the encoders did [rad], motion by motion, without what was undone."""
         self._best = self.errors[0], 0  # the smallest of them, and the motions until then
         self._start = seen.state
+        self._judged: tuple[Observation, tuple[float, float]] | None = None
         self._off_allowed = safety.caution.off_rotation
         self._bearing: set[str] | None = None  # links without a pad that bear on the object at the start
 
@@ -95,7 +96,7 @@ class Progress:
         Args:
             blind: the pose was not measured.
         """
-        error = self.focus.error(self.target, after.state)
+        error = self._error(after)
         # a goal that nobody saw is not reached
         self.errors.append(max(error, 1.001 * self.safety.rule.tolerance) if blind else error)
 
@@ -112,17 +113,27 @@ class Progress:
     def come(self, after: Observation, moved: Tensor) -> None:
         """One more motion that counts, of the encoders by ``moved`` [rad]."""
         self.way.append(moved)
-        error = self.focus.error(self.target, after.state)
+        error = self._error(after)
         if error < self._best[0]:
             self._best = error, len(self.way)
 
     def strayed(self, seen: Observation) -> bool:
         """The object was nearer to its target by more than two tolerances, by motions that are not undone."""
         least, motions = self._best
-        error = self.focus.error(self.target, seen.state)
+        error = self._error(seen)
         further = error > least + _STRAYED * self.safety.rule.tolerance
         return further and len(self.way) > motions and seen.status is PlantStatus.HELD
 
     def _off_rotation(self, seen: Observation) -> float:
         """Of the object off the focus since the start [rad]."""
-        return self.focus.off_rotation(seen.state.minus(self._start))
+        return self._of(seen)[1]
+
+    def _error(self, seen: Observation) -> float:
+        return self._of(seen)[0]
+
+    def _of(self, seen: Observation) -> tuple[float, float]:
+        """|e| and the rotation off the focus, computed once for each reading."""
+        if self._judged is None or self._judged[0] is not seen:
+            off = self.focus.off_rotation(seen.state.minus(self._start))
+            self._judged = seen, (self.focus.error(self.target, seen.state), off)
+        return self._judged[1]

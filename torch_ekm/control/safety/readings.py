@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from ...plant import Observation, PlantStatus
-from ...typing import Float, Tensor
+from ...typing import Array, Tensor
 from ..decision import Decision, Expectation, StopReason
 from .fingertips import hold
 from .safety import Guards, Objection
@@ -43,8 +44,8 @@ class ReadingTests:
         doubt = self._age(seen) or self._range(seen)
         if before is None or doubt is not None:
             return doubt
-        ds, still = seen.state.minus(before.state), torch.zeros_like(before.a)
-        return self._encoders(before, still, seen) or self._jump(ds, torch.zeros_like(ds), seen)
+        ds, still = seen.state.minus(before.state).numpy(), torch.zeros_like(before.a)
+        return self._encoders(before, still, seen) or self._jump(ds, 0 * ds, seen)
 
     def after_motion(
         self,
@@ -59,7 +60,7 @@ class ReadingTests:
         doubt = self._speed(before, seen) if doubt is None else doubt
         if expected is None or (doubt is not None and not doubt.blind):
             return doubt
-        ds, predicted = seen.state.minus(before.state), expected.increment
+        ds, predicted = seen.state.minus(before.state).numpy(), expected.increment.numpy()
         if doubt is not None:  # blind: the joints are still looked at
             ds[-6:] = predicted[-6:]
             return self._jump(ds, predicted, seen) or doubt
@@ -98,7 +99,10 @@ class ReadingTests:
         """Sensors that stand still bit by bit, and how far the encoders went meanwhile [rad]."""
         if before is None:
             return {}
-        moved, same = float((seen.a - before.a).abs().max()), self._same(seen)
+        same = self._same(seen)
+        if not any(same.values()):
+            return {}
+        moved = float((seen.a - before.a).abs().max())
         path = {sensor: way + moved for sensor, way in self._path.items() if same[sensor]}
         return {sensor: way for sensor, way in path.items() if way > self.guards.unchanged}
 
@@ -117,21 +121,21 @@ class ReadingTests:
 
     def _encoders(self, before: Observation, command: Tensor, seen: Observation) -> Objection | None:
         """An encoder that went further than it was commanded to, or back."""
-        moved = seen.a - before.a
-        away = torch.maximum(command.clamp(max=0) - moved, moved - command.clamp(min=0))
+        moved, v = (seen.a - before.a).numpy(), command.numpy()
+        away = np.maximum(np.minimum(v, 0) - moved, moved - np.maximum(v, 0))
         i, names = int(away.argmax()), self.hand.actuator_names
         if away[i] > self.guards.encoder_jump:
             message = (
-                f"encoder '{names[i]}' went {deg(moved[i])} where {deg(command[i])} were commanded "
+                f"encoder '{names[i]}' went {deg(moved[i])} where {deg(v[i])} were commanded "
                 f"(Guards.encoder_jump is {deg(self.guards.encoder_jump)}): look after its cable and zero"
             )
             return Objection(StopReason.ENCODER_JUMP, message)
         return None
 
     def _speed(self, before: Observation, seen: Observation) -> Objection | None:
-        moved, names = seen.a - before.a, self.hand.actuator_names
-        seconds, i = seen.taken.encoders - before.taken.encoders, int(moved.abs().argmax())
-        if seen.dated and before.dated and moved[i].abs() > self.guards.speed * max(seconds, 0.0):
+        moved, names = (seen.a - before.a).numpy(), self.hand.actuator_names
+        seconds, i = seen.taken.encoders - before.taken.encoders, int(abs(moved).argmax())
+        if seen.dated and before.dated and abs(moved[i]) > self.guards.speed * max(seconds, 0.0):
             message = (
                 f"encoder '{names[i]}' went {deg(moved[i])} in {seconds:.3g} s (Guards.speed is "
                 f"{deg(self.guards.speed)}/s): the driver must wait for the end of a motion, and date it"
@@ -139,18 +143,18 @@ class ReadingTests:
             return Objection(StopReason.SPEED_CEILING, message)
         return None
 
-    def _jump(self, ds: Tensor, predicted: Tensor, seen: Observation) -> Objection | None:
+    def _jump(self, ds: Array, predicted: Array, seen: Observation) -> Objection | None:
         """What no motion does."""
         guards, n_q = self.guards, self.hand.n_q
         off = ds - predicted
-        i = int(off[:n_q].abs().argmax())
-        if off[i].abs() > guards.joint_jump:
+        i = int(abs(off[:n_q]).argmax())
+        if abs(off[i]) > guards.joint_jump:
             message = (
                 f"joint '{self.hand.joint_names[i]}' turned {deg(ds[i])} where {deg(predicted[i])} "
                 f"were predicted (Guards.joint_jump is {deg(guards.joint_jump)}): look after its sensor"
             )
             return Objection(StopReason.JOINT_JUMP, message)
-        way, turn = (float(torch.linalg.vector_norm(part)) for part in (off[-6:-3], off[-3:]))
+        way, turn = (math.sqrt(part @ part) for part in (off[-6:-3], off[-3:]))
         if (way > guards.translation_jump or turn > guards.rotation_jump) and hold(seen):
             message = (
                 f"the pose is {1e3 * way:.1f} mm and {deg(turn)} away from what was predicted, while "
@@ -161,11 +165,11 @@ class ReadingTests:
         return None
 
     def _gate(
-        self, before: Observation, ds: Tensor, expected: Expectation, seen: Observation, blind: int
+        self, before: Observation, ds: Array, expected: Expectation, seen: Observation, blind: int
     ) -> Objection | None:
         """The innovation against its covariance."""
-        sigma, predicted = self._deviation(before, expected, seen, blind), expected.increment
-        z, n_q = (ds - predicted).abs() / sigma, self.hand.n_q
+        sigma, predicted = self._deviation(before, expected, seen, blind), expected.increment.numpy()
+        z, n_q = abs(ds - predicted) / sigma, self.hand.n_q
         i = int(z.argmax())
         if z[i] <= self.guards.gate:
             return None
@@ -181,32 +185,28 @@ class ReadingTests:
         )
         return Objection(StopReason.BLIND, message, gated=True)
 
-    def _deviation(
-        self, before: Observation, expected: Expectation, seen: Observation, blind: int
-    ) -> Float[Tensor, " n_s"]:
+    def _deviation(self, before: Observation, expected: Expectation, seen: Observation, blind: int) -> Array:
         """sigma of each entry of an increment, see :class:`~torch_ekm.control.Guards`."""
-        guards, n_q, predicted = self.guards, self.hand.n_q, expected.increment
-        variance = predicted.new_zeros(predicted.shape)
+        guards, n_q, predicted = self.guards, self.hand.n_q, expected.increment.numpy()
+        variance = np.zeros(len(predicted))
         variance[:n_q] = 2 * guards.joint_noise**2
         for reading in (before, seen):
             variance[n_q:] += self._stated(reading)
         # blind motions before this one left the pose as unsure as the model is
         share = guards.relative * (1 + blind)
-        parts = predicted[:n_q], predicted[-6:-3], predicted[-3:]
-        way, turn = torch.linalg.vector_norm(parts[1]), torch.linalg.vector_norm(parts[2])
+        way, turn = (math.sqrt(part @ part) for part in (predicted[-6:-3], predicted[-3:]))
         along, about = way + _LEVER * turn, turn + way / _LEVER
-        size = torch.cat([parts[0].abs().amax().expand(n_q), along.expand(3), about.expand(3)])
-        variance += (share * size).square()
-        return (variance + expected.deviation.square()).sqrt()
+        size = np.array([abs(predicted[:n_q]).max()] * n_q + [along] * 3 + [about] * 3)
+        return np.sqrt(variance + (share * size) ** 2 + expected.deviation.numpy() ** 2)
 
-    def _stated(self, reading: Observation) -> Float[Tensor, " 6"]:
-        """Variances of a pose: as stated, and no less than what the guards allow."""
+    def _stated(self, reading: Observation) -> Array:
+        """Variances of a pose ``(6,)``: as stated, and no less than what the guards allow."""
         o, R = self.guards.translation_noise**2, self.guards.rotation_noise**2
-        least = reading.q.new_tensor([o, o, o, R, R, R])
+        least = np.array([o, o, o, R, R, R])
         stated = reading.info.get("estimate", {}).get("pose_covariance")
         if stated is None:
             return least
-        return torch.maximum(torch.nan_to_num(stated.diagonal()), least)
+        return np.maximum(np.nan_to_num(stated.diagonal().numpy()), least)
 
     def follow(self, before: Observation | None, seen: Observation) -> None:
         """Remember a reading, and how far the encoders went since joints and pose changed."""
@@ -223,7 +223,7 @@ class ReadingTests:
         return {"joints": torch.equal(seen.q, last.q), "pose": stands}
 
 
-def deg(angle: float | Tensor) -> str:
+def deg(angle: Any) -> str:
     """An angle [rad] as a text in degrees."""
     return f"{float(angle) / _DEG:.3g} deg"
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import torch
+from typing import Any
 
+from ..._arrays import like, namespace
 from ...contact.contact_kinematics import ContactKinematics
 from ...kinematics.se3 import hat
-from ...typing import Bool, Float, Tensor
+from ...typing import AnyArray, Bool, Float, Tensor
 from .potential import posture_stiffness
 
 
@@ -21,10 +22,10 @@ def precedence(upstream: Bool[Tensor, "n_link n_q"]) -> Bool[Tensor, "n_q n_q"]:
 
 def geometric_stiffness(
     kin: ContactKinematics,
-    force: Float[Tensor, "*batch n_c 3"],
-    spin_moment: Float[Tensor, "*batch n_c"],
+    force: Float[AnyArray, "*batch n_c 3"],
+    spin_moment: Float[AnyArray, "*batch n_c"],
     precedes: Bool[Tensor, "n_q n_q"],
-) -> Float[Tensor, "*batch n_s n_s"]:
+) -> Float[AnyArray, "*batch n_s n_s"]:
     """``dF/ds`` at constant contact forces: hand part S, object part T, rolling and soft-finger spin.
 
     ```
@@ -43,8 +44,8 @@ def geometric_stiffness(
         spin_moment: ``mu_4i`` about the inward normal [N m], held constant about the moving normal.
         precedes: from :func:`precedence`.
     """
-    n_q = kin.axis.shape[-2]
-    D = torch.zeros(*force.shape[:-2], n_q + 6, n_q + 6, dtype=force.dtype, device=force.device)
+    n_q, xp = kin.axis.shape[-2], namespace(force)
+    D = xp.zeros((*force.shape[:-2], n_q + 6, n_q + 6), dtype=force.dtype, device=force.device)
     f_hat = hat(force)
     D[..., :n_q, :n_q] = posture_stiffness(force, kin.point_jacobian.mT, kin.axis, precedes)
     D[..., n_q + 3 :, n_q + 3 :] = -(f_hat @ hat(kin.lever)).sum(-3)
@@ -55,21 +56,22 @@ def geometric_stiffness(
     return D
 
 
-def _over_contacts(left: Tensor, right: Tensor) -> Tensor:
+def _over_contacts(left: AnyArray, right: AnyArray) -> Any:
     """``sum_i left_i^T right_i`` as one product."""
-    return left.flatten(-3, -2).mT @ right.flatten(-3, -2)
+    left, right = (x.reshape(*x.shape[:-3], -1, x.shape[-1]) for x in (left, right))
+    return left.mT @ right
 
 
-def _spin_terms(kin: ContactKinematics, spin_moment: Tensor, precedes: Tensor) -> Tensor:
+def _spin_terms(kin: ContactKinematics, spin_moment: AnyArray, precedes: Tensor) -> Any:
     n_q, Omega = kin.axis.shape[-2], kin.relative_spin
     moment = -kin.contacts.normal * spin_moment[..., None]
-    inner = torch.zeros_like(Omega)
+    inner = 0 * Omega
     inner[..., n_q + 3 :] = -hat(moment)
     inner = inner + spin_moment[..., None, None] * (kin.contacts.object_curvature @ kin.roll @ Omega)
     D = _over_contacts(Omega, inner)
     # (z_b x z_a) . m = z_a . (m x z_b), for b strictly proximal to a, both upstream of the contact
     J_w = kin.spin_jacobian
     W = _over_contacts(J_w, hat(moment) @ J_w)
-    strictly = (precedes & ~precedes.mT).mT.to(W.dtype)
-    D[..., :n_q, :n_q] += W * strictly
+    precedes = like(precedes, W)
+    D[..., :n_q, :n_q] += W * (precedes & ~precedes.mT).mT
     return D
