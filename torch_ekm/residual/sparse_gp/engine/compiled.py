@@ -17,11 +17,13 @@ from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from ....typing import Array, Tensor
 from ...kernels.action_linear import ActionLinearKernel
+from ...kernels.deep import DeepKernel
 from ...kernels.kernel import Kernel
 from ...kernels.stationary import Matern32, Matern52, SquaredExponential
 from ...report import MomentsWithJacobians, UpdateReport
 from ..monitor import RobustWeight
 from ..part import Host
+from .embedding import Embedding
 from .recursion import Absorbed
 from .reference import ReferenceEngine
 
@@ -32,7 +34,7 @@ _SLOW = "compiled loops are off, and sparse GPs take longer: {}; numba's folder 
 def load_kernels() -> ModuleType | None:
     """The compiled loops; None where numba is missing, does not fit numpy, or cannot write its cache."""
     try:
-        from . import numba_kernels
+        from . import numba_kernels, numba_network
     except ImportError as error:
         if error.name not in ("numba", "llvmlite"):  # it is there, and does not fit
             warnings.warn(_SLOW.format(error), stacklevel=2)
@@ -40,6 +42,7 @@ def load_kernels() -> ModuleType | None:
     except RuntimeError as error:
         warnings.warn(_SLOW.format(error), stacklevel=2)
         return None
+    numba_kernels.embed_fleet = numba_network.embed_fleet
     return numba_kernels
 
 
@@ -55,6 +58,7 @@ class CompiledEngine(ReferenceEngine):
     def __init__(self) -> None:
         self._kernel: Kernel | None = None
         self._sources: list[tuple[dict, str, Tensor, int]] = []
+        self._network: Embedding | None = None
         self._usable = False
 
     def __deepcopy__(self, memo: dict) -> CompiledEngine:
@@ -101,8 +105,12 @@ class CompiledEngine(ReferenceEngine):
         if on is not None:
             mask = (on > 0).reshape(-1).numpy()
             figures[2] = 1.0
+        inputs = x.numpy().reshape(-1)
+        if self._network is not None:
+            inputs = self._network.of(x, self._units_x, slopes=False)
+            self._network.keep(mask)
         self._absorb(
-            flags, mask, x.numpy().reshape(-1), y.numpy().reshape(-1), k, prior, *self._state, *self._hyper,
+            flags, mask, inputs, y.numpy().reshape(-1), k, prior, *self._state, *self._hyper,
             self._noise, *self._units, self._robust, self._levels,
             posterior.novelty_threshold, posterior.jitter, event, figures, errors,
         )  # fmt: skip
@@ -119,14 +127,18 @@ class CompiledEngine(ReferenceEngine):
         """One query per model, what is not wanted being empty; None if torch must do it."""
         if not self._takes(gp, x) or self._given:
             return None
-        n, nd = self._n_models * self._m, self._n_models * self._m * self._d
+        n, nd = self._n_models * self._m, self._n_models * self._m * self._width
         mean, v = np.empty(n), np.empty(n if variance else 0)
         J, dv = np.empty(nd if slopes else 0), np.empty(nd if slopes and variance else 0)
         basis, active, _, _, moments, vectors = self._state
+        network = self._network
+        inputs = x.numpy().reshape(-1) if network is None else network.of(x, self._units_x, slopes)
         self._query(
-            self._flags, x.numpy().reshape(-1), basis, active, moments, vectors, *self._hyper, *self._units,
+            self._flags, inputs, basis, active, moments, vectors, *self._hyper, *self._units,
             variance, slopes, mean, v, J, dv,
         )  # fmt: skip
+        if network is not None and slopes:
+            J, dv = network.by_x(J, self._n_models), network.by_x(dv, self._n_models) if variance else dv
         one, two = (*self._batch, self._m), (*self._batch, self._m, self._d)
         shapes = one, one if variance else (0,), two if slopes else (0,), two if slopes and variance else (0,)
         results = (torch.from_numpy(a.reshape(s)) for a, s in zip((mean, v, J, dv), shapes, strict=True))
@@ -142,6 +154,8 @@ class CompiledEngine(ReferenceEngine):
             self._bind(gp)
         if not self._usable:
             return False
+        if self._network is not None:
+            self._network.follow()
         return not (torch.is_grad_enabled() and any(p.requires_grad for p in self._parameters))
 
     def _is_current(self) -> bool:
@@ -153,6 +167,7 @@ class CompiledEngine(ReferenceEngine):
 
     def _bind(self, gp: Host) -> None:
         self._kernel, self._posterior, self._usable = gp.kernel, gp.posterior, False
+        self._network = None
         self._batch, self._d, self._m = tuple(gp.batch_shape), gp.in_features, gp.out_features
         self._n_models = n = gp.batch_shape.numel()
         posterior = gp.posterior
@@ -177,18 +192,27 @@ class CompiledEngine(ReferenceEngine):
         self._levels = levels[0].numpy().reshape(n) if levels else np.empty(0)
         self._none1, self._none2, self._all = np.empty(0), np.empty((0, 0)), np.ones(n, np.bool_)
         self._state = tuple(t.numpy().reshape(n, *t.shape[len(self._batch) :]) for t in state)
+        self._width = self._d
         self._noise = gp.log_noise_variance.detach().numpy().reshape(n, -1)
         self._hyper: tuple[Array, ...] = np.zeros((1, 0)), np.zeros(1), np.zeros((1, 0))
         self._units: tuple[Array, ...] = (
             np.zeros((1, self._d)), np.ones((1, self._d)), np.zeros((1, self._m)), np.ones((1, self._m))
         )  # fmt: skip
         if not self._given and own is not None:
-            lengthscale, variance, *action = (p.detach().numpy() for p in self._parameters)
+            lengthscale, variance, *others = (p.detach().numpy() for p in self._parameters)
             rows = variance.reshape(-1)
-            action = action[0] if action else np.zeros((len(rows), 0))
+            action = others[0] if n_actions else np.zeros((len(rows), 0))
             self._hyper = lengthscale.reshape(len(rows), -1), rows, action.reshape(len(rows), -1)
             if units:
                 self._units = tuple(t.numpy().reshape(n, -1) for t in units)
+            if isinstance(gp.kernel, DeepKernel):
+                self._network = Embedding(kernels, gp.kernel, posterior)
+                self._width = width = self._network.width
+                self._units_x = self._units[:2]
+                plain = np.zeros((len(self._units[2]), width))
+                self._units = plain, plain + 1.0, *self._units[2:]
+                self._hyper = np.zeros((len(rows), width)), rows, action.reshape(len(rows), 0)
+                self._state = self._network.basis, *self._state[1:]
         self._absorb: Callable = kernels.absorb_fleet
         self._query: Callable = kernels.query_fleet
         self._usable = True
@@ -225,7 +249,8 @@ _KINDS = {SquaredExponential: 0, Matern32: 1, Matern52: 2}
 
 def _known(kernel: Kernel, batch: tuple[int, ...]) -> tuple[tuple[int, int], list[Tensor]] | None:
     """(kind, width of the action) and the parameters of a kernel that the loops know themselves."""
-    state = kernel.state_kernel if type(kernel) is ActionLinearKernel else kernel
+    inner = {ActionLinearKernel: "state_kernel", DeepKernel: "base"}.get(type(kernel))
+    state = kernel if inner is None else getattr(kernel, inner)
     kind = _KINDS.get(type(state))  # a subclass may compute something else
     if kind is None:
         return None
@@ -234,8 +259,11 @@ def _known(kernel: Kernel, batch: tuple[int, ...]) -> tuple[tuple[int, int], lis
     if isinstance(kernel, ActionLinearKernel):
         parameters.append(kernel.log_action_variance)
         n_actions = kernel.action_features
-    variance = parameters[1]
     shapes = [tuple(p.shape[:-1]) for p in (parameters[0], *parameters[2:])]
+    if isinstance(kernel, DeepKernel):
+        parameters += [*kernel.weights, *kernel.biases]
+        shapes += [tuple(w.shape[:-2]) for w in kernel.weights] + [tuple(b.shape[:-1]) for b in kernel.biases]
+    variance = parameters[1]
     alike = all(shape == tuple(variance.shape) for shape in shapes) and variance.shape in ((), batch)
     return ((kind, n_actions), parameters) if alike else None
 
