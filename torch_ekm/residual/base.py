@@ -88,6 +88,11 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         """
         return self.predict(x, observation=True)
 
+    def observed(self, x: Float[Tensor, "*any in_features"]) -> tuple[Tensor, Tensor]:
+        """Mean and variance of y at x, those of ``predict(x, observation=True)``."""
+        law = self.predict(x, observation=True)
+        return law.mean, law.variance
+
     def reset(self) -> None:
         """Forget all samples; hyperparameters stay as they are."""
         for buffer in self.buffers(recurse=False):
@@ -168,11 +173,13 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         if mask is not None:  # a NaN times zero is a NaN: clear what must not be used
             x, y = x.where(mask[..., None], 0.0), y.where(mask[..., None], 0.0)
         if not time:
-            return self._step(x, y, mask)
+            return self.step(x, y, mask)
         masks = [None] * len(x) if mask is None else mask.unbind()
-        return UpdateReport.stack([self._step(*sample) for sample in zip(x, y, masks, strict=True)])
+        return UpdateReport.stack([self.step(*sample) for sample in zip(x, y, masks, strict=True)])
 
-    def _step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        """Take in one checked sample per model of ``mask``, as :meth:`update` does after its checks."""
+        x, y = x.to(self._kept), y.to(self._kept)
         if mask is not None and not mask.is_cuda and not bool(mask.any()):
             return UpdateReport.of_nothing(mask, self.dtype)
         return self.absorb(x, y, mask)
@@ -316,10 +323,10 @@ class SingleLearner(ResidualLearner):
             valid = "() for this learner; make one for each model"
             raise ParameterError("batch_shape", tuple(self.batch_shape), valid)
 
-    def _step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         if mask is not None and not bool(mask):
             return UpdateReport.of_nothing(mask, self.dtype)
-        return self.absorb(x, y, None)
+        return self.absorb(x.to(self._kept), y.to(self._kept), None)
 
 
 def recordable(x: Any) -> Any:

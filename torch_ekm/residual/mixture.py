@@ -13,20 +13,21 @@ from torch.distributions import Distribution, Normal
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import ResidualLearner
+from .mixture_engine import CompiledJudge
 from .report import MomentsWithJacobians, UpdateReport
 from .tails import MEMORY, ScaleMixture
 
 _CARRIES = (-0.3, 0.0, 0.2, 0.4, 0.6, 0.8)  # values of kappa to choose from
 _CAPS = (3.0, 30.0)  # and of c
 _PRIOR = 0.8  # belief that a learner is to be taken at its word
-_FREEDOM = 10.0  # of the t law that judges the experts: an outlier must not decide alone
-_LEVEL_DECAY, _TREND_DECAY = 0.995, 0.98
+FREEDOM = 10.0  # of the t law that judges the experts: an outlier must not decide alone
+LEVEL_DECAY, TREND_DECAY = 0.995, 0.98
 _SLOW = 0.2  # largest rate of a level that outlives the end of a trajectory
-_YOUNG = 4  # samples that are not judged by: learners do not know their units yet
-_RMS_SHARE = 0.5, 6.0  # of the running rms, by which experts are judged; at most so many typical scales
-_RATE = 0.01  # of the running variance
-_FARTHEST = 1e6  # standard deviations
-_LEAST = -50.0  # log evidence: nobody is ruled out for good
+YOUNG = 4  # samples that are not judged by: learners do not know their units yet
+RMS_LEAST, RMS_MOST = 0.5, 6.0  # of the running rms, by which experts are judged; at most so many typical scales
+RATE = 0.01  # of the running variance
+FARTHEST = 1e6  # standard deviations
+LEAST = -50.0  # log evidence: nobody is ruled out for good
 
 
 class MixtureResidual(ResidualLearner):
@@ -102,11 +103,13 @@ class MixtureResidual(ResidualLearner):
         self.trend = nn.Buffer(torch.zeros(wide, **factory))
         # what a query needs of the weights: sum p h per learner, and sum p (l - kappa w)
         self.gain = nn.Buffer(torch.zeros(*wide[:-1], len(members), **factory))
+        self.share = nn.Buffer(torch.zeros_like(self.gain))  # the sum of p per learner
         self.offset = nn.Buffer(torch.zeros(wide[:-1], **factory))
         self.inflation = nn.Buffer(torch.ones(wide[:-1], **factory))
         self.count = nn.Buffer(torch.zeros(self.batch_shape, **factory))
         fleet = {"batch_shape": self.batch_shape, **factory}
         self.tails = ScaleMixture(self.out_features, **fleet)
+        self._judge = CompiledJudge()
         self._settle()
 
     # -- predictions ----------------------------------------------------------------------------
@@ -184,7 +187,7 @@ class MixtureResidual(ResidualLearner):
     @property
     def weights(self) -> Float[Tensor, "*batch out learners"]:
         """Posterior probability of each learner, at whatever share."""
-        return self.beliefs @ self.owner
+        return self.share.clone()
 
     @property
     def shares(self) -> Float[Tensor, " experts"]:
@@ -224,42 +227,12 @@ class MixtureResidual(ResidualLearner):
         self._settle()
 
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        mean, deviation, means = self._standard(x)
-        # what is carried over is cut by a scale in which outliers have little say; what experts are judged by
-        # heeds the few large samples of a stream that mostly rests, too
-        typical = self.tails.typical()
-        share, most = _RMS_SHARE
-        judged_by = typical * (share * self.inflation.sqrt() / typical).clamp(1.0, most)
-        innovation = y.unsqueeze(-1) - self._means(means)
-        scale = (deviation * typical).unsqueeze(-1)
-        far = _bounded(innovation / scale)
-        r = (far * (typical / judged_by).unsqueeze(-1)).square()
-        evidence = MEMORY * self.evidence - 0.5 * (_FREEDOM + 1.0) * torch.log1p(r / _FREEDOM)
-        evidence = (evidence - evidence.amax(-1, keepdim=True)).clamp_min(_LEAST)
-        innovation = scale * far / (1.0 + (far / self._experts[4]).square())
-        trend = _TREND_DECAY * self.trend + self._experts[3] * innovation
-        level = _LEVEL_DECAY * self.level + self._experts[2] * innovation + trend
-        sane = level.abs() <= _FARTHEST * scale  # else it is of a time when y was another size
-        trend, level = trend.where(sane, 0.0), level.where(sane, 0.0)
-        z = _bounded((y - mean) / deviation)
-        rate = (1.0 / (self.count - _YOUNG + 2.0).clamp_min(1.0)).clamp_min(_RATE).unsqueeze(-1)
-        inflation = (self.inflation + rate * (z.square() - self.inflation)).clamp_min(1e-12)
-        news = {
-            "evidence": evidence, "innovation": innovation, "level": level, "trend": trend,
-            "inflation": inflation,
-        }  # fmt: skip
-        judged = self.count >= _YOUNG
-        if mask is not None:
-            judged = judged & mask
-        for name, value in news.items():
-            buffer = self.get_buffer(name)
-            on = judged[(..., *(None,) * (value.dim() - judged.dim()))]
-            buffer.copy_(torch.where(on, value, buffer))
-        nis = (z.square() / self.inflation).mean(-1)
-        self.tails.observe(z, (self.count - _YOUNG).clamp_min(0.0), judged)
-        self.count += 1.0 if mask is None else mask.to(self.count.dtype)
-        reports = [learner.update(x, y, mask) for learner in self.members]
-        part = (self._settle() @ self.owner).mean(-2)  # of each learner, over the outputs
+        moments = [learner.observed(x) for learner in self.members]
+        nis = self._judge.judge(self, y, mask, moments)
+        if nis is None:
+            nis = self._judged(y, mask, moments)
+        reports = [learner.step(x, y, mask) for learner in self.members]
+        part = self.share.mean(-2)  # of each learner, over the outputs
         novelty, weight = (
             (part * torch.stack(each, dim=-1).to(part)).sum(-1)
             for each in zip(*((one.novelty, one.weight) for one in reports), strict=True)
@@ -269,28 +242,67 @@ class MixtureResidual(ResidualLearner):
 
     # -- pieces ---------------------------------------------------------------------------------
 
+    def _judged(self, y: Tensor, mask: Tensor | None, moments: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+        """Evidence, what is carried over, variance and tails after one sample per model; returns the nis."""
+        mean, deviation, means = self._together(moments)
+        # what is carried over is cut by a scale in which outliers have little say; what experts are judged by
+        # heeds the few large samples of a stream that mostly rests, too
+        typical = self.tails.typical()
+        judged_by = typical * (RMS_LEAST * self.inflation.sqrt() / typical).clamp(1.0, RMS_MOST)
+        innovation = y.unsqueeze(-1) - self._means(means)
+        scale = (deviation * typical).unsqueeze(-1)
+        far = _bounded(innovation / scale)
+        r = (far * (typical / judged_by).unsqueeze(-1)).square()
+        evidence = MEMORY * self.evidence - 0.5 * (FREEDOM + 1.0) * torch.log1p(r / FREEDOM)
+        evidence = (evidence - evidence.amax(-1, keepdim=True)).clamp_min(LEAST)
+        innovation = scale * far / (1.0 + (far / self._experts[4]).square())
+        trend = TREND_DECAY * self.trend + self._experts[3] * innovation
+        level = LEVEL_DECAY * self.level + self._experts[2] * innovation + trend
+        sane = level.abs() <= FARTHEST * scale  # else it is of a time when y was another size
+        trend, level = trend.where(sane, 0.0), level.where(sane, 0.0)
+        z = _bounded((y - mean) / deviation)
+        rate = (1.0 / (self.count - YOUNG + 2.0).clamp_min(1.0)).clamp_min(RATE).unsqueeze(-1)
+        inflation = (self.inflation + rate * (z.square() - self.inflation)).clamp_min(1e-12)
+        news = {
+            "evidence": evidence, "innovation": innovation, "level": level, "trend": trend,
+            "inflation": inflation,
+        }  # fmt: skip
+        judged = self.count >= YOUNG
+        if mask is not None:
+            judged = judged & mask
+        for name, value in news.items():
+            buffer = self.get_buffer(name)
+            on = judged[(..., *(None,) * (value.dim() - judged.dim()))]
+            buffer.copy_(torch.where(on, value, buffer))
+        nis = (z.square() / self.inflation).mean(-1)
+        self.tails.observe(z, (self.count - YOUNG).clamp_min(0.0), judged)
+        self.count += 1.0 if mask is None else mask.to(self.count.dtype)
+        self._settle()
+        return nis
+
     def _means(self, means: Float[Tensor, "*any out learners"]) -> Float[Tensor, "*any out experts"]:
         return self.shares * (means @ self.owner.mT) + self.carried
 
-    def _settle(self) -> Float[Tensor, "*batch out experts"]:
-        """Gain and offset from the beliefs, and these."""
+    def _settle(self) -> None:
+        """Gain, share and offset from the beliefs."""
         p = self.beliefs
         self.gain.copy_((p * self.shares) @ self.owner)
+        self.share.copy_(p @ self.owner)
         self.offset.copy_((p * self.carried).sum(-1))
-        return p
 
     def _standard(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean, the deviation by which innovations are standardised (the learners' own), their means."""
-        laws = [learner.predict(x, observation=True) for learner in self.members]
-        means = torch.stack([law.mean for law in laws], dim=-1).to(x.dtype)
-        variances = torch.stack([law.variance for law in laws], dim=-1).to(x.dtype)
+        return self._together([learner.observed(x) for learner in self.members])
+
+    def _together(self, moments: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
+        means, variances = (torch.stack(part, dim=-1).to(self.dtype) for part in zip(*moments, strict=True))
         mean = (self.gain * means).sum(-1) + self.offset
-        return mean, (self.weights * variances).sum(-1).sqrt(), means
+        return mean, (self.share * variances).sum(-1).sqrt(), means
 
 
 def _bounded(z: Tensor) -> Tensor:
     """Squares stay finite; what is farther off says nothing more."""
-    return z.nan_to_num(_FARTHEST).clamp(-_FARTHEST, _FARTHEST)
+    return z.nan_to_num(FARTHEST).clamp(-FARTHEST, FARTHEST)
 
 
 def _same_shapes(members: list[ResidualLearner]) -> ResidualLearner:

@@ -95,7 +95,7 @@ class DetectChanges(Part):
     """
 
     def bind(self, learner: Host) -> None:
-        """Room for the last samples, newest last; shifted rather than indexed: masks need no pointers."""
+        """Room for the last samples, one place for all models of a fleet."""
         zeros, fleet = learner.posterior.basis.new_zeros, learner.posterior.batch_shape
         self.level = nn.Buffer(zeros(fleet))
         self.inputs = nn.Buffer(zeros(_MEMORY, *fleet, learner.in_features))
@@ -104,15 +104,17 @@ class DetectChanges(Part):
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Take a sample in; models that face another system start again."""
-        nis, mask = sample.report.nis, sample.mask
-        step = RATE * ((nis > _LARGE).to(nis.dtype) - self.level)
-        self.level += step if mask is None else step * mask
-        level = self.level if mask is None else self.level.where(mask > 0, torch.inf)  # inf: no sample
-        for kept, new in ((self.inputs, sample.x), (self.targets, sample.y), (self.levels, level)):
-            kept.copy_(torch.cat([kept[1:], new.unsqueeze(0)]))
-        changed = self.level > _ALARM
-        self.level.masked_fill_(changed, _COOL)
-        if bool(changed.any()):
-            later = (self.levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0) > 0
-            learner.start_anew(changed, self.inputs, self.targets, later & self.levels.isfinite())
+        mask, place = sample.mask, learner.n_samples % _MEMORY
+        large = (sample.report.nis > _LARGE).to(self.level.dtype)
+        self.level.lerp_(large, RATE) if mask is None else self.level.lerp_(large, RATE * mask)
+        self.inputs[place] = sample.x
+        self.targets[place] = sample.y
+        # inf: no sample
+        self.levels[place] = self.level if mask is None else self.level.where(mask > 0, torch.inf)
+        if bool((self.level > _ALARM).any()):
+            changed = self.level > _ALARM
+            self.level.masked_fill_(changed, _COOL)
+            x, y, levels = (t.roll(-1 - place, 0) for t in (self.inputs, self.targets, self.levels))
+            later = (levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0) > 0
+            learner.start_anew(changed, x, y, later & levels.isfinite())
         return False

@@ -127,10 +127,13 @@ class SparseOnlineGP(Host):
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """N(mean, var), with the observation noise added on request."""
-        mean, variance = self.engine.moments(self, x)
-        if observation:
-            variance = variance + self.noise_variance.to(self.dtype)
+        mean, variance = self.observed(x) if observation else self.engine.moments(self, x)
         return Normal(mean, variance.sqrt(), validate_args=False)
+
+    def observed(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance of y, noise included."""
+        mean, variance = self.engine.moments(self, x)
+        return mean, variance + self.noise_variance.to(self.dtype)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and its derivative, ``(alpha'k, alpha' dk/dx)``, in closed form."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 from torch.autograd.forward_ad import unpack_dual
 from torch.autograd.graph import increment_version
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
@@ -180,7 +181,7 @@ class CompiledEngine(ReferenceEngine):
         robust = [part for part in gp.weighing if type(part) is RobustWeight]
         levels = [part.level for part in robust]
         tensors = (*state, gp.log_noise_variance, *self._parameters, *(units or ()), *levels)
-        self._sources = _sources(gp, tensors)
+        self._sources = sources_of(gp, tensors)
         on_host = all(t.is_cpu and t.is_contiguous() for t in tensors) and gp.dtype == torch.float64
         kernels = load_kernels() if on_host else None
         if kernels is None or len(robust) < len(gp.weighing):
@@ -268,7 +269,7 @@ def _known(kernel: Kernel, batch: tuple[int, ...]) -> tuple[tuple[int, int], lis
     return ((kind, n_actions), parameters) if alike else None
 
 
-def _sources(gp: Host, tensors: tuple[Tensor, ...]) -> list[tuple[dict, str, Tensor, int]]:
+def sources_of(gp: nn.Module, tensors: tuple[Tensor, ...]) -> list[tuple[dict, str, Tensor, int]]:
     """Where in the learner each of these tensors is kept, and its place in memory."""
     wanted = {id(tensor) for tensor in tensors}
     found = []
