@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from abc import abstractmethod
 from collections.abc import Iterable
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -86,6 +87,14 @@ class Host(DoubleStateLearner):
     """Samples of each model since the caches were made, ``(*batch_shape)``."""
     weighing: tuple[Part, ...]
     """Parts that weigh samples."""
+    calibrating: bool
+    """Whether a part changes the observation noise at any sample."""
+
+    @property
+    @abstractmethod
+    def noise_variance(self) -> Float[Tensor, "*batch out"]:
+        """Observation noise variance, in the outputs' own squared units."""
+
     _parts: tuple[Part, ...]
 
     def part(self, kind: type[P]) -> P | None:

@@ -114,6 +114,7 @@ class SparseOnlineGP(Host):
         units = next((part for part in self._parts if isinstance(part, Units)), Units())
         # not as a second child: its buffers would be in the state dict twice
         object.__setattr__(self, "units", units)
+        self.calibrating = bool(_overriding(self._parts, "noise"))
         self.weighing = _overriding(self._parts, "weigh")
         self._noting = _overriding(self._parts, "after_update")
         self._rebuilding = _overriding(self._parts, "on_rebuild", "after_rebuild")
@@ -132,8 +133,7 @@ class SparseOnlineGP(Host):
 
     def observed(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of y, noise included."""
-        mean, variance = self.engine.moments(self, x)
-        return mean, variance + self.noise_variance.to(self.dtype)
+        return self.engine.observed(self, x)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and its derivative, ``(alpha'k, alpha' dk/dx)``, in closed form."""

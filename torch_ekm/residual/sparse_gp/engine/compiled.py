@@ -61,6 +61,10 @@ class CompiledEngine(ReferenceEngine):
         self._sources: list[tuple[dict, str, Tensor, int]] = []
         self._network: Embedding | None = None
         self._usable = False
+        self._marks: list[int] = []  # versions of all tensors: torch changed something where they differ
+        self._n_absorbed = 0  # and the loops where this does
+        self._asked: tuple[Any, ...] | None = None
+        self._noise_then: tuple[Any, ...] | None = None
 
     def __deepcopy__(self, memo: dict) -> CompiledEngine:
         return CompiledEngine()
@@ -76,6 +80,15 @@ class CompiledEngine(ReferenceEngine):
     def moments(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
         found = self._ask(gp, x, variance=True)
         return super().moments(gp, x) if found is None else found[:2]
+
+    def observed(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
+        found = self._ask(gp, x, variance=True)
+        if found is None:
+            return super().observed(gp, x)
+        kept = self._noise_then
+        if kept is None or kept[0] != self._marks or gp.calibrating:
+            self._noise_then = kept = self._marks, gp.noise_variance
+        return found[0], found[1] + kept[1]
 
     def linearize(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
         found = self._ask(gp, x, slopes=True)
@@ -115,6 +128,7 @@ class CompiledEngine(ReferenceEngine):
             self._noise, *self._units, self._robust, self._levels,
             posterior.novelty_threshold, posterior.jitter, event, figures, errors,
         )  # fmt: skip
+        self._n_absorbed += 1
         if self._given:  # a kernel may remember what it made of the basis
             increment_version(posterior.basis)
         batch = self._batch
@@ -125,15 +139,28 @@ class CompiledEngine(ReferenceEngine):
     def _ask(
         self, gp: Host, x: Tensor, *, variance: bool = False, slopes: bool = False
     ) -> MomentsWithJacobians | None:
-        """One query per model, what is not wanted being empty; None if torch must do it."""
+        """One query per model, what is not wanted being empty; None if torch must do it.
+
+        The last answer is kept: an update asks again what was asked for a prediction.
+        """
         if not self._takes(gp, x) or self._given:
             return None
+        given = x.numpy().reshape(-1)
+        state = given.tobytes(), self._n_absorbed, self._marks
+        wanted = (True, variance, slopes, variance and slopes)
+        kept = self._asked
+        if kept is None or kept[0] != state or any(w and not k for w, k in zip(wanted, kept[1], strict=True)):
+            self._asked = kept = state, wanted, self._answer(x, given, variance, slopes)
+        return MomentsWithJacobians(*(torch.from_numpy(a.copy()) for a in kept[2]))
+
+    def _answer(self, x: Tensor, inputs: Array, variance: bool, slopes: bool) -> list[Array]:
         n, nd = self._n_models * self._m, self._n_models * self._m * self._width
         mean, v = np.empty(n), np.empty(n if variance else 0)
         J, dv = np.empty(nd if slopes else 0), np.empty(nd if slopes and variance else 0)
         basis, active, _, _, moments, vectors = self._state
         network = self._network
-        inputs = x.numpy().reshape(-1) if network is None else network.of(x, self._units_x, slopes)
+        if network is not None:
+            inputs = network.of(x, self._units_x, slopes)
         self._query(
             self._flags, inputs, basis, active, moments, vectors, *self._hyper, *self._units,
             variance, slopes, mean, v, J, dv,
@@ -142,8 +169,7 @@ class CompiledEngine(ReferenceEngine):
             J, dv = network.by_x(J, self._n_models), network.by_x(dv, self._n_models) if variance else dv
         one, two = (*self._batch, self._m), (*self._batch, self._m, self._d)
         shapes = one, one if variance else (0,), two if slopes else (0,), two if slopes and variance else (0,)
-        results = (torch.from_numpy(a.reshape(s)) for a, s in zip((mean, v, J, dv), shapes, strict=True))
-        return MomentsWithJacobians(*results)
+        return [a.reshape(s) for a, s in zip((mean, v, J, dv), shapes, strict=True)]
 
     # -- what they work on ----------------------------------------------------------------------
 
@@ -155,8 +181,11 @@ class CompiledEngine(ReferenceEngine):
             self._bind(gp)
         if not self._usable:
             return False
-        if self._network is not None:
-            self._network.follow()
+        marks = [source[2]._version for source in self._sources]
+        if marks != self._marks:
+            if self._network is not None:
+                self._network.follow()
+            self._marks = marks
         return not (torch.is_grad_enabled() and any(p.requires_grad for p in self._parameters))
 
     def _is_current(self) -> bool:
@@ -184,8 +213,10 @@ class CompiledEngine(ReferenceEngine):
         self._sources = sources_of(gp, tensors)
         on_host = all(t.is_cpu and t.is_contiguous() for t in tensors) and gp.dtype == torch.float64
         kernels = load_kernels() if on_host else None
-        if kernels is None or len(robust) < len(gp.weighing):
+        plain = not any(t.is_inference() for t in tensors)  # these have no version
+        if kernels is None or len(robust) < len(gp.weighing) or not plain:
             return
+        self._marks, self._asked, self._noise_then = [], None, None
         self._given = own is None or units is None
         kind, n_actions = (kernels.GIVEN, 0) if self._given or own is None else own[0]
         self._flags = np.array([kind, n_actions])

@@ -34,7 +34,7 @@ class Embedding:
         self._scale = np.empty((1, d))
 
     def follow(self) -> None:
-        """Embed the basis again if it or a parameter changed."""
+        """Embed the basis again if it or a parameter changed without :meth:`keep`."""
         marks = [tensor._version for tensor in self._tensors]
         if marks != self._marks:
             with torch.no_grad():
