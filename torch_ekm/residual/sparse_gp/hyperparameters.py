@@ -13,6 +13,7 @@ from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..adam import Adam
 from ..kernels.kernel import is_shared
+from ..native import native_buffers
 from .forgetting import ForgettingFactor, ProcessNoise
 from .monitor import DetectChanges, RobustWeight
 from .part import Host, Part, Sample
@@ -87,13 +88,13 @@ class LearnHyperparameters(Part):
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Keep the sample, in its own units; with a full window, descend."""
-        place, mask, weight = learner.n_samples % self.window, sample.mask, sample.report.weight
-        self.window_x[..., place, :] = sample.x
-        self.window_y[..., place, :] = sample.y
+        place, kept = learner.n_samples % self.window, native_buffers(self)
+        x, y, mask, _, weight = sample.native()
         weight = weight if mask is None else weight * mask
-        self.window_on[..., place] = weight
+        kept["window_x"][..., place, :], kept["window_y"][..., place, :] = x, y
+        kept["window_on"][..., place] = weight
         if self.past is not None:
-            self.past.offer(sample.x, sample.y, weight)
+            self.past.offer(x, y, weight)
         if place == self.window - 1:
             self.descend(learner)
         return False

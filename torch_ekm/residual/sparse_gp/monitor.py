@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import nn
 
 from ..._checks import check_positive
 from ...typing import Float, Tensor
+from ..native import native_buffers
 from .part import Host, Part, Sample
 
 _CALIBRATION_RATE = 0.2  # of the logarithm of a factor on the noise
@@ -104,14 +107,13 @@ class DetectChanges(Part):
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Take a sample in; models that face another system start again."""
-        mask, place = sample.mask, learner.n_samples % _MEMORY
-        large = (sample.report.nis > _LARGE).to(self.level.dtype)
-        self.level.lerp_(large, RATE) if mask is None else self.level.lerp_(large, RATE * mask)
-        self.inputs[place] = sample.x
-        self.targets[place] = sample.y
-        # inf: no sample
-        self.levels[place] = self.level if mask is None else self.level.where(mask > 0, torch.inf)
-        if bool((self.level > _ALARM).any()):
+        place, kept, (x, y, mask, nis, _) = learner.n_samples % _MEMORY, native_buffers(self), sample.native()
+        level = kept["level"]
+        level += RATE * (1.0 if mask is None else mask) * ((nis > _LARGE) * 1.0 - level)
+        kept["inputs"][place], kept["targets"][place], kept["levels"][place] = x, y, level
+        if mask is not None:  # inf: no sample
+            kept["levels"][place][mask == 0] = math.inf
+        if (level > _ALARM).any():
             changed = self.level > _ALARM
             self.level.masked_fill_(changed, _COOL)
             x, y, levels = (t.roll(-1 - place, 0) for t in (self.inputs, self.targets, self.levels))

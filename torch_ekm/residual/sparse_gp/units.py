@@ -6,6 +6,7 @@ import torch
 
 from ...exceptions import ParameterError
 from ...typing import Tensor
+from ..native import native
 from ..running_scale import ALIEN, BLOCK, RunningScale
 from .part import Host, Part, Units
 
@@ -81,8 +82,9 @@ class Standardize(Part, Units):
     def before_update(self, learner: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
         """Take the sample in; while units are rough, adopt them before it is learned."""
         n = learner.n_samples
-        self.input.observe(n, x, mask)
-        self.output.observe(n, y, mask)
+        x_n, y_n, on = native(x), native(y), native(mask)
+        self.input.observe(n, x_n, on)
+        self.output.observe(n, y_n, on)
         if n & (n + 1) == 0 and n < _DOUBLING:
             if n + 1 < BLOCK:
                 self._adopt(learner, young=True)
