@@ -88,9 +88,11 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         """
         return self.predict(x, observation=True)
 
-    def observed(self, x: Float[Tensor, "*any in_features"]) -> tuple[Tensor, Tensor]:
-        """Mean and variance of y at x, those of ``predict(x, observation=True)``."""
-        law = self.predict(x, observation=True)
+    def moments(
+        self, x: Float[Tensor, "*any in_features"], *, observation: bool = False
+    ) -> tuple[Float[Tensor, "*all out_features"], Float[Tensor, "*all out_features"]]:
+        """Mean and variance of :meth:`predict`."""
+        law = self.predict(x, observation=observation)
         return law.mean, law.variance
 
     def reset(self) -> None:

@@ -42,9 +42,9 @@ class LastResidual(ResidualLearner):
         """The law of f at x and the last sample."""
         return self.learner.predict(self._with_last(self.check_query(x)), observation=observation)
 
-    def observed(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def moments(self, x: Tensor, *, observation: bool = False) -> tuple[Tensor, Tensor]:
         """Those of f at x and the last sample."""
-        return self.learner.observed(self._with_last(self.check_query(x)))
+        return self.learner.moments(self._with_last(self.check_query(x)), observation=observation)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean of f and its slope by x; that by the last sample is left out."""

@@ -103,7 +103,10 @@ class MixtureResidual(ResidualLearner):
         self.trend = nn.Buffer(torch.zeros(wide, **factory))
         # what a query needs of the weights: sum p h per learner, and sum p (l - kappa w)
         self.gain = nn.Buffer(torch.zeros(*wide[:-1], len(members), **factory))
-        self.share = nn.Buffer(torch.zeros_like(self.gain))  # the sum of p per learner
+        # of the experts of each learner and share: sum p, mean of l - kappa w, sum p (l - kappa w - mean)^2
+        alike = torch.zeros(*self.gain.shape, len(shares), **factory)
+        self.mass, self.shift, self.spread = (nn.Buffer(alike.clone()) for _ in range(3))
+        self._shares = nn.Buffer(torch.tensor(shares, **factory), persistent=False)
         self.offset = nn.Buffer(torch.zeros(wide[:-1], **factory))
         self.inflation = nn.Buffer(torch.ones(wide[:-1], **factory))
         self.count = nn.Buffer(torch.zeros(self.batch_shape, **factory))
@@ -127,11 +130,8 @@ class MixtureResidual(ResidualLearner):
         deviation = deviation * self.inflation.sqrt()
         if observation:
             return Normal(mean, deviation, validate_args=False)
-        laws = [learner.predict(x) for learner in self.members]
-        variances = torch.stack([law.variance for law in laws], dim=-1).to(x.dtype)
-        inside = self.shares.square() * (variances @ self.owner.mT)
-        between = (self._means(means) - mean.unsqueeze(-1)).square()
-        variance = (self.beliefs * (inside + between)).sum(-1)
+        variances = torch.stack([learner.moments(x)[1] for learner in self.members], dim=-1).to(x.dtype)
+        variance = self._spread(variances, self._apart(means, mean))
         # y is measured: experts that disagree by more than y scatters do not know less of g than of y
         return Normal(mean, torch.minimum(variance.sqrt(), deviation), validate_args=False)
 
@@ -162,14 +162,13 @@ class MixtureResidual(ResidualLearner):
                 raise ParameterError("learners", type(learner).__name__, valid)
         each = [cast("Any", learner).predict_with_jacobians(x) for learner in self.members]
         m, v, dm, dv = (torch.stack(part, dim=-1).to(x.dtype) for part in zip(*each, strict=True))
-        noisy = [learner.predict(x, observation=True).variance for learner in self.members]
+        noisy = [learner.moments(x, observation=True)[1] for learner in self.members]
         mean = (self.gain * m).sum(-1) + self.offset
-        p, h, inflation = self.beliefs, self.shares, self.inflation
-        apart = self._means(m) - mean.unsqueeze(-1)
-        variance = (p * (h.square() * (v @ self.owner.mT) + apart.square())).sum(-1)
-        of_v, of_m = (p * h.square()) @ self.owner, (2.0 * p * h * apart) @ self.owner
+        apart, p, h = self._apart(m, mean), self.mass, self._shares
+        variance = self._spread(v, apart)
+        of_v, of_m = p @ h.square(), 2.0 * (p * apart) @ h
         slope = (of_v.unsqueeze(-2) * dv).sum(-1) + (of_m.unsqueeze(-2) * dm).sum(-1)
-        share = self.weights
+        share, inflation = self.weights, self.inflation
         most = inflation * (share * torch.stack(noisy, dim=-1).to(x.dtype)).sum(-1)
         steepest = inflation.unsqueeze(-1) * (share.unsqueeze(-2) * dv).sum(-1)
         return MomentsWithJacobians(
@@ -187,7 +186,7 @@ class MixtureResidual(ResidualLearner):
     @property
     def weights(self) -> Float[Tensor, "*batch out learners"]:
         """Posterior probability of each learner, at whatever share."""
-        return self.share.clone()
+        return self.mass.sum(-1)
 
     @property
     def shares(self) -> Float[Tensor, " experts"]:
@@ -227,12 +226,12 @@ class MixtureResidual(ResidualLearner):
         self._settle()
 
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        moments = [learner.observed(x) for learner in self.members]
+        moments = [learner.moments(x, observation=True) for learner in self.members]
         nis = self._judge.judge(self, y, mask, moments)
         if nis is None:
             nis = self._judged(y, mask, moments)
         reports = [learner.step(x, y, mask) for learner in self.members]
-        part = self.share.mean(-2)  # of each learner, over the outputs
+        part = self.weights.mean(-2)  # of each learner, over the outputs
         novelty, weight = (
             (part * torch.stack(each, dim=-1).to(part)).sum(-1)
             for each in zip(*((one.novelty, one.weight) for one in reports), strict=True)
@@ -284,20 +283,31 @@ class MixtureResidual(ResidualLearner):
         return self.shares * (means @ self.owner.mT) + self.carried
 
     def _settle(self) -> None:
-        """Gain, share and offset from the beliefs."""
-        p = self.beliefs
-        self.gain.copy_((p * self.shares) @ self.owner)
-        self.share.copy_(p @ self.owner)
-        self.offset.copy_((p * self.carried).sum(-1))
+        """What queries need of the beliefs."""
+        p, carried = (t.unflatten(-1, (*self.mass.shape[-2:], -1)) for t in (self.beliefs, self.carried))
+        self.mass.copy_(p.sum(-1))
+        self.shift.copy_((p * carried).sum(-1) / self.mass.clamp_min(torch.finfo(p.dtype).tiny))
+        self.spread.copy_((p * (carried - self.shift.unsqueeze(-1)).square()).sum(-1))
+        self.gain.copy_(self.mass @ self._shares)
+        self.offset.copy_((self.mass * self.shift).sum((-2, -1)))
+
+    def _apart(self, means: Tensor, mean: Tensor) -> Float[Tensor, "*any out learners shares"]:
+        """How far the experts of each learner and share are from the mixture's mean, in their mean."""
+        return self._shares * means.unsqueeze(-1) + self.shift - mean[..., None, None]
+
+    def _spread(self, variances: Tensor, apart: Tensor) -> Float[Tensor, "*any out"]:
+        """Variance of g: within the experts, and between them."""
+        inside = self._shares.square() * variances.unsqueeze(-1)
+        return (self.mass * (inside + apart.square()) + self.spread).sum((-2, -1))
 
     def _standard(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean, the deviation by which innovations are standardised (the learners' own), their means."""
-        return self._together([learner.observed(x) for learner in self.members])
+        return self._together([learner.moments(x, observation=True) for learner in self.members])
 
     def _together(self, moments: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
         means, variances = (torch.stack(part, dim=-1).to(self.dtype) for part in zip(*moments, strict=True))
         mean = (self.gain * means).sum(-1) + self.offset
-        return mean, (self.share * variances).sum(-1).sqrt(), means
+        return mean, (self.weights * variances).sum(-1).sqrt(), means
 
 
 def _bounded(z: Tensor) -> Tensor:

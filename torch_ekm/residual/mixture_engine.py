@@ -49,7 +49,7 @@ class CompiledJudge:
         with np.errstate(all="ignore"):
             loops.measure_fleet(
                 y.contiguous().numpy().reshape(rows), means, variances, self._experts, a["innovation"],
-                a["level"], a["gain"], a["share"], self._offset, self._inflation, *self._tails, far, ratio,
+                a["level"], a["gain"], a["mass"], self._offset, self._inflation, *self._tails, far, ratio,
                 figures,
             )  # fmt: skip
             np.log1p(ratio, out=ratio)
@@ -59,8 +59,9 @@ class CompiledJudge:
             )  # fmt: skip
             np.exp(ratio, out=ratio)
         loops.settle_fleet(
-            on, ratio, self._experts, a["innovation"], a["level"], a["gain"], a["share"], self._offset
-        )
+            on, ratio, self._experts, a["innovation"], a["level"], a["mass"], a["shift"], a["spread"],
+            a["gain"], self._offset,
+        )  # fmt: skip
         return torch.from_numpy(nis.reshape(tuple(g.batch_shape)))
 
     def _bind(self, g: MixtureResidual) -> None:
@@ -73,7 +74,7 @@ class CompiledJudge:
 
         self._loops, self._n = numba_mixture, g.batch_shape.numel()
         rows, (n_experts, n_learners) = self._n * g.out_features, g.owner.shape
-        names = "evidence", "innovation", "level", "trend", "gain", "share"
+        names = "evidence", "innovation", "level", "trend", "gain", "mass", "shift", "spread"
         self._arrays: dict[str, Array] = {k: g.get_buffer(k).numpy().reshape(rows, -1) for k in names}
         self._offset, self._inflation = g.offset.numpy().reshape(-1), g.inflation.numpy().reshape(-1)
         self._count, self._prior = g.count.numpy().reshape(-1), g.prior.double().numpy()

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit, types
 
 from .mixture import FARTHEST, FREEDOM, LEAST, LEVEL_DECAY, RATE, RMS_LEAST, RMS_MOST, TREND_DECAY, YOUNG
-from .sparse_gp.engine.numba_kernels import _A1, _A2, _COMMON, _F, _INNER
+from .sparse_gp.engine.numba_kernels import _A1, _A2, _COMMON, _F, _INNER, _TINY
 from .tails import LARGEST, MEMORY
 
 _ON = types.boolean[::1]
@@ -43,7 +43,7 @@ def _typical(log_scale, evidence):
 
 @njit(types.void(_A1, _A2, _A2, _A2, _A2, _A2, _A2, _A2, _A1, _A1, _A2, _A2, _A2, _A2, _A2), **_COMMON)
 def measure_fleet(
-    y, means, variances, experts, innovation, level, gain, share, offset, inflation, log_scale, tail_evidence,
+    y, means, variances, experts, innovation, level, gain, mass, offset, inflation, log_scale, tail_evidence,
     far, ratio, figures,
 ):  # fmt: skip
     """How far y lies from each expert's mean: ``far`` in typical scales, ``ratio = r / 10`` as it is judged.
@@ -53,12 +53,13 @@ def measure_fleet(
         figures: standardised innovation of the mixture's mean, and typical scale, of each output.
     """
     h, kappa, n_learners = experts[0], experts[1], means.shape[1]
-    each = experts.shape[1] // n_learners
+    each, n_shares = experts.shape[1] // n_learners, mass.shape[1] // n_learners
     for o in range(y.shape[0]):
         mean, variance = offset[o], 0.0
         for i in range(n_learners):
             mean += gain[o, i] * means[o, i]
-            variance += share[o, i] * variances[o, i]
+            for s in range(n_shares):
+                variance += mass[o, i * n_shares + s] * variances[o, i]
         deviation = math.sqrt(variance)
         typical = _typical(log_scale[o], tail_evidence[o])
         scale = deviation * typical
@@ -154,25 +155,29 @@ def fold_fleet(
             nis[b] += z * z / inflation[o] / m
 
 
-@njit(types.void(_ON, _A2, _A2, _A2, _A2, _A2, _A2, _A1), **_COMMON)
-def settle_fleet(on, p, experts, innovation, level, gain, share, offset):
-    """Gain, share and offset from weights p of the experts that do not sum to 1 yet, see ``_settle``."""
-    h, kappa, n_learners = experts[0], experts[1], gain.shape[1]
-    each, m = experts.shape[1] // n_learners, p.shape[0] // on.shape[0]
+@njit(types.void(_ON, _A2, _A2, _A2, _A2, _A2, _A2, _A2, _A2, _A1), **_COMMON)
+def settle_fleet(on, p, experts, innovation, level, mass, shift, spread, gain, offset):
+    """What queries need of the experts, from weights p that do not sum to 1 yet, see ``_settle``."""
+    h, kappa, n_groups = experts[0], experts[1], mass.shape[1]
+    each, m = experts.shape[1] // n_groups, p.shape[0] // on.shape[0]
+    n_shares = n_groups // gain.shape[1]
     for o in range(p.shape[0]):
         if not on[o // m]:
             continue
-        row, w, lev, total, carried = p[o], innovation[o], level[o], 0.0, 0.0
+        row, w, lev, total = p[o], innovation[o], level[o], 0.0
         for e in range(row.shape[0]):
-            carried += row[e] * (lev[e] - kappa[e] * w[e])
-        for i in range(n_learners):
-            held, taken = 0.0, 0.0
-            for e in range(i * each, (i + 1) * each):
+            total += row[e]
+        for i in range(gain.shape[1]):
+            gain[o, i] = 0.0
+        offset[o] = 0.0
+        for g in range(n_groups):
+            held, carried, apart = 0.0, 0.0, 0.0
+            for e in range(g * each, (g + 1) * each):
                 held += row[e]
-                taken += row[e] * h[e]
-            gain[o, i], share[o, i] = taken, held
-            total += held
-        for i in range(n_learners):
-            gain[o, i] /= total
-            share[o, i] /= total
-        offset[o] = carried / total
+                carried += row[e] * (lev[e] - kappa[e] * w[e])
+            middle = carried / max(held, _TINY)
+            for e in range(g * each, (g + 1) * each):
+                apart += row[e] * (lev[e] - kappa[e] * w[e] - middle) ** 2
+            mass[o, g], shift[o, g], spread[o, g] = held / total, middle, apart / total
+            gain[o, g // n_shares] += held / total * h[g * each]
+            offset[o] += carried / total

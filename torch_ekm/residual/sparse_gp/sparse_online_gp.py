@@ -128,12 +128,12 @@ class SparseOnlineGP(Host):
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """N(mean, var), with the observation noise added on request."""
-        mean, variance = self.observed(x) if observation else self.engine.moments(self, x)
+        mean, variance = self.moments(x, observation=observation)
         return Normal(mean, variance.sqrt(), validate_args=False)
 
-    def observed(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance of y, noise included."""
-        return self.engine.observed(self, x)
+    def moments(self, x: Tensor, *, observation: bool = False) -> tuple[Tensor, Tensor]:
+        """Mean and variance, with the observation noise on request."""
+        return self.engine.observed(self, x) if observation else self.engine.moments(self, x)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and its derivative, ``(alpha'k, alpha' dk/dx)``, in closed form."""
