@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import nn
 from torch.distributions import Distribution, Normal
@@ -160,6 +161,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
 
         Raises:
             ShapeError: a shape does not fit. The state is untouched.
+            ParameterError: x, y or mask are no numbers, or the learner was made within torch.inference_mode().
             NonFiniteError: NaN, infinity or a number whose square is infinite in an unmasked sample,
                 under ``on_invalid="raise"``; a block is refused as a whole. The state is untouched.
         """
@@ -167,9 +169,14 @@ class ResidualLearner(Recorded, nn.Module, ABC):
             return self._update(x, y, mask)
 
     def _update(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        if self._like.is_inference():  # torch refuses to change these later on
+            raise ParameterError("learner", "made within torch.inference_mode()", "made outside of it")
         x, y = self._cast(x), self._cast(y, "y")
         if mask is not None and not isinstance(mask, Tensor):
-            mask = torch.as_tensor(mask, device=self.device)
+            try:
+                mask = torch.as_tensor(mask, device=self.device)
+            except (TypeError, ValueError, RuntimeError) as error:
+                raise ParameterError("mask", mask, f"a tensor of torch.bool ({error})") from None
         time = self._check_pair(x, y, mask)
         mask = self._refuse(x, y, mask, len(time))
         if mask is not None:  # a NaN times zero is a NaN: clear what must not be used
@@ -230,11 +237,11 @@ class ResidualLearner(Recorded, nn.Module, ABC):
 
     def _cast(self, x: Tensor, name: str = "x") -> Tensor:
         try:
-            if not (isinstance(x, Tensor) and x.is_complex()):
+            if not (x.is_complex() if isinstance(x, Tensor) else np.iscomplexobj(x)):
                 return recordable(torch.as_tensor(x, dtype=self._kept, device=self._like.device))
         except (TypeError, ValueError) as error:
             raise ParameterError(name, x, f"real numbers ({error})") from None
-        raise ParameterError(name, x.dtype, "of real numbers")
+        raise ParameterError(name, getattr(x, "dtype", complex), "of real numbers")
 
     def check_query(self, x: Float[Tensor, "*any in_features"]) -> Float[Tensor, "*all in_features"]:
         """x in the learner's dtype, with all the fleet's axes.
@@ -332,7 +339,12 @@ class SingleLearner(ResidualLearner):
 
 
 def recordable(x: Any) -> Any:
-    """A tensor of inference mode as one that autograd takes, outside of that mode; all else as it is."""
+    """Tensors of inference mode as ones that autograd takes, outside of that mode, also within tuples, lists and
+    dicts; all else as it is."""
+    if type(x) in (tuple, list, dict):
+        return type(x)(map(recordable, x.items() if type(x) is dict else x))
+    if isinstance(x, tuple) and hasattr(x, "_fields"):
+        return type(x)(*map(recordable, x))
     of_inference = isinstance(x, Tensor) and x.is_inference() and not torch.is_inference_mode_enabled()
     return x.clone() if of_inference else x
 

@@ -86,6 +86,7 @@ class Host(DoubleStateLearner):
     units: Units
     engine: Any
     refresh_every: int
+    refresh_offset: int
     n_samples: int
     """Samples before the present one."""
     pending: Tensor
@@ -108,6 +109,10 @@ class Host(DoubleStateLearner):
         In :meth:`Part.bind` it is looked for among those before.
         """
         return next((part for part in self._parts if isinstance(part, kind)), None)
+
+    def is_due(self, n: int) -> bool:
+        """Whether parts may change the state, and the caches are rebuilt, after n samples."""
+        return n >= self.refresh_every and (n - self.refresh_offset) % self.refresh_every == 0
 
     def shared_noise(self) -> Float[Tensor, "*batch"]:
         """Noise by which the gain is computed: geometric mean over the (standardised) outputs."""

@@ -77,21 +77,16 @@ class PrequentialLoss(nn.Module):
             old.copy_(new)
 
     def with_gradients(
-        self, kernel: Kernel, log_noise: Tensor, queries: Queries, *, moved: bool = True
+        self, kernel: Kernel, log_noise: Tensor, queries: Queries
     ) -> tuple[Tensor, list[Tensor | None]]:
         """Loss of each model ``(*batch_shape)`` [nats per sample and output], derivatives of their sum.
 
-        The derivatives are those by ``[*kernel.parameters(), log_noise]``.
-
-        Args:
-            moved: whether kernel or noise changed since the old state's caches were made: they are
-                made again then.
+        The derivatives are those by ``[*kernel.parameters(), log_noise]``, at the values by which the old
+        state's caches were made.
         """
         with _differentiable(kernel):
             K, k, prior = outcome = self._covariances(kernel, queries.x)
             K_, k_ = K.detach(), k.detach()
-            if moved:
-                self.state.rebuild_from(K_, log_noise.mean(-1).exp())
             C, Q, alpha = self.state.covariance, self.state.moments[..., 1, :, :], self.state.alpha
             E, F = C @ k_, Q @ k_
             kE, u, mean = (k_ * E).sum(-2), (k_ * F).sum(-2), k_.mT @ alpha

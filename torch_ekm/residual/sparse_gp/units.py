@@ -90,7 +90,7 @@ class Standardize(Part, Units):
                 self._adopt(learner, young=True)
                 x, y, on = self.input.block, self.output.block, self.input.block_on
                 learner.learn_anew(x[..., :n, :], y[..., :n, :], on[..., :n, 0])
-            elif (n + 1) % learner.refresh_every:  # else it comes of itself
+            elif not learner.is_due(n + 1):  # else it comes of itself
                 learner.refresh()
 
     def on_rebuild(self, learner: Host) -> None:
