@@ -220,7 +220,7 @@ def test_what_is_no_real_number_is_named(make):
         learner.update(x, None)
     with pytest.raises(ParameterError, match=r"y = torch.complex64 .* real numbers"):
         learner.update(x, y.to(torch.complex64))
-    with pytest.raises(ParameterError, match=r"y = dtype\('complex128'\) .* real numbers"):
+    with pytest.raises(ParameterError, match=r"y = dtype\('complex64'\) .* real numbers"):
         learner.update(x, y.numpy() * 1j)
     with pytest.raises(ParameterError, match="mask = 'all'"):
         learner.update(x, y, "all")
