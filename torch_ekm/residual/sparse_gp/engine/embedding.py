@@ -55,7 +55,7 @@ class Embedding:
         )  # fmt: skip
         return found.reshape(-1)
 
-    def keep(self, on: Array) -> None:
+    def keep(self, on: np.ndarray) -> None:
         """Write the last inputs into the free slots of the basis of the models ``on``."""
         models = np.flatnonzero(on)
         self._raw[models, self._slot[models]] = self._z[models]
