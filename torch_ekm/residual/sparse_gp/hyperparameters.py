@@ -100,6 +100,9 @@ class LearnHyperparameters(Part):
         if self.past is not None:
             self.past.offer(x, y, weight)
         if due or ((place + 1) % self.stride == 0 and place + self.stride < self.window):
+            if due and self.steps > 1:
+                self._move(learner)
+                self.loss.state.rebuild(learner.kernel, learner.shared_noise())
             self.descend(learner)
         if due:
             self._move(learner)
