@@ -13,6 +13,7 @@ from torch.distributions import Distribution, Normal
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import ResidualLearner
+from .experts import FARTHEST, FREEDOM, LEAST, LEVEL_DECAY, RATE, RMS_LEAST, RMS_MOST, TREND_DECAY, YOUNG
 from .mixture_engine import CompiledJudge
 from .report import MomentsWithJacobians, UpdateReport
 from .tails import MEMORY, ScaleMixture
@@ -20,14 +21,7 @@ from .tails import MEMORY, ScaleMixture
 _CARRIES = (-0.3, 0.0, 0.2, 0.4, 0.6, 0.8)  # values of kappa to choose from
 _CAPS = (3.0, 30.0)  # and of c
 _PRIOR = 0.8  # belief that a learner is to be taken at its word
-FREEDOM = 10.0  # of the t law that judges the experts: an outlier must not decide alone
-LEVEL_DECAY, TREND_DECAY = 0.995, 0.98
 _SLOW = 0.2  # largest rate of a level that outlives the end of a trajectory
-YOUNG = 4  # samples that are not judged by: learners do not know their units yet
-RMS_LEAST, RMS_MOST = 0.5, 6.0  # of the running rms, by which experts are judged; at most so many typical scales
-RATE = 0.01  # of the running variance
-FARTHEST = 1e6  # standard deviations
-LEAST = -50.0  # log evidence: nobody is ruled out for good
 
 
 class MixtureResidual(ResidualLearner):

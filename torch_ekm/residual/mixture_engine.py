@@ -9,10 +9,24 @@ import torch
 from torch.distributions import StudentT
 
 from ..typing import Array, Tensor
-from .sparse_gp.engine.compiled import load_kernels, sources_of
+from .sparse_gp.engine.compiled import sources_of
+from .sparse_gp.engine.loading import load_loops
 
 if TYPE_CHECKING:
     from .mixture import MixtureResidual
+
+
+def warm_up() -> bool:
+    """Load the compiled loops now, not at the first update; returns whether there are any (extra ``fast``).
+
+    A fresh installation compiles them first, for some ten seconds. Without this call another process does so
+    meanwhile, and torch does the work.
+    """
+    if load_loops(wait=True) is None:
+        return False
+    from . import numba_mixture  # noqa: F401  loaded by its import
+
+    return True
 
 
 class CompiledJudge:
@@ -33,6 +47,8 @@ class CompiledJudge:
 
     def judge(self, g: MixtureResidual, y: Tensor, mask: Tensor | None, moments: list) -> Tensor | None:
         """Take one sample per model in, given what the learners predicted; the nis, or None: torch must do it."""
+        if load_loops() is None:
+            return None
         if any(owner.get(name) is not t or t.data_ptr() != at for owner, name, t, at in self._sources):
             self._sources = []
         if not self._sources:
@@ -66,8 +82,8 @@ class CompiledJudge:
 
     def _bind(self, g: MixtureResidual) -> None:
         self._sources = sources_of(g, tuple(g.buffers(recurse=False)) + tuple(g.tails.buffers()))
-        kernels = load_kernels() if g.dtype == torch.float64 and g.device.type == "cpu" else None
-        self._usable = kernels is not None and all(t.is_contiguous() for _, _, t, _ in self._sources)
+        on_host = g.dtype == torch.float64 and g.device.type == "cpu"
+        self._usable = on_host and all(t.is_contiguous() for _, _, t, _ in self._sources)
         if not self._usable:
             return
         from . import numba_mixture

@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numba import njit, types
 
-from .mixture import FARTHEST, FREEDOM, LEAST, LEVEL_DECAY, RATE, RMS_LEAST, RMS_MOST, TREND_DECAY, YOUNG
+from .experts import FARTHEST, FREEDOM, LEAST, LEVEL_DECAY, RATE, RMS_LEAST, RMS_MOST, TREND_DECAY, YOUNG
 from .sparse_gp.engine.numba_kernels import _A1, _A2, _COMMON, _F, _INNER, _TINY
 from .tails import LARGEST, MEMORY
 

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
-from functools import cache
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -25,26 +22,9 @@ from ...report import MomentsWithJacobians, UpdateReport
 from ..monitor import RobustWeight
 from ..part import Host
 from .embedding import Embedding
+from .loading import load_loops
 from .recursion import Absorbed
 from .reference import ReferenceEngine
-
-_SLOW = "compiled loops are off, and sparse GPs take longer: {}; numba's folder is named by NUMBA_CACHE_DIR"
-
-
-@cache
-def load_kernels() -> ModuleType | None:
-    """The compiled loops; None where numba is missing, does not fit numpy, or cannot write its cache."""
-    try:
-        from . import numba_kernels, numba_network
-    except ImportError as error:
-        if error.name not in ("numba", "llvmlite"):  # it is there, and does not fit
-            warnings.warn(_SLOW.format(error), stacklevel=2)
-        return None
-    except RuntimeError as error:
-        warnings.warn(_SLOW.format(error), stacklevel=2)
-        return None
-    numba_kernels.embed_fleet = numba_network.embed_fleet
-    return numba_kernels
 
 
 class CompiledEngine(ReferenceEngine):
@@ -177,6 +157,8 @@ class CompiledEngine(ReferenceEngine):
         """Whether this call is one for compiled loops; prepares the arrays."""
         if torch.compiler.is_compiling() or not _is_plain(x, (*gp.batch_shape, gp.in_features)):
             return False
+        if load_loops() is None:
+            return False
         if gp.kernel is not self._kernel or not self._is_current():
             self._bind(gp)
         if not self._usable:
@@ -212,13 +194,13 @@ class CompiledEngine(ReferenceEngine):
         tensors = (*state, gp.log_noise_variance, *self._parameters, *(units or ()), *levels)
         self._sources = sources_of(gp, tensors)
         on_host = all(t.is_cpu and t.is_contiguous() for t in tensors) and gp.dtype == torch.float64
-        kernels = load_kernels() if on_host else None
         plain = not any(t.is_inference() for t in tensors)  # these have no version
-        if kernels is None or len(robust) < len(gp.weighing) or not plain:
+        if not on_host or len(robust) < len(gp.weighing) or not plain:
             return
-        self._marks, self._asked, self._noise_then = [], None, None
+        self._marks, self._asked, self._noise_then, loops = [], None, None, load_loops()
+        assert loops is not None  # else this is not called
         self._given = own is None or units is None
-        kind, n_actions = (kernels.GIVEN, 0) if self._given or own is None else own[0]
+        kind, n_actions = (_GIVEN, 0) if self._given or own is None else own[0]
         self._flags = np.array([kind, n_actions])
         self._robust = np.array([part.threshold**2 for part in robust])
         self._levels = levels[0].numpy().reshape(n) if levels else np.empty(0)
@@ -238,15 +220,15 @@ class CompiledEngine(ReferenceEngine):
             if units:
                 self._units = tuple(t.numpy().reshape(n, -1) for t in units)
             if isinstance(gp.kernel, DeepKernel):
-                self._network = Embedding(kernels, gp.kernel, posterior)
+                self._network = Embedding(loops, gp.kernel, posterior)
                 self._width = width = self._network.width
                 self._units_x = self._units[:2]
                 plain = np.zeros((len(self._units[2]), width))
                 self._units = plain, plain + 1.0, *self._units[2:]
                 self._hyper = np.zeros((len(rows), width)), rows, action.reshape(len(rows), 0)
                 self._state = self._network.basis, *self._state[1:]
-        self._absorb: Callable = kernels.absorb_fleet
-        self._query: Callable = kernels.query_fleet
+        self._absorb: Callable = loops.absorb_fleet
+        self._query: Callable = loops.query_fleet
         self._usable = True
 
 
@@ -276,7 +258,8 @@ def _has_memory(x: Tensor) -> bool:
     return True
 
 
-_KINDS = {SquaredExponential: 0, Matern32: 1, Matern52: 2}
+# as numba_kernels has them
+_KINDS, _GIVEN = {SquaredExponential: 0, Matern32: 1, Matern52: 2}, 3
 
 
 def _known(kernel: Kernel, batch: tuple[int, ...]) -> tuple[tuple[int, int], list[Tensor]] | None:

@@ -10,7 +10,9 @@ import math
 import numpy as np
 from numba import njit, types
 
-from .numba_kernels import _A1, _A2, _A3, _COMMON, _I1
+from .numba_kernels import _A1, _A2, _A3, _COMMON, _I1, absorb_fleet, query_fleet
+
+__all__ = ["absorb_fleet", "embed_fleet", "query_fleet"]
 
 
 @njit(
