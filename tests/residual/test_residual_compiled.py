@@ -199,6 +199,9 @@ def test_a_fresh_installation_learns_while_another_process_compiles(monkeypatch)
     class Compiler:
         result = None
 
+        def wait(self):
+            return self.result
+
         def poll(self):
             return self.result
 
