@@ -15,8 +15,8 @@ __all__ = [
     "EquilibriumError", "FileFormatError", "FolderInUseError", "GraspError", "JointMismatchError",
     "MissingExtraError", "NeverAtRestError", "NoContactError", "NoDerivativeError", "NoStateError",
     "NonFiniteError", "NonMonotoneFitError", "ObjectLostError", "OutputError", "ParameterError",
-    "PenetrationError", "ShapeError", "SingularGraspError", "SolverError", "SpeedWarning", "StaleReadingError",
-    "StateMismatchError", "UnknownNameError", "UnstableGraspError", "WorkerDiedError",
+    "PenetrationError", "ShapeError", "SingularGraspError", "SolverError", "SpeedWarning",
+    "StaleReadingError", "StateMismatchError", "UnknownNameError", "UnstableGraspError", "WorkerDiedError",
 ]  # fmt: skip
 
 _LONGEST = 2000  # characters of a message

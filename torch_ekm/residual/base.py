@@ -161,7 +161,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
 
         Raises:
             ShapeError: a shape does not fit. The state is untouched.
-            ParameterError: x, y or mask are no numbers, or the learner was made within torch.inference_mode().
+            ParameterError: x, y or mask are no numbers, or the learner was made within inference mode.
             NonFiniteError: NaN, infinity or a number whose square is infinite in an unmasked sample,
                 under ``on_invalid="raise"``; a block is refused as a whole. The state is untouched.
         """
@@ -339,14 +339,17 @@ class SingleLearner(ResidualLearner):
 
 
 def recordable(x: Any) -> Any:
-    """Tensors of inference mode as ones that autograd takes, outside of that mode, also within tuples, lists and
-    dicts; all else as it is."""
-    if type(x) in (tuple, list, dict):
-        return type(x)(map(recordable, x.items() if type(x) is dict else x))
+    """Outside of inference mode its tensors as ones that autograd takes, also within tuples, lists and dicts;
+    all else as it is."""
+    if type(x) is dict:
+        return {name: recordable(value) for name, value in x.items()}
+    if type(x) in (tuple, list):
+        return type(x)(map(recordable, x))
     if isinstance(x, tuple) and hasattr(x, "_fields"):
         return type(x)(*map(recordable, x))
-    of_inference = isinstance(x, Tensor) and x.is_inference() and not torch.is_inference_mode_enabled()
-    return x.clone() if of_inference else x
+    if isinstance(x, Tensor) and x.is_inference() and not torch.is_inference_mode_enabled():
+        return x.clone()
+    return x
 
 
 def value_and_jacobian(

@@ -30,7 +30,7 @@ def warm_up() -> bool:
 
 
 class CompiledJudge:
-    """The buffers of a mixture as arrays that share their memory, made again whenever a buffer is another one.
+    """A mixture's buffers as arrays that share their memory, made again whenever a buffer is another one.
 
     It judges on the CPU in float64, where numba is installed.
     """
@@ -46,7 +46,7 @@ class CompiledJudge:
         return CompiledJudge, ()
 
     def judge(self, g: MixtureResidual, y: Tensor, mask: Tensor | None, moments: list) -> Tensor | None:
-        """Take one sample per model in, given what the learners predicted; the nis, or None: torch must do it."""
+        """Take one sample per model in, given what the learners predicted; the nis. None: torch must do it."""
         if load_loops() is None:
             return None
         if any(owner.get(name) is not t or t.data_ptr() != at for owner, name, t, at in self._sources):
@@ -96,7 +96,11 @@ class CompiledJudge:
         self._count, self._prior = g.count.numpy().reshape(-1), g.prior.double().numpy()
         self._experts, tails = g.get_buffer("_experts").numpy(), g.tails
         law = StudentT(tails.freedoms)
-        self._laws = tails.rates.numpy(), tails.freedoms.numpy(), law.log_prob(torch.zeros_like(tails.freedoms)).numpy()
+        self._laws = (
+            tails.rates.numpy(),
+            tails.freedoms.numpy(),
+            law.log_prob(torch.zeros_like(tails.freedoms)).numpy(),
+        )
         self._tails = tuple(t.numpy().reshape(rows, -1) for t in (tails.log_scale, tails.evidence))
         learners, experts = np.empty((2, rows, n_learners)), np.empty((2, rows, n_experts))
         self._work = *learners, *experts, np.empty((rows, 2))

@@ -2,9 +2,9 @@
 
 Equations and names are those of :class:`~torch_ekm.residual.MixtureResidual` and
 :class:`~torch_ekm.residual.tails.ScaleMixture`, which stay the reference. Arrays of two axes have a row for
-each output of each model, all but ``experts``: rows h, kappa, rho, beta, c, a column for each expert, those of
-the first learner first. Logarithms and exponentials of all experts are numpy's, which are vectorised, between
-the calls.
+each output of each model, all but ``experts``: rows h, kappa, rho, beta, c, a column for each expert, those
+of the first learner first. Logarithms and exponentials of all experts are numpy's, which are vectorised,
+between the calls.
 """
 
 from __future__ import annotations
@@ -105,8 +105,8 @@ def fold_fleet(
 ):  # fmt: skip
     """Take one sample per model in, where ``on``.
 
-    ``ratio`` is ``log(1 + ratio)`` now; it becomes the logarithm of the experts' weights, 0 at the largest. ``on``
-    becomes false where models are too young to be judged.
+    ``ratio`` is ``log(1 + ratio)`` now; it becomes the logarithm of the experts' weights, 0 at the largest.
+    ``on`` becomes false where models are too young to be judged.
 
     Args:
         constants: log densities of the tails' laws at 0, at scale 1.

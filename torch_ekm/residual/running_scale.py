@@ -75,18 +75,17 @@ class RunningScale(nn.Module):
         """n samples of each model in the learner's units."""
         return (x - self.shift.unsqueeze(-2)) / self.scale.unsqueeze(-2)
 
-    def observe(self, n: int, x: Any, on: Any) -> None:
-        """The sample after n others, ``(*batch, features)``, for the models ``on``; a full block is pooled.
+    def observe(self, place: int, x: Any, on: Any) -> None:
+        """A sample ``(*batch, features)`` for the models ``on``, at its place in the block, which the last pools.
 
         Both as :func:`~torch_ekm.residual.native.native` gives them; ``on`` None: all.
         """
-        place = n % BLOCK
         kept = native_buffers(self)
         kept["block"][..., place, :] = x
         kept["block_on"][..., place, 0] = 1.0 if on is None else on
         if place == BLOCK - 1:
-            kept = self.weight, self.centre, self.spread, self.large
-            for buffer, found in zip(kept, self._pooled(), strict=True):
+            pooled = self.weight, self.centre, self.spread, self.large
+            for buffer, found in zip(pooled, self._pooled(), strict=True):
                 buffer.copy_(found)
 
     def settle(self, *, young: bool = False, settled: float = 0.1) -> tuple[Tensor, Tensor]:

@@ -99,8 +99,9 @@ class DeepKernel(Kernel):
         return self._between(a, a if z is x else self.embed(z))
 
     def with_queries(self, z: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        m, both = z.shape[-2], self.embed(torch.cat([z, x], dim=-2))
-        return tuple(self._between(both[..., :m, :], both).tensor_split([m], dim=-1))
+        m, points = z.shape[-2], self.embed(torch.cat([z, x], dim=-2))
+        both = self._between(points[..., :m, :], points)
+        return both[..., :m], both[..., m:]
 
     def _between(self, a: Tensor, b: Tensor) -> Tensor:
         centre = b[..., :1, :].detach()  # see StationaryKernel

@@ -44,8 +44,8 @@ class Kernel(Recorded, nn.Module, ABC):
         self, z: Float[Tensor, "*batch m d"], x: Float[Tensor, "*batch n d"]
     ) -> tuple[Tensor, Tensor]:
         """``(k(z_i, z_j), k(z_i, x_j))``, shapes ``(*batch, m, m)`` and ``(*batch, m, n)``."""
-        m = z.shape[-2]
-        return tuple(self(z, torch.cat([z, x], dim=-2)).tensor_split([m], dim=-1))
+        both, m = self(z, torch.cat([z, x], dim=-2)), z.shape[-2]
+        return both[..., :m], both[..., m:]
 
     def vector(self, x: Float[Tensor, "*batch d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
         """k(x, z_j) for one query per model, ``(*batch, m)``."""

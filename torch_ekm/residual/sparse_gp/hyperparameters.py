@@ -49,7 +49,8 @@ class LearnHyperparameters(Part):
 
     Args:
         rate: Adam's first step on the logarithms of the hyperparameters.
-        steps: gradient steps per rebuild, spread over the samples up to it.
+        steps: gradient steps per rebuild, spread over the samples up to it; the last one starts where the
+            others lead.
         memory: samples of the past to learn from, too (ReplayMemory); 0: the last k only. Not with
             :class:`ProcessNoise`: where g wanders the past is another g.
 
@@ -146,7 +147,7 @@ class LearnHyperparameters(Part):
         return {**dict(learner.kernel.named_parameters()), "log_noise": learner.log_noise_variance}
 
     def descend(self, learner: Host) -> None:
-        """A step of Adam on the loss, model by model; a model without samples or finite gradient stays as it is.
+        """A step of Adam on the loss, model by model; one without samples or finite gradient stays as it is.
 
         The parameters move at the next rebuild: until then the caches are those of the old ones.
         """

@@ -83,8 +83,12 @@ class Standardize(Part, Units):
         """Take the sample in; while units are rough, adopt them before it is learned."""
         n = learner.n_samples
         x_n, y_n, on = native(x), native(y), native(mask)
-        self.input.observe(n, x_n, on)
-        self.output.observe(n, y_n, on)
+        place = n if n < BLOCK else (n - learner.refresh_offset) % BLOCK  # full just before a rebuild
+        if n == BLOCK and place > 0:  # what is behind was pooled already
+            self.input.block_on.zero_()
+            self.output.block_on.zero_()
+        self.input.observe(place, x_n, on)
+        self.output.observe(place, y_n, on)
         if n & (n + 1) == 0 and n < _DOUBLING:
             if n + 1 < BLOCK:
                 self._adopt(learner, young=True)

@@ -1,4 +1,4 @@
-"""Where a deep kernel is a plain one: the network's work for compiled loops, and what it made of the basis."""
+"""Where a deep kernel is a plain one: what its network makes of queries and basis, for compiled loops."""
 
 from __future__ import annotations
 

@@ -14,8 +14,8 @@ from ....exceptions import SpeedWarning
 
 _OFF = "compiled loops are off, and learners take longer: {}; numba's folder is named by NUMBA_CACHE_DIR"
 _FIRST_TIME = (
-    "another process compiles loops, once and for some ten seconds; torch does the work until then, and results "
-    "may differ by rounding. torch_ekm.warm_up() waits for them"
+    "another process compiles loops, once and for some ten seconds; until then torch does the work, and "
+    "results may differ by rounding. torch_ekm.warm_up() waits for them"
 )
 
 

@@ -29,7 +29,8 @@ KIND, ACTIONS = 0, 1
 _EPS, _TINY = np.finfo(np.float64).eps, np.finfo(np.float64).tiny
 # NaN and infinity keep their meaning: samples are tested for them in here.
 _COMMON = {
-    "cache": True, "nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp", "nsz"}
+    "cache": True, "nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy",
+    "fastmath": {"reassoc", "contract", "arcp", "nsz"},
 }  # fmt: skip
 _INNER = {**_COMMON, "no_cpython_wrapper": True}  # called from loops alone
 _A1, _A2, _A3, _A4 = (types.Array(types.float64, n, "C") for n in (1, 2, 3, 4))
