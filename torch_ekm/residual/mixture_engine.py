@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,9 +11,6 @@ from torch.distributions import StudentT
 from ..typing import Array, Tensor
 from .sparse_gp.engine.compiled import sources_of
 from .sparse_gp.engine.loading import load_loops
-
-if TYPE_CHECKING:
-    from .mixture import MixtureResidual
 
 
 def warm_up() -> bool:
@@ -45,8 +42,11 @@ class CompiledJudge:
     def __reduce__(self) -> tuple:
         return CompiledJudge, ()
 
-    def judge(self, g: MixtureResidual, y: Tensor, mask: Tensor | None, moments: list) -> Tensor | None:
-        """Take one sample per model in, given what the learners predicted; the nis. None: torch must do it."""
+    def judge(self, g: Any, y: Tensor, mask: Tensor | None, moments: list) -> Tensor | None:
+        """Take one sample per model in, given what the mixture's learners predicted; returns the nis.
+
+        None: torch must do it.
+        """
         if load_loops() is None:
             return None
         if any(owner.get(name) is not t or t.data_ptr() != at for owner, name, t, at in self._sources):
@@ -80,7 +80,7 @@ class CompiledJudge:
         )  # fmt: skip
         return torch.from_numpy(nis.reshape(tuple(g.batch_shape)))
 
-    def _bind(self, g: MixtureResidual) -> None:
+    def _bind(self, g: Any) -> None:
         self._sources = sources_of(g, tuple(g.buffers(recurse=False)) + tuple(g.tails.buffers()))
         on_host = g.dtype == torch.float64 and g.device.type == "cpu"
         self._usable = on_host and all(t.is_contiguous() for _, _, t, _ in self._sources)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import ModuleType
 
 import numpy as np
@@ -23,7 +24,7 @@ class Embedding:
         self._loops, self._kernel, self._posterior = loops, kernel, posterior
         self._tensors = (posterior.basis, kernel.base.log_lengthscale, *kernel.weights, *kernel.biases)
         self._marks: list[int] | None = None
-        n, (M, d) = posterior.batch_shape.numel(), posterior.basis.shape[-2:]
+        n, (M, d) = math.prod(posterior.batch_shape), posterior.basis.shape[-2:]
         widths = [d, *(weight.shape[-1] for weight in kernel.weights)]
         self._widths, self.width = np.array(widths), d + widths[-1]
         self._raw, self._slot = posterior.basis.numpy().reshape(n, M, d), posterior.slot.numpy().reshape(n)
