@@ -76,7 +76,7 @@ class RunningScale(nn.Module):
         return (x - self.shift.unsqueeze(-2)) / self.scale.unsqueeze(-2)
 
     def observe(self, place: int, x: Any, on: Any) -> None:
-        """A sample ``(*batch, features)`` of the models ``on``, at its place in the block; the last place pools.
+        """A sample ``(*batch, features)`` of the models ``on``, at its place in the block; the last pools.
 
         Both as :func:`~torch_ekm.residual.native.native` gives them; ``on`` None: all.
         """
