@@ -158,6 +158,27 @@ def test_where_torch_must_do_the_work(monkeypatch):
 
 
 @numba_here
+@pytest.mark.parametrize("name", ["plain", "deep"])
+def test_an_answer_is_kept_as_long_as_it_holds(name, monkeypatch):
+    x, y = hard_stream(60)
+    gp = pair(name)[1]
+    gp.update(x[:40], y[:40])
+    query = x[50].clone()
+    first = gp.predict(query)
+    assert not used(gp, lambda: gp(query), monkeypatch)
+    first.loc.zero_()  # whose answer it is
+    query += 1.0
+    changed = gp(query)
+    torch.testing.assert_close(changed, gp(query.unsqueeze(0))[0])
+    gp.update(query, y[50])
+    torch.testing.assert_close(gp(query), gp(query.unsqueeze(0))[0])
+    assert not torch.equal(gp(query), changed)
+    next(gp.kernel.parameters()).add_(0.1)
+    gp.refresh()
+    torch.testing.assert_close(gp(query), gp(query.unsqueeze(0))[0])
+
+
+@numba_here
 def test_arrays_follow_buffers_that_are_replaced():
     x, y = hard_stream(60)
     gp = pair("all")[1]

@@ -112,7 +112,7 @@ class DetectChanges(Part):
         level += RATE * (1.0 if mask is None else mask) * ((nis > _LARGE) * 1.0 - level)
         kept["inputs"][place], kept["targets"][place], kept["levels"][place] = x, y, level
         if mask is not None:  # inf: no sample
-            kept["levels"][place][mask == 0] = math.inf
+            kept["levels"][place, ...][mask == 0] = math.inf
         if (level > _ALARM).any():
             changed = self.level > _ALARM
             self.level.masked_fill_(changed, _COOL)
