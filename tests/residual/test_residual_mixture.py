@@ -278,6 +278,7 @@ def test_variance_and_slopes_are_those_of_all_experts() -> None:
     within = g.shares.square() * (variances @ g.owner.mT)
     mean = (g.beliefs * each).sum(-1)
     expected = (g.beliefs * (within + (each - mean.unsqueeze(-1)).square())).sum(-1)
+    torch.testing.assert_close(g._spread(variances, g._apart(means, mean)), expected, atol=0, rtol=1e-9)
     law = g.predict(x[0])
     torch.testing.assert_close(law.mean, mean)
     limit = g.predict(x[0], observation=True).variance
