@@ -34,6 +34,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_collection_finish() -> None:
     pinches.install()
+    from torch_ekm import warm_up  # behind the hook above
+
+    warm_up()  # tests of bits must not depend on when loops are compiled
     gc.freeze()  # what is imported stays: the collector need not go through it again and again
 
 

@@ -32,6 +32,7 @@ from .residual import (
     Standardize,
     ZeroResidual,
     default_learner,
+    warm_up,
 )
 
 try:
@@ -60,4 +61,5 @@ __all__ = [
     "exceptions",
     "load",
     "save",
+    "warm_up",
 ]

@@ -15,8 +15,8 @@ __all__ = [
     "EquilibriumError", "FileFormatError", "FolderInUseError", "GraspError", "JointMismatchError",
     "MissingExtraError", "NeverAtRestError", "NoContactError", "NoDerivativeError", "NoStateError",
     "NonFiniteError", "NonMonotoneFitError", "ObjectLostError", "OutputError", "ParameterError",
-    "PenetrationError", "ShapeError", "SingularGraspError", "SolverError", "StaleReadingError",
-    "StateMismatchError", "UnknownNameError", "UnstableGraspError", "WorkerDiedError",
+    "PenetrationError", "ShapeError", "SingularGraspError", "SolverError", "SpeedWarning",
+    "StaleReadingError", "StateMismatchError", "UnknownNameError", "UnstableGraspError", "WorkerDiedError",
 ]  # fmt: skip
 
 _LONGEST = 2000  # characters of a message
@@ -27,6 +27,10 @@ class EKMError(Exception):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restore, (type(self), self.args, self.__dict__)
+
+
+class SpeedWarning(UserWarning):
+    """Compiled loops are off, or not there yet: results are the same to rounding, and take longer."""
 
 
 def _restore(kind: type[EKMError], args: tuple[Any, ...], attributes: dict[str, Any]) -> EKMError:

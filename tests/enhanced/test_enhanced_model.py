@@ -196,6 +196,18 @@ def test_control_loops_need_no_autograd(context, make, generator: torch.Generato
         ekm.update(state, action, world(state, action))
 
 
+def test_states_of_inference_mode_may_be_nested() -> None:
+    def f(state, action):
+        return action * state["q"] + state["pair"][1]
+
+    ekm = EnhancedModel(f, SparseOnlineGP(4, 2), encode=lambda state: state["q"])
+    with torch.inference_mode():
+        q, action = torch.rand(2, dtype=torch.float64), torch.rand(2, dtype=torch.float64)
+        value, jacobian = ekm.linearize({"q": q, "pair": (q, [q][0])}, action)
+    torch.testing.assert_close(value, action * q + q)
+    torch.testing.assert_close(jacobian, q.diag())
+
+
 def test_a_new_sequence_carries_nothing_over(generator: torch.Generator) -> None:
     ekm = train(EnhancedModel(model, MixtureResidual(SparseOnlineGP(N_S + N_A, 3))), generator, 60)
     assert bool(ekm.learner.innovation.any())

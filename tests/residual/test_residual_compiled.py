@@ -9,6 +9,7 @@ import sys
 import pytest
 import torch
 
+from torch_ekm.exceptions import SpeedWarning
 from torch_ekm.residual import (
     ActionLinearKernel,
     CalibrateNoise,
@@ -23,12 +24,13 @@ from torch_ekm.residual import (
     SparseOnlineGP,
     SquaredExponential,
     Standardize,
+    warm_up,
 )
-from torch_ekm.residual.sparse_gp.engine import compiled
+from torch_ekm.residual.sparse_gp.engine import loading
 from torch_ekm.residual.sparse_gp.engine.reference import ReferenceEngine
 
 D, M = 4, 2
-numba_here = pytest.mark.skipif(compiled.load_kernels() is None, reason="needs the extra 'fast'")
+numba_here = pytest.mark.skipif(not warm_up(), reason="needs the extra 'fast'")
 
 
 def hard_stream(n: int, *fleet: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -156,6 +158,27 @@ def test_where_torch_must_do_the_work(monkeypatch):
 
 
 @numba_here
+@pytest.mark.parametrize("name", ["plain", "deep"])
+def test_an_answer_is_kept_as_long_as_it_holds(name, monkeypatch):
+    x, y = hard_stream(60)
+    gp = pair(name)[1]
+    gp.update(x[:40], y[:40])
+    query = x[50].clone()
+    first = gp.predict(query)
+    assert not used(gp, lambda: gp(query), monkeypatch)
+    first.loc.zero_()  # whose answer it is
+    query += 1.0
+    changed = gp(query)
+    torch.testing.assert_close(changed, gp(query.unsqueeze(0))[0])
+    gp.update(query, y[50])
+    torch.testing.assert_close(gp(query), gp(query.unsqueeze(0))[0])
+    assert not torch.equal(gp(query), changed)
+    next(gp.kernel.parameters()).add_(0.1)
+    gp.refresh()
+    torch.testing.assert_close(gp(query), gp(query.unsqueeze(0))[0])
+
+
+@numba_here
 def test_arrays_follow_buffers_that_are_replaced():
     x, y = hard_stream(60)
     gp = pair("all")[1]
@@ -182,15 +205,44 @@ def test_without_numba_torch_does_it_all(monkeypatch):
     engine = "torch_ekm.residual.sparse_gp.engine"
     monkeypatch.delitem(sys.modules, f"{engine}.numba_kernels", raising=False)
     monkeypatch.delattr(sys.modules[engine], "numba_kernels", raising=False)
-    compiled.load_kernels.cache_clear()
-    try:
-        assert compiled.load_kernels() is None
-        gp = pair("all")[1]
-        gp.update(x, y)
-        assert torch.equal(gp(x), reference(x))
-        assert torch.equal(gp(x[0]), reference(x[0]))
-    finally:
-        compiled.load_kernels.cache_clear()
+    monkeypatch.delitem(sys.modules, f"{engine}.numba_network", raising=False)
+    monkeypatch.delattr(sys.modules[engine], "numba_network", raising=False)
+    monkeypatch.setattr(loading, "_loader", loading.Loader())
+    assert not warm_up()
+    gp = pair("all")[1]
+    gp.update(x, y)
+    assert torch.equal(gp(x), reference(x))
+    assert torch.equal(gp(x[0]), reference(x[0]))
+
+
+@numba_here
+def test_a_fresh_installation_learns_while_another_process_compiles(monkeypatch):
+    class Compiler:
+        result = None
+
+        def wait(self):
+            return self.result
+
+        def poll(self):
+            return self.result
+
+    started, compiler = [], Compiler()
+    monkeypatch.setattr(loading, "_is_cached", lambda: False)
+    monkeypatch.setattr(subprocess, "Popen", lambda *args, **options: (started.append(args), compiler)[1])
+    monkeypatch.setattr(loading, "_loader", loading.Loader())
+    x, y = hard_stream(120)
+    gp, reference = pair("all")[1], pair("all")[0]
+    with pytest.warns(SpeedWarning, match="warm_up"):
+        gp.update(x[:80], y[:80])
+    reference.update(x[:80], y[:80])
+    assert torch.equal(gp(x[0]), reference(x[0]))
+    assert not used(gp, lambda: gp(x[0]), pytest.MonkeyPatch())
+    compiler.result = 0
+    gp.update(x[80:], y[80:])
+    reference.update(x[80:], y[80:])
+    assert used(gp, lambda: gp(x[1]), pytest.MonkeyPatch())
+    assert_alike(reference, gp, x, float(y.abs().max()))
+    assert len(started) == 1
 
 
 @numba_here
@@ -212,11 +264,11 @@ def test_where_numba_can_write_no_cache_torch_does_it_all():
     code = (
         "import numba.core.caching as caching, torch; caching.CacheImpl._locator_classes = []\n"
         "from torch_ekm import SparseOnlineGP\n"
-        "from torch_ekm.residual.sparse_gp.engine.compiled import load_kernels\n"
+        "from torch_ekm import warm_up\n"
         "x = torch.ones(3).double(); gp = SparseOnlineGP(3, 1); gp.update(x, x[:1])\n"
-        "assert load_kernels() is None and float(gp(x)) > 0.9"
+        "assert not warm_up() and float(gp(x)) > 0.9"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "compiled loops are off" in done.stderr  # said once, not silent
+    assert "SpeedWarning: compiled loops are off" in done.stderr  # said once, not silent
     assert done.stderr.count("NUMBA_CACHE_DIR") == 1

@@ -220,8 +220,21 @@ def test_what_is_no_real_number_is_named(make):
         learner.update(x, None)
     with pytest.raises(ParameterError, match=r"y = torch.complex64 .* real numbers"):
         learner.update(x, y.to(torch.complex64))
+    with pytest.raises(ParameterError, match=r"y = dtype\('complex64'\) .* real numbers"):
+        learner.update(x, y.numpy() * 1j)
+    with pytest.raises(ParameterError, match="mask = 'all'"):
+        learner.update(x, y, "all")
     for name, value in learner.state_dict().items():
         assert not isinstance(value, torch.Tensor) or torch.equal(value, before[name])
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("make", [default_learner, RecursiveLeastSquares])
+def test_a_learner_made_in_inference_mode_is_named(make):
+    with torch.inference_mode():
+        learner = make(3, 2)
+    with pytest.raises(ParameterError, match="made outside"):
+        learner.update(torch.zeros(3), torch.zeros(2))
 
 
 @pytest.mark.usefixtures("unchecked")

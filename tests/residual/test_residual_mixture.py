@@ -20,6 +20,7 @@ from torch_ekm.residual import (
     RecursiveLeastSquares,
     RobustWeight,
     ZeroResidual,
+    default_learner,
 )
 
 
@@ -245,3 +246,54 @@ def test_the_report_is_that_of_all_members() -> None:
     expected = float(mixture.weights.mean(-2) @ torch.tensor(own, dtype=torch.float64))
     assert own[0] < 0.1 < 0.9 < own[1]
     assert float(report.novelty) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("fleet", [(), (3,)])
+def test_compiled_loops_judge_as_torch_does(fleet) -> None:
+    made = [default_learner(3, 2, capacity=8, batch_shape=fleet, on_invalid="skip") for _ in range(2)]
+    made[1]._judge.judge = lambda *sample: None
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(45, *fleet, 3, generator=generator, dtype=torch.float64)
+    y = torch.sin(x[..., :2]) + 0.1 * torch.randn(45, *fleet, 2, generator=generator, dtype=torch.float64)
+    y[20] *= 1e3
+    x[21, ..., 0] = torch.nan
+    on = torch.rand(45, *fleet, generator=generator) < 0.9
+    for t in range(len(x)):
+        reports = [g.update(x[t], y[t], on[t]) for g in made]
+        torch.testing.assert_close(*[report.nis for report in reports], atol=1e-10, rtol=1e-8)
+    for ask in ("forward", "predict_with_jacobians"):
+        torch.testing.assert_close(*[getattr(g, ask)(x[0]) for g in made], atol=1e-10, rtol=1e-8)
+    laws = [g.predictive(x[0]).log_prob(y[0]) for g in made]
+    torch.testing.assert_close(*laws, atol=1e-10, rtol=1e-8)
+
+
+def test_variance_and_slopes_are_those_of_all_experts() -> None:
+    g = default_learner(3, 2, capacity=8)
+    x = torch.randn(60, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    g.update(x, torch.sin(x[:, :2]))
+    means, variances = (
+        torch.stack(each, -1) for each in zip(*(m.moments(x[0]) for m in g.members), strict=True)
+    )
+    each = g.shares * (means @ g.owner.mT) + g.carried
+    within = g.shares.square() * (variances @ g.owner.mT)
+    mean = (g.beliefs * each).sum(-1)
+    expected = (g.beliefs * (within + (each - mean.unsqueeze(-1)).square())).sum(-1)
+    torch.testing.assert_close(g._spread(variances, g._apart(means, mean)), expected, atol=0, rtol=1e-9)
+    law = g.predict(x[0])
+    torch.testing.assert_close(law.mean, mean)
+    limit = g.predict(x[0], observation=True).variance
+    torch.testing.assert_close(law.variance, torch.minimum(expected, limit))
+
+
+def test_learners_rebuild_at_different_samples(monkeypatch) -> None:
+    g, rebuilt = default_learner(3, 2, capacity=8), []
+    for i, member in enumerate(g.members):
+        gp = member.learner if isinstance(member, LastResidual) else member
+        monkeypatch.setattr(
+            gp, "refresh", lambda i=i, gp=gp, own=gp.refresh: (rebuilt.append((i, gp.n_samples)), own())
+        )
+    x = torch.randn(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    g.update(x, x[:, :2])
+    late = [n for _, n in rebuilt if 130 < n <= 200]
+    assert len(late) == len({*late}) >= 8
+    assert {n % 8 for n in late} == {0}

@@ -13,6 +13,7 @@ from .kernels.kernel import Kernel
 from .kernels.stationary import Matern32, Matern52, SquaredExponential
 from .last_residual import LastResidual
 from .mixture import MixtureResidual
+from .mixture_engine import warm_up
 from .report import UpdateEvent, UpdateReport
 from .sparse_gp.deep import DeepKernelSOGP
 from .sparse_gp.forgetting import ForgettingFactor, ProcessNoise
@@ -50,4 +51,5 @@ __all__ = [
     "ZeroResidual",
     "action_covariance",
     "default_learner",
+    "warm_up",
 ]

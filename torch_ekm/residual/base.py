@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import nn
 from torch.distributions import Distribution, Normal
@@ -88,6 +89,13 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         """
         return self.predict(x, observation=True)
 
+    def moments(
+        self, x: Float[Tensor, "*any in_features"], *, observation: bool = False
+    ) -> tuple[Float[Tensor, "*all out_features"], Float[Tensor, "*all out_features"]]:
+        """Mean and variance of :meth:`predict`."""
+        law = self.predict(x, observation=observation)
+        return law.mean, law.variance
+
     def reset(self) -> None:
         """Forget all samples; hyperparameters stay as they are."""
         for buffer in self.buffers(recurse=False):
@@ -153,6 +161,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
 
         Raises:
             ShapeError: a shape does not fit. The state is untouched.
+            ParameterError: x, y or mask are no numbers, or the learner was made within inference mode.
             NonFiniteError: NaN, infinity or a number whose square is infinite in an unmasked sample,
                 under ``on_invalid="raise"``; a block is refused as a whole. The state is untouched.
         """
@@ -160,19 +169,26 @@ class ResidualLearner(Recorded, nn.Module, ABC):
             return self._update(x, y, mask)
 
     def _update(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        if self._like.is_inference():  # torch refuses to change these later on
+            raise ParameterError("learner", "made within torch.inference_mode()", "made outside of it")
         x, y = self._cast(x), self._cast(y, "y")
         if mask is not None and not isinstance(mask, Tensor):
-            mask = torch.as_tensor(mask, device=self.device)
+            try:
+                mask = torch.as_tensor(mask, device=self.device)
+            except (TypeError, ValueError, RuntimeError) as error:
+                raise ParameterError("mask", mask, f"a tensor of torch.bool ({error})") from None
         time = self._check_pair(x, y, mask)
         mask = self._refuse(x, y, mask, len(time))
         if mask is not None:  # a NaN times zero is a NaN: clear what must not be used
             x, y = x.where(mask[..., None], 0.0), y.where(mask[..., None], 0.0)
         if not time:
-            return self._step(x, y, mask)
+            return self.step(x, y, mask)
         masks = [None] * len(x) if mask is None else mask.unbind()
-        return UpdateReport.stack([self._step(*sample) for sample in zip(x, y, masks, strict=True)])
+        return UpdateReport.stack([self.step(*sample) for sample in zip(x, y, masks, strict=True)])
 
-    def _step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        """Take in one checked sample per model of ``mask``, as :meth:`update` does after its checks."""
+        x, y = x.to(self._kept), y.to(self._kept)
         if mask is not None and not mask.is_cuda and not bool(mask.any()):
             return UpdateReport.of_nothing(mask, self.dtype)
         return self.absorb(x, y, mask)
@@ -221,11 +237,11 @@ class ResidualLearner(Recorded, nn.Module, ABC):
 
     def _cast(self, x: Tensor, name: str = "x") -> Tensor:
         try:
-            if not (isinstance(x, Tensor) and x.is_complex()):
+            if not (x.is_complex() if isinstance(x, Tensor) else np.iscomplexobj(x)):
                 return recordable(torch.as_tensor(x, dtype=self._kept, device=self._like.device))
         except (TypeError, ValueError) as error:
             raise ParameterError(name, x, f"real numbers ({error})") from None
-        raise ParameterError(name, x.dtype, "of real numbers")
+        raise ParameterError(name, getattr(x, "dtype", complex), "of real numbers")
 
     def check_query(self, x: Float[Tensor, "*any in_features"]) -> Float[Tensor, "*all in_features"]:
         """x in the learner's dtype, with all the fleet's axes.
@@ -316,16 +332,24 @@ class SingleLearner(ResidualLearner):
             valid = "() for this learner; make one for each model"
             raise ParameterError("batch_shape", tuple(self.batch_shape), valid)
 
-    def _step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         if mask is not None and not bool(mask):
             return UpdateReport.of_nothing(mask, self.dtype)
-        return self.absorb(x, y, None)
+        return self.absorb(x.to(self._kept), y.to(self._kept), None)
 
 
 def recordable(x: Any) -> Any:
-    """A tensor of inference mode as one that autograd takes, outside of that mode; all else as it is."""
-    of_inference = isinstance(x, Tensor) and x.is_inference() and not torch.is_inference_mode_enabled()
-    return x.clone() if of_inference else x
+    """Outside of inference mode its tensors as ones that autograd takes, also within tuples, lists and dicts;
+    all else as it is."""
+    if type(x) is dict:
+        return {name: recordable(value) for name, value in x.items()}
+    if type(x) in (tuple, list):
+        return type(x)(map(recordable, x))
+    if isinstance(x, tuple) and hasattr(x, "_fields"):
+        return type(x)(*map(recordable, x))
+    if isinstance(x, Tensor) and x.is_inference() and not torch.is_inference_mode_enabled():
+        return x.clone()
+    return x
 
 
 def value_and_jacobian(

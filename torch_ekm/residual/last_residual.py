@@ -42,6 +42,10 @@ class LastResidual(ResidualLearner):
         """The law of f at x and the last sample."""
         return self.learner.predict(self._with_last(self.check_query(x)), observation=observation)
 
+    def moments(self, x: Tensor, *, observation: bool = False) -> tuple[Tensor, Tensor]:
+        """Those of f at x and the last sample."""
+        return self.learner.moments(self._with_last(self.check_query(x)), observation=observation)
+
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean of f and its slope by x; that by the last sample is left out."""
         mean, slope = self.learner.linearize(self._with_last(self.check_query(x)))
@@ -73,7 +77,7 @@ class LastResidual(ResidualLearner):
         self.last.zero_()
 
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        report = self.learner.update(self._with_last(x), y, mask)
+        report = self.learner.step(self._with_last(x), y, mask)
         self.last.copy_(y if mask is None else y.where(mask.unsqueeze(-1), self.last))
         return report
 

@@ -13,20 +13,15 @@ from torch.distributions import Distribution, Normal
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import ResidualLearner
+from .experts import FARTHEST, FREEDOM, LEAST, LEVEL_DECAY, RATE, RMS_LEAST, RMS_MOST, TREND_DECAY, YOUNG
+from .mixture_engine import CompiledJudge
 from .report import MomentsWithJacobians, UpdateReport
 from .tails import MEMORY, ScaleMixture
 
 _CARRIES = (-0.3, 0.0, 0.2, 0.4, 0.6, 0.8)  # values of kappa to choose from
 _CAPS = (3.0, 30.0)  # and of c
 _PRIOR = 0.8  # belief that a learner is to be taken at its word
-_FREEDOM = 10.0  # of the t law that judges the experts: an outlier must not decide alone
-_LEVEL_DECAY, _TREND_DECAY = 0.995, 0.98
 _SLOW = 0.2  # largest rate of a level that outlives the end of a trajectory
-_YOUNG = 4  # samples that are not judged by: learners do not know their units yet
-_RMS_SHARE = 0.5, 6.0  # of the running rms, by which experts are judged; at most so many typical scales
-_RATE = 0.01  # of the running variance
-_FARTHEST = 1e6  # standard deviations
-_LEAST = -50.0  # log evidence: nobody is ruled out for good
 
 
 class MixtureResidual(ResidualLearner):
@@ -102,11 +97,16 @@ class MixtureResidual(ResidualLearner):
         self.trend = nn.Buffer(torch.zeros(wide, **factory))
         # what a query needs of the weights: sum p h per learner, and sum p (l - kappa w)
         self.gain = nn.Buffer(torch.zeros(*wide[:-1], len(members), **factory))
+        # of the experts of each learner and share: sum p, mean of l - kappa w, sum p (l - kappa w - mean)^2
+        alike = torch.zeros(*self.gain.shape, len(shares), **factory)
+        self.mass, self.shift, self.spread = (nn.Buffer(alike.clone()) for _ in range(3))
+        self._shares = nn.Buffer(torch.tensor(shares, **factory), persistent=False)
         self.offset = nn.Buffer(torch.zeros(wide[:-1], **factory))
         self.inflation = nn.Buffer(torch.ones(wide[:-1], **factory))
         self.count = nn.Buffer(torch.zeros(self.batch_shape, **factory))
         fleet = {"batch_shape": self.batch_shape, **factory}
         self.tails = ScaleMixture(self.out_features, **fleet)
+        self._judge = CompiledJudge()
         self._settle()
 
     # -- predictions ----------------------------------------------------------------------------
@@ -124,11 +124,8 @@ class MixtureResidual(ResidualLearner):
         deviation = deviation * self.inflation.sqrt()
         if observation:
             return Normal(mean, deviation, validate_args=False)
-        laws = [learner.predict(x) for learner in self.members]
-        variances = torch.stack([law.variance for law in laws], dim=-1).to(x.dtype)
-        inside = self.shares.square() * (variances @ self.owner.mT)
-        between = (self._means(means) - mean.unsqueeze(-1)).square()
-        variance = (self.beliefs * (inside + between)).sum(-1)
+        variances = torch.stack([learner.moments(x)[1] for learner in self.members], dim=-1).to(x.dtype)
+        variance = self._spread(variances, self._apart(means, mean))
         # y is measured: experts that disagree by more than y scatters do not know less of g than of y
         return Normal(mean, torch.minimum(variance.sqrt(), deviation), validate_args=False)
 
@@ -159,14 +156,13 @@ class MixtureResidual(ResidualLearner):
                 raise ParameterError("learners", type(learner).__name__, valid)
         each = [cast("Any", learner).predict_with_jacobians(x) for learner in self.members]
         m, v, dm, dv = (torch.stack(part, dim=-1).to(x.dtype) for part in zip(*each, strict=True))
-        noisy = [learner.predict(x, observation=True).variance for learner in self.members]
+        noisy = [learner.moments(x, observation=True)[1] for learner in self.members]
         mean = (self.gain * m).sum(-1) + self.offset
-        p, h, inflation = self.beliefs, self.shares, self.inflation
-        apart = self._means(m) - mean.unsqueeze(-1)
-        variance = (p * (h.square() * (v @ self.owner.mT) + apart.square())).sum(-1)
-        of_v, of_m = (p * h.square()) @ self.owner, (2.0 * p * h * apart) @ self.owner
+        apart, p, h = self._apart(m, mean), self.mass, self._shares
+        variance = self._spread(v, apart)
+        of_v, of_m = p @ h.square(), 2.0 * (p * apart) @ h
         slope = (of_v.unsqueeze(-2) * dv).sum(-1) + (of_m.unsqueeze(-2) * dm).sum(-1)
-        share = self.weights
+        share, inflation = self.weights, self.inflation
         most = inflation * (share * torch.stack(noisy, dim=-1).to(x.dtype)).sum(-1)
         steepest = inflation.unsqueeze(-1) * (share.unsqueeze(-2) * dv).sum(-1)
         return MomentsWithJacobians(
@@ -184,7 +180,7 @@ class MixtureResidual(ResidualLearner):
     @property
     def weights(self) -> Float[Tensor, "*batch out learners"]:
         """Posterior probability of each learner, at whatever share."""
-        return self.beliefs @ self.owner
+        return self.mass.sum(-1)
 
     @property
     def shares(self) -> Float[Tensor, " experts"]:
@@ -224,42 +220,12 @@ class MixtureResidual(ResidualLearner):
         self._settle()
 
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        mean, deviation, means = self._standard(x)
-        # what is carried over is cut by a scale in which outliers have little say; what experts are judged by
-        # heeds the few large samples of a stream that mostly rests, too
-        typical = self.tails.typical()
-        share, most = _RMS_SHARE
-        judged_by = typical * (share * self.inflation.sqrt() / typical).clamp(1.0, most)
-        innovation = y.unsqueeze(-1) - self._means(means)
-        scale = (deviation * typical).unsqueeze(-1)
-        far = _bounded(innovation / scale)
-        r = (far * (typical / judged_by).unsqueeze(-1)).square()
-        evidence = MEMORY * self.evidence - 0.5 * (_FREEDOM + 1.0) * torch.log1p(r / _FREEDOM)
-        evidence = (evidence - evidence.amax(-1, keepdim=True)).clamp_min(_LEAST)
-        innovation = scale * far / (1.0 + (far / self._experts[4]).square())
-        trend = _TREND_DECAY * self.trend + self._experts[3] * innovation
-        level = _LEVEL_DECAY * self.level + self._experts[2] * innovation + trend
-        sane = level.abs() <= _FARTHEST * scale  # else it is of a time when y was another size
-        trend, level = trend.where(sane, 0.0), level.where(sane, 0.0)
-        z = _bounded((y - mean) / deviation)
-        rate = (1.0 / (self.count - _YOUNG + 2.0).clamp_min(1.0)).clamp_min(_RATE).unsqueeze(-1)
-        inflation = (self.inflation + rate * (z.square() - self.inflation)).clamp_min(1e-12)
-        news = {
-            "evidence": evidence, "innovation": innovation, "level": level, "trend": trend,
-            "inflation": inflation,
-        }  # fmt: skip
-        judged = self.count >= _YOUNG
-        if mask is not None:
-            judged = judged & mask
-        for name, value in news.items():
-            buffer = self.get_buffer(name)
-            on = judged[(..., *(None,) * (value.dim() - judged.dim()))]
-            buffer.copy_(torch.where(on, value, buffer))
-        nis = (z.square() / self.inflation).mean(-1)
-        self.tails.observe(z, (self.count - _YOUNG).clamp_min(0.0), judged)
-        self.count += 1.0 if mask is None else mask.to(self.count.dtype)
-        reports = [learner.update(x, y, mask) for learner in self.members]
-        part = (self._settle() @ self.owner).mean(-2)  # of each learner, over the outputs
+        moments = [learner.moments(x, observation=True) for learner in self.members]
+        nis = self._judge.judge(self, y, mask, moments)
+        if nis is None:
+            nis = self._judged(y, mask, moments)
+        reports = [learner.step(x, y, mask) for learner in self.members]
+        part = self.weights.mean(-2)  # of each learner, over the outputs
         novelty, weight = (
             (part * torch.stack(each, dim=-1).to(part)).sum(-1)
             for each in zip(*((one.novelty, one.weight) for one in reports), strict=True)
@@ -269,28 +235,78 @@ class MixtureResidual(ResidualLearner):
 
     # -- pieces ---------------------------------------------------------------------------------
 
+    def _judged(self, y: Tensor, mask: Tensor | None, moments: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+        """Evidence, what is carried over, variance and tails after one sample per model; returns the nis."""
+        mean, deviation, means = self._together(moments)
+        # what is carried over is cut by a scale in which outliers have little say; what experts are judged by
+        # heeds the few large samples of a stream that mostly rests, too
+        typical = self.tails.typical()
+        judged_by = typical * (RMS_LEAST * self.inflation.sqrt() / typical).clamp(1.0, RMS_MOST)
+        innovation = y.unsqueeze(-1) - self._means(means)
+        scale = (deviation * typical).unsqueeze(-1)
+        far = _bounded(innovation / scale)
+        r = (far * (typical / judged_by).unsqueeze(-1)).square()
+        evidence = MEMORY * self.evidence - 0.5 * (FREEDOM + 1.0) * torch.log1p(r / FREEDOM)
+        evidence = (evidence - evidence.amax(-1, keepdim=True)).clamp_min(LEAST)
+        innovation = scale * far / (1.0 + (far / self._experts[4]).square())
+        trend = TREND_DECAY * self.trend + self._experts[3] * innovation
+        level = LEVEL_DECAY * self.level + self._experts[2] * innovation + trend
+        sane = level.abs() <= FARTHEST * scale  # else it is of a time when y was another size
+        trend, level = trend.where(sane, 0.0), level.where(sane, 0.0)
+        z = _bounded((y - mean) / deviation)
+        rate = (1.0 / (self.count - YOUNG + 2.0).clamp_min(1.0)).clamp_min(RATE).unsqueeze(-1)
+        inflation = (self.inflation + rate * (z.square() - self.inflation)).clamp_min(1e-12)
+        news = {
+            "evidence": evidence, "innovation": innovation, "level": level, "trend": trend,
+            "inflation": inflation,
+        }  # fmt: skip
+        judged = self.count >= YOUNG
+        if mask is not None:
+            judged = judged & mask
+        for name, value in news.items():
+            buffer = self.get_buffer(name)
+            on = judged[(..., *(None,) * (value.dim() - judged.dim()))]
+            buffer.copy_(torch.where(on, value, buffer))
+        nis = (z.square() / self.inflation).mean(-1)
+        self.tails.observe(z, (self.count - YOUNG).clamp_min(0.0), judged)
+        self.count += 1.0 if mask is None else mask.to(self.count.dtype)
+        self._settle()
+        return nis
+
     def _means(self, means: Float[Tensor, "*any out learners"]) -> Float[Tensor, "*any out experts"]:
         return self.shares * (means @ self.owner.mT) + self.carried
 
-    def _settle(self) -> Float[Tensor, "*batch out experts"]:
-        """Gain and offset from the beliefs, and these."""
-        p = self.beliefs
-        self.gain.copy_((p * self.shares) @ self.owner)
-        self.offset.copy_((p * self.carried).sum(-1))
-        return p
+    def _settle(self) -> None:
+        """What queries need of the beliefs."""
+        p, carried = (t.unflatten(-1, (*self.mass.shape[-2:], -1)) for t in (self.beliefs, self.carried))
+        self.mass.copy_(p.sum(-1))
+        self.shift.copy_((p * carried).sum(-1) / self.mass.clamp_min(torch.finfo(p.dtype).tiny))
+        self.spread.copy_((p * (carried - self.shift.unsqueeze(-1)).square()).sum(-1))
+        self.gain.copy_(self.mass @ self._shares)
+        self.offset.copy_((self.mass * self.shift).sum((-2, -1)))
+
+    def _apart(self, means: Tensor, mean: Tensor) -> Float[Tensor, "*any out learners shares"]:
+        """How far the experts of each learner and share are from the mixture's mean, in their mean."""
+        return self._shares * means.unsqueeze(-1) + self.shift - mean[..., None, None]
+
+    def _spread(self, variances: Tensor, apart: Tensor) -> Float[Tensor, "*any out"]:
+        """Variance of g: within the experts, and between them."""
+        inside = self._shares.square() * variances.unsqueeze(-1)
+        return (self.mass * (inside + apart.square()) + self.spread).sum((-2, -1))
 
     def _standard(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean, the deviation by which innovations are standardised (the learners' own), their means."""
-        laws = [learner.predict(x, observation=True) for learner in self.members]
-        means = torch.stack([law.mean for law in laws], dim=-1).to(x.dtype)
-        variances = torch.stack([law.variance for law in laws], dim=-1).to(x.dtype)
+        return self._together([learner.moments(x, observation=True) for learner in self.members])
+
+    def _together(self, moments: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
+        means, variances = (torch.stack(part, dim=-1).to(self.dtype) for part in zip(*moments, strict=True))
         mean = (self.gain * means).sum(-1) + self.offset
         return mean, (self.weights * variances).sum(-1).sqrt(), means
 
 
 def _bounded(z: Tensor) -> Tensor:
     """Squares stay finite; what is farther off says nothing more."""
-    return z.nan_to_num(_FARTHEST).clamp(-_FARTHEST, _FARTHEST)
+    return z.nan_to_num(FARTHEST).clamp(-FARTHEST, FARTHEST)
 
 
 def _same_shapes(members: list[ResidualLearner]) -> ResidualLearner:

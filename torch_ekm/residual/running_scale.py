@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import nn
 
 from ..typing import Float, Tensor
+from .native import native_buffers
 
 BLOCK = 32  #: samples of a block; those before the first one is full count from the first on
 _TRIMMED = (8.0, 4.0)  # an eighth, or a fourth of a block
@@ -72,16 +75,17 @@ class RunningScale(nn.Module):
         """n samples of each model in the learner's units."""
         return (x - self.shift.unsqueeze(-2)) / self.scale.unsqueeze(-2)
 
-    def observe(
-        self, n: int, x: Float[Tensor, "*batch features"], on: Float[Tensor, "*batch"] | None
-    ) -> None:
-        """The sample after n others, for the models ``on``; a full block is pooled."""
-        place = n % BLOCK
-        self.block[..., place, :] = x
-        self.block_on[..., place, 0] = 1.0 if on is None else on
+    def observe(self, place: int, x: Any, on: Any) -> None:
+        """A sample ``(*batch, features)`` of the models ``on``, at its place in the block; the last pools.
+
+        Both as :func:`~torch_ekm.residual.native.native` gives them; ``on`` None: all.
+        """
+        kept = native_buffers(self)
+        kept["block"][..., place, :] = x
+        kept["block_on"][..., place, 0] = 1.0 if on is None else on
         if place == BLOCK - 1:
-            kept = self.weight, self.centre, self.spread, self.large
-            for buffer, found in zip(kept, self._pooled(), strict=True):
+            pooled = self.weight, self.centre, self.spread, self.large
+            for buffer, found in zip(pooled, self._pooled(), strict=True):
                 buffer.copy_(found)
 
     def settle(self, *, young: bool = False, settled: float = 0.1) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ from ..typing import Float, Tensor
 
 MEMORY = 0.99  #: forgetting factor of the evidence
 _RATES, _FREEDOMS = (0.02, 0.06, 0.2), (2.0, 4.0, 30.0)
-_LARGEST = 14.0  # of the logarithm of a scale: a noise-free stream must not end in 0/0
+LARGEST = 14.0  # of the logarithm of a scale: a noise-free stream must not end in 0/0
 
 
 class ScaleMixture(nn.Module):
@@ -70,7 +70,7 @@ class ScaleMixture(nn.Module):
         step = torch.maximum(self.rates, (0.5 / (1.0 + count / 4.0))[..., None, None]) * score
         evidence = MEMORY * self.evidence + density
         evidence = evidence - evidence.amax(-1, keepdim=True)
-        log_scale = (self.log_scale + step).clamp(-_LARGEST, _LARGEST)
+        log_scale = (self.log_scale + step).clamp(-LARGEST, LARGEST)
         if mask is not None:
             on = mask[..., None, None] > 0
             log_scale = torch.where(on, log_scale, self.log_scale)

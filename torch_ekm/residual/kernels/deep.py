@@ -95,7 +95,15 @@ class DeepKernel(Kernel):
         return kept[2]
 
     def forward(self, x: Tensor, z: Tensor) -> Tensor:
-        a, b = self.embed(x), self.embed(z)
+        a = self.embed(x)
+        return self._between(a, a if z is x else self.embed(z))
+
+    def with_queries(self, z: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        m, points = z.shape[-2], self.embed(torch.cat([z, x], dim=-2))
+        both = self._between(points[..., :m, :], points)
+        return both[..., :m], both[..., m:]
+
+    def _between(self, a: Tensor, b: Tensor) -> Tensor:
         centre = b[..., :1, :].detach()  # see StationaryKernel
         d2 = squared_distances(a - centre, b - centre)
         return self.base.log_variance.exp()[..., None, None] * self.base.phi(d2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 
 import torch
 from torch import nn
@@ -13,6 +12,7 @@ from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..adam import Adam
 from ..kernels.kernel import is_shared
+from ..native import native_buffers
 from .forgetting import ForgettingFactor, ProcessNoise
 from .monitor import DetectChanges, RobustWeight
 from .part import Host, Part, Sample
@@ -49,7 +49,8 @@ class LearnHyperparameters(Part):
 
     Args:
         rate: Adam's first step on the logarithms of the hyperparameters.
-        steps: gradient steps per rebuild.
+        steps: gradient steps per rebuild, spread over the samples up to it; the last one starts where the
+            others lead.
         memory: samples of the past to learn from, too (ReplayMemory); 0: the last k only. Not with
             :class:`ProcessNoise`: where g wanders the past is another g.
 
@@ -78,8 +79,12 @@ class LearnHyperparameters(Part):
         self.window_y = nn.Buffer(like.new_zeros(*fleet, self.window, posterior.out_features))
         self.window_on = nn.Buffer(like.new_zeros(*fleet, self.window))
         self.n_steps = nn.Buffer(like.new_zeros(fleet))
+        self.stride = max(self.window // self.steps, 1)
         self.loss = PrequentialLoss(posterior, factor, None if weight is None else weight.threshold)
-        self.adam = Adam([*learner.kernel.parameters(), learner.log_noise_variance], betas=(0.9, 0.99))
+        parameters = [*learner.kernel.parameters(), learner.log_noise_variance]
+        self.adam = Adam(parameters, betas=(0.9, 0.99))
+        for i, p in enumerate(parameters):
+            self.register_buffer(f"move_{i}", torch.zeros_like(p.detach()))
         horizon = math.inf if factor == 1.0 else 1.0 / (1.0 - factor)
         if learner.part(DetectChanges) is not None:  # so that the new system's samples are let in at once
             horizon = min(horizon, self.memory)
@@ -87,15 +92,21 @@ class LearnHyperparameters(Part):
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Keep the sample, in its own units; with a full window, descend."""
-        place, mask, weight = learner.n_samples % self.window, sample.mask, sample.report.weight
-        self.window_x[..., place, :] = sample.x
-        self.window_y[..., place, :] = sample.y
+        n, kept = learner.n_samples, native_buffers(self)
+        place, due = (n - learner.refresh_offset) % self.window, learner.is_due(n + 1)
+        x, y, mask, _, weight = sample.native()
         weight = weight if mask is None else weight * mask
-        self.window_on[..., place] = weight
+        kept["window_x"][..., place, :], kept["window_y"][..., place, :] = x, y
+        kept["window_on"][..., place] = weight
         if self.past is not None:
-            self.past.offer(sample.x, sample.y, weight)
-        if place == self.window - 1:
+            self.past.offer(x, y, weight)
+        if due or ((place + 1) % self.stride == 0 and place + self.stride < self.window):
+            if due and self.steps > 1:
+                self._move(learner)
+                self.loss.state.rebuild(learner.kernel, learner.shared_noise())
             self.descend(learner)
+        if due:
+            self._move(learner)
         return False
 
     def after_rebuild(self, learner: Host) -> None:
@@ -132,16 +143,16 @@ class LearnHyperparameters(Part):
             absorbed, age = torch.cat([absorbed, torch.ones_like(age_past)]), torch.cat([age, age_past])
         return Queries(*learner.units.of_sets(x, y), weight, absorbed, age)
 
-    def descend(self, learner: Host) -> None:
-        """Adam on the loss, model by model; a model without samples or finite gradient stays as it is."""
-        kernel, log_noise = learner.kernel, learner.log_noise_variance
-        parameters = {**dict(kernel.named_parameters()), "log_noise": log_noise}
-        for step in range(self.steps):
-            queries = self.queries(learner)
-            _, gradients = self.loss.with_gradients(kernel, log_noise, queries, moved=step > 0)
-            self._move(parameters, gradients)
+    def _theta(self, learner: Host) -> dict[str, Tensor]:
+        return {**dict(learner.kernel.named_parameters()), "log_noise": learner.log_noise_variance}
 
-    def _move(self, parameters: Mapping[str, Tensor], gradients: Sequence[Tensor | None]) -> None:
+    def descend(self, learner: Host) -> None:
+        """A step of Adam on the loss, model by model; one without samples or finite gradient stays as it is.
+
+        The parameters move at the next rebuild: until then the caches are those of the old ones.
+        """
+        kernel, log_noise, parameters = learner.kernel, learner.log_noise_variance, self._theta(learner)
+        _, gradients = self.loss.with_gradients(kernel, log_noise, self.queries(learner))
         on = (self.window_on.sum(-1) > 0).to(self.n_steps.dtype)
         self.n_steps += on
         n = self.n_steps.clamp_min(1.0)
@@ -154,10 +165,18 @@ class LearnHyperparameters(Part):
             shared = self.shared_kernel and name != "log_noise"
             good = gradient.isfinite() & (_spread(on, p, shared) > 0)
             rate = (self.rate if logarithm else _NETWORK_RATE) * _spread(correction, p, shared)
+            move = self.get_buffer(f"move_{i}")
             if not logarithm:
-                p.mul_(1.0 - _NETWORK_DECAY * _spread(noise * _shrink(n), p, shared))
-            self.adam.move(i, p, gradient.where(good, 0.0), rate, good)
-            if logarithm:  # far beyond what standardised data can mean
+                move.sub_(_NETWORK_DECAY * _spread(noise * _shrink(n), p, shared) * p)
+            self.adam.move(i, move, gradient.where(good, 0.0), rate, good)
+
+    def _move(self, learner: Host) -> None:
+        """The parameters as the steps since the last rebuild want them."""
+        for i, (name, p) in enumerate(self._theta(learner).items()):
+            move = self.get_buffer(f"move_{i}")
+            p.add_(move)
+            move.zero_()
+            if name.split(".")[-1].startswith("log_"):  # far beyond what standardised data can mean
                 p.clamp_(-14.0 if name == "log_noise" else -7.0, 7.0)
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import nn
 
 from ..._checks import check_positive
 from ...typing import Float, Tensor
+from ..native import native_buffers
 from .part import Host, Part, Sample
 
 _CALIBRATION_RATE = 0.2  # of the logarithm of a factor on the noise
@@ -95,7 +98,7 @@ class DetectChanges(Part):
     """
 
     def bind(self, learner: Host) -> None:
-        """Room for the last samples, newest last; shifted rather than indexed: masks need no pointers."""
+        """Room for the last samples, one place for all models of a fleet."""
         zeros, fleet = learner.posterior.basis.new_zeros, learner.posterior.batch_shape
         self.level = nn.Buffer(zeros(fleet))
         self.inputs = nn.Buffer(zeros(_MEMORY, *fleet, learner.in_features))
@@ -104,15 +107,16 @@ class DetectChanges(Part):
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Take a sample in; models that face another system start again."""
-        nis, mask = sample.report.nis, sample.mask
-        step = RATE * ((nis > _LARGE).to(nis.dtype) - self.level)
-        self.level += step if mask is None else step * mask
-        level = self.level if mask is None else self.level.where(mask > 0, torch.inf)  # inf: no sample
-        for kept, new in ((self.inputs, sample.x), (self.targets, sample.y), (self.levels, level)):
-            kept.copy_(torch.cat([kept[1:], new.unsqueeze(0)]))
-        changed = self.level > _ALARM
-        self.level.masked_fill_(changed, _COOL)
-        if bool(changed.any()):
-            later = (self.levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0) > 0
-            learner.start_anew(changed, self.inputs, self.targets, later & self.levels.isfinite())
+        place, kept, (x, y, mask, nis, _) = learner.n_samples % _MEMORY, native_buffers(self), sample.native()
+        level = kept["level"]
+        level += RATE * (1.0 if mask is None else mask) * ((nis > _LARGE) * 1.0 - level)
+        kept["inputs"][place], kept["targets"][place], kept["levels"][place] = x, y, level
+        if mask is not None:  # inf: no sample
+            kept["levels"][place, ...][mask == 0] = math.inf
+        if (level > _ALARM).any():
+            changed = self.level > _ALARM
+            self.level.masked_fill_(changed, _COOL)
+            x, y, levels = (t.roll(-1 - place, 0) for t in (self.inputs, self.targets, self.levels))
+            later = (levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0) > 0
+            learner.start_anew(changed, x, y, later & levels.isfinite())
         return False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from abc import abstractmethod
 from collections.abc import Iterable
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -14,6 +15,7 @@ from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..base import DoubleStateLearner
 from ..kernels.kernel import Kernel
+from ..native import native
 from ..report import UpdateReport
 from .posterior import SparsePosterior
 
@@ -70,6 +72,10 @@ class Sample(NamedTuple):
     variance: Float[Tensor, "*batch"]
     report: UpdateReport
 
+    def native(self) -> tuple[Any, Any, Any, Any, Any]:
+        """x, y, mask, nis and weight as :func:`~torch_ekm.residual.native.native` gives them."""
+        return tuple(map(native, (self.x, self.y, self.mask, self.report.nis, self.report.weight)))
+
 
 class Host(DoubleStateLearner):
     """What a part finds in its learner: the state, and how it is forgotten and learned again."""
@@ -80,12 +86,21 @@ class Host(DoubleStateLearner):
     units: Units
     engine: Any
     refresh_every: int
+    refresh_offset: int
     n_samples: int
     """Samples before the present one."""
     pending: Tensor
     """Samples of each model since the caches were made, ``(*batch_shape)``."""
     weighing: tuple[Part, ...]
     """Parts that weigh samples."""
+    calibrating: bool
+    """Whether a part changes the observation noise at any sample."""
+
+    @property
+    @abstractmethod
+    def noise_variance(self) -> Float[Tensor, "*batch out"]:
+        """Observation noise variance, in the outputs' own squared units."""
+
     _parts: tuple[Part, ...]
 
     def part(self, kind: type[P]) -> P | None:
@@ -94,6 +109,10 @@ class Host(DoubleStateLearner):
         In :meth:`Part.bind` it is looked for among those before.
         """
         return next((part for part in self._parts if isinstance(part, kind)), None)
+
+    def is_due(self, n: int) -> bool:
+        """Whether parts may change the state, and the caches are rebuilt, after n samples."""
+        return n >= self.refresh_every and (n - self.refresh_offset) % self.refresh_every == 0
 
     def shared_noise(self) -> Float[Tensor, "*batch"]:
         """Noise by which the gain is computed: geometric mean over the (standardised) outputs."""

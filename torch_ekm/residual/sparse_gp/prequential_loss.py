@@ -77,21 +77,16 @@ class PrequentialLoss(nn.Module):
             old.copy_(new)
 
     def with_gradients(
-        self, kernel: Kernel, log_noise: Tensor, queries: Queries, *, moved: bool = True
+        self, kernel: Kernel, log_noise: Tensor, queries: Queries
     ) -> tuple[Tensor, list[Tensor | None]]:
         """Loss of each model ``(*batch_shape)`` [nats per sample and output], derivatives of their sum.
 
-        The derivatives are those by ``[*kernel.parameters(), log_noise]``.
-
-        Args:
-            moved: whether kernel or noise changed since the old state's caches were made: they are
-                made again then.
+        The derivatives are those by ``[*kernel.parameters(), log_noise]``, at the values by which the old
+        state's caches were made.
         """
         with _differentiable(kernel):
             K, k, prior = outcome = self._covariances(kernel, queries.x)
             K_, k_ = K.detach(), k.detach()
-            if moved:
-                self.state.rebuild_from(K_, log_noise.mean(-1).exp())
             C, Q, alpha = self.state.covariance, self.state.moments[..., 1, :, :], self.state.alpha
             E, F = C @ k_, Q @ k_
             kE, u, mean = (k_ * E).sum(-2), (k_ * F).sum(-2), k_.mT @ alpha
@@ -109,32 +104,42 @@ class PrequentialLoss(nn.Module):
 
     def _covariances(self, kernel: Kernel, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """K at the old basis, k and k** of the queries, from one evaluation of the kernel."""
-        basis, M = self.state.basis, self.state.basis.shape[-2]
-        both = kernel(basis, torch.cat([basis, x], dim=-2))
-        k = both[..., M:] * self.state.active.unsqueeze(-1)
-        return self.state.as_gram(both[..., :M], kernel), k, kernel.diagonal_of_set(x)
+        basis = self.state.basis
+        K, k = kernel.with_queries(basis, x)
+        return self.state.as_gram(K, kernel), k * self.state.active.unsqueeze(-1), kernel.diagonal_of_set(x)
 
     def _density(
         self, mean: Tensor, v: Tensor, p: Tensor, u: Tensor, log_noise: Tensor, queries: Queries
     ) -> tuple[Tensor, _Slopes]:
-        """The loss from the state's predictions, and its derivatives by them."""
-        leaves = [value.detach().requires_grad_(True) for value in (mean, v, p, u, log_noise)]
-        mean, v, p, u, log_noise = leaves
-        c = self._left_out(p, u, log_noise.mean(-1, keepdim=True).exp(), queries)
-        variance = (v + p * (c - 1.0)).clamp_min(0.0).unsqueeze(-1) + log_noise.exp().unsqueeze(-2)
-        z2 = ((queries.y - mean) * c.unsqueeze(-1)).square() / variance
-        robust = self.robust
+        """The loss from the state's predictions, and its derivatives by them, each by the chain rule."""
+        s2, noise = log_noise.mean(-1, keepdim=True).exp(), log_noise.exp().unsqueeze(-2)
+        on, tiny, m = queries.weight, torch.finfo(p.dtype).tiny, mean.shape[-1]
+        # c: what residual and p of each query grow by once it is left out of the state
+        held = queries.absorbed * on * self.forgetting_factor**queries.age / s2
+        exact = 1.0 / (1.0 - held * p).clamp_min(torch.finfo(p.dtype).eps)
+        least = p.clamp_min(tiny)
+        most = (u / least).clamp_min(1.0)
+        c, bounded = torch.minimum(exact, most), exact > most
+        left = v + p * (c - 1.0)
+        variance = left.clamp_min(0.0).unsqueeze(-1) + noise
+        residual, factor, robust = queries.y - mean, c.unsqueeze(-1), self.robust
+        z2 = (residual * factor).square() / variance
         misfit = z2 if robust is None else (robust**2 + 1.0) * torch.log1p(z2 / robust**2)
-        density = 0.5 * (misfit + variance.log() + math.log(2 * math.pi)).mean(-1)
-        on = queries.weight
-        loss = (density * on).sum(-1) / on.sum(-1).clamp_min(torch.finfo(on.dtype).tiny)
-        return loss.detach(), _Slopes(*torch.autograd.grad(loss.sum(), leaves, materialize_grads=True))
+        share = on / on.sum(-1, keepdim=True).clamp_min(tiny)
+        loss = (0.5 * (misfit + variance.log() + math.log(2 * math.pi)).mean(-1) * share).sum(-1)
 
-    def _left_out(self, p: Tensor, u: Tensor, s2: Tensor, queries: Queries) -> Tensor:
-        """c: what residual and p of each query grow by once it is left out of the state."""
-        most = (u / p.clamp_min(torch.finfo(p.dtype).tiny)).clamp_min(1.0)
-        weight = queries.absorbed * queries.weight * self.forgetting_factor**queries.age
-        return torch.minimum(1.0 / (1.0 - weight * p / s2).clamp_min(torch.finfo(p.dtype).eps), most)
+        each = (0.5 / m) * share.unsqueeze(-1)
+        by_z2 = each if robust is None else each * (robust**2 + 1.0) / (robust**2 + z2)
+        pull = 2.0 * by_z2 * residual * factor / variance
+        by_variance = (each - by_z2 * z2) / variance
+        by_left = by_variance.sum(-1) * (left >= 0)
+        by_c = (pull * residual).sum(-1) + by_left * p
+        by_exact = torch.where(bounded, 0.0, by_c) * exact.square() * held
+        by_most = by_c * (bounded & (u >= least)) / least
+        by_s2 = -(by_exact * p).sum(-1, keepdim=True)  # times s2
+        by_log_noise = (by_variance * noise).sum(-2) + by_s2 / m
+        by_p = by_left * (c - 1.0) + by_exact - by_most * most
+        return loss, _Slopes(-pull * factor, by_left, by_p, by_most, by_log_noise)
 
 
 @contextmanager

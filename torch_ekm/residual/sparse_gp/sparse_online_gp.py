@@ -61,6 +61,7 @@ class SparseOnlineGP(Host):
         refresh_every: samples after which parts may change the state, and the caches are rebuilt. Without a
             part that does, and on the CPU, one looks whether they have drifted (four times as often where
             they do); they are rebuilt when they have, and at the latest after eight times as many.
+        refresh_offset: samples by which this comes later, for learners that are not to do it at the same one.
         options: see ResidualLearner.
 
     Attributes:
@@ -87,11 +88,13 @@ class SparseOnlineGP(Host):
         parts: Iterable[nn.Module] | None = None,
         standardize: bool | Standardize = True,
         refresh_every: int = 32,
+        refresh_offset: int = 0,
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
         self.capacity = check_count("capacity", capacity)
         self.refresh_every = check_count("refresh_every", refresh_every)
+        self.refresh_offset = check_count("refresh_offset", refresh_offset, least=0) % self.refresh_every
         shape, double = self.batch_shape, {"dtype": torch.float64, "device": self.device}
         if kernel is None:
             kernel = Matern32(self.in_features, batch_shape=shape, **double)
@@ -114,6 +117,7 @@ class SparseOnlineGP(Host):
         units = next((part for part in self._parts if isinstance(part, Units)), Units())
         # not as a second child: its buffers would be in the state dict twice
         object.__setattr__(self, "units", units)
+        self.calibrating = bool(_overriding(self._parts, "noise"))
         self.weighing = _overriding(self._parts, "weigh")
         self._noting = _overriding(self._parts, "after_update")
         self._rebuilding = _overriding(self._parts, "on_rebuild", "after_rebuild")
@@ -127,10 +131,12 @@ class SparseOnlineGP(Host):
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """N(mean, var), with the observation noise added on request."""
-        mean, variance = self.engine.moments(self, x)
-        if observation:
-            variance = variance + self.noise_variance.to(self.dtype)
+        mean, variance = self.moments(x, observation=observation)
         return Normal(mean, variance.sqrt(), validate_args=False)
+
+    def moments(self, x: Tensor, *, observation: bool = False) -> tuple[Tensor, Tensor]:
+        """Mean and variance, with the observation noise on request."""
+        return self.engine.observed(self, x) if observation else self.engine.moments(self, x)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and its derivative, ``(alpha'k, alpha' dk/dx)``, in closed form."""
@@ -188,7 +194,7 @@ class SparseOnlineGP(Host):
         done = self.engine.absorb(self, x, y, on)
         n = self.n_samples + 1
         if self._rebuilding or self.device.type != "cpu":  # on a GPU looking would mean waiting
-            anew = n % self.refresh_every == 0
+            anew = self.is_due(n)
         else:
             every = max(self.refresh_every // 4, 1) if self.drifts else self.refresh_every
             anew = n % every == 0 and self._is_stale(n)

@@ -6,6 +6,7 @@ import torch
 
 from ...exceptions import ParameterError
 from ...typing import Tensor
+from ..native import native
 from ..running_scale import ALIEN, BLOCK, RunningScale
 from .part import Host, Part, Units
 
@@ -81,14 +82,19 @@ class Standardize(Part, Units):
     def before_update(self, learner: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
         """Take the sample in; while units are rough, adopt them before it is learned."""
         n = learner.n_samples
-        self.input.observe(n, x, mask)
-        self.output.observe(n, y, mask)
+        x_n, y_n, on = native(x), native(y), native(mask)
+        place = n if n < BLOCK else (n - learner.refresh_offset) % BLOCK  # full just before a rebuild
+        if n == BLOCK and place > 0:  # what is behind was pooled already
+            self.input.block_on.zero_()
+            self.output.block_on.zero_()
+        self.input.observe(place, x_n, on)
+        self.output.observe(place, y_n, on)
         if n & (n + 1) == 0 and n < _DOUBLING:
             if n + 1 < BLOCK:
                 self._adopt(learner, young=True)
                 x, y, on = self.input.block, self.output.block, self.input.block_on
                 learner.learn_anew(x[..., :n, :], y[..., :n, :], on[..., :n, 0])
-            elif (n + 1) % learner.refresh_every:  # else it comes of itself
+            elif not learner.is_due(n + 1):  # else it comes of itself
                 learner.refresh()
 
     def on_rebuild(self, learner: Host) -> None:

@@ -3,44 +3,28 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
-from functools import cache
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 from torch.autograd.forward_ad import unpack_dual
 from torch.autograd.graph import increment_version
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from ....typing import Array, Tensor
 from ...kernels.action_linear import ActionLinearKernel
+from ...kernels.deep import DeepKernel
 from ...kernels.kernel import Kernel
 from ...kernels.stationary import Matern32, Matern52, SquaredExponential
 from ...report import MomentsWithJacobians, UpdateReport
 from ..monitor import RobustWeight
 from ..part import Host
+from .embedding import Embedding
+from .loading import load_loops
 from .recursion import Absorbed
 from .reference import ReferenceEngine
-
-_SLOW = "compiled loops are off, and sparse GPs take longer: {}; numba's folder is named by NUMBA_CACHE_DIR"
-
-
-@cache
-def load_kernels() -> ModuleType | None:
-    """The compiled loops; None where numba is missing, does not fit numpy, or cannot write its cache."""
-    try:
-        from . import numba_kernels
-    except ImportError as error:
-        if error.name not in ("numba", "llvmlite"):  # it is there, and does not fit
-            warnings.warn(_SLOW.format(error), stacklevel=2)
-        return None
-    except RuntimeError as error:
-        warnings.warn(_SLOW.format(error), stacklevel=2)
-        return None
-    return numba_kernels
 
 
 class CompiledEngine(ReferenceEngine):
@@ -55,7 +39,12 @@ class CompiledEngine(ReferenceEngine):
     def __init__(self) -> None:
         self._kernel: Kernel | None = None
         self._sources: list[tuple[dict, str, Tensor, int]] = []
+        self._network: Embedding | None = None
         self._usable = False
+        self._marks: list[int] = []  # versions of all tensors: torch changed something where they differ
+        self._n_absorbed = 0  # and the loops where this does
+        self._asked: tuple[Any, ...] | None = None
+        self._noise_then: tuple[Any, ...] | None = None
 
     def __deepcopy__(self, memo: dict) -> CompiledEngine:
         return CompiledEngine()
@@ -71,6 +60,15 @@ class CompiledEngine(ReferenceEngine):
     def moments(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
         found = self._ask(gp, x, variance=True)
         return super().moments(gp, x) if found is None else found[:2]
+
+    def observed(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
+        found = self._ask(gp, x, variance=True)
+        if found is None:
+            return super().observed(gp, x)
+        kept = self._noise_then
+        if kept is None or kept[0] != self._marks or gp.calibrating:
+            self._noise_then = kept = self._marks, gp.noise_variance
+        return found[0], found[1] + kept[1]
 
     def linearize(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
         found = self._ask(gp, x, slopes=True)
@@ -101,11 +99,16 @@ class CompiledEngine(ReferenceEngine):
         if on is not None:
             mask = (on > 0).reshape(-1).numpy()
             figures[2] = 1.0
+        inputs = x.numpy().reshape(-1)
+        if self._network is not None:
+            inputs = self._network.of(x, self._units_x, slopes=False)
+            self._network.keep(mask)
         self._absorb(
-            flags, mask, x.numpy().reshape(-1), y.numpy().reshape(-1), k, prior, *self._state, *self._hyper,
+            flags, mask, inputs, y.numpy().reshape(-1), k, prior, *self._state, *self._hyper,
             self._noise, *self._units, self._robust, self._levels,
             posterior.novelty_threshold, posterior.jitter, event, figures, errors,
         )  # fmt: skip
+        self._n_absorbed += 1
         if self._given:  # a kernel may remember what it made of the basis
             increment_version(posterior.basis)
         batch = self._batch
@@ -116,21 +119,37 @@ class CompiledEngine(ReferenceEngine):
     def _ask(
         self, gp: Host, x: Tensor, *, variance: bool = False, slopes: bool = False
     ) -> MomentsWithJacobians | None:
-        """One query per model, what is not wanted being empty; None if torch must do it."""
+        """One query per model, what is not wanted being empty; None if torch must do it.
+
+        The last answer is kept: an update asks again what was asked for a prediction.
+        """
         if not self._takes(gp, x) or self._given:
             return None
-        n, nd = self._n_models * self._m, self._n_models * self._m * self._d
+        given = x.numpy().reshape(-1)
+        state = given.tobytes(), self._n_absorbed, self._marks
+        wanted = (True, variance, slopes, variance and slopes)
+        kept = self._asked
+        if kept is None or kept[0] != state or any(w and not k for w, k in zip(wanted, kept[1], strict=True)):
+            self._asked = kept = state, wanted, self._answer(x, given, variance, slopes)
+        return MomentsWithJacobians(*(torch.from_numpy(a.copy()) for a in kept[2]))
+
+    def _answer(self, x: Tensor, inputs: Array, variance: bool, slopes: bool) -> list[Array]:
+        n, nd = self._n_models * self._m, self._n_models * self._m * self._width
         mean, v = np.empty(n), np.empty(n if variance else 0)
         J, dv = np.empty(nd if slopes else 0), np.empty(nd if slopes and variance else 0)
         basis, active, _, _, moments, vectors = self._state
+        network = self._network
+        if network is not None:
+            inputs = network.of(x, self._units_x, slopes)
         self._query(
-            self._flags, x.numpy().reshape(-1), basis, active, moments, vectors, *self._hyper, *self._units,
+            self._flags, inputs, basis, active, moments, vectors, *self._hyper, *self._units,
             variance, slopes, mean, v, J, dv,
         )  # fmt: skip
+        if network is not None and slopes:
+            J, dv = network.by_x(J, self._n_models), network.by_x(dv, self._n_models) if variance else dv
         one, two = (*self._batch, self._m), (*self._batch, self._m, self._d)
         shapes = one, one if variance else (0,), two if slopes else (0,), two if slopes and variance else (0,)
-        results = (torch.from_numpy(a.reshape(s)) for a, s in zip((mean, v, J, dv), shapes, strict=True))
-        return MomentsWithJacobians(*results)
+        return [a.reshape(s) for a, s in zip((mean, v, J, dv), shapes, strict=True)]
 
     # -- what they work on ----------------------------------------------------------------------
 
@@ -138,10 +157,17 @@ class CompiledEngine(ReferenceEngine):
         """Whether this call is one for compiled loops; prepares the arrays."""
         if torch.compiler.is_compiling() or not _is_plain(x, (*gp.batch_shape, gp.in_features)):
             return False
+        if load_loops() is None:
+            return False
         if gp.kernel is not self._kernel or not self._is_current():
             self._bind(gp)
         if not self._usable:
             return False
+        marks = [source[2]._version for source in self._sources]
+        if marks != self._marks:
+            if self._network is not None:
+                self._network.follow()
+            self._marks = marks
         return not (torch.is_grad_enabled() and any(p.requires_grad for p in self._parameters))
 
     def _is_current(self) -> bool:
@@ -153,6 +179,7 @@ class CompiledEngine(ReferenceEngine):
 
     def _bind(self, gp: Host) -> None:
         self._kernel, self._posterior, self._usable = gp.kernel, gp.posterior, False
+        self._network = None
         self._batch, self._d, self._m = tuple(gp.batch_shape), gp.in_features, gp.out_features
         self._n_models = n = gp.batch_shape.numel()
         posterior = gp.posterior
@@ -165,32 +192,43 @@ class CompiledEngine(ReferenceEngine):
         robust = [part for part in gp.weighing if type(part) is RobustWeight]
         levels = [part.level for part in robust]
         tensors = (*state, gp.log_noise_variance, *self._parameters, *(units or ()), *levels)
-        self._sources = _sources(gp, tensors)
+        self._sources = sources_of(gp, tensors)
         on_host = all(t.is_cpu and t.is_contiguous() for t in tensors) and gp.dtype == torch.float64
-        kernels = load_kernels() if on_host else None
-        if kernels is None or len(robust) < len(gp.weighing):
+        plain = not any(t.is_inference() for t in tensors)  # these have no version
+        if not on_host or len(robust) < len(gp.weighing) or not plain:
             return
+        self._marks, self._asked, self._noise_then, loops = [], None, None, load_loops()
+        assert loops is not None  # else this is not called
         self._given = own is None or units is None
-        kind, n_actions = (kernels.GIVEN, 0) if self._given or own is None else own[0]
+        kind, n_actions = (_GIVEN, 0) if self._given or own is None else own[0]
         self._flags = np.array([kind, n_actions])
         self._robust = np.array([part.threshold**2 for part in robust])
         self._levels = levels[0].numpy().reshape(n) if levels else np.empty(0)
         self._none1, self._none2, self._all = np.empty(0), np.empty((0, 0)), np.ones(n, np.bool_)
         self._state = tuple(t.numpy().reshape(n, *t.shape[len(self._batch) :]) for t in state)
+        self._width = self._d
         self._noise = gp.log_noise_variance.detach().numpy().reshape(n, -1)
         self._hyper: tuple[Array, ...] = np.zeros((1, 0)), np.zeros(1), np.zeros((1, 0))
         self._units: tuple[Array, ...] = (
             np.zeros((1, self._d)), np.ones((1, self._d)), np.zeros((1, self._m)), np.ones((1, self._m))
         )  # fmt: skip
         if not self._given and own is not None:
-            lengthscale, variance, *action = (p.detach().numpy() for p in self._parameters)
+            lengthscale, variance, *others = (p.detach().numpy() for p in self._parameters)
             rows = variance.reshape(-1)
-            action = action[0] if action else np.zeros((len(rows), 0))
+            action = others[0] if n_actions else np.zeros((len(rows), 0))
             self._hyper = lengthscale.reshape(len(rows), -1), rows, action.reshape(len(rows), -1)
             if units:
                 self._units = tuple(t.numpy().reshape(n, -1) for t in units)
-        self._absorb: Callable = kernels.absorb_fleet
-        self._query: Callable = kernels.query_fleet
+            if isinstance(gp.kernel, DeepKernel):
+                self._network = Embedding(loops, gp.kernel, posterior)
+                self._width = width = self._network.width
+                self._units_x = self._units[:2]
+                plain = np.zeros((len(self._units[2]), width))
+                self._units = plain, plain + 1.0, *self._units[2:]
+                self._hyper = np.zeros((len(rows), width)), rows, action.reshape(len(rows), 0)
+                self._state = self._network.basis, *self._state[1:]
+        self._absorb: Callable = loops.absorb_fleet
+        self._query: Callable = loops.query_fleet
         self._usable = True
 
 
@@ -220,12 +258,14 @@ def _has_memory(x: Tensor) -> bool:
     return True
 
 
-_KINDS = {SquaredExponential: 0, Matern32: 1, Matern52: 2}
+# as numba_kernels has them
+_KINDS, _GIVEN = {SquaredExponential: 0, Matern32: 1, Matern52: 2}, 3
 
 
 def _known(kernel: Kernel, batch: tuple[int, ...]) -> tuple[tuple[int, int], list[Tensor]] | None:
     """(kind, width of the action) and the parameters of a kernel that the loops know themselves."""
-    state = kernel.state_kernel if type(kernel) is ActionLinearKernel else kernel
+    inner = {ActionLinearKernel: "state_kernel", DeepKernel: "base"}.get(type(kernel))
+    state = kernel if inner is None else getattr(kernel, inner)
     kind = _KINDS.get(type(state))  # a subclass may compute something else
     if kind is None:
         return None
@@ -234,13 +274,16 @@ def _known(kernel: Kernel, batch: tuple[int, ...]) -> tuple[tuple[int, int], lis
     if isinstance(kernel, ActionLinearKernel):
         parameters.append(kernel.log_action_variance)
         n_actions = kernel.action_features
-    variance = parameters[1]
     shapes = [tuple(p.shape[:-1]) for p in (parameters[0], *parameters[2:])]
+    if isinstance(kernel, DeepKernel):
+        parameters += [*kernel.weights, *kernel.biases]
+        shapes += [tuple(w.shape[:-2]) for w in kernel.weights] + [tuple(b.shape[:-1]) for b in kernel.biases]
+    variance = parameters[1]
     alike = all(shape == tuple(variance.shape) for shape in shapes) and variance.shape in ((), batch)
     return ((kind, n_actions), parameters) if alike else None
 
 
-def _sources(gp: Host, tensors: tuple[Tensor, ...]) -> list[tuple[dict, str, Tensor, int]]:
+def sources_of(gp: nn.Module, tensors: tuple[Tensor, ...]) -> list[tuple[dict, str, Tensor, int]]:
     """Where in the learner each of these tensors is kept, and its place in memory."""
     wanted = {id(tensor) for tensor in tensors}
     found = []

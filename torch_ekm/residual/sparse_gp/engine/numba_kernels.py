@@ -7,7 +7,8 @@ models share (a kernel, plain units) has length 1 there. No call holds the GIL, 
 and other libraries may not share one OpenMP runtime.
 
 Loops over the last axis touch two or three arrays each: with more the compiler gives up proving that they
-do not overlap, and does not vectorise.
+do not overlap, and does not vectorise. Entries are assigned one by one: an assignment of an array to a slice
+can fail, and numba compiles the message with it, for seconds.
 """
 
 from __future__ import annotations
@@ -28,15 +29,17 @@ KIND, ACTIONS = 0, 1
 _EPS, _TINY = np.finfo(np.float64).eps, np.finfo(np.float64).tiny
 # NaN and infinity keep their meaning: samples are tested for them in here.
 _COMMON = {
-    "cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp", "nsz"}
+    "cache": True, "nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy",
+    "fastmath": {"reassoc", "contract", "arcp", "nsz"},
 }  # fmt: skip
+_INNER = {**_COMMON, "no_cpython_wrapper": True}  # called from loops alone
 _A1, _A2, _A3, _A4 = (types.Array(types.float64, n, "C") for n in (1, 2, 3, 4))
 _I1, _F = types.Array(types.int64, 1, "C"), types.float64
 _HYPER = (_A2, _A1, _A2)  # log lengthscales, log variance, log action variances
 _UNITS = (_A2, _A2, _A2, _A2)  # shift and scale of inputs and of outputs
 
 
-@njit(types.Tuple((_F, _F))(types.int64, _F), **_COMMON)
+@njit(types.Tuple((_F, _F))(types.int64, _F), **_INNER)
 def _phi_psi(kind, d2):
     """Correlation and ``-2 dphi/d(d2)`` at a squared scaled distance, see StationaryKernel."""
     if kind == SQUARED_EXPONENTIAL:
@@ -51,7 +54,7 @@ def _phi_psi(kind, d2):
     return (1.0 + r + r * r / 3.0) * decay, (5.0 / 3.0) * (1.0 + r) * decay
 
 
-@njit(_F(_I1, _A1, _A2, _A1, _A1, _F, _A1, _A1, _A2, types.boolean), **_COMMON)
+@njit(_F(_I1, _A1, _A2, _A1, _A1, _F, _A1, _A1, _A2, types.boolean), **_INNER)
 def _kernel(flags, z, basis, active, log_lengthscale, log_variance, log_action, k, dk, slopes):
     """k (and with ``slopes`` dk) between z and the basis; returns k(z, z)."""
     kind, n_a = flags[KIND], flags[ACTIONS]
@@ -88,7 +91,7 @@ def _kernel(flags, z, basis, active, log_lengthscale, log_variance, log_action, 
     return variance * norm
 
 
-@njit(types.void(_A2, _A1, _A1), **_COMMON)
+@njit(types.void(_A2, _A1, _A1), **_INNER)
 def _times(matrix, vector, out):
     """``out = matrix vector``, for a matrix that is symmetric: its rows lie together."""
     n = vector.shape[0]
@@ -99,13 +102,13 @@ def _times(matrix, vector, out):
         out[i] = total
 
 
-@njit(_F(_F, _F), **_COMMON)
+@njit(_F(_F, _F), **_INNER)
 def _remaining(c, q):
     """``c + q``, which rounding must not turn negative."""
     return max(c + q, 100.0 * _EPS * q)
 
 
-@njit(types.int64(_F, _A1, _A1, _A1, _A3, _A3), **_COMMON)
+@njit(types.int64(_F, _A1, _A1, _A1, _A3, _A3), **_INNER)
 def _least_loss(s2, active, c_diag, q_diag, moments, vectors):
     """The point that loses least when it is pruned, see ``pruning_loss``."""
     best, m, losses = np.inf, vectors.shape[2], np.empty(active.shape[0])
@@ -128,7 +131,7 @@ def _least_loss(s2, active, c_diag, q_diag, moments, vectors):
     return 0
 
 
-@njit(types.void(_A3, _A3, _A1, _A1, _A1, _A1, _F, _F, types.int64, _F), **_COMMON)
+@njit(types.void(_A3, _A3, _A1, _A1, _A1, _A1, _F, _F, types.int64, _F), **_INNER)
 def _add_and_prune(moments, vectors, s, p, work_c, work_q, gain, grow, i, w):
     """Add the new point to C and Q and prune point i of all three, in one pass.
 
@@ -172,7 +175,7 @@ def _add_and_prune(moments, vectors, s, p, work_c, work_q, gain, grow, i, w):
 
 @njit(
     types.int64(_I1, _A1, _A1, _F, _F, _A1, _A2, _A1, _I1, _I1, _A3, _A3, _A1, _A1, _F, _F, _A1, _A1),
-    **_COMMON,
+    **_INNER,
 )
 def _absorb(
     flags, z, t, prior, s2, k, basis, active, count, slot_, moments, vectors, robust, level, threshold,
@@ -190,7 +193,8 @@ def _absorb(
     for i in range(M):
         kCk, ke = kCk + Ck[i] * k[i], ke + e[i] * k[i]
     gamma, v = max(prior - ke, 0.0), prior + kCk
-    error[:] = t
+    for o in range(m):
+        error[o] = t[o]
     for i in range(M):
         for o in range(m):
             error[o] -= k[i] * vectors[0, i, o]
@@ -210,7 +214,8 @@ def _absorb(
     novel = gamma > threshold * prior
     dropped = 0.0 if novel else gamma
     gain, precision = 1.0 / (noise + v - dropped), s2 / noise
-    basis[slot] = z
+    for j in range(z.shape[0]):
+        basis[slot, j] = z[j]
     figures[0], figures[1], figures[2], figures[3] = gamma / max(prior, _TINY), nis, weight, v
 
     s = Ck
@@ -265,7 +270,7 @@ def _absorb(
     return 3
 
 
-@njit(types.void(_A2, _A2, _A2), **_COMMON)
+@njit(types.void(_A2, _A2, _A2), **_INNER)
 def _slopes(alpha, dk, out):
     """``out = alpha' dk``."""
     out[:] = 0.0
@@ -328,7 +333,8 @@ def absorb_fleet(
             flags, z, t, prior, s2, k, basis[b], active[b], count[b : b + 1], slot[b : b + 1], moments[b],
             vectors[b], robust, levels[b : b + 1], threshold, jitter, found, errors[b * m : (b + 1) * m],
         )  # fmt: skip
-        figures[:, b] = found
+        for r in range(4):
+            figures[r, b] = found[r]
 
 
 @njit(

@@ -28,6 +28,11 @@ class ReferenceEngine:
         v = gp.kernel.diagonal(z) + (column.mT @ (gp.posterior.covariance @ column)).squeeze(-1).squeeze(-1)
         return _mean(gp, k), _out(gp, v.clamp_min(0.0).unsqueeze(-1), 2)
 
+    def observed(self, gp: Host, x: Float[Tensor, "*any in"]) -> tuple[Tensor, Tensor]:
+        """Mean and variance of y, noise included."""
+        mean, variance = self.moments(gp, x)
+        return mean, variance + gp.noise_variance.to(gp.dtype)
+
     def linearize(self, gp: Host, x: Float[Tensor, "*any in"]) -> tuple[Tensor, Tensor]:
         """Mean and its derivative, ``(alpha'k, alpha' dk/dx)``, in closed form."""
         # free slots need no mask here: their rows in alpha and C are 0

@@ -1,0 +1,86 @@
+"""The compiled loops: loaded from numba's cache, or compiled by another process while torch does the work."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from types import ModuleType
+
+from ....exceptions import SpeedWarning
+
+_OFF = "compiled loops are off, and learners take longer: {}; numba's folder is named by NUMBA_CACHE_DIR"
+_FIRST_TIME = (
+    "another process compiles loops, once and for some ten seconds; until then torch does the work, and "
+    "results may differ by rounding. torch_ekm.warm_up() waits for them"
+)
+
+
+class Loader:
+    """Finds the loops once in a process."""
+
+    def __init__(self) -> None:
+        self._loops: ModuleType | None = None
+        self._is_done = False
+        self._compiler: subprocess.Popen | None = None
+
+    def load(self, *, wait: bool = False) -> ModuleType | None:
+        """The loops; None where numba is missing, does not fit numpy, or cannot write its cache, and as long
+        as another process compiles them."""
+        if not self._is_done and (wait or not self._is_compiled_elsewhere()):
+            if self._compiler is not None:
+                self._compiler.wait()
+            self._loops, self._is_done = _imported(), True
+        return self._loops
+
+    def _is_compiled_elsewhere(self) -> bool:
+        if self._compiler is None:
+            if not sys.executable or importlib.util.find_spec("numba") is None or _is_cached():
+                return False
+            code = "import torch_ekm; torch_ekm.warm_up()"
+            path, silent = os.pathsep.join(filter(None, sys.path)), subprocess.DEVNULL
+            try:
+                self._compiler = subprocess.Popen(
+                    [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path},
+                    stdin=silent, stdout=silent, stderr=silent,
+                )  # fmt: skip
+            except OSError:
+                return False
+            warnings.warn(_FIRST_TIME, SpeedWarning, stacklevel=2)
+        return self._compiler.poll() is None
+
+
+_loader = Loader()
+
+
+def load_loops(*, wait: bool = False) -> ModuleType | None:
+    """See :meth:`Loader.load`."""
+    return _loader.load(wait=wait)
+
+
+def _imported() -> ModuleType | None:
+    try:
+        from . import numba_network
+    except ImportError as error:
+        if error.name not in ("numba", "llvmlite"):  # it is there, and does not fit
+            warnings.warn(_OFF.format(error), SpeedWarning, stacklevel=2)
+        return None
+    except RuntimeError as error:
+        warnings.warn(_OFF.format(error), SpeedWarning, stacklevel=2)
+        return None
+    return numba_network
+
+
+def _is_cached() -> bool:
+    """Whether numba has compiled the last of the loops since the file was written, as far as one can see."""
+    from numba.misc.appdirs import user_cache_dir
+
+    source = Path(__file__).with_name("numba_network.py")
+    name = f"numba_network.embed_fleet-*.py{sys.version_info.major}{sys.version_info.minor}.nbi"
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    folders = [Path(given)] if given else [source.parent, Path(user_cache_dir("numba", False))]
+    found = (index for folder in folders for index in folder.glob(f"*/{name}"))
+    return any(index.stat().st_mtime >= source.stat().st_mtime for index in found)
