@@ -293,6 +293,7 @@ class Ablation(Protocol):
             long_step_deg=0.0,
             blind_deg=0.0,
             controllers=variant.controllers,
+            new_objects=False,
         )
         return {name: (one, controller, seed) for name, (_, controller, seed) in one.jobs(seeds).items()}
 

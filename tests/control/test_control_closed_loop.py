@@ -97,7 +97,7 @@ def test_target_that_is_reached_already_needs_no_command(held) -> None:
     assert plant.commands == 1  # seen twice within the tolerance
 
 
-@pytest.mark.parametrize("solved", [0, 1, 4])
+@pytest.mark.parametrize("solved", [0, 1, 2])
 def test_a_program_that_no_solver_solves_gives_up_holding(held, monkeypatch, solved: int) -> None:
     """Next to buckling a Jacobian is out of all scale: the loop goes back and ends, and raises nothing."""
     solve, calls = ControlProblem.solve, []
@@ -233,7 +233,8 @@ def test_the_learner_is_seen_motions_what_the_encoders_did(held) -> None:
     class Half(FrozenPlant):
         def move(self, delta_a: torch.Tensor) -> None:
             super().move(delta_a)
-            self.observation = dataclasses.replace(self.observation, a=self.observation.a + 0.5 * delta_a)
+            old = self.observation
+            self.observation = dataclasses.replace(old, a=old.a + 0.5 * delta_a, q=old.q + 1e-9)
 
     controller = LookAndMoveController(ekm, axis)
     knowledge = HandKnowledge.of(loop.kinematic.hand, adapts=False)

@@ -16,7 +16,7 @@ from torch_ekm.residual import (
     Standardize,
     default_learner,
 )
-from torch_ekm.residual.running_scale import RunningScale
+from torch_ekm.residual.running_scale import BLOCK, RunningScale
 
 SMALL = {
     "sogp": lambda **o: SparseOnlineGP(3, 2, capacity=30, **o),
@@ -133,7 +133,7 @@ def test_a_slow_change_of_scale_is_followed():
     scale = RunningScale(3, [True] * 3)
     scale.memory = 300
     for t in range(n):
-        scale.observe(t, x[t], None)
+        scale.observe(t % BLOCK, x[t], None)
     scale.settle()
     torch.testing.assert_close(scale.scale, torch.full_like(scale.scale, 8.5), rtol=0.2, atol=0.0)
 
@@ -145,7 +145,7 @@ def test_what_rests_keeps_its_units():
     x = torch.randn(4000, 1, generator=generator, dtype=torch.float64)
     x[1000:] *= 1e-6
     for t in range(len(x)):
-        scale.observe(t, x[t], None)
+        scale.observe(t % BLOCK, x[t], None)
     scale.settle()
     assert 0.3 < float(scale.scale) < 1.2
 
@@ -186,7 +186,7 @@ def test_bursts_are_no_outliers():
     for on in (burst, alone):
         scale = RunningScale(1)
         for n, x in enumerate(torch.where(on, large, small)):
-            scale.observe(n, x, None)
+            scale.observe(n % BLOCK, x, None)
         scale.settle()
         found.append(float(scale.scale))
     assert found[0] > 0.04

@@ -128,7 +128,7 @@ def test_a_pinch_across_another_axis_is_not_passed_off_as_the_wanted_one(tmp_pat
     settings.write_text('[object]\nname = "slab"\nfriction = 0.8\ngrasp_width = 0.1\n')
     hand, slab = load_hand("planar_two_finger"), str(tmp_path / "slab.urdf")
     monkeypatch.setattr(pinch, "_GUESSES", 1)  # the others fail too
-    with pytest.raises(EquilibriumError, match=r"grasp_axis|too wide"):
+    with pytest.raises(EquilibriumError, match=r"'slab'|grasp_axis"):
         plan_pinch(pinch_problem(hand, load_object(slab), PlantConfig(), PlantParameters()), PinchRequest())
     monkeypatch.undo()
     settings.write_text(settings.read_text() + "grasp_axis = [0.0, 0.0, 1.0]\n")

@@ -301,8 +301,9 @@ class Pace(nn.Module):
         """
         bound, asked = self.options.bound, share * self.factor
         phi = bound.share(lin, delta_a, predicted, seen, asked)
-        phi = max(phi, min(1.0, bound.least / max(asked, 1e-9)))
-        return min(phi, bound.grip_share(lin, seen))
+        least = min(1.0, bound.least / max(asked, 1e-9))
+        grip, sure = bound.grip_share(lin, seen), seen.pads_are_right(lin)
+        return min(max(min(phi, grip), least), grip if sure else 1.0)
 
     def judge(self, disagreement: float, share: float = 1.0) -> None:
         """Learn from one motion.
