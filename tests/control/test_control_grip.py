@@ -47,18 +47,25 @@ def plant() -> SimulatedHand:
 
 
 @pytest.mark.parametrize(
-    ("share", "seed", "most"),
-    [(None, 0, 6.0), (0.0, 3, 6.0), ([1.0, 0, 1, 1, 1], 2, 6.0), (0.3, 2, 10.5)],
+    ("share", "seed", "most", "reason"),
+    [
+        (None, 0, 6.0, StopReason.REACHED),
+        (0.0, 3, 6.0, StopReason.REACHED),
+        ([1.0, 0, 1, 1, 1], 2, 6.0, StopReason.REACHED),
+        (0.3, 2, 10.5, StopReason.STALLED),  # it waits for a grip that it never feels
+    ],
     ids=["no sensors", "dead", "one dead", "a third"],
 )
-def test_hand_that_feels_nothing_or_wrong_neither_squeezes_nor_drops(plant, share, seed, most) -> None:
+def test_hand_that_feels_nothing_or_wrong_neither_squeezes_nor_drops(
+    plant, share, seed, most, reason
+) -> None:
     felt = Felt(plant, share)
     start = felt.reset(seed)
     model = KinematicModel(plant.hand, plant.object)
     controller = LookAndMoveController(model, plant.rotation_axis)
     loop = ClosedLoop(felt, controller, knowledge=HandKnowledge.of(plant.hand))
     done = loop.run(PoseTarget.turned(start.state, plant.rotation_axis, degrees=15))
-    assert done.reason is StopReason.REACHED
+    assert done.reason is reason
     forces = torch.stack(felt.forces)
     assert float(forces.max()) < most
     assert float(forces.min()) > 1.0  # no contact is lost

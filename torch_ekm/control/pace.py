@@ -87,13 +87,13 @@ class StepBound:
 
     w_off and v_off are the predicted rotation and translation off the focus; m_after the predicted friction
     margins. A contact that slides holds no weight W across its way: the heavier the object is for its grip,
-    the less may be missing. The fingers that
-    oppose the strongest one may bear enough together while one of them lets go: steps p above those of
-    pace 1, which change the forces faster than they are corrected, ask for a force f_i of each that is near
-    the mean f_mean of them.
+    the less may be missing. The fingers that oppose the strongest one may bear enough together while one of
+    them lets go: steps p above those of pace 1, which change the forces faster than they are corrected, ask
+    for a force f_i of each that is near the mean f_mean of them.
 
     A step is not cut below ``least`` of the largest one at pace 1: standing still turns nothing. But a grip f
-    is tightened first: below 0.75 of the wanted one steps become smaller, and at 0.55 of it there are none.
+    is tightened first: below 0.75 of the wanted one steps become smaller, and at 0.55 of it, where pads
+    measure it, there are none.
     """
 
     off_rotation: float = 1.5 * _DEG
@@ -104,7 +104,7 @@ class StepBound:
     """Margin that may be missing where friction and weight are equal [N]."""
     even: float = 0.85
     """Of the mean of the fingers that oppose the strongest one, what each of them should bear."""
-    least: float = 0.7
+    least: float = 0.35
     """Infinite: steps are cut by the grip alone."""
 
     def __post_init__(self) -> None:
@@ -301,9 +301,9 @@ class Pace(nn.Module):
         """
         bound, asked = self.options.bound, share * self.factor
         phi = bound.share(lin, delta_a, predicted, seen, asked)
-        least = min(1.0, bound.least / max(asked, 1e-9))
-        grip, sure = bound.grip_share(lin, seen), seen.pads_are_right(lin)
-        return min(max(min(phi, grip), least), grip if sure else 1.0)
+        least, grip = min(1.0, bound.least / max(asked, 1e-9)), bound.grip_share(lin, seen)
+        # an estimate is no reason to wait
+        return min(max(min(phi, grip), least), 1.0 if seen.fingertip_force is None else grip)
 
     def judge(self, disagreement: float, share: float = 1.0) -> None:
         """Learn from one motion.

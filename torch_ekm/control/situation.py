@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from ..description import HandDescription
     from ..model import Linearization
 
-_DENIED = 1.75  # times what pads measure; joints and springs of used hands say up to 1.5 times
-
 
 @dataclass(frozen=True)
 class Situation:
@@ -56,15 +54,6 @@ class Situation:
             return estimated
         measured = as_array(self.fingertip_force)[self.hand.pad_indices(kinematic.contacts.finger)]
         return np.where(np.isnan(measured), 0.0 if estimated is None else estimated, measured)
-
-    def pads_are_right(self, kinematic: Linearization) -> bool:
-        """Some pad measures, and joints and springs do not say that the fingers bear far more."""
-        if self.fingertip_force is None:
-            return False
-        f_n = self.normal_force(kinematic)
-        if f_n is None or self.joint_force is None:
-            return True
-        return float(self.joint_force.max()) < _DENIED * float(f_n.max())
 
 
 def grip_shares(f_n: Array, grip: float) -> Array:
