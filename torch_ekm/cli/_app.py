@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, ParamSpec, TypeVar
@@ -102,17 +101,6 @@ def parse_angles(text: str) -> tuple[float, ...]:
     if not angles or not all(0 < abs(angle) < 180 for angle in angles):
         raise ParameterError("angles", text, valid)
     return angles
-
-
-def parse_step(degrees: float) -> float:
-    """Degrees as radians.
-
-    Raises:
-        ParameterError: a motion cannot turn an object by so much.
-    """
-    if not 0 < degrees <= 45:
-        raise ParameterError("step", degrees, "more than 0 and at most 45 deg")
-    return math.radians(degrees)
 
 
 def names(text: str) -> tuple[str, ...]:

@@ -85,21 +85,18 @@ def check(
 
         with open_driver(plant, dry_run=dry_run, say=say) as driver:
             rows = check_plant(driver, driver.hand)
-        print_table(Check._fields, rows, str(plant))
-        if any(row.state == "error" for row in rows):
-            raise typer.Exit(1)
-        return
-    if not hand:
+    elif not hand:
         raise ParameterError("hand", hand, "a hand or a path to a URDF; or --plant with a wiring file")
-    from ..inspection.check import check_hand
+    else:
+        from ..inspection.check import check_hand
 
-    if picture.is_dir() or not picture.resolve().parent.is_dir():
-        raise OutputError(picture, "there is no such folder, or a folder of this name")
-    if picture.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise ParameterError("file", str(picture), "a name that ends in .png, .jpg, .jpeg")
-    with console.status("Checking: some seconds, a minute or two where the pinch fails"):
-        rows = check_hand(hand, object, picture)
-    print_table(Check._fields, rows, hand)
+        if picture.is_dir() or not picture.resolve().parent.is_dir():
+            raise OutputError(picture, "there is no such folder, or a folder of this name")
+        if picture.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+            raise ParameterError("file", str(picture), "a name that ends in .png, .jpg, .jpeg")
+        with console.status("Checking: some seconds, a minute or two where the pinch fails"):
+            rows = check_hand(hand, object, picture)
+    print_table(Check._fields, rows, hand if plant is None else str(plant))
     if any(row.state == "error" for row in rows):
         raise typer.Exit(1)
 

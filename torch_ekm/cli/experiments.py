@@ -2,26 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from .._terminal import print_report, progress, say
 from ..exceptions import ParameterError
-from ._app import (
-    AN_OBJECT,
-    Engine,
-    Hand,
-    Jobs,
-    Preset,
-    Sensing,
-    app,
-    names,
-    needs,
-    parse_angles,
-    parse_seeds,
-    parse_step,
-)
+from ._app import AN_OBJECT, Engine, Hand, Jobs, Preset, Sensing, app, names, needs, parse_angles, parse_seeds
 
 from typer import Argument, Option  # isort: skip
 
@@ -95,7 +83,9 @@ def reproduce(
     from ..experiments.config import Setting
     from ..experiments.reproduce import plan
 
-    limiting = LimitingFunction() if step is None else LimitingFunction(step=parse_step(step))
+    if step is not None and not 0 < step <= 45:
+        raise ParameterError("step", step, "more than 0 and at most 45 deg")
+    limiting = LimitingFunction() if step is None else LimitingFunction(step=math.radians(step))
     pace = PaceOptions(limiting=limiting)
     setting = Setting(hand=hand, preset=preset, engine=engine, learner=learner, sensing=sensing, pace=pace)
     turns = parse_angles(angles) if angles else None

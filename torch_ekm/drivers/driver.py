@@ -131,10 +131,8 @@ class HandDriver(ABC):
         now, a = time.monotonic(), self._a(reading)
         read = torch.tensor(list(reading.joints), dtype=torch.float64)
         force = self._values(self.wiring.fingertips, reading.fingertips)
-        stamps = Stamps(
-            reading.taken,
+        joints_taken, forces_taken = (
             min(reading.joints_taken, reading.taken),
-            -math.inf,
             min(reading.fingertips_taken, now),
         )
         return Observation(
@@ -150,7 +148,7 @@ class HandDriver(ABC):
                 "sensed": tuple(one.name for one in self.wiring.joints),
                 "joints": self._values(self.wiring.joints, reading.joints).tolist(),
             },
-            stamps=stamps._replace(pose=now),
+            stamps=Stamps(reading.taken, joints_taken, now, forces_taken),
         )
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
@@ -255,12 +253,9 @@ class HandDriver(ABC):
             while len(seen) > 1 and seen[1][0] <= seen[-1][0] - self.limits.still_for:
                 seen.pop(0)
             spans = bool(seen) and seen[-1][0] - seen[0][0] >= self.limits.still_for
-            if spans and not any(one[2] for one in seen):
-                way = torch.stack([one[1] for one in seen])
-                spread = way.amax(0) - way.amin(0)
-                if float(spread.max()) <= self.limits.still:
-                    self._after = seen[0][0]
-                    return
+            if spans and not any(one[2] for one in seen) and not any(self._spread(seen)):
+                self._after = seen[0][0]
+                return
             if now - began > seconds + self.limits.timeout:
                 break
             time.sleep(_POLL)
@@ -279,7 +274,7 @@ class HandDriver(ABC):
         if not seen:
             return [False] * self.hand.n_a
         way = torch.stack([one[1] for one in seen])
-        return (way.amax(0) - way.amin(0) > self.limits.still).tolist()
+        return (~(way.amax(0) - way.amin(0) <= self.limits.still)).tolist()
 
     def _fresh(self) -> BusReading:
         """A reading whose sensors are all newer than the last motion, and no older than two periods."""

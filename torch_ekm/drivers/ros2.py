@@ -13,7 +13,6 @@ import torch
 from .._extras import require
 from ..description import HandDescription
 from ..exceptions import BusError
-from ..typing import Tensor
 from .driver import BusReading, HandDriver
 from .pose import Sighting
 from .wiring import Wiring
@@ -221,21 +220,9 @@ class RosPose:
                 self._topic, f"the pose is in the frame '{there}', it should be in '{self._frame}'"
             )
         o, r = message.pose.position, message.pose.orientation
-        rotation = _rotation(r.w, r.x, r.y, r.z)
-        if rotation is None:
+        if not abs(r.w**2 + r.x**2 + r.y**2 + r.z**2 - 1) < 1e-3:
             raise BusError(self._topic, "the orientation is no unit quaternion")
-        position = rotation.new_tensor([o.x, o.y, o.z])
-        return Sighting(position, rotation, self._plant.taken(message.header.stamp))
-
-
-def _rotation(w: float, x: float, y: float, z: float) -> Tensor | None:
-    if abs(w * w + x * x + y * y + z * z - 1) > 1e-3:
-        return None
-    return torch.tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ],
-        dtype=torch.float64,
-    )
+        rotation = require("scipy.spatial.transform").Rotation.from_quat([r.x, r.y, r.z, r.w])
+        position = torch.tensor([o.x, o.y, o.z], dtype=torch.float64)
+        taken = self._plant.taken(message.header.stamp)
+        return Sighting(position, torch.from_numpy(rotation.as_matrix()), taken)

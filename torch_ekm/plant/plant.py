@@ -26,4 +26,3 @@ class Plant(Protocol):
 
     def close(self) -> None:
         """Release devices, windows and files; the plant is not used afterwards."""
-        ...

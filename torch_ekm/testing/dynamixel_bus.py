@@ -8,7 +8,7 @@ import time
 import tty
 from collections.abc import Callable, Sequence
 
-from .motors import HandMotors, Motors
+from .motors import Motors
 
 _HEADER = b"\xff\xff\xfd\x00"
 _PING, _READ, _WRITE, _SYNC_READ, _SYNC_WRITE, _STATUS = 0x01, 0x02, 0x03, 0x82, 0x83, 0x55
@@ -29,10 +29,11 @@ class DynamixelBus:
 
     Args:
         ids: of the servos.
-        motors: what moves, in ticks; None: motors that stand at 2048 and go 4096 ticks a second.
+        motors: what moves, in ticks, or anything with the same methods; None: motors that stand at 2048 and
+            go 4096 ticks a second.
     """
 
-    def __init__(self, ids: Sequence[int], motors: Motors | HandMotors | None = None) -> None:
+    def __init__(self, ids: Sequence[int], motors: Motors | None = None) -> None:
         self.ids, self.motors = tuple(ids), motors or Motors([2048.0] * len(ids), 4096.0)
         self.tables = {servo: bytearray(_SIZE) for servo in self.ids}
         self.spoil: Callable[[bytes], bytes] = lambda packet: packet

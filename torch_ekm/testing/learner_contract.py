@@ -23,7 +23,6 @@ def check_residual_learner(
     dtypes: tuple[torch.dtype, ...] = (torch.float64, torch.float32),
     n_samples: int = 24,
     differentiable: bool = True,
-    vmap: bool = True,
     separates_noise: bool = True,
     has_state: bool = True,
 ) -> None:
@@ -36,8 +35,7 @@ def check_residual_learner(
         factory: ``factory(dtype=...)`` gives a fresh learner, the same one each time, on any device.
         dtypes: floating types to try.
         n_samples: length of the stream that is learned.
-        differentiable: whether gradients of ``forward`` reach x and equal ``linearize``.
-        vmap: whether ``torch.func.vmap(jacrev(learner))`` must work.
+        differentiable: whether gradients of ``forward`` reach x and equal ``linearize``, also in ``vmap``.
         separates_noise: whether ``predict(x, observation=True)`` is wider than ``predict(x)``.
         has_state: whether it has a state dict; without one it raises NoStateError, and is copied and
             pickled only.
@@ -62,7 +60,7 @@ def check_residual_learner(
         _check_learns(learner, x, separates_noise)
         _check_queries(learner, x)
         if differentiable:
-            _check_gradients(learner, x, vmap)
+            _check_gradients(learner, x)
         _check_modes(learner, x)
         _check_persistence(learner, factory, x, y, has_state)
         _check_mask(learner, x, y)
@@ -134,7 +132,7 @@ def _check_queries(learner: ResidualLearner, x: Tensor) -> None:
         _close(value, mean, learner, "linearize and forward differ")
 
 
-def _check_gradients(learner: ResidualLearner, x: Tensor, vmap: bool) -> None:
+def _check_gradients(learner: ResidualLearner, x: Tensor) -> None:
     tolerance = 1e-8 if learner.dtype == torch.float64 else 1e-3
     query = x[0].clone().requires_grad_(True)
     jacobian = learner.linearize(query)[1].detach()
@@ -143,7 +141,7 @@ def _check_gradients(learner: ResidualLearner, x: Tensor, vmap: bool) -> None:
         (row,) = torch.autograd.grad(value[..., j].sum(), query, retain_graph=True)
         error = float((row - jacobian[..., j, :]).abs().max())
         assert error <= tolerance, f"linearize is not the gradient of forward: off by {error:.1e}"
-    if vmap and not learner.batch_shape:
+    if not learner.batch_shape:
         full = torch.func.vmap(torch.func.jacrev(learner))(x[:3])
         error = (full - learner.linearize(x[:3])[1]).abs().max()
         assert float(error) <= tolerance, "vmap of jacrev differs from linearize"

@@ -143,23 +143,22 @@ class Report:
             OutputError: the folder cannot be written to.
         """
         make_folder(folder)
-        with told_as_output_error(folder):
-            return self._write(folder)
-
-    def _write(self, folder: Path) -> Path:
         configuration = json.dumps({**self.configuration, "versions": versions()}, indent=2, sort_keys=True)
-        (folder / "configuration.json").write_text(configuration + "\n", encoding="utf-8")
-        texts = {key: getattr(self, key) for key in ("title", "summary", "legend")}
-        tables = [{key: getattr(table, key) for key in ("name", "caption", "note")} for table in self.tables]
-        texts |= {"figures": [vars(figure) for figure in self.figures], "tables": tables}
-        (folder / "report.json").write_text(json.dumps(texts, indent=1) + "\n", encoding="utf-8")
-        for table in self.tables:
-            with (folder / f"{table.name}.csv").open("w", newline="", encoding="utf-8") as stream:
-                csv.writer(stream).writerows([table.header, *table.text()])
-        (folder / "report.md").write_text(self.markdown(), encoding="utf-8")
-        page = folder / "index.html"
-        page.write_text(self._render("html", configuration=configuration), encoding="utf-8")
-        return page
+        with told_as_output_error(folder):
+            (folder / "configuration.json").write_text(configuration + "\n", encoding="utf-8")
+            texts = {key: getattr(self, key) for key in ("title", "summary", "legend")}
+            tables = [
+                {key: getattr(table, key) for key in ("name", "caption", "note")} for table in self.tables
+            ]
+            texts |= {"figures": [vars(figure) for figure in self.figures], "tables": tables}
+            (folder / "report.json").write_text(json.dumps(texts, indent=1) + "\n", encoding="utf-8")
+            for table in self.tables:
+                with (folder / f"{table.name}.csv").open("w", newline="", encoding="utf-8") as stream:
+                    csv.writer(stream).writerows([table.header, *table.text()])
+            (folder / "report.md").write_text(self.markdown(), encoding="utf-8")
+            page = folder / "index.html"
+            page.write_text(self._render("html", configuration=configuration), encoding="utf-8")
+            return page
 
     def markdown(self, level: int = 1) -> str:
         """The page as Markdown.

@@ -208,7 +208,7 @@ def _places(names: Sequence[str], at: Array, low: Array, high: Array, chosen: ND
 
 def _guesses(problem: PinchProblem, request: PinchRequest) -> Iterator[Array]:
     """The object between the fingertips: in the preferred posture, then in those that suit it best."""
-    for moving in itertools.chain([problem.preferred()], _facing_postures(problem)):
+    for moving in itertools.chain([problem.preferred], _facing_postures(problem)):
         tips = problem.tips(moving)
         force = np.outer(np.ones(len(tips)), problem.towards) * request.force
         force[1:] *= -1.0 / max(1, len(tips) - 1)

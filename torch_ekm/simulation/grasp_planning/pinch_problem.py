@@ -121,11 +121,12 @@ class PinchProblem:
         self._prepare_mechanism()
         self.axes = object_axes(obj)
         """Of the object, as columns: long axis, grasp axis, their product."""
-        self._preferred = self._half_bent()
+        self.preferred = self._half_bent()
+        """Half-bent fingers: most at the last joint, which the pinch force bends anyway."""
         self.towards = self._direction_of_grasp()
-        third = np.cross(self.along, self.towards)
-        self._third = third
-        self._nominal = np.column_stack([self.along, self.towards, third]) @ self.axes.T
+        self._third = np.cross(self.along, self.towards)
+        # long axis along the hand's wanted direction, grasp axis from the thumb to the fingers
+        self._nominal = np.column_stack([self.along, self.towards, self._third]) @ self.axes.T
 
     def _prepare_mechanism(self) -> None:
         hand, J_a = self.hand, self.transmission.J_a
@@ -143,15 +144,11 @@ class PinchProblem:
 
     def _unpack(self, x: Array) -> tuple[Array, Array, Array]:
         n = len(self.moving)
-        rotation = exp(torch.from_numpy(x[:, n + 3 : n + 6])).numpy() @ self.nominal_rotation()
+        rotation = exp(torch.from_numpy(x[:, n + 3 : n + 6])).numpy() @ self._nominal
         return self.posture(x[:, :n]), x[:, n : n + 3], rotation
 
-    def nominal_rotation(self) -> Array:
-        """Long axis along the hand's wanted direction, grasp axis from the thumb to the fingers."""
-        return self._nominal
-
     def _direction_of_grasp(self) -> Array:
-        tips = self.tips(self.preferred())
+        tips = self.tips(self.preferred)
         across = tips[1:].mean(axis=0) - tips[0]
         across -= self.along * (self.along @ across)
         return across / np.linalg.norm(across)
@@ -183,10 +180,6 @@ class PinchProblem:
         """All joints, coupled ones following, others at rest ``(*batch, n_q)`` [rad]."""
         q0 = self.transmission.spring_rest
         return q0 + (moving - q0[self.moving]) @ self.follow.T
-
-    def preferred(self) -> Array:
-        """Half-bent fingers: most at the last joint, which the pinch force bends anyway."""
-        return self._preferred
 
     def _half_bent(self) -> Array:
         low, high = self.joint_range
@@ -277,7 +270,7 @@ class PinchProblem:
         facing = np.concatenate([-g.facing[:, :1], g.facing[:, 1:]], axis=1)
         opposed = np.maximum(0.0, 0.98 - facing) / 0.05
         clear = np.maximum(0.0, 0.002 - g.clearance) / 1e-3
-        posture = (x[:, : len(self.moving)] - self.preferred()) / 0.3
+        posture = (x[:, : len(self.moving)] - self.preferred) / 0.3
         taut = np.maximum(0.0, 0.02 - self.tension(g)[:, self._pulling]) / 0.01
         hard = 3 * self.equations(request, g)
         wishes = [cone, share, cap, pad, np.stack(place, axis=1), tilt, opposed, clear, posture, taut]

@@ -127,12 +127,12 @@ class CardScene:
     cards: tuple[PlacedCard, ...] = ()
     bodies: tuple[ConvexBody, ...] = ()
 
-    def obstructed(self, card: int, shade: int = 70) -> CardScene:
+    def obstructed(self, card: int) -> CardScene:
         """The scene with a ball half way between the camera and a card, which hides all of it."""
         outline = self.cards[card].outline / 2
         centre = outline.mean(axis=0)
         radius = 1.2 * np.linalg.norm(outline - centre, axis=1).max()
-        return replace(self, bodies=(*self.bodies, ConvexBody(centre[None], np.array([radius]), shade)))
+        return replace(self, bodies=(*self.bodies, ConvexBody(centre[None], np.array([radius]), shade=70)))
 
 
 def _convex_hull(points: Array) -> Array:

@@ -58,13 +58,8 @@ def true_object(obj: ObjectDescription, parameters: PlantParameters) -> ObjectDe
 
 def chain(hand: HandDescription, link: str) -> list[int]:
     """Joints that move a link, the nearest first."""
-    above = {joint.child: joint for joint in hand.urdf.joints}
-    chain = []
-    while link in above:
-        if above[link].name in hand.joint_names:
-            chain.append(hand.joint_names.index(above[link].name))
-        link = above[link].parent
-    return chain
+    names = [joint.name for joint in reversed(hand.urdf.joints_to(link))]
+    return [hand.joint_names.index(name) for name in names if name in hand.joint_names]
 
 
 def make_transmission(hand: HandDescription, parameters: PlantParameters) -> Transmission:

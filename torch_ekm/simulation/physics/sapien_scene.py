@@ -59,11 +59,9 @@ class SapienScene:
     # -- properties that may change in mid-run ----------------------------------------------------
 
     def set_object(self, obj: ObjectDescription) -> None:
-        """Mass, centre of mass and inertia; the shapes stay."""
         set_inertia(self._object, obj.mass, obj.com, obj.inertia)
 
     def oppose(self, links: set[str]) -> None:
-        """These links are of the finger that opposes the others."""
         for shape, link in self._hand.link_of.items():
             if link in links:
                 shape.set_physical_material(self._opposed)
@@ -76,7 +74,6 @@ class SapienScene:
             material.static_friction = material.dynamic_friction = value
 
     def set_link_weight(self, pulls: bool) -> None:
-        """Whether gravity pulls at the links too; without, only at the object."""
         for link in self._hand.articulation.links:
             link.disable_gravity = not pulls
 
@@ -88,7 +85,6 @@ class SapienScene:
 
     @property
     def q(self) -> Array:
-        """Joint angles in the hand's order ``(n_q,)`` [rad]."""
         return self._hand.articulation.qpos.astype(np.float64)[self._hand.order]
 
     @q.setter
@@ -98,7 +94,6 @@ class SapienScene:
 
     @property
     def next_q(self) -> Array:
-        """Joint angles after the next step, if they keep their speed ``(n_q,)`` [rad]."""
         return self.q + self.time_step * self._hand.articulation.qvel.astype(np.float64)[self._hand.order]
 
     @property
@@ -116,12 +111,10 @@ class SapienScene:
 
     @property
     def object_speed(self) -> tuple[float, float]:
-        """Linear [m/s] and angular speed [rad/s] of the object, norms."""
         linear, angular = self._object.linear_velocity, self._object.angular_velocity
         return float(np.linalg.norm(linear)), float(np.linalg.norm(angular))
 
     def hold_object(self, held: bool) -> None:
-        """Fix the object where it is, or let it go at rest."""
         if self._object.kinematic and not held:
             self._object.kinematic = False
             self._object.linear_velocity = self._object.angular_velocity = np.zeros(3, np.float32)
@@ -131,13 +124,11 @@ class SapienScene:
     # -- time ---------------------------------------------------------------------------------------
 
     def step(self, drive_targets: Array) -> None:
-        """One time step with the joints' drives aimed at the targets ``(n_q,)`` [rad]."""
         for joint, target in zip(self._hand.joints, drive_targets.tolist(), strict=True):
             joint.set_drive_target(target)
         self._system.step()
 
     def push(self, force: Array, torque: Array) -> None:
-        """Push the object during the next step: [N] at its centre of mass and [N m], hand frame."""
         self._object.add_force_torque(force.astype(np.float32), torque.astype(np.float32))
 
     def touches(self) -> dict[str, float]:

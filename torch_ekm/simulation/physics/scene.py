@@ -50,35 +50,27 @@ class Scene(Protocol):
 
     def set_object(self, obj: ObjectDescription) -> None:
         """Mass, centre of mass and inertia; the shapes stay."""
-        ...
 
     def oppose(self, links: set[str]) -> None:
         """These links are of the finger that opposes the others."""
-        ...
 
     def set_friction(self, friction: float, opposed: float) -> None:
         """Coefficients of the object's two sides, the second at the finger that opposes the others."""
-        ...
 
     def set_link_weight(self, pulls: bool) -> None:
         """Whether gravity pulls at the links too; without, only at the object."""
-        ...
 
     def set_drive_stiffness(self, stiffness: Array) -> None:
         """Of each joint's drive ``(n_q,)`` [N m/rad]."""
-        ...
 
     def hold_object(self, held: bool) -> None:
         """Fix the object where it is, or let it go at rest."""
-        ...
 
     def step(self, drive_targets: Array) -> None:
         """One time step with the joints' drives aimed at the targets ``(n_q,)`` [rad]."""
-        ...
 
     def push(self, force: Array, torque: Array) -> None:
         """Push the object during the next step: [N] at its centre of mass and [N m], hand frame."""
-        ...
 
     def touches(self) -> dict[str, float]:
         """Links that touch the object now, each with the sum of the sizes of its normal forces [N]."""
