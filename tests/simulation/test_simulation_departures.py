@@ -19,9 +19,10 @@ from torch_ekm.simulation.sensors import Sensors
 HAND = load_hand("icub_right")
 N_Q, STIFFNESS = HAND.n_q, 4.0
 ARMED = np.flatnonzero(HAND.actuation_jacobian.any(axis=0))
+ROUND, NO_LOSSES = JointShape(np.zeros(N_Q), np.zeros(N_Q), 0.0), CableLosses(0.0, 0.0, 0.0, np.zeros(N_Q))
 
 
-def make(shape: JointShape | None = None, losses: CableLosses | None = None) -> Transmission:
+def make(shape: JointShape = ROUND, losses: CableLosses = NO_LOSSES) -> Transmission:
     actuators = tuple(dataclasses.replace(actuator, stiffness=STIFFNESS) for actuator in HAND.actuators)
     real = dataclasses.replace(HAND, actuators=actuators, joint_friction=np.zeros(N_Q))
     return Transmission(real, 0.0, shape, losses)
@@ -47,7 +48,7 @@ def test_the_drives_give_the_gradient_of_the_energy_of_odd_pulleys_springs_and_c
     draw = np.random.default_rng(1)
     shape = JointShape(np.where(free, 0.0, 0.25), draw.uniform(-3, 3, N_Q), 0.5)
     coupling = 0.2
-    transmission = make(shape, dataclasses.replace(CableLosses.none(N_Q), coupling=coupling))
+    transmission = make(shape, dataclasses.replace(NO_LOSSES, coupling=coupling))
     S, q = coupled_posture(HAND.coupling), flexed()
     motor = taut(transmission, q)
     compliance = (np.eye(HAND.n_a) * (1 - coupling) + coupling) / STIFFNESS
@@ -71,7 +72,7 @@ def test_the_drives_give_the_gradient_of_the_energy_of_odd_pulleys_springs_and_c
 
 
 def test_a_slack_tendon_neither_pushes_nor_shares_its_slack() -> None:
-    transmission = make(losses=dataclasses.replace(CableLosses.none(N_Q), coupling=0.2))
+    transmission = make(losses=dataclasses.replace(NO_LOSSES, coupling=0.2))
     q = flexed()
     motor = taut(transmission, q, 0.05)
     pulling = np.flatnonzero([actuator.tendon for actuator in HAND.actuators])
@@ -85,7 +86,7 @@ def test_a_slack_tendon_neither_pushes_nor_shares_its_slack() -> None:
 
 
 def test_hysteresis_holds_a_share_of_the_pull_against_either_direction() -> None:
-    transmission = make(losses=dataclasses.replace(CableLosses.none(N_Q), hysteresis=0.1))
+    transmission = make(losses=dataclasses.replace(NO_LOSSES, hysteresis=0.1))
     q, plain = flexed(), make()
     held = []
     for by in (0.05, 0.2, 0.2):  # from below, then from above
@@ -97,7 +98,7 @@ def test_hysteresis_holds_a_share_of_the_pull_against_either_direction() -> None
 
 
 def test_cable_friction_is_a_share_of_what_the_cables_turn_a_joint_with() -> None:
-    transmission = make(losses=dataclasses.replace(CableLosses.none(N_Q), capstan=0.1))
+    transmission = make(losses=dataclasses.replace(NO_LOSSES, capstan=0.1))
     q = flexed()
     motor = taut(transmission, q)
     cables = STIFFNESS * 0.1 * (HAND.actuation_jacobian.sum(axis=0) @ coupled_posture(HAND.coupling))

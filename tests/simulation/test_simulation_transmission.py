@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from torch_ekm.description import load_hand
+from torch_ekm.simulation.mechanism.departures import CableLosses, JointShape
 from torch_ekm.simulation.mechanism.transmission import Transmission, coupled_posture
 
 
@@ -16,7 +17,9 @@ def make(hand=None, stiffness=4.0, friction=0.0, creep=0.0, **changes):
     actuators = tuple(dataclasses.replace(actuator, stiffness=stiffness) for actuator in hand.actuators)
     friction = np.full(hand.n_q, friction)
     real = dataclasses.replace(hand, actuators=actuators, joint_friction=friction, **changes)
-    return hand, Transmission(real, creep)
+    zeros = np.zeros(hand.n_q)
+    shape, losses = JointShape(zeros, zeros, 0.0), CableLosses(0.0, 0.0, 0.0, zeros)
+    return hand, Transmission(real, creep, shape, losses)
 
 
 def torque(transmission, q, motor):

@@ -121,8 +121,8 @@ def follow_to_the_end(
             farthest = copy.copy(hand)
     motions.close()
     limits = [name for name in farthest.at_limits() if name not in idle]
-    standing = _Standing(farthest.at_stops(_BEARS), limits, farthest.linearization)
-    end, what, message = _end(stop, hand, standing)
+    sliding = _sliding(farthest.linearization)
+    end, what, message = _end(stop, hand, limits, farthest.at_stops(_BEARS), sliding)
     until = angles[:calm]
     if calm is not None or end is not ReachEnd.NOTHING:  # the last of them leads to the sign
         until = until[:-1] or until
@@ -210,22 +210,12 @@ def out_of_reach(
     )
 
 
-@dataclass(frozen=True)
-class _Standing:
-    """What stood at its limit at the largest angle."""
-
-    stops: list[str]
-    actuators: list[str]
-    linearization: Linearization | None
-
-    @property
-    def sliding(self) -> list[str]:
-        """Pads in the order of their margins, those that have none to spare."""
-        lin = self.linearization
-        if lin is None or not lin.forces.solved:
-            return []
-        left = sorted(zip(lin.forces.relative_margin.tolist(), lin.contacts.finger, strict=True))
-        return [pad for share, pad in left if share < 0.05]
+def _sliding(lin: Linearization | None) -> list[str]:
+    """Pads in the order of their margins, those that have none to spare."""
+    if lin is None or not lin.forces.solved:
+        return []
+    left = sorted(zip(lin.forces.relative_margin.tolist(), lin.contacts.finger, strict=True))
+    return [pad for share, pad in left if share < 0.05]
 
 
 def _axis_of(focus: FocusedPose) -> Float[Tensor, " 3"]:
@@ -248,8 +238,10 @@ def _model_hand(controller: LookAndMoveController, seen: Observation) -> ModelHa
     return ModelHand(model, seen.state, seen.a, seen.fingertip_force)
 
 
-def _end(stop: Stop, hand: ModelHand, at: _Standing) -> tuple[ReachEnd, tuple[str, ...], str]:
-    """Kind, names and sentence."""
+def _end(
+    stop: Stop, hand: ModelHand, limits: list[str], stops: list[str], sliding: list[str]
+) -> tuple[ReachEnd, tuple[str, ...], str]:
+    """Kind, names and sentence, by what stood at its limit at the largest angle."""
     said = hand.failure or stop.message
     if stop.reason is StopReason.REACHED:
         return ReachEnd.NOTHING, (), "nothing ends it within the limit"
@@ -261,11 +253,11 @@ def _end(stop: Stop, hand: ModelHand, at: _Standing) -> tuple[ReachEnd, tuple[st
     if "no finger touches" in said:
         return ReachEnd.CONTACT, (), said
     if hand.failure or "of the friction" in said:
-        return ReachEnd.FRICTION, tuple(at.sliding), said
+        return ReachEnd.FRICTION, tuple(sliding), said
     for end, found, verb in (
-        (ReachEnd.ACTUATOR, at.actuators, "stands at the end of its range"),
-        (ReachEnd.JOINT_STOP, at.stops, "stands at its stop"),
-        (ReachEnd.FRICTION, at.sliding, "slides"),
+        (ReachEnd.ACTUATOR, limits, "stands at the end of its range"),
+        (ReachEnd.JOINT_STOP, stops, "stands at its stop"),
+        (ReachEnd.FRICTION, sliding, "slides"),
     ):
         if found:
             return end, tuple(found), f"{found[0]} {verb}" + (f"; {said}" if said else "")

@@ -130,19 +130,15 @@ class _Conversion:
         model, left_out = self.model, set()
         for b, name in names.items():
             kinds = [int(model.jnt_type[j]) for j in self._joints_of(b)]
-            tree = [c for c in names if c == b or self._is_below(c, b)]
+            tree = {b}
+            for c in names:  # parents come first
+                if int(model.body_parentid[c]) in tree:
+                    tree.add(c)
             moving = sum(len(self._joints_of(c)) for c in tree)
             if int(self._kind.mjJNT_FREE) in kinds and moving == 1:
-                left_out |= set(tree)
+                left_out |= tree
                 self.notes.append(f"'{name}' floats and has no joints: it is left out")
         return left_out
-
-    def _is_below(self, body: int, other: int) -> bool:
-        while body > 0:
-            body = int(self.model.body_parentid[body])
-            if body == other:
-                return True
-        return False
 
     def _limits(self, joint: int) -> tuple[float, float]:
         if not self.model.jnt_limited[joint]:

@@ -90,21 +90,18 @@ class DynamixelBus:
 
     def _obey(self, servo: int, instruction: int, rest: bytes) -> None:
         self._asked = time.monotonic()
+        address, size = (int.from_bytes(rest[k : k + 2], "little") for k in (0, 2))
         if instruction == _PING:
             for one in self.ids if servo == _BROADCAST else (servo,):
                 self._answer(one, bytes([0x06, 0x04, 46]))
         elif instruction == _READ:
-            address, size = (int.from_bytes(rest[k : k + 2], "little") for k in (0, 2))
             self._answer(servo, self._table(servo, address, size))
         elif instruction == _SYNC_READ:
-            address, size = (int.from_bytes(rest[k : k + 2], "little") for k in (0, 2))
             for one in rest[4:]:
                 self._answer(one, self._table(one, address, size))
         elif instruction == _WRITE and servo in self.tables:
-            address = int.from_bytes(rest[:2], "little")
             self._answer(servo, b"", 0 if self._write(address, {servo: rest[2:]}) else _ACCESS)
         elif instruction == _SYNC_WRITE:
-            address, size = (int.from_bytes(rest[k : k + 2], "little") for k in (0, 2))
             entries = [rest[k : k + size + 1] for k in range(4, len(rest), size + 1)]
             self._write(address, {one[0]: one[1:] for one in entries if one[0] in self.tables})
 

@@ -25,13 +25,8 @@ class JointShape:
     """v of each joint ``(n_q,)``."""
     phase: Array
     """Of each joint ``(n_q,)`` [rad]."""
-    stiffening: float = 0.0
+    stiffening: float
     """s [1/rad^2]."""
-
-    @classmethod
-    def round(cls, n_q: int) -> JointShape:
-        """Round pulleys and linear springs."""
-        return cls(np.zeros(n_q), np.zeros(n_q))
 
     @property
     def largest_arm(self) -> Array:
@@ -82,11 +77,6 @@ class CableLosses:
     coupling: float
     play: Array
     """Full width of each joint ``(n_q,)`` [rad]."""
-
-    @classmethod
-    def none(cls, n_q: int) -> CableLosses:
-        """No losses."""
-        return cls(0.0, 0.0, 0.0, np.zeros(n_q))
 
     @functools.cached_property
     def any_play(self) -> bool:

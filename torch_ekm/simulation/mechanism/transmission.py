@@ -46,17 +46,11 @@ class Transmission:
     Args:
         hand: as it really is; the model's may be another.
         creep: how fast a loaded tendon lengthens for good [rad/(N m s)].
-        shape: of pulleys and springs; None: as described.
-        losses: None: there are none.
+        shape: of pulleys and springs.
+        losses: of cables and joints.
     """
 
-    def __init__(
-        self,
-        hand: HandDescription,
-        creep: float = 0.0,
-        shape: JointShape | None = None,
-        losses: CableLosses | None = None,
-    ) -> None:
+    def __init__(self, hand: HandDescription, creep: float, shape: JointShape, losses: CableLosses) -> None:
         stiffness = np.array([actuator.stiffness for actuator in hand.actuators])
         self.n_a, self.n_q = hand.n_a, hand.n_q
         self.J_a = hand.actuation_jacobian
@@ -75,8 +69,7 @@ class Transmission:
         self._any_tendon = bool(self._pulls_only.any())
         self.spring_stiffness, self.spring_rest = hand.spring_stiffness, hand.spring_rest
         self.friction = hand.joint_friction
-        self.shape = JointShape.round(hand.n_q) if shape is None else shape
-        self.losses = CableLosses.none(hand.n_q) if losses is None else losses
+        self.shape, self.losses = shape, losses
         rubs = (self.friction > 0) | ((self.losses.capstan > 0) & self._lead.any(axis=0))
         self._k_f = np.where(rubs, _BRISTLE_STIFFNESS, 0.0)
         self._bends = self._reach(self.friction)
