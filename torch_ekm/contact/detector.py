@@ -78,7 +78,6 @@ class ContactDetector:
         self._other_links = LinkShapes(self._coal, hand, LINK_MARGIN, self._coarse_distance)
         self._request = self._coal.DistanceRequest()
         self._result = self._coal.DistanceResult()
-        self._at: tuple[Array, Any] | None = None
 
     def __call__(
         self,
@@ -174,10 +173,7 @@ class ContactDetector:
 
     def _coarse_distance(self, pad: Pad | Solid, T_pad: Array, solid: Solid, T_solid: Array) -> float:
         """coal's signed distance [m]: the gap without the crown, to its tolerance of 1e-6."""
-        here = self._coal.Transform3s(T_pad[:3, :3], T_pad[:3, 3])
-        if self._at is None or self._at[0] is not T_solid:  # links are asked of one primitive
-            self._at = T_solid, self._coal.Transform3s(T_solid[:3, :3], T_solid[:3, 3])
-        there = self._at[1]
+        here, there = (self._coal.Transform3s(T[:3, :3], T[:3, 3]) for T in (T_pad, T_solid))
         self._result.clear()
         shapes = pad.geometry, here, solid.geometry, there
         return self._coal.distance(*shapes, self._request, self._result)

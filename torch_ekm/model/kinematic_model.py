@@ -326,8 +326,7 @@ class KinematicModel(nn.Module):
         held = self.balance.held_by_stops(at.q, f.stop_torque)
         held[..., lock] = True
         slack = like(self.balance.slack(forces), at.q)
-        solved = self.reduction.solve(D, A, kin.rows, held, slack, o.on_unstable)
-        J, dmu, dlam, stability, space = solved
+        J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held, slack, o.on_unstable)
         df, dn = force_change(kin, dmu), normal_motion(kin, J)
         normal = normal_sensitivity(kin, f, df, dn)
         margin = margin_sensitivity(kin, f, dmu, df, dn, normal)
@@ -335,8 +334,8 @@ class KinematicModel(nn.Module):
         J, dmu, dlam, normal, margin, df, dn, held, stability, D, A, slack = tensors
         equations = None
         if held.dim() == 1:
-            space, moving = space if plain else None, self.moving(contacts)
-            equations = MotionEquations(self.reduction, D, A, tuple(kin.rows), held, slack, moving, space)
+            moving = self.moving(contacts)
+            equations = MotionEquations(self.reduction, D, A, tuple(kin.rows), held, slack, moving)
         found = Linearization(
             state=state,
             contacts=contacts,

@@ -29,8 +29,6 @@ class GraspResponse(NamedTuple):
     """dlam/da."""
     stability: Float[AnyArray, "*batch"] | np.float64
     """Smallest eigenvalue of the stiffness with the actuators locked."""
-    space: tuple[AnyArray, AnyArray] | None = None
-    """``E^+`` and its null space, where they hold for all moment arms: no actuator is rigid."""
 
 
 class Drives(NamedTuple):
@@ -118,7 +116,7 @@ class Reduction(nn.Module):
         parts: list[Tensor] = []
         for unique in torch.unique(pattern, dim=0):
             at = (pattern == unique).all(-1)
-            group = self._solve(flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable)[:4]
+            group = self._solve(flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable)
             parts = parts or [part.new_empty(len(pattern), *part.shape[1:]) for part in group]
             for whole, part in zip(parts, group, strict=True):
                 whole[at] = part
@@ -179,8 +177,7 @@ class Reduction(nn.Module):
         dlam = system.actuator_force(step, n_h)
         dmu = system.row_scale[:, None] * step.reaction[..., :n_h, :]
         S = like(self.scaled_basis, dmu)
-        space = None if len(system.rigid) else (step.pinv, step.null)
-        return GraspResponse(_left(S.mT, step.motion), dmu, dlam, step.stability, space)
+        return GraspResponse(_left(S.mT, step.motion), dmu, dlam, step.stability)
 
 
 class ReducedStep(NamedTuple):
