@@ -97,14 +97,7 @@ class ContactDetector:
             NonFiniteError: an entry is NaN or infinite.
         """
         frames, solids = self._placed(q, position, rotation)
-        found: list[tuple[int, PadContact]] = []
-        missed: list[NearMiss] = []
-        for k, (pad, link) in enumerate(zip(self._pads, self._links, strict=True)):
-            contact = self._nearest(pad, frames[link], solids, self.margin)
-            if isinstance(contact, PadContact):
-                found.append((k, contact))
-            else:
-                missed.append(NearMiss(self.hand.pads[k].link, self.hand.pads[k].name, contact))
+        found, missed = self._of_pads(frames, solids, self.margin)
         missed += self._other_links.touching(frames, solids)
         return self._contact_set(found, missed, position.dtype, position.device)
 
@@ -123,11 +116,7 @@ class ContactDetector:
             ShapeError, NonFiniteError: as of a call.
         """
         frames, solids = self._placed(q, position, rotation)
-        found = []
-        for k, (pad, link) in enumerate(zip(self._pads, self._links, strict=True)):
-            contact = self._nearest(pad, frames[link], solids, margin)
-            if isinstance(contact, PadContact):
-                found.append((k, contact))
+        found, _ = self._of_pads(frames, solids, margin)
         links = self._other_links.contacts(frames, solids, margin, CROWN_RADIUS)
         return self._contact_set(found, [], position.dtype, position.device, links)
 
@@ -151,6 +140,19 @@ class ContactDetector:
         T_object[:3, 3] = position.detach().to("cpu", torch.float64).numpy()
         solids = [(solid, T_object @ solid.shape.transform) for solid in self._shapes]
         return frames, solids
+
+    def _of_pads(
+        self, frames: Array, solids: list[tuple[Solid, Array]], margin: float
+    ) -> tuple[list[tuple[int, PadContact]], list[NearMiss]]:
+        """Pads within the margin, by their place in the hand, and the others."""
+        found, missed = [], []
+        for k, (pad, link) in enumerate(zip(self._pads, self._links, strict=True)):
+            contact = self._nearest(pad, frames[link], solids, margin)
+            if isinstance(contact, PadContact):
+                found.append((k, contact))
+            else:
+                missed.append(NearMiss(self.hand.pads[k].link, self.hand.pads[k].name, contact))
+        return found, missed
 
     def _nearest(
         self, pad: Pad, T_link: Array, solids: list[tuple[Solid, Array]], margin: float

@@ -56,8 +56,6 @@ class GraspEncoding(Recorded):
         return len(self.joints) + 6
 
     def __call__(self, state: GraspState) -> Float[Tensor, "*batch n_features"]:
-        x = state.coordinates(self.reference)
-        n_q = state.q.shape[-1]
-        dq = x[..., self.joints] - self.reference.q[..., self.joints]
-        do, dphi = x[..., n_q : n_q + 3], x[..., n_q + 3 :]
-        return torch.cat([dq / _Q_SCALE, do / _POSITION_SCALE, dphi / _ROTATION_SCALE], dim=-1)
+        dq, do, dphi = state.minus(self.reference).split([state.q.shape[-1], 3, 3], dim=-1)
+        parts = dq[..., self.joints] / _Q_SCALE, do / _POSITION_SCALE, dphi / _ROTATION_SCALE
+        return torch.cat(parts, dim=-1)

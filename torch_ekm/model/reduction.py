@@ -60,27 +60,19 @@ class Reduction(nn.Module):
         pose = torch.eye(6, dtype=dtype)
         if hand.planar_normal is not None:
             pose = planar_pose_basis(torch.tensor(hand.planar_normal, dtype=dtype))
-        self.joint_basis: Tensor
-        self.pose_basis: Tensor
-        self.basis: Tensor
-        self.scaled_basis: Tensor
-        self.actuation: Tensor
-        self.stiffness: Tensor
-        self.register_buffer("joint_basis", joint, persistent=False)
-        self.register_buffer("pose_basis", pose, persistent=False)
-        self.register_buffer("basis", torch.block_diag(joint, pose), persistent=False)
+        self.joint_basis = nn.Buffer(joint, persistent=False)
+        self.pose_basis = nn.Buffer(pose, persistent=False)
         pose_scaled = pose.clone()
         pose_scaled[:3] *= CHARACTERISTIC_LENGTH
-        self.register_buffer("scaled_basis", torch.block_diag(joint, pose_scaled), persistent=False)
+        self.scaled_basis = nn.Buffer(torch.block_diag(joint, pose_scaled), persistent=False)
         J_a = torch.as_tensor(hand.actuation_jacobian).to(dtype)
-        self.register_buffer("actuation", J_a, persistent=False)
+        self.actuation = nn.Buffer(J_a, persistent=False)
         stiffness = torch.tensor([actuator.stiffness for actuator in hand.actuators], dtype=dtype)
         # next to a spring of 1 N m/rad a million is rigid to 1e-6, but drowns it in the tests of rank
         rigid = stiffness * J_a.square().sum(-1) > 1e6
         if not options.actuator_compliance:
             rigid = torch.ones_like(rigid)
-        stiffness = torch.where(rigid, torch.inf, stiffness)
-        self.register_buffer("stiffness", stiffness, persistent=False)
+        self.stiffness = nn.Buffer(torch.where(rigid, torch.inf, stiffness), persistent=False)
 
     def solve(
         self,

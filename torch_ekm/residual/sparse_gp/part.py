@@ -93,8 +93,6 @@ class Host(DoubleStateLearner):
     """Samples of each model since the caches were made, ``(*batch_shape)``."""
     weighing: tuple[Part, ...]
     """Parts that weigh samples."""
-    calibrating: bool
-    """Whether a part changes the observation noise at any sample."""
 
     @property
     @abstractmethod
