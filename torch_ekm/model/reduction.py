@@ -66,13 +66,13 @@ class Reduction(nn.Module):
         pose_scaled[:3] *= CHARACTERISTIC_LENGTH
         self.scaled_basis = nn.Buffer(torch.block_diag(joint, pose_scaled), persistent=False)
         J_a = torch.as_tensor(hand.actuation_jacobian).to(dtype)
-        self.actuation = nn.Buffer(J_a, persistent=False)
+        self.actuation: Tensor = nn.Buffer(J_a, persistent=False)
         stiffness = torch.tensor([actuator.stiffness for actuator in hand.actuators], dtype=dtype)
         # next to a spring of 1 N m/rad a million is rigid to 1e-6, but drowns it in the tests of rank
         rigid = stiffness * J_a.square().sum(-1) > 1e6
         if not options.actuator_compliance:
             rigid = torch.ones_like(rigid)
-        self.stiffness = nn.Buffer(torch.where(rigid, torch.inf, stiffness), persistent=False)
+        self.stiffness: Tensor = nn.Buffer(torch.where(rigid, torch.inf, stiffness), persistent=False)
 
     def solve(
         self,
@@ -108,7 +108,8 @@ class Reduction(nn.Module):
         parts: list[Tensor] = []
         for unique in torch.unique(pattern, dim=0):
             at = (pattern == unique).all(-1)
-            group = self._solve(flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable)
+            one = flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable
+            group: tuple[Any, ...] = self._solve(*one)
             parts = parts or [part.new_empty(len(pattern), *part.shape[1:]) for part in group]
             for whole, part in zip(parts, group, strict=True):
                 whole[at] = part

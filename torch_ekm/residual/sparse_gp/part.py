@@ -15,7 +15,6 @@ from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..base import DoubleStateLearner
 from ..kernels.kernel import Kernel
-from ..native import native
 from ..report import UpdateReport
 from .posterior import SparsePosterior
 
@@ -71,10 +70,6 @@ class Sample(NamedTuple):
     innovation: Float[Tensor, "*batch out"]  #: in the learner's units, as the latent variance
     variance: Float[Tensor, "*batch"]
     report: UpdateReport
-
-    def native(self) -> tuple[Any, Any, Any, Any, Any]:
-        """x, y, mask, nis and weight as :func:`~torch_ekm.residual.native.native` gives them."""
-        return tuple(map(native, (self.x, self.y, self.mask, self.report.nis, self.report.weight)))
 
 
 class Host(DoubleStateLearner):
