@@ -109,7 +109,7 @@ class Reduction(nn.Module):
         for unique in torch.unique(pattern, dim=0):
             at = (pattern == unique).all(-1)
             one = flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable
-            group: tuple[Any, ...] = self._solve(*one)
+            group = [torch.as_tensor(part) for part in self._solve(*one)]
             parts = parts or [part.new_empty(len(pattern), *part.shape[1:]) for part in group]
             for whole, part in zip(parts, group, strict=True):
                 whole[at] = part
