@@ -53,7 +53,7 @@ def controller(grasp, enhanced: bool = False, **parts) -> LookAndMoveController:
     if enhanced:
         learner = SparseOnlineGP(6 + plant.hand.n_a, 6)
         rows = list(range(plant.hand.n_q, plant.hand.n_q + 6))
-        used = EnhancedModel(model, learner, encode=lambda s: s.coordinates(s)[..., -6:], outputs=rows)
+        used = EnhancedModel(model, learner, encode=lambda s: s.minus(s)[..., -6:], outputs=rows)
     axis = FocusedPose.rotation_about(plant.rotation_axis)
     return LookAndMoveController(used, axis, **{"pace": paced(), **parts})
 

@@ -92,14 +92,3 @@ def test_learner_and_encoding_of_ones_own(model: Held, state: GraspState) -> Non
     assert ekm.encode is encode
     again = EnhancedModel.for_grasp(model, state, ekm.learner, encode)  # one that knows something already
     assert again.learner is ekm.learner
-
-
-def test_the_encoding_of_a_state_follows_what_is_written_to_it(model: Held, state: GraspState) -> None:
-    encode = GraspEncoding.of(model, state)
-    other = GraspState(state.q + 0.1, state.position.clone(), state.rotation)
-    first = encode(other)
-    assert encode(other) is first
-    other.position[0] += 0.01
-    assert not torch.equal(encode(other), first)
-    asked = GraspState((state.q + 0.1).requires_grad_(True), state.position, state.rotation)
-    assert encode(asked).requires_grad

@@ -78,7 +78,6 @@ class ContactDetector:
         self._other_links = LinkShapes(self._coal, hand, LINK_MARGIN, self._coarse_distance)
         self._request = self._coal.DistanceRequest()
         self._result = self._coal.DistanceResult()
-        self._at: tuple[Array, Any] | None = None
 
     def __call__(
         self,
@@ -98,14 +97,7 @@ class ContactDetector:
             NonFiniteError: an entry is NaN or infinite.
         """
         frames, solids = self._placed(q, position, rotation)
-        found: list[tuple[int, PadContact]] = []
-        missed: list[NearMiss] = []
-        for k, (pad, link) in enumerate(zip(self._pads, self._links, strict=True)):
-            contact = self._nearest(pad, frames[link], solids, self.margin)
-            if isinstance(contact, PadContact):
-                found.append((k, contact))
-            else:
-                missed.append(NearMiss(self.hand.pads[k].link, self.hand.pads[k].name, contact))
+        found, missed = self._of_pads(frames, solids, self.margin)
         missed += self._other_links.touching(frames, solids)
         return self._contact_set(found, missed, position.dtype, position.device)
 
@@ -124,11 +116,7 @@ class ContactDetector:
             ShapeError, NonFiniteError: as of a call.
         """
         frames, solids = self._placed(q, position, rotation)
-        found = []
-        for k, (pad, link) in enumerate(zip(self._pads, self._links, strict=True)):
-            contact = self._nearest(pad, frames[link], solids, margin)
-            if isinstance(contact, PadContact):
-                found.append((k, contact))
+        found, _ = self._of_pads(frames, solids, margin)
         links = self._other_links.contacts(frames, solids, margin, CROWN_RADIUS)
         return self._contact_set(found, [], position.dtype, position.device, links)
 
@@ -153,6 +141,19 @@ class ContactDetector:
         solids = [(solid, T_object @ solid.shape.transform) for solid in self._shapes]
         return frames, solids
 
+    def _of_pads(
+        self, frames: Array, solids: list[tuple[Solid, Array]], margin: float
+    ) -> tuple[list[tuple[int, PadContact]], list[NearMiss]]:
+        """Pads within the margin, by their place in the hand, and the others."""
+        found, missed = [], []
+        for k, (pad, link) in enumerate(zip(self._pads, self._links, strict=True)):
+            contact = self._nearest(pad, frames[link], solids, margin)
+            if isinstance(contact, PadContact):
+                found.append((k, contact))
+            else:
+                missed.append(NearMiss(self.hand.pads[k].link, self.hand.pads[k].name, contact))
+        return found, missed
+
     def _nearest(
         self, pad: Pad, T_link: Array, solids: list[tuple[Solid, Array]], margin: float
     ) -> PadContact | float:
@@ -174,10 +175,7 @@ class ContactDetector:
 
     def _coarse_distance(self, pad: Pad | Solid, T_pad: Array, solid: Solid, T_solid: Array) -> float:
         """coal's signed distance [m]: the gap without the crown, to its tolerance of 1e-6."""
-        here = self._coal.Transform3s(T_pad[:3, :3], T_pad[:3, 3])
-        if self._at is None or self._at[0] is not T_solid:  # links are asked of one primitive
-            self._at = T_solid, self._coal.Transform3s(T_solid[:3, :3], T_solid[:3, 3])
-        there = self._at[1]
+        here, there = (self._coal.Transform3s(T[:3, :3], T[:3, 3]) for T in (T_pad, T_solid))
         self._result.clear()
         shapes = pad.geometry, here, solid.geometry, there
         return self._coal.distance(*shapes, self._request, self._result)

@@ -73,11 +73,17 @@ def flat_contact(coal, link: Solid, T_link: Array, solid: Solid, T_solid: Array)
     local = T_solid[:3, :3].T @ (points[1] - T_solid[:3, 3])
     inner = T_solid[:3, :3].T @ n
     principal, sharp = surface_curvature(solid.shape, tuple(local.tolist()), tuple(inner.tolist()))
-    K_o = np.zeros((3, 3))
-    for curvature, direction in principal:
-        e = T_solid[:3, :3] @ direction
-        K_o += curvature * np.outer(e, e)
+    K_o = _curvature(principal, T_solid[:3, :3])
     return PadContact(point, n, gap, np.zeros((3, 3)), K_o, sharp or not principal)
+
+
+def _curvature(principal: list, rotation: Array) -> Array:
+    """Of the object, from its principal curvatures in its own axes."""
+    K = np.zeros((3, 3))
+    for curvature, direction in principal:
+        e = rotation @ direction
+        K += curvature * np.outer(e, e)
+    return K
 
 
 def pad_contact(pad: Pad | LinkCapsule, T_pad: Array, solid: Solid, T_solid: Array, R: float) -> PadContact:
@@ -99,10 +105,7 @@ def pad_contact(pad: Pad | LinkCapsule, T_pad: Array, solid: Solid, T_solid: Arr
     principal, sharp = surface_curvature(solid.shape, c, n_local)
 
     n = rotation @ n_local
-    K_o = np.zeros((3, 3))
-    for curvature, direction in principal:
-        e = rotation @ direction
-        K_o += curvature * np.outer(e, e)
+    K_o = _curvature(principal, rotation)
     K_f = (np.eye(3) - np.outer(n, n)) / pad.radius
     lean = float(n @ T_pad[:3, 2])
     # On the side: the crown instead of 1/rho along the axis. There |lean| <= half crown, except deep inside a

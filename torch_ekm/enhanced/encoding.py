@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from .._arrays import is_plain
 from .._recorded import Recorded
 from ..exceptions import UnknownNameError
 from ..kinematics.grasp_state import GraspState
@@ -37,7 +36,6 @@ class GraspEncoding(Recorded):
             if not 0 <= joint < n_q:
                 raise UnknownNameError("joint index", str(joint), [f"0..{n_q - 1}"])
         self.reference, self.joints = reference, joints
-        self._last: tuple[GraspState, list[int], Tensor] | None = None
 
     @classmethod
     def of(cls, model: KinematicModel, state: GraspState) -> GraspEncoding:
@@ -58,17 +56,6 @@ class GraspEncoding(Recorded):
         return len(self.joints) + 6
 
     def __call__(self, state: GraspState) -> Float[Tensor, "*batch n_features"]:
-        parts = state.q, state.position, state.rotation
-        if not is_plain(*parts) or any(part.is_inference() for part in parts):
-            return self._encoded(state)
-        now = [part._version for part in parts]  # a tensor may be written to
-        if self._last is None or self._last[0] is not state or self._last[1] != now:
-            self._last = state, now, self._encoded(state)  # a motion asks several times
-        return self._last[2]
-
-    def _encoded(self, state: GraspState) -> Tensor:
-        x = state.coordinates(self.reference)
-        n_q = state.q.shape[-1]
-        dq = x[..., self.joints] - self.reference.q[..., self.joints]
-        do, dphi = x[..., n_q : n_q + 3], x[..., n_q + 3 :]
-        return torch.cat([dq / _Q_SCALE, do / _POSITION_SCALE, dphi / _ROTATION_SCALE], dim=-1)
+        dq, do, dphi = state.minus(self.reference).split([state.q.shape[-1], 3, 3], dim=-1)
+        parts = dq[..., self.joints] / _Q_SCALE, do / _POSITION_SCALE, dphi / _ROTATION_SCALE
+        return torch.cat(parts, dim=-1)

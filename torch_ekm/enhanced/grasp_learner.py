@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-from ..residual import (
-    ActionLinearKernel,
-    ForgettingFactor,
-    RobustWeight,
-    SparseOnlineGP,
-    SquaredExponential,
-)
+from ..residual import ActionLinearKernel, ForgettingFactor, RobustWeight, SparseOnlineGP, SquaredExponential
 
 #: s2 of a motion in mm and deg: what camera, servo and play leave unexplained.
 NOISE_VARIANCE = 0.1

@@ -135,7 +135,6 @@ class HandFigures(ParameterFilter):
         self.hand, self._entries, self._kind = hand, tuple(found), kind.numpy()
         self._described = np.array([one.nominal for one in found])
         self._prior_std = np.array([one.prior for one in found])
-        self._solved: tuple[MotionEquations, Tensor, Motion | None] | None = None
         self._at = [  # where the figures of each kind stand in its array
             tuple(map(np.array, zip(*(one.index for one in found if one.kind == name), strict=True)))
             for name in KINDS
@@ -226,16 +225,10 @@ class HandFigures(ParameterFilter):
 
     def solve(self, equations: MotionEquations) -> Motion | None:
         """J_m with the present figures; None where the grasp would buckle with them."""
-        if self._solved is not None:  # a motion is decided, expected and learned from at the same figures
-            of, mean, motion = self._solved
-            if of is equations and torch.equal(mean, self.mean):
-                return motion
         try:
-            motion = equations.solve(*self.present(equations.reduction.drives))
+            return equations.solve(*self.present(equations.reduction.drives))
         except GraspError:
-            motion = None
-        self._solved = equations, self.mean.clone(), motion
-        return motion
+            return None
 
     def present(self, described: Drives) -> tuple[Float[Tensor, " n_q"], Drives]:
         """Change of the springs against the description [N m/rad] and the drives, both as known now."""

@@ -38,10 +38,7 @@ def save(learner: ResidualLearner | EnhancedModel, path: str | os.PathLike) -> N
 
 
 def load(
-    path: str | os.PathLike,
-    *,
-    model: Callable[[Any, Any], Any] | None = None,
-    classes: Iterable[type] = (),
+    path: str | os.PathLike, *, model: Callable[[Any, Any], Any] | None = None, classes: Iterable[type] = ()
 ) -> Any:
     """What :func:`save` wrote, made again and in the state it had. Nothing in the file is ever run.
 

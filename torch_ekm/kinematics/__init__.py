@@ -9,11 +9,4 @@ from .link_poses import LinkPoses
 from .play import Play
 from .servo_model import ServoModel
 
-__all__ = [
-    "ActuationMap",
-    "GraspState",
-    "HandKinematics",
-    "LinkPoses",
-    "Play",
-    "ServoModel",
-]
+__all__ = ["ActuationMap", "GraspState", "HandKinematics", "LinkPoses", "Play", "ServoModel"]

@@ -45,14 +45,9 @@ class ActuationMap(nn.Module):
         P = torch.linalg.pinv(B)[:, : hand.n_a]
         if N.shape[-1]:  # remove from P what the springs would not do by themselves
             P = P - N @ torch.linalg.solve(N.mT @ K_s @ N, N.mT @ K_s @ P)
-        for name, value in (
-            ("J_a", J_a),
-            ("C", C),
-            ("free_motion", P),
-            ("null", N),
-            ("_offset", torch.from_numpy(hand.actuator_offset)),
-            ("_rest", torch.from_numpy(hand.spring_rest)),
-        ):
+        offset, rest = torch.from_numpy(hand.actuator_offset), torch.from_numpy(hand.spring_rest)
+        parts = {"J_a": J_a, "C": C, "free_motion": P, "null": N, "_offset": offset, "_rest": rest}
+        for name, value in parts.items():
             self.register_buffer(name, value.to(dtype, copy=True), persistent=False)
 
     def actuators(self, q: Float[Tensor, "*batch n_q"]) -> Float[Tensor, "*batch n_a"]:

@@ -73,11 +73,6 @@ class GraspState:
         dphi = log(self.rotation @ earlier.rotation.mT)
         return torch.cat([self.q - earlier.q, self.position - earlier.position, dphi], dim=-1)
 
-    def coordinates(self, reference: GraspState) -> Float[Tensor, "*batch n_s"]:
-        """Inputs for a learner: ``[q; o - o_ref; Log(R R_ref^T)]``."""
-        dphi = log(self.rotation @ reference.rotation.mT)
-        return torch.cat([self.q, self.position - reference.position, dphi], dim=-1)
-
 
 def _check_rotation(R: Tensor) -> None:
     """``cof R = R``: every column is the cross product of the other two, which holds for rotations only."""

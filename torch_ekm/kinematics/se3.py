@@ -70,14 +70,8 @@ def log(rotation: Float[AnyArray, "*batch 3 3"]) -> Float[Any, "*batch 3"]:
     if isinstance(rotation, Tensor) and is_plain(rotation):
         return torch.from_numpy(log(rotation.numpy()))
     xp = namespace(rotation)
-    w = xp.stack(
-        [
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ],
-        -1,
-    )
+    pairs = (2, 1), (0, 2), (1, 0)
+    w = xp.stack([rotation[..., i, j] - rotation[..., j, i] for i, j in pairs], -1)
     sine2 = (w * w).sum(-1) / 4  # sin^2 t
     trace = rotation[..., 0, 0] + rotation[..., 1, 1] + rotation[..., 2, 2]
     cosine = (trace - 1) / 2

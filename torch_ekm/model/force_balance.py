@@ -148,7 +148,7 @@ class ForceBalance:
                 expected=None if prior is None else prior.mean[k],
                 expected_covariance=None if prior is None else prior.covariance[k],
             )
-            solution = contact_forces(eq, options, problems[-1][1].active if problems else ())
+            solution = contact_forces(eq, options)
             mu, lam = solution.mu, solution.lam
             residual, torque = np.zeros(n_q), np.zeros(n_q)
             if solution.status is ForceStatus.SOLVED:

@@ -36,21 +36,9 @@ def only_if_asked(method: Callable[..., Any]) -> Any:
 
     @functools.wraps(method)
     def wrapped(self: Any, state: GraspState, *args: Any, **kwargs: Any) -> Any:
-        asked = torch.is_grad_enabled() and any(
-            x.requires_grad
-            for x in (
-                self.spring_stiffness,
-                self.spring_rest,
-                self.reduction.actuation,
-                self.reduction.stiffness,
-                self.weight,
-                self.com,
-                state.q,
-                state.position,
-                state.rotation,
-            )
-        )
-        with torch.set_grad_enabled(asked):
+        figures = self.spring_stiffness, self.spring_rest, *self.reduction.drives, self.weight, self.com
+        given = *figures, state.q, state.position, state.rotation
+        with torch.set_grad_enabled(torch.is_grad_enabled() and any(x.requires_grad for x in given)):
             return method(self, state, *args, **kwargs)
 
     return wrapped

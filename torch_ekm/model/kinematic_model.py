@@ -99,18 +99,14 @@ class KinematicModel(nn.Module):
         self.link_names = tuple(self.kinematics.link_names)
         self.reduction = Reduction(hand, self.options, dtype)
         self.balance = ForceBalance(hand, self.options, self.reduction)
-
-        def buffer(name: str, value: object) -> None:
-            self.register_buffer(name, torch.as_tensor(value).to(dtype), persistent=False)
-
-        buffer("spring_stiffness", hand.spring_stiffness)
-        buffer("spring_rest", hand.spring_rest)
-        buffer("weight", float(obj.mass) * torch.tensor(hand.gravity, dtype=torch.float64))
-        buffer("com", obj.com)
-        normal = hand.planar_normal
-        self.register_buffer(
-            "plane", None if normal is None else torch.tensor(normal, dtype=dtype), persistent=False
-        )
+        figures = {
+            "spring_stiffness": hand.spring_stiffness, "spring_rest": hand.spring_rest, "com": obj.com,
+            "weight": float(obj.mass) * torch.tensor(hand.gravity, dtype=torch.float64),
+            "plane": hand.planar_normal,
+        }  # fmt: skip
+        for name, value in figures.items():
+            value = None if value is None else torch.as_tensor(value).to(dtype)
+            self.register_buffer(name, value, persistent=False)
         self.register_buffer("precedes", precedence(self.kinematics.upstream), persistent=False)
 
     def with_figures(self, figures: FollowedFigures) -> KinematicModel:
@@ -216,13 +212,8 @@ class KinematicModel(nn.Module):
             GraspEndsError: no equilibrium is near.
             GraspError: what :meth:`linearize` raises.
         """
-        start = self.linearize(
-            state,
-            self.touching(state),
-            fingertip_force=fingertip_force,
-            expected=expected,
-            on_unstable="flag",
-        )
+        known = {"fingertip_force": fingertip_force, "expected": expected}
+        start = self.linearize(state, self.touching(state), **known, on_unstable="flag")
         return ContactMotion(self, start, a=a).move(delta_a)
 
     def moving(self, contacts: ContactSet) -> Bool[Tensor, " n_q"]:
@@ -303,15 +294,11 @@ class KinematicModel(nn.Module):
         A = constraint_matrix(kin)
         V_s, V_ss = self.potential(at)
         lock = [joint_index(self.hand, name) for name in locked]
-        last, measured = None, None
+        last, measured, before = None, None, () if previous is None else previous.contacts.finger
         if fingertip_force is not None:
             measured = at_pads(self.hand, contacts, fingertip_force, at.q)
         if forces is None:
-            if (
-                previous is not None
-                and previous.forces.solved
-                and previous.contacts.finger == contacts.finger
-            ):
+            if previous is not None and previous.forces.solved and before == contacts.finger:
                 last = previous.forces
             readings = None if measured is None else [measured[finger] for finger in contacts.finger]
             touch = None if readings is None else namespace(at.q).stack(readings, -1)
@@ -326,8 +313,7 @@ class KinematicModel(nn.Module):
         held = self.balance.held_by_stops(at.q, f.stop_torque)
         held[..., lock] = True
         slack = like(self.balance.slack(forces), at.q)
-        solved = self.reduction.solve(D, A, kin.rows, held, slack, o.on_unstable)
-        J, dmu, dlam, stability, space = solved
+        J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held, slack, o.on_unstable)
         df, dn = force_change(kin, dmu), normal_motion(kin, J)
         normal = normal_sensitivity(kin, f, df, dn)
         margin = margin_sensitivity(kin, f, dmu, df, dn, normal)
@@ -335,8 +321,10 @@ class KinematicModel(nn.Module):
         J, dmu, dlam, normal, margin, df, dn, held, stability, D, A, slack = tensors
         equations = None
         if held.dim() == 1:
-            space, moving = space if plain else None, self.moving(contacts)
-            equations = MotionEquations(self.reduction, D, A, tuple(kin.rows), held, slack, moving, space)
+            moving = self.moving(contacts)
+            equations = MotionEquations(self.reduction, D, A, tuple(kin.rows), held, slack, moving)
+        reused, names = last is not None, self.hand.joint_names
+        doubts = find_doubts(o, names, contacts, forces, stability, reused, measured, before)
         found = Linearization(
             state=state,
             contacts=contacts,
@@ -353,16 +341,7 @@ class KinematicModel(nn.Module):
             stability=stability,
             options=o,
             equations=equations,
-            doubts=find_doubts(
-                o,
-                self.hand.joint_names,
-                contacts,
-                forces,
-                stability,
-                reused=last is not None,
-                measured=measured,
-                before=() if previous is None else previous.contacts.finger,
-            ),
+            doubts=doubts,
         )
         return self.followed(found)
 

@@ -56,7 +56,6 @@ def two_stage(
     R: Float[AnyArray, "... m n_a"],
     F: Float[AnyArray, "... n n_a"] | None = None,
     *,
-    space: tuple[AnyArray, AnyArray] | None = None,
     on_unstable: str = "raise",
     actuators: Sequence[str] = (),
 ) -> KKTSolution:
@@ -70,7 +69,6 @@ def two_stage(
         E: rows that hold exactly.
         R: how fast each row is driven by each actuator; one for all states, or one for each.
         F: generalised forces of compliant actuators, per unit of da; one for all states, or one for each.
-        space: ``E^+`` and N, where they are known.
         on_unstable: "raise", or "flag" (return the formal answer; read ``stability``).
         actuators: their names, for messages.
 
@@ -84,7 +82,7 @@ def two_stage(
     xp = namespace(D)
     eps = xp.finfo(D.dtype).eps
     rank_tolerance, stiffness_tolerance = max(_RANK, 10 * eps), max(_STIFFNESS, 10 * eps)
-    pinv, N = _range_and_null(E, rank_tolerance) if space is None else space
+    pinv, N = _range_and_null(E, rank_tolerance)
     P = pinv @ R
     lost = E @ P - R
     if 0 not in lost.shape and _largest(lost) > 10 * eps**0.5 * _largest(R):

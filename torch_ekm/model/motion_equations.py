@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 
 from .._arrays import is_plain, like
-from ..typing import AnyArray, Bool, Float, Tensor
+from ..typing import Bool, Float, Tensor
 from .manipulation import two_stage
 from .reduction import Drives, Reduction
 
@@ -42,8 +42,6 @@ class MotionEquations:
     slack: Bool[Tensor, " n_a"]
     moving: Bool[Tensor, " n_q"]
     """Joints of the fingers that touch."""
-    space: tuple[AnyArray, AnyArray] | None = None
-    """``E^+`` and N of the constraints, in arrays, where they are the same for all figures."""
 
     def solve(self, springs: Float[Tensor, " n_q"], drives: Drives) -> Motion:
         """J_m with other figures.
@@ -72,8 +70,7 @@ class Motion:
         stiffness, A, held, slack, J_a, K_a = (x.numpy() if plain else x for x in given)
         self._S, self._drives = like(reduction.scaled_basis, stiffness), Drives(J_a, K_a)
         self._system = system = reduction.reduced(stiffness, A, list(of.rows), held, slack, self._drives)
-        known = {"space": of.space if plain else None, "actuators": reduction.actuators}
-        self._step = two_stage(system.D, system.E, system.R, system.F, **known)
+        self._step = two_stage(system.D, system.E, system.R, system.F, actuators=reduction.actuators)
         self.jacobian: Float[Tensor, "n_s n_a"] = torch.as_tensor(self._S @ self._step.motion)
         """J_m."""
 

@@ -29,8 +29,6 @@ class GraspResponse(NamedTuple):
     """dlam/da."""
     stability: Float[AnyArray, "*batch"] | np.float64
     """Smallest eigenvalue of the stiffness with the actuators locked."""
-    space: tuple[AnyArray, AnyArray] | None = None
-    """``E^+`` and its null space, where they hold for all moment arms: no actuator is rigid."""
 
 
 class Drives(NamedTuple):
@@ -62,27 +60,19 @@ class Reduction(nn.Module):
         pose = torch.eye(6, dtype=dtype)
         if hand.planar_normal is not None:
             pose = planar_pose_basis(torch.tensor(hand.planar_normal, dtype=dtype))
-        self.joint_basis: Tensor
-        self.pose_basis: Tensor
-        self.basis: Tensor
-        self.scaled_basis: Tensor
-        self.actuation: Tensor
-        self.stiffness: Tensor
-        self.register_buffer("joint_basis", joint, persistent=False)
-        self.register_buffer("pose_basis", pose, persistent=False)
-        self.register_buffer("basis", torch.block_diag(joint, pose), persistent=False)
+        self.joint_basis = nn.Buffer(joint, persistent=False)
+        self.pose_basis = nn.Buffer(pose, persistent=False)
         pose_scaled = pose.clone()
         pose_scaled[:3] *= CHARACTERISTIC_LENGTH
-        self.register_buffer("scaled_basis", torch.block_diag(joint, pose_scaled), persistent=False)
+        self.scaled_basis = nn.Buffer(torch.block_diag(joint, pose_scaled), persistent=False)
         J_a = torch.as_tensor(hand.actuation_jacobian).to(dtype)
-        self.register_buffer("actuation", J_a, persistent=False)
+        self.actuation: Tensor = nn.Buffer(J_a, persistent=False)
         stiffness = torch.tensor([actuator.stiffness for actuator in hand.actuators], dtype=dtype)
         # next to a spring of 1 N m/rad a million is rigid to 1e-6, but drowns it in the tests of rank
         rigid = stiffness * J_a.square().sum(-1) > 1e6
         if not options.actuator_compliance:
             rigid = torch.ones_like(rigid)
-        stiffness = torch.where(rigid, torch.inf, stiffness)
-        self.register_buffer("stiffness", stiffness, persistent=False)
+        self.stiffness: Tensor = nn.Buffer(torch.where(rigid, torch.inf, stiffness), persistent=False)
 
     def solve(
         self,
@@ -118,7 +108,8 @@ class Reduction(nn.Module):
         parts: list[Tensor] = []
         for unique in torch.unique(pattern, dim=0):
             at = (pattern == unique).all(-1)
-            group = self._solve(flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable)[:4]
+            one = flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable
+            group = [torch.as_tensor(part) for part in self._solve(*one)]
             parts = parts or [part.new_empty(len(pattern), *part.shape[1:]) for part in group]
             for whole, part in zip(parts, group, strict=True):
                 whole[at] = part
@@ -179,8 +170,7 @@ class Reduction(nn.Module):
         dlam = system.actuator_force(step, n_h)
         dmu = system.row_scale[:, None] * step.reaction[..., :n_h, :]
         S = like(self.scaled_basis, dmu)
-        space = None if len(system.rigid) else (step.pinv, step.null)
-        return GraspResponse(_left(S.mT, step.motion), dmu, dlam, step.stability, space)
+        return GraspResponse(_left(S.mT, step.motion), dmu, dlam, step.stability)
 
 
 class ReducedStep(NamedTuple):

@@ -95,12 +95,8 @@ class CompiledJudge:
         self._offset, self._inflation = g.offset.numpy().reshape(-1), g.inflation.numpy().reshape(-1)
         self._count, self._prior = g.count.numpy().reshape(-1), g.prior.double().numpy()
         self._experts, tails = g.get_buffer("_experts").numpy(), g.tails
-        law = StudentT(tails.freedoms)
-        self._laws = (
-            tails.rates.numpy(),
-            tails.freedoms.numpy(),
-            law.log_prob(torch.zeros_like(tails.freedoms)).numpy(),
-        )
+        at_zero = StudentT(tails.freedoms).log_prob(torch.zeros_like(tails.freedoms))
+        self._laws = tuple(t.numpy() for t in (tails.rates, tails.freedoms, at_zero))
         self._tails = tuple(t.numpy().reshape(rows, -1) for t in (tails.log_scale, tails.evidence))
         learners, experts = np.empty((2, rows, n_learners)), np.empty((2, rows, n_experts))
         self._work = *learners, *experts, np.empty((rows, 2))

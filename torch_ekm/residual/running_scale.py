@@ -1,12 +1,9 @@
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import nn
 
 from ..typing import Float, Tensor
-from .native import native_buffers
 
 BLOCK = 32  #: samples of a block; those before the first one is full count from the first on
 _TRIMMED = (8.0, 4.0)  # an eighth, or a fourth of a block
@@ -75,14 +72,13 @@ class RunningScale(nn.Module):
         """n samples of each model in the learner's units."""
         return (x - self.shift.unsqueeze(-2)) / self.scale.unsqueeze(-2)
 
-    def observe(self, place: int, x: Any, on: Any) -> None:
+    def observe(self, place: int, x: Float[Tensor, "*batch features"], on: Tensor | None) -> None:
         """A sample ``(*batch, features)`` of the models ``on``, at its place in the block; the last pools.
 
-        Both as :func:`~torch_ekm.residual.native.native` gives them; ``on`` None: all.
+        ``on`` None: all models.
         """
-        kept = native_buffers(self)
-        kept["block"][..., place, :] = x
-        kept["block_on"][..., place, 0] = 1.0 if on is None else on
+        self.block[..., place, :] = x
+        self.block_on[..., place, 0] = 1.0 if on is None else on
         if place == BLOCK - 1:
             pooled = self.weight, self.centre, self.spread, self.large
             for buffer, found in zip(pooled, self._pooled(), strict=True):

@@ -90,6 +90,3 @@ class ForceSolution:
     """Number of QPs; 0: the answer without inequalities keeps them all."""
     covariance: Array | None = None
     """Of ``mu`` about the answer, ``(n_h, n_h)``; None without ``expected_covariance``."""
-    active: tuple[int, ...] = ()
-    """Inequalities that held with equality before the cones were cut out: where to start with a problem like
-    this one."""

@@ -1,10 +1,8 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import warnings
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,9 +18,7 @@ _TOLERANCE = 2e-7  # [N] largest friction violation left by the cutting planes
 _MAX_CUTS = 30
 
 
-def contact_forces(
-    eq: BalanceEquations, options: ForceOptions | None = None, start: Sequence[int] = ()
-) -> ForceSolution:
+def contact_forces(eq: BalanceEquations, options: ForceOptions | None = None) -> ForceSolution:
     """Forces that balance the object exactly and the joints as well as possible.
 
     The object balance is hard (mass and contact geometry are known best), the joint balance soft:
@@ -30,9 +26,6 @@ def contact_forces(
     planes.
 
     Never raises for an impossible grasp: read ``status`` and ``violation``.
-
-    Args:
-        start: ``active`` of a problem like this one; the answer does not depend on it.
     """
     options = options or ForceOptions()
     n_h = eq.object_matrix.shape[1]
@@ -47,8 +40,7 @@ def contact_forces(
     bounds = [(-np.eye(len(cost.q)), -problem.lb), (np.eye(len(cost.q)), problem.ub)]
     sides = [(rows[np.isfinite(most)], most[np.isfinite(most)]) for rows, most in bounds]
     limits, most = (np.concatenate(part) for part in zip(*sides, strict=True))
-    first = None
-    active = [row for row in start if row < len(most) + len(problem.h)]
+    active: list[int] = []
     for solves in range(1, _MAX_CUTS + 1):
         G, h = np.concatenate([limits, problem.G]), np.concatenate([most, problem.h])
         optimum = None if program is None else solve_by_active_set(program, G, h, active)
@@ -59,7 +51,6 @@ def contact_forces(
             x, active = solution.x, []
         else:
             x, active = optimum.x, optimum.active
-        first = tuple(active) if first is None else first
         unknowns = cost.scale * x
         new = cutting_planes(eq.cones, unknowns[:n_h], _TOLERANCE)
         if not len(new):
@@ -68,7 +59,7 @@ def contact_forces(
         rows = np.zeros((len(new), len(cost.scale)))
         rows[:, :n_h] = new * cost.scale[:n_h]
         problem.G, problem.h = np.concatenate([problem.G, rows]), np.append(problem.h, np.zeros(len(new)))
-    return dataclasses.replace(_unpack(eq, unknowns, solves, covariance), active=first)
+    return _unpack(eq, unknowns, solves, covariance)
 
 
 def _keeps_all(eq: BalanceEquations, unknowns: Array) -> bool:

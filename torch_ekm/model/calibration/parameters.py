@@ -166,9 +166,5 @@ class Unknowns:
             for actuator, k, a, w in zip(self.hand.actuators, stiffness, offset, backlash, strict=True)
         )
         return dataclasses.replace(
-            self.hand,
-            actuators=actuators,
-            actuation_jacobian=J_a,
-            spring_stiffness=springs,
-            spring_rest=rest,
+            self.hand, actuators=actuators, actuation_jacobian=J_a, spring_stiffness=springs, spring_rest=rest
         )

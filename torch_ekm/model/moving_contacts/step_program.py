@@ -68,13 +68,7 @@ class HandLaws:
         self._stops = np.flatnonzero(moves & np.isfinite(hand.joint_lower + hand.joint_upper))
 
     def program(
-        self,
-        here: PlacedGrasp,
-        loads: ContactLoads,
-        way: Way,
-        gap: Array,
-        load: Array,
-        damping: float,
+        self, here: PlacedGrasp, loads: ContactLoads, way: Way, gap: Array, load: Array, damping: float
     ) -> StepProgram:
         """Of what is left of a step.
 

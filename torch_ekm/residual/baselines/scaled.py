@@ -9,7 +9,6 @@ from torch.distributions import Normal
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..base import ResidualLearner
-from ..native import native
 from ..report import UpdateReport
 from ..running_scale import BLOCK, RunningScale
 
@@ -125,8 +124,8 @@ class ScaledLearner(ResidualLearner):
     def _observe(self, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
         n, on = self.n_samples, None if mask is None else mask.to(x.dtype)
         place = n % BLOCK
-        self.input.observe(place, native(x), native(on))
-        self.output.observe(place, native(y), native(on))
+        self.input.observe(place, x, on)
+        self.output.observe(place, y, on)
         if n + 1 < BLOCK and n & (n + 1) == 0:
             self.input.settle(young=True)
             self.output.settle(young=True)

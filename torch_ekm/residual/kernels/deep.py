@@ -47,7 +47,6 @@ class DeepKernel(Kernel):
         fleet, generator = like.shape[:-1], torch.Generator().manual_seed(seed)
         widths = [like.shape[-1], *check_counts("hidden", hidden), check_count("features", features)]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
-        self._remembered: tuple[tuple[Tensor, ...], list, Tensor] | None = None
         for layer, (n_in, n_out) in enumerate(itertools.pairwise(widths)):
             scale = (_INITIAL_SCALE if layer == len(widths) - 2 else 1.0) / n_in**0.5
             # every model of a fleet starts with the same weights, as a single model would
@@ -79,31 +78,9 @@ class DeepKernel(Kernel):
         w = self.base.log_lengthscale.neg().exp().unsqueeze(-2)
         return torch.cat([x * w, self.net(x)], dim=-1)
 
-    def _net_of_set(self, z: Float[Tensor, "*any n d"]) -> Float[Tensor, "*batch n features"]:
-        """:meth:`net`, remembered: between two samples each query asks for the same basis."""
-        tensors = (z, *self.weights, *self.biases)
-        plain = not torch.compiler.is_compiling() and type(z) is Tensor and not z.is_inference()
-        if not plain or any(t.requires_grad for t in tensors):
-            return self.net(z)
-        try:
-            marks = [(t._version, t.data_ptr()) for t in tensors]
-        except RuntimeError:  # within vmap, grad and jvp of torch.func a tensor has no memory of its own
-            return self.net(z)
-        kept = self._remembered
-        if kept is None or kept[1] != marks or any(a is not b for a, b in zip(kept[0], tensors, strict=True)):
-            self._remembered = kept = tensors, marks, self.net(z)
-        return kept[2]
-
     def forward(self, x: Tensor, z: Tensor) -> Tensor:
         a = self.embed(x)
-        return self._between(a, a if z is x else self.embed(z))
-
-    def with_queries(self, z: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        m, points = z.shape[-2], self.embed(torch.cat([z, x], dim=-2))
-        both = self._between(points[..., :m, :], points)
-        return both[..., :m], both[..., m:]
-
-    def _between(self, a: Tensor, b: Tensor) -> Tensor:
+        b = a if z is x else self.embed(z)
         centre = b[..., :1, :].detach()  # see StationaryKernel
         d2 = squared_distances(a - centre, b - centre)
         return self.base.log_variance.exp()[..., None, None] * self.base.phi(d2)
@@ -111,7 +88,7 @@ class DeepKernel(Kernel):
     def vector(self, x: Tensor, z: Tensor) -> Tensor:
         w = self.base.log_lengthscale.neg().exp().unsqueeze(-2)
         row = x.unsqueeze(-2)
-        d2 = ((z - row) * w).square().sum(-1) + (self._net_of_set(z) - self.net(row)).square().sum(-1)
+        d2 = ((z - row) * w).square().sum(-1) + (self.net(z) - self.net(row)).square().sum(-1)
         return self.base.log_variance.exp().unsqueeze(-1) * self.base.phi(d2)
 
     def diagonal(self, x: Tensor) -> Tensor:
@@ -121,7 +98,7 @@ class DeepKernel(Kernel):
         w = self.base.log_lengthscale.neg().exp().unsqueeze(-2)
         value, slope = self.net_jacobian(x)
         near = (z - x.unsqueeze(-2)) * w
-        far = self._net_of_set(z) - value.unsqueeze(-2)
+        far = self.net(z) - value.unsqueeze(-2)
         phi, psi = self.base.phi_psi(near.square().sum(-1) + far.square().sum(-1))
         v = self.base.log_variance.exp().unsqueeze(-1)
         return v * phi, (v * psi).unsqueeze(-1) * (near * w + far @ slope.mT)

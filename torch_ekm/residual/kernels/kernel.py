@@ -40,13 +40,6 @@ class Kernel(Recorded, nn.Module, ABC):
         """d k(x, x)/dx of one point per model; 0 here, where the same prior variance holds everywhere."""
         return torch.zeros_like(x)
 
-    def with_queries(
-        self, z: Float[Tensor, "*batch m d"], x: Float[Tensor, "*batch n d"]
-    ) -> tuple[Tensor, Tensor]:
-        """``(k(z_i, z_j), k(z_i, x_j))``, shapes ``(*batch, m, m)`` and ``(*batch, m, n)``."""
-        both, m = self(z, torch.cat([z, x], dim=-2)), z.shape[-2]
-        return both[..., :m], both[..., m:]
-
     def vector(self, x: Float[Tensor, "*batch d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
         """k(x, z_j) for one query per model, ``(*batch, m)``."""
         return self(x.unsqueeze(-2), z).squeeze(-2)

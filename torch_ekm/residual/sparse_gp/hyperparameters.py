@@ -12,7 +12,6 @@ from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..adam import Adam
 from ..kernels.kernel import is_shared
-from ..native import native_buffers
 from .forgetting import ForgettingFactor, ProcessNoise
 from .monitor import DetectChanges, RobustWeight
 from .part import Host, Part, Sample
@@ -92,12 +91,12 @@ class LearnHyperparameters(Part):
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Keep the sample, in its own units; with a full window, descend."""
-        n, kept = learner.n_samples, native_buffers(self)
+        n = learner.n_samples
         place, due = (n - learner.refresh_offset) % self.window, learner.is_due(n + 1)
-        x, y, mask, _, weight = sample.native()
-        weight = weight if mask is None else weight * mask
-        kept["window_x"][..., place, :], kept["window_y"][..., place, :] = x, y
-        kept["window_on"][..., place] = weight
+        x, y, weight = sample.x, sample.y, sample.report.weight
+        weight = weight if sample.mask is None else weight * sample.mask
+        self.window_x[..., place, :], self.window_y[..., place, :] = x, y
+        self.window_on[..., place] = weight
         if self.past is not None:
             self.past.offer(x, y, weight)
         if due or ((place + 1) % self.stride == 0 and place + self.stride < self.window):

@@ -9,7 +9,6 @@ from torch import nn
 
 from ..._checks import check_positive
 from ...typing import Float, Tensor
-from ..native import native_buffers
 from .part import Host, Part, Sample
 
 _CALIBRATION_RATE = 0.2  # of the logarithm of a factor on the noise
@@ -107,14 +106,13 @@ class DetectChanges(Part):
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Take a sample in; models that face another system start again."""
-        place, kept, (x, y, mask, nis, _) = learner.n_samples % _MEMORY, native_buffers(self), sample.native()
-        level = kept["level"]
-        level += RATE * (1.0 if mask is None else mask) * ((nis > _LARGE) * 1.0 - level)
-        kept["inputs"][place], kept["targets"][place], kept["levels"][place] = x, y, level
-        if mask is not None:  # inf: no sample
-            kept["levels"][place, ...][mask == 0] = math.inf
-        if (level > _ALARM).any():
-            changed = self.level > _ALARM
+        place, mask = learner.n_samples % _MEMORY, sample.mask
+        step = RATE * ((sample.report.nis > _LARGE) * 1.0 - self.level)
+        self.level += step if mask is None else step * mask
+        level = self.level if mask is None else self.level.where(mask > 0, math.inf)  # inf: no sample
+        self.inputs[place], self.targets[place], self.levels[place] = sample.x, sample.y, level
+        changed = self.level > _ALARM
+        if changed.any():
             self.level.masked_fill_(changed, _COOL)
             x, y, levels = (t.roll(-1 - place, 0) for t in (self.inputs, self.targets, self.levels))
             later = (levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0) > 0

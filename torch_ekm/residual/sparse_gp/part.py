@@ -15,7 +15,6 @@ from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..base import DoubleStateLearner
 from ..kernels.kernel import Kernel
-from ..native import native
 from ..report import UpdateReport
 from .posterior import SparsePosterior
 
@@ -72,10 +71,6 @@ class Sample(NamedTuple):
     variance: Float[Tensor, "*batch"]
     report: UpdateReport
 
-    def native(self) -> tuple[Any, Any, Any, Any, Any]:
-        """x, y, mask, nis and weight as :func:`~torch_ekm.residual.native.native` gives them."""
-        return tuple(map(native, (self.x, self.y, self.mask, self.report.nis, self.report.weight)))
-
 
 class Host(DoubleStateLearner):
     """What a part finds in its learner: the state, and how it is forgotten and learned again."""
@@ -93,8 +88,6 @@ class Host(DoubleStateLearner):
     """Samples of each model since the caches were made, ``(*batch_shape)``."""
     weighing: tuple[Part, ...]
     """Parts that weigh samples."""
-    calibrating: bool
-    """Whether a part changes the observation noise at any sample."""
 
     @property
     @abstractmethod

@@ -104,9 +104,10 @@ class PrequentialLoss(nn.Module):
 
     def _covariances(self, kernel: Kernel, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """K at the old basis, k and k** of the queries, from one evaluation of the kernel."""
-        basis = self.state.basis
-        K, k = kernel.with_queries(basis, x)
-        return self.state.as_gram(K, kernel), k * self.state.active.unsqueeze(-1), kernel.diagonal_of_set(x)
+        basis, M = self.state.basis, self.state.basis.shape[-2]
+        both = kernel(basis, torch.cat([basis, x], dim=-2))
+        k = both[..., M:] * self.state.active.unsqueeze(-1)
+        return self.state.as_gram(both[..., :M], kernel), k, kernel.diagonal_of_set(x)
 
     def _density(
         self, mean: Tensor, v: Tensor, p: Tensor, u: Tensor, log_noise: Tensor, queries: Queries

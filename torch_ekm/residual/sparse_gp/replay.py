@@ -6,7 +6,6 @@ from typing import Any
 from torch import nn
 
 from ...typing import Bool, Tensor
-from ..native import native_buffers
 from .posterior import SparsePosterior
 
 
@@ -39,15 +38,14 @@ class ReplayMemory(nn.Module):
         self.number = nn.Buffer(like.new_zeros(n))
         self._n_offered = self._n_taken = 0  # on the host, as the places are
 
-    def offer(self, x: Any, y: Any, weight: Any) -> None:
-        """A sample per model with its weight in the update, 0 where there was none (see ``native``)."""
+    def offer(self, x: Tensor, y: Tensor, weight: Tensor) -> None:
+        """A sample per model with its weight in the update, 0 where there was none."""
         n = self._n_offered
         self._n_offered += 1
         place = n if n < self.capacity else _scattered(n) % math.ceil(min(n + 1, self.horizon))
         if place < self.capacity:
-            kept = native_buffers(self)
-            kept["x"][..., place, :], kept["y"][..., place, :], kept["weight"][..., place] = x, y, weight
-            kept["absorbed"][place], kept["number"][place] = 0.0, n
+            self.x[..., place, :], self.y[..., place, :], self.weight[..., place] = x, y, weight
+            self.absorbed[place], self.number[place] = 0.0, n
 
     def settle(self) -> None:
         """All that is kept is now part of the state that is to predict it."""

@@ -117,7 +117,6 @@ class SparseOnlineGP(Host):
         units = next((part for part in self._parts if isinstance(part, Units)), Units())
         # not as a second child: its buffers would be in the state dict twice
         object.__setattr__(self, "units", units)
-        self.calibrating = bool(_overriding(self._parts, "noise"))
         self.weighing = _overriding(self._parts, "weigh")
         self._noting = _overriding(self._parts, "after_update")
         self._rebuilding = _overriding(self._parts, "on_rebuild", "after_rebuild")

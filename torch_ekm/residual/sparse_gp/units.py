@@ -6,7 +6,6 @@ import torch
 
 from ...exceptions import ParameterError
 from ...typing import Tensor
-from ..native import native
 from ..running_scale import ALIEN, BLOCK, RunningScale
 from .part import Host, Part, Units
 
@@ -82,13 +81,12 @@ class Standardize(Part, Units):
     def before_update(self, learner: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
         """Take the sample in; while units are rough, adopt them before it is learned."""
         n = learner.n_samples
-        x_n, y_n, on = native(x), native(y), native(mask)
         place = n if n < BLOCK else (n - learner.refresh_offset) % BLOCK  # full just before a rebuild
         if n == BLOCK and place > 0:  # what is behind was pooled already
             self.input.block_on.zero_()
             self.output.block_on.zero_()
-        self.input.observe(place, x_n, on)
-        self.output.observe(place, y_n, on)
+        self.input.observe(place, x, mask)
+        self.output.observe(place, y, mask)
         if n & (n + 1) == 0 and n < _DOUBLING:
             if n + 1 < BLOCK:
                 self._adopt(learner, young=True)

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
-from torch.autograd.forward_ad import unpack_dual
-from torch.autograd.graph import increment_version
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
+from ...._arrays import is_plain
 from ....typing import Array, Tensor
 from ...kernels.action_linear import ActionLinearKernel
 from ...kernels.deep import DeepKernel
@@ -42,9 +41,6 @@ class CompiledEngine(ReferenceEngine):
         self._network: Embedding | None = None
         self._usable = False
         self._marks: list[int] = []  # versions of all tensors: torch changed something where they differ
-        self._n_absorbed = 0  # and the loops where this does
-        self._asked: tuple[Any, ...] | None = None
-        self._noise_then: tuple[Any, ...] | None = None
 
     def __deepcopy__(self, memo: dict) -> CompiledEngine:
         return CompiledEngine()
@@ -60,15 +56,6 @@ class CompiledEngine(ReferenceEngine):
     def moments(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
         found = self._ask(gp, x, variance=True)
         return super().moments(gp, x) if found is None else found[:2]
-
-    def observed(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
-        found = self._ask(gp, x, variance=True)
-        if found is None:
-            return super().observed(gp, x)
-        kept = self._noise_then
-        if kept is None or kept[0] != self._marks or gp.calibrating:
-            self._noise_then = kept = self._marks, gp.noise_variance
-        return found[0], found[1] + kept[1]
 
     def linearize(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
         found = self._ask(gp, x, slopes=True)
@@ -108,9 +95,6 @@ class CompiledEngine(ReferenceEngine):
             self._noise, *self._units, self._robust, self._levels,
             posterior.novelty_threshold, posterior.jitter, event, figures, errors,
         )  # fmt: skip
-        self._n_absorbed += 1
-        if self._given:  # a kernel may remember what it made of the basis
-            increment_version(posterior.basis)
         batch = self._batch
         novelty, nis, weight, variance = torch.from_numpy(figures.reshape(4, *batch)).unbind()
         report = UpdateReport(torch.from_numpy(event.reshape(batch)), novelty, nis, weight)
@@ -119,26 +103,14 @@ class CompiledEngine(ReferenceEngine):
     def _ask(
         self, gp: Host, x: Tensor, *, variance: bool = False, slopes: bool = False
     ) -> MomentsWithJacobians | None:
-        """One query per model, what is not wanted being empty; None if torch must do it.
-
-        The last answer is kept: an update asks again what was asked for a prediction.
-        """
+        """One query per model, what is not wanted being empty; None if torch must do it."""
         if not self._takes(gp, x) or self._given:
             return None
-        given = x.numpy().reshape(-1)
-        state = given.tobytes(), self._n_absorbed, self._marks
-        wanted = (True, variance, slopes, variance and slopes)
-        kept = self._asked
-        if kept is None or kept[0] != state or any(w and not k for w, k in zip(wanted, kept[1], strict=True)):
-            self._asked = kept = state, wanted, self._answer(x, given, variance, slopes)
-        return MomentsWithJacobians(*(torch.from_numpy(a.copy()) for a in kept[2]))
-
-    def _answer(self, x: Tensor, inputs: Array, variance: bool, slopes: bool) -> list[Array]:
         n, nd = self._n_models * self._m, self._n_models * self._m * self._width
         mean, v = np.empty(n), np.empty(n if variance else 0)
         J, dv = np.empty(nd if slopes else 0), np.empty(nd if slopes and variance else 0)
         basis, active, _, _, moments, vectors = self._state
-        network = self._network
+        network, inputs = self._network, x.numpy().reshape(-1)
         if network is not None:
             inputs = network.of(x, self._units_x, slopes)
         self._query(
@@ -149,7 +121,8 @@ class CompiledEngine(ReferenceEngine):
             J, dv = network.by_x(J, self._n_models), network.by_x(dv, self._n_models) if variance else dv
         one, two = (*self._batch, self._m), (*self._batch, self._m, self._d)
         shapes = one, one if variance else (0,), two if slopes else (0,), two if slopes and variance else (0,)
-        return [a.reshape(s) for a, s in zip((mean, v, J, dv), shapes, strict=True)]
+        found = zip((mean, v, J, dv), shapes, strict=True)
+        return MomentsWithJacobians(*(torch.from_numpy(a.reshape(s)) for a, s in found))
 
     # -- what they work on ----------------------------------------------------------------------
 
@@ -197,7 +170,7 @@ class CompiledEngine(ReferenceEngine):
         plain = not any(t.is_inference() for t in tensors)  # these have no version
         if not on_host or len(robust) < len(gp.weighing) or not plain:
             return
-        self._marks, self._asked, self._noise_then, loops = [], None, None, load_loops()
+        self._marks, loops = [], load_loops()
         assert loops is not None  # else this is not called
         self._given = own is None or units is None
         kind, n_actions = (_GIVEN, 0) if self._given or own is None else own[0]
@@ -233,29 +206,11 @@ class CompiledEngine(ReferenceEngine):
 
 
 def _is_plain(x: Any, shape: tuple[int, ...]) -> bool:
-    """Whether x is an ordinary tensor whose memory can be read without losing a derivative."""
-    return (
-        type(x) is Tensor
-        and x.shape == shape
-        and x.dtype is torch.float64
-        and x.is_cpu
-        and not x.requires_grad
-        and x.is_contiguous()
-        and unpack_dual(x).tangent is None
-        and _has_memory(x)
-        # somebody records what torch is asked to do: torch has no public way to ask
-        and not is_in_torch_dispatch_mode()
-        and not torch.jit.is_tracing()
-    )
-
-
-def _has_memory(x: Tensor) -> bool:
-    """Not so within vmap, grad and jvp of torch.func, where a tensor stands for others."""
-    try:
-        x.data_ptr()
-    except RuntimeError:
+    """Whether x is an ordinary tensor of that shape, of which torch keeps no record."""
+    if not is_plain(x) or x.shape != shape or not x.is_contiguous():
         return False
-    return True
+    # somebody records what torch is asked to do: torch has no public way to ask
+    return not is_in_torch_dispatch_mode() and not torch.jit.is_tracing()
 
 
 # as numba_kernels has them

@@ -60,8 +60,6 @@ class Embedding:
         """Write the last inputs into the free slots of the basis of the models ``on``."""
         models = np.flatnonzero(on)
         self._raw[models, self._slot[models]] = self._z[models]
-        torch.autograd.graph.increment_version(self._posterior.basis)  # the kernel remembers its features
-        self._marks = [tensor._version for tensor in self._tensors]
 
     def by_x(self, slope: Array, models: int) -> Array:
         """Slopes by the last input from those by what was made of it, ``(models, rows, d)``."""

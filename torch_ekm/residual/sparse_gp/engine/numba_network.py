@@ -15,10 +15,7 @@ from .numba_kernels import _A1, _A2, _A3, _COMMON, _I1, absorb_fleet, query_flee
 __all__ = ["absorb_fleet", "embed_fleet", "query_fleet"]
 
 
-@njit(
-    types.void(_I1, _A2, _A2, _A2, _A2, _A1, types.boolean, _A2, _A2, _A3),
-    **_COMMON,
-)
+@njit(types.void(_I1, _A2, _A2, _A2, _A2, _A1, types.boolean, _A2, _A2, _A3), **_COMMON)
 def embed_fleet(widths, network, log_lengthscale, shift, scale, x, with_slopes, z, embedded, slope):
     """``[z / L, net(z)]`` of one input per model, and ``(d net/dz)'``, see DeepKernel.
 
