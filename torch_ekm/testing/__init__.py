@@ -9,6 +9,6 @@ from __future__ import annotations
 from .dynamixel_bus import DynamixelBus
 from .fuzzed_plant import FuzzedPlant
 from .learner_contract import check_residual_learner
-from .motors import HandMotors, Motors
+from .motors import Motors
 
-__all__ = ["DynamixelBus", "FuzzedPlant", "HandMotors", "Motors", "check_residual_learner"]
+__all__ = ["DynamixelBus", "FuzzedPlant", "Motors", "check_residual_learner"]
