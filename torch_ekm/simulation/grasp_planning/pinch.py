@@ -21,7 +21,7 @@ from ..config import PlantConfig
 from ..mechanism.assembly import make_transmission, true_object
 from ..parameters import PlantParameters
 from .graspable import half_extent
-from .pinch_problem import PinchGeometry, PinchProblem, PinchRequest
+from .pinch_problem import PinchGeometry, PinchProblem, PinchRequest, opposition
 from .requirements import require_two_pads_and_limits, unmet
 
 _FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
@@ -270,13 +270,9 @@ def _most_opposed(hand: HandDescription) -> int:
     tips = T[..., :3, :3] @ np.array([pad.end for pad in hand.pads])[..., None]
     tips = tips[..., 0] + T[..., :3, 3]
     directions = (T[..., :3, :3] @ np.array([pad.direction for pad in hand.pads])[..., None])[..., 0]
-    scores = []
-    for one in range(len(hand.pads)):
-        others = np.arange(len(hand.pads)) != one
-        across = tips[:, others].mean(axis=1) - tips[:, one]
-        across /= np.linalg.norm(across, axis=1, keepdims=True)
-        facing = np.einsum("bci,bi->bc", directions, across) * np.where(others, -1.0, 1.0)
-        scores.append(facing.min(axis=1).max())
+    pads = range(len(hand.pads))
+    orders = ([one, *(pad for pad in pads if pad != one)] for one in pads)
+    scores = [opposition(tips[:, at], directions[:, at])[0].min(axis=1).max() for at in orders]
     return int(np.argmax(scores))
 
 

@@ -164,12 +164,7 @@ class PinchProblem:
 
     def opposition(self, moving: Array) -> tuple[Array, Array]:
         """How well the pads face each other, cosines ``(b, c)``, and their distance ``(b,)`` [m]."""
-        tips, directions = self.tips(moving), self.directions(moving)
-        across = tips[:, 1:].mean(axis=1) - tips[:, 0]
-        distance = np.linalg.norm(across, axis=1)
-        across /= distance[:, None]
-        facing = np.einsum("bci,bi->bc", directions, across)
-        facing[:, 1:] *= -1.0
+        facing, distance = opposition(self.tips(moving), self.directions(moving))
         return facing, distance - self._radius[0] - self._radius[1:].mean()
 
     def _pad_poses(self, moving: Array) -> Array:
@@ -317,6 +312,21 @@ class PinchProblem:
         shift = step * np.eye(len(x))
         values = self.residuals(np.concatenate([x + shift, x - shift]), request, ranges)
         return ((values[: len(x)] - values[len(x) :]) / (2 * step)).T
+
+
+def opposition(tips: Array, directions: Array) -> tuple[Array, Array]:
+    """How well the first pad and the others face each other, cosines ``(b, c)``, and their distance ``(b,)``.
+
+    Args:
+        tips: centres of the pads' rounded ends ``(b, c, 3)`` [m].
+        directions: outward directions of their middles ``(b, c, 3)``.
+    """
+    across = tips[:, 1:].mean(axis=1) - tips[:, 0]
+    distance = np.linalg.norm(across, axis=1)
+    across /= distance[:, None]
+    facing = np.einsum("bci,bi->bc", directions, across)
+    facing[:, 1:] *= -1.0
+    return facing, distance
 
 
 def _cross(a: Array, b: Array) -> Array:
