@@ -128,7 +128,7 @@ _OPTIONS: list[tuple[str, str, Callable[[Setting], dict[str, Any]], tuple[str, .
     ("controller", "actuators cut at 6 deg", _short_actuator_steps, _ALL),
     ("care", "a grip of 5 N for every object", _part(GripForceTask, force=5.0), _ALL),
     ("care", "the pace fixed", _part(TrustRegion, start=1.0, smallest=1.0, largest=1.0), _LEARNING),
-    ("care", "steps never cut", _part(StepBound, least=math.inf), _ALL),
+    ("care", "steps cut by the grip alone", _part(StepBound, least=math.inf), _ALL),
     ("care", "large steps with uneven forces", _part(StepBound, even=1e-3), _LEARNING),
     ("care", "no second look", _part(Caution, looks=0), _ALL),
     ("care", "no way back", _part(Caution, **_NO_WAY_BACK), _ALL),

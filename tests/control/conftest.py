@@ -1,4 +1,4 @@
-"""A grasp that tests of the controller begin with."""
+"""Grasps that tests of the controller begin with."""
 
 from __future__ import annotations
 
@@ -16,3 +16,11 @@ def grasp():
     seen = plant.reset(seed=3)
     model = KinematicModel(plant.hand, plant.object)
     return plant, model, seen, GraspState(seen.q, seen.position, seen.rotation)
+
+
+@pytest.fixture(scope="module")
+def held():
+    """Another: first observation, axis and kinematic model."""
+    plant = SimulatedHand("icub_right", "box")
+    seen = plant.reset(seed=4)
+    return seen, plant.rotation_axis, KinematicModel(plant.hand, plant.object)

@@ -13,20 +13,11 @@ from torch_ekm.control import ClosedLoop, Guards, LookAndMoveController, PoseTar
 from torch_ekm.control import StopReason as Reason
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import ParameterError
-from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantStatus, PlantWrapper, ServoInverse, Stamps
-from torch_ekm.simulation import SimulatedHand
 from torch_ekm.testing import FuzzedPlant
 
 DEG = math.pi / 180
 SAFETY = Safety(rule=StoppingRule(max_steps=25))
-
-
-@pytest.fixture(scope="module")
-def held():
-    plant = SimulatedHand("icub_right", "box")
-    seen = plant.reset(seed=4)
-    return seen, plant.rotation_axis, KinematicModel(plant.hand, plant.object)
 
 
 class Run:

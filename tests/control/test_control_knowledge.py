@@ -21,18 +21,9 @@ from torch_ekm.enhanced import EnhancedModel, save
 from torch_ekm.exceptions import FileFormatError, ParameterError, StateMismatchError
 from torch_ekm.kinematics import ServoModel
 from torch_ekm.kinematics.servo_model import IdealServos
-from torch_ekm.model import KinematicModel
 from torch_ekm.residual import SparseOnlineGP
-from torch_ekm.simulation import SimulatedHand
 
 DEG = math.pi / 180
-
-
-@pytest.fixture(scope="module")
-def held():
-    plant = SimulatedHand("icub_right", "box")
-    seen = plant.reset(seed=4)
-    return seen, plant.rotation_axis, KinematicModel(plant.hand, plant.object)
 
 
 @pytest.fixture(scope="module")

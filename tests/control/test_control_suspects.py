@@ -18,18 +18,9 @@ from torch_ekm.control import (
 )
 from torch_ekm.control import StopReason as Reason
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation
-from torch_ekm.simulation import SimulatedHand
 
 DEG = math.pi / 180
-
-
-@pytest.fixture(scope="module")
-def held():
-    plant = SimulatedHand("icub_right", "box")
-    seen = plant.reset(seed=4)
-    return seen, plant.rotation_axis, KinematicModel(plant.hand, plant.object)
 
 
 def run(held, fault: Fault, since: int) -> Manipulation:

@@ -105,7 +105,7 @@ class StepBound:
     even: float = 0.85
     """Of the mean of the fingers that oppose the strongest one, what each of them should bear."""
     least: float = 0.35
-    """Infinite: steps are cut by the grip alone."""
+    """Infinite: steps are cut by a measured grip alone."""
 
     def __post_init__(self) -> None:
         for name in ("off_rotation", "off_travel", "creep", "even", "least"):
@@ -300,10 +300,10 @@ class Pace(nn.Module):
             share: of the largest step that was asked for.
         """
         bound, asked = self.options.bound, share * self.factor
-        phi = bound.share(lin, delta_a, predicted, seen, asked)
-        least, grip = min(1.0, bound.least / max(asked, 1e-9)), bound.grip_share(lin, seen)
-        # an estimate is no reason to wait
-        return min(max(min(phi, grip), least), 1.0 if seen.fingertip_force is None else grip)
+        grip = bound.grip_share(lin, seen)
+        phi = min(bound.share(lin, delta_a, predicted, seen, asked), grip)
+        phi = max(phi, min(1.0, bound.least / max(asked, 1e-9)))
+        return phi if seen.fingertip_force is None else min(phi, grip)  # an estimate is no reason to wait
 
     def judge(self, disagreement: float, share: float = 1.0) -> None:
         """Learn from one motion.
