@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("sapien")
@@ -35,3 +36,4 @@ def test_it_runs(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert (tmp_path / "speed.svg").is_file()
     rows = (tmp_path / "speed.csv").read_text().splitlines()
     assert len(rows) == 10
+    assert np.finfo(float).tiny / np.array([4.0]) > 0  # subnormal numbers are as they were
