@@ -342,21 +342,28 @@ def test_another_thread_stops_it_after_the_motion_under_way(held) -> None:
 
 
 class Overshooting(HoldingPlant):
-    """The object turns for four motions, then comes back; motions that are undone turn it forth again."""
+    """The object turns for four motions, then comes back; motions that are undone turn it forth again.
+
+    ``slides``: it has slid, and they turn it further back.
+    """
 
     ANGLES = (0.0, 3.0, 6.0, 8.0, 9.0, 7.0, 7.1, 6.0, 6.1, 6.0, 6.1)
 
-    def __init__(self, seen: Observation, axis: torch.Tensor) -> None:
+    def __init__(self, seen: Observation, axis: torch.Tensor, slides: bool = False) -> None:
         super().__init__(dataclasses.replace(seen, fingertip_force=None))
-        self.axis, self.way, self.rotation = axis, [], seen.rotation
+        self.axis, self.way, self.rotation, self.slides = axis, [], seen.rotation, slides
+        self.undone = 0
 
     def move(self, delta_a: torch.Tensor) -> None:
         super().move(delta_a)
         undone = self.way and torch.allclose(self.way[-1], -delta_a, atol=1e-9)
         self.way = self.way[:-1] if undone else [*self.way, delta_a]
+        self.undone += bool(undone)
 
     @property
     def turned(self) -> float:
+        if self.slides and self.undone:
+            return self.ANGLES[10] - self.undone
         return self.ANGLES[min(len(self.way), 10)]
 
     def observe(self) -> Observation:
@@ -373,3 +380,14 @@ def test_a_turn_that_stalls_returns_to_its_best_state(held) -> None:
     assert done.reason is Reason.STALLED
     assert max(plant.ANGLES) - plant.turned < 1.0  # two tolerances
     assert len(plant.commands) == len(done.steps) > len(plant.way)
+
+
+def test_an_object_that_slid_is_not_taken_further_off_on_the_way_back(held) -> None:
+    seen, axis, controller = held
+    plant = Overshooting(seen, axis, slides=True)
+    rule = StoppingRule(max_steps=12, stall_window=5)
+    done = ClosedLoop(plant, controller, safety=Safety(rule=rule)).run(
+        PoseTarget.turned(seen.state, axis, degrees=20)
+    )
+    assert done.reason is Reason.STALLED
+    assert plant.undone == 1  # 1 deg further off are more than two tolerances

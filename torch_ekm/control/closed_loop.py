@@ -298,8 +298,9 @@ class ClosedLoop:
     def _return_to_best(
         self, seen: Observation, decision: Decision | None, progress: Progress, watch: Watch
     ) -> Generator[Step, None, Observation]:
-        """Undo the motions that led away from where the object was nearest to its target."""
-        while decision is not None and progress.strayed(seen) and progress.halt is None:
+        """Undo the motions that led away from where the object was nearest to its target, if that helps."""
+        began = seen
+        while decision is not None and progress.strayed(seen, began) and progress.halt is None:
             back = self.controller.retreat(decision, -progress.way.pop())
             step = self._move(seen, back, progress, watch)
             yield step

@@ -117,12 +117,17 @@ class Progress:
         if error < self._best[0]:
             self._best = error, len(self.way)
 
-    def strayed(self, seen: Observation) -> bool:
-        """The object was nearer to its target by more than two tolerances, by motions that are not undone."""
+    def strayed(self, seen: Observation, began: Observation) -> bool:
+        """The object was nearer to its target by more than two tolerances, and going back may bring it there.
+
+        Args:
+            began: what was seen before the way back. An object that slid on the way does not come back by
+                it: the hand stops where it is further off by as much.
+        """
         least, motions = self._best
-        error = self._error(seen)
-        further = error > least + _STRAYED * self.safety.rule.tolerance
-        return further and len(self.way) > motions and seen.status is PlantStatus.HELD
+        error, allowed = self._error(seen), _STRAYED * self.safety.rule.tolerance
+        strays = least + allowed < error <= self._error(began) + allowed
+        return strays and len(self.way) > motions and seen.status is PlantStatus.HELD
 
     def _off_rotation(self, seen: Observation) -> float:
         """Of the object off the focus since the start [rad]."""
