@@ -170,6 +170,20 @@ class Survey:
         )
         return Turns(tuple(itertools.chain.from_iterable(found)))
 
+    def ratio(self, plant: tuple[str, str] | None = None) -> float:
+        """Motions of the E-KM over those of KM+I, of the turns that both reached."""
+        ours, theirs = (
+            {
+                (*key[:2], one.object, one.seed, one.trial): one.steps
+                for key, records in self.turns.items()
+                for one in records
+                if key[2] == name and plant in (None, key[:2]) and not (one.lost or one.not_reached)
+            }
+            for name in ("E-KM", "KM+I")
+        )
+        same = ours.keys() & theirs.keys()
+        return sum(ours[key] for key in same) / sum(theirs[key] for key in same) if same else math.nan
+
     @property
     def verdict(self) -> str:
         """The last line."""
@@ -184,9 +198,8 @@ class Survey:
         rows: list[list[Cell]] = []
         for plant in [*self.plants, None]:
             one = [self.of(name, plant) for name in self.controllers]
-            ours, theirs = self.of("E-KM", plant).motions, self.of("KM+I", plant).motions
             name = "all" if plant is None else " ".join(plant).replace("_", " ").strip()
-            rows.append([name, len(one[-1].records), *map(str, one), ours / theirs, *self._ends(plant)])
+            rows.append([name, len(one[-1].records), *map(str, one), self.ratio(plant), *self._ends(plant)])
         columns = [
             "plant",
             "turns",
@@ -195,10 +208,10 @@ class Survey:
             "other ends of the E-KM",
         ]
         note = (
-            "Lost, reached, and mean motions of the turns that reached the target. Every plant is preset"
-            " nominal with the family's figures, but worn, hostile and the mixtures odd 1 to odd 5, which are"
-            " presets. Poses are true plus noise; of hostile, which has a dead sensor, from camera and Hall"
-            " sensors."
+            "Lost, reached, and mean motions of the turns that reached the target; E-KM:KM+I: motions of the"
+            " turns that both reached. Every plant is preset nominal with the family's figures, but worn,"
+            " hostile and the mixtures odd 1 to odd 5, which are presets. Poses are true plus noise; of"
+            " hostile, which has a dead sensor, from camera and Hall sensors."
         )
         return Table("plants", "Hands of other kinds than described", columns, rows, note)
 
