@@ -66,6 +66,7 @@ def test_hand_that_feels_nothing_or_wrong_neither_squeezes_nor_drops(
     loop = ClosedLoop(felt, controller, knowledge=HandKnowledge.of(plant.hand))
     done = loop.run(PoseTarget.turned(start.state, plant.rotation_axis, degrees=15))
     assert done.reason is reason
+    assert ("turning waits for a grip of" in done.stop.message) == (reason is StopReason.STALLED)
     forces = torch.stack(felt.forces)
     assert float(forces.max()) < most
     assert float(forces.min()) > 1.0  # no contact is lost

@@ -216,6 +216,7 @@ class ClosedLoop:
                 if progress.halt is not None:
                     self.hold()
                 elif over.reason is StopReason.STALLED:
+                    over = over._replace(message=watch.hindrances(seen, decision))
                     seen = yield from self._return_to_best(seen, decision, progress, watch)
                 return Stop(over.reason, seen, over.message)
             seen, decision, sign, seconds = self._decide(seen, progress, watch)

@@ -221,9 +221,10 @@ class LookAndMoveController:
         if f_n is None or least is None:
             return None
         force, needed = torch.from_numpy(f_n), torch.from_numpy(least.least(f_n, seen))
-        if self.forces is None:
-            return Grip(force, needed, torch.zeros_like(force))
-        return Grip(force, needed, self.forces.variance.sqrt()[seen.hand.pad_indices(lin.contacts.finger)])
+        std = torch.zeros_like(force)
+        if self.forces is not None:
+            std = self.forces.variance.sqrt()[seen.hand.pad_indices(lin.contacts.finger)]
+        return Grip(force, needed, std, seen.grip or 0.0)
 
     def _none(self, status: StopReason, failure: EKMError, focused: Tensor) -> Decision:
         """No motion, and why."""

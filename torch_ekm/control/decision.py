@@ -57,6 +57,8 @@ class Grip(NamedTuple):
     """What each should bear at least, see :class:`~torch_ekm.control.NormalForceLimit` [N]."""
     std: Float[Tensor, " n_c"]
     """How far predictions of it are off [N]; 0 where nobody knows."""
+    wanted: float
+    """Of the finger that opposes the others, see :class:`~torch_ekm.control.GripForceTask` [N]; 0: none."""
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ _ROTATION_NOISE = 0.3 * _DEG  # [rad]
 _FORCE_NOISE = 0.5  # [N]
 _FORCE_SHARE = 0.25  # of the force that a finger bears: an error that leaves it its grip
 SLIDES = 2.0  # rho of the twist alone from which the object is thought to slide
-_WEAK, _FIRM = 0.55, 0.75  # of the wanted grip: with which nothing is turned, and with which steps are whole
+_WEAK, FIRM = 0.55, 0.75  # of the wanted grip: with which nothing is turned, and with which steps are whole
 _UNFELT = 1.0  # largest p where no pad measures: forces that nobody sees drift with the way that is made
 _FOR_NEW = 1.4  # largest p with an object that is new to a hand whose figures are known
 _USED = 0.7  # a motion below this share of what was allowed says nothing for a larger one
@@ -154,7 +154,7 @@ class StepBound:
         if f_n is None or not seen.grip:
             return 1.0
         held = float(f_n.max()) / seen.grip
-        return min(max((held - _WEAK) / (_FIRM - _WEAK), 0.0), 1.0)
+        return min(max((held - _WEAK) / (FIRM - _WEAK), 0.0), 1.0)
 
 
 class ForceSurprise(NamedTuple):
