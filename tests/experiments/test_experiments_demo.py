@@ -74,7 +74,7 @@ def test_report_is_complete_and_says_how_it_was_made(report: Report, folder: Pat
         "prediction.csv",
         "prediction_error.svg",
         "convergence.svg",
-        "steady_state_error_box.png",
+        "steady_state_error.png",
         "hand.png",
         "animation.html",
         "configuration.json",

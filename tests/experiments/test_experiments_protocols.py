@@ -15,7 +15,14 @@ from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments import runner
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
 from torch_ekm.experiments.learners import LEARNERS, make_learner
-from torch_ekm.experiments.protocols.generalize import Generalize, new_object_table
+from torch_ekm.experiments.protocols.generalize import (
+    ENDS,
+    OTHER_ANGLES,
+    SHARES,
+    TABLE_I,
+    Generalize,
+    new_object_table,
+)
 from torch_ekm.experiments.protocols.online import Online
 from torch_ekm.experiments.records import NotGrasped, TrialRecord
 from torch_ekm.experiments.runner import Bench
@@ -86,6 +93,16 @@ def test_a_corrected_object_does_not_take_up_old_results(tmp_path: Path) -> None
     urdf.write_text(urdf.read_text() + "\n")
     assert jobs().isdisjoint(before)
     assert len(jobs()) == len(before)
+
+
+def test_every_object_is_asked_for_shares_of_its_end() -> None:
+    protocol = Generalize()
+    for item, end in ENDS.items():
+        assert protocol.angles_of(item) == pytest.approx([share * end for share in SHARES], abs=0.05)
+    assert set(TABLE_I) <= set(ENDS)
+    assert ENDS["carton"] < 10  # its links meet it: 25 deg were never to be reached
+    assert protocol.angles_of("own.urdf") == OTHER_ANGLES
+    assert dataclasses.replace(protocol, angles_deg=(3.0,)).angles_of("box") == (3.0,)
 
 
 def test_every_learner_for_a_hand_starts_at_zero_and_learns() -> None:

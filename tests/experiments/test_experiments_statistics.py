@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 
 import numpy as np
@@ -12,7 +13,12 @@ import torch
 from experiments_records import frame, not_grasped, turn
 
 from torch_ekm.exceptions import ParameterError
-from torch_ekm.experiments.protocols.generalize import ends_table, object_table
+from torch_ekm.experiments.protocols.generalize import (
+    cell_table,
+    ends_table,
+    object_table,
+    significance_table,
+)
 from torch_ekm.experiments.protocols.online import Online, prediction_curves, recovery_trials
 from torch_ekm.experiments.records import NotGrasped, TrialRecord, prediction_error
 from torch_ekm.experiments.reporting.report import Column, Table
@@ -338,3 +344,26 @@ def test_learning_table_finds_the_last_negative_result() -> None:
     assert row[4:] == [1, None]  # after the last trial there is nothing to see
     ekm, _ = prediction_curves(frame(records[:5]), 6)
     assert ekm.loc[0].notna().tolist() == [True] * 5 + [False]
+
+
+def test_cells_are_won_and_lost_hand_by_hand() -> None:
+    records = []
+    for seed, item, trial in itertools.product(range(12), ("box", "can"), range(3)):
+        where = {"object": item, "trial": trial, "angle_deg": 5.0 * (trial + 1)}
+        theirs = 1.0 + 0.1 * trial
+        ours = 2.0 if (item, trial) == ("can", 1) and seed < 3 else 0.1 * theirs
+        records += [turn("KM", seed, theirs, **where), turn("E-KM", seed, ours, **where)]
+    trials = frame(records)
+    rows = {row[0]: row[1:] for row in cell_table(trials).text()}
+    assert rows["box"] == ["5: 1.00, 0.10, 12 of 12", "10: 1.10, 0.11, 12 of 12", "15: 1.20, 0.12, 12 of 12"]
+    assert rows["can"][1] == "10: 1.10, 0.58, 9 of 12"
+    found = {row[0]: row[1:] for row in significance_table(trials).text()}
+    assert found["cells won"] == ["24 of 25", "6 of 6, least 5"]
+    assert found["cells lost (hands)"][1] == "can, trial 2 (3)"
+    assert float(found["p of two samples, one hand (median)"][1]) < 1e-4
+    assert float(found["p paired, all hands"][1]) < 1e-4
+    assert found["turns until significant"][1] == "1"
+    few = {row[0]: row[1:] for row in significance_table(trials[trials["seed"] < 3]).text()}
+    assert few["p paired, all hands"][1] == "-"
+    assert not significance_table(trials[trials["controller"] == "KM"]).rows
+    assert not cell_table(trials[trials["controller"] == "KM"]).rows

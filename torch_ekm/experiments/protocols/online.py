@@ -133,11 +133,13 @@ class Online(Protocol):
         learned = [Learning.of(ekm.loc[seed], km.loc[seed], self.events) for seed in ekm.index]
         rows: list[list[Cell]] = []
         for name, what, paper in (
-            ("last_negative", "last index of negative result [trials]", "16"),
+            ("last_negative", "trials until significant (last index of negative result)", "16"),
             ("last_upper", "last upper boundary [deg]", "-0.57"),
         ):
             found = np.array([x for one in learned if (x := getattr(one, name)) is not None], dtype=float)
             rows.append([what, paper, bootstrap_mean(found) if len(found) else None, len(found)])
+        hands = [(ekm.loc[seed].dropna(), km.loc[seed].dropna()) for seed in ekm.index]
+        rows += [[*row, len(ekm)] for row in tables.p_rows(hands, *tables.prediction_means(trials), "< 0.05")]
         columns = ["figure", "paper", Column("here, mean over seeds", ".2f"), "seeds"]
         note = (
             "After how many trials the E-KM predicts better for good, and by how much at least at the end. "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -99,39 +99,50 @@ def plot_learning_test(ekm_deg: Array, km_deg: Array) -> Figure:
     return figure
 
 
-def plot_steady_state_error(turns: DataFrame, what: str = "") -> Figure:
-    """Steady-state error of each controller for each target (the paper's Fig. 6): every run and the mean.
+def plot_steady_state_error(turns: DataFrame) -> Figure:
+    """Steady-state error of each controller for each object and target (the paper's Fig. 6): every run and
+    the mean.
 
     A few turns at many times the error of all others are crosses at the upper edge; a mean that they carry
     beyond it is written there.
 
     Args:
-        turns: of :func:`~torch_ekm.experiments.reporting.trials.trial_frame`, of one object.
-        what: named in the title.
+        turns: of :func:`~torch_ekm.experiments.reporting.trials.trial_frame`.
     """
-    top, controllers = _top(turns), turns["controller"].unique()
-    targets = sorted(turns["angle_deg"].unique())
-    figure, (axis,) = new_figure(max(4.0, 1.3 * len(targets)), 3.4)
+    objects = list(turns.groupby("object", sort=False))
+    columns = min(len(objects), 3)
+    rows = -(-len(objects) // columns)
+    figure, panels = new_figure(max(6.5, 3.6 * columns), 3.4 if rows == 1 else 2.6 * rows, columns, rows)
+    for axis, (name, mine) in zip(panels, objects, strict=False):
+        _draw_errors(axis, mine, list(turns["controller"].unique()))
+        axis.set_title(str(name).replace("_", " "), loc="left", fontsize=10)
+    for axis in panels[len(objects) :]:
+        axis.set_axis_off()
+    for axis in panels[: len(objects) : columns]:
+        axis.set_ylabel("steady-state error [deg]")
+    drawn = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))
+    figure.legend(drawn.values(), drawn.keys(), frameon=False, loc="outside upper right", ncols=4)
+    return figure
+
+
+def _draw_errors(axis: Any, turns: DataFrame, controllers: list[str]) -> None:
+    """Those of one object."""
+    top, targets = _top(turns), sorted(turns["angle_deg"].unique())
     width = 0.8 / len(controllers)
     for (name, target), errors in turns.groupby(["controller", "angle_deg"], sort=False)["error_deg"]:
-        j, values = list(controllers).index(name), errors.to_numpy()
+        j, values = controllers.index(name), errors.to_numpy()
         colour, marker = COLOURS.get(name, f"C{j}"), _MARKERS.get(name, "o")
         x = targets.index(target) + (j - (len(controllers) - 1) / 2) * width
-        label = name if target == targets[0] else None
-        axis.bar(x, values.mean(), width * 0.9, color=colour, alpha=0.45, label=label)
+        axis.bar(x, values.mean(), width * 0.9, color=colour, alpha=0.45, label=name)
         at = x + (np.linspace(-0.3, 0.3, len(values)) * width if len(values) > 1 else np.zeros(1))
         inside = values <= top
-        axis.plot(at[inside], values[inside], marker, color=colour, markersize=3)
+        axis.plot(at[inside], values[inside], marker, color=colour, markersize=2)
         axis.plot(at[~inside], [0.97 * top] * int((~inside).sum()), "x", color=colour)
         if values.mean() > top:
             note = {"xytext": (-9, 0), "textcoords": "offset points", "fontsize": 8, "ha": "right"}
             axis.annotate(f"mean {values.mean():.1f}", (x, 0.9 * top), **note)
     axis.set_xticks(range(len(targets)), [f"{target:g}" for target in targets])
-    limits = (0, top if np.isfinite(top) else None)
-    axis.set(xlabel="target [deg]", ylabel="steady-state error [deg]", ylim=limits)
-    axis.set_title(f"Steady-state error{', ' + what if what else ''}", loc="left")
-    axis.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
-    return figure
+    axis.set(xlabel="target [deg]", ylim=(0, top if np.isfinite(top) else None))
 
 
 def _top(turns: DataFrame) -> float:
@@ -142,11 +153,8 @@ def _top(turns: DataFrame) -> float:
 
 def crosses_caption(turns: DataFrame) -> str:
     """What the crosses in :func:`plot_steady_state_error` are; "": there are none."""
-    top = _top(turns)
-    beyond = int((turns["error_deg"] > top).sum())
-    if not beyond:
-        return ""
-    return f" Crosses at the upper edge: {beyond} turn{'' if beyond == 1 else 's'} above {top:.1f} deg."
+    beyond = sum(int((mine["error_deg"] > _top(mine)).sum()) for _, mine in turns.groupby("object"))
+    return f" Crosses at the upper edge: {beyond} turn{'' if beyond == 1 else 's'} above." if beyond else ""
 
 
 def plot_convergence(turns: DataFrame, target: str = "") -> Figure:

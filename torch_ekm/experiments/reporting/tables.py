@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from ..._extras import require
 from ...control import StopReason
 from ...typing import Array
 from ..config import CONTROLLERS, FIRST_REPORTED
@@ -153,6 +154,14 @@ def ratio_and_p(ours: Array, theirs: Array, n_seeds: int) -> tuple[Estimate | No
         return None, None
     test = stats.paired_test(ours, theirs) if n_seeds >= LEAST_SEEDS else None
     return stats.bootstrap_ratio(ours, theirs), None if test is None else test.p
+
+
+def p_rows(hands: Sequence[tuple[Array, Array]], ours: Array, theirs: Array, paper: str) -> list[list[Cell]]:
+    """p of the paper's two-sided test of two samples, on each hand alone, and of the paired one on all."""
+    each = [require("scipy.stats").ttest_ind(*hand).pvalue for hand in hands if len(hand[0]) > 1]
+    test = stats.paired_test(ours, theirs) if len(hands) >= LEAST_SEEDS else None
+    one, all_hands = f"{np.median(each):.1e}" if each else None, None if test is None else f"{test.p:.1e}"
+    return [["p of two samples, one hand (median)", paper, one], ["p paired, all hands", None, all_hands]]
 
 
 def prediction_means(trials: DataFrame, kind: str = "") -> tuple[Array, Array]:
