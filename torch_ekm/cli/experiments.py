@@ -61,9 +61,7 @@ def reproduce(
         str, Option(help="action-linear, rbf, SOGP deep, ...; an unknown name lists all.")
     ] = "action-linear",
     sensing: Sensing = True,
-    angles: Annotated[
-        str, Option(help="Turns [deg], e.g. 5,10,15; else shares of each object's end (generalize).")
-    ] = "",
+    angles: Annotated[str, Option(help="Turns [deg], e.g. 5,10; else shares of each end (generalize).")] = "",
     step: Annotated[
         float | None,
         Option(help="Turn of one motion at pace 1 [deg]; 2.5 if left out (less where a contact moves far)."),
