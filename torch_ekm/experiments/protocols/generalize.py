@@ -40,10 +40,10 @@ TABLE_II: dict[str, tuple[float, float]] = {
     "can": (1.1, 0.6),
 }
 #: Upper ends of the workspaces in this hand [deg]: what nine of ten grasps reach, as found by
-#: ``python benchmarks/workspace.py --seeds 0:1`` (carton: 0:2).
+#: ``python benchmarks/workspace.py --seeds 0:1`` (carton: 0:4).
 ENDS: dict[str, float] = {
     "box": 43, "weighted_box": 44, "can": 57, "bottle": 64, "applier": 50, "pen_case": 44,
-    "flashlight": 89, "charger": 25, "tea_tin": 21, "jar": 34, "carton": 4,
+    "flashlight": 89, "charger": 25, "tea_tin": 21, "jar": 34, "carton": 3,
 }  # fmt: skip
 #: Shares of the end that are asked for, as in Table I.
 SHARES = (0.2, 0.4, 0.6, 0.8, 1.0)
