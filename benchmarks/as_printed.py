@@ -263,9 +263,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     base = Setting(preset=given.preset, plant=preset(given.preset), engine=given.engine)
     todo, keys = {}, {}
     for name, seed, item in ((name, seed, item) for seed in seeds for item in objects for name in SYSTEMS):
-        setting, asked = SYSTEMS[name][2](base), angles or TABLE_I.get(item)
-        job = f"{name.replace(' ', '_').replace(',', '')}_{digest(setting, (item,), asked, WARM_UP)}_{seed}"
-        todo[job], keys[job] = (name, setting, item, asked, seed), (name, Path(item).stem, seed)
+        setting = SYSTEMS[name][2](base)
+        job = f"{name.replace(' ', '_').replace(',', '')}_{digest(setting, (item,), angles, WARM_UP)}_{seed}"
+        todo[job], keys[job] = (name, setting, item, angles, seed), (name, Path(item).stem, seed)
     with progress("running", len(todo)) as advance:
         results = run_jobs(session, todo, given.out, given.jobs, advance)
     systems = Systems(records_by(keys, results))

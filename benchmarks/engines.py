@@ -48,7 +48,7 @@ _WARM_UP = 3
 
 def session(setting: Setting, item: str, controller: str, seed: int) -> list[dict[str, Any]]:
     """Turns of Table I, after the warm-up."""
-    protocol = Generalize(setting, (item,), TABLE_I.get(item), _WARM_UP, 0.0, 0.0)
+    protocol = Generalize(setting, (item,), None, _WARM_UP, 0.0, 0.0)
     return [one.to_json() for one in protocol.session(item, controller, seed) if one.kind == "turn"]
 
 

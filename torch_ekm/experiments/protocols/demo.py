@@ -18,7 +18,7 @@ from ..reporting.plots import plot_convergence, plot_prediction_error, save_figu
 from ..reporting.report import Cell, Column, FigureFile, Report, Table
 from ..reporting.statistics import DataFrame
 from ..reporting.trials import select
-from .generalize import TABLE_I, Generalize
+from .generalize import Generalize
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,6 @@ class Demo(Generalize):
     def object(self) -> str:
         """Name or path of the one that is turned."""
         return self.objects[0]
-
-    def angles_of(self, object: str) -> tuple[float, ...]:
-        """Those of the paper's Table I, for its objects."""
-        usual = super().angles_of(object)
-        return usual if self.angles_deg is not None else TABLE_I.get(object, usual)
 
     def quick(self) -> Self:
         """The same with the first two angles only."""
