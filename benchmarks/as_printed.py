@@ -159,6 +159,7 @@ class Systems:
     def __init__(self, turns: dict[tuple[str, str, int], list[TrialRecord]]) -> None:
         self.turns = turns
         self.objects = list(dict.fromkeys(item for _, item, _ in turns))
+        self.names = [name for name in SYSTEMS if any(key[0] == name for key in turns)]
 
     def _pairs(self, name: str, item: str | None) -> list[list[TrialRecord]]:
         """The turns of each pair of object and seed."""
@@ -184,7 +185,7 @@ class Systems:
         km, ekm = (float(np.mean([pair[k] for pair in TABLE_II.values()])) for k in (0, 1))
         rows.append(["KM, in the paper", km, None, None, None, None, None])
         rows.append(["E-KM, in the paper", ekm, 100 * ekm / km, None, None, None, None])
-        for name in SYSTEMS:
+        for name in self.names:
             turns, errors = self.of(name), self.errors(name)
             ratio = self._ratio(name)
             error = stats.bootstrap_mean(errors) if len(errors) > 1 else float(errors.mean())
@@ -202,7 +203,7 @@ class Systems:
         return Table("systems", "The paper's system and this package's", columns, rows, note)
 
     def _ratio(self, name: str) -> float | None:
-        if name not in _BESIDE:
+        if _BESIDE.get(name) not in self.names:
             return None
         return 100 * float(self.errors(name).mean() / self.errors(_BESIDE[name]).mean())
 
@@ -215,7 +216,7 @@ class Systems:
             ]
             for k, name in enumerate(("KM", "E-KM"))
         ]
-        for name in SYSTEMS:
+        for name in self.names:
             here = (
                 f"{self.errors(name, item).mean():.2f} ({self.of(name, item).lost})" for item in self.objects
             )
@@ -225,12 +226,12 @@ class Systems:
 
     def ends(self) -> Table:
         """Why the turns ended."""
-        reasons = sorted({one.reason for name in SYSTEMS for one in self.of(name).records})
-        count = {name: [one.reason for one in self.of(name).records] for name in SYSTEMS}
+        reasons = sorted({one.reason for name in self.names for one in self.of(name).records})
+        count = {name: [one.reason for one in self.of(name).records] for name in self.names}
         rows: list[list[Cell]] = [
-            [reason, *(count[name].count(reason) for name in SYSTEMS)] for reason in reasons
+            [reason, *(count[name].count(reason) for name in self.names)] for reason in reasons
         ]
-        return Table("ends", "Why the turns ended", ["reason", *SYSTEMS], rows, "Turns.")
+        return Table("ends", "Why the turns ended", ["reason", *self.names], rows, "Turns.")
 
     @property
     def verdict(self) -> str:
@@ -238,10 +239,11 @@ class Systems:
         parts = (
             f"{name} {self.errors(name).mean():.2f} deg, lost {self.of(name).lost} of"
             f" {len(self.of(name).records)}"
-            for name in SYSTEMS
+            for name in self.names
         )
-        ratios = ", ".join(f"{self._ratio(name):.0f} %" for name in _BESIDE)
-        return f"{'; '.join(parts)}; E-KM:KM as printed, with tasks, and here {ratios}"
+        beside = [f"{ratio:.0f} %" for name in _BESIDE if (ratio := self._ratio(name)) is not None]
+        told = f"; E-KM:KM as printed, with tasks, and here {', '.join(beside)}" if len(beside) > 1 else ""
+        return f"{'; '.join(parts)}{told}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -249,6 +251,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("--objects", default=",".join(TABLE_I), help="names or paths")
     parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1010"), help="FIRST:END")
+    parser.add_argument(
+        "--systems",
+        default="all",
+        choices=("all", "fingertips"),
+        help="fingertips: E-KM with and without",
+    )
     parser.add_argument("--preset", default="nominal", choices=list(PRESETS))
     parser.add_argument("--engine", default="sapien", choices=ENGINES)
     parser.add_argument("--jobs", type=int, default=2, help="processes at once")
@@ -261,8 +269,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.quick:
         objects, seeds, angles = objects[:1], seeds[:1], (5.0,)
     base = Setting(preset=given.preset, plant=preset(given.preset), engine=given.engine)
+    names = list(SYSTEMS) if given.systems == "all" else ["E-KM", "E-KM without fingertips"]
     todo, keys = {}, {}
-    for name, seed, item in ((name, seed, item) for seed in seeds for item in objects for name in SYSTEMS):
+    for seed, item, name in itertools.product(seeds, objects, names):
         setting = SYSTEMS[name][2](base)
         job = f"{name.replace(' ', '_').replace(',', '')}_{digest(setting, (item,), angles, WARM_UP)}_{seed}"
         todo[job], keys[job] = (name, setting, item, angles, seed), (name, Path(item).stem, seed)

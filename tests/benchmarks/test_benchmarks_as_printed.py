@@ -40,6 +40,14 @@ def test_a_lost_object_counts_with_the_whole_angle() -> None:
     assert "as printed, with tasks, and here 350 %, 100 %, 25 %" in found.verdict
 
 
+def test_some_systems_alone_are_told_without_the_others() -> None:
+    pair = {("E-KM", "box", 0): [record(0.1)], ("E-KM without fingertips", "box", 0): [record(0.2)]}
+    found = Systems(pair)
+    assert found.verdict == "E-KM 0.10 deg, lost 0 of 1; E-KM without fingertips 0.20 deg, lost 0 of 1"
+    assert [row[0] for row in found.summary().text()][2:] == ["E-KM", "E-KM without fingertips"]
+    assert found.ends().text() == [["reached", "1", "1"]]
+
+
 def test_the_system_has_what_the_paper_prints_and_no_more() -> None:
     pytest.importorskip("sapien")
     bench = PrintedBench(as_printed.as_printed(Setting(hand="planar_two_finger")), "box", "E-KM")

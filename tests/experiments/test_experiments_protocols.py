@@ -191,6 +191,13 @@ def test_same_seed_same_session() -> None:
     assert step.poses == ()  # for pictures of turns only
 
 
+def test_a_long_step_of_a_true_model_ends_where_it_was_to() -> None:
+    bench = Bench(Setting(engine="mujoco", preset="none"), "box", "KM")
+    step = bench.long_step(0, 0, 5.0)
+    assert isinstance(step, TrialRecord)
+    assert step.true_error_deg < 0.3
+
+
 def test_a_new_object_begins_with_the_hand_of_another(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "_MOTIONS", 5)
     protocol = Generalize(

@@ -106,6 +106,15 @@ def test_pinch_force_is_what_was_asked(grasped):
         assert plant.reset(0).fingertip_force[0] == pytest.approx(wanted, rel=0.03)
 
 
+def test_centred_grasps_are_all_the_same():
+    plant = SimulatedHand("icub_right", "box", PlantConfig(spread=0.0))
+    plans = []
+    for seed in (0, 1):
+        plant.reset(seed)
+        plans.append(plant.plan.points)
+    np.testing.assert_allclose(*plans, atol=1e-9)
+
+
 def test_a_hand_says_how_hard_it_pinches():
     hand = dataclasses.replace(load_hand("icub_right"), pinch_force=3.0)
     assert SimulatedHand(hand, "box").reset(0).fingertip_force[0] == pytest.approx(3.0, rel=0.03)
@@ -279,7 +288,7 @@ def test_impossible_parameters_are_refused(changes):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"time_step": 0.0}, {"time_step": 0.005}, {"along": (0, 0, 0)}, {"gravity": (0, 0)}],
+    [{"time_step": 0.0}, {"time_step": 0.005}, {"along": (0, 0, 0)}, {"gravity": (0, 0)}, {"spread": 2.0}],
 )
 def test_impossible_settings_are_refused(changes):
     with pytest.raises(ParameterError, match=next(iter(changes))):

@@ -273,7 +273,8 @@ class ClosedLoop:
         looks = self.safety.caution.looks
         while True:
             began = time.perf_counter()
-            decision = self.controller.decide(seen.state, seen.a, progress.target, seen.fingertip_force)
+            target = progress.belief.target(seen)
+            decision = self.controller.decide(seen.state, seen.a, target, seen.fingertip_force)
             seconds = time.perf_counter() - began
             sign = progress.sign(seen, decision)
             if not sign or looks == 0 or seen.status is not PlantStatus.HELD:
@@ -338,6 +339,7 @@ class ClosedLoop:
             if turns and decision.share > 0 and self._slides(lin, increment, expected):
                 self.controller.tighter += self.safety.caution.slip
         pull = self._figures.commit(moved, after.a)
+        progress.belief.see(after, None if self.controller.enhanced is None else expected)
         seconds += time.perf_counter() - began
         if turns:
             progress.add(after, blind=watch.blind > 0)

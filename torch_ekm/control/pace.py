@@ -24,9 +24,9 @@ _AGREE = 1.0  # rho up to which the pace grows
 _DISAGREE = 1.6  # rho from which it shrinks
 _GROW, _SHRINK = 1.2, 0.7
 # error that is no surprise, as a share of the motion; of a translation the contacts' way counts
-_RELATIVE = 0.12
-_TRANSLATION_NOISE = 0.3e-3  # [m] standard deviation of a measured motion
-_ROTATION_NOISE = 0.3 * _DEG  # [rad]
+RELATIVE = 0.12
+TRANSLATION_NOISE = 0.3e-3  # [m] standard deviation of a measured motion
+ROTATION_NOISE = 0.3 * _DEG  # [rad]
 _FORCE_NOISE = 0.5  # [N]
 _FORCE_SHARE = 0.25  # of the force that a finger bears: an error that leaves it its grip
 SLIDES = 2.0  # rho of the twist alone from which the object is thought to slide
@@ -221,10 +221,10 @@ class TrustRegion:
             forces: of the contacts; None: unknown.
         """
         unit = np.array([lever] * 3 + [1.0] * 3)
-        noise = np.array([_TRANSLATION_NOISE] * 3 + [_ROTATION_NOISE] * 3)
+        noise = np.array([TRANSLATION_NOISE] * 3 + [ROTATION_NOISE] * 3)
         said, off = predicted.numpy(), (came - predicted).numpy()
         size = np.linalg.norm(said / unit)
-        z = off**2 / (noise**2 + (_RELATIVE * size * unit) ** 2)
+        z = off**2 / (noise**2 + (RELATIVE * size * unit) ** 2)
         fingers = np.zeros(0) if forces is None else forces.z.numpy() ** 2
         fingers = fingers[~np.isnan(fingers)]
         return math.sqrt(max(np.concatenate([z, fingers]).mean(), fingers.max(initial=0.0)))

@@ -40,6 +40,8 @@ class Setting:
     preset: str = "nominal"
     plant: PlantParameters | None = None
     """In place of the preset's."""
+    config: PlantConfig = field(default_factory=PlantConfig)
+    """How the simulated hand is run: gravity, grasps."""
     engine: str = "sapien"
     """The physics of the simulated hand; or "mujoco"."""
     model: ModelOptions = field(default_factory=ModelOptions)
@@ -69,7 +71,8 @@ class Setting:
         for name in ("capacity", "frames"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
-        kinds = {"plant": PlantParameters, "model": ModelOptions, "pace": PaceOptions, "safety": Safety}
+        kinds = {"plant": PlantParameters, "config": PlantConfig, "model": ModelOptions}
+        kinds |= {"pace": PaceOptions, "safety": Safety}
         for name, kind in kinds.items():
             value = self.parameters if name == "plant" else getattr(self, name)
             if not isinstance(value, kind):
@@ -104,13 +107,13 @@ class Setting:
         if controller not in CONTROLLERS:
             raise UnknownNameError("controller", controller, CONTROLLERS)
         relative_to = "setpoint" if controller.endswith("+I") else "encoder"
-        return PlantConfig(relative_to=relative_to)
+        return dataclasses.replace(self.config, relative_to=relative_to)
 
     def figures(self) -> dict[str, Any]:
         """All figures of plant, model, controller and learner, defaults included."""
         return {
             "plant": dataclasses.asdict(self.parameters),
-            "plant_config": dataclasses.asdict(PlantConfig()),
+            "plant_config": dataclasses.asdict(self.config),
             "model": dataclasses.asdict(self.model),
             "controller": [repr(part) for part in (*self.tasks, *self.limits, self.pace, self.safety)],
             "learner": learner_figures(self.learner, self.capacity, **self.learner_options),

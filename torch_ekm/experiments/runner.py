@@ -14,6 +14,7 @@ from ..control import (
     ActuatorLimit,
     ClosedLoop,
     HandKnowledge,
+    LimitingFunction,
     LookAndMoveController,
     Manipulation,
     Pace,
@@ -41,6 +42,13 @@ _LEARNS_BY = (14.0, -8.0, 22.0)  # [deg] in this order
 _MOTIONS = 30  # at least, unless turns end early
 _MOST_TURNS = 12
 _FIRST_GRASP = 1000  # its number: never one that is tested
+
+
+class _Uncut(Pace):
+    """Every step is made as it was asked for."""
+
+    def cut(self, *decided: Any) -> float:
+        return 1.0
 
 
 class Bench:
@@ -167,8 +175,8 @@ class Bench:
     def long_step(self, seed: int, trial: int, step_deg: float) -> Record:
         """One motion of ``step_deg`` from a fresh grasp: how far from it does the object come to rest?
 
-        Feedback has no say in it. The true error is that of the rotation about the axis, from where the
-        object really was; the learner stays as it is.
+        Feedback has no say in it: the whole angle to the target is asked for, as measured, and no step is
+        cut. The true error is that of the rotation about the axis; the learner stays as it is.
         """
         start = self.grasp(seed, trial)
         about = Trial(self.name, "long step", self.controller, seed, trial, step_deg)
@@ -176,11 +184,10 @@ class Bench:
             return NotGrasped(**vars(about), message=self.no_grasp)
         axis = self.hand.rotation_axis
         setting, replace = self.setting, dataclasses.replace
-        limiting = replace(setting.pace.limiting, step=step_deg * _DEG, contact_travel=None)
+        limiting = LimitingFunction(gain=1.0, step=2 * step_deg * _DEG, contact_travel=None)
         wide = ActuatorLimit(step=20 * _DEG)
         limits = tuple(wide if isinstance(one, ActuatorLimit) else one for one in setting.limits)
-        pace = Pace(replace(setting.pace, limiting=limiting), adapts=self.learns)
-        pace.load_state_dict(self.pace.state_dict())
+        pace = _Uncut(replace(setting.pace, limiting=limiting), adapts=False)
         controller = LookAndMoveController(self._predictor, axis, setting.tasks, limits, pace)
         rule = replace(setting.safety.rule, max_steps=1, off_limit=math.inf)
         safety = replace(setting.safety, rule=rule)
@@ -188,10 +195,13 @@ class Bench:
             self.plant, controller, knowledge=self.knowledge, safety=safety, learn=False, decline=False
         )
         done = _whole(loop.run(PoseTarget.turned(start, axis, step_deg * _DEG)))
-        before = true_state(done.steps[0].before if done.steps else done.stop.final)
-        turned = true_state(done.stop.final).minus(before)[-3:] @ axis
+        asked, turned = step_deg, 0.0
+        if done.steps:  # the last one: before it some may have tightened the grip
+            asked = float(done.steps[-1].decision.desired) / _DEG
+            before, after = true_state(done.steps[-1].before), true_state(done.stop.final)
+            turned = float(after.minus(before)[-3:] @ axis) / _DEG
         record = TrialRecord.of(about, done, axis, learns=self.learns)
-        return dataclasses.replace(record, true_error_deg=abs(float(turned) / _DEG - step_deg))
+        return dataclasses.replace(record, true_error_deg=abs(turned - asked))
 
     def close(self) -> None:
         """Close the plant: its simulation and rendering end; the bench is not used afterwards."""

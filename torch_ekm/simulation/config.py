@@ -31,6 +31,9 @@ class PlantConfig:
     along: tuple[float, float, float] | None = None
     """Direction in the hand of the object's long axis, within 5 deg, about which a pinch can turn it. None:
     the normal of a planar hand, else y, square to the planes in which the iCub's fingers bend."""
+    spread: float = 1.0
+    """Factor on how far points and tilts of the grasps are drawn from the middle of the object; 0: all are
+    centred."""
     relative_to: str = "encoder"
     """Commands are increments of the "encoder" or of the "setpoint"."""
 
@@ -39,6 +42,8 @@ class PlantConfig:
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ParameterError(name, value, "finite and greater than 0")
+        if not 0 <= self.spread <= 1:
+            raise ParameterError("spread", self.spread, "between 0 and 1")
         if self.time_step > 0.004:
             raise ParameterError("time_step", self.time_step, "at most 0.004 s: the tendons need it")
         if self.gravity is not None and (len(self.gravity) != 3 or not all(map(math.isfinite, self.gravity))):

@@ -308,7 +308,7 @@ class SimulatedHand:
         """Where to grasp."""
         c = self.config
         drawn = self._generator.uniform(-1.0, 1.0, size=6)  # the last two keep the noise of earlier versions
-        along, across, first, second = drawn[:4].tolist()
+        along, across, first, second = (c.spread * drawn[:4]).tolist()
         return PinchRequest(
             force=self.hand.pinch_force if c.pinch_force is None else c.pinch_force,
             along=along * _OFFSET_ALONG,

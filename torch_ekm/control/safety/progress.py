@@ -7,6 +7,7 @@ import math
 from ...model import ModelStatus
 from ...plant import Observation, PlantStatus
 from ...typing import Tensor
+from ..belief import Belief
 from ..decision import Decision, StopReason
 from ..focus import FocusedPose, PoseTarget
 from .safety import Objection, Safety
@@ -37,6 +38,7 @@ class Progress:
 
     def __init__(self, safety: Safety, target: PoseTarget, focus: FocusedPose, seen: Observation) -> None:
         self.safety, self.target, self.focus = safety, target, focus
+        self.belief = Belief(focus, target, seen)
         self.errors = [focus.error(target, seen.state)]
         """|e| before each motion and after the last, as a turn [rad]."""
         self.way: list[Tensor] = []
