@@ -132,6 +132,9 @@ def _resolve(kind: str, name: str | Path, known: dict[str, Path], endings: tuple
     if isinstance(name, str) and name in known:
         return known[name]
     path = Path(name)
+    if path.suffix == ".xacro":
+        urdf = path.with_name(f"{path.name.removesuffix('.xacro').removesuffix('.urdf')}.urdf")
+        raise DescriptionError(path, f"a xacro file is no URDF yet; run first: xacro {path} > {urdf}")
     if path.suffix not in endings:
         raise UnknownNameError(kind, str(name), (*known, f"a path to a {' or '.join(endings)} file"))
     return path
