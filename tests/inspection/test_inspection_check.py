@@ -110,7 +110,7 @@ def test_a_pad_that_the_urdf_lacks_is_printed_to_be_pasted(files):
     urdf, transmission = files
     transmission.write_text(transmission.read_text().replace("radius = 0.006", "radius = 0.009", 1))
     (row,) = [row for row in module._pads(load_hand(urdf)) if row.state != "ok"]
-    pasted = row.mend.removeprefix("make both the same: ")
+    pasted = row.mend[row.mend.index("<collision>") :]
     link = f'<link name="{load_hand(urdf).pads[0].link}">'
     text = re.sub(r"<collision>.*?</collision>", "", urdf.read_text(), flags=re.DOTALL)
     urdf.write_text(text.replace(link, link + pasted))

@@ -107,12 +107,10 @@ def compare(
         ),
     ] = "",
     targets: Annotated[
-        str, Option("--targets", "--measured", help="Columns to predict; y, y1, y2, ... if left out.")
+        str, Option("--targets", "--measured", help="To predict; y, y1, ... if left out.")
     ] = "",
     inputs: Annotated[str, Option(help="Columns to predict from; all others if left out.")] = "",
-    predicted: Annotated[
-        str, Option(help="What your model says of each measured column: y is the rest.")
-    ] = "",
+    predicted: Annotated[str, Option(help="What your model says of each of these: y is the rest.")] = "",
     observation: Annotated[str, Option(help="Columns whose next increments are predicted.")] = "",
     run_column: Annotated[str, Option("--run", help="Column with one number in each run.")] = "",
     clock: Annotated[str | None, Option(help="Of a ROS bag or MCAP: the topic that sets the rhythm.")] = None,

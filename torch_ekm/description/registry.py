@@ -133,8 +133,7 @@ def _resolve(kind: str, name: str | Path, known: dict[str, Path], endings: tuple
         return known[name]
     path = Path(name)
     if path.suffix == ".xacro":
-        urdf = path.with_name(f"{path.name.removesuffix('.xacro').removesuffix('.urdf')}.urdf")
-        raise DescriptionError(path, f"a xacro file is no URDF yet; run first: xacro {path} > {urdf}")
+        raise DescriptionError(path, f"run first: xacro {path} > {path.with_suffix('').with_suffix('.urdf')}")
     if path.suffix not in endings:
         raise UnknownNameError(kind, str(name), (*known, f"a path to a {' or '.join(endings)} file"))
     return path

@@ -79,19 +79,14 @@ def _pads(hand: HandDescription) -> Iterator[Check]:
         shapes, lack = hand.urdf.link(pad.link).collisions, direction_unmet(hand, pad)
         ends = np.array([pad.start, pad.end])
         depth = -signed_distance(shapes, ends)[0] if shapes else np.zeros(2)
-        name = f"pad '{pad.name}'"
+        name, mend = f"pad '{pad.name}'", f"paste into <link name='{pad.link}'>: {_collision(pad)}"
         if lack is not None:
             yield Check(name, "error", f"{found}; {lack.problem}", lack.remedy)
         elif not shapes:
-            lack = "its link has no primitive <collision>"
-            yield Check(
-                name, "error", f"{found}; {lack}", f"paste into <link name='{pad.link}'>: {_collision(pad)}"
-            )
+            yield Check(name, "error", f"{found}; its link has no primitive <collision>", mend)
         elif any(shape.kind == "box" and (signed_distance((shape,), ends)[0] < 0).all() for shape in shapes):
-            mend = f"write it as a capsule: {_collision(pad)}"
             yield Check(name, "warning", f"{found}; in a <collision> box, whose edges touch first", mend)
         elif np.abs(depth - pad.radius).max() > _SURFACE:
-            mend = f"make both the same: {_collision(pad)}"
             yield Check(name, "warning", f"{found}; not the <collision> of its link", mend)
         else:
             yield Check(name, "ok", found)

@@ -50,12 +50,9 @@ class OwnRecording:
     about: str
 
     def stream(self, limit: int | None = None) -> Stream:
-        """For :func:`compare`: in units of its first tenth (20 to 200 samples), which is not scored.
+        """For :func:`compare`: the first ``limit`` motions (None: all), in units of their first tenth.
 
-        Only x is centred: 0 is what the model says.
-
-        Args:
-            limit: only the first so many motions.
+        That (20 to 200 samples) is not scored. Only x is centred: 0 is what the model says.
         """
         x, y = self.x.numpy(), self.y.numpy()
         return in_own_units(self.name, x, y, self.about, limit, centre_y=False, ddof=1)

@@ -43,10 +43,8 @@ class ComparisonReport(Comparison):
             caption += f"is learned{some}."
             figure = plot_learning_curves(self, stream, shown)
             figures.append(save(figure, name=f"curve_{stream}", caption=caption))
-        streams = {}
-        for s in self.streams:
-            samples = {"samples": len(s), "available": max(s.available, len(s)), "warm_up": s.warm_up}
-            streams[s.name] = {**samples, "about": s.about}
+        rows = {s.name: {"samples": len(s), "available": max(s.available, len(s))} for s in self.streams}
+        streams = {s.name: {**rows[s.name], "warm_up": s.warm_up, "about": s.about} for s in self.streams}
         report = Report(
             title="Residual learners compared",
             summary=" ".join(self.verdicts()),

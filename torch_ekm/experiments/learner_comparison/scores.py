@@ -140,8 +140,7 @@ class Comparison:
             if gives_away(stream):
                 text += " The inputs give y: is what was measured among them?"
             text += stream.notes
-            sure = [score.learner for score in self.row(stream.name) if score.nll > _ABSURD]
-            if sure:
+            if sure := [score.learner for score in self.row(stream.name) if score.nll > _ABSURD]:
                 text += f" Too certain by far (NLL): {', '.join(sure)}; do not use their variances."
             sentences.append(text)
         return sentences

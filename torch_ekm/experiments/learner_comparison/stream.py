@@ -31,7 +31,7 @@ class Stream:
         segments: lengths of parts that stand for themselves (objects, grasps), for the statistics.
         about: what it is, and what "the model alone" predicts.
         available: samples of the file or recording, of which these are the first; 0: nobody counted.
-        notes: what the user should look at, such as an input that gives y.
+        notes: what the user should look at, such as a clock among the inputs.
 
     Raises:
         ShapeError: lengths do not fit.
@@ -111,8 +111,7 @@ def load_table(
     chosen = chosen or [name for name in names if name not in {*outputs, *model, *runs}]
     if not chosen:
         raise DescriptionError(path, "all columns are targets; at least one must be an input")
-    both = [name for name in chosen if name in outputs]
-    if both:
+    if both := [name for name in chosen if name in outputs]:
         raise DescriptionError(path, f"column '{both[0]}' cannot be both input and target")
     x, y = read(chosen), read(outputs) - (read(model) if model else 0.0)
     if len(x) < LEAST:
@@ -154,9 +153,8 @@ def in_own_units(
         start = values[:warm_up]
         deviation = start.std(0, ddof=ddof)
         whole = values.std(0, ddof=ddof)
-        deviation = np.where(
-            deviation > np.maximum(_REST * whole, 1e-9 * np.abs(values).max(0)), deviation, whole
-        )
+        moves = deviation > np.maximum(_REST * whole, 1e-9 * np.abs(values).max(0))
+        deviation = np.where(moves, deviation, whole)
         away = values - start.mean(0) if centre else values
         return torch.from_numpy(away / np.where(deviation > 0, deviation, 1.0))
 

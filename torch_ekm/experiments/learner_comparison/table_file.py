@@ -41,17 +41,15 @@ def open_table(path: Path, clock: str | None = None) -> tuple[Names, Read]:
     kind = path.suffix.lower()
     if kind not in readers and (path.is_dir() or kind in _BAGS):
         if clock is None:
-            valid = "a topic, such as that of the commands, for a recording of ROS (--clock)"
-            raise ParameterError("clock", clock, valid)
+            raise ParameterError("clock", clock, "a topic that sets the rhythm, such as that of the commands")
         heard, _, values = interop.read_bag(path, clock)
         return heard, lambda wanted: values[:, [heard.index(name) for name in wanted]]
     if not path.is_file():
         raise DescriptionError(path, "there is no such file")
     if kind not in readers:
-        problem = "are not read; use .csv, .parquet or a recording of ROS"
-        raise DescriptionError(path, f"files of kind '{path.suffix}' {problem}")
+        raise DescriptionError(path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet")
     names, read = readers[kind](path)
-    names = names[names[:1] == ("",) :]
+    names = names[1:] if names[:1] == ("",) else names
     for i, name in enumerate(names):
         if not name:
             raise DescriptionError(path, f"column {i + 1} has no name in the header")

@@ -29,7 +29,7 @@ _MEANINGS = {
     StopReason.STALLED.value: "the error falls no further",
     StopReason.STEP_LIMIT.value: "all motions are used up",
     StopReason.ACTUATOR_LIMITS.value: "the motors that are needed are at the ends of their ranges",
-    StopReason.UNSTABLE_GRASP.value: "the model says that the grasp is about to buckle",
+    StopReason.UNSTABLE_GRASP.value: "the model says that the grasp buckles, or cannot be held",
     StopReason.GIVEN_UP.value: "the grasp came too near to a loss, and the way back did not help",
     StopReason.WEAK_GRASP.value: "declined: a finger bore less than the object needs",
     StopReason.OUT_OF_REACH.value: "declined before anything moved",
