@@ -106,9 +106,7 @@ def compare(
             "unknown name lists all. If left out: all but those of other libraries."
         ),
     ] = "",
-    targets: Annotated[
-        str, Option("--targets", "--measured", help="To predict; y, y1, ... if left out.")
-    ] = "",
+    targets: Annotated[str, Option("--targets", "--measured", help="To predict; else y, y1, ...")] = "",
     inputs: Annotated[str, Option(help="Columns to predict from; all others if left out.")] = "",
     predicted: Annotated[str, Option(help="What your model says of each of these: y is the rest.")] = "",
     observation: Annotated[str, Option(help="Columns whose next increments are predicted.")] = "",

@@ -17,10 +17,7 @@ from ..typing import AnyArray, Bool, Float, Tensor
 from .manipulation import KKTSolution, two_stage
 from .options import ModelOptions
 
-_TWO_HARD_FINGERS = (
-    "two hard fingers cannot hold anything in space, it turns about the line through them: write "
-    "planar_normal for a planar hand, torsional_friction for soft pads"
-)
+_TWO_HARD = "two hard fingers cannot hold anything in space: write planar_normal, or torsional_friction"
 
 
 class GraspResponse(NamedTuple):
@@ -174,7 +171,7 @@ class Reduction(nn.Module):
                 error.direction = direction / torch.linalg.vector_norm(direction).clamp_min(1e-300)
                 spatial = self.pose_basis.shape[-1] == 6 and all(row % 6 < 3 for row in rows)
                 if spatial and len(rows) == 6 and float(error.direction[-3:].square().sum()) > 0.5:
-                    error.args = (_TWO_HARD_FINGERS,)
+                    error.args = (_TWO_HARD,)
             raise
         dlam = system.actuator_force(step, n_h)
         dmu = system.row_scale[:, None] * step.reaction[..., :n_h, :]

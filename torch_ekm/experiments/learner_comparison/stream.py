@@ -117,8 +117,8 @@ def load_table(
     if len(x) < LEAST:
         raise DescriptionError(path, f"it has {len(x)} samples; at least {LEAST} are needed to compare")
     about = f"{', '.join(outputs)} from {len(chosen)} columns of {Path(path).name}"
-    number = read(runs)[:limit].sum(1)
-    parts = np.diff(np.flatnonzero(np.diff(number, prepend=np.nan, append=np.nan))).tolist()
+    number = np.pad(read(runs)[:limit].sum(1), 1, constant_values=np.nan)  # zeros without runs
+    parts = np.diff(np.flatnonzero(np.diff(number))).tolist()
     grows = (np.diff(x, axis=0) <= 0).sum(0) < len(parts)  # but for the starts of runs
     clocks = ", ".join(name for name, clock in zip(chosen, grows, strict=True) if clock)
     notes = f" {clocks} only grows, like a clock or the number of a row: leave it out." if clocks else ""
