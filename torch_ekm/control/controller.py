@@ -85,7 +85,7 @@ class LookAndMoveController:
         self.tighter = 0.0
         """Grip force on top of the one that suits the object [N]."""
         for part in (*self.tasks, *self.limits):
-            if isinstance(part, type) or not isinstance(part, Task):  # a Limit looks the same
+            if isinstance(part, type) or not callable(getattr(part, "rows", None)):
                 raise ParameterError("tasks, limits", part, "objects with a method rows(model, seen)")
         self._weight = float(torch.linalg.vector_norm(self.kinematic.weight))
         self._previous: tuple[Linearization, Tensor] | None = None
