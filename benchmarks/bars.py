@@ -1,4 +1,4 @@
-"""What was aimed at before the figures were known, and whether it was met: for us, not for users."""
+"""Bars that were set before the figures were known, and which of them are missed."""
 
 from __future__ import annotations
 
@@ -27,13 +27,12 @@ class Target:
 
 
 def targets_table(targets: Sequence[Target]) -> Table:
-    """Each target: met, or by how much not."""
+    """The targets that are missed, and by how much: no rows where all are met."""
     columns: dict[Column, Callable[[Target], Cell]] = {
-        Column("at least", "g"): lambda target: target.least,
-        Column("at most", "g"): lambda target: target.most,
         Column("measured", ".3g"): lambda target: target.measured,
-        Column("met"): lambda target: target.missed_by == 0,
-        Column("missed by", ".3g"): lambda target: target.missed_by or None,
+        Column("bar", "g"): lambda target: target.least if target.most is None else target.most,
+        Column("missed by", ".3g"): lambda target: target.missed_by,
     }
-    note = "Targets were set before the figures were known."
-    return Table.of("targets", "Targets", "target", {t.what: t for t in targets}, columns, note)
+    missed = {target.what: target for target in targets if target.missed_by > 0}
+    note = f"Of {len(targets)} bars, set before the figures were known, these are missed."
+    return Table.of("targets", "Missed bars", "figure", missed, columns, note)

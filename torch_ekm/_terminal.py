@@ -81,9 +81,9 @@ def unbroken(text: str, width: int) -> str:
 
 
 def print_report(report: Report, folder: Path, notes: bool = False) -> None:
-    """What came of it, the tables, and where the page is."""
+    """What came of it, the first table, and where the page is, which has the others."""
     say(unbroken(as_printed(report.summary), console.width))
-    for table in report.tables:
+    for table in report.tables[:1]:
         print_table(table.header, table.text(), table.caption, table.note if notes else None)
     say(f"Report:    {(folder / 'index.html').resolve()}")
 

@@ -54,7 +54,7 @@ def write_report(result: RecordedHandResult, folder: str | Path) -> Report:
     tables = [score_table(result, h, subset) for h in HORIZONS for subset in SUBSETS]
     tables += [paired_table(result), object_table(result)]
     if not result.quick:
-        tables.insert(0, targets_table(targets(result)))
+        tables = [*(t for t in [targets_table(targets(result))] if t.rows), *tables]
     report = Report(
         title="Recorded motions of a Yale T42, predicted",
         summary=summary(result),

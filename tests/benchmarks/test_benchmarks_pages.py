@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 from pathlib import Path
 
@@ -108,8 +109,14 @@ def test_targets_say_by_how_much_they_are_missed() -> None:
     assert Target("x", 30.0, most=25).missed_by == 5
     assert Target("x", 80.0, least=90).missed_by == 10
     assert Target("x", 0.5, least=1, most=3).missed_by == 0.5
-    rows = targets_table([Target("a", 20.0, most=25), Target("b", 30.0, most=25)]).text()
-    assert rows == [["a", "-", "25", "20", "yes", "-"], ["b", "-", "25", "30", "no", "5"]]
+    table = targets_table([Target("a", 20.0, most=25), Target("b", 30.0, most=25), Target("c", 1.0, least=2)])
+    assert table.header == ["figure", "measured", "bar", "missed by"]
+    assert table.text() == [["b", "30", "25", "5"], ["c", "1", "2", "1"]]  # what is met is not listed
+
+
+def test_no_page_says_that_a_bar_is_met() -> None:
+    pages = [*(write_pages.HERE.parent / "docs").rglob("*.md"), write_pages.HERE.parent / "README.md"]
+    assert not [page.name for page in pages if re.search(r"\|\s*met\s*\|", page.read_text("utf-8"))]
 
 
 SCRIPTS = [path for path in write_pages.HERE.glob("**/*.py") if path.parent.name != "recorded_hand"]

@@ -30,8 +30,9 @@ from torch_ekm.control import (
     StepBound,
     StopReason,
 )
+from torch_ekm.control.qp import build_qp
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.exceptions import NonFiniteError, ShapeError, UnknownNameError
+from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel, ModelStatus
 from torch_ekm.residual import SparseOnlineGP
@@ -178,6 +179,22 @@ def test_a_wish_and_a_limit_of_ones_own_have_effect(grasp, enhanced: bool) -> No
         assert abs(float(decision.predicted[joint])) <= most
         turn = float(plant.rotation_axis @ decision.predicted[-3:])
         assert turn == pytest.approx(STEP, rel=2e-2)  # and the turn is still made
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_wrong_tasks_and_limits_are_refused(grasp) -> None:
+    for wrong in ({"tasks": ["focus"]}, {"tasks": [EffortTask]}, {"limits": [5 * DEG]}):
+        with pytest.raises(ParameterError, match=r"tasks, limits .*rows\(model, seen\)"):
+            controller(grasp, **wrong)
+    n_u = 3
+    for rows, error, says in (
+        (np.eye(n_u), ParameterError, "Squares, Equality, Inequality, Bounds or None"),
+        (Squares(np.eye(n_u), np.zeros(n_u), -1.0), ParameterError, "weight"),
+        (Squares(np.eye(2), np.zeros(2)), ShapeError, r"\(n, 3\)"),
+        (Inequality(np.ones((1, 4)), np.zeros(1)), ShapeError, "rows of Inequality"),
+    ):
+        with pytest.raises(error, match=says):
+            build_qp(n_u, [rows])
 
 
 def test_without_a_focus_task_the_rest_is_done(grasp) -> None:

@@ -18,6 +18,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = {
     "gymnasium_environment": (("sapien", "gymnasium"), [], r"success True"),
     "own_hand": (("sapien",), [], r"KM: stalled .*\nE-KM: reached"),
+    "own_task_and_wrapper": (("sapien",), [], r"^reached"),
     "own_learner_in_compare": (("matplotlib",), [], r"kernel average +0\.[1-6]"),
     "real_hand_driver": (("sapien",), [], r"^reached"),
     "record_and_replay": (("sapien", "h5py"), [], r"(trial_00000\d\.h5 ok.*\n){2}[\s\S]*trial 1: error"),

@@ -86,6 +86,18 @@ def test_units_of_a_table_are_printed(capsys: pytest.CaptureFixture[str]) -> Non
         assert text in printed
 
 
+def test_the_terminal_has_the_answer_the_first_table_and_the_path(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    tables = [Table(name, f"Caption {name}", ["case"], [["a" * 20]]) for name in ("one", "two")]
+    print_report(Report("Title", "The answer.", tables), tmp_path)
+    printed = capsys.readouterr().out
+    assert printed.startswith("The answer.")
+    assert "Caption one" in printed
+    assert "Caption two" not in printed
+    assert str(tmp_path / "index.html") in printed
+
+
 HOSTILE = "\x1b]0;owned\x07 \x1b[31m[red]x[/] \u202egnp \x9b2J \ud800"
 
 

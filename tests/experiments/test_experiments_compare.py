@@ -315,6 +315,47 @@ def test_columns_that_are_not_asked_for_may_hold_anything(kind: str, tmp_path: P
         load_table(path, inputs=["torque"])
 
 
+def test_y_is_measured_less_predicted_and_runs_stand_for_themselves(tmp_path: Path) -> None:
+    values = np.column_stack([np.arange(60), table(), np.arange(60) // 10])
+    path = write(tmp_path / "a.csv", values, ",a,b,said,seen,run")  # as pandas writes it, its index first
+    stream = load_table(path, ["seen"], predicted=["said"], run="run")
+    given = in_own_units("a", values[:, 1:3], values[:, 4:5] - values[:, 3:4], centre_y=False)
+    torch.testing.assert_close(stream.x, given.x)
+    torch.testing.assert_close(stream.y, given.y)
+    assert stream.segments == (10,) * 6
+    assert load_table(path, ["seen"], 35, predicted=["said"], run="run").segments == (10, 10, 10, 5)
+    with pytest.raises(ParameterError, match="one for each measured column"):
+        load_table(path, ["seen", "a"], predicted=["said"])
+    arguments = ["compare", "--data", str(path), "--predicted", "said", "--learners", "linear RLS"]
+    whole = [*arguments, "--measured", "seen", "--run", "run", "--out", str(tmp_path / "out"), "--jobs", "1"]
+    result = CliRunner().invoke(app, whole)
+    assert result.exit_code == 0, result.output
+    assert "in 6 parts" in " ".join(result.output.split())
+    assert isinstance(CliRunner().invoke(app, arguments).exception, ParameterError)
+
+
+def test_a_clock_among_the_inputs_is_suspected(tmp_path: Path) -> None:
+    run = np.arange(60) // 20
+    values = np.column_stack([np.arange(60) % 20, table()[:, 1:], run])
+    stream = load_table(write(tmp_path / "a.csv", values, "time,b,c,y,run"), run="run")
+    assert "time only grows" in compare(stream, ("linear RLS",)).verdicts()[0]
+    assert not load_table(write(tmp_path / "b.csv", table())).notes
+
+
+def test_an_absurd_density_is_told(compared: Comparison) -> None:
+    scores = {key: dataclasses.replace(score, nll=1e6) for key, score in compared.scores.items()}
+    absurd = dataclasses.replace(compared, scores=scores).verdicts()[0]
+    assert "Too certain by far (NLL): model alone, linear RLS, SOGP plain" in absurd
+    assert "certain" not in compared.verdicts()[0]
+
+
+def test_rest_at_the_beginning_is_no_unit() -> None:
+    moving = table(300)
+    moving[:40] *= 1e-5
+    stream = in_own_units("a", moving[:, :3], moving[:, 3:])
+    assert max(float(stream.x.abs().max()), float(stream.y.abs().max())) < 6
+
+
 def test_how_many_of_how_many_rows_were_used_is_told(tmp_path: Path) -> None:
     stream = load_table(write(tmp_path / "a.csv", table(60)), limit=50)
     assert stream.used == "the first 50 of 60 rows"

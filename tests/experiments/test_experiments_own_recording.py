@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from torch_ekm.exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.experiments.learner_comparison.own_recording import Columns, load_own
+from torch_ekm.experiments.learner_comparison.recordings import load_recording
 from torch_ekm.experiments.learner_comparison.run import compare
 
 COLUMNS = Columns(state=["angle", "extra*"], command=["rate"], observation=["angle"])
@@ -52,6 +54,14 @@ def test_what_a_learner_would_have_gained(tmp_path: Path) -> None:
     report = compare(stream, ("model alone", "SOGP adaptive"))
     assert report.scores["own", "model alone"].rms.mean == pytest.approx(1.0, abs=1e-5)
     assert report.scores["own", "SOGP adaptive"].rms.mean < 0.4
+
+
+def test_increments_from_the_command_line(tmp_path: Path) -> None:
+    path, _ = pendulum(tmp_path / "own.csv")
+    given = load_own(path, Columns(["angle", "rate"], [], ["angle"])).stream(150)
+    read = load_recording(path, 150, ["angle"], inputs=["angle", "rate"])
+    assert torch.equal(read.y, given.y)
+    assert len(read) == 150
 
 
 def test_what_does_not_fit_is_named(tmp_path: Path) -> None:

@@ -11,12 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from experiments_records import turn
 from made_up_sessions import made_up_generalize, made_up_online
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
 from torch_ekm.description.registry import object_paths
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
+from torch_ekm.experiments.protocols.demo import Demo
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.protocols.online import Online
 from torch_ekm.experiments.reporting.report import Report
@@ -71,6 +73,20 @@ def test_report_is_complete(name: str, reports: Callable[[str], tuple[Report, Pa
     assert configuration["plant"]["dead_zone"] > 0
     assert "Development seeds" in report.summary
     assert "no verdict" in report.summary
+
+
+def test_a_hand_that_cannot_be_modelled_gives_the_reason_alone_and_ends_with_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = {"reason": "unstable grasp", "message": "two hard fingers", "seconds": (), "errors_deg": (9.0,)}
+    monkeypatch.setattr(Demo, "session", lambda _, item, name, seed: [turn(name, seed, 9.0, **ended)])
+    out = tmp_path / "demo"
+    shown = CliRunner().invoke(app, ["demo", "--seeds", "1:3", "--jobs", "1", "--out", str(out)])
+    assert shown.exit_code == 1, shown.output
+    said = " ".join(shown.output.split())
+    assert "Nothing was turned. 4 of 4 turns ended with 'unstable grasp': two hard fingers." in said
+    assert "%" not in shown.output
+    assert not list(out.glob("comparison.csv"))
 
 
 @pytest.mark.usefixtures("made_up")

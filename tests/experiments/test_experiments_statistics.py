@@ -317,6 +317,13 @@ def test_the_answer_comes_in_a_sentence_with_losses_and_no_verdict_from_few_seed
     assert "no verdict" not in many
 
 
+def test_where_most_turns_fail_the_answer_says_why() -> None:
+    ends = {"reason": "object lost", "message": "turned off the axis"}
+    said = verdict(frame([turn("E-KM", 0, 0.1), *(turn("E-KM", k, 9.0, **ends) for k in (1, 2))]), range(3))
+    assert "The E-KM: 2 of 3 turns ended with 'object lost': turned off the axis." in said
+    assert "ended with" not in verdict(frame([turn("E-KM", k, 0.1) for k in range(3)]), range(3))
+
+
 def test_why_turns_ended_is_told_of_each_controller() -> None:
     records = [turn("KM", seed, 1.0, reason="stalled") for seed in range(3)] + [turn("E-KM", 0, 0.25)]
     records.append(turn("E-KM", 1, 0.3, reason="object lost"))

@@ -106,6 +106,27 @@ def test_each_fault_has_its_row(fault, files, monkeypatch):
     assert bool(rows[0].mend) == (state != "ok")
 
 
+def test_a_pad_that_the_urdf_lacks_is_printed_to_be_pasted(files):
+    urdf, transmission = files
+    transmission.write_text(transmission.read_text().replace("radius = 0.006", "radius = 0.009", 1))
+    (row,) = [row for row in module._pads(load_hand(urdf)) if row.state != "ok"]
+    pasted = row.mend[row.mend.index("<collision>") :]
+    link = f'<link name="{load_hand(urdf).pads[0].link}">'
+    text = re.sub(r"<collision>.*?</collision>", "", urdf.read_text(), flags=re.DOTALL)
+    urdf.write_text(text.replace(link, link + pasted))
+    assert next(module._pads(load_hand(urdf))).state == "ok"
+
+
+def test_which_pad_opposes_which_is_said():
+    (row,) = module._reach(load_hand("icub_right"), load_object("box"))
+    assert row.found == "pad thumb opposes index and middle, 30 mm between them"
+
+
+def test_a_xacro_file_is_told_which_command_comes_first(tmp_path):
+    (row,) = check_hand(str(tmp_path / "my.urdf.xacro"))
+    assert row.found.endswith(f"xacro {tmp_path}/my.urdf.xacro > {tmp_path}/my.urdf")
+
+
 @pytest.mark.usefixtures("brief")
 def test_a_planner_that_fails_names_the_joint_and_not_the_object():
     narrow = HAND.joint_upper.copy()
@@ -191,7 +212,7 @@ def test_springs_too_soft_for_the_usual_force_are_told_which_one_they_bear(monke
     rows = {row.name: row for row in check_hand("mine", "can")}
     assert rows["pinch"].state == "error"
     assert "sound at 2 N" in rows["pinch force"].found
-    assert "'pinch_force = 2'" in rows["pinch force"].mend
+    assert "pinch_force = 2 under [hand]" in rows["pinch force"].mend
     gentle = dataclasses.replace(hand, pinch_force=2.0)
     rows = {row.name: row for row in module._pinch(gentle, load_object("can"), None, PlantConfig())}
     assert rows["pinch"].state == "ok"

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
+from torch_ekm.experiments.learner_comparison.recordings import load_recording
 from torch_ekm.interop import log_to_mcap, read_bag
 from torch_ekm.kinematics import se3
 from torch_ekm.plant import Observation, PlantStatus, Trajectory, TrialLog, Truth
@@ -90,6 +91,19 @@ def test_a_recording_is_a_table(tmp_path: Path) -> None:
     assert not any("image" in name for name in everything.names), "81 numbers are an image"
     with pytest.raises(UnknownNameError, match="/object_pose"):
         read_bag(bag, clock="/wrench")
+
+
+def test_learners_are_compared_on_a_recording(tmp_path: Path) -> None:
+    one, log = trajectory(3, n=45), TrialLog(tmp_path / "log", {})
+    log.write(0, one)
+    (bag,) = log_to_mcap(log, tmp_path / "bags")
+    columns = {"inputs": ["/commands.position*"], "targets": ["/q.position[0]"]}
+    assert load_recording(bag, clock="/commands", **columns).x.shape == (45, 2)
+    (file,) = bag.glob("*.mcap")
+    moves = load_recording(file, None, ["/q.position[0]"], clock="/commands", inputs=columns["inputs"])
+    assert moves.y.shape == (44, 1)
+    with pytest.raises(ParameterError, match="a topic that sets the rhythm"):
+        load_recording(file, **columns)
 
 
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])

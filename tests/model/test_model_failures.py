@@ -55,6 +55,12 @@ def test_a_motion_that_nothing_resists_is_an_error_whatever_the_option_says(on_u
     assert caught.value.direction[-3:].norm() > 0.1
 
 
+def test_two_hard_fingers_in_space_are_told_what_to_write():
+    toy = three_finger()
+    with pytest.raises(UnstableGraspError, match=r"^two hard fingers .* planar_normal, or torsional"):
+        rebuilt(toy, contacts=select(toy.contacts, [0, 1])).linearize(toy.state)
+
+
 def test_one_soft_contact_cannot_hold_but_the_answer_is_finite():
     toy = three_finger()
     soft = select(toy.contacts, [0]).replace(torsional_friction=torch.full((1,), 0.005, dtype=F64))

@@ -11,10 +11,10 @@ from .._terminal import print_report, progress, say
 from ..exceptions import ParameterError
 from ._app import AN_OBJECT, Engine, Hand, Jobs, Preset, Sensing, app, names, needs, parse_angles, parse_seeds
 
+import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
 
 if TYPE_CHECKING:
-    from ..experiments.reporting.report import Report
     from ..experiments.reproduce import Experiment
 
 
@@ -39,8 +39,7 @@ def demo(
 
     protocol, chosen = Demo(Setting(hand=hand), (object,)), parse_seeds(seeds)
     planned = Experiment(protocol.quick(), chosen[:2], quick) if quick else Experiment(protocol, chosen)
-    for figure in _run("manipulating", planned, out, jobs).figures:
-        say(f"           {(out / figure.path).resolve()}")
+    _run("manipulating", planned, out, jobs)
 
 
 @app.command()
@@ -98,7 +97,7 @@ def reproduce(
 @needs("plots")
 def compare(
     data: Annotated[
-        list[str], Option(help="A .csv or .parquet file, or the name of a recording; repeatable.")
+        list[str], Option(help="A .csv or .parquet file, a ROS bag, or a recording's name; repeatable.")
     ],
     learners: Annotated[
         str,
@@ -107,8 +106,12 @@ def compare(
             "unknown name lists all. If left out: all but those of other libraries."
         ),
     ] = "",
-    targets: Annotated[str, Option(help="Columns to predict; y, y1, y2, ... if left out.")] = "",
-    inputs: Annotated[str, Option(help="Columns to predict from; all but the targets if left out.")] = "",
+    targets: Annotated[str, Option("--targets", "--measured", help="To predict; else y, y1, ...")] = "",
+    inputs: Annotated[str, Option(help="Columns to predict from; all others if left out.")] = "",
+    predicted: Annotated[str, Option(help="What your model says of each of these: y is the rest.")] = "",
+    observation: Annotated[str, Option(help="Columns whose next increments are predicted.")] = "",
+    run_column: Annotated[str, Option("--run", help="Column with one number in each run.")] = "",
+    clock: Annotated[str | None, Option(help="Of a ROS bag or MCAP: the topic that sets the rhythm.")] = None,
     out: Annotated[Path, Option(help="Folder for tables and figures.")] = Path("compare_output"),
     limit: Annotated[
         int, Option(min=0, help="Rows of a file or recording that are used, its first; 0: all.")
@@ -141,6 +144,10 @@ def compare(
             chosen,
             targets=names(targets),
             inputs=names(inputs),
+            predicted=names(predicted),
+            observation=names(observation),
+            run=run_column,
+            clock=clock,
             limit=limit or None,
             folder=out / "runs",
             processes=jobs,
@@ -149,10 +156,11 @@ def compare(
     print_report(compared.write(out), out, notes=True)
 
 
-def _run(what: str, planned: Experiment, folder: Path, jobs: int) -> Report:
+def _run(what: str, planned: Experiment, folder: Path, jobs: int) -> None:
     from ..experiments.reproduce import reproduce as run
 
     with progress(what, len(planned.jobs)) as advance:
         report = run(planned, folder, jobs, advance)
     print_report(report, folder)
-    return report
+    if report.empty:
+        raise typer.Exit(1)

@@ -12,7 +12,7 @@ import torch
 from .._checks import check_finite, check_shape
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
-from ..exceptions import EKMError, GraspError, NoContactError, SolverError
+from ..exceptions import EKMError, GraspError, NoContactError, ParameterError, SolverError
 from ..kinematics import GraspState
 from ..model import ModelStatus
 from ..typing import Float, Tensor
@@ -62,6 +62,9 @@ class LookAndMoveController:
         tasks: what a step should do (:class:`Task`); None: :data:`DEFAULT_TASKS`.
         limits: what it must not do (:class:`Limit`); None: :data:`DEFAULT_LIMITS`.
         pace: how far a step goes; None: a new :class:`Pace`, which adapts if the model is an enhanced one.
+
+    Raises:
+        ParameterError: a task or limit without a method ``rows``.
     """
 
     def __init__(
@@ -81,6 +84,9 @@ class LookAndMoveController:
         """What was learned of how the pads' forces answer; a :class:`ClosedLoop` sets it."""
         self.tighter = 0.0
         """Grip force on top of the one that suits the object [N]."""
+        for part in (*self.tasks, *self.limits):
+            if isinstance(part, type) or not callable(getattr(part, "rows", None)):
+                raise ParameterError("tasks, limits", part, "objects with a method rows(model, seen)")
         self._weight = float(torch.linalg.vector_norm(self.kinematic.weight))
         self._previous: tuple[Linearization, Tensor] | None = None
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from .._extras import require
 from ..contact.forces.active_set import EqualityProgram, solve_by_active_set
-from ..exceptions import ParameterError, SolverError
+from ..exceptions import ParameterError, ShapeError, SolverError
 from ..typing import Array, Tensor
 
 Numbers = Tensor | Array | float
@@ -153,15 +153,22 @@ def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
         rows: of each task and limit; None asks for nothing.
 
     Raises:
-        ParameterError: bounds that cross, or a figure that is not finite.
+        ParameterError: no rows, a negative weight, bounds that cross, or a figure that is not finite.
+        ShapeError: rows of another number of actuators.
     """
     P, q = np.zeros((n_u, n_u)), np.zeros(n_u)
     lower, upper = np.full(n_u, -np.inf), np.full(n_u, np.inf)
     reached: list[tuple[Array, Array, Array]] = [(np.zeros((0, n_u)), np.zeros(0), np.zeros(0))]
     kept = reached.copy()
     for row in rows:
+        if row is not None and not isinstance(row, Rows):
+            raise ParameterError("rows", row, "Squares, Equality, Inequality, Bounds or None")
+        if row is not None and as_array(row[0]).shape[-1:] not in ((), (n_u,)):
+            raise ShapeError(f"rows of {type(row).__name__}", f"(n, {n_u})", as_array(row[0]).shape)
         if isinstance(row, Squares):
             unit, weight = as_array(row.unit).reshape(-1, 1), as_array(row.weight).reshape(-1, 1)
+            if (weight < 0).any():
+                raise ParameterError("weight", row.weight, "at least 0: the program is convex")
             A, b = as_array(row.A) * DEGREE / unit, as_array(row.b) / unit[:, 0]
             twice = 2 * A.T
             P += twice @ (weight * A)

@@ -132,6 +132,8 @@ def _resolve(kind: str, name: str | Path, known: dict[str, Path], endings: tuple
     if isinstance(name, str) and name in known:
         return known[name]
     path = Path(name)
+    if path.suffix == ".xacro":
+        raise DescriptionError(path, f"run first: xacro {path} > {path.with_suffix('').with_suffix('.urdf')}")
     if path.suffix not in endings:
         raise UnknownNameError(kind, str(name), (*known, f"a path to a {' or '.join(endings)} file"))
     return path

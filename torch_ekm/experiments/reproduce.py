@@ -16,6 +16,7 @@ from .protocols.generalize import Generalize
 from .protocols.online import Online
 from .protocols.protocol import Protocol
 from .reporting.report import Report
+from .reporting.tables import why
 from .reporting.trials import trial_frame
 
 PROTOCOLS: dict[str, type[Protocol]] = {"online": Online, "generalize": Generalize}
@@ -97,6 +98,10 @@ def reproduce(
     results = {name: [read(figures) for figures in session] for name, session in kept.items()}
     trials = trial_frame(results, protocol.setting.safety.rule.max_steps)
     report = protocol.report(seeds, trials, folder)
+    report.empty = not (trials["motions"] > 0).any()
+    if report.empty:  # errors and ratios of turns that nobody made mean nothing
+        report.summary, report.figures = f"Nothing was turned. {why(trials)}", []
+        report.tables = [table for table in report.tables if table.name == "stop_reasons"]
     report.summary += f" {protocol.setting}."
     if experiment.quick:
         report.title += ": a quick run"

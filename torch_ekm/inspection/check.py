@@ -14,7 +14,7 @@ from ..contact import ContactSet
 from ..contact.contact_kinematics import contact_frames
 from ..contact.signed_distance import signed_distance
 from ..control import ClosedLoop, LookAndMoveController
-from ..description import HandDescription, ObjectDescription, Shape, load_hand, load_object
+from ..description import ContactPad, HandDescription, ObjectDescription, Shape, load_hand, load_object
 from ..exceptions import EKMError, MissingExtraError
 from ..kinematics import ActuationMap, HandKinematics, LinkPoses
 from ..model import KinematicModel, Linearization, ModelOptions, ModelStatus
@@ -79,18 +79,29 @@ def _pads(hand: HandDescription) -> Iterator[Check]:
         shapes, lack = hand.urdf.link(pad.link).collisions, direction_unmet(hand, pad)
         ends = np.array([pad.start, pad.end])
         depth = -signed_distance(shapes, ends)[0] if shapes else np.zeros(2)
-        name = f"pad '{pad.name}'"
+        name, mend = f"pad '{pad.name}'", f"paste into <link name='{pad.link}'>: {_collision(pad)}"
         if lack is not None:
             yield Check(name, "error", f"{found}; {lack.problem}", lack.remedy)
         elif not shapes:
-            yield Check(name, "error", f"{found}; its link has no primitive <collision>", "write its capsule")
+            yield Check(name, "error", f"{found}; its link has no primitive <collision>", mend)
         elif any(shape.kind == "box" and (signed_distance((shape,), ends)[0] < 0).all() for shape in shapes):
-            mend = "write it as a capsule: a cylinder and two spheres"
             yield Check(name, "warning", f"{found}; in a <collision> box, whose edges touch first", mend)
         elif np.abs(depth - pad.radius).max() > _SURFACE:
-            yield Check(name, "warning", f"{found}; not the <collision> of its link", "make both the same")
+            yield Check(name, "warning", f"{found}; not the <collision> of its link", mend)
         else:
             yield Check(name, "ok", found)
+
+
+def _collision(pad: ContactPad) -> str:
+    """The pad as a URDF has it: a ball, or a cylinder with a ball on either end."""
+    ends = np.array([pad.start, pad.end])
+    x, y, z = ends[1] - ends[0]
+    rpy = f"0 {math.atan2(math.hypot(x, y), z):.6g} {math.atan2(y, x):.6g}"
+    rod = f'<cylinder radius="{pad.radius:g}" length="{math.hypot(x, y, z):.6g}"/>'
+    parts = [(end, "0 0 0", f'<sphere radius="{pad.radius:g}"/>') for end in np.unique(ends, axis=0)]
+    parts += [(ends.mean(axis=0), rpy, rod)] if len(parts) > 1 else []
+    form = '<collision><origin xyz="{:.6g} {:.6g} {:.6g}" rpy="{}"/><geometry>{}</geometry></collision>'
+    return "".join(form.format(*at, turned, body) for at, turned, body in parts)
 
 
 def _tensions(hand: HandDescription) -> Iterator[Check]:
@@ -147,8 +158,9 @@ def _reach(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
         state: State = "error" if lack.certain else "warning"
         yield Check("limits", state, f"{lack.part}: {lack.problem}", lack.remedy)
     if not lacks:
-        names = " and ".join(pad.name for pad in problem.pads)
-        yield Check("limits", "ok", f"pads {names} can hold {1e3 * obj.grasp_width:.0f} mm between them")
+        first, *others = (pad.name for pad in problem.pads)
+        found = f"pad {first} opposes {' and '.join(others)}, {1e3 * obj.grasp_width:.0f} mm between them"
+        yield Check("limits", "ok", found)
 
 
 def _gentler(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
@@ -156,7 +168,7 @@ def _gentler(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     smaller = [force for force in _GENTLER if force < hand.pinch_force]
     for force in smaller:
         if not any(row.state == "error" for row in _pinch(hand, obj, None, PlantConfig(pinch_force=force))):
-            mend = f"'pinch_force = {force:g}' in [hand], or stiffer springs"
+            mend = f"write pinch_force = {force:g} under [hand], or stiffer springs"
             yield Check("pinch force", "warning", f"too high: the pinch is sound at {force:g} N", mend)
             return
     if smaller:

@@ -17,6 +17,8 @@ from ..typing import AnyArray, Bool, Float, Tensor
 from .manipulation import KKTSolution, two_stage
 from .options import ModelOptions
 
+_TWO_HARD = "two hard fingers cannot hold anything in space: write planar_normal, or torsional_friction"
+
 
 class GraspResponse(NamedTuple):
     """How the grasp answers to a unit motion of each actuator."""
@@ -167,6 +169,9 @@ class Reduction(nn.Module):
             if error.direction is not None:  # into state coordinates
                 direction = self.scaled_basis @ error.direction
                 error.direction = direction / torch.linalg.vector_norm(direction).clamp_min(1e-300)
+                spatial = self.pose_basis.shape[-1] == 6 and all(row % 6 < 3 for row in rows)
+                if spatial and len(rows) == 6 and float(error.direction[-3:].square().sum()) > 0.5:
+                    error.args = (_TWO_HARD,)
             raise
         dlam = system.actuator_force(step, n_h)
         dmu = system.row_scale[:, None] * step.reaction[..., :n_h, :]

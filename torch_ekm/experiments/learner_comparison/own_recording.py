@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ... import interop
 from ...exceptions import DescriptionError, ParameterError, ShapeError
 from ...typing import Array, Float, Tensor
 from .stream import LEAST, Stream, in_own_units
@@ -50,12 +49,13 @@ class OwnRecording:
     y: Float[Tensor, "n m"]
     about: str
 
-    def stream(self) -> Stream:
-        """For :func:`compare`: in units of its first tenth (20 to 200 samples), which is not scored.
+    def stream(self, limit: int | None = None) -> Stream:
+        """For :func:`compare`: the first ``limit`` motions (None: all), in units of their first tenth.
 
-        Only x is centred: 0 is what the model says.
+        That (20 to 200 samples) is not scored. Only x is centred: 0 is what the model says.
         """
-        return in_own_units(self.name, self.x.numpy(), self.y.numpy(), self.about, centre_y=False, ddof=1)
+        x, y = self.x.numpy(), self.y.numpy()
+        return in_own_units(self.name, x, y, self.about, limit, centre_y=False, ddof=1)
 
 
 def load_own(
@@ -84,16 +84,7 @@ def load_own(
     path = Path(path)
     if every < 1 or int(every) != every:
         raise ParameterError("every", every, "an integer of at least 1")
-    if path.suffix.lower() in (".csv", ".tsv", ".txt", ".parquet", ".pq"):
-        names, read = open_table(path)
-    elif clock is None:
-        raise ParameterError("clock", clock, "a topic, such as that of the commands, for a recording of ROS")
-    else:
-        names, _, values = interop.read_bag(path, clock)
-
-        def read(wanted: Sequence[str], /) -> Array:
-            return values[:, [names.index(name) for name in wanted]]
-
+    names, read = open_table(path, clock)
     roles = columns.state, columns.command, columns.observation
     state, command, outputs = (find_columns(wanted, names) for wanted in roles)
     known, commanded, seen = read(state), read(command), read(outputs)

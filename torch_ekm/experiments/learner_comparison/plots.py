@@ -73,27 +73,10 @@ def plot_learning_curves(
         windowed = np.split(comparison.errors[stream, name], edges[1:-1])
         error = np.sqrt([reduce(squared) for squared in windowed])
         axis.plot(middle, error, color=colour, linewidth=1.4, label=name)
-    axis.set(xlabel="sample", ylabel=f"{measure} error [sd of y]", ylim=(0, None))
+    unit = f"sd of y in the first {one.warm_up}" if one.warm_up else "units of the recording"
+    axis.set(xlabel="sample", ylabel=f"{measure} error [{unit}]", ylim=(0, None))
     axis.set_title(f"{stream}: {one.about}", loc="left", fontsize=9)
     axis.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return figure
-
-
-def plot_ranks(comparison: Comparison) -> Figure:
-    """Mean rank on the streams, +- half the critical difference: what overlaps is not distinguishable."""
-    ranks, difference = comparison.ranks().mean(0), comparison.critical_difference()
-    order = np.argsort(ranks)
-    figure, (axis,) = new_figure(6.5, 0.26 * len(ranks) + 1.0)
-    for place, i in enumerate(order):
-        colour = colour_of(comparison.learners[i])
-        if np.isfinite(difference):
-            ends = ranks[i] + np.array([-0.5, 0.5]) * difference
-            axis.plot(ends, [place, place], color=colour, linewidth=5, alpha=0.3)
-        axis.plot(ranks[i], place, "o", color=colour)
-    axis.set_yticks(range(len(ranks)), [comparison.learners[i] for i in order], fontsize=8)
-    axis.set_ylim(len(ranks) - 0.4, -0.6)
-    axis.grid(axis="y", visible=False)
-    axis.set_xlabel(f"mean rank on {len(comparison.streams)} streams (1 is best)")
     return figure
 
 

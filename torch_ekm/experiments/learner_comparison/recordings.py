@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -14,6 +15,7 @@ import torch
 from ..._extras import require
 from ...exceptions import DescriptionError, EKMError, UnknownNameError
 from ...typing import Array
+from .own_recording import Columns, load_own
 from .stream import Stream, in_own_units, load_table
 
 LIMIT = 1500  #: samples of a recording that are used if nobody says otherwise
@@ -25,7 +27,7 @@ _T42_HORIZON = 10  # [steps] of the log in one sample
 
 
 def load_recording(
-    name: str | Path, limit: int | None = LIMIT, targets: Sequence[str] = (), inputs: Sequence[str] = ()
+    name: str | Path, limit: int | None = LIMIT, observation: Sequence[str] = (), **columns: Any
 ) -> Stream:
     """A public recording by name, or a file of one's own by path.
 
@@ -33,7 +35,8 @@ def load_recording(
         name: ``simulated_hand``, a recording in the folder ``TORCH_EKM_DATA`` (the error lists them), or a
             path.
         limit: only the first so many samples (of each object alike, where there are many); None: all.
-        targets, inputs: columns to predict, and to predict from, in a file of one's own.
+        observation: columns of a file of one's own whose increments are predicted, from ``inputs``.
+        columns: of such a file, as :func:`load_table` takes them.
 
     Raises:
         UnknownNameError: neither a known name nor a file.
@@ -51,9 +54,12 @@ def load_recording(
         except (ValueError, LookupError, EOFError, BadZipFile) as error:  # of whatever reads the file
             problem = f"the recording '{name}' there is damaged: {error}"
             raise DescriptionError(os.environ["TORCH_EKM_DATA"], problem) from None
-    if Path(name).suffix:
-        return load_table(name, targets, limit, inputs)
-    known = ("simulated_hand", *_READERS, "a path to a .csv or .parquet file")
+    if observation:
+        which = Columns(columns.get("inputs") or observation, (), observation)
+        return load_own(name, which, clock=columns.get("clock")).stream(limit)
+    if Path(name).suffix or columns.get("clock"):
+        return load_table(name, limit=limit, **columns)
+    known = ("simulated_hand", *_READERS, "a path to a file")
     raise UnknownNameError("recording", str(name), known)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..reporting.plots import save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from .plots import plot_cost, plot_learning_curves, plot_ranks, plot_scores
+from .plots import plot_cost, plot_learning_curves, plot_scores
 from .scores import Comparison, Score
 
 
@@ -34,11 +34,6 @@ class ComparisonReport(Comparison):
             "the default learner and sparse online GPs; filled: the best of each stream."
         )
         figures = [save(plot_scores(self), name="scores", caption=caption)]
-        if len(self.streams) > 1:
-            caption = (
-                "Mean rank over the streams, 1 is best; learners whose bars overlap are not distinguishable."
-            )
-            figures.append(save(plot_ranks(self), name="ranks", caption=caption))
         caption = "Error against the time of one prediction and one update: best at the lower left."
         figures.append(save(plot_cost(self), name="cost", caption=caption))
         for stream in (s.name for s in self.streams):
@@ -48,10 +43,8 @@ class ComparisonReport(Comparison):
             caption += f"is learned{some}."
             figure = plot_learning_curves(self, stream, shown)
             figures.append(save(figure, name=f"curve_{stream}", caption=caption))
-        streams = {}
-        for s in self.streams:
-            samples = {"samples": len(s), "available": max(s.available, len(s)), "warm_up": s.warm_up}
-            streams[s.name] = {**samples, "about": s.about}
+        rows = {s.name: {"samples": len(s), "available": max(s.available, len(s))} for s in self.streams}
+        streams = {s.name: {**rows[s.name], "warm_up": s.warm_up, "about": s.about} for s in self.streams}
         report = Report(
             title="Residual learners compared",
             summary=" ".join(self.verdicts()),

@@ -32,6 +32,10 @@ def compare(
     *,
     targets: Sequence[str] = (),
     inputs: Sequence[str] = (),
+    predicted: Sequence[str] = (),
+    observation: Sequence[str] = (),
+    run: str = "",
+    clock: str | None = None,
     limit: int | None = LIMIT,
     folder: str | Path | None = None,
     processes: int = 1,
@@ -43,12 +47,16 @@ def compare(
     ``report.write(folder)`` leaves tables, figures and a page.
 
     Args:
-        data: CSV or Parquet files, names of recordings (see ``torch-ekm compare --help``), streams; of
-            different names.
+        data: CSV or Parquet files, recordings of ROS, names of public ones (see ``torch-ekm compare
+            --help``), streams; of different names.
         learners: name -> ``factory(in_features, out_features)``, lambdas and classes of a notebook included;
             or names of the package's own. By default all of these but those of other libraries.
         targets: columns of the files to predict; ``y``, ``y1``, ``y2``, ... if none is named.
-        inputs: columns of the files to predict from; all but the targets if none is named.
+        inputs: columns of the files to predict from; all others if none is named.
+        predicted: columns with what the model says of the targets, which are then what was measured.
+        observation: in place of targets: columns whose increments are predicted, as :func:`load_own` does.
+        run: a column with one number in each run.
+        clock: the topic that sets the rhythm, in a recording of ROS.
         limit: only the first so many samples of a file or recording; None: all.
         folder: keeps what is finished, so that an interrupted comparison goes on where it stopped. A result
             is read again if the samples are the same, and a learner of that name is made with the same
@@ -66,9 +74,9 @@ def compare(
     """
     factories = _factories(learners)
     data = [data] if isinstance(data, str | Path | Stream) else list(data)
+    columns = {"targets": targets, "inputs": inputs, "predicted": predicted, "run": run, "clock": clock}
     streams = [
-        one if isinstance(one, Stream) else load_recording(one, limit, tuple(targets), tuple(inputs))
-        for one in data
+        one if isinstance(one, Stream) else load_recording(one, limit, observation, **columns) for one in data
     ]
     names = [stream.name for stream in streams]
     if not names or not factories:

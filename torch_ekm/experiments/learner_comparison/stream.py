@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ...exceptions import DescriptionError, ShapeError
+from ...exceptions import DescriptionError, ParameterError, ShapeError
 from ...typing import Array, Float, Tensor
 from .table_file import find_columns, open_table
 
+_REST = 0.01  # of the deviation in all: less is rest
 LEAST = 40  #: samples; fewer do not distinguish learners
 
 
@@ -29,6 +31,7 @@ class Stream:
         segments: lengths of parts that stand for themselves (objects, grasps), for the statistics.
         about: what it is, and what "the model alone" predicts.
         available: samples of the file or recording, of which these are the first; 0: nobody counted.
+        notes: what the user should look at, such as a clock among the inputs.
 
     Raises:
         ShapeError: lengths do not fit.
@@ -41,6 +44,7 @@ class Stream:
     segments: tuple[int, ...] = ()
     about: str = ""
     available: int = 0
+    notes: str = ""
 
     def __post_init__(self) -> None:
         n = len(self.y)
@@ -69,7 +73,14 @@ class Stream:
 
 
 def load_table(
-    path: str | Path, targets: Sequence[str] = (), limit: int | None = None, inputs: Sequence[str] = ()
+    path: str | Path,
+    targets: Sequence[str] = (),
+    limit: int | None = None,
+    inputs: Sequence[str] = (),
+    *,
+    predicted: Sequence[str] = (),
+    run: str = "",
+    clock: str | None = None,
 ) -> Stream:
     """A stream from a CSV or Parquet file, see ``table_file.open_table``.
 
@@ -77,30 +88,42 @@ def load_table(
         path: the file; rows in the order of time.
         targets: columns to predict; those called ``y``, ``y1``, ``y2``, ... if none is named.
         limit: only the first so many rows.
-        inputs: columns to predict from; all but the targets if none is named.
+        inputs: columns to predict from; all others if none is named.
+        predicted: what the model says of each target: y is target - predicted, and 0 is the model alone.
+        run: a column with one number in each run.
+        clock: the topic that sets the rhythm, in a recording of ROS.
 
     Raises:
         DescriptionError: the file cannot be used; the message names line and column. No target is named,
             and no column is called ``y``. A column is both input and target.
         UnknownNameError: there is no such column; the message lists the columns.
+        ParameterError: not one prediction for each target, or a recording of ROS without ``clock``.
     """
-    names, read = open_table(Path(path))
-    chosen, outputs = (find_columns(wanted, names) for wanted in (inputs, targets))
+    names, read = open_table(Path(path), clock)
+    wanted = inputs, targets, predicted, [run] if run else []
+    chosen, outputs, model, runs = (find_columns(columns, names) for columns in wanted)
+    if model and len(model) != len(outputs):
+        raise ParameterError("predicted", model, f"one for each measured column, {len(outputs)}")
     outputs = outputs or [name for name in names if name == "y" or (name[:1] == "y" and name[1:].isdigit())]
     if not outputs:
         problem = "no column is called 'y' (or y1, y2, ...); name the targets: targets=, or --targets"
         raise DescriptionError(path, f"{problem}. The columns are {', '.join(names)}")
-    chosen = chosen or [name for name in names if name not in outputs]
+    chosen = chosen or [name for name in names if name not in {*outputs, *model, *runs}]
     if not chosen:
         raise DescriptionError(path, "all columns are targets; at least one must be an input")
-    both = [name for name in chosen if name in outputs]
-    if both:
+    if both := [name for name in chosen if name in outputs]:
         raise DescriptionError(path, f"column '{both[0]}' cannot be both input and target")
-    x, y = read(chosen), read(outputs)
+    x, y = read(chosen), read(outputs) - (read(model) if model else 0.0)
     if len(x) < LEAST:
         raise DescriptionError(path, f"it has {len(x)} samples; at least {LEAST} are needed to compare")
     about = f"{', '.join(outputs)} from {len(chosen)} columns of {Path(path).name}"
-    return in_own_units(Path(path).stem, x, y, about, limit)
+    number = np.pad(read(runs)[:limit].sum(1), 1, constant_values=np.nan)  # zeros without runs
+    parts = np.diff(np.flatnonzero(np.diff(number))).tolist()
+    grows = (np.diff(x, axis=0) <= 0).sum(0) < len(parts)  # but for the starts of runs
+    clocks = ", ".join(name for name, clock in zip(chosen, grows, strict=True) if clock)
+    notes = f" {clocks} only grows, like a clock or the number of a row: leave it out." if clocks else ""
+    stream = in_own_units(Path(path).stem, x, y, about, limit, centre_y=not model)
+    return dataclasses.replace(stream, segments=tuple(parts) if runs else (), notes=notes)
 
 
 def in_own_units(
@@ -115,7 +138,8 @@ def in_own_units(
 ) -> Stream:
     """Standardize by the first tenth of the stream (20 to 200 samples), which is then not scored.
 
-    Nothing of what is scored is seen beforehand. A constant input stays 0.
+    Nothing of what is scored is seen beforehand, but the unit of what rests in that tenth, which is that of
+    the whole stream. A constant input stays 0.
 
     Args:
         limit: only the first so many samples.
@@ -128,7 +152,9 @@ def in_own_units(
     def units(values: Array, centre: bool = True) -> Tensor:
         start = values[:warm_up]
         deviation = start.std(0, ddof=ddof)
-        deviation = np.where(deviation > 1e-9 * np.abs(values).max(0), deviation, values.std(0, ddof=ddof))
+        whole = values.std(0, ddof=ddof)
+        moves = deviation > np.maximum(_REST * whole, 1e-9 * np.abs(values).max(0))
+        deviation = np.where(moves, deviation, whole)
         away = values - start.mean(0) if centre else values
         return torch.from_numpy(away / np.where(deviation > 0, deviation, 1.0))
 

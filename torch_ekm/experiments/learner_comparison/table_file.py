@@ -9,34 +9,47 @@ from pathlib import Path
 
 import numpy as np
 
+from ... import interop
 from ..._extras import require
-from ...exceptions import DescriptionError, UnknownNameError
+from ...exceptions import DescriptionError, ParameterError, UnknownNameError
 from ...typing import Array
 
 Names = tuple[str, ...]
+_BAGS = (".mcap", ".db3", ".bag")
 #: Values ``(n_rows, n)`` of the n columns that it is given.
 Read = Callable[[Sequence[str]], Array]
 
 
-def open_table(path: Path) -> tuple[Names, Read]:
+def open_table(path: Path, clock: str | None = None) -> tuple[Names, Read]:
     """Column names, and a function that reads some of the columns, rows in the order of time.
 
     CSV (``.csv``, ``.tsv``, ``.txt``): UTF-8, separated by comma, semicolon or tab; the first line names the
     columns, every other field is a number with a decimal point. Parquet (``.parquet``): every column is
     numeric. Nothing may be missing: a learner cannot guess what a hole means. Columns that are not read may
-    hold anything.
+    hold anything; a first one without a name, which pandas writes as its index, is skipped.
+
+    A recording of ROS (MCAP, sqlite3, .bag, the folder of rosbag2) has a row for each message of the topic
+    ``clock``.
 
     Raises:
         DescriptionError: the file cannot be used; the message names line (row) and column. The function
             raises it, too.
+        ParameterError: a recording of ROS without ``clock``.
+        UnknownNameError: the recording has no such topic; the message lists them.
     """
     readers = {".csv": _csv, ".tsv": _csv, ".txt": _csv, ".parquet": _parquet, ".pq": _parquet}
+    kind = path.suffix.lower()
+    if kind not in readers and (path.is_dir() or kind in _BAGS):
+        if clock is None:
+            raise ParameterError("clock", clock, "a topic that sets the rhythm, such as that of the commands")
+        heard, _, values = interop.read_bag(path, clock)
+        return heard, lambda wanted: values[:, [heard.index(name) for name in wanted]]
     if not path.is_file():
         raise DescriptionError(path, "there is no such file")
-    if path.suffix.lower() not in readers:
-        problem = "are not read; use .csv or .parquet (a ROS bag: load_own)"
-        raise DescriptionError(path, f"files of kind '{path.suffix}' {problem}")
-    names, read = readers[path.suffix.lower()](path)
+    if kind not in readers:
+        raise DescriptionError(path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet")
+    names, read = readers[kind](path)
+    names = names[1:] if names[:1] == ("",) else names
     for i, name in enumerate(names):
         if not name:
             raise DescriptionError(path, f"column {i + 1} has no name in the header")
@@ -130,6 +143,6 @@ def _parquet(path: Path) -> tuple[Names, Read]:
         return found
 
     def read(columns: Sequence[str]) -> Array:
-        return np.column_stack([values(name) for name in columns])
+        return np.stack([values(name) for name in columns], -1) if columns else np.empty((len(table), 0))
 
     return tuple(table.column_names), read

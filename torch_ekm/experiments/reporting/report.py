@@ -135,6 +135,8 @@ class Report:
     """So many of the first tables are not folded."""
     legend: Mapping[str, str] = field(default_factory=dict)
     """What is compared: name -> one line."""
+    empty: bool = False
+    """Nothing was measured: the summary says why, and a command ends with 1."""
 
     def write(self, folder: Path) -> Path:
         """Write everything into ``folder`` and return the page's path; equal reports give equal files.

@@ -29,7 +29,7 @@ _MEANINGS = {
     StopReason.STALLED.value: "the error falls no further",
     StopReason.STEP_LIMIT.value: "all motions are used up",
     StopReason.ACTUATOR_LIMITS.value: "the motors that are needed are at the ends of their ranges",
-    StopReason.UNSTABLE_GRASP.value: "the model says that the grasp is about to buckle",
+    StopReason.UNSTABLE_GRASP.value: "the model says that the grasp buckles, or cannot be held",
     StopReason.GIVEN_UP.value: "the grasp came too near to a loss, and the way back did not help",
     StopReason.WEAK_GRASP.value: "declined: a finger bore less than the object needs",
     StopReason.OUT_OF_REACH.value: "declined before anything moved",
@@ -226,6 +226,8 @@ def verdict(trials: DataFrame, seeds: Sequence[int]) -> str:
         ]
         parts.append(f"The {', '.join([first, *ends[1:]])}, on {_counted(len(seeds), 'seed')}.")
         parts.append(f"Objects lost, and turns that did not reach the target: {', '.join(failed)}.")
+        if 2 * (turns[order[0]]["reason"] == _REACHED).sum() < len(turns[order[0]]):
+            parts.append(f"The {order[0]}: {why(turns[order[0]])}")
     ours, theirs = prediction_means(trials)
     if len(ours):
         wrong = f"{stats.bootstrap_mean(ours):.2f} deg, the KM by {stats.bootstrap_mean(theirs):.2f} deg"
@@ -237,6 +239,13 @@ def verdict(trials: DataFrame, seeds: Sequence[int]) -> str:
             parts.append(f"Error of the E-KM over that of {', '.join(ratios)} (paired).")
     parts += [f"{name} was never grasped ({why})." for name, why in _never_grasped(trials).items()]
     return f"{' '.join(parts) or 'Nothing to compare.'} {which_seeds(seeds)}"
+
+
+def why(turns: DataFrame) -> str:
+    """The reason for which most of these turns ended, and what was said of it."""
+    reasons = turns["reason"].value_counts()
+    said = turns.loc[turns["reason"] == reasons.index[0], "message"].mode()[0]
+    return f"{reasons.iloc[0]} of {len(turns)} turns ended with '{reasons.index[0]}'{said and f': {said}'}."
 
 
 def warmed_up(turns: int) -> str:

@@ -78,7 +78,7 @@ def direction_unmet(hand: HandDescription, pad: ContactPad) -> Unmet | None:
         return Unmet(
             f"pad '{pad.name}'",
             f"its direction {_text(pad.direction)} points away from where joint '{name}' closes it",
-            f"write 'direction' along {_text(closes / np.abs(closes).max())}, in the frame of '{pad.link}'",
+            f"write direction = {_text(closes / np.abs(closes).max())}, in the frame of '{pad.link}'",
         )
     return Unmet(
         f"pad '{pad.name}'",
