@@ -273,8 +273,9 @@ class ClosedLoop:
         looks = self.safety.caution.looks
         while True:
             began = time.perf_counter()
-            target = progress.belief.target(seen)
-            decision = self.controller.decide(seen.state, seen.a, target, seen.fingertip_force)
+            decision = self.controller.decide(
+                seen.state, seen.a, progress.belief.target(seen), seen.fingertip_force
+            )
             seconds = time.perf_counter() - began
             sign = progress.sign(seen, decision)
             if not sign or looks == 0 or seen.status is not PlantStatus.HELD:
@@ -336,8 +337,10 @@ class ClosedLoop:
             fades = decision.share > 0 and not verdict.note and watch.grip.follow(decision, felt)
             if verdict.teaches and self.learn:
                 report = self._learn(seen, decision, lin, moved, increment, expected, felt, fades)
-            if turns and decision.share > 0 and self._slides(lin, increment, expected):
-                self.controller.tighter += self.safety.caution.slip
+            if turns and decision.share > 0 and self.controller.enhanced is not None:
+                # moved otherwise than predicted, it slides, or turns out of the grip
+                slides = self._disagreement(lin, increment, expected) > SLIDES
+                self.controller.tighter += slides * self.safety.caution.slip
         pull = self._figures.commit(moved, after.a)
         progress.belief.see(after, None if self.controller.enhanced is None else expected)
         seconds += time.perf_counter() - began
@@ -386,10 +389,6 @@ class ClosedLoop:
         """rho of a motion, see :class:`~torch_ekm.control.TrustRegion`."""
         trust = self.controller.pace.options.trust
         return trust.disagreement(expected.increment[-6:], ds[-6:], float(lin.lever), felt)
-
-    def _slides(self, lin: Linearization, ds: Tensor, expected: Expectation) -> bool:
-        """The object moved otherwise than an E-KM predicted: it slides, or turns out of the grip."""
-        return self.controller.enhanced is not None and self._disagreement(lin, ds, expected) > SLIDES
 
     def _learn_forces(self, lin: Linearization, moved: Tensor, felt: ForceSurprise) -> None:
         """Pads that touched and measured before and after teach how their forces answer."""
