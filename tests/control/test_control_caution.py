@@ -139,7 +139,8 @@ def test_a_step_is_cut_in_proportion_to_what_is_predicted_to_go_wrong(held) -> N
     plant, model, seen = held
     controller = LookAndMoveController(model, plant.rotation_axis)
     lin, focus = model.linearize(seen.state), controller.focus
-    at = Situation(plant.hand, focus, seen.state, seen.a, None, torch.zeros(6), torch.zeros(1), weight=0.8)
+    on = torch.zeros(6, dtype=torch.float64)
+    at = Situation(plant.hand, focus, seen.state, seen.a, None, on, torch.zeros(1), weight=0.8)
     still, bound = torch.zeros(plant.hand.n_a, dtype=torch.float64), StepBound()
     predicted = torch.zeros(plant.hand.n_q + 6, dtype=torch.float64)
     assert bound.share(lin, still, predicted, at) == 1.0
@@ -150,6 +151,14 @@ def test_a_step_is_cut_in_proportion_to_what_is_predicted_to_go_wrong(held) -> N
     carried = predicted.clone()
     carried[-6:] = 10e-3 * focus.off_matrix[focus.off_translation][0]
     assert bound.share(lin, still, carried, at) == pytest.approx(0.25)
+    slides = -lin.margin_sensitivity[0]
+    slides *= 40.0 / float(slides.square().sum())  # [N] that the margin falls by
+    at_once = [bound.share(lin, slides, predicted, at, asked) for asked in (0.5, 1.0, 2.0)]
+    assert at_once[0] == at_once[1] < at_once[2] < 1.0  # what was predicted well may slide by more
+    for turned, room in ((1.0, 1.0), (2.0, 0.5), (3.0, 0.0)):
+        away = dataclasses.replace(at, error=turned * DEG * off)
+        share = at_once[0] + room * (at_once[2] - at_once[0])
+        assert bound.share(lin, slides, predicted, away, 2.0) == pytest.approx(share, rel=1e-3)
     force = float(at.normal_force(lin).max())  # type: ignore[union-attr]
     grips = [dataclasses.replace(at, grip=force / part) for part in (1.2, 0.75, 0.65, 0.55, 0.3)]
     assert [bound.grip_share(lin, one) for one in grips] == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0])

@@ -31,6 +31,7 @@ _FORCE_NOISE = 0.5  # [N]
 _FORCE_SHARE = 0.25  # of the force that a finger bears: an error that leaves it its grip
 SLIDES = 2.0  # rho of the twist alone from which the object is thought to slide
 _WEAK, FIRM = 0.55, 0.75  # of the wanted grip: with which nothing is turned, and with which steps are whole
+_ON, _OFF = 1 * _DEG, 3 * _DEG  # of the axis: up to which, and from which, the object counts as off it
 _UNFELT = 1.0  # largest p where no pad measures: forces that nobody sees drift with the way that is made
 _FOR_NEW = 1.4  # largest p with an object that is new to a hand whose figures are known
 _USED = 0.7  # a motion below this share of what was allowed says nothing for a larger one
@@ -82,14 +83,17 @@ def contact_travel(twist: Float[Tensor, " 6"], lever: Float[Tensor, "n_c 3"]) ->
 
 @dataclass(frozen=True)
 class StepBound:
-    """``phi = min(1, off_rotation/|w_off|, off_travel/|v_off|, (m + creep mu f/W)/(m - m_after),
-    max(1/p, (f_i/(even f_mean))^2))``: the share of a step that is made.
+    """``phi = min(1, off_rotation/|w_off|, off_travel/|v_off|, (m + c)/(m - m_after),
+    max(1/p, (f_i/(even f_mean))^2)), c = creep mu f/W (1 + (p - 1)^+ r)``: the share of a step that is made.
 
     w_off and v_off are the predicted rotation and translation off the focus; m_after the predicted friction
     margins. A contact that slides holds no weight W across its way: the heavier the object is for its grip,
-    the less may be missing. The fingers that oppose the strongest one may bear enough together while one of
-    them lets go: steps p above those of pace 1, which change the forces faster than they are corrected, ask
-    for a force f_i of each that is near the mean f_mean of them.
+    the less may be missing. Where motions were predicted well (p) more may be, as long as the object keeps
+    to the axis: r is 1 up to 1 deg off it and 0 from 3 deg on.
+
+    The fingers that oppose the strongest one may bear enough together while one of them lets go: steps p
+    above those of pace 1, which change the forces faster than they are corrected, ask for a force f_i of
+    each that is near the mean f_mean of them.
 
     A step is not cut below ``least`` of the largest one at pace 1: standing still turns nothing. But a grip f
     is tightened first: below 0.75 of the wanted one steps become smaller, and at 0.55 of it, where pads
@@ -140,7 +144,9 @@ class StepBound:
                 even = max(float(others.min()), 0.0) / max(self.even * float(others.mean()), 1e-9)
                 phi = min(phi, max(1 / max(asked, 1.0), even**2))
         friction = float(lin.contacts.friction.mean()) * force
-        spare = self.creep * friction / max(seen.weight, 1e-3)
+        stands = (seen.focus.off_matrix @ seen.error).numpy()[~translation]
+        room = min(max((_OFF - math.sqrt(stands @ stands)) / (_OFF - _ON), 0.0), 1.0)
+        spare = self.creep * (1 + max(asked - 1.0, 0.0) * room) * friction / max(seen.weight, 1e-3)
         before, after = lin.margins.numpy(), lin.margins_after(delta_a).numpy()
         missing = after < -spare
         if missing.any():
