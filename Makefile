@@ -8,7 +8,7 @@ export OMP_NUM_THREADS ?= 1
 # compiled once, and read by the many processes of the tests
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast coverage docs notebooks notebooks-smoke lint types imports check install clean
+.PHONY: demo test test-fast coverage docs notebooks notebooks-smoke lint types imports check release install clean
 
 install: $(VENV)/installed
 
@@ -68,6 +68,26 @@ imports: install
 	$(BIN)/lint-imports
 
 check: lint types imports test
+
+# sdist and wheel, checked in fresh environments by README's first two examples: the light core, then extra "sim"
+PYTHONS ?= 3.11 3.12 3.13
+release: install
+	@test -n "$(REPOSITORY)" || { echo 'give its address: make release REPOSITORY=https://...'; exit 1; }
+	grep -q '^\[project.urls\]' pyproject.toml || printf '\n[project.urls]\nRepository = "$(REPOSITORY)"\n' >> pyproject.toml
+	grep -q "^## $$($(BIN)/python -c 'import torch_ekm; print(torch_ekm.__version__)')" CHANGELOG.md
+	$(BIN)/python -m pip install --quiet build twine
+	rm -rf dist && $(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m twine check --strict dist/*
+	for n in 1 2; do awk -v n=$$n '/^```python/ {k++; p = k == n; next} /^```/ {p = 0} p' README.md > dist/example_$$n.py; done
+	set -e; for v in $(PYTHONS); do \
+		rm -rf dist/check && python$$v -m venv dist/check; \
+		dist/check/bin/python -m pip install --quiet -c constraints.txt torch numpy; \
+		dist/check/bin/python -m pip install --quiet -c constraints.txt dist/*.whl; \
+		(cd dist && check/bin/python example_1.py); \
+		dist/check/bin/python -m pip install --quiet -c constraints.txt "$$(ls dist/*.whl)[sim]"; \
+		(cd dist && check/bin/python example_2.py); \
+		echo "Python $$v: both examples run"; \
+	done; rm -rf dist/check
 
 clean:
 	rm -rf $(VENV) demo_output htmlcov .coverage .pytest_cache .ruff_cache .hypothesis docs/_build docs/reference/api/generated docs/tutorials/notebooks
