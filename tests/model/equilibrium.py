@@ -16,7 +16,7 @@ from torch_ekm.contact.forces.balance import ForceStatus
 from torch_ekm.contact.forces.friction import friction_cones, margins
 from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics.grasp_state import GraspState
-from torch_ekm.model.force_balance import ForceBalance, KnownForces, Statics, pack_forces
+from torch_ekm.model.force_balance import ForceBalance, pack_forces
 from torch_ekm.model.grasp_forces import GraspForces
 from torch_ekm.model.kinematic_model import KinematicModel
 from torch_ekm.model.stiffness.geometric import geometric_stiffness
@@ -201,10 +201,10 @@ class EquilibriumSolver:
         model = self.model
         _, kin = self._geometry(self.start)
         A = constraint_matrix(kin)
-        at = Statics(self.start.q, kin, A, model.potential(self.start)[0], self.held)
+        at = self.start.q, kin, A, model.potential(self.start)[0], self.held
         forces = dataclasses.replace(model.options.forces, normal_std=std)
         options = dataclasses.replace(model.options, forces=forces)
-        return ForceBalance(model.hand, options, model.reduction)(at, KnownForces(wish))
+        return ForceBalance(model.hand, options, model.reduction)(*at, normal=wish)
 
     def _geometry(self, state: GraspState) -> tuple[ContactSet, ContactKinematics]:
         contacts = self.surfaces(state.q, state.position, state.rotation)

@@ -19,7 +19,7 @@ from ..kinematics.hand_kinematics import HandKinematics
 from ..kinematics.link_poses import Kinematics, LinkPoses
 from ..typing import AnyArray, Bool, Float, Tensor
 from .checks import at_pads, check_contacts, check_inertia, check_state, joint_index
-from .force_balance import ForceBalance, KnownForces, Statics
+from .force_balance import ForceBalance
 from .gradients import following, only_if_asked
 from .grasp_forces import ExpectedForces, GraspForces
 from .linearization import FollowedFigures, Linearization
@@ -27,7 +27,7 @@ from .motion_equations import MotionEquations
 from .moving_contacts.contact_motion import ContactMotion, ContactStep
 from .options import ModelOptions
 from .reduction import Reduction
-from .sensitivity import force_change, margin_sensitivity, normal_motion, normal_sensitivity
+from .sensitivity import sensitivities
 from .stiffness.geometric import geometric_stiffness, precedence
 from .stiffness.potential import gravity_gradient, gravity_hessian, spring_torque
 from .validity import find_doubts
@@ -302,8 +302,7 @@ class KinematicModel(nn.Module):
                 last = previous.forces
             readings = None if measured is None else [measured[finger] for finger in contacts.finger]
             touch = None if readings is None else namespace(at.q).stack(readings, -1)
-            known = KnownForces(touch, expected, last)
-            forces = self.balance(Statics(at.q, kin, A, V_s, lock), known)
+            forces = self.balance(at.q, kin, A, V_s, lock, normal=touch, expected=expected, last=last)
 
         o = self.options
         if on_unstable is not None and on_unstable != o.on_unstable:
@@ -314,36 +313,27 @@ class KinematicModel(nn.Module):
         held[..., lock] = True
         slack = like(self.balance.slack(forces), at.q)
         J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held, slack, o.on_unstable)
-        df, dn = force_change(kin, dmu), normal_motion(kin, J)
-        normal = normal_sensitivity(kin, f, df, dn)
-        margin = margin_sensitivity(kin, f, dmu, df, dn, normal)
-        tensors = map(torch.as_tensor, (J, dmu, dlam, normal, margin, df, dn, held, stability, D, A, slack))
-        J, dmu, dlam, normal, margin, df, dn, held, stability, D, A, slack = tensors
+        found = sensitivities(kin, f, J, dmu)
+        dlam, held, stability, D, A, slack = map(torch.as_tensor, (dlam, held, stability, D, A, slack))
         equations = None
         if held.dim() == 1:
             moving = self.moving(contacts)
             equations = MotionEquations(self.reduction, D, A, tuple(kin.rows), held, slack, moving)
         reused, names = last is not None, self.hand.joint_names
         doubts = find_doubts(o, names, contacts, forces, stability, reused, measured, before)
-        found = Linearization(
+        lin = Linearization(
             state=state,
             contacts=contacts,
             forces=forces,
-            manipulation_jacobian=J,
-            contact_force_sensitivity=dmu,
+            **found,
             actuator_force_sensitivity=dlam,
-            normal_force_sensitivity=normal,
-            margin_sensitivity=margin,
-            force_vector_sensitivity=df,
-            normal_motion=dn,
-            normal_rows=tuple(kin.normal_rows),
             held_joints=held,
             stability=stability,
             options=o,
             equations=equations,
             doubts=doubts,
         )
-        return self.followed(found)
+        return self.followed(lin)
 
     def load_stiffness(
         self,
