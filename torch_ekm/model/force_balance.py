@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -34,8 +33,7 @@ _STOP_TORQUE = 0.01  # [N m] above which a stop holds its joint; below, the join
 class ForceBalance:
     """Builds :class:`BalanceEquations` for each state of a batch and solves them one by one.
 
-    Joints near a limit get a one-sided stop torque and locked joints a free one, next to the soft joint
-    residual.
+    Joints near a limit get a one-sided stop torque, next to the soft joint residual.
     """
 
     def __init__(self, hand: HandDescription, options: ModelOptions, reduction: Reduction) -> None:
@@ -89,7 +87,6 @@ class ForceBalance:
         kin: ContactKinematics,
         A: Float[AnyArray, "*batch n_h n_s"],
         V_s: Float[AnyArray, "*batch n_s"],
-        locked: Sequence[int] = (),
         *,
         normal: Float[AnyArray, "*batch n_c"] | None = None,
         expected: ExpectedForces | None = None,
@@ -102,7 +99,6 @@ class ForceBalance:
             kin: the contacts.
             A: their constraint matrix.
             V_s: gradient of the potential energy [N m, N].
-            locked: joints that stick, by index.
             normal: measured normal forces [N], NaN where there is no sensor.
             expected: prediction from the state before.
             last: forces of the step before, which stand in where the problem has no answer; None: zeros.
@@ -124,7 +120,7 @@ class ForceBalance:
         table: list[tuple] = []
         problems: list[tuple[BalanceEquations, ForceSolution]] = []
         for k, q_k in enumerate(as_states(q, 1)):
-            joints, lower, upper = self._bounded(q_k, locked)
+            joints, lower, upper = self._bounded(q_k)
             eq = BalanceEquations(
                 object_matrix=object_matrix[k],
                 object_load=object_load[k],
@@ -207,11 +203,10 @@ class ForceBalance:
         )
         return first, second, third
 
-    def _bounded(self, q: np.ndarray, locked: Sequence[int]) -> tuple[list[int], np.ndarray, np.ndarray]:
-        """Joints with a torque of their own, and its bounds: stops push inwards, locks both ways."""
+    def _bounded(self, q: np.ndarray) -> tuple[list[int], np.ndarray, np.ndarray]:
+        """Joints with a torque of their own, and its bounds: stops push inwards."""
         lower, upper = np.zeros(len(q)), np.zeros(len(q))
         upper[q <= self.low], lower[q >= self.high] = np.inf, -np.inf
-        lower[[*locked]], upper[[*locked]] = -np.inf, np.inf
         joints = [int(j) for j in np.flatnonzero((lower < 0) | (upper > 0))]
         return joints, lower[joints], upper[joints]
 

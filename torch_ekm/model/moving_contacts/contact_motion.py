@@ -112,7 +112,7 @@ class ContactMotion:
 
     A model that follows figures of the hand moves with those that are known when the motion begins.
 
-    With a detector of one's own only what it reports can touch. Joints locked by name are free here.
+    With a detector of one's own only what it reports can touch.
 
     Args:
         model: of hand and object.
