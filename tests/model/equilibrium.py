@@ -16,7 +16,7 @@ from torch_ekm.contact.forces.balance import ForceStatus
 from torch_ekm.contact.forces.friction import friction_cones, margins
 from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics.grasp_state import GraspState
-from torch_ekm.model.force_balance import ForceBalance, KnownForces, Statics, pack_forces
+from torch_ekm.model.force_balance import ForceBalance, pack_forces
 from torch_ekm.model.grasp_forces import GraspForces
 from torch_ekm.model.kinematic_model import KinematicModel
 from torch_ekm.model.stiffness.geometric import geometric_stiffness
@@ -182,7 +182,7 @@ class EquilibriumSolver:
             miss = (normal_force - forces.normal)[known]
             if float(miss.abs().max()) <= tolerance:
                 return at
-            lin = self.model.linearize(at.state, at.contacts, forces=forces, locked=self._locked)
+            lin = self.model.linearize(at.state, at.contacts, forces=forces)
             da = torch.linalg.pinv(lin.normal_force_sensitivity[known], rtol=1e-4) @ miss
             da = da * min(1.0, 0.1 / float(da.abs().max()))
             at = self.move(at, at.a + da)
@@ -193,18 +193,14 @@ class EquilibriumSolver:
         kin = self.model.contact_kinematics(at.state, at.contacts, rolling=True)
         return known_forces(kin, at.mu, at.lam)
 
-    @property
-    def _locked(self) -> list[str]:
-        return [self.model.hand.joint_names[j] for j in self.held]
-
     def _forces(self, wish: Tensor | None, std: float) -> GraspForces:
         model = self.model
         _, kin = self._geometry(self.start)
         A = constraint_matrix(kin)
-        at = Statics(self.start.q, kin, A, model.potential(self.start)[0], self.held)
+        at = self.start.q, kin, A, model.potential(self.start)[0]
         forces = dataclasses.replace(model.options.forces, normal_std=std)
         options = dataclasses.replace(model.options, forces=forces)
-        return ForceBalance(model.hand, options, model.reduction)(at, KnownForces(wish))
+        return _Balance(model.hand, options, model.reduction, held=self.held)(*at, normal=wish)
 
     def _geometry(self, state: GraspState) -> tuple[ContactSet, ContactKinematics]:
         contacts = self.surfaces(state.q, state.position, state.rotation)
@@ -335,3 +331,15 @@ def known_forces(kin: ContactKinematics, mu: Tensor, lam: Tensor) -> GraspForces
         status=(ForceStatus.SOLVED,) * len(pairs),
         violation=mu.new_zeros(batch),
     )
+
+
+class _Balance(ForceBalance):
+    """With held joints, whose torque is free."""
+
+    def __init__(self, *args, held: list[int]) -> None:
+        super().__init__(*args)
+        self.held = held
+
+    def _bounded(self, q):
+        joints = self.held
+        return joints, np.full(len(joints), -np.inf), np.full(len(joints), np.inf)

@@ -218,8 +218,6 @@ def test_bad_input_is_named():
         model(state, torch.zeros(4, dtype=F64))
     with pytest.raises(NonFiniteError, match=r"contacts\.point"):
         model.linearize(state, toy.contacts.replace(point=toy.contacts.point * float("nan")))
-    with pytest.raises(UnknownNameError, match="thumb"):
-        model.linearize(state, locked=["thumb_7"])
     with pytest.raises(UnknownNameError, match="f9"):
         model.linearize(state, toy.contacts.replace(link=("f9", "f9", "f9")))
     batch = GraspState(*(x.expand(2, *x.shape) for x in (state.q, state.position, state.rotation)))

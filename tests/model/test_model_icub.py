@@ -185,19 +185,6 @@ def test_how_much_a_stop_bears_is_told_by_the_fingertips():
         model.linearize(at.state, contacts, fingertip_force=felt[:2])
 
 
-@pytest.mark.parametrize("joints", [("thumb_2",), ("index_2", "middle_2")])
-def test_a_locked_joint_equals_the_exact_equilibria_with_it_held(joints):
-    from equilibrium import EquilibriumSolver
-
-    model, _, at = gripped("box")
-    held = tuple(model.hand.joint_names.index(name) for name in joints)
-    solver = EquilibriumSolver(model, at.state, at.contacts, held=held)
-    start = dataclasses.replace(at, stop=torch.zeros(len(held), dtype=F64))
-    expected = finite_difference_jacobian(solver, start, 2e-4)
-    J = model.linearize(at.state, at.contacts, forces=solver.forces(at), locked=joints).manipulation_jacobian
-    assert relative_error(J, expected, 20) < 1e-9
-
-
 def test_batch_equals_single_states():
     model, solver, at = gripped("box")
     states = list(noisy_states(at, 6, 1))

@@ -124,6 +124,13 @@ class TomlTable:
             raise self.error(f"'{key}' must be {valid}, got {value:g}")
         return value
 
+    def whole(self, key: str, default: Any = _NOTHING, least: int = 0) -> int:
+        """A whole number of at least ``least``."""
+        value = self.number(key, default, minimum=least)
+        if value != int(value):
+            raise self.error(f"'{key}' must be a whole number, got {value:g}")
+        return int(value)
+
     def angle(self, key: str, default: Any = _NOTHING) -> float:
         """The angle under ``key`` [rad] or ``key_deg`` [deg], in rad."""
         if self._in_degrees(key):

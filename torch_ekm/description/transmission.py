@@ -182,10 +182,8 @@ def _hall(path: Path, place: str, data: Any, names: tuple[str, ...]) -> HallSens
     joint = table.text("joint")
     if joint not in names:
         raise JointMismatchError(path, (), (joint,), names)
-    channel = table.number("channel", minimum=0)
-    if channel != int(channel):
-        raise table.error(f"'channel' must be a whole number, got {channel:g}")
-    return HallSensor(joint, int(channel), table.number("open", 255.0), table.number("closed", 0.0))
+    channel = table.whole("channel")
+    return HallSensor(joint, channel, table.number("open", 255.0), table.number("closed", 0.0))
 
 
 def _joint_table(path: Path, data: Any, names: tuple[str, ...]) -> np.ndarray:

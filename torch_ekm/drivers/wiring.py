@@ -17,8 +17,7 @@ _HAND = ("driver", "description")
 _CHANNEL = ("name", "id", "sign", "zero", "per_rad")
 _MOTOR = (*_CHANNEL, "range", "range_deg")
 _FINGERTIP = ("name", "id", "count", "zero", "per_newton")
-_LIMITS = {"increment": math.radians(20), "rate": math.radians(60), "still": math.radians(0.2)}
-_SECONDS = {"still_for": 0.1, "timeout": 3.0, "period": 0.02}
+_ANGLES = ("increment", "rate", "still")  # of the limits
 _HEADER = re.compile(r"^\s*(\[\[?)\s*([\w.-]+)\s*\]")
 _KEY = re.compile(r"""^\s*["']?([\w-]+)["']?\s*=""")
 _QUOTED = re.compile(r"'([\w-]+)'")
@@ -62,16 +61,16 @@ class Limits:
         ParameterError: a figure is not positive.
     """
 
-    increment: float = _LIMITS["increment"]
+    increment: float = math.radians(20)
     """Largest command to a motor; a larger one is refused."""
-    rate: float = _LIMITS["rate"]
+    rate: float = math.radians(60)
     """Of a motor [rad/s]."""
-    still: float = _LIMITS["still"]
+    still: float = math.radians(0.2)
     """A hand rests when no motor moves more than this within ``still_for``."""
-    still_for: float = _SECONDS["still_for"]
-    timeout: float = _SECONDS["timeout"]
+    still_for: float = 0.1
+    timeout: float = 3.0
     """A motion that takes longer, on top of its distance over ``rate``, never comes to rest."""
-    period: float = _SECONDS["period"]
+    period: float = 0.02
     """Between two messages of the slowest sensor; a reading older than two is stale."""
 
     def __post_init__(self) -> None:
@@ -98,13 +97,6 @@ class LinedTable(TomlTable):
         keys = (key for key in named if key in self.lines)
         line = self.lines.get(next(keys, ""), 0)
         return DescriptionError(f"{self.path}:{line}" if line else self.path, f"{self.place}: {problem}")
-
-    def whole(self, key: str, default: int, least: int = 0) -> int:
-        """A whole number of at least ``least``."""
-        value = self.number(key, default, minimum=least)
-        if value != int(value):
-            raise self.error(f"'{key}' must be a whole number, got {value:g}")
-        return int(value)
 
 
 @dataclass(frozen=True)
@@ -187,10 +179,11 @@ class Wiring:
             missing = [name for name in needed if name not in [one.name for one in found]]
             if missing and (found or kind == "motors"):
                 raise DescriptionError(path, f"[[{kind}]]: there is none for {', '.join(missing)}")
-        valid = (*(f"{key}{end}" for key in _LIMITS for end in ("", "_deg")), *_SECONDS)
+        known = vars(Limits())
+        valid = (*known, *(f"{key}_deg" for key in _ANGLES))
         given = LinedTable(path, "[limits]", data.get("limits", {}), valid, lines.get("limits", {}))
-        figures = {key: given.angle(key, default) for key, default in _LIMITS.items()}
-        figures |= {key: given.number(key, default) for key, default in _SECONDS.items()}
+        read = {key: given.angle if key in _ANGLES else given.number for key in known}
+        figures = {key: read[key](key, default) for key, default in known.items()}
         try:
             limits = Limits(**figures)
         except ParameterError as error:

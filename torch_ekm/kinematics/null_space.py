@@ -1,16 +1,17 @@
 from __future__ import annotations
 
-import torch
+from typing import Any
 
-from ..typing import Float, Tensor
+from .._arrays import namespace
+from ..typing import AnyArray, Float
 
 
-def null_space(rows: Float[Tensor, "m n"]) -> Float[Tensor, "n n_free"]:
+def null_space(rows: Float[AnyArray, "m n"]) -> Float[Any, "n n_free"]:
     """Orthonormal basis N of ``rows N = 0`` (SVD); all of space where there are no rows.
 
     Args:
         rows: constraints whose entries compare with 1: angles, or lengths divided by a typical one. Singular
             values up to 1e-9 count as 0.
     """
-    _, sigma, Vh = torch.linalg.svd(rows, full_matrices=True)
+    _, sigma, Vh = namespace(rows).linalg.svd(rows, full_matrices=True)
     return Vh[int((sigma > 1e-9).sum()) :].mT

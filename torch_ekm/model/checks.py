@@ -85,10 +85,3 @@ def at_pads(
             raise UnknownNameError("pad", name, pads)
         measured.setdefault(name, xp.full_like(fingertip_force[..., 0], xp.nan))
     return measured
-
-
-def joint_index(hand: HandDescription, name: str) -> int:
-    """Where the joint of this name stands."""
-    if name not in hand.joint_names:
-        raise UnknownNameError("joint", name, hand.joint_names)
-    return hand.joint_names.index(name)

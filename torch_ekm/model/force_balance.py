@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,38 +30,10 @@ torque a stop takes from the contact forces; fingertip sensors can."""
 _STOP_TORQUE = 0.01  # [N m] above which a stop holds its joint; below, the joint may leave
 
 
-@dataclass(frozen=True)
-class Statics:
-    """A state, or a batch, as its equilibrium ``V_s + A^T mu + B^T lam = 0`` sees it."""
-
-    q: Float[AnyArray, "*batch n_q"]
-    """Joint angles [rad]."""
-    kin: ContactKinematics
-    A: Float[AnyArray, "*batch n_h n_s"]
-    """Constraint matrix of the contacts."""
-    V_s: Float[AnyArray, "*batch n_s"]
-    """Gradient of the potential energy [N m, N]."""
-    locked: list[int]
-    """Joints that stick, by index."""
-
-
-@dataclass(frozen=True)
-class KnownForces:
-    """What sensors and the step before say of the forces; None: nothing."""
-
-    normal: Float[AnyArray, "*batch n_c"] | None = None
-    """Measured normal forces [N], NaN where there is no sensor."""
-    expected: ExpectedForces | None = None
-    """Prediction from the state before."""
-    last: GraspForces | None = None
-    """Forces of the step before, which stand in where the problem has no answer."""
-
-
 class ForceBalance:
     """Builds :class:`BalanceEquations` for each state of a batch and solves them one by one.
 
-    Joints near a limit get a one-sided stop torque and locked joints a free one, next to the soft joint
-    residual.
+    Joints near a limit get a one-sided stop torque, next to the soft joint residual.
     """
 
     def __init__(self, hand: HandDescription, options: ModelOptions, reduction: Reduction) -> None:
@@ -110,17 +81,37 @@ class ForceBalance:
             slack = slack & found.reshape(*lam.shape[:-1], 1)
         return slack
 
-    def __call__(self, at: Statics, known: KnownForces) -> GraspForces:
-        """Solve every state; where there is no answer use the forces of ``known.last`` or zeros."""
-        q, kin, options = at.q, at.kin, self.options.forces
+    def __call__(
+        self,
+        q: Float[AnyArray, "*batch n_q"],
+        kin: ContactKinematics,
+        A: Float[AnyArray, "*batch n_h n_s"],
+        V_s: Float[AnyArray, "*batch n_s"],
+        *,
+        normal: Float[AnyArray, "*batch n_c"] | None = None,
+        expected: ExpectedForces | None = None,
+        last: GraspForces | None = None,
+    ) -> GraspForces:
+        """Forces in the equilibrium ``V_s + A^T mu + B^T lam = 0`` of every state.
+
+        Args:
+            q: joint angles [rad].
+            kin: the contacts.
+            A: their constraint matrix.
+            V_s: gradient of the potential energy [N m, N].
+            normal: measured normal forces [N], NaN where there is no sensor.
+            expected: prediction from the state before.
+            last: forces of the step before, which stand in where the problem has no answer; None: zeros.
+        """
+        given, options = (A, V_s), self.options.forces
         batch, n_q = q.shape[:-1], q.shape[-1]
-        A, V_s = as_states(at.A, 2), as_states(at.V_s, 1)
+        A, V_s = as_states(A, 2), as_states(V_s, 1)
         Z_p, Z = self.pose_basis, self.joint_basis
         object_matrix, hand_matrix = -Z_p.T @ A[:, :, n_q:].mT, Z.T @ A[:, :, :n_q].mT
         object_load, hand_load = V_s[:, n_q:] @ Z_p, V_s[:, :n_q] @ Z
-        measured = None if known.normal is None else as_states(known.normal, 1)
-        estimating = measured is not None or known.expected is not None
-        prior = ForcePrior(kin, known.expected, options) if estimating else None
+        measured = None if normal is None else as_states(normal, 1)
+        estimating = measured is not None or expected is not None
+        prior = ForcePrior(kin, expected, options) if estimating else None
         cones = friction_cones(
             kin.models, kin.contacts.friction.tolist(), kin.contacts.torsional_friction.tolist()
         )
@@ -129,7 +120,7 @@ class ForceBalance:
         table: list[tuple] = []
         problems: list[tuple[BalanceEquations, ForceSolution]] = []
         for k, q_k in enumerate(as_states(q, 1)):
-            joints, lower, upper = self._bounded(q_k, at.locked)
+            joints, lower, upper = self._bounded(q_k)
             eq = BalanceEquations(
                 object_matrix=object_matrix[k],
                 object_load=object_load[k],
@@ -154,9 +145,8 @@ class ForceBalance:
             if solution.status is ForceStatus.SOLVED:
                 residual = self.lift @ solution.residual
                 np.add.at(torque, joints, solution.bound)
-            elif known.last is not None:
-                last = (known.last.mu, known.last.lam)
-                mu, lam = (as_states(x.expand(*batch, -1), 1)[k] for x in last)
+            elif last is not None:
+                mu, lam = (as_states(x.expand(*batch, -1), 1)[k] for x in (last.mu, last.lam))
             else:
                 mu, lam = np.zeros_like(mu), np.zeros_like(lam)
             table.append((mu, lam, residual, torque, *margins(cones, mu), [solution.violation]))
@@ -169,9 +159,9 @@ class ForceBalance:
         if isinstance(q, Tensor):
             parts = {name: torch.from_numpy(value).to(q) for name, value in parts.items()}
         parts["violation"] = parts["violation"][..., 0]
-        inputs = (at.A, at.V_s, self.reduction.actuation)
+        inputs = (*given, self.reduction.actuation)
         if isinstance(q, Tensor) and torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
-            moving = self._with_graph(problems, at, *(parts[name] for name in names[:3]))
+            moving = self._with_graph(problems, *given, *(parts[name] for name in names[:3]))
             parts.update(zip(names, moving, strict=False))
         status = tuple(solution.status for _, solution in problems)
         forces = pack_forces(kin, **parts, status=status)
@@ -185,14 +175,15 @@ class ForceBalance:
     def _with_graph(
         self,
         problems: list[tuple[BalanceEquations, ForceSolution]],
-        at: Statics,
+        A: Tensor,
+        V_s: Tensor,
         mu: Tensor,
         lam: Tensor,
         residual: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """``mu``, ``lam`` and e with their derivative; those of an unsolved problem are constants."""
-        n_q, batch, A = at.q.shape[-1], mu.dim() - 1, at.A
-        V_q, V_p = at.V_s[..., :n_q], at.V_s[..., n_q:]
+        n_q, batch = V_s.shape[-1] - 6, mu.dim() - 1
+        V_q, V_p = V_s[..., :n_q], V_s[..., n_q:]
         Z, Z_p, lift = (torch.from_numpy(x).to(A) for x in (self.joint_basis, self.pose_basis, self.lift))
         J_a = (self.reduction.actuation @ Z).mT
         G, load, hand, V_z = -Z_p.mT @ A[..., n_q:].mT, V_p @ Z_p, Z.mT @ A[..., :n_q].mT, V_q @ Z
@@ -212,11 +203,10 @@ class ForceBalance:
         )
         return first, second, third
 
-    def _bounded(self, q: np.ndarray, locked: list[int]) -> tuple[list[int], np.ndarray, np.ndarray]:
-        """Joints with a torque of their own, and its bounds: stops push inwards, locks both ways."""
+    def _bounded(self, q: np.ndarray) -> tuple[list[int], np.ndarray, np.ndarray]:
+        """Joints with a torque of their own, and its bounds: stops push inwards."""
         lower, upper = np.zeros(len(q)), np.zeros(len(q))
         upper[q <= self.low], lower[q >= self.high] = np.inf, -np.inf
-        lower[locked], upper[locked] = -np.inf, np.inf
         joints = [int(j) for j in np.flatnonzero((lower < 0) | (upper > 0))]
         return joints, lower[joints], upper[joints]
 

@@ -42,7 +42,7 @@ class GraspForces:
     residual: Float[Tensor, "*batch n_q"]
     """e, unexplained joint torque [N m]: large means a wrong spring, a wrong rest angle, or slipping."""
     stop_torque: Float[Tensor, "*batch n_q"]
-    """Torque of joint stops and locks on the joint [N m]."""
+    """Torque of joint stops on the joint [N m]."""
     margin: Float[Tensor, "*batch n_c"]
     """``mu_s f_n - |f_t|`` [N] (soft fingers: with the scaled spin moment): 0 at the friction cone."""
     relative_margin: Float[Tensor, "*batch n_c"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import torch
 from torch import nn
@@ -18,8 +17,8 @@ from ..kinematics.grasp_state import GraspState
 from ..kinematics.hand_kinematics import HandKinematics
 from ..kinematics.link_poses import Kinematics, LinkPoses
 from ..typing import AnyArray, Bool, Float, Tensor
-from .checks import at_pads, check_contacts, check_inertia, check_state, joint_index
-from .force_balance import ForceBalance, KnownForces, Statics
+from .checks import at_pads, check_contacts, check_inertia, check_state
+from .force_balance import ForceBalance
 from .gradients import following, only_if_asked
 from .grasp_forces import ExpectedForces, GraspForces
 from .linearization import FollowedFigures, Linearization
@@ -27,7 +26,7 @@ from .motion_equations import MotionEquations
 from .moving_contacts.contact_motion import ContactMotion, ContactStep
 from .options import ModelOptions
 from .reduction import Reduction
-from .sensitivity import force_change, margin_sensitivity, normal_motion, normal_sensitivity
+from .sensitivity import sensitivities
 from .stiffness.geometric import geometric_stiffness, precedence
 from .stiffness.potential import gravity_gradient, gravity_hessian, spring_torque
 from .validity import find_doubts
@@ -250,7 +249,6 @@ class KinematicModel(nn.Module):
         fingertip_force: Float[Tensor, "*batch n_pads"] | None = None,
         expected: ExpectedForces | None = None,
         previous: Linearization | None = None,
-        locked: Sequence[str] = (),
         on_unstable: str | None = None,
     ) -> Linearization:
         """Contacts, forces, ``J_m``, the force sensitivities and what speaks against them, at a state.
@@ -272,7 +270,6 @@ class KinematicModel(nn.Module):
             previous: the last linearization of this grasp whose forces were found. Where that problem has
                 no answer, its forces stand in, if the same fingers touch. A pad that touched then and is
                 left out now is a doubt.
-            locked: joints that stick, by name.
             on_unstable: in place of the option of this name.
 
         Raises:
@@ -293,7 +290,6 @@ class KinematicModel(nn.Module):
         kin = self.contact_kinematics(at, in_numpy(contacts) if plain else contacts, poses=poses)
         A = constraint_matrix(kin)
         V_s, V_ss = self.potential(at)
-        lock = [joint_index(self.hand, name) for name in locked]
         last, measured, before = None, None, () if previous is None else previous.contacts.finger
         if fingertip_force is not None:
             measured = at_pads(self.hand, contacts, fingertip_force, at.q)
@@ -302,8 +298,7 @@ class KinematicModel(nn.Module):
                 last = previous.forces
             readings = None if measured is None else [measured[finger] for finger in contacts.finger]
             touch = None if readings is None else namespace(at.q).stack(readings, -1)
-            known = KnownForces(touch, expected, last)
-            forces = self.balance(Statics(at.q, kin, A, V_s, lock), known)
+            forces = self.balance(at.q, kin, A, V_s, normal=touch, expected=expected, last=last)
 
         o = self.options
         if on_unstable is not None and on_unstable != o.on_unstable:
@@ -311,39 +306,29 @@ class KinematicModel(nn.Module):
         f = in_numpy(forces) if plain else forces
         D = self.load_stiffness(kin, f.force, f.spin_moment) + V_ss
         held = self.balance.held_by_stops(at.q, f.stop_torque)
-        held[..., lock] = True
         slack = like(self.balance.slack(forces), at.q)
         J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held, slack, o.on_unstable)
-        df, dn = force_change(kin, dmu), normal_motion(kin, J)
-        normal = normal_sensitivity(kin, f, df, dn)
-        margin = margin_sensitivity(kin, f, dmu, df, dn, normal)
-        tensors = map(torch.as_tensor, (J, dmu, dlam, normal, margin, df, dn, held, stability, D, A, slack))
-        J, dmu, dlam, normal, margin, df, dn, held, stability, D, A, slack = tensors
+        found = sensitivities(kin, f, J, dmu)
+        dlam, held, stability, D, A, slack = map(torch.as_tensor, (dlam, held, stability, D, A, slack))
         equations = None
         if held.dim() == 1:
             moving = self.moving(contacts)
             equations = MotionEquations(self.reduction, D, A, tuple(kin.rows), held, slack, moving)
         reused, names = last is not None, self.hand.joint_names
         doubts = find_doubts(o, names, contacts, forces, stability, reused, measured, before)
-        found = Linearization(
+        lin = Linearization(
             state=state,
             contacts=contacts,
             forces=forces,
-            manipulation_jacobian=J,
-            contact_force_sensitivity=dmu,
+            **found,
             actuator_force_sensitivity=dlam,
-            normal_force_sensitivity=normal,
-            margin_sensitivity=margin,
-            force_vector_sensitivity=df,
-            normal_motion=dn,
-            normal_rows=tuple(kin.normal_rows),
             held_joints=held,
             stability=stability,
             options=o,
             equations=equations,
             doubts=doubts,
         )
-        return self.followed(found)
+        return self.followed(lin)
 
     def load_stiffness(
         self,

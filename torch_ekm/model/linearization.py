@@ -50,7 +50,7 @@ class Linearization:
     normal_rows: tuple[int, ...]
     """Position of each contact's normal force in ``mu``."""
     held_joints: Bool[Tensor, "*batch n_q"]
-    """Joints that a stop or a lock holds."""
+    """Joints that a stop holds."""
     stability: Float[Tensor, "*batch"]
     """Smallest eigenvalue of the stiffness with locked actuators, translations in units of L [N m/rad]."""
     options: ModelOptions

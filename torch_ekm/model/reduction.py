@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import nn
 
@@ -20,17 +19,9 @@ from .options import ModelOptions
 _TWO_HARD = "two hard fingers cannot hold anything in space: write planar_normal, or torsional_friction"
 
 
-class GraspResponse(NamedTuple):
-    """How the grasp answers to a unit motion of each actuator."""
-
-    motion: Float[AnyArray, "*batch n_s n_a"]
-    """J_m."""
-    contact_force: Float[AnyArray, "*batch n_h n_a"]
-    """dmu/da."""
-    actuator_force: Float[AnyArray, "*batch n_a n_a"]
-    """dlam/da."""
-    stability: Float[AnyArray, "*batch"] | np.float64
-    """Smallest eigenvalue of the stiffness with the actuators locked."""
+GraspResponse = tuple[AnyArray, AnyArray, AnyArray, Any]
+"""J_m ``(*batch, n_s, n_a)``, dmu/da ``(*batch, n_h, n_a)``, dlam/da ``(*batch, n_a, n_a)``, and the smallest
+eigenvalue of the stiffness with the actuators locked ``(*batch)``."""
 
 
 class Drives(NamedTuple):
@@ -117,7 +108,7 @@ class Reduction(nn.Module):
             for whole, part in zip(parts, group, strict=True):
                 whole[at] = part
         motion, contact, actuator, stability = (part.reshape(*batch, *part.shape[1:]) for part in parts)
-        return GraspResponse(motion, contact, actuator, stability)
+        return motion, contact, actuator, stability
 
     @property
     def drives(self) -> Drives:
@@ -176,7 +167,7 @@ class Reduction(nn.Module):
         dlam = system.actuator_force(step, n_h)
         dmu = system.row_scale[:, None] * step.reaction[..., :n_h, :]
         S = like(self.scaled_basis, dmu)
-        return GraspResponse(_left(S.mT, step.motion), dmu, dlam, step.stability)
+        return _left(S.mT, step.motion), dmu, dlam, step.stability
 
 
 class ReducedStep(NamedTuple):

@@ -2,11 +2,36 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import torch
+
 from .._arrays import namespace
 from ..contact.contact_kinematics import ContactKinematics
 from ..contact.contact_model import ContactModel
 from ..typing import AnyArray, Float
 from .grasp_forces import GraspForces
+
+
+def sensitivities(
+    kin: ContactKinematics,
+    forces: GraspForces,
+    J: Float[AnyArray, "*batch n_s n_a"],
+    dmu: Float[AnyArray, "*batch n_h n_a"],
+) -> dict[str, Any]:
+    """Fields of a :class:`~torch_ekm.model.Linearization` that follow from J_m and dmu/da."""
+    df, dn = force_change(kin, dmu), normal_motion(kin, J)
+    normal = _of_normals(kin, forces, df, dn)
+    found = {
+        "manipulation_jacobian": J,
+        "contact_force_sensitivity": dmu,
+        "normal_force_sensitivity": normal,
+        "margin_sensitivity": _of_margins(kin, forces, dmu, df, dn, normal),
+        "force_vector_sensitivity": df,
+        "normal_motion": dn,
+    }
+    tensors = {name: torch.as_tensor(part) for name, part in found.items()}
+    return {**tensors, "normal_rows": tuple(kin.normal_rows)}
 
 
 def normal_motion(
@@ -28,7 +53,7 @@ def force_change(
     return kin.frame @ full.reshape(*batch, n_c, 6, n_a)[..., :3, :]
 
 
-def normal_sensitivity(
+def _of_normals(
     kin: ContactKinematics, forces: GraspForces, df: AnyArray, dn: AnyArray
 ) -> Float[AnyArray, "*batch n_c n_a"]:
     """``d f_n/da = n_in . df + f . d n_in`` [N/rad]; ``dn`` from :func:`normal_motion`."""
@@ -36,7 +61,7 @@ def normal_sensitivity(
     return -(normal @ df + force @ dn)[..., 0, :]
 
 
-def margin_sensitivity(
+def _of_margins(
     kin: ContactKinematics, forces: GraspForces, dmu: AnyArray, df: AnyArray, dn: AnyArray, normal: AnyArray
 ) -> Float[AnyArray, "*batch n_c n_a"]:
     """``d (mu_s f_n - |u|)/da``, ``u = [f_t; m_n mu_s/gamma]`` [N/rad]; ``d|u|`` counts as 0 at u = 0."""

@@ -53,7 +53,7 @@ class BalanceEquations:
     spin_columns: tuple[int, ...] = ()
     """Components of ``mu`` that are moments."""
     bound_matrix: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    """Z^T of unit joint torques with bounds of their own (stops, locks), ``(n_z, n_t)``."""
+    """Z^T of unit joint torques with bounds of their own (stops), ``(n_z, n_t)``."""
     bound_lower: Array = field(default_factory=lambda: np.zeros(0))
     bound_upper: Array = field(default_factory=lambda: np.zeros(0))
     weight: Array | None = None
@@ -81,7 +81,7 @@ class ForceSolution:
     lam: Array
     """Minus the actuator forces along +a [N or N m]."""
     bound: Array
-    """Torques of stops and locks [N m]."""
+    """Torques of stops [N m]."""
     residual: Array
     """r: unexplained generalised torque, ``(n_z,)`` [N m]. Large: wrong spring or rest angle, slipping."""
     violation: float

@@ -83,7 +83,7 @@ def force_problem(eq: BalanceEquations, cost: ForceCost, cuts: Array, *, soft: b
     """Add the inequalities to the cost: a ``qpsolvers.Problem``.
 
     ```
-    0 <= f_n <= f_max,  |u_i| <= mu_s f_n,i,  -lam >= 0 for tendons,  bounds of stops and locks
+    0 <= f_n <= f_max,  |u_i| <= mu_s f_n,i,  -lam >= 0 for tendons,  bounds of stops
     ```
 
     The friction cones stand in it as polyhedra around them; ``cuts`` carve those down to the cones.

@@ -90,8 +90,6 @@ class StepSolution(NamedTuple):
     """bool ``(n_c,)``."""
     jacobian: Array
     """Of the residual with respect to ``[z; lam; t]``."""
-    iterations: int
-    """Newton's and those of splitting."""
 
     def response(self, load: Array, gap: Array) -> Response:
         """Derivative of the answer in its mode, by parameters that change ``load`` and ``gap``.
@@ -127,32 +125,30 @@ def solve(problem: StepProblem, lam: Array, t: Array) -> StepSolution | None:
     ``w + mu_s |v|`` (Acary, Cadoux, Lemarechal and Malick, ZAMM 91, 2011); slow, but it finds the contacts
     that slide, and Newton's method the digits. None: neither converges.
     """
-    z, count = np.zeros(problem.E.shape[1]), 0
+    z = np.zeros(problem.E.shape[1])
     for attempt in range(_ROUNDS):
-        found, used = _newton(problem, z, lam, t)
-        count += used
+        found = _newton(problem, z, lam, t)
         if found is not None:
-            return found._replace(iterations=count)
+            return found
         with np.errstate(over="ignore", invalid="ignore"):  # it may diverge where D is indefinite
             split = _split(problem, lam, t, _RHO_SPLITTING[attempt % len(_RHO_SPLITTING)])
-        count += _SPLITTING
         if split is not None and np.isfinite(split[1]).all():
             z, lam, t = split
     return None
 
 
-def _newton(problem: StepProblem, z: Array, lam: Array, t: Array) -> tuple[StepSolution | None, int]:
+def _newton(problem: StepProblem, z: Array, lam: Array, t: Array) -> StepSolution | None:
     n_z, m, shape = len(z), len(lam), t.shape
     x = np.concatenate([z, lam, t.ravel()])
     F, J, active, slides = _residual(problem, x)
-    for count in range(_NEWTON):
+    for _ in range(_NEWTON):
         if np.abs(F).max() < _TOLERANCE:
             z, lam, t = np.split(x, [n_z, n_z + m])
-            return StepSolution(z, lam, t.reshape(shape), active, slides, J, 0), count
+            return StepSolution(z, lam, t.reshape(shape), active, slides, J)
         try:
             way = np.linalg.solve(J, -F)
         except np.linalg.LinAlgError:
-            return None, count
+            return None
         share, size = 1.0, F @ F
         while True:
             trial = x + share * way
@@ -161,9 +157,9 @@ def _newton(problem: StepProblem, z: Array, lam: Array, t: Array) -> tuple[StepS
                 break
             share *= 0.5
             if share < _SHORTEST:
-                return None, count
+                return None
         x, (F, J, active, slides) = trial, found
-    return None, _NEWTON
+    return None
 
 
 def _residual(p: StepProblem, x: Array) -> tuple[Array, Array, Mask, Mask]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from enum import Enum
@@ -63,9 +62,6 @@ class ContactStep:
     """How far each contact slid [m]; those that did not are left out."""
     jacobian: Float[Tensor, "n_s n_a"]
     """``d increment/d da`` of the last substep, contacts doing what they do at its end."""
-    substeps: int
-    iterations: int
-    """Of all programs."""
 
     @property
     def farthest_slide(self) -> float:
@@ -87,13 +83,11 @@ class _Solved(NamedTuple):
         return self.names, self.answer.active.tolist(), self.answer.slides.tolist()
 
 
-@dataclass(frozen=True)
-class _Substep:
+class _Substep(NamedTuple):
     last: _Solved
     rates: Response
     """By da."""
     slid: dict[str, float]
-    iterations: int
 
 
 class ContactMotion:
@@ -118,7 +112,7 @@ class ContactMotion:
 
     A model that follows figures of the hand moves with those that are known when the motion begins.
 
-    With a detector of one's own only what it reports can touch. Joints locked by name are free here.
+    With a detector of one's own only what it reports can touch.
 
     Args:
         model: of hand and object.
@@ -178,7 +172,7 @@ class ContactMotion:
         names = self._grasp.contacts.finger
         way, slid = delta_a.detach().double().numpy(), dict[str, float]()
         share = 1 / max(1, math.ceil(float(np.abs(way).max(initial=0.0)) / _LARGEST))
-        done, substeps, iterations = 0.0, 0, 0
+        done = 0.0
         while True:
             share = min(share, 1 - done)
             found = self._substep(share * way)
@@ -191,9 +185,9 @@ class ContactMotion:
                 self._stand(*before)
                 raise ends
             _add(slid, found.slid)
-            done, substeps, iterations = done + share, substeps + 1, iterations + found.iterations
+            done += share
             if done > 1 - 1e-9:
-                return self._report(before[0], names, found, slid, substeps, iterations)
+                return self._report(before[0], names, found, slid)
 
     def linearize(self, delta_a: Float[Tensor, " n_a"]) -> Linearization:
         """``d increment/d da`` here, in the mode that a motion by ``delta_a`` [rad] brings: contacts stick,
@@ -248,18 +242,17 @@ class ContactMotion:
 
     def _substep(self, da: Array) -> _Substep | None:
         """Newton on the state: equilibrium, gaps and cones of the end. None: no convergence."""
-        here, loads, iterations, was = self._grasp, self.loads, 0, None
+        here, loads, was = self._grasp, self.loads, None
         way = Way(here, loads.pull, da, np.zeros(self._laws.S.shape[1]))
         for correction in range(_CORRECTIONS):
             done = self._solve(here, loads, way)
             if done is None or _farthest(done.state.minus(self.state)) > _FARTHEST:
                 return None
-            iterations += done.answer.iterations
             size, doing = float(np.abs(done.answer.z).max()), done.doing
             if correction and (size < _SAME or (size < _FINE and doing == was)):
                 self._stand(done.state, None, done.loads)
                 rates = self._laws.response(done.program.problem, done.answer)
-                return _Substep(done, rates, _slides(done), iterations)
+                return _Substep(done, rates, _slides(done))
             loads, here, was = done.loads, self._place(done.state), doing
             way = way._replace(total=way.total + done.answer.z)
         return None
@@ -267,7 +260,7 @@ class ContactMotion:
     def _fall(self, da: Array) -> _Substep | None:
         """A motion after which no equilibrium is near: the grasp moves on, damped, until it finds one.
         None: it finds none."""
-        begin, iterations, slid = self.state, 0, dict[str, float]()
+        begin, slid = self.state, dict[str, float]()
         for _ in range(_FALLS):
             way = Way(self._grasp, self.loads.pull, da, np.zeros(self._laws.S.shape[1]))
             done = self._solve(self._grasp, self.loads, way, _DAMPING)
@@ -275,12 +268,11 @@ class ContactMotion:
                 return None
             self._stand(done.state, None, done.loads)
             da = np.zeros(len(da))
-            iterations += done.answer.iterations
             _add(slid, _slides(done))
             rest = self._substep(da) if float(np.abs(done.answer.z).max()) < _CALM else None
             if rest is not None:
                 _add(slid, rest.slid)
-                return dataclasses.replace(rest, slid=slid, iterations=iterations + rest.iterations)
+                return rest._replace(slid=slid)
         return None
 
     def _solve(
@@ -303,13 +295,7 @@ class ContactMotion:
         return _Solved(contacts.finger, program, answer, after, state)
 
     def _report(
-        self,
-        before: GraspState,
-        names: tuple[str, ...],
-        last: _Substep,
-        slid: dict[str, float],
-        substeps: int,
-        iterations: int,
+        self, before: GraspState, names: tuple[str, ...], last: _Substep, slid: dict[str, float]
     ) -> ContactStep:
         """Of a whole motion; ``names``: contacts that were near when it began."""
         answer, mu_s = last.last.answer, last.last.program.problem.mu_s
@@ -332,8 +318,6 @@ class ContactMotion:
             modes=modes,
             slid=slid,
             jacobian=torch.from_numpy(self._laws.S @ last.rates.z),
-            substeps=substeps,
-            iterations=iterations,
         )
 
     def _place(self, state: GraspState) -> PlacedGrasp:

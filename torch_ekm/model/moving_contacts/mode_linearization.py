@@ -10,7 +10,7 @@ from ...contact.forces.friction import friction_cones, margins
 from ...typing import Array
 from ..force_balance import pack_forces
 from ..linearization import Linearization
-from ..sensitivity import force_change, margin_sensitivity, normal_motion, normal_sensitivity
+from ..sensitivity import sensitivities
 from ..validity import find_doubts
 from .placed_grasp import ContactLoads, GraspModel, L, PlacedGrasp
 
@@ -61,21 +61,13 @@ def mode_linearization(
         violation=torch.zeros((), dtype=torch.float64),
         status=(ForceStatus.SOLVED,),
     )
-    df, dn = force_change(kin, dmu_t), normal_motion(kin, J)
-    df_n = normal_sensitivity(kin, forces, df, dn)
     stability = torch.tensor(torch.inf, dtype=torch.float64)
     return Linearization(
         state=grasp.state,
         contacts=contacts,
         forces=forces,
-        manipulation_jacobian=J,
-        contact_force_sensitivity=dmu_t,
+        **sensitivities(kin, forces, J, dmu_t),
         actuator_force_sensitivity=torch.from_numpy(actuator),
-        normal_force_sensitivity=df_n,
-        margin_sensitivity=margin_sensitivity(kin, forces, dmu_t, df, dn, df_n),
-        force_vector_sensitivity=df,
-        normal_motion=dn,
-        normal_rows=tuple(kin.normal_rows),
         held_joints=torch.from_numpy(stop != 0),
         stability=stability,
         options=model.options,

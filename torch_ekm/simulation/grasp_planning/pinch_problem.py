@@ -11,6 +11,7 @@ from ...contact import signed_distance
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import UnknownNameError
 from ...kinematics import HandKinematics
+from ...kinematics.null_space import null_space
 from ...kinematics.se3 import exp
 from ...typing import Array
 from ..mechanism.assembly import chain
@@ -131,12 +132,12 @@ class PinchProblem:
     def _prepare_mechanism(self) -> None:
         hand, J_a = self.hand, self.transmission.J_a
         C = hand.coupling.reshape(-1, hand.n_q)
-        self._passive = _null_space(np.vstack([J_a, C])[:, self.moving])
+        self._passive = null_space(np.vstack([J_a, C])[:, self.moving])
         rest = np.setdiff1d(np.arange(hand.n_q), self.moving)
         self.follow = np.zeros((hand.n_q, len(self.moving)))  # joints that a coupling drags along
         self.follow[self.moving] = np.eye(len(self.moving))
         self.follow[rest] = -np.linalg.pinv(C[:, rest]) @ C[:, self.moving]
-        free = _null_space(C)
+        free = null_space(C)
         self._to_tension = np.linalg.pinv((J_a @ free).T) @ free.T
         tendon = np.array([actuator.tendon for actuator in hand.actuators], dtype=bool)
         self.in_use = (J_a @ self.follow).any(axis=1)
@@ -334,8 +335,3 @@ def _cross(a: Array, b: Array) -> Array:
     a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
     b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
     return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
-
-
-def _null_space(matrix: Array) -> Array:
-    _, singular, vt = np.linalg.svd(matrix)
-    return np.asarray(vt[int((singular > 1e-9).sum()) :].T, dtype=np.float64)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...description import HandDescription
 from ...description.shape import Shape
-from ...description.urdf import UrdfJoint, UrdfLink, UrdfModel
+from ...description.urdf import UrdfJoint, UrdfLink
 from ...exceptions import DescriptionError
 from ...typing import Array
 
@@ -51,7 +51,7 @@ def moving_links(hand: HandDescription) -> list[MovingLink]:
     links = {root: MovingLink(root, None, None, np.eye(4))}
     carrier: dict[str, tuple[str, Array]] = {root: (root, np.eye(4))}
     parts: dict[str, list[tuple[Array, UrdfLink]]] = {root: [(np.eye(4), urdf.link(root))]}
-    for joint in _parents_first(urdf):
+    for joint in sorted(urdf.joints, key=lambda joint: len(urdf.joints_to(joint.parent))):
         owner, offset = carrier[joint.parent]
         placed, child = offset @ joint.transform, urdf.link(joint.child)
         if joint.kind == "fixed":
@@ -83,17 +83,6 @@ def _fill(link: MovingLink, pieces: list[tuple[Array, UrdfLink]]) -> None:
     if link.mass > 0:
         link.com = first / link.mass
         link.inertia = about_frame - link.mass * _steiner(link.com)
-
-
-def _parents_first(urdf: UrdfModel) -> list[UrdfJoint]:
-    """The joints, each after the one that carries its parent link."""
-    placed, waiting, order = {urdf.root}, list(urdf.joints), []
-    while waiting:
-        ready = [joint for joint in waiting if joint.parent in placed]
-        order += ready
-        placed |= {joint.child for joint in ready}
-        waiting = [joint for joint in waiting if joint.child not in placed]
-    return order
 
 
 def principal(inertia: Array) -> tuple[Array, Array]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Protocol
 
 from ...description import HandDescription, ObjectDescription
-from ...exceptions import UnknownNameError
 from ...typing import Array
 from ..mechanism.transmission import Transmission
 
@@ -96,7 +95,6 @@ def make_scene(
     ``native``: tendons for MuJoCo to run, as :class:`~.mujoco_scene.MujocoScene` takes it.
 
     Raises:
-        UnknownNameError: there is no such engine; the message lists them.
         MissingExtraError: it is not installed.
         DescriptionError: what stands in the hand's URDF cannot be simulated.
     """
@@ -104,8 +102,6 @@ def make_scene(
         from .sapien_scene import SapienScene
 
         return SapienScene(hand, obj, time_step, contact_stiffness)
-    if engine == "mujoco":
-        from .mujoco_scene import MujocoScene
+    from .mujoco_scene import MujocoScene
 
-        return MujocoScene(hand, obj, time_step, contact_stiffness, native)
-    raise UnknownNameError("engine", engine, ENGINES)
+    return MujocoScene(hand, obj, time_step, contact_stiffness, native)
