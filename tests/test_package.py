@@ -144,7 +144,7 @@ def test_the_command_line_compares_and_copies_with_the_extra_plots_alone(tmp_pat
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     compared, copied_and_told = done.stdout.split("$ notebooks")
-    assert "On the first 45 of 50 rows" in compared
+    assert "On the first 45 of 50 rows" in " ".join(compared.split())
     assert (tmp_path / "out" / "index.html").is_file()
     assert len(list((tmp_path / "copies").glob("*.ipynb"))) >= 6
     assert "torch-ekm" in copied_and_told.split("$ --version")[1]
