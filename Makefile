@@ -80,14 +80,14 @@ release: install
 	$(BIN)/python -m twine check --strict dist/*
 	for n in 1 2; do awk -v n=$$n '/^```python/ {k++; p = k == n; next} /^```/ {p = 0} p' README.md > dist/example_$$n.py; done
 	set -e; for v in $(PYTHONS); do \
-		rm -rf dist/check && python$$v -m venv dist/check; \
-		dist/check/bin/python -m pip install --quiet -c constraints.txt torch numpy; \
-		dist/check/bin/python -m pip install --quiet -c constraints.txt dist/*.whl; \
-		(cd dist && check/bin/python example_1.py); \
-		dist/check/bin/python -m pip install --quiet -c constraints.txt "$$(ls dist/*.whl)[sim]"; \
-		(cd dist && check/bin/python example_2.py); \
+		python$$v -m venv dist/check-$$v; \
+		dist/check-$$v/bin/python -m pip install --quiet -c constraints.txt torch numpy; \
+		dist/check-$$v/bin/python -m pip install --quiet -c constraints.txt dist/*.whl; \
+		(cd dist && check-$$v/bin/python example_1.py); \
+		dist/check-$$v/bin/python -m pip install --quiet -c constraints.txt "$$(ls dist/*.whl)[sim]"; \
+		(cd dist && check-$$v/bin/python example_2.py); \
 		echo "Python $$v: both examples run"; \
-	done; rm -rf dist/check
+	done
 
 clean:
 	rm -rf $(VENV) demo_output htmlcov .coverage .pytest_cache .ruff_cache .hypothesis docs/_build docs/reference/api/generated docs/tutorials/notebooks
