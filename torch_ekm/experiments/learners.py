@@ -19,18 +19,11 @@ N_OUT = 6
 Factory = Callable[..., ResidualLearner]
 
 
-class _Written(str):
-    """Code, not a text."""
-
-    __repr__ = str.__str__
-
-
-_KERNEL = _Written("SquaredExponential(d)")
 #: Inputs and outputs of the order of 1 are taken as they are.
 _AS_GIVEN: dict[str, Any] = {"noise_variance": NOISE_VARIANCE, "standardize": False}
 
 
-class Kind:
+def _kind(make: Factory, size: str = "", kernel: str = "", **figures: Any) -> Factory:
     """A factory ``(in_features, out_features, n_actions=0, capacity=100, **options)`` of one kind of learner.
 
     Args:
@@ -39,42 +32,27 @@ class Kind:
         figures: its other arguments.
     """
 
-    def __init__(self, make: Factory, size: str = "", kernel: str = "", **figures: Any) -> None:
-        self.make, self.size, self.kernel, self.figures = make, size, kernel, figures
-
-    def __call__(
-        self, d: int, m: int, *, n_actions: int = 0, capacity: int = 100, **options: Any
+    def factory(
+        d: int, m: int, *, n_actions: int = 0, capacity: int = 100, **options: Any
     ) -> ResidualLearner:
-        return self.make(d, m, **self._arguments(capacity, residual.SquaredExponential(d)) | options)
+        given = {size: capacity, kernel: residual.SquaredExponential(d)}
+        return make(d, m, **{**figures, **{name: given[name] for name in given if name}, **options})
 
-    @property
-    def call(self) -> str:
-        """How a user makes it, of d inputs and m outputs."""
-        arguments = self._arguments(100, _KERNEL)
-        return f"{self.make.__name__}({', '.join(['d', 'm', *(f'{k}={v!r}' for k, v in arguments.items())])})"
-
-    def _arguments(self, capacity: int, kernel: Any) -> dict[str, Any]:
-        given = {self.size: capacity, self.kernel: kernel}
-        return {**self.figures, **{name: value for name, value in given.items() if name}}
+    return factory
 
 
-class Sparse(Kind):
+def _sparse(
+    make: Factory = residual.SparseOnlineGP, kernel: str = "kernel", parts: Any = (), **figures: Any
+) -> Factory:
     """A sparse online GP that distrusts and forgets by two figures, and has other parts."""
+    plain = _kind(make, "capacity", kernel, **_AS_GIVEN)
+    own = {"robust": None, "forgetting_factor": 1.0, "parts": parts, **figures}
 
-    def __init__(
-        self, make: Factory = residual.SparseOnlineGP, kernel: str = "kernel", parts: Any = (), **figures: Any
-    ) -> None:
-        super().__init__(make, "capacity", kernel, **_AS_GIVEN)
-        self.parts = {"robust": None, "forgetting_factor": 1.0, "parts": parts, **figures}
+    def factory(d: int, m: int, **options: Any) -> ResidualLearner:
+        chosen = {name: options.pop(name, value) for name, value in own.items()}
+        return plain(d, m, **options, parts=_parts(**chosen))
 
-    def __call__(
-        self, d: int, m: int, *, n_actions: int = 0, capacity: int = 100, **options: Any
-    ) -> ResidualLearner:
-        chosen = {name: options.pop(name, value) for name, value in self.parts.items()}
-        return super().__call__(d, m, capacity=capacity, **options, parts=_parts(**chosen))
-
-    def _arguments(self, capacity: int, kernel: Any) -> dict[str, Any]:
-        return super()._arguments(capacity, kernel) | {"parts": _parts(**self.parts)}
+    return factory
 
 
 def _parts(robust: float | None, forgetting_factor: float, parts: Any) -> list[Any]:
@@ -83,17 +61,9 @@ def _parts(robust: float | None, forgetting_factor: float, parts: Any) -> list[A
     return [*weight, *fading, *parts]
 
 
-class Mixture:
+def _mixture(d: int, m: int, **options: Any) -> ResidualLearner:
     """One learner that stands still and learns features, one that wanders: evidence decides."""
-
-    kinds = (
-        Sparse(residual.DeepKernelSOGP, "base", robust=3.0),
-        Sparse(robust=3.0, parts=[residual.ProcessNoise(0.003), residual.LearnHyperparameters()]),
-    )
-    call = f"MixtureResidual([{', '.join(kind.call for kind in kinds)}])"
-
-    def __call__(self, d: int, m: int, **options: Any) -> ResidualLearner:
-        return residual.MixtureResidual([kind(d, m, **options) for kind in self.kinds])
+    return residual.MixtureResidual([kind(d, m, **options) for kind in _MIXED])
 
 
 def _rbf(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearner:
@@ -111,7 +81,11 @@ def _action_linear(
     return _ON_A_HAND(d, m, **{"kernel": kernel, **options})
 
 
-_ON_A_HAND = Sparse(robust=3.0, forgetting_factor=0.995)
+_MIXED = (
+    _sparse(residual.DeepKernelSOGP, "base", robust=3.0),
+    _sparse(robust=3.0, parts=[residual.ProcessNoise(0.003), residual.LearnHyperparameters()]),
+)
+_ON_A_HAND = _sparse(robust=3.0, forgetting_factor=0.995)
 _FRESH: dict[str, Any] = {**_AS_GIVEN, "forgetting_factor": 0.99, "robust": 3.0}
 _LEARNING = [residual.LearnHyperparameters()]
 
@@ -119,32 +93,32 @@ _LEARNING = [residual.LearnHyperparameters()]
 #: inputs are an action. Inputs and outputs are of the order of 1; all but the first three start from the same
 #: generic prior: lengthscale sqrt(d), unit variance, and about 100 of whatever they keep.
 LEARNERS: dict[str, Factory] = {
-    "default": Kind(residual.default_learner, "capacity"),
+    "default": _kind(residual.default_learner, "capacity"),
     "action-linear": _action_linear,
     "rbf": _rbf,
-    "model alone": Kind(residual.ZeroResidual),
-    "linear RLS": Kind(residual.RecursiveLeastSquares, **_FRESH),
-    "random features": Kind(residual.RandomFeatureRLS, "n_frequencies", **_FRESH),
-    "MLP": Kind(residual.ReplayMLP, standardize=False),
-    "MLP ensemble": Kind(residual.ReplayMLP, members=3, standardize=False),
-    "SOGP default": Kind(residual.SparseOnlineGP, "capacity"),
-    "SOGP plain": Sparse(),  # nothing forgotten, every sample trusted
-    "SOGP": Sparse(forgetting_factor=0.99, robust=3.0),
-    "SOGP adaptive": Sparse(
+    "model alone": _kind(residual.ZeroResidual),
+    "linear RLS": _kind(residual.RecursiveLeastSquares, **_FRESH),
+    "random features": _kind(residual.RandomFeatureRLS, "n_frequencies", **_FRESH),
+    "MLP": _kind(residual.ReplayMLP, standardize=False),
+    "MLP ensemble": _kind(residual.ReplayMLP, members=3, standardize=False),
+    "SOGP default": _kind(residual.SparseOnlineGP, "capacity"),
+    "SOGP plain": _sparse(),  # nothing forgotten, every sample trusted
+    "SOGP": _sparse(forgetting_factor=0.99, robust=3.0),
+    "SOGP adaptive": _sparse(
         forgetting_factor=0.99, robust=3.0, parts=[residual.CalibrateNoise(), *_LEARNING]
     ),
-    "SOGP detecting": Sparse(
+    "SOGP detecting": _sparse(
         robust=3.0, parts=[residual.CalibrateNoise(), residual.DetectChanges(), *_LEARNING]
     ),
     # no forgetting: what features are learned from is the past
-    "SOGP deep": Sparse(
+    "SOGP deep": _sparse(
         residual.DeepKernelSOGP,
         "base",
         robust=3.0,
         parts=[residual.CalibrateNoise(), residual.DetectChanges()],
     ),
-    "SOGP mixture": Mixture(),
-    "river forest": Kind(interop.RiverResidual),
+    "SOGP mixture": _mixture,
+    "river forest": _kind(interop.RiverResidual),
 }
 #: Learners of other libraries: ten to a hundred times as slow, and in an extra of their own.
 PEERS = ("river forest",)

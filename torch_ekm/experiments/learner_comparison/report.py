@@ -18,10 +18,9 @@ class ComparisonReport(Comparison):
     """A comparison that prints as a table and can be written."""
 
     def tables(self) -> list[Table]:
-        """One for each stream; of several streams an overview first, how the learners are made last."""
+        """One for each stream; of several streams an overview first."""
         tables = [score_table(self, stream.name) for stream in self.streams]
-        made = [constructor_table(self)] if any(self.calls.values()) else []
-        return [overview_table(self), *tables, *made] if len(tables) > 1 else [*tables, *made]
+        return [overview_table(self), *tables] if len(tables) > 1 else tables
 
     def __str__(self) -> str:
         return "\n".join([str(self.tables()[0]), *self.verdicts()])
@@ -99,17 +98,6 @@ def overview_table(comparison: Comparison) -> Table:
     heads = [name + (", median" if comparison.measure(name) == "median" else "") for name in names]
     columns = ["learner", *heads, Column("mean rank", ".1f")]
     return Table("overview", "rms error / that of the model alone", columns, rows, note)
-
-
-def constructor_table(comparison: Comparison) -> Table:
-    """The constructor call with which a user makes each learner."""
-    calls = {name: comparison.calls.get(name, "") for name in comparison.learners}
-    rows: list[list[Cell]] = [[name, call] for name, call in calls.items() if call]
-    note = (
-        "d inputs, m outputs. The streams above are in units of their own first samples; in the units of "
-        "your own data omit standardize=False."
-    )
-    return Table("learners", "How they are made", ["learner", "call"], rows, note)
 
 
 def curve_learners(comparison: Comparison, stream: str, most: int = 6) -> Sequence[str]:

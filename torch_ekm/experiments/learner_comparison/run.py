@@ -101,8 +101,7 @@ def compare(
         rms = block_bootstrap(squared, alone, blocks)
         median = block_bootstrap(squared, alone, blocks, measure="median")
         scores[stream.name, name] = Score(stream.name, name, rms, median, **result)
-    calls = {name: getattr(factory, "call", "") for name, factory in factories.items()}
-    return ComparisonReport(tuple(streams), tuple(factories), scores, errors, calls)
+    return ComparisonReport(tuple(streams), tuple(factories), scores, errors)
 
 
 def run_one(stream: Stream, factory: Factory) -> dict[str, Any]:

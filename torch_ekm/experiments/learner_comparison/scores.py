@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -52,8 +52,6 @@ class Comparison:
     """(stream, learner) -> score."""
     errors: dict[tuple[str, str], Array]
     """(stream, learner) -> squared error of each scored sample, mean over the outputs."""
-    calls: dict[str, str] = field(default_factory=dict)
-    """learner -> how a user makes it, of d inputs and m outputs, where that is known."""
 
     def measure(self, stream: str) -> Measure:
         """What the learners are ranked by: rms errors, or medians where few samples make the rms.

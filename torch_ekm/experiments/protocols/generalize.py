@@ -163,7 +163,6 @@ class Generalize(Protocol):
         shown = [
             paper_table(trials),
             significance,
-            cell_table(trials),
             tables.reason_table(trials),
             object_table(trials),
             ends_table(trials),
@@ -173,7 +172,6 @@ class Generalize(Protocol):
             tables.comparison_table(trials),
             probe_table(trials),
             tables.prediction_table(trials),
-            tables.timing_table(trials),
         ]
         shown = [table for table in shown if table.rows]
         names = ", ".join(object_name(item) for item in self.objects)
@@ -215,20 +213,6 @@ def cell_errors(trials: DataFrame) -> tuple[DataFrame, DataFrame]:
     return ekm.align(km, join="inner")
 
 
-def cell_table(trials: DataFrame) -> Table:
-    """Error of KM and E-KM for each object and target (the paper's Fig. 6)."""
-    rows: dict[str, list[Cell]] = {}
-    for (cell, ekm), (_, km) in zip(*(errors.iterrows() for errors in cell_errors(trials)), strict=True):
-        won = f"{(ekm < km).sum()} of {(ekm - km).count()}"
-        text = f"{cell[2]:g}: {km.mean():.2f}, {ekm.mean():.2f}, {won}"
-        rows.setdefault(cell[0], [cell[0]]).append(text)
-    most = max(map(len, rows.values()), default=1)
-    filled = [row + [None] * (most - len(row)) for row in rows.values()]
-    columns = ["object", *(f"trial {k}" for k in range(1, most))]
-    note = "Target [deg]: mean errors of KM and E-KM [deg], hands on which the E-KM ends nearer."
-    return Table("cells", "Each object and target (the paper's Fig. 6)", columns, filled, note)
-
-
 def significance_table(trials: DataFrame) -> Table:
     """Cells that the E-KM wins on a hand, and the tests of its errors, of the paper's objects if any."""
     both = trials[trials["object"].isin(list(TABLE_II))]
@@ -262,17 +246,16 @@ def object_table(trials: DataFrame) -> Table:
         by = tables.by_controller(chosen)
         if not {"KM", "E-KM"} <= set(by):
             continue
-        ours, theirs = stats.paired_means(by["E-KM"], by["KM"], "error_deg")
-        test = stats.paired_test(ours, theirs) if chosen["seed"].nunique() >= stats.LEAST_SEEDS else None
+        pair = stats.paired_means(by["E-KM"], by["KM"], "error_deg")
         errors = (stats.estimate(by[name], "error_deg") if name in by else None for name in CONTROLLERS)
-        rows.append([item, *errors, stats.bootstrap_ratio(ours, theirs), *(test or (None, None))])
+        rows.append([item, *errors, *tables.ratio_and_p(*pair, chosen["seed"].nunique())])
     columns = [
         "object", *(f"{name} [deg]" for name in CONTROLLERS), Column("E-KM:KM [%]", ".0f", percent=True),
-        Column("p paired", ".1g"), Column("effect size", ".1f"),
+        Column("p paired", ".1g"),
     ]  # fmt: skip
     note = (
         "Steady-state error, lost objects with the whole angle. Ratio of means with the bootstrap over "
-        "pairs of object and seed; the effect size is Cohen's d of the paired differences."
+        "pairs of object and seed."
     )
     return Table("by_object", "Steady-state error of each object", columns, rows, note)
 

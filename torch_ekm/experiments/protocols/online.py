@@ -113,12 +113,10 @@ class Online(Protocol):
             self.paper_table(trials),
             tables.reason_table(trials),
             self.learning_table(trials),
-            self.learning_table(trials, against_truth=True),
             tables.prediction_table(trials),
             tables.controller_table(trials),
             tables.motion_table(trials),
             tables.comparison_table(trials),
-            tables.timing_table(trials),
         ]
         what = f"{self.trials} turns of the {object_name(self.object)} for each seed and controller."
         if len(seeds) >= LEAST_SEEDS:
@@ -147,9 +145,9 @@ class Online(Protocol):
         )
         return Table("paper", "Figures of the paper and those found here", columns, rows, note)
 
-    def learning_table(self, trials: DataFrame, against_truth: bool = False) -> Table:
+    def learning_table(self, trials: DataFrame) -> Table:
         """How fast the E-KM learns (the paper's Fig. 5b), for each seed and for the mean over seeds."""
-        ekm, km = prediction_curves(trials, self.trials, "true_" if against_truth else "")
+        ekm, km = prediction_curves(trials, self.trials)
         items = {str(seed): (ekm.loc[seed], km.loc[seed]) for seed in ekm.index}
         if len(ekm) > 1:
             items["of the seeds' mean errors"] = ekm.mean(), km.mean()
@@ -168,8 +166,7 @@ class Online(Protocol):
             "(the paper: 16; last upper boundary -0.57 deg). Recovered: trials after the event until the "
             "E-KM's error is below half of the KM's; trials with an event are left out of the ratio."
         )
-        name, what = ("learning_true", "the truth") if against_truth else ("learning", "measurements")
-        return Table(name, f"How fast the E-KM learns: errors against {what}", columns, rows, note)
+        return Table("learning", "How fast the E-KM learns: errors against measurements", columns, rows, note)
 
 
 @dataclass(frozen=True)
@@ -210,15 +207,11 @@ def recovery_trials(ekm: Series, km: Series, event: int) -> int | None:
     return int(better[0]) - event if len(better) else None
 
 
-def prediction_curves(trials: DataFrame, n: int, kind: str = "") -> tuple[DataFrame, DataFrame]:
-    """Prediction errors of E-KM and KM [deg], a row for each seed, columns 1 to n; NaN: nothing moved.
-
-    Args:
-        kind: "true_" for errors against the plant's truth.
-    """
+def prediction_curves(trials: DataFrame, n: int) -> tuple[DataFrame, DataFrame]:
+    """Prediction errors of E-KM and KM [deg], a row for each seed, columns 1 to n; NaN: nothing moved."""
     mine, seeds = select(trials, controller="E-KM"), sorted(trials["seed"].unique())
     ekm, km = (
-        mine.pivot(index="seed", columns="trial", values=f"{kind}prediction_{name}")
+        mine.pivot(index="seed", columns="trial", values=f"prediction_{name}")
         .reindex(index=seeds, columns=range(1, n + 1))
         .astype(float)
         for name in ("ekm", "km")

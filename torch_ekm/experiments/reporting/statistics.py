@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,23 +118,14 @@ def rate(events: Iterable[bool]) -> Rate:
     return Rate(count, len(outcomes), float(interval.low), float(interval.high))
 
 
-class PairedTest(NamedTuple):
-    """Two-sided paired t-test of ``ours - theirs`` over the same units."""
-
-    p: float
-    effect_size: float
-    """Cohen's d of the differences."""
-
-
-def paired_test(ours: Array, theirs: Array) -> PairedTest | None:
-    """Compare errors of the same units (``scipy.stats.ttest_rel``); None with fewer than two."""
+def paired_p(ours: Array, theirs: Array) -> float | None:
+    """p of the two-sided paired t-test (``scipy.stats.ttest_rel``); None: fewer than two."""
     if len(ours) < 2:
         return None
     difference = ours - theirs
     if np.ptp(difference) == 0:  # a t-test of a constant is undefined; say what it means
-        return PairedTest(float(difference[0] == 0), 0.0)
-    p = require("scipy.stats").ttest_rel(ours, theirs).pvalue
-    return PairedTest(float(p), float(difference.mean() / difference.std(ddof=1)))
+        return float(difference[0] == 0)
+    return float(require("scipy.stats").ttest_rel(ours, theirs).pvalue)
 
 
 @dataclass(frozen=True)

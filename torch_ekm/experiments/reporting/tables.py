@@ -152,15 +152,15 @@ def ratio_and_p(ours: Array, theirs: Array, n_seeds: int) -> tuple[Estimate | No
     """Ratio of means, and p of the paired t-test, where there are such and enough seeds."""
     if not len(ours) or theirs.mean() == 0:
         return None, None
-    test = stats.paired_test(ours, theirs) if n_seeds >= LEAST_SEEDS else None
-    return stats.bootstrap_ratio(ours, theirs), None if test is None else test.p
+    p = stats.paired_p(ours, theirs) if n_seeds >= LEAST_SEEDS else None
+    return stats.bootstrap_ratio(ours, theirs), p
 
 
 def p_rows(hands: Sequence[tuple[Array, Array]], ours: Array, theirs: Array, paper: str) -> list[list[Cell]]:
     """p of the paper's two-sided test of two samples, on each hand alone, and of the paired one on all."""
     each = [require("scipy.stats").ttest_ind(*hand).pvalue for hand in hands if len(hand[0]) > 1]
-    test = stats.paired_test(ours, theirs) if len(hands) >= LEAST_SEEDS else None
-    one, all_hands = f"{np.median(each):.1e}" if each else None, None if test is None else f"{test.p:.1e}"
+    p = stats.paired_p(ours, theirs) if len(hands) >= LEAST_SEEDS else None
+    one, all_hands = f"{np.median(each):.1e}" if each else None, None if p is None else f"{p:.1e}"
     return [["p of two samples, one hand (median)", paper, one], ["p paired, all hands", None, all_hands]]
 
 
@@ -198,18 +198,6 @@ def prediction_table(trials: DataFrame) -> Table:
         "'Measured' includes the camera's noise, which no model can predict; 'true' does not."
     )
     return Table("prediction", "One-step prediction error", columns, rows, note)
-
-
-def timing_table(trials: DataFrame) -> Table:
-    """Decision and training, without plant and camera."""
-    rows: list[list[Cell]] = []
-    for name, mine in by_controller(trials).items():
-        seconds = 1e3 * mine["seconds"].explode().dropna().astype(float)
-        if len(seconds):
-            rows.append([name, *map(float, seconds.quantile([0.5, 0.9, 0.99])), len(seconds)])
-    columns = [Column(name, ".1f") for name in ("controller", "median [ms]", "90 % [ms]", "99 % [ms]")]
-    note = "Wall-clock time on the machine that ran the report, with whatever else it was doing."
-    return Table("timing", "Time of one control step", [*columns, "motions"], rows, note)
 
 
 def verdict(trials: DataFrame, seeds: Sequence[int]) -> str:
