@@ -14,6 +14,7 @@ from experiments_records import frame, not_grasped, turn
 
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.protocols.generalize import (
+    cell_table,
     ends_table,
     object_table,
     significance_table,
@@ -356,6 +357,9 @@ def test_cells_are_won_and_lost_hand_by_hand() -> None:
         ours = 2.0 if (item, trial) == ("can", 1) and seed < 3 else 0.1 * theirs
         records += [turn("KM", seed, theirs, **where), turn("E-KM", seed, ours, **where)]
     trials = frame(records)
+    rows = {row[0]: row[1:] for row in cell_table(trials).text()}
+    assert rows["box"] == ["5: 1.00, 0.10, 12 of 12", "10: 1.10, 0.11, 12 of 12", "15: 1.20, 0.12, 12 of 12"]
+    assert rows["can"][1] == "10: 1.10, 0.58, 9 of 12"
     found = {row[0]: row[1:] for row in significance_table(trials).text()}
     assert found["cells won"] == ["24 of 25", "6 of 6, least 5"]
     assert found["cells lost (hands)"][1] == "can, trial 2 (3)"
@@ -365,3 +369,4 @@ def test_cells_are_won_and_lost_hand_by_hand() -> None:
     few = {row[0]: row[1:] for row in significance_table(trials[trials["seed"] < 3]).text()}
     assert few["p paired, all hands"][1] == "-"
     assert not significance_table(trials[trials["controller"] == "KM"]).rows
+    assert not cell_table(trials[trials["controller"] == "KM"]).rows
