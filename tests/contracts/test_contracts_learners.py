@@ -75,7 +75,7 @@ LEARNERS = {
     "sogp_process_noise": lambda **o: sogp(parts=[ProcessNoise(0.01)], refresh_every=4, **o),
     "mixture": lambda **o: MixtureResidual(sogp(parts=[RobustWeight(3.0), ProcessNoise(0.003)], **o)),
     "mixture_of_two": lambda **o: MixtureResidual(
-        [sogp(parts=[ProcessNoise(0.01)], **o), RecursiveLeastSquares(3, 2, **o)], shares=(0.0, 1.0)
+        [sogp(parts=[ProcessNoise(0.01)], **o), RecursiveLeastSquares(3, 2, **o)], levels=(0.0, 0.1)
     ),
     "deep": deep,
     "deep_sogp": lambda **o: DeepKernelSOGP(3, 2, capacity=8, hidden=(8,), refresh_every=4, **o),

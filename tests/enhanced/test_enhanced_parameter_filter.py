@@ -144,6 +144,7 @@ def test_any_model_with_parameters_adapts_in_an_enhanced_model() -> None:
         ds = pendulum(state, action, true) + 0.005 * torch.randn(2, dtype=F64, generator=draw)
         model.update(state, action, ds)
     torch.testing.assert_close(theta.mean, true, atol=0.3, rtol=0)
+    assert not theta.mean.requires_grad
     state, action = torch.tensor([0.5, 0.0], dtype=F64), torch.tensor([1.0], dtype=F64)
     nominal = model.nominal(state, action)
     torch.testing.assert_close(nominal, pendulum(state, action, theta.mean))

@@ -50,7 +50,7 @@ LEARNERS = {
     "matern": lambda: sogp(kernel=Matern32(3, lengthscale=2.0)),
     "deep": lambda: DeepKernelSOGP(3, 2, capacity=8, hidden=(8,), seed=3, parts=[Standardize()]),
     "learns": lambda: sogp(parts=[ForgettingFactor(0.9), LearnHyperparameters(memory=20)], refresh_every=8),
-    "mixture": lambda: MixtureResidual([sogp(), RecursiveLeastSquares(3, 2)], shares=(0.0, 1.0)),
+    "mixture": lambda: MixtureResidual([sogp(), RecursiveLeastSquares(3, 2)], levels=(0.0, 0.1)),
     "network": lambda: ReplayMLP(3, 2, hidden=(8,), members=2),
     "single": lambda: sogp(dtype=torch.float32),
 }
@@ -121,7 +121,7 @@ def test_an_enhanced_model_with_its_encoding(tmp_path: Path) -> None:
         (lambda: sogp(kernel=Matern32(3)), "kernel: SquaredExponential in the state, Matern32 here"),
         (lambda: sogp(parts=[RobustWeight(3.0)], standardize=False), "parts"),
         (lambda: sogp(parts=[Standardize(), RobustWeight(2.0)]), r"parts\[1\].threshold: 3.0 in the state"),
-        (lambda: sogp(jitter=1e-3), "jitter"),
+        (lambda: sogp(novelty_threshold=1e-3), "novelty_threshold"),
         (lambda: sogp(dtype=torch.float32), "dtype: float64 in the state, float32 here"),
         (lambda: SparseOnlineGP(4, 2, capacity=8), "in_features: 3 in the state, 4 here"),
         (lambda: RecursiveLeastSquares(3, 2), "SparseOnlineGP in the state, RecursiveLeastSquares here"),

@@ -124,11 +124,11 @@ def test_a_replayed_sample_is_predicted_by_the_exact_gp_of_all_others():
         2,
         capacity=24,
         refresh_every=24,
-        jitter=1e-10,
         noise_variance=0.01,
         parts=[LearnHyperparameters(memory=24)],
     )
     learning_of(gp).steps = 0  # the kernel stays
+    gp.posterior.jitter = learning_of(gp).loss.state.jitter = 1e-10
     gp.update(x, y)
     a = learning_of(gp).loss
     s2 = gp.noise_variance

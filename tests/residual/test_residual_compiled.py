@@ -64,7 +64,6 @@ OPTIONS = {
         "kernel": DeepKernel(SquaredExponential(D), hidden=(8,)),
         "parts": [Standardize()],
     },
-    "nugget": lambda shape: {"jitter": 1e-4},
     "noises": lambda shape: {"noise_variance": torch.tensor([0.1, 0.3]).double()},
     "wanders": lambda shape: {"parts": [ProcessNoise(0.01), RobustWeight(2.0)], "refresh_every": 8},
     "offset": lambda shape: {"parts": [Standardize(output_offset="learned"), RobustWeight(3.0)]},

@@ -100,7 +100,7 @@ def test_the_better_learner_of_two_is_found_per_output():
     noise = 0.05 * torch.randn(500, 2, generator=generator, dtype=torch.float64)
     y = torch.cat([x[:, :1], torch.zeros(500, 1, dtype=torch.float64)], 1) + noise
     learners = [RecursiveLeastSquares(2, 2), ZeroResidual(2, 2)]
-    mixture = MixtureResidual(learners, shares=(1.0,))
+    mixture = MixtureResidual(learners)
     mixture.update(x, y)
     assert float(mixture.weights[0, 0]) > 0.99
     assert float((mixture(x[:50]) - y[:50]).square().mean().sqrt()) < 0.06
@@ -177,7 +177,7 @@ def test_a_fleet_is_so_many_single_mixtures():
 
 
 @pytest.mark.parametrize(
-    "options", [{"shares": ()}, {"shares": (1.5,)}, {"levels": (-0.1,)}, {"trends": (2.0,)}]
+    "options", [{"levels": ()}, {"levels": (1.5,)}, {"levels": (-0.1,)}, {"trends": (2.0,)}]
 )
 def test_wrong_choices_are_named(options):
     with pytest.raises(ParameterError, match=next(iter(options))):

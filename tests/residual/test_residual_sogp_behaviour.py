@@ -74,8 +74,9 @@ def test_textbook_recursion_does_break():
     x, y = smooth(3000)
     gp = sogp(
         4, 2, capacity=40, kernel=SquaredExponential(4, lengthscale=1.0), noise_variance=1e-4,
-        novelty_threshold=1e-9, jitter=0.0, refresh_every=10**9,
+        novelty_threshold=1e-9, refresh_every=10**9,
     )  # fmt: skip
+    gp.posterior.jitter = 0.0
     gp.update(x, y)
     identity = gp.posterior.moments[1] @ gp.posterior.gram(gp.kernel)
     on = gp.posterior.active.bool()
@@ -200,7 +201,7 @@ def test_process_noise_follows_a_change_that_a_factor_is_slow_to_forget():
     "options",
     [
         {"capacity": 0}, {"capacity": 2.5}, {"noise_variance": 0.0}, {"noise_variance": -1.0},
-        {"noise_variance": float("nan")}, {"novelty_threshold": -0.1}, {"jitter": 1.0},
+        {"noise_variance": float("nan")}, {"novelty_threshold": -0.1}, {"novelty_threshold": 1.0},
         {"refresh_every": 0}, {"batch_shape": (0,)},
         {"on_invalid": "ignore"},
     ],

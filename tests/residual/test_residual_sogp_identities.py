@@ -56,8 +56,10 @@ def exact_gp(k, x, y, xs, s2=S2):
 
 
 def learner(**options):
-    options = {"capacity": N, "noise_variance": S2, "novelty_threshold": 0.0, "jitter": 0.0, **options}
-    return sogp(D, M, kernel=options.pop("kernel", None) or kernel(), **options)
+    options = {"capacity": N, "noise_variance": S2, "novelty_threshold": 0.0, **options}
+    gp = sogp(D, M, kernel=options.pop("kernel", None) or kernel(), **options)
+    gp.posterior.jitter = 0.0
+    return gp
 
 
 def on_basis(z, **options):

@@ -10,6 +10,7 @@ from torch import nn
 
 from .._checks import check_shape
 from ..exceptions import NoDerivativeError, ParameterError
+from ..residual.base import recordable, value_and_jacobian
 from ..typing import Float, Tensor
 from .parameter_filter import FilterReport, ParameterFilter
 
@@ -57,12 +58,11 @@ class AdaptiveModel(nn.Module):
             NoDerivativeError: f carries no derivative by theta.
             ShapeError, NonFiniteError: nothing is changed.
         """
-        theta = self.theta.mean.to(action).requires_grad_(True)
-        with torch.enable_grad():
-            predicted = self.function(state, action.detach(), theta)
-            check_shape("increment", increment, predicted.shape, "as the prediction has")
-            if not predicted.requires_grad:
-                raise NoDerivativeError("its result carries none by theta")
-            rows = [torch.autograd.grad(one, theta, retain_graph=True)[0] for one in predicted]
-        noise = self.noise_std.square().expand(len(predicted))
-        return self.theta.update(increment - predicted.detach(), torch.stack(rows), noise)
+        fixed = recordable(state), recordable(action.detach())
+        predicted, rows = value_and_jacobian(
+            lambda theta: self.function(*fixed, theta), self.theta.mean.to(action)
+        )
+        check_shape("increment", increment, predicted.shape, "as the prediction has")
+        if rows is None:
+            raise NoDerivativeError("its result carries none by theta")
+        return self.theta.update(increment - predicted, rows, self.noise_std.square().expand(len(predicted)))

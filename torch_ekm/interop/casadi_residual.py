@@ -9,8 +9,7 @@ import numpy as np
 
 from .._extras import require
 from ..exceptions import ParameterError
-from ..residual import LastResidual, MixtureResidual, ResidualLearner, SparseOnlineGP, Standardize
-from ..residual.sparse_gp.part import Units
+from ..residual import LastResidual, MixtureResidual, ResidualLearner, SparseOnlineGP
 from ..typing import Array
 from .casadi_kernels import Inputs, covariance
 
@@ -35,7 +34,7 @@ class CasadiResidual:
         variance: with the variance, whose coefficients are most of p.
 
     Raises:
-        ParameterError: a learner, kernel or units of another kind.
+        ParameterError: a learner or kernel of another kind.
     """
 
     def __init__(self, learner: ResidualLearner, *, variance: bool = True) -> None:
@@ -82,15 +81,12 @@ def _build(learner: ResidualLearner, inputs: Inputs, variance: bool) -> _Express
 def _sparse(learner: SparseOnlineGP, inputs: Inputs, variance: bool) -> _Expression:
     """``mean = scale alpha'k + offset``, ``var = scale^2 (k** + k'Ck)``, k in the learner's units."""
     units, posterior = learner.units, learner.posterior
-    if isinstance(units, Standardize):
-        shift = inputs.take("shift", lambda: units.input.shift)
-        wide = inputs.take("input_scale", lambda: units.input.scale)
-        scale = inputs.take("output_scale", lambda: units.output.scale)
-        offset = inputs.take("output_shift", lambda: units.output.shift)
-    elif type(units) is Units:
-        shift, wide, scale, offset = 0.0, 1.0, ca.SX.ones(learner.out_features), 0.0
-    else:
-        raise ParameterError("units", type(units).__name__, "those of x and y, or Standardize")
+    shift, wide, scale, offset = 0.0, 1.0, ca.SX.ones(learner.out_features), 0.0
+    if units.affine():
+        names = "shift", "input_scale", "output_shift", "output_scale"
+        shift, wide, offset, scale = (
+            inputs.take(name, lambda i=i: units.affine()[i]) for i, name in enumerate(names)
+        )
     column, diagonal = covariance(learner.kernel, lambda: posterior.basis, inputs)
     alpha = inputs.take("alpha", lambda: posterior.alpha)
     C = inputs.take("C", lambda: posterior.covariance) if variance else None

@@ -18,7 +18,8 @@ from .mixture_engine import CompiledJudge
 from .report import MomentsWithJacobians, UpdateReport
 from .tails import MEMORY, ScaleMixture
 
-_CARRIES = (-0.3, 0.0, 0.2, 0.4, 0.6, 0.8)  # values of kappa to choose from
+_SHARES = (0.0, 0.5, 1.0)  # values of h to choose from
+_CARRIES = (-0.3, 0.0, 0.2, 0.4, 0.6, 0.8)  # of kappa
 _CAPS = (3.0, 30.0)  # and of c
 _PRIOR = 0.8  # belief that a learner is to be taken at its word
 _SLOW = 0.2  # largest rate of a level that outlives the end of a trajectory
@@ -51,8 +52,7 @@ class MixtureResidual(ResidualLearner):
 
     Args:
         learners: one or more of the same shapes; they belong to the mixture from now on.
-        shares, levels, trends: values of h, rho and beta to choose from; a trend goes with levels that are
-            larger.
+        levels, trends: values of rho and beta to choose from; a trend goes with levels that are larger.
         on_invalid: see ResidualLearner.
 
     Raises:
@@ -63,7 +63,6 @@ class MixtureResidual(ResidualLearner):
         self,
         learners: ResidualLearner | Sequence[ResidualLearner],
         *,
-        shares: Sequence[float] = (0.0, 0.5, 1.0),
         levels: Sequence[float] = (0.0, 0.03, 0.1),
         trends: Sequence[float] = (0.0,),
         **options: Any,
@@ -72,12 +71,12 @@ class MixtureResidual(ResidualLearner):
         first = _same_shapes(members)
         shape = {"batch_shape": tuple(first.batch_shape), "dtype": first.dtype, "device": first.device}
         super().__init__(first.in_features, first.out_features, **{**shape, **options})
-        for name, values in (("shares", shares), ("levels", levels), ("trends", trends)):
+        for name, values in (("levels", levels), ("trends", trends)):
             if not values or not all(0 <= value <= 1 for value in values):
                 raise ParameterError(name, values, "one or more numbers in [0, 1]")
         self.learners = nn.ModuleList(members)
         rises = [(rho, beta) for rho in levels for beta in trends if beta == 0 or beta < rho]
-        experts = itertools.product(range(len(members)), shares, _CARRIES, rises, _CAPS)
+        experts = itertools.product(range(len(members)), _SHARES, _CARRIES, rises, _CAPS)
         flat = [(b, h, kappa, *rise, c) for b, h, kappa, rise, c in experts]
         owner, *values = zip(*flat, strict=True)
         factory = {"dtype": self.dtype, "device": self.device}
@@ -85,10 +84,8 @@ class MixtureResidual(ResidualLearner):
         members_of = torch.nn.functional.one_hot(torch.tensor(owner), len(members))
         self.owner = nn.Buffer(members_of.to(self._like), persistent=False)
         """1 where an expert takes its mean from that learner, ``(experts, learners)``."""
-        # the belief of `shares` is split over what is not a share of 1, if 1 is among them
-        plain = self.shares == max(shares)
-        others = max(len(set(shares)) - 1, 1)
-        prior = torch.where(plain, _PRIOR, (1 - _PRIOR) / others).log()
+        # what is not believed of a share of 1 is split over the others
+        prior = torch.where(self.shares == 1.0, _PRIOR, (1 - _PRIOR) / (len(_SHARES) - 1)).log()
         self.prior = nn.Buffer(prior, persistent=False)
         wide = (*self.batch_shape, self.out_features, len(owner))
         self.evidence = nn.Buffer(torch.zeros(wide, **factory))
@@ -98,9 +95,9 @@ class MixtureResidual(ResidualLearner):
         # what a query needs of the weights: sum p h per learner, and sum p (l - kappa w)
         self.gain = nn.Buffer(torch.zeros(*wide[:-1], len(members), **factory))
         # of the experts of each learner and share: sum p, mean of l - kappa w, sum p (l - kappa w - mean)^2
-        alike = torch.zeros(*self.gain.shape, len(shares), **factory)
+        alike = torch.zeros(*self.gain.shape, len(_SHARES), **factory)
         self.mass, self.shift, self.spread = (nn.Buffer(alike.clone()) for _ in range(3))
-        self._shares = nn.Buffer(torch.tensor(shares, **factory), persistent=False)
+        self._shares = nn.Buffer(torch.tensor(_SHARES, **factory), persistent=False)
         self.offset = nn.Buffer(torch.zeros(wide[:-1], **factory))
         self.inflation = nn.Buffer(torch.ones(wide[:-1], **factory))
         self.count = nn.Buffer(torch.zeros(self.batch_shape, **factory))

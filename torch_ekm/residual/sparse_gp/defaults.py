@@ -11,7 +11,7 @@ from ..._checks import check_counts
 from .forgetting import ProcessNoise
 from .hyperparameters import LearnHyperparameters
 from .monitor import DetectChanges, RobustWeight
-from .part import Part, Units, copy_parts
+from .part import Part, copy_parts
 from .units import Standardize
 
 
@@ -37,6 +37,6 @@ def chosen_parts(parts: Iterable[nn.Module] | None, standardize: bool | Standard
         ParameterError: parts do not go together.
     """
     own = default_parts() if parts is None else copy_parts(parts)
-    if standardize and not any(isinstance(part, Units) for part in own):
+    if standardize and not any(isinstance(part, Standardize) for part in own):
         own[:0] = copy_parts([standardize if isinstance(standardize, Standardize) else Standardize()])
     return own

@@ -16,49 +16,77 @@ from ...typing import Bool, Float, Tensor
 from ..base import DoubleStateLearner
 from ..kernels.kernel import Kernel
 from ..report import UpdateReport
+from ..running_scale import RunningScale
 from .posterior import SparsePosterior
 
 
 class Units:
-    """The units in which a learner works: those of x and y, unless a part knows others."""
+    """The units in which a learner works: those of x and y, or ``z = (x - shift) / scale``, and y the same.
+
+    Args:
+        input, output: scales of x and y; None: as they are.
+        centred: whether y has an offset, too.
+    """
+
+    def __init__(
+        self, input: RunningScale | None = None, output: RunningScale | None = None, *, centred: bool = False
+    ) -> None:
+        self.input, self.output, self._centred = input, output, centred
 
     def inputs(self, x: Float[Tensor, "*any columns"]) -> Float[Tensor, "*any columns"]:
         """x, or its first columns, in the learner's units."""
-        return x
+        return x if self.input is None else self.input(x)
 
     def targets(self, y: Float[Tensor, "*any out"]) -> Float[Tensor, "*any out"]:
         """y ``(*any, out)`` in the learner's units."""
-        return y
+        return y if self.output is None else self.output(y)
 
     def of_sets(
         self, x: Float[Tensor, "*batch n in"], y: Float[Tensor, "*batch n out"]
     ) -> tuple[Tensor, Tensor]:
         """n samples of each model in the learner's units."""
-        return x, y
+        if self.input is None or self.output is None:
+            return x, y
+        return self.input.of_sets(x), self.output.of_sets(y)
 
     def sets_as_given(self, z: Float[Tensor, "*batch n in"]) -> Float[Tensor, "*batch n in"]:
         """Inputs in the learner's units back in their own."""
-        return z
+        return (
+            z if self.input is None else z * self.input.scale.unsqueeze(-2) + self.input.shift.unsqueeze(-2)
+        )
 
     def value(self, value: Float[Tensor, "*any out_or_1"], power: int) -> Tensor:
         """An output in its own unit, or (power 2) a variance in its square."""
-        return value
+        if self.output is None:
+            return value
+        if power == 1 and self._centred:
+            return value * self.output.scale + self.output.shift
+        return value * _power(self.output.scale, power)
 
     def slope(self, slope: Float[Tensor, "*any out_or_1 columns"], power: int) -> Tensor:
         """The derivative of such a value by the last columns of x."""
-        return slope
+        if self.input is None or self.output is None:
+            return slope
+        by = self.input.scale[..., None, self.input.scale.shape[-1] - slope.shape[-1] :]
+        return slope * _power(self.output.scale, power).unsqueeze(-1) / by
 
     def curvature(self, curvature: Float[Tensor, "*any out_or_1 columns columns"]) -> Tensor:
         """The second derivative of a variance by the last columns of x."""
-        return curvature
+        if self.input is None or self.output is None:
+            return curvature
+        inverse = 1.0 / self.input.scale[..., self.input.scale.shape[-1] - curvature.shape[-1] :]
+        scaled = curvature * (inverse.unsqueeze(-1) * inverse.unsqueeze(-2)).unsqueeze(-3)
+        return scaled * self.output.scale.square()[..., None, None]
 
-    def affine(self) -> tuple[Tensor, ...] | None:
-        """Buffers (shift, scale) of x, then of y, with ``z = (x - shift) / scale``, for compiled loops.
+    def affine(self) -> tuple[Tensor, ...]:
+        """Buffers (shift, scale) of x, then of y, for compiled loops, which change in place; or ``()``."""
+        if self.input is None or self.output is None:
+            return ()
+        return self.input.shift, self.input.scale, self.output.shift, self.output.scale
 
-        They are read at each call and so change in place; ``()`` if x and y stay as they are. None if the
-        units are something else: the other methods are called then.
-        """
-        return () if type(self) is Units else None
+
+def _power(scale: Tensor, power: int) -> Tensor:
+    return scale if power == 1 else scale.square()
 
 
 class Sample(NamedTuple):

@@ -22,6 +22,8 @@ class SparsePosterior(nn.Module):
     Always float64, see :class:`~torch_ekm.residual.SparseOnlineGP`. Arguments as there.
     """
 
+    jitter = 1e-6  #: nugget on k(x, x) at basis vectors, relative to k**
+
     def __init__(
         self,
         in_features: int,
@@ -29,16 +31,14 @@ class SparsePosterior(nn.Module):
         capacity: int,
         *,
         novelty_threshold: float,
-        jitter: float,
         batch_shape: tuple[int, ...] = (),
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__()
-        for name, value in (("novelty_threshold", novelty_threshold), ("jitter", jitter)):
-            if not 0 <= value < 1:
-                raise ParameterError(name, value, "in [0, 1)")
+        if not 0 <= novelty_threshold < 1:
+            raise ParameterError("novelty_threshold", novelty_threshold, "in [0, 1)")
         self.capacity, self.batch_shape, self.out_features = capacity, batch_shape, out_features
-        self.novelty_threshold, self.jitter = novelty_threshold, jitter
+        self.novelty_threshold = novelty_threshold
         factory = {"dtype": torch.float64, "device": device}
         # One slot more than the capacity: a new point moves in before another is pruned. What a
         # free slot holds in `basis` is meaningless; its rows and columns elsewhere are 0.

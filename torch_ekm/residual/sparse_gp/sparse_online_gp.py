@@ -55,7 +55,6 @@ class SparseOnlineGP(Host):
             with lengthscale sqrt(in_features) and unit variance.
         noise_variance: s2 in the (standardised) output's squared units, one number or one per output.
         novelty_threshold: smallest ``gamma / k**`` of a new basis vector.
-        jitter: nugget on k(x, x) at basis vectors, relative to k**.
         parts: what it does apart from projecting samples; copied.
         standardize: whether it follows the stream's units, unless a part does; or how.
         refresh_every: samples after which parts may change the state, and the caches are rebuilt. Without a
@@ -84,7 +83,6 @@ class SparseOnlineGP(Host):
         kernel: Kernel | None = None,
         noise_variance: float | Tensor = 0.1,
         novelty_threshold: float = 1e-4,
-        jitter: float = 1e-6,
         parts: Iterable[nn.Module] | None = None,
         standardize: bool | Standardize = True,
         refresh_every: int = 32,
@@ -102,21 +100,18 @@ class SparseOnlineGP(Host):
         noise_shape = (*shape, self.out_features)
         self.log_noise_variance = log_parameter("noise_variance", noise_variance, noise_shape, **double)
         sizes = self.in_features, self.out_features, self.capacity
-        figures = {"novelty_threshold": novelty_threshold, "jitter": jitter}
-        self.posterior = SparsePosterior(*sizes, **figures, batch_shape=shape, device=self.device)
+        fleet = {"batch_shape": shape, "device": self.device}
+        self.posterior = SparsePosterior(*sizes, novelty_threshold=novelty_threshold, **fleet)
         # samples of each model since the caches were made
         self.pending = nn.Buffer(torch.zeros(shape, **double))
         self.engine: ReferenceEngine = CompiledEngine()
         self.drifts = False  # the last look at the caches found them less exact than rounding would have it
         self.n_samples = 0  # on the host, so that the rhythm of rebuilds never asks the GPU
-        self._parts = ()
+        self._parts, self.units = (), Units()
         for part in chosen_parts(parts, standardize):
             part.bind(self)
             self._parts += (part,)
         self.parts = nn.ModuleList(self._parts)
-        units = next((part for part in self._parts if isinstance(part, Units)), Units())
-        # not as a second child: its buffers would be in the state dict twice
-        object.__setattr__(self, "units", units)
         self.weighing = _overriding(self._parts, "weigh")
         self._noting = _overriding(self._parts, "after_update")
         self._rebuilding = _overriding(self._parts, "on_rebuild", "after_rebuild")

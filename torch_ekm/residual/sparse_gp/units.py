@@ -12,7 +12,7 @@ from .part import Host, Part, Units
 _DOUBLING = 1024  # samples up to which units are adopted after 1, 2, 4, 8, ... samples, too
 
 
-class Standardize(Part, Units):
+class Standardize(Part):
     """``z = (x - shift) / scale_x``, ``t = (y - offset) / scale_y``, from robust moments of the stream.
 
     Inputs are centred where the kernel is shift invariant; outputs are only scaled, so that 0 stays 0, unless
@@ -45,38 +45,7 @@ class Standardize(Part, Units):
         centred = [self.output_offset == "learned"] * learner.out_features
         self.input = RunningScale(learner.in_features, shifted, **fleet)
         self.output = RunningScale(learner.out_features, centred, **fleet)
-
-    def inputs(self, x: Tensor) -> Tensor:
-        return self.input(x)
-
-    def targets(self, y: Tensor) -> Tensor:
-        return self.output(y)
-
-    def of_sets(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        return self.input.of_sets(x), self.output.of_sets(y)
-
-    def sets_as_given(self, z: Tensor) -> Tensor:
-        return z * self.input.scale.unsqueeze(-2) + self.input.shift.unsqueeze(-2)
-
-    def value(self, value: Tensor, power: int) -> Tensor:
-        if power == 1 and self.output_offset == "learned":
-            return value * self.output.scale + self.output.shift
-        return value * self._scale(power)
-
-    def slope(self, slope: Tensor, power: int) -> Tensor:
-        first = self.input.scale.shape[-1] - slope.shape[-1]
-        return slope * self._scale(power).unsqueeze(-1) / self.input.scale[..., None, first:]
-
-    def curvature(self, curvature: Tensor) -> Tensor:
-        inverse = 1.0 / self.input.scale[..., self.input.scale.shape[-1] - curvature.shape[-1] :]
-        scaled = curvature * (inverse.unsqueeze(-1) * inverse.unsqueeze(-2)).unsqueeze(-3)
-        return scaled * self._scale(2)[..., None, None]
-
-    def _scale(self, power: int) -> Tensor:
-        return self.output.scale if power == 1 else self.output.scale.square()
-
-    def affine(self) -> tuple[Tensor, ...]:
-        return self.input.shift, self.input.scale, self.output.shift, self.output.scale
+        learner.units = Units(self.input, self.output, centred=self.output_offset == "learned")
 
     def before_update(self, learner: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
         """Take the sample in; while units are rough, adopt them before it is learned."""

@@ -164,7 +164,7 @@ class CompiledEngine(ReferenceEngine):
         self._parameters = tuple(own[1] if own is not None else gp.kernel.parameters())
         robust = [part for part in gp.weighing if type(part) is RobustWeight]
         levels = [part.level for part in robust]
-        tensors = (*state, gp.log_noise_variance, *self._parameters, *(units or ()), *levels)
+        tensors = (*state, gp.log_noise_variance, *self._parameters, *units, *levels)
         self._sources = sources_of(gp, tensors)
         on_host = all(t.is_cpu and t.is_contiguous() for t in tensors) and gp.dtype == torch.float64
         plain = not any(t.is_inference() for t in tensors)  # these have no version
@@ -172,8 +172,8 @@ class CompiledEngine(ReferenceEngine):
             return
         self._marks, loops = [], load_loops()
         assert loops is not None  # else this is not called
-        self._given = own is None or units is None
-        kind, n_actions = (_GIVEN, 0) if self._given or own is None else own[0]
+        self._given = own is None
+        kind, n_actions = (_GIVEN, 0) if own is None else own[0]
         self._flags = np.array([kind, n_actions])
         self._robust = np.array([part.threshold**2 for part in robust])
         self._levels = levels[0].numpy().reshape(n) if levels else np.empty(0)
@@ -185,7 +185,7 @@ class CompiledEngine(ReferenceEngine):
         self._units: tuple[Array, ...] = (
             np.zeros((1, self._d)), np.ones((1, self._d)), np.zeros((1, self._m)), np.ones((1, self._m))
         )  # fmt: skip
-        if not self._given and own is not None:
+        if own is not None:
             lengthscale, variance, *others = (p.detach().numpy() for p in self._parameters)
             rows = variance.reshape(-1)
             action = others[0] if n_actions else np.zeros((len(rows), 0))
