@@ -55,14 +55,16 @@ def test_lost_missed_and_motions_are_counted(tmp_path: Path) -> None:
         record("given up", 9, off=31.0),
     ]
     theirs = [record("reached", 14)] * 3 + [record("object lost", 3)]
+    theirs[1] = dataclasses.replace(theirs[1], seconds=(0.0,) * 10)  # the third has no turn to compare with
+    ours, theirs = ([dataclasses.replace(r, trial=k) for k, r in enumerate(rs)] for rs in (ours, theirs))
     turns = Turns(tuple(ours))
     assert (turns.lost, turns.missed, turns.reached, turns.motions) == (1, 1, 2, 7.0)
     assert math.isnan(Turns(()).motions)
     survey = Survey({("arms", "strong", "KM+I"): theirs, ("arms", "strong", "E-KM"): ours})
-    verdict = "E-KM lost 1 of 4, reached 2, motions 7.0; KM+I lost 1 of 4, reached 3, motions 14.0"
+    verdict = "E-KM lost 1 of 4, reached 2, motions 7.0; KM+I lost 1 of 4, reached 3, motions 12.7"
     assert survey.verdict == verdict
     row = survey.table().text()[0]
-    assert row == ["arms strong", "4", "1, 3, 14.0", "1, 2, 7.0", "50", "1 stalled, 1 given up"]
+    assert row == ["arms strong", "4", "1, 3, 12.7", "1, 2, 7.0", "58", "1 stalled, 1 given up"]
     survey.report(tmp_path, "mujoco")
     assert verdict in (tmp_path / "report.md").read_text(encoding="utf-8")
     assert (tmp_path / "any_hand_mujoco.svg").exists()
