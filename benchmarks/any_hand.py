@@ -10,26 +10,25 @@ stopped.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from command_line import study_parser
 
 from torch_ekm._terminal import progress
-from torch_ekm.cli._app import parse_seeds
 from torch_ekm.experiments.config import Setting, digest, object_name
 from torch_ekm.experiments.jobs import run_jobs
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
-from torch_ekm.simulation import ENGINES, PlantParameters, preset
+from torch_ekm.simulation import PlantParameters, preset
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -93,8 +92,14 @@ def session(
     plant: PlantParameters, item: str, controller: str, seed: int, engine: str = "sapien"
 ) -> list[dict[str, Any]]:
     """Warm-up (E-KM only), then the turns: how each ended."""
-    setting = setting_of(plant, engine)
-    protocol = Generalize(setting, (item,), ANGLES, WARM_UP, 0.0, 0.0)
+    return turns_of(setting_of(plant, engine), item, controller, seed, ANGLES, WARM_UP)
+
+
+def turns_of(
+    setting: Setting, item: str, controller: str, seed: int, angles: tuple[float, ...], warm_up: int
+) -> list[dict[str, Any]]:
+    """Warm-up (E-KM only), then the turns: how each ended."""
+    protocol = Generalize(setting, (item,), angles, warm_up, 0.0, 0.0)
     return [one.to_json() for one in protocol.session(item, controller, seed) if one.kind == "turn"]
 
 
@@ -149,8 +154,24 @@ class Turns:
         steps = [one.steps for one in self.records if not (one.lost or one.not_reached)]
         return float(np.mean(steps)) if steps else math.nan
 
+    @property
+    def error(self) -> float:
+        """Mean true error at the end [deg]; a lost object counts with the whole angle."""
+        wrong = [one.angle_deg if one.lost else one.true_error_deg for one in self.records]
+        return float(np.mean(wrong)) if wrong else math.nan
+
+    @property
+    def other_ends(self) -> str:
+        """How those ended that did not reach the target."""
+        return count_of(one.reason for one in self.records if one.lost or one.not_reached)
+
     def __str__(self) -> str:
         return f"{self.lost}, {self.reached}, {self.motions:.1f}"
+
+
+def count_of(reasons: Iterable[str]) -> str:
+    """Each with its number, the most frequent first."""
+    return ", ".join(f"{n} {reason}" for reason, n in Counter(reasons).most_common())
 
 
 class Survey:
@@ -199,7 +220,15 @@ class Survey:
         for plant in [*self.plants, None]:
             one = [self.of(name, plant) for name in self.controllers]
             name = "all" if plant is None else " ".join(plant).replace("_", " ").strip()
-            rows.append([name, len(one[-1].records), *map(str, one), self.ratio(plant), *self._ends(plant)])
+            rows.append(
+                [
+                    name,
+                    len(one[-1].records),
+                    *map(str, one),
+                    self.ratio(plant),
+                    self.of("E-KM", plant).other_ends,
+                ]
+            )
         columns = [
             "plant",
             "turns",
@@ -214,11 +243,6 @@ class Survey:
             " hostile, which has a dead sensor, from camera and Hall sensors."
         )
         return Table("plants", "Hands of other kinds than described", columns, rows, note)
-
-    def _ends(self, plant: tuple[str, str] | None) -> list[Cell]:
-        """How the E-KM's other turns ended."""
-        ends = Counter(one.reason for one in self.of("E-KM", plant).records if one.lost or one.not_reached)
-        return [", ".join(f"{n} {reason}" for reason, n in ends.most_common())]
 
     def picture(self) -> Figure:
         """Turns lost and not reached, and motions, for each plant."""
@@ -261,21 +285,15 @@ def records_by(keys: Mapping[str, Any], results: Mapping[str, Any]) -> dict[Any,
 
 
 def main() -> None:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     names = ", ".join((*FAMILIES, *OTHERS))
+    parser = study_parser(
+        __doc__, "any_hand", objects="box,bottle", seeds="1000:1002", engine="sapien",
+        quick="one plant, object and seed",
+    )  # fmt: skip
     parser.add_argument(
         "--families", default="all", help=f"all, strong, or of {names}; FAMILY:weak for one strength"
     )
-    parser.add_argument("--objects", default="box,bottle", help="names or paths")
-    parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1002"), help="FIRST:END")
     parser.add_argument("--controllers", default=",".join(CONTROLLERS))
-    parser.add_argument("--engine", default="sapien", choices=ENGINES)
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once")
-    parser.add_argument("--out", type=Path, default=Path("any_hand_output"), help="keeps what is finished")
-    parser.add_argument(
-        "--quick", action="store_true", help="one plant, object and seed: to see that it works"
-    )
     given = parser.parse_args()
     wanted = given.families.split(",")
     objects, seeds = given.objects.split(","), given.seeds

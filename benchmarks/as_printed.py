@@ -13,7 +13,6 @@ where it stopped.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 from collections.abc import Callable, Generator, Sequence
@@ -23,9 +22,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 from any_hand import Turns, records_by
+from command_line import study_parser
 
 from torch_ekm._terminal import progress
-from torch_ekm.cli._app import parse_seeds
 from torch_ekm.control import (
     DEFAULT_TASKS,
     ActuatorLimit,
@@ -51,7 +50,7 @@ from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.model import Linearization
 from torch_ekm.plant import Observation, Plant
-from torch_ekm.simulation import ENGINES, PRESETS, preset
+from torch_ekm.simulation import PRESETS, preset
 
 WARM_UP = 3
 CAPACITY = 60  # basis vectors; the paper gives no figure
@@ -172,12 +171,7 @@ class Systems:
     def errors(self, name: str, item: str | None = None) -> np.ndarray:
         """Mean steady-state error of each pair of object and seed [deg]; lost objects count with the whole
         angle."""
-        wrong = (
-            [one.angle_deg if one.lost else one.true_error_deg for one in records]
-            for records in self._pairs(name, item)
-            if records
-        )
-        return np.array([np.mean(each) for each in wrong])
+        return np.array([Turns(tuple(records)).error for records in self._pairs(name, item) if records])
 
     def summary(self) -> Table:
         """A row for each system."""
@@ -247,10 +241,10 @@ class Systems:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
-    parser.add_argument("--objects", default=",".join(TABLE_I), help="names or paths")
-    parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1010"), help="FIRST:END")
+    parser = study_parser(
+        __doc__, "as_printed", objects=",".join(TABLE_I), seeds="1000:1010", engine="sapien",
+        quick="one object, seed and angle",
+    )  # fmt: skip
     parser.add_argument(
         "--systems",
         default="all",
@@ -258,12 +252,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         help="fingertips: E-KM with and without",
     )
     parser.add_argument("--preset", default="nominal", choices=list(PRESETS))
-    parser.add_argument("--engine", default="sapien", choices=ENGINES)
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once")
-    parser.add_argument("--out", type=Path, default=Path("as_printed_output"), help="keeps what is finished")
-    parser.add_argument(
-        "--quick", action="store_true", help="one object, seed and angle: to see that it works"
-    )
     given = parser.parse_args(arguments)
     objects, seeds, angles = given.objects.split(","), given.seeds, None
     if given.quick:

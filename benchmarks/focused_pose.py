@@ -11,7 +11,6 @@ goes on where it stopped.
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -20,9 +19,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
+from command_line import study_parser
 
 from torch_ekm._terminal import progress
-from torch_ekm.cli._app import parse_seeds
 from torch_ekm.control import (
     ClosedLoop,
     Direction,
@@ -38,7 +37,7 @@ from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figu
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.kinematics import GraspState
-from torch_ekm.simulation import ENGINES, preset
+from torch_ekm.simulation import preset
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -275,19 +274,11 @@ class Outcome:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
-    parser.add_argument("--objects", default="box,can", help="names or paths")
-    parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1004"), help="FIRST:END")
+    parser = study_parser(
+        __doc__, "focused_pose", objects="box,can", seeds="1000:1004", engine="mujoco",
+        quick="one object, one seed, whole poses",
+    )  # fmt: skip
     parser.add_argument("--preset", default="nominal")
-    parser.add_argument("--engine", default="mujoco", choices=ENGINES)
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once")
-    parser.add_argument(
-        "--out", type=Path, default=Path("focused_pose_output"), help="keeps what is finished"
-    )
-    parser.add_argument(
-        "--quick", action="store_true", help="one object, one seed, whole poses: to see that it works"
-    )
     given = parser.parse_args(arguments)
     objects, seeds, groups = given.objects.split(","), given.seeds, list(TARGETS)
     if given.quick:

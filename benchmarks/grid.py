@@ -9,25 +9,22 @@ Finished sessions stay in ``--out``: an interrupted run goes on where it stopped
 
 from __future__ import annotations
 
-import argparse
 import itertools
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from any_hand import Turns, records_by
+from any_hand import Turns, records_by, turns_of
+from command_line import study_parser
 
 from torch_ekm._terminal import progress
-from torch_ekm.cli._app import parse_seeds
 from torch_ekm.experiments.config import Setting, digest, object_name
 from torch_ekm.experiments.jobs import run_jobs
-from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.plots import new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
-from torch_ekm.simulation import ENGINES, PlantConfig, preset
+from torch_ekm.simulation import PlantConfig, preset
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,8 +64,7 @@ def cells(engine: str) -> dict[str, Setting]:
 
 def session(setting: Setting, item: str, controller: str, seed: int) -> list[dict[str, Any]]:
     """Warm-up (E-KM only), then the turns: how each ended."""
-    protocol = Generalize(setting, (item,), ANGLES, WARM_UP, 0.0, 0.0)
-    return [one.to_json() for one in protocol.session(item, controller, seed) if one.kind == "turn"]
+    return turns_of(setting, item, controller, seed, ANGLES, WARM_UP)
 
 
 class Grid:
@@ -83,20 +79,14 @@ class Grid:
         found = (mine for key, mine in self.turns.items() if key[1] == controller and cell in (None, key[0]))
         return Turns(tuple(itertools.chain.from_iterable(found)))
 
-    @staticmethod
-    def error(turns: Turns) -> float:
-        """Mean true error at the end [deg]; a lost object counts with the whole angle."""
-        wrong = [one.angle_deg if one.lost else one.true_error_deg for one in turns.records]
-        return float(np.mean(wrong)) if wrong else float("nan")
-
     @property
     def verdict(self) -> str:
         """The last line."""
         ours, theirs = (self.of(name) for name in CONTROLLERS)
         return (
             f"E-KM lost {ours.lost} of {len(ours.records)}, reached {ours.reached},"
-            f" error {self.error(ours):.2f} deg; KM+I lost {theirs.lost}, reached {theirs.reached},"
-            f" error {self.error(theirs):.2f} deg"
+            f" error {ours.error:.2f} deg; KM+I lost {theirs.lost}, reached {theirs.reached},"
+            f" error {theirs.error:.2f} deg"
         )
 
     def table(self) -> Table:
@@ -104,7 +94,7 @@ class Grid:
         rows: list[list[Cell]] = []
         for cell in (*self.cells, None):
             found = [self.of(name, cell) for name in CONTROLLERS]
-            figures = ((one.lost, one.reached, self.error(one)) for one in found)
+            figures = ((one.lost, one.reached, one.error) for one in found)
             turns = len(found[0].records)
             rows.append([cell or "all", turns, *itertools.chain.from_iterable(figures)])
         columns: list[str | Column] = ["cell", "turns"]
@@ -119,14 +109,8 @@ class Grid:
         """How the turns ended that did not reach their target."""
         rows: list[list[Cell]] = []
         for cell in self.cells:
-            missed = {
-                name: Counter(o.reason for o in self.of(name, cell).records if o.lost or o.not_reached)
-                for name in CONTROLLERS
-            }
-            if any(missed.values()):
-                ends = (
-                    ", ".join(f"{n} {why}" for why, n in missed[name].most_common()) for name in CONTROLLERS
-                )
+            ends = [self.of(name, cell).other_ends for name in CONTROLLERS]
+            if any(ends):
                 rows.append([cell, *ends])
         return Table("ends", "Lost, or not reached", ["cell", *CONTROLLERS], rows)
 
@@ -151,7 +135,7 @@ class Grid:
 
     def _map(self, axis: Any, controller: str, shown: list[list[str]], named: bool) -> None:
         """Colours by the error; in each cell the error, and how many objects were lost."""
-        error = np.array([[self.error(self.of(controller, cell)) for cell in row] for row in shown])
+        error = np.array([[self.of(controller, cell).error for cell in row] for row in shown])
         low, high = np.log(_COLOURS)
         share = (np.log(np.maximum(error, 1e-3)) - low) / (high - low)
         axis.imshow(share, cmap="cividis_r", vmin=0, vmax=1, aspect="auto")
@@ -176,17 +160,11 @@ class Grid:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
-    parser.add_argument("--objects", default="box,can", help="names or paths")
-    parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1004"), help="FIRST:END")
+    parser = study_parser(
+        __doc__, "grid", objects="box,can", seeds="1000:1004", engine="mujoco",
+        quick="one cell, object and seed",
+    )  # fmt: skip
     parser.add_argument("--cells", default="", help="names separated by semicolons; all if left out")
-    parser.add_argument("--engine", default="mujoco", choices=ENGINES)
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once")
-    parser.add_argument("--out", type=Path, default=Path("grid_output"), help="keeps what is finished")
-    parser.add_argument(
-        "--quick", action="store_true", help="one cell, object and seed: to see that it works"
-    )
     given = parser.parse_args(arguments)
     objects, seeds, found = given.objects.split(","), given.seeds, cells(given.engine)
     wanted = [name.strip() for name in given.cells.split(";")] if given.cells else list(found)

@@ -11,18 +11,17 @@ interrupted run goes on where it stopped.
 
 from __future__ import annotations
 
-import argparse
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from any_hand import count_of
+from command_line import study_parser
 from focused_pose import axes_of
 
 from torch_ekm._terminal import progress
-from torch_ekm.cli._app import parse_seeds
 from torch_ekm.exceptions import EKMError
 from torch_ekm.experiments.config import Setting, digest
 from torch_ekm.experiments.jobs import run_jobs
@@ -31,7 +30,7 @@ from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figu
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.kinematics import GraspState
-from torch_ekm.simulation import ENGINES, preset
+from torch_ekm.simulation import preset
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -198,7 +197,7 @@ class Outcome:
                 if turns := self.of(part, sign=sign):
                     counts = len(turns), sum(turn.lost for turn in turns), sum(turn.reached for turn in turns)
                     error = float(np.mean([turn.error for turn in turns if not turn.lost] or [np.nan]))
-                    ends = _ends(turns)
+                    ends = count_of(turn.reason for turn in turns if not turn.reached)
                     rows.append(
                         [f"{part}, {'+' if sign > 0 else '-'}", *counts, _motions(turns), error, ends]
                     )
@@ -260,26 +259,12 @@ def _motions(turns: Iterable[Turn]) -> float | None:
     return float(np.mean(motions)) if motions else None
 
 
-def _ends(turns: Iterable[Turn]) -> str:
-    """How the others ended."""
-    ends = Counter(turn.reason for turn in turns if not turn.reached)
-    return ", ".join(f"{n} {reason}" for reason, n in ends.most_common())
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
-    parser.add_argument("--objects", default="box,can", help="names or paths")
-    parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1005"), help="FIRST:END")
+    parser = study_parser(
+        __doc__, "there_and_back", objects="box,can", seeds="1000:1005", engine="mujoco",
+        quick="one object, one seed, two turns of each",
+    )  # fmt: skip
     parser.add_argument("--preset", default="nominal")
-    parser.add_argument("--engine", default="mujoco", choices=ENGINES)
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once")
-    parser.add_argument(
-        "--out", type=Path, default=Path("there_and_back_output"), help="keeps what is finished"
-    )
-    parser.add_argument(
-        "--quick", action="store_true", help="one object, one seed, two turns of each: to see that it works"
-    )
     given = parser.parse_args(arguments)
     objects, seeds, most = given.objects.split(","), given.seeds, None
     if given.quick:

@@ -10,23 +10,22 @@ true plus noise. Finished sessions stay in ``--out``: an interrupted run goes on
 
 from __future__ import annotations
 
-import argparse
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from any_hand import count_of
+from command_line import study_parser
 
 from torch_ekm._terminal import progress
-from torch_ekm.cli._app import parse_seeds
 from torch_ekm.experiments.config import Setting, digest
 from torch_ekm.experiments.jobs import run_jobs
 from torch_ekm.experiments.protocols.generalize import ENDS
 from torch_ekm.experiments.records import TrialRecord, true_state
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
 from torch_ekm.experiments.runner import Bench
-from torch_ekm.simulation import ENGINES
 
 FAR = 90.0  # [deg] farther than grasps go
 WARM_UP = 8.0  # [deg]
@@ -65,7 +64,7 @@ def ends_table(turns: Sequence[dict[str, Any]]) -> Table:
     rows: list[list[Cell]] = []
     for item, mine in by.items():
         angles = [turn["angle"] for turn in mine]
-        ends = ", ".join(f"{n} {end}" for end, n in Counter(turn["end"] for turn in mine).most_common())
+        ends = count_of(turn["end"] for turn in mine)
         spread = min(angles), float(np.median(angles)), max(angles)
         lost = sum(turn["lost"] for turn in mine)
         rows.append([item, len(mine), *spread, end_of(angles), lost, ends])
@@ -78,14 +77,10 @@ def ends_table(turns: Sequence[dict[str, Any]]) -> Table:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
-    parser.add_argument("--objects", default=",".join(ENDS), help="names or paths")
-    parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("0:8"), help="FIRST:END")
-    parser.add_argument("--engine", default="sapien", choices=ENGINES)
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once")
-    parser.add_argument("--out", type=Path, default=Path("workspace_output"), help="keeps what is finished")
-    parser.add_argument("--quick", action="store_true", help="one object, one seed: to see that it works")
+    parser = study_parser(
+        __doc__, "workspace", objects=",".join(ENDS), seeds="0:8", engine="sapien",
+        quick="one object, one seed",
+    )  # fmt: skip
     given = parser.parse_args(arguments)
     objects, seeds, far = given.objects.split(","), given.seeds, FAR
     if given.quick:

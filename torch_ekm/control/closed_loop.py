@@ -188,7 +188,8 @@ class ClosedLoop:
             raise
 
     def _motions(self, target: PoseTarget) -> Generator[Step, None, Stop]:
-        watch = Watch(self.safety.guards, self.controller.kinematic, self._expect, self.safety.rule.tolerance)
+        model = self.controller.kinematic
+        watch = Watch(self.safety.guards, model, self._expect, self.safety.rule.tolerance)
         first = watch.first(self.plant.observe(), self.plant.observe)
         seen = first.seen
         self.controller.reset()
@@ -216,7 +217,7 @@ class ClosedLoop:
                 if progress.halt is not None:
                     self.hold()
                 elif over.reason is StopReason.STALLED:
-                    over = over._replace(message=watch.hindrances(seen, decision))
+                    over = over._replace(message=progress.hindrances(seen, decision, model))
                     seen = yield from self._return_to_best(seen, decision, progress, watch)
                 return Stop(over.reason, seen, over.message)
             seen, decision, sign, seconds = self._decide(seen, progress, watch)
@@ -273,9 +274,8 @@ class ClosedLoop:
         looks = self.safety.caution.looks
         while True:
             began = time.perf_counter()
-            decision = self.controller.decide(
-                seen.state, seen.a, progress.belief.target(seen), seen.fingertip_force
-            )
+            target = progress.belief.target(seen)
+            decision = self.controller.decide(seen.state, seen.a, target, seen.fingertip_force)
             seconds = time.perf_counter() - began
             sign = progress.sign(seen, decision)
             if not sign or looks == 0 or seen.status is not PlantStatus.HELD:

@@ -144,8 +144,7 @@ class StepBound:
                 even = max(float(others.min()), 0.0) / max(self.even * float(others.mean()), 1e-9)
                 phi = min(phi, max(1 / max(asked, 1.0), even**2))
         friction = float(lin.contacts.friction.mean()) * force
-        stands = (seen.focus.off_matrix @ seen.error).numpy()[~translation]
-        room = min(max((_OFF - math.sqrt(stands @ stands)) / (_OFF - _ON), 0.0), 1.0)
+        room = min(max((_OFF - seen.focus.off_rotation(seen.error)) / (_OFF - _ON), 0.0), 1.0)
         spare = self.creep * (1 + max(asked - 1.0, 0.0) * room) * friction / max(seen.weight, 1e-3)
         before, after = lin.margins.numpy(), lin.margins_after(delta_a).numpy()
         missing = after < -spare

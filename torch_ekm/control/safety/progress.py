@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 from ...model import ModelStatus
 from ...plant import Observation, PlantStatus
@@ -10,9 +11,14 @@ from ...typing import Tensor
 from ..belief import Belief
 from ..decision import Decision, StopReason
 from ..focus import FocusedPose, PoseTarget
+from ..pace import FIRM
 from .safety import Objection, Safety
 
+if TYPE_CHECKING:
+    from ...model import KinematicModel
+
 _LEAP = math.radians(4)  # of a pose beyond what was predicted, where nothing else has changed: worth a word
+_AT_STOP = math.radians(0.5)  # a joint as near to the end of its range stands there
 _STRAYED = 2.0  # tolerances of the error by which a turn that stalls has left its best state
 
 
@@ -76,15 +82,31 @@ class Progress:
         """What speaks for a loss to come; empty: nothing."""
         if decision.status is not StopReason.RUNNING:
             return decision.message
-        lin, turned = decision.linearization, self._off_rotation(seen)
-        near = () if lin is None else (d for d in lin.doubts if d.kind is ModelStatus.LINK_TOUCHES)
-        bearing = {doubt.what for doubt in near if doubt.value < self.safety.caution.link_gap}
+        turned, bearing = self._off_rotation(seen), _bearing(decision, self.safety.caution.link_gap)
         self._bearing = bearing if self._bearing is None else self._bearing
         if turned > self._off_allowed:
             return f"the object has turned {math.degrees(turned):.1f} deg off the focus"
-        if bearing <= self._bearing:
+        return "" if bearing <= self._bearing else _bears(min(bearing - self._bearing))
+
+    def hindrances(self, seen: Observation, decision: Decision | None, model: KinematicModel) -> str:
+        """What f, linearized for the decision, sees that keeps the object from its target; empty: nothing."""
+        if decision is None or decision.linearization is None:
             return ""
-        return f"link '{min(bearing - self._bearing)}', which has no pad, bears on the object"
+        lin, grip, q, hand = decision.linearization, decision.grip, seen.q.numpy(), model.hand
+        found = []
+        if grip is not None and float(grip.force.max()) < FIRM * grip.wanted:
+            found.append(
+                f"turning waits for a grip of {grip.wanted:.1f} N, and no finger bears more than "
+                f"{float(grip.force.max()):.1f} N"
+            )
+        found += map(_bears, sorted(_bearing(decision, self.safety.caution.link_gap)))
+        stands = (q <= hand.joint_lower + _AT_STOP) | (q >= hand.joint_upper - _AT_STOP)
+        stands &= (hand.joint_lower < hand.joint_upper) & model.moving(lin.contacts).numpy()
+        found += [f"joint '{hand.joint_names[j]}' stands at its stop" for j in stands.nonzero()[0]]
+        slide = [d.what for d in lin.doubts if d.kind is ModelStatus.FRICTION_LIMIT]
+        found += [f"pad '{pad}' is at its friction limit" for pad in slide]
+        found += [d.message for d in lin.doubts if d.kind is ModelStatus.SENSORS_DISAGREE]
+        return "; ".join(found)
 
     def alarm(self, seen: Observation) -> None:
         """A sign is heeded: an object that has slid off the focus may stay there, and turn a little more."""
@@ -144,3 +166,13 @@ class Progress:
             off = self.focus.off_rotation(seen.state.minus(self._start))
             self._judged = seen, (self.focus.error(self.target, seen.state), off)
         return self._judged[1]
+
+
+def _bearing(decision: Decision, gap: float) -> set[str]:
+    """Links without a pad that are as near to the object as ``gap`` [m]."""
+    doubts = () if decision.linearization is None else decision.linearization.doubts
+    return {d.what for d in doubts if d.kind is ModelStatus.LINK_TOUCHES and d.value < gap}
+
+
+def _bears(link: str) -> str:
+    return f"link '{link}', which has no pad, bears on the object"

@@ -11,11 +11,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 
 from ...exceptions import GraspError
-from ...model import ModelStatus
 from ...plant import Observation, PlantStatus
 from ...typing import Tensor
 from ..decision import Decision, Expectation, StopReason
-from ..pace import FIRM
 from .fingertips import FingertipWatch
 from .grip import GripWatch
 from .readings import ReadingTests, agree, deg
@@ -27,8 +25,6 @@ if TYPE_CHECKING:
 _DEG = math.pi / 180
 _STILL = 0.05 * _DEG  # an encoder that moves less stands
 _STRETCH = 12 * _DEG  # tendons stretch by less
-_AT_STOP = 0.5 * _DEG  # a joint as near to the end of its range stands there
-_BEARS = 0.2e-3  # [m] a link as near to the object bears on it
 _ASKED = 0.5 * _DEG  # a smaller command to a motor that was stuck before does not show whether it still is
 
 
@@ -188,27 +184,6 @@ class Watch:
             "'torch-ekm check --plant'"
         )
         return Objection(StopReason.WRONG_WAY, message)
-
-    def hindrances(self, seen: Observation, decision: Decision | None) -> str:
-        """What the model sees that keeps the object from its target; empty: nothing."""
-        if decision is None or decision.linearization is None:
-            return ""
-        lin, grip, q, hand = decision.linearization, decision.grip, seen.q.numpy(), self.hand
-        found = []
-        if grip is not None and float(grip.force.max()) < FIRM * grip.wanted:
-            found.append(
-                f"turning waits for a grip of {grip.wanted:.1f} N, and no finger bears more than "
-                f"{float(grip.force.max()):.1f} N"
-            )
-        bears = [d for d in lin.doubts if d.kind is ModelStatus.LINK_TOUCHES and d.value < _BEARS]
-        found += [f"link '{doubt.what}', which has no pad, bears on the object" for doubt in bears]
-        stands = (q <= hand.joint_lower + _AT_STOP) | (q >= hand.joint_upper - _AT_STOP)
-        stands &= (hand.joint_lower < hand.joint_upper) & self.fingertips.model.moving(lin.contacts).numpy()
-        found += [f"joint '{hand.joint_names[j]}' stands at its stop" for j in stands.nonzero()[0]]
-        slide = [d.what for d in lin.doubts if d.kind is ModelStatus.FRICTION_LIMIT]
-        found += [f"pad '{pad}' is at its friction limit" for pad in slide]
-        found += [d.message for d in lin.doubts if d.kind is ModelStatus.SENSORS_DISAGREE]
-        return "; ".join(found)
 
     def suspects(self, seen: Observation) -> str:
         """Which sensors contradict each other where the model refuses a state."""
