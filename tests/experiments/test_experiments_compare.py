@@ -10,13 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from torch_ekm._terminal import print_report
-from torch_ekm.cli import app
-from torch_ekm.exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
+from torch_ekm.exceptions import ParameterError, ShapeError, UnknownNameError
 from torch_ekm.experiments import compare
-from torch_ekm.experiments.learner_comparison.recordings import load_recording
 from torch_ekm.experiments.learner_comparison.report import ComparisonReport, overview_table, score_table
 from torch_ekm.experiments.learner_comparison.run import run_one
 from torch_ekm.experiments.learner_comparison.scores import (
@@ -24,7 +21,7 @@ from torch_ekm.experiments.learner_comparison.scores import (
     Score,
     block_bootstrap,
 )
-from torch_ekm.experiments.learner_comparison.stream import Stream, in_own_units, load_table
+from torch_ekm.experiments.learner_comparison.stream import Stream
 from torch_ekm.experiments.learner_comparison.table_file import open_table
 from torch_ekm.experiments.learners import COMPARED, LEARNERS, learner_factory
 from torch_ekm.experiments.reporting.report import Report, Table
@@ -202,178 +199,11 @@ def test_every_kind_of_learner_in_the_package_contends() -> None:
             assert cls is residual.ResidualLearner or issubclass(cls, kinds), f"{name} is not compared"
 
 
-# -- files ----------------------------------------------------------------------------------------
-
-
-def table(n: int = 60) -> np.ndarray:
-    return np.random.default_rng(0).normal(size=(n, 4))
-
-
-def write(path: Path, values: np.ndarray, names: str = "a,b,c,y") -> Path:
-    np.savetxt(path, values, delimiter=",", header=names, comments="")
-    return path
-
-
-GOOD = "1,2,3\n" * 50
-BROKEN = {
-    "text": ("a,b,y\n1,2,3\n4,wood,6\n", r"line 3, column 'b': 'wood' is no number"),
-    "missing": ("a,b,y\n1,2,3\n4,,6\n", r"line 3, column 'b' is empty"),
-    "nan": ("a,b,y\n1,2,3\n4,nan,6\n", r"line 3, column 'b': 'nan' is not finite"),
-    "one row": ("a,b,y\n1,2,3\n", r"it has 1 samples; at least 40"),
-    "header only": ("a,b,y\n", r"it has 0 samples"),
-    "no header": ("1,2,3\n4,5,6\n", r"line 1 holds numbers only; the first line must name"),
-    "ragged": ("a,b,y\n1,2,3\n1,2\n", r"line 3 has 2 fields, but the header names 3"),
-    "empty": ("\n \n", r"the file is empty"),
-    "twice": ("a,a,y\n" + GOOD, r"two columns are called 'a'"),
-    "nameless": ("a,,y\n" + GOOD, r"column 2 has no name"),
-    "targets only": ("y1,y2,y3\n" + GOOD, r"all columns are targets"),
-}
-
-
-@pytest.mark.parametrize("case", BROKEN)
-def test_a_broken_file_is_told_by_line_and_column(case: str, tmp_path: Path) -> None:
-    text, message = BROKEN[case]
-    path = tmp_path / "broken.csv"
-    path.write_text(text)
-    with pytest.raises(DescriptionError, match=message):
-        load_table(path)
-
-
-def test_other_files(tmp_path: Path) -> None:
-    with pytest.raises(DescriptionError, match="no such file"):
-        load_table(tmp_path / "nothing.csv")
-    (tmp_path / "a.xlsx").write_text("x")
-    with pytest.raises(DescriptionError, match=r"'\.xlsx' are not read"):
-        load_table(tmp_path / "a.xlsx")
-    (tmp_path / "latin.csv").write_bytes("größe,y\n1,2\n".encode("latin-1"))
-    with pytest.raises(DescriptionError, match="UTF-8"):
-        load_table(tmp_path / "latin.csv")
-    with pytest.raises(UnknownNameError, match="t42"):
-        load_recording("t43")
-    with pytest.raises(UnknownNameError, match="a, b, c, y"):
-        load_table(write(tmp_path / "good.csv", table()), ["torque"])
-
-
-@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
-def test_csv_is_read_as_it_was_written(delimiter: str, tmp_path: Path) -> None:
-    values = table()
-    path = tmp_path / "good.csv"
-    np.savetxt(path, values, delimiter=delimiter, header=delimiter.join("abcd"), comments="", fmt="%.17g")
-    names, read = open_table(path)
-    assert names == ("a", "b", "c", "d")
-    np.testing.assert_array_equal(read("dbca"), values[:, [3, 1, 2, 0]])
-
-
-def test_parquet_is_csv(tmp_path: Path) -> None:
-    pyarrow = pytest.importorskip("pyarrow")
-    parquet = pytest.importorskip("pyarrow.parquet")
-    values = table()
-    columns = dict(zip("abcd", values.T, strict=True))
-    parquet.write_table(pyarrow.table(columns), tmp_path / "good.parquet")
-    names, read = open_table(tmp_path / "good.parquet")
-    assert names == ("a", "b", "c", "d")
-    np.testing.assert_array_equal(read("dbca"), values[:, [3, 1, 2, 0]])
-    holes = pyarrow.table({"a": [1.0, None], "y": [1.0, 2.0]})
-    parquet.write_table(holes, tmp_path / "holes.parquet")
-    with pytest.raises(DescriptionError, match="row 2, column 'a'"):
-        load_table(tmp_path / "holes.parquet")
-    parquet.write_table(pyarrow.table({"a": ["wood"], "y": [1.0]}), tmp_path / "text.parquet")
-    with pytest.raises(DescriptionError, match="column 'a' holds string"):
-        load_table(tmp_path / "text.parquet")
-    (tmp_path / "fake.parquet").write_text("no")
-    with pytest.raises(DescriptionError, match="no Parquet file"):
-        load_table(tmp_path / "fake.parquet")
-
-
-def test_targets_are_named_or_found(tmp_path: Path) -> None:
-    values = table()
-    path = write(tmp_path / "a.csv", values, "a,b,c,load")
-    with pytest.raises(DescriptionError, match=r"no column is called 'y'.*--targets.* are a, b, c, load"):
-        load_table(path)
-    assert load_table(path, ["a", "c"]).y.shape == (60, 2)
-    assert load_table(write(tmp_path / "b.csv", values, "y1,a,y2,b")).y.shape == (60, 2)
-
-
-@pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_columns_that_are_not_asked_for_may_hold_anything(kind: str, tmp_path: Path) -> None:
-    values, path = table(), tmp_path / f"a.{kind}"
-    if kind == "csv":
-        lines = [",".join(["monday", *map(repr, row), ""]) for row in values.tolist()]
-        path.write_text("\n".join(["day,a,b,c,y,note", *lines]))
-    else:
-        parquet, pyarrow = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("pyarrow")
-        columns = {"day": ["monday"] * 60, **dict(zip("abcy", values.T, strict=True)), "note": [None] * 60}
-        parquet.write_table(pyarrow.table(columns), path)
-    chosen, given = load_table(path, inputs=["c", "a"]), in_own_units("a", values[:, [2, 0]], values[:, 3:])
-    torch.testing.assert_close(chosen.x, given.x)
-    torch.testing.assert_close(chosen.y, given.y)
-    with pytest.raises(DescriptionError, match="column 'day'"):
-        load_table(path)
-    with pytest.raises(DescriptionError, match="column 'y' cannot be both"):
-        load_table(path, inputs=["a", "y"])
-    with pytest.raises(UnknownNameError, match=r"torque.*day, a, b, c, y, note"):
-        load_table(path, inputs=["torque"])
-
-
-def test_y_is_measured_less_predicted_and_runs_stand_for_themselves(tmp_path: Path) -> None:
-    values = np.column_stack([np.arange(60), table(), np.arange(60) // 10])
-    path = write(tmp_path / "a.csv", values, ",a,b,said,seen,run")  # as pandas writes it, its index first
-    stream = load_table(path, ["seen"], predicted=["said"], run="run")
-    given = in_own_units("a", values[:, 1:3], values[:, 4:5] - values[:, 3:4], centre_y=False)
-    torch.testing.assert_close(stream.x, given.x)
-    torch.testing.assert_close(stream.y, given.y)
-    assert stream.segments == (10,) * 6
-    assert load_table(path, ["seen"], 35, predicted=["said"], run="run").segments == (10, 10, 10, 5)
-    with pytest.raises(ParameterError, match="one for each measured column"):
-        load_table(path, ["seen", "a"], predicted=["said"])
-    arguments = ["compare", "--data", str(path), "--predicted", "said", "--learners", "linear RLS"]
-    whole = [*arguments, "--measured", "seen", "--run", "run", "--out", str(tmp_path / "out"), "--jobs", "1"]
-    result = CliRunner().invoke(app, whole)
-    assert result.exit_code == 0, result.output
-    assert "in 6 parts" in " ".join(result.output.split())
-    assert isinstance(CliRunner().invoke(app, arguments).exception, ParameterError)
-
-
-def test_a_clock_among_the_inputs_is_suspected(tmp_path: Path) -> None:
-    run = np.arange(60) // 20
-    values = np.column_stack([np.arange(60) % 20, table()[:, 1:], run])
-    stream = load_table(write(tmp_path / "a.csv", values, "time,b,c,y,run"), run="run")
-    assert "time only grows" in compare(stream, ("linear RLS",)).verdicts()[0]
-    assert not load_table(write(tmp_path / "b.csv", table())).notes
-
-
 def test_an_absurd_density_is_told(compared: Comparison) -> None:
     scores = {key: dataclasses.replace(score, nll=1e6) for key, score in compared.scores.items()}
     absurd = dataclasses.replace(compared, scores=scores).verdicts()[0]
     assert "Too certain by far (NLL): model alone, linear RLS, SOGP plain" in absurd
     assert "certain" not in compared.verdicts()[0]
-
-
-def test_rest_at_the_beginning_is_no_unit() -> None:
-    moving = table(300)
-    moving[:40] *= 1e-5
-    stream = in_own_units("a", moving[:, :3], moving[:, 3:])
-    assert max(float(stream.x.abs().max()), float(stream.y.abs().max())) < 6
-
-
-def test_how_many_of_how_many_rows_were_used_is_told(tmp_path: Path) -> None:
-    stream = load_table(write(tmp_path / "a.csv", table(60)), limit=50)
-    assert stream.used == "the first 50 of 60 rows"
-    report = compare(stream, ("default", "linear RLS"))
-    assert report.verdicts()[0].endswith("On the first 50 of 60 rows.")
-    assert "default" in report.verdicts()[0]
-    assert report.tables()[0].rows[0][0] in ("default", "default *")
-
-
-def test_units_come_from_the_warm_up_alone() -> None:
-    values = table(300)
-    changed = values.copy()
-    changed[100:] *= 50.0
-    one, two = (in_own_units("a", v[:, :3], v[:, 3:]) for v in (values, changed))
-    assert one.warm_up == 30
-    torch.testing.assert_close(one.x[:100], two.x[:100], rtol=0, atol=0)
-    torch.testing.assert_close(one.y[:100], two.y[:100], rtol=0, atol=0)
-    assert float(one.x[:30].std(0, correction=0).sub(1).abs().max()) < 1e-12
 
 
 def test_a_stream_survives_its_file(tmp_path: Path) -> None:
@@ -382,65 +212,3 @@ def test_a_stream_survives_its_file(tmp_path: Path) -> None:
     values = read(names)
     assert names == ("x1", "x2", "x3", "y1", "y2")
     np.testing.assert_array_equal(values, torch.cat([stream.x, stream.y], 1).numpy())
-
-
-def test_data_folder_must_be_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.delenv("TORCH_EKM_DATA", raising=False)
-    with pytest.raises(DescriptionError, match="TORCH_EKM_DATA"):
-        load_recording("t42")
-    monkeypatch.setenv("TORCH_EKM_DATA", str(tmp_path))
-    with pytest.raises(DescriptionError, match="not there"):
-        load_recording("t42")
-
-
-def test_icub_grasp_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "icub_grasp" / "iCubGraspDataset"
-    folder.mkdir(parents=True)
-    for trial in (2, 1, 10):
-        slices = []
-        for t in range(20):
-            slices += [" ".join([str(10.0 * t + trial)] * 9)]
-            slices += [" ".join(["5.0"] * 5)] + [" ".join(["240"] * 12)] * 5
-        (folder / f"book_{trial}.txt").write_text("-10000\n" + "\n".join(slices) + "\n")
-    monkeypatch.setenv("TORCH_EKM_DATA", str(tmp_path))
-    recording = load_recording("icub_grasp", limit=None)
-    assert recording.segments == (18, 18, 18)
-    assert recording.x.shape == (54, 23)
-    torch.testing.assert_close(recording.y, torch.ones(54, 9, dtype=torch.float64))  # 10 deg a step, unit 10
-    firsts = recording.x[::18, 0] * 30.0
-    assert firsts.tolist() == pytest.approx([11.0, 12.0, 20.0])  # trials 1, 2, 10 in this order
-
-
-def test_command_prints_and_writes_what_the_function_returns(tmp_path: Path) -> None:
-    path, out = write(tmp_path / "mine.csv", table(80)), tmp_path / "out"
-    arguments = ["compare", "--data", str(path), "--learners", "linear RLS,SOGP plain", "--out", str(out)]
-    result = CliRunner().invoke(app, [*arguments, "--jobs", "1"])
-    assert result.exit_code == 0, result.output
-    for name in ("index.html", "scores.svg", "scores_mine.csv", "curve_mine.png", "configuration.json"):
-        assert (out / name).stat().st_size > 100, name
-    direct = compare(path, ("linear RLS", "SOGP plain"))
-    written = (out / "scores_mine.csv").read_text().splitlines()[1:]
-    for line, score in zip(written, direct.row("mine"), strict=True):
-        assert line.split(",")[1].strip('"').startswith(f"{score.rms.mean:.3f} [")
-
-
-def test_command_refuses_clearly(tmp_path: Path) -> None:
-    path = write(tmp_path / "mine.csv", table(80))
-    result = CliRunner().invoke(app, ["compare", "--data", str(path), "--learners", "magic"])
-    assert isinstance(result.exception, UnknownNameError)
-    assert not Path("compare_output").exists()
-
-
-@pytest.mark.usefixtures("planned_anew")
-def test_simulated_hand_repeats_bit_by_bit() -> None:
-    pytest.importorskip("sapien")
-    from torch_ekm.experiments.learner_comparison.simulated_stream import record_simulated_hand
-
-    one = record_simulated_hand(12, seed=3)
-    assert one.x.shape == (12, 26)
-    assert one.y.shape == (12, 6)
-    assert sum(one.segments) == 12
-    assert len(one.segments) > 1  # grasped again
-    same = record_simulated_hand(12, seed=3)
-    assert torch.equal(one.x, same.x)
-    assert torch.equal(one.y, same.y)

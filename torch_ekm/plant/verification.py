@@ -34,7 +34,7 @@ def verify_log(folder: str | Path) -> list[Finding]:
     """Check every byte of a log: each trial, the index, and the hand's and object's files it was made from.
 
     A trial is right if its SHA-256 is, it can be read, it is the one that its name says, and its
-    configuration is that of the others. The digests detect damage, not somebody who changes a file
+    configuration is that of the others. The digests detect damage, not deliberate changes of a file
     and its digest.
 
     Returns:

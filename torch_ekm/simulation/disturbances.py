@@ -1,4 +1,4 @@
-"""Things that happen in the middle of a run: a tendon is replaced, somebody tugs at the object."""
+"""Things that happen in the middle of a run: a tendon is replaced, the object is tugged at."""
 
 from __future__ import annotations
 

@@ -209,7 +209,7 @@ def _is_plain(x: Any, shape: tuple[int, ...]) -> bool:
     """Whether x is an ordinary tensor of that shape, of which torch keeps no record."""
     if not is_plain(x) or x.shape != shape or not x.is_contiguous():
         return False
-    # somebody records what torch is asked to do: torch has no public way to ask
+    # operations of torch are being recorded: torch has no public way to ask
     return not is_in_torch_dispatch_mode() and not torch.jit.is_tracing()
 
 
