@@ -63,7 +63,7 @@ def test_a_sensor_that_is_off_is_named(held, sensor, since) -> None:
 
 
 def test_moment_arms_that_are_not_as_described_are_no_fault_of_a_sensor(held) -> None:
-    seen, axis, model = held
+    seen, _, model = held
     watch = Watch(Guards(), model, lambda lin, moved: None)
     watch.first(seen, lambda: seen)
     J_a = model.hand.actuation_jacobian
