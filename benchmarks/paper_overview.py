@@ -70,6 +70,7 @@ def _bars(axis: Any, series: Sequence[tuple[str, str, bool, Sequence[float]]]) -
         look = {"facecolor": "none", "edgecolor": colour, "hatch": "////"} if paper else {"facecolor": colour}
         axis.bar(x, values, 0.9 * width, label=label, linewidth=0.8, **look)
     axis.set_xticks(range(len(TABLE_II)), [item.replace("_", "\n") for item in TABLE_II], fontsize=8)
+    axis.margins(y=0.35)  # for the legend
 
 
 def _draw_errors(axis: Any, nominal: Errors) -> None:
@@ -109,7 +110,7 @@ def _draw_cells(axis: Any, cells: Sequence[tuple[str, float, float]], missing: s
         axis.plot([x - 0.6, x + 0.6], [CAN_TRIAL_2] * 2, color=_PAPER, linewidth=1.5, label=label)
     middles = [float(np.mean(there)) for there in places.values()]
     axis.set_xticks(middles, [item.replace("_", "\n") for item in places], fontsize=8)
-    axis.set_ylim(0, 1.35 * max(max(cell[1:]) for cell in cells))
+    axis.set_ylim(0, max(1.35 * max(max(cell[1:]) for cell in cells), 1.6 * CAN_TRIAL_2))
 
 
 def _draw_curves(axis: Any, ekm: DataFrame, km: DataFrame, events: Sequence[int]) -> None:
