@@ -50,7 +50,7 @@ def test_some_systems_alone_are_told_without_the_others() -> None:
 
 
 def test_the_misprinted_stiffness_is_the_papers_letter_by_letter() -> None:
-    """``D_oq dq = sum_i (J_i dq) x f_i``, the printed sign of T; nothing stands in the object's own columns."""
+    """``D_oq dq = sum_i (J_i dq) x f_i``, the printed sign of T; the object's own columns are empty."""
     pytest.importorskip("mujoco")
     bench = MisprintedBench(as_printed.as_printed(Setting(engine="mujoco")), "box", "KM")
     state = bench.grasp(3, 0)
