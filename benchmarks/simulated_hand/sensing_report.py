@@ -136,7 +136,7 @@ class Outcome:
         worst = max((row["largest"] for row in self.hall), default=math.nan)
         ekm, km = self.of("E-KM"), self.of("KM")
         alone = np.abs(self.motors["position controller alone"])
-        steps = [rms(e for t in ekm for e in getattr(t, name)) for name in ("one_step_km", "one_step")]
+        steps = [_mean(e for t in ekm for e in getattr(t, name)) for name in ("one_step_km", "one_step")]
         items = [item for item in TABLE_II if self.of("E-KM", item=item)]
         stated = [f"{item} {TABLE_II[item][0]}, {TABLE_II[item][1]}" for item in items]
         errors = {item: [_error(self.of(who, item=item)) for who in ("KM", "E-KM")] for item in items}
@@ -161,7 +161,7 @@ class Outcome:
              f"{np.median(blind or [math.nan]):.2f}, {max(blind, default=math.nan):.2f} deg"],
         ]  # fmt: skip
         note = (
-            "Depth: rms, 0.35 to 0.45 m from the camera. One motion: rms, here of the E-KM's motions. "
+            "Depth: rms, 0.35 to 0.45 m from the camera. One motion: mean, here of both on the E-KM's motions. "
             "End of a turn: mean; here of turns of 9, 19 and 27 deg, not of Table I's."
         )
         return Table(
@@ -175,9 +175,9 @@ class Outcome:
             if turns := self.of(who, readings):
                 held = [turn for turn in turns if not turn.lost]
                 count = f"{sum(turn.reached for turn in turns)} of {len(turns)}", sum(t.lost for t in turns)
-                motions = float(np.mean([turn.motions for turn in turns if turn.reached] or [math.nan]))
+                motions = _mean(turn.motions for turn in turns if turn.reached)
                 figures = (
-                    rms(e for turn in held for e in turn.one_step),
+                    _mean(e for turn in held for e in turn.one_step),
                     rms(e for turn in held for row in turn.joints for e in row),
                     rms(e for turn in held for e in turn.rotation),
                 )
@@ -187,9 +187,9 @@ class Outcome:
             "joints [deg]", Column("rotation [deg]", ".3f"),
         ]  # fmt: skip
         note = (
-            "Means of turns that reached the target (motions), and of objects that were not lost (error); "
-            "rms of predictions of one motion, by the truth, of joint angles, and of the measured rotation since "
-            "the grasp. All sensed: lens from 20 pictures, Hall sensors. Fingertips are noisy in all rows."
+            "Means: motions of turns that reached the target, true error of objects that were not lost, error "
+            "of the prediction of one motion by the truth; rms: joint angles, measured rotation since the "
+            "grasp. All sensed: lens from 20 pictures, Hall sensors. Fingertips are noisy in all."
         )
         return Table("turns", "What the readings are worth in turns", columns, rows, note)
 
@@ -210,7 +210,7 @@ class Outcome:
         ]  # fmt: skip
         note = (
             "Over a second sweep of the whole range, where the channel is not saturated; no reading: share "
-            "of the range where it is. Misfit: what a cubic misses; the rest is noise and rounding. A count is "
+            "of the range where it is. Misfit: what a cubic misses; the rest is noise, rounding. A count is "
             f"about {90 / 255:.2f} deg. In turns: after encoders, couplings and contacts are joined."
         )
         return Table("hall", "Hall fit of each joint", columns, rows, note)
@@ -263,8 +263,8 @@ class Outcome:
         columns = ["measured by", "turns", "reached", "lost", "median error [deg]", "largest [deg]"]
         note = (
             f"Turns of {BLIND:g} deg there and back in one grasp, the camera off since its start. Reached: "
-            "by the estimate. Touch: joints and fingertips correct the prediction. True error about the axis at "
-            "the end, of objects in the hand."
+            "by the estimate. Touch: joints and fingertips correct the prediction. True error about the axis "
+            "at the end, of objects in the hand."
         )
         return Table("blind", "Whole turns without the camera", columns, rows, note)
 
@@ -331,7 +331,12 @@ class Outcome:
         return report
 
 
+def _mean(values: Iterable[float]) -> float:
+    """NaN of none."""
+    found = list(values)
+    return float(np.mean(found)) if found else math.nan
+
+
 def _error(turns: Iterable[Turn]) -> float:
     """Mean true error of objects that were not lost [deg]."""
-    errors = [turn.error for turn in turns if not turn.lost]
-    return float(np.mean(errors)) if errors else math.nan
+    return _mean(turn.error for turn in turns if not turn.lost)

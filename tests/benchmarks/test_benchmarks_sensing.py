@@ -19,7 +19,7 @@ from simulated_hand.tracking_accuracy import measure_tracking
 
 def turn(controller: str, error: float, **other) -> Turn:
     usual = {"readings": "all sensed", "object": "box", "seed": 0, "angle": 9.0, "lost": False, "motions": 5}
-    motions = {"one_step": [0.3, -0.4], "one_step_km": [1.0, 1.0], "motors": [0.5, -1.5]}
+    motions = {"one_step": [0.3, 0.4], "one_step_km": [1.0, 1.0], "motors": [0.5, -1.5]}
     read = {"joints": [[1.0, 2.0], [1.0, -2.0]], "rotation": [0.1], "position": [0.2]}
     return Turn(controller=controller, error=error, reached=True, **{**usual, **motions, **read, **other})
 
