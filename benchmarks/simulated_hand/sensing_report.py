@@ -161,7 +161,7 @@ class Outcome:
              f"{np.median(blind or [math.nan]):.2f}, {max(blind, default=math.nan):.2f} deg"],
         ]  # fmt: skip
         note = (
-            "Depth: rms, 0.35 to 0.45 m from the camera. One motion: mean, here of both on the E-KM's motions. "
+            "Depth: rms, 0.35 to 0.45 m from the camera. One motion: mean, here on the E-KM's motions. "
             "End of a turn: mean; here of turns of 9, 19 and 27 deg, not of Table I's."
         )
         return Table(
@@ -187,9 +187,9 @@ class Outcome:
             "joints [deg]", Column("rotation [deg]", ".3f"),
         ]  # fmt: skip
         note = (
-            "Means: motions of turns that reached the target, true error of objects that were not lost, error "
-            "of the prediction of one motion by the truth; rms: joint angles, measured rotation since the "
-            "grasp. All sensed: lens from 20 pictures, Hall sensors. Fingertips are noisy in all."
+            "Means: motions of turns that reached the target, true error of objects that were not lost, "
+            "error of the prediction of one motion by the truth. Root mean squares: joint angles, measured "
+            "rotation since the grasp. All sensed: lens from 20 pictures, Hall sensors, fingertips."
         )
         return Table("turns", "What the readings are worth in turns", columns, rows, note)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import partial
 from pathlib import Path
 
@@ -83,6 +84,19 @@ def test_a_quick_run_prints_its_verdict_and_is_kept(tmp_path: Path, monkeypatch,
     assert (tmp_path / "sensing.svg").exists()
     kept = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*_1.json")}
     assert len(kept) == 4
+    turns, blind = (
+        json.loads(next(tmp_path.glob(f"{part}_*.json")).read_text())["result"] for part in ("turns", "blind")
+    )
+    errors = np.array(turns[0]["joints"])
+    assert 0.05 < np.sqrt(np.mean(errors[:, 1:4] ** 2)) < 2.0  # [deg] of Hall sensors
+    assert len(errors) == turns[0]["motions"] + 1 == len(turns[0]["position"])
+    assert 0.01 < np.abs(turns[0]["motors"]).max() < 3.0
+    assert max(turns[0]["position"]) < 1.0
+    sighted, touch, _ = (one["motions"] for one in blind)
+    assert all(at["sd"] is None for at in sighted)
+    assert 0 < touch[0]["sd"] < touch[-1]["sd"] < 1.0
+    assert max(abs(at["error"]) for at in sighted) < 0.3
+    assert np.diff([0.0, *(at["s"] for at in touch)]).min() > 0.1
     sensing.main(words)
     assert capsys.readouterr().out.splitlines()[-1] == first
     assert kept == {path: path.stat().st_mtime_ns for path in kept}
