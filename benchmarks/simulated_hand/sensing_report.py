@@ -123,10 +123,15 @@ class Outcome:
     def verdict(self) -> str:
         """The last line."""
         wrong, calibrated = (self.lens(name, "depth") for name in ("not calibrated", "20 pictures"))
+        alone = rms(self.motors["position controller alone"])
+        steps = [_mean(e for t in self.of("E-KM", name) for e in t.one_step) for name in list(READINGS)[:2]]
+        dark = float(np.median(self.first("touch") or [math.nan]))
+        most = max((len(one["motions"]) for one in self.blind if one["by"] == "touch"), default=0)
         return (
             f"Hall fit {rms(row['rms'] for row in self.hall):.2f} deg; depth {wrong:.1f} mm, calibrated "
-            f"{calibrated:.2f} mm; motors {rms(self.motors['position controller alone']):.2f} deg; a turn "
-            f"without the camera {np.median(self.first('touch') or [math.nan]):.2f} deg"
+            f"{calibrated:.2f} mm; motors {alone:.2f} deg; prediction of one motion {steps[0]:.2f} deg, with "
+            f"true joint angles {steps[1]:.2f} deg; a turn without the camera {dark:.2f} deg, after {most} "
+            f"motions {self.dark('touch', most, 'error') if most else math.nan:.1f} deg"
         )
 
     def paper_table(self) -> Table:
@@ -151,7 +156,7 @@ class Outcome:
              f"{self.lens('not calibrated', 'depth'):.1f} mm"],
             ["depth of a board, lens calibrated", '"reduced"',
              f"{self.lens('20 pictures', 'depth'):.2f} mm"],
-            ["position controller: rms, within 1 deg", "+-1 deg",
+            ["position controller: rms, within 1 deg", "±1 deg",
              f"{rms(alone):.2f} deg, {100 * float((alone <= 1).mean()) if len(alone) else math.nan:.0f} %"],
             ["one motion's prediction: KM, E-KM", "E-KM at least 0.57 deg better",
              f"{steps[0]:.2f}, {steps[1]:.2f} deg"],
@@ -160,9 +165,12 @@ class Outcome:
             [f"a blind turn of {BLIND:g} deg: median, largest", "not tried",
              f"{np.median(blind or [math.nan]):.2f}, {max(blind, default=math.nan):.2f} deg"],
         ]  # fmt: skip
+        middle = float(np.median([turn.error for turn in ekm if not turn.lost] or [math.nan]))
         note = (
-            "Depth: rms, 0.35 to 0.45 m from the camera. One motion: mean, here on the E-KM's motions. "
-            "End of a turn: mean; here of turns of 9, 19 and 27 deg, not of Table I's."
+            "Depth: rms, 0.35 to 0.45 m from the camera. One motion: mean, here on the E-KM's motions. End "
+            "of a turn: mean; here of turns of 9, 19 and 27 deg, not of Table I's; the largest of the E-KM's "
+            f"is {max((turn.error for turn in ekm if not turn.lost), default=math.nan):.1f}, their median "
+            f"{middle:.2f} deg."
         )
         return Table(
             "paper", "The paper's sensing, and the same here", ["figure", "paper", "here"], rows, note
@@ -293,12 +301,12 @@ class Outcome:
         for k, name in enumerate(LENSES):
             values = [lens["known"][name]["depth"] for lens in self.lenses]
             depth.plot([k] * len(values), values, "o", ms=5, alpha=0.7, color=COLOURS["E-KM"])
-        depth.set_xticks(range(len(LENSES)), [name.replace(" ", "\n") for name in LENSES])
+        depth.set_xticks(range(len(LENSES)), [name.replace(" ", "\n") for name in LENSES], fontsize=8)
         depth.set(yscale="log", ylabel="depth, rms [mm]", xlabel="lens", xlim=(-0.5, len(LENSES) - 0.5))
         for (name, errors), colour in zip(self.motors.items(), (COLOURS["KM"], COLOURS["E-KM"]), strict=True):
             if errors:
                 motors.ecdf(np.abs(errors), color=colour, label=name)
-        motors.axvline(1.0, color=COLOURS["limit"], linestyle="--", label="the paper's +-1 deg")
+        motors.axvline(1.0, color=COLOURS["limit"], linestyle="--", label="the paper's ±1 deg")
         motors.set(xlabel="error of a motor [deg]", ylabel="share of the motions", xlim=(0, 2))
         motors.legend(loc="lower right", frameon=False, fontsize=7)
         for name, who in zip(BLIND_BY, ("KM", "E-KM", "KM+I"), strict=True):
@@ -307,7 +315,7 @@ class Outcome:
             dark.plot(numbers, [self.dark(name, n, "error") for n in numbers], color=COLOURS[who], label=name)
             stated = [self.dark(name, n, "sd") for n in numbers]
             dark.plot(numbers, stated, "--", lw=1, color=COLOURS[who])
-        dark.set(xlabel="motions since the last picture (dashed: stated)", ylabel="rotation, rms [deg]")
+        dark.set(xlabel="motions, camera off (dashed: stated)", ylabel="rotation, rms [deg]")
         dark.legend(frameon=False, fontsize=7)
         return figure
 

@@ -61,7 +61,7 @@ def test_figures_are_those_of_the_turns() -> None:
     rows = {row[0]: row[1:] for row in outcome.paper_table().text()}
     assert rows["Hall fit over a sweep: rms, largest"][1] == "3.00, 6.0 deg"
     assert rows["joints in turns: with, without Hall sensor"][1] == "1.00, 2.00 deg"
-    assert rows["position controller: rms, within 1 deg"] == ["+-1 deg", "1.12 deg, 50 %"]
+    assert rows["position controller: rms, within 1 deg"] == ["±1 deg", "1.12 deg, 50 %"]
     assert rows["one motion's prediction: KM, E-KM"][1] == "1.00, 0.35 deg"
     assert rows["end of a turn: KM, E-KM"] == ["box 2.8, 0.8 deg", "box 2.0, 0.1 deg"]
     assert rows["a blind turn of 15 deg: median, largest"][1] == "1.00, 1.00 deg"
