@@ -18,9 +18,11 @@ from wirings import T42, write
 
 pytest.importorskip("dynamixel_sdk")
 
+from dynamixel_bus import DynamixelBus
+from motors import Motors
+
 from torch_ekm.drivers import DynamixelPlant
 from torch_ekm.exceptions import BusError, DescriptionError, DeviceError
-from torch_ekm.testing import DynamixelBus, Motors
 
 DEG = math.pi / 180
 TICK = 2 * math.pi / 4096
@@ -88,7 +90,7 @@ FAULTS = {
 
 
 def _signed(packet: bytes) -> bytes:
-    from torch_ekm.testing.dynamixel_bus import checksum
+    from dynamixel_bus import checksum
 
     return packet + checksum(packet).to_bytes(2, "little")
 

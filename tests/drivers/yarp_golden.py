@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from torch_ekm.testing import Motors
+from motors import Motors
 
 WELCOME = b"Welcome torch_ekm\r\n"
 AXES = 9
@@ -91,7 +91,7 @@ class GoldenYarp:
         self.commands.append(text)
         moved = re.fullmatch(r"\[set\] \[pos\] (\d+) (\S+)", text)
         if moved is not None:
-            goal = list(self.motors._goal)
+            goal = list(self.motors.goal)
             goal[int(moved[1]) - 7] = float(moved[2])
             self.motors.send(goal)
         return "[ok]"
