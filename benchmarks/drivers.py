@@ -9,6 +9,7 @@ kills after which the motors stood within 100 ms.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import os
 import random
@@ -238,6 +239,18 @@ def wrong_wirings() -> tuple[int, int]:
     return int(found[1]) if found else 0, 12
 
 
+def kept(out: Path, folder: Path, bus: Bus, measure: Callable[..., Any], n: int) -> Any:
+    """What ``measure(bus, folder, n)`` gives, from ``out`` if it is there."""
+    path = out / f"{bus.kind}_{measure.__name__}_{n}.json"
+    if not path.exists():
+        found = measure(bus, folder, n)
+        out.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(found), encoding="utf-8")
+    found = json.loads(path.read_text(encoding="utf-8"))
+    tell(f"{bus.kind} {measure.__name__}: {found}")
+    return found
+
+
 def tell(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
@@ -248,6 +261,7 @@ def main() -> None:
         "--yarp-python", default=sys.executable, metavar="PATH", help="a Python with YARP's bindings"
     )
     options.add_argument("--quick", action="store_true", help="a fiftieth of it: to see that it works")
+    options.add_argument("--out", type=Path, default=Path("drivers_output"), help="keeps what is finished")
     given = options.parse_args()
     n_turns, n_spoilt, n = (1, 200, 2) if given.quick else (20, 10_000, 50)
     rows, parts, killed, of = [], [], 0, 0
@@ -261,13 +275,11 @@ def main() -> None:
             if not bus.installed:
                 parts.append(f"{bus.kind} not installed")
                 continue
-            median, tenth = added(bus, folder, n)
-            stood, longest = kills(bus, folder, n)
-            tell(f"{bus.kind}: {median:.1f} ms, {tenth:.1f} ms; stood {stood}, {longest:.0f} ms at most")
-            count, motions, errors, beyond = spoilt(bus, folder, n_spoilt)
-            tell(f"{bus.kind}: {count} spoilt, {motions} motions, {errors} errors, {beyond} beyond")
-            pulled = pulls(bus, folder, n)
-            agree, most = turns(bus, folder, n_turns)
+            done = partial(kept, given.out, folder, bus)
+            median, tenth = done(added, n)
+            stood, longest = done(kills, n)
+            count, motions, errors, beyond = done(spoilt, n_spoilt)
+            pulled, (agree, most) = done(pulls, n), done(turns, n_turns)
             rows.append(
                 f"|{bus.kind}: {bus.end}|{agree}/{n_turns}, {most:.4f} deg"
                 f"|{count}: {motions} motions, {errors} typed errors|{beyond}"
