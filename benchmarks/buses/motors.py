@@ -43,7 +43,7 @@ class Motors:
     @property
     def moving(self) -> bool:
         """Whether one has not arrived."""
-        return self.now() != self.goal
+        return time.monotonic() < self.stands_at
 
     def send(self, goal: Sequence[float]) -> None:
         """Off to other goals."""
