@@ -19,6 +19,7 @@ import contextlib
 import json
 import os
 import select
+import signal
 import socket
 import struct
 import subprocess
@@ -164,7 +165,7 @@ class Yarp:
         environment = {**os.environ, "YARP_CONFIG_HOME": self._folder.name}
         server = [str(Path(python).parent / "yarpserver"), "--socket", str(self._server)]
         quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        self._processes = [subprocess.Popen(server, env=environment, **quiet)]
+        self._processes = [subprocess.Popen(server, env=environment, start_new_session=True, **quiet)]
         self.place = f"127.0.0.1:{self._server}"
         end = time.monotonic() + 30
         while not self._ask("query /root").startswith("Welcome"):
@@ -179,6 +180,7 @@ class Yarp:
             stderr=subprocess.DEVNULL,
             text=True,
             env=environment,
+            start_new_session=True,
         )
         self._processes.append(self._board)
         assert self._board.stdout is not None
@@ -264,7 +266,7 @@ class Yarp:
 
     def close(self) -> None:
         for one in self._processes:
-            one.kill()
+            os.killpg(one.pid, signal.SIGKILL)  # yarpserver is started by a script
             one.wait()
         self._folder.cleanup()
 

@@ -275,7 +275,7 @@ class HandDriver(ABC):
             if now - began > seconds + self.limits.timeout:
                 break
             left = seen[0][0] + self.limits.still_for - now if seen else _POLL
-            time.sleep(min(_POLL, max(0.0, left)))
+            time.sleep(left if 0 < left < _POLL else _POLL)
         with contextlib.suppress(Exception):
             self.hold()
         names = [m.name for m, way in zip(self.wiring.motors, self._spread(seen), strict=True) if way]
