@@ -14,7 +14,7 @@ pytest.importorskip("rclpy", reason="rclpy is not here: source a ROS 2, or insta
 from far_end import BUSES, End
 
 from torch_ekm.drivers import Ros2Plant, RosPose, WithPose
-from torch_ekm.exceptions import BusError, DescriptionError, StaleReadingError
+from torch_ekm.exceptions import BusError, DescriptionError, NeverAtRestError, StaleReadingError
 
 ROS2 = next(bus for bus in BUSES if bus.kind == "ros2")
 TEXT = """\
@@ -92,9 +92,10 @@ def test_a_motion_a_pose_and_faults_over_ros(hand, path) -> None:
             wrong()
         hand.ask("pull silent")
         time.sleep(0.1)
-        with pytest.raises(StaleReadingError, match=r"motors of hand.toml"):
+        with pytest.raises(NeverAtRestError, match="sends nothing new"):
             driver.command(radians(0.05, 0.0))
-        assert hand.ask("goals") == []
+        with pytest.raises(StaleReadingError, match=r"motors of hand.toml"):
+            driver.hold()
         hand.ask("plug")
 
 
