@@ -29,7 +29,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent / "buses"))
 
-from far_end import BUSES, OBJECT, SPEED, Bus, opened, simulated, wiring
+from far_end import BUSES, OBJECT, SPEED, UNITS, Bus, opened, simulated, wiring
 
 from torch_ekm.control import ClosedLoop, LookAndMoveController, Manipulation, PoseTarget, StopReason
 from torch_ekm.description import HandDescription, load_object
@@ -113,7 +113,8 @@ def spoilt(bus: Bus, folder: Path, n: int) -> tuple[int, int, int, int]:
         bus.driver(path) as driver,
     ):
         channels = driver.wiring.motors
-        slack = [1e-6 + (1.5 / one.per_unit if bus.kind == "dynamixel" else 0.0) for one in channels]
+        # where the motors are is known to within the motion that counts as rest, and a tick of the bus
+        slack = driver.limits.still + (1.5 / UNITS["dynamixel"] if bus.kind == "dynamixel" else 1e-6)
         end.ask("goals")
         while count < n:
             at = [one.value(x) for one, x in zip(channels, end.rest()["motors"], strict=True)]
@@ -127,8 +128,8 @@ def spoilt(bus: Bus, folder: Path, n: int) -> tuple[int, int, int, int]:
             for goal in end.ask("goals"):
                 a = [one.value(x) for one, x in zip(channels, goal, strict=True)]
                 beyond += not all(
-                    abs(x - here) <= 0.03 + e and one.lower - e <= x <= one.upper + e
-                    for x, here, one, e in zip(a, at, channels, slack, strict=True)
+                    abs(x - here) <= 0.03 + slack and one.lower - slack <= x <= one.upper + slack
+                    for x, here, one in zip(a, at, channels, strict=True)
                 )
             count = end.ask("now")["spoilt"]
         end.ask("spoil 0")
