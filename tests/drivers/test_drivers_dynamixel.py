@@ -148,7 +148,7 @@ def test_garbled_messages_send_no_motor_beyond_its_limits(bus, tmp_path) -> None
     """Cut, doubled, late and garbled answers: the command is right, or there is a typed error."""
     draw = random.Random(0)
     with open_at(bus, tmp_path, still="still_for = 0.05|still_for = 0.01") as plant:
-        bus.spoil, failures, motions = Spoiler(0.3, seed=0), 0, 0
+        bus.spoil, failures, motions = Spoiler(0.1, seed=0), 0, 0
         for _ in range(25):
             while bus.motors.moving:
                 time.sleep(0.002)
