@@ -258,9 +258,9 @@ def tell(text: str) -> None:
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    options.add_argument(
-        "--yarp-python", default=sys.executable, metavar="PATH", help="a Python with YARP's bindings"
-    )
+    python = os.environ.get("TORCH_EKM_YARP_PYTHON", sys.executable)
+    about = "that has YARP's bindings; $TORCH_EKM_YARP_PYTHON"
+    options.add_argument("--yarp-python", default=python, metavar="PATH", help=about)
     options.add_argument("--quick", action="store_true", help="a fiftieth of it: to see that it works")
     options.add_argument("--out", type=Path, default=Path("drivers_output"), help="keeps what is finished")
     given = options.parse_args()
