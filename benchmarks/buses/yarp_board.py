@@ -7,10 +7,10 @@ comes back is the answer.
 import os
 import sys
 
-import yarp
-
 
 def main() -> None:
+    import yarp
+
     lines = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # where YARP logs
     yarp.Network.init()
