@@ -1,7 +1,9 @@
-"""Drivers against the genuine other ends that are installed: python benchmarks/drivers.py [--turns N].
+"""Drivers against the genuine other ends that are installed: python benchmarks/drivers.py.
 
-The same simulated hand is turned in process and behind each bus. Last line: turns that agree within 0.05 deg
-and have the same reason, wrong wirings refused, kills after which the hand stood within 100 ms.
+The same simulated hand is turned in process and behind each bus; then motors alone are sent spoilt messages,
+lose their cable, and their driver's process is killed. YARP's bindings may be installed in another Python
+than this one. Last line: turns that agree within 0.05 deg and have the same reason, wrong wirings refused,
+kills after which the motors stood within 100 ms.
 """
 
 from __future__ import annotations
@@ -10,39 +12,35 @@ import argparse
 import json
 import math
 import os
+import random
 import re
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from importlib.util import find_spec
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
-from torch_ekm.control import ClosedLoop, LookAndMoveController, Manipulation, PoseTarget
+sys.path.insert(0, str(Path(__file__).parent / "buses"))
+
+from far_end import BUSES, OBJECT, SPEED, UNITS, Bus, opened, simulated, wiring
+
+from torch_ekm.control import ClosedLoop, LookAndMoveController, Manipulation, PoseTarget, StopReason
 from torch_ekm.description import HandDescription, load_object
-from torch_ekm.drivers import Channel, DynamixelPlant, HandDriver, Ros2Plant, Sighting, WithPose
+from torch_ekm.drivers import Channel, WithPose, dynamixel, yarp
 from torch_ekm.enhanced import EnhancedModel
+from torch_ekm.exceptions import DeviceError
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, Plant, PlantWrapper
-from torch_ekm.simulation import SimulatedHand, preset
 
-HAND, OBJECT, DEGREES = "planar_two_finger", "can", 8.0
-TICKS = 4096 / (2 * math.pi)
+DEGREES = 8.0
 DEG = math.pi / 180
-ZEROS, SIGNS = (900, 3100), (1, -1)
-
-
-def simulated() -> SimulatedHand:
-    """A used hand; noise and what is drawn at each motion are off, so that two runs can be compared."""
-    still = {name: 0.0 for name in ("actuator_error", "joint_noise", "position_noise", "rotation_noise")}
-    parameters = preset("nominal").replace(**still, force_noise=0.0, force_sensors=False)
-    return SimulatedHand(HAND, OBJECT, parameters=parameters)
 
 
 class Rounded(PlantWrapper):
@@ -79,85 +77,10 @@ def turn(plant: Plant, hand: HandDescription, seen: Observation, degrees: float)
     return loop.run(PoseTarget.turned(seen.state, axis, degrees=degrees))
 
 
-class Bus(NamedTuple):
-    """A driver, and what its other end is called."""
-
-    kind: str
-    driver: Callable[..., HandDriver]
-    needs: str
-    per_rad: float
-    digits: Callable[[float], float]
-
-
-BUSES = (
-    Bus("dynamixel", DynamixelPlant, "dynamixel_sdk", TICKS, lambda x: float(round(x))),
-    Bus("ros2", Ros2Plant, "rclpy", 1.0, float),
-)
-
-
-class End:
-    """The other end, a process of its own with the hand; lines in, lines out."""
-
-    def __init__(self, kind: str, *arguments: str) -> None:
-        command = [sys.executable, str(Path(__file__).with_name("bus_ends.py")), kind, *arguments]
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        self.port = self._line().split()[-1]
-
-    def _line(self) -> str:
-        assert self.process.stdout is not None
-        return self.process.stdout.readline()
-
-    def ask(self, word: str) -> Any:
-        assert self.process.stdin is not None
-        self.process.stdin.write(word + "\n")
-        self.process.stdin.flush()
-        return json.loads(self._line())
-
-    def __call__(self) -> Sighting:
-        """The object and the joints, as the hand's own camera sees them."""
-        seen = self.ask("pose")
-        q, position, rotation = (
-            torch.tensor(seen[n], dtype=torch.float64) for n in ("q", "position", "rotation")
-        )
-        return Sighting(position, rotation, time.monotonic(), q)
-
-    def lost(self, _: Sighting) -> bool:
-        return self.ask("pose")["lost"]
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.wait()
-
-
-def wiring(bus: Bus, folder: Path, port: str, hand: HandDescription, rate: float = 100.0) -> Path:
-    place = (
-        f'port = "{port}"\nbaud = 1000000\n'
-        if bus.kind == "dynamixel"
-        else 'command = "/hand/joint_trajectory"\n'
-    )
-    text = f'[hand]\ndriver = "{bus.kind}"\ndescription = "{HAND}"\n[bus]\n{place}'
-    text += f"[limits]\nrate_deg = {rate}\nstill_for = 0.05\n"
-    for k, name in enumerate(hand.actuator_names):
-        number, zero = (str(k + 1), ZEROS[k]) if bus.kind == "dynamixel" else (f'"{name}"', 0)
-        text += f'[[motors]]\nname = "{name}"\nid = {number}\nsign = {SIGNS[k]}\nzero = {zero}\n'
-    path = folder / "hand.toml"
-    path.write_text(text)
-    return path
-
-
-@contextmanager
-def opened(bus: Bus, folder: Path, *arguments: str, rate: float = 100.0) -> Iterator[tuple[End, Path]]:
-    end = End(bus.kind, *arguments)
-    try:
-        yield end, wiring(bus, folder, end.port, SimulatedHand(HAND, OBJECT).hand, rate)
-    finally:
-        end.close()
-
-
 def turns(bus: Bus, folder: Path, n: int) -> tuple[int, float]:
-    """How many agree, and the largest time that the driver adds to a motion [ms]."""
-    agree, inner = 0, simulated()
-    with opened(bus, folder) as (end, path), bus.driver(path) as driver:
+    """How many agree, and by how much those that agree differ at most [deg]."""
+    agree, most, inner = 0, 0.0, simulated()
+    with opened(bus, folder, "hand") as (end, path), bus.driver(path) as driver:
         plant = WithPose(driver, end, lost=end.lost)
         for seed in range(1000, 1000 + n):
             degrees = DEGREES if seed % 2 else -DEGREES
@@ -166,54 +89,145 @@ def turns(bus: Bus, folder: Path, n: int) -> tuple[int, float]:
             one = turn(here, driver.hand, here.observation(first), degrees)
             end.ask(f"reset {seed}")
             other = turn(plant, driver.hand, plant.reset(seed), degrees)
-            off = (
-                float(torch.linalg.vector_norm(one.stop.final.state.minus(other.stop.final.state)[-3:])) / DEG
-            )
+            apart = one.stop.final.state.minus(other.stop.final.state)[-3:]
+            off = float(torch.linalg.vector_norm(apart)) / DEG
             same = off <= 0.05 and one.reason is other.reason
-            agree += same
-            print(
+            agree, most = agree + same, max(most, off) if same else most
+            tell(
                 f"{bus.kind} {seed}: {one.reason.value}, {other.reason.value}, {len(one.steps)} and "
-                f"{len(other.steps)} motions, {off:.4f} deg apart{'' if same else '  <--'}",
-                flush=True,
+                f"{len(other.steps)} motions, {off:.4f} deg apart"
+                f"{'' if same else '  <-- ' + other.stop.message}"
             )
-        began = time.monotonic()
-        for _ in range(200):
-            driver._read()
-        reading = 1e3 * (time.monotonic() - began) / 200
-    return agree, reading
+    return agree, most
+
+
+def spoilt(bus: Bus, folder: Path, n: int) -> tuple[int, int, int, int]:
+    """Spoilt messages, motions, typed errors, and commands beyond the limits.
+
+    How many of the messages are spoilt is drawn before each motion, 0.3 to 60 %.
+    """
+    draw, motions, errors, beyond, count = random.Random(1000), 0, 0, 0, 0
+    dynamixel._PATIENCE_MS, yarp._TIMEOUT = 50.0, 0.05  # what is cut is waited for
+    with (
+        opened(bus, folder, str(SPEED), rate_deg=30.0, timeout=0.5) as (end, path),
+        bus.driver(path) as driver,
+    ):
+        channels = driver.wiring.motors
+        # where the motors are is known to within the motion that counts as rest, and a tick of the bus
+        slack = driver.limits.still + (1.5 / UNITS["dynamixel"] if bus.kind == "dynamixel" else 1e-6)
+        end.ask("goals")
+        while count < n:
+            at = [one.value(x) for one, x in zip(channels, end.rest()["motors"], strict=True)]
+            delta = torch.tensor([draw.uniform(-0.03, 0.03) for _ in channels], dtype=torch.float64)
+            end.ask(f"spoil {10 ** draw.uniform(-2.5, -0.2):.4f}")
+            try:
+                driver.command(delta)
+                motions += 1
+            except DeviceError:
+                errors += 1
+            for goal in end.ask("goals"):
+                a = [one.value(x) for one, x in zip(channels, goal, strict=True)]
+                beyond += not all(
+                    abs(x - here) <= 0.03 + slack and one.lower - slack <= x <= one.upper + slack
+                    for x, here, one in zip(a, at, channels, strict=True)
+                )
+            count = end.ask("now")["spoilt"]
+        end.ask("spoil 0")
+    return count, motions, errors, beyond
+
+
+class Pulled(PlantWrapper):
+    """The cable is pulled so many seconds after the begin of a motion."""
+
+    def __init__(self, plant: Plant, pull: Callable[[], object], motion: int, after: float) -> None:
+        super().__init__(plant)
+        self._pull, self._left, self._after = pull, motion, after
+
+    def command(self, delta_a: torch.Tensor) -> Observation:
+        if self._left == 0:
+            threading.Timer(self._after, self._pull).start()
+        self._left -= 1
+        return super().command(delta_a)
+
+
+def pulls(bus: Bus, folder: Path, n: int) -> int:
+    """After how many the turn ends with a typed error as its cause, and the object is held."""
+    typed, draw = 0, random.Random(1000)
+    with opened(bus, folder, "hand") as (end, path):
+        for seed in range(1000, 1000 + n):
+            end.ask(f"reset {seed}")
+            way = ("closed", "silent")[seed % 2]
+            with bus.driver(path) as driver:
+                pull = partial(end.ask, f"pull {way}")
+                pulled = Pulled(driver, pull, motion=draw.randrange(3), after=draw.uniform(0, 0.1))
+                plant = WithPose(pulled, end, lost=end.lost)
+                stop = turn(plant, driver.hand, plant.reset(seed), DEGREES).stop
+            good = stop.reason is StopReason.PLANT_FAILED and isinstance(stop.cause, DeviceError)
+            good = good and not end.rest()["lost"]
+            typed += good
+            tell(f"{bus.kind} {seed}, {way}: {stop.reason.value}: {stop.message}{'' if good else '  <--'}")
+            path = wiring(bus, folder, end.ask("plug"))
+    return typed
+
+
+def added(bus: Bus, folder: Path, n: int) -> tuple[float, float]:
+    """What a motion of 3 deg takes beyond its distance and the time it must be at rest: median, 90 % [ms]."""
+    took, way = [], 3 * DEG
+    with opened(bus, folder, str(SPEED), rate_deg=30.0) as (_, path), bus.driver(path) as driver:
+        for k in range(n):
+            delta = torch.full((driver.hand.n_a,), way if k % 2 else -way, dtype=torch.float64)
+            began = time.monotonic()
+            driver.command(delta)
+            took.append(1e3 * (time.monotonic() - began - way / SPEED - driver.limits.still_for))
+    return float(np.median(took)), float(np.quantile(took, 0.9))
 
 
 _MOVES = """
-import sys, torch
+import importlib, os, signal, sys, torch
 from torch_ekm.drivers import open_driver
-plant = open_driver(sys.argv[1])
-print("moving", flush=True)
-while True:
-    for sign in (1.0, -1.0):
-        plant.command(sign * torch.full((plant.hand.n_a,), 0.3, dtype=torch.float64))
+torch.set_num_threads(1)
+for name in sys.argv[2:]:
+    importlib.import_module(name)
+signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+print("ready", flush=True)
+for _ in sys.stdin:
+    child = os.fork()
+    if child:
+        print(child, flush=True)
+        continue
+    plant = open_driver(sys.argv[1])
+    while True:
+        for sign in (1.0, -1.0):
+            plant.command(sign * torch.full((plant.hand.n_a,), 0.3, dtype=torch.float64))
 """
 
 
-def kills(bus: Bus, folder: Path, n: int) -> int:
-    """How often the motors stood 100 ms after the driver's process was killed in a motion."""
-    stood = 0
-    with opened(bus, folder, "motors", rate=30.0) as (end, path):
+def kills(bus: Bus, folder: Path, n: int) -> tuple[int, float]:
+    """How often the motors stood 100 ms after the driver's process was killed, and the longest [ms]."""
+    stood, longest = 0, 0.0
+    imported = [bus.needs] if bus.python == sys.executable and bus.kind != "yarp" else []
+    with opened(bus, folder, str(SPEED), rate_deg=30.0) as (end, path):
+        words = [sys.executable, "-c", _MOVES, str(path), *imported]
+        parent = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert parent.stdin is not None
+        assert parent.stdout is not None
+        parent.stdout.readline()
         for k in range(n):
-            child = subprocess.Popen(
-                [sys.executable, "-c", _MOVES, str(path)], stdout=subprocess.PIPE, text=True
-            )
-            assert child.stdout is not None
-            child.stdout.readline()
+            parent.stdin.write("\n")
+            parent.stdin.flush()
+            child = int(parent.stdout.readline())
             while not end.ask("now")["moving"]:
                 time.sleep(0.002)
             time.sleep(0.02 + 0.013 * (k % 20))
-            os.kill(child.pid, signal.SIGKILL)
-            time.sleep(0.1)
-            stands = end.ask("now")["motors"]
-            time.sleep(0.15)
-            stood += end.ask("now")["motors"] == stands
-            child.wait()
-    return stood
+            killed = time.monotonic()
+            os.kill(child, signal.SIGKILL)
+            time.sleep(0.4)
+            said = end.ask("now")
+            late = 1e3 * (said["stands_at"] - killed)
+            stood, longest = stood + (late <= 100 and not said["moving"]), max(longest, late)
+        parent.kill()
+        parent.communicate()
+    return stood, longest
 
 
 def wrong_wirings() -> tuple[int, int]:
@@ -226,22 +240,61 @@ def wrong_wirings() -> tuple[int, int]:
     return int(found[1]) if found else 0, 12
 
 
+def kept(out: Path, folder: Path, bus: Bus, measure: Callable[..., Any], n: int) -> Any:
+    """What ``measure(bus, folder, n)`` gives, from ``out`` if it is there."""
+    path = out / f"{bus.kind}_{measure.__name__}_{n}.json"
+    if not path.exists():
+        found = measure(bus, folder, n)
+        out.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(found), encoding="utf-8")
+    found = json.loads(path.read_text(encoding="utf-8"))
+    tell(f"{bus.kind} {measure.__name__}: {found}")
+    return found
+
+
+def tell(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("--turns", type=int, default=20)
-    options.add_argument("--kills", type=int, default=50)
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    python = os.environ.get("TORCH_EKM_YARP_PYTHON", sys.executable)
+    about = "that has YARP's bindings; $TORCH_EKM_YARP_PYTHON"
+    options.add_argument("--yarp-python", default=python, metavar="PATH", help=about)
+    options.add_argument("--quick", action="store_true", help="a fiftieth of it: to see that it works")
+    options.add_argument("--out", type=Path, default=Path("drivers_output"), help="keeps what is finished")
     given = options.parse_args()
-    parts, killed, of = [], 0, 0
+    n_turns, n_spoilt, n = (1, 200, 2) if given.quick else (20, 10_000, 50)
+    rows, parts, killed, of = [], [], 0, 0
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    with tempfile.TemporaryDirectory() as folder:
+    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
         for bus in BUSES:
-            if find_spec(bus.needs) is None:
+            if bus.kind == "yarp":
+                bus = bus._replace(python=given.yarp_python)
+            if not bus.installed:
                 parts.append(f"{bus.kind} not installed")
                 continue
-            agree, reading = turns(bus, Path(folder), given.turns)
-            print(f"{bus.kind}: a reading of the bus takes {reading:.2f} ms", flush=True)
-            parts.append(f"{bus.kind} {agree}/{given.turns}")
-            killed, of = killed + kills(bus, Path(folder), given.kills), of + given.kills
+            done = partial(kept, given.out, folder, bus)
+            median, tenth = done(added, n)
+            stood, longest = done(kills, n)
+            count, motions, errors, beyond = done(spoilt, n_spoilt)
+            pulled, (agree, most) = done(pulls, n), done(turns, n_turns)
+            rows.append(
+                f"|{bus.kind}: {bus.end}|{agree}/{n_turns}, {most:.4f} deg"
+                f"|{count}: {motions} motions, {errors} typed errors|{beyond}"
+                f"|{stood}/{n}, {longest:.0f} ms|{pulled}/{n}|{median:.1f}, {tenth:.1f}|"
+            )
+            parts.append(f"{bus.kind} {agree}/{n_turns}")
+            killed, of = killed + stood, of + n
+    print(
+        "|bus|turns as in process, at most apart|spoilt messages|commands beyond limits"
+        "|process killed: stood within 100 ms, longest|cable pulled: typed stop, object held"
+        "|added to a motion, median and 90 % [ms]|"
+    )
+    print("|---|---|---|---|---|---|---|")
+    print(*rows, "", sep="\n")
     refused, wirings = wrong_wirings()
     print(f"{', '.join(parts)}, wrong wirings {refused}/{wirings}, kills {killed}/{of}")
 

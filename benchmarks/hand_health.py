@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from typing import NamedTuple
 
 import numpy as np
@@ -100,12 +101,16 @@ def main() -> None:
     options.add_argument("--quick", action="store_true", help="three seeds for development of the T42")
     given = options.parse_args()
     first, end = (0, 3) if given.quick else map(int, given.seeds.split(":"))
+    print(
+        f"|hand|tendons that broke|found within {AFTER} motions|right actuator|motions before|false alarms|"
+    )
+    print("|---|---|---|---|---|---|")
     for hand in ["yale_t42"] if given.quick else HANDS:
         description, cases, found, right, false, healthy = load_hand(hand), 0, 0, 0, 0, 0
         for seed in range(first, end):
             one = case(hand, seed)
             if one is None:
-                print(f"{hand} {seed}: no grasp", flush=True)
+                print(f"{hand} {seed}: no grasp", file=sys.stderr, flush=True)
                 continue
             changes = hand_health(description, [(0, one.log)])
             early = [change for change in changes if change.motion < one.at]
@@ -113,11 +118,9 @@ def main() -> None:
             cases, healthy, false = cases + 1, healthy + one.at, false + len(early)
             found, right = found + bool(late), right + (bool(late) and late[0].actuator == one.motor)
             said = "; ".join(f"{change.actuator} {change.motion}: {change.found}" for change in changes)
-            print(f"{hand} {seed}: {one.motor} breaks at {one.at}: {said or 'not found'}", flush=True)
-        print(
-            f"{hand}: broken tendons found within {AFTER} motions {found}/{cases}, "
-            f"right actuator {right}/{cases}, false alarms {false} in {healthy} motions"
-        )
+            text = f"{hand} {seed}: {one.motor} breaks at {one.at}: {said or 'not found'}"
+            print(text, file=sys.stderr, flush=True)
+        print(f"|{hand}|{cases}|{found}|{right}|{healthy}|{false}|", flush=True)
 
 
 if __name__ == "__main__":

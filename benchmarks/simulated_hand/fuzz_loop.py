@@ -17,6 +17,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 import torch
+from fuzzed_plant import FuzzedPlant
 from joblib import Parallel, delayed
 
 from torch_ekm.control import ClosedLoop, HandKnowledge, LookAndMoveController, PoseTarget, StopReason
@@ -25,7 +26,6 @@ from torch_ekm.exceptions import EKMError, GraspError
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantStatus, PlantWrapper
 from torch_ekm.simulation import PlantConfig, SimulatedHand, preset
-from torch_ekm.testing import FuzzedPlant
 
 DEG = math.pi / 180
 STEP = 16 * DEG  # of ActuatorLimit

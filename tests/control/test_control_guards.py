@@ -7,6 +7,7 @@ import math
 
 import pytest
 import torch
+from fuzzed_plant import FuzzedPlant
 from obedient_plant import Obedient, turned, watched
 
 from torch_ekm.control import ClosedLoop, Guards, LookAndMoveController, PoseTarget, Safety, StoppingRule
@@ -14,7 +15,6 @@ from torch_ekm.control import StopReason as Reason
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.plant import Observation, PlantStatus, PlantWrapper, ServoInverse, Stamps
-from torch_ekm.testing import FuzzedPlant
 
 DEG = math.pi / 180
 SAFETY = Safety(rule=StoppingRule(max_steps=25))

@@ -9,11 +9,15 @@ import re
 import sys
 import textwrap
 import types
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from dynamixel_bus import DynamixelBus
+from motors import Motors
 
+PORT = "/dev/ttyUSB0"
 DOCS = Path(__file__).parents[2] / "docs"
 _BLOCK = re.compile(r"^( *)```python\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
 
@@ -45,10 +49,22 @@ def skip_without_its_packages(code: list[str]) -> None:
                     pytest.skip(f"{name} is not installed")
 
 
+@pytest.fixture
+def serial_port() -> Iterator[str]:
+    """What a page calls its serial port: two emulated servos answer there."""
+    with DynamixelBus([1, 2], Motors([1600.0, 1600.0], 4000.0)) as bus:
+        yield bus.port
+
+
 @pytest.mark.parametrize("page", [one for one in sources() if blocks(one)], ids=name_of)
-def test_the_examples_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_examples_of_a_page_run(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
     code = blocks(page)
     skip_without_its_packages(code)
+    if any(PORT in block for block in code):
+        pytest.importorskip("dynamixel_sdk")
+        code = [block.replace(PORT, request.getfixturevalue("serial_port")) for block in code]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")
     module = types.ModuleType("documentation_page")  # classes of a page can be pickled

@@ -140,6 +140,33 @@ def test_a_stale_sensor_is_named(driver) -> None:
         driver.observe()
 
 
+class Published:
+    """The newest of messages 10 ms apart, whose every fourth is wrong: looks may see one message twice."""
+
+    def __init__(self) -> None:
+        self.came = time.monotonic()
+
+    def __call__(self, reading):
+        number = int((time.monotonic() - self.came) / 0.01)
+        taken = self.came + 0.01 * number
+        return dataclasses.replace(
+            reading, motors=[900.0, 2900.0] if number % 4 == 0 else reading.motors, taken=taken
+        )
+
+
+def test_a_message_that_is_wrong_is_not_confirmed_by_itself(driver) -> None:
+    """It is the newest one at the first look, and at the second."""
+    driver.spoil = Published()
+    driver._write(driver._bus(driver._stands().numpy()), 0.0)
+    assert driver.written[-1][0] == pytest.approx([1600.0, 2400.0])
+
+
+def test_holding_takes_the_middle_of_three_readings(driver) -> None:
+    driver.spoil = Published()
+    driver.hold()
+    assert driver.written[-1][0] == pytest.approx([1600.0, 2400.0])
+
+
 def test_a_dry_run_prints_and_sends_nothing(tmp_path) -> None:
     said: list[str] = []
     driver = FakeDriver(write(tmp_path), dry_run=True, say=said.append)

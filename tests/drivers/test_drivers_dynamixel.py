@@ -18,9 +18,12 @@ from wirings import T42, write
 
 pytest.importorskip("dynamixel_sdk")
 
+from dynamixel_bus import DynamixelBus
+from motors import Motors
+from spoiling import Spoiler
+
 from torch_ekm.drivers import DynamixelPlant
 from torch_ekm.exceptions import BusError, DescriptionError, DeviceError
-from torch_ekm.testing import DynamixelBus, Motors
 
 DEG = math.pi / 180
 TICK = 2 * math.pi / 4096
@@ -88,7 +91,7 @@ FAULTS = {
 
 
 def _signed(packet: bytes) -> bytes:
-    from torch_ekm.testing.dynamixel_bus import checksum
+    from dynamixel_bus import checksum
 
     return packet + checksum(packet).to_bytes(2, "little")
 
@@ -144,26 +147,8 @@ def test_two_servos_with_one_id(bus, tmp_path) -> None:
 def test_garbled_messages_send_no_motor_beyond_its_limits(bus, tmp_path) -> None:
     """Cut, doubled, late and garbled answers: the command is right, or there is a typed error."""
     draw = random.Random(0)
-    kept: list[bytes] = [b""]
-
-    def spoil(packet: bytes) -> bytes:
-        if draw.random() > 0.3:
-            return packet
-        kind, last = draw.randrange(5), kept[0]
-        kept[0] = packet
-        if kind == 0:
-            return packet[: draw.randrange(len(packet))]
-        if kind == 1:
-            return packet + packet
-        if kind == 2:
-            return last
-        if kind == 3:
-            return last + packet
-        place = draw.randrange(len(packet))
-        return packet[:place] + bytes([draw.randrange(256)]) + packet[place + 1 :]
-
     with open_at(bus, tmp_path, still="still_for = 0.05|still_for = 0.01") as plant:
-        bus.spoil, failures, motions = spoil, 0, 0
+        bus.spoil, failures, motions = Spoiler(0.1, seed=0), 0, 0
         for _ in range(25):
             while bus.motors.moving:
                 time.sleep(0.002)

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import math
 import os
-import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -16,14 +11,16 @@ import torch
 
 pytest.importorskip("rclpy", reason="rclpy is not here: source a ROS 2, or install the extra 'ros2'")
 
+from far_end import BUSES, End
+
 from torch_ekm.drivers import Ros2Plant, RosPose, WithPose
 from torch_ekm.exceptions import BusError, DescriptionError, NeverAtRestError, StaleReadingError
 
-DEG = math.pi / 180
+ROS2 = next(bus for bus in BUSES if bus.kind == "ros2")
 TEXT = """\
 [hand]
 driver = "ros2"
-description = "yale_t42"
+description = "planar_two_finger"
 [bus]
 command = "/hand/joint_trajectory"
 [limits]
@@ -32,38 +29,10 @@ rate_deg = 200
 timeout = 0.5
 [[motors]]
 name = "left"
-id = "left_motor"
 [[motors]]
 name = "right"
-id = "right_motor"
 sign = -1
 """
-
-
-class Hand:
-    """The other end."""
-
-    def __init__(self, speed: float = 4.0) -> None:
-        script = Path(__file__).with_name("ros2_hand.py")
-        self.process = subprocess.Popen(
-            [sys.executable, str(script), str(speed)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        assert self.process.stdout is not None
-        self.process.stdout.readline()
-
-    def ask(self, word: str) -> str:
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.write(word + "\n")
-        self.process.stdin.flush()
-        return self.process.stdout.readline()
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.wait()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -77,10 +46,10 @@ def _alone():
 
 
 @pytest.fixture(scope="module")
-def hand():
-    hand = Hand()
-    yield hand
-    hand.close()
+def hand(_alone):
+    end = End(ROS2, "4.0")  # rad/s
+    yield end
+    end.close()
 
 
 @pytest.fixture
@@ -99,33 +68,35 @@ def test_a_motion_a_pose_and_faults_over_ros(hand, path) -> None:
         pose = RosPose(driver, "/object", "camera")
         plant = WithPose(driver, pose)
         seen = plant.reset(seed=0)
-        assert float(seen.a[0]) == -float(seen.a[1])
+        torch.testing.assert_close(seen.a, radians(0.8, 0.8))  # the bus has -0.8 of the right one
         torch.testing.assert_close(seen.position, radians(0.0, 0.1, 0.0))
         assert seen.taken.pose >= seen.taken.encoders
         after = plant.command(radians(0.05, 0.02))
         torch.testing.assert_close(after.a - seen.a, radians(0.05, 0.02), atol=1e-6, rtol=0)
         assert after.taken.encoders > seen.time
-        sent = hand.ask("goals")
+        hand.ask("goals")
         for word, error, words in (
-            ("nan", BusError, "NaN"), ("name", BusError, "has no 'left_motor'; it has: other"),
+            ("nan", BusError, "NaN"), ("name", BusError, "has no 'left'; it has: other"),
             ("short", BusError, "2 names and 1 positions"), ("old", StaleReadingError, "motors of hand.toml"),
         ):  # fmt: skip
-            hand.ask(f"spoil {word}")
+            hand.ask(f"fault {word}")
             time.sleep(0.05)
             with pytest.raises(error, match=words):
                 driver.observe()
-        assert hand.ask("goals") == sent
-        hand.ask("spoil")
+        assert hand.ask("goals") == []
+        hand.ask("fault")
         time.sleep(0.05)
         wrong = RosPose(driver, "/object", "hand")
         time.sleep(0.2)
         with pytest.raises(BusError, match="in the frame 'camera', it should be in 'hand'"):
             wrong()
-        hand.ask("spoil nothing")
+        hand.ask("pull silent")
         time.sleep(0.1)
         with pytest.raises(NeverAtRestError, match="sends nothing new"):
             driver.command(radians(0.05, 0.0))
-        hand.ask("spoil")
+        with pytest.raises(StaleReadingError, match=r"motors of hand.toml"):
+            driver.hold()
+        hand.ask("plug")
 
 
 def test_what_is_not_there_is_named(path, monkeypatch) -> None:
@@ -136,34 +107,3 @@ def test_what_is_not_there_is_named(path, monkeypatch) -> None:
     path.write_text(TEXT.replace("[limits]", 'kind = "velocity"\n[limits]'))
     with pytest.raises(DescriptionError, match=r"hand.toml:6: .*'kind' must be one of trajectory, array"):
         Ros2Plant(path)
-
-
-_MOVES = """
-import sys, torch
-from torch_ekm.drivers import Ros2Plant
-plant = Ros2Plant(sys.argv[1])
-print("moving", flush=True)
-while True:
-    for sign in (1.0, -1.0):
-        plant.command(sign * torch.tensor([0.3, 0.3], dtype=torch.float64))
-"""
-
-
-def test_the_hand_stands_soon_after_its_process_is_killed(path) -> None:
-    """One point of a trajectory is 80 ms of motion at most; then the controller holds."""
-    path.write_text(TEXT.replace("rate_deg = 200", "rate_deg = 30"))
-    hand = Hand(speed=30 * DEG)
-    try:
-        child = subprocess.Popen([sys.executable, "-c", _MOVES, str(path)], stdout=subprocess.PIPE, text=True)
-        assert child.stdout is not None
-        child.stdout.readline()
-        while not json.loads(hand.ask("now"))[1]:
-            time.sleep(0.005)
-        os.kill(child.pid, signal.SIGKILL)
-        child.wait()
-        time.sleep(0.1 + 0.05)
-        stands = json.loads(hand.ask("now"))
-        time.sleep(0.2)
-        assert json.loads(hand.ask("now")) == [stands[0], False]
-    finally:
-        hand.close()

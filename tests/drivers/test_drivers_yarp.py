@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from spoiling import Spoiler
 from yarp_golden import GoldenYarp
 
 from torch_ekm.description import load_hand
@@ -114,24 +115,9 @@ def test_a_cable_that_is_pulled_is_a_typed_error(yarp, tmp_path) -> None:
 
 def test_garbled_messages_send_no_axis_beyond_its_limits(yarp, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("torch_ekm.drivers.yarp._TIMEOUT", 0.1)
-    draw, kept = random.Random(1), [b""]
-
-    def spoil(data: bytes) -> bytes:
-        if draw.random() > 0.1:
-            return data
-        kind, last = draw.randrange(4), kept[0]
-        kept[0] = data
-        if kind == 0:
-            return data[: draw.randrange(len(data))]
-        if kind == 1:
-            return data + data
-        if kind == 2:
-            return last
-        place = draw.randrange(len(data))
-        return data[:place] + bytes([draw.randrange(32, 127)]) + data[place + 1 :]
-
+    draw = random.Random(1)
     plant, failed, moved = YarpPlant(wiring(tmp_path, yarp.server, HALL, ANALOG)), 0, 0
-    yarp.spoil = spoil
+    yarp.spoil = Spoiler(0.1, seed=1)
     for _ in range(25):
         while yarp.motors.moving:
             time.sleep(0.005)

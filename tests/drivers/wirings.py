@@ -6,8 +6,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from motors import Motors
+
 from torch_ekm.drivers import BusReading, HandDriver, Wiring
-from torch_ekm.testing import Motors
 
 T42 = """\
 [hand]

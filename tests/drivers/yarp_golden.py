@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import re
 import socket
 import threading
 import time
 from collections.abc import Callable
 
-from torch_ekm.testing import Motors
+from motors import Motors
+from yarp_text import answer
 
 WELCOME = b"Welcome torch_ekm\r\n"
 AXES = 9
@@ -83,18 +83,9 @@ class GoldenYarp:
                 one.sendall(self.spoil(self._answer(text).encode() + b"\r\n"))
 
     def _answer(self, text: str) -> str:
-        if text == "[get] [encs]":
-            encoders = " ".join([*(["0.0"] * 7), *(repr(x) for x in self.motors.now())])
-            return f"[is] encs ({encoders}) 1.5 [ok]"
-        if text == "[get] [dons]":
-            return f"[is] dons ({' '.join([str(int(not self.motors.moving))] * (7 + AXES))}) 1.5 [ok]"
-        self.commands.append(text)
-        moved = re.fullmatch(r"\[set\] \[pos\] (\d+) (\S+)", text)
-        if moved is not None:
-            goal = list(self.motors._goal)
-            goal[int(moved[1]) - 7] = float(moved[2])
-            self.motors.send(goal)
-        return "[ok]"
+        if not text.startswith("[get]"):
+            self.commands.append(text)
+        return answer(text, self.motors, first=7)
 
     def _stream(self, one: socket.socket) -> None:
         for text in self._lines(one):

@@ -232,10 +232,11 @@ def test_signs_of_a_held_object_by_its_pose() -> None:
 
 def test_the_command_checks_a_hand_on_a_bus(tmp_path) -> None:
     pytest.importorskip("dynamixel_sdk")
+    from dynamixel_bus import DynamixelBus
+    from motors import Motors
     from typer.testing import CliRunner
 
     from torch_ekm.cli import app
-    from torch_ekm.testing import DynamixelBus, Motors
 
     with DynamixelBus([1, 2], Motors([1600.0, 1500.0], 4000.0)) as bus:
         head = f'[hand]\ndriver = "dynamixel"\ndescription = "yale_t42"\n[bus]\nport = "{bus.port}"\n'

@@ -16,6 +16,9 @@ import torch
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("typer")
 
+from dynamixel_bus import DynamixelBus
+from motors import Motors
+
 from torch_ekm.cli import main
 from torch_ekm.control import HandKnowledge
 from torch_ekm.drivers import BusReading, DynamixelPlant, HandDriver, Wiring
@@ -23,7 +26,6 @@ from torch_ekm.exceptions import DescriptionError, DeviceError
 from torch_ekm.inspection.identify_servo import identify_servo
 from torch_ekm.inspection.slack import Taut, find_slack, write_zeros
 from torch_ekm.kinematics import Play
-from torch_ekm.testing import DynamixelBus, Motors
 
 DEG = math.pi / 180
 TICKS = 4096 / (2 * math.pi)

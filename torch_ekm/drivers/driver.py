@@ -18,7 +18,7 @@ from .posture import Posture
 from .wiring import Channel, Wiring
 
 _REACH = 0.08  # [s] a motion goes out in pieces of so much: a hand whose computer dies goes no farther
-_POLL = 0.005  # [s]
+_POLL = 0.001  # [s]
 _TRIES = 5  # of a motion that a watchdog stops, of readings that disagree
 _BEYOND = math.radians(15)  # a motor that reads farther outside its range is not sent anywhere
 _SLACK = 1e-6  # [rad] of a limit: sums of floats
@@ -82,6 +82,7 @@ class HandDriver(ABC):
         self._posture = Posture(wiring.hand, [one.name for one in wiring.joints])
         self._joints = self._by_lines if joints is None else joints
         self._after = -math.inf  # a reading must be newer: of the last motion's end
+        self._last: BusReading | None = None  # that was observed
 
     # -- what a bus does ----------------------------------------------------------------------------
 
@@ -183,13 +184,17 @@ class HandDriver(ABC):
         return self.observe()
 
     def hold(self) -> None:
-        """Command the motors to stay where they are.
+        """Command the motors to stay where they are: at the median of three readings, one may be wrong.
 
         Raises:
             BusError: the bus does not take it.
+            StaleReadingError: the motors send nothing new.
         """
         if not self.dry_run:
-            self._write(list(self._read().motors), _REACH)
+            readings = [self._read()]
+            while len(readings) < 3:
+                readings.append(self._another(readings[-1]))
+            self._write(np.median([one.motors for one in readings], axis=0).tolist(), _REACH)
 
     def close(self) -> None:
         """Hold, and give the bus back; errors of the bus are ignored."""
@@ -206,17 +211,27 @@ class HandDriver(ABC):
     # -- inside -------------------------------------------------------------------------------------
 
     def _stands(self) -> Tensor:
-        """Where the motors are, by two readings that agree: one alone may be an old packet."""
-        last = self._a(self._read())
+        """Where the motors are, by two readings that agree: one alone may be wrong, or an old packet."""
+        last = self._last or self._read()
         for _ in range(_TRIES):
-            a = self._a(self._read())
-            if float((a - last).abs().max()) <= self.limits.still:
+            reading = self._another(last)
+            a = self._a(reading)
+            if float((a - self._a(last)).abs().max()) <= self.limits.still:
                 return a
-            last = a
+            last = reading
         problem = (
             f"the motors' readings disagree in {_TRIES} looks: something moves them, or the bus is noisy"
         )
         raise BusError(self.wiring.path.name, problem)
+
+    def _another(self, than: BusReading) -> BusReading:
+        """A reading that was taken later: what is published need not be new at each look."""
+        began = time.monotonic()
+        while (reading := self._read()).taken <= than.taken:
+            if time.monotonic() - began > max(1.0, 4 * self.limits.period):
+                raise self._stale("motors", reading.taken)
+            time.sleep(_POLL)
+        return reading
 
     def _move(self, start: Array, goal: Array) -> None:
         """Send a motion piece by piece, and wait for its end."""
@@ -239,8 +254,9 @@ class HandDriver(ABC):
     def _wait(self, seconds: float) -> None:
         """Read until so much time is over: a bus with a watchdog is kept awake."""
         end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self._read()
+        while (left := end - time.monotonic()) > 0:
+            if left > 5 * _POLL:  # else a slow bus would answer after the end
+                self._read()
             time.sleep(min(_POLL, max(0.0, end - time.monotonic())))
 
     def _rest(self, seconds: float) -> None:
@@ -258,7 +274,8 @@ class HandDriver(ABC):
                 return
             if now - began > seconds + self.limits.timeout:
                 break
-            time.sleep(_POLL)
+            left = seen[0][0] + self.limits.still_for - now if seen else _POLL
+            time.sleep(left if 0 < left < _POLL else _POLL)
         with contextlib.suppress(Exception):
             self.hold()
         names = [m.name for m, way in zip(self.wiring.motors, self._spread(seen), strict=True) if way]
@@ -288,16 +305,20 @@ class HandDriver(ABC):
             # two periods before this call, not before now: a reading does not grow stale by being waited for
             late = {k: at for k, at in old.items() if at < max(began - 2 * self.limits.period, self._after)}
             if not late:
+                self._last = reading
                 return reading
             if time.monotonic() - began > max(1.0, 4 * self.limits.period):
                 name, at = min(late.items(), key=lambda one: one[1])
-                raise StaleReadingError(
-                    f"{name} of {self.wiring.path.name}",
-                    f"the newest reading is {time.monotonic() - at:.3g} s old, [limits] period allows "
-                    f"{2 * self.limits.period:.3g} s: look after the sensor's cable or node",
-                )
+                raise self._stale(name, at)
             time.sleep(_POLL)
             reading = self._read()
+
+    def _stale(self, name: str, at: float) -> StaleReadingError:
+        return StaleReadingError(
+            f"{name} of {self.wiring.path.name}",
+            f"the newest reading is {time.monotonic() - at:.3g} s old, [limits] period allows "
+            f"{2 * self.limits.period:.3g} s: look after the sensor's cable or node",
+        )
 
     def _within(self, start: Array, goal: Array) -> Array:
         """The goal, cut at the motors' ranges; one that stands outside is never sent farther out."""

@@ -19,6 +19,7 @@ _VELOCITY = 0.229 * 2 * math.pi / 60  # [rad/s] of a unit of Profile Velocity
 _WATCHDOG_MS = 80
 _TRIES = 2  # of a question
 _PATIENCE_MS = 100.0  # for an answer, where the SDK's 34 ms are less: both ends may share a busy machine
+_LOOK = 0.001  # [s] the port sleeps for an answer before the SDK asks again
 # control table of the X series: (address, bytes)
 _MODE, _TORQUE, _HARDWARE, _WATCHDOG = (11, 1), (64, 1), (70, 1), (98, 1)
 _CURRENT, _PROFILE, _GOAL = (102, 2), (112, 4), (116, 4)
@@ -68,6 +69,7 @@ class DynamixelPlant(HandDriver):
         with self._told(), contextlib.redirect_stdout(None):
             if not self._handler.setBaudRate(baud):
                 raise bus.error(f"'baud' {baud} is none of the SDK's, such as 57600, 1000000, 4000000")
+            self._handler.ser.timeout = _LOOK  # the SDK has 0, and keeps a core busy with asking
         try:
             for one in self.wiring.motors:
                 self._ping(int(one.id), f"motor '{one.name}', id {one.id} ({self.wiring.path}:{one.line})")

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..exceptions import ParameterError
-from ..kinematics.se3 import exp
-from ..plant import Observation, Plant, PlantStatus, PlantWrapper
-from ..typing import Tensor
+from torch_ekm.exceptions import ParameterError
+from torch_ekm.kinematics.se3 import exp
+from torch_ekm.plant import Observation, Plant, PlantStatus, PlantWrapper
+from torch_ekm.typing import Tensor
 
 KINDS = ("late", "frozen", "frozen, with running stamps", "jumping", "missing", "out of range")
 _LONGEST = 12  # observations of a fault

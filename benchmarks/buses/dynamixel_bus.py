@@ -8,7 +8,7 @@ import time
 import tty
 from collections.abc import Callable, Sequence
 
-from .motors import Motors
+from motors import Motors
 
 _HEADER = b"\xff\xff\xfd\x00"
 _PING, _READ, _WRITE, _SYNC_READ, _SYNC_WRITE, _STATUS = 0x01, 0x02, 0x03, 0x82, 0x83, 0x55
@@ -135,8 +135,9 @@ class DynamixelBus:
         silence = time.monotonic() - self._asked
         for table in self.tables.values():
             if 0 < table[_WATCHDOG] < _OUT and silence > 0.02 * table[_WATCHDOG]:
+                # when a servo would have: this thread may be late
+                self.motors.stop(self._asked + 0.02 * table[_WATCHDOG])
                 table[_WATCHDOG] = _OUT
-                self.motors.stop()
 
     def _answer(self, servo: int, data: bytes, error: int = 0) -> None:
         if servo not in self.tables or servo in self.silent:

@@ -1,4 +1,4 @@
-"""The contract of a learner as one call: ``check_residual_learner(factory)``."""
+"""Checks for authors of learners: the contract as one call, ``check_residual_learner(factory)``."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Normal
 
-from ..exceptions import EKMError, NonFiniteError, NoStateError, ShapeError, StateMismatchError
-from ..residual.base import ResidualLearner, UpdateReport
+from .exceptions import EKMError, NonFiniteError, NoStateError, ShapeError, StateMismatchError
+from .residual.base import ResidualLearner, UpdateReport
+
+__all__ = ["check_residual_learner"]
 
 QUERY_SHAPES = ((), (1,), (5,), (2, 3))
 
