@@ -110,7 +110,8 @@ class DetectChanges(Part):
         step = RATE * ((sample.report.nis > _LARGE) * 1.0 - self.level)
         self.level += step if mask is None else step * mask
         level = self.level if mask is None else self.level.where(mask > 0, math.inf)  # inf: no sample
-        self.inputs[place], self.targets[place], self.levels[place] = sample.x, sample.y, level
+        for kept, value in ((self.inputs, sample.x), (self.targets, sample.y), (self.levels, level)):
+            kept.select(0, place).copy_(value)
         changed = self.level > _ALARM
         if changed.any():
             self.level.masked_fill_(changed, _COOL)

@@ -132,6 +132,11 @@ class SparseOnlineGP(Host):
         """Mean and variance, with the observation noise on request."""
         return self.engine.observed(self, x) if observation else self.engine.moments(self, x)
 
+    def both_moments(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean, latent variance, and the same with the observation noise."""
+        mean, variance = self.engine.moments(self, x)
+        return mean, variance, variance + self.noise_variance.to(self.dtype)
+
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and its derivative, ``(alpha'k, alpha' dk/dx)``, in closed form."""
         return self.engine.linearize(self, x)
