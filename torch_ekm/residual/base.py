@@ -97,7 +97,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         return law.mean, law.variance
 
     def both_moments(self, x: Float[Tensor, "*any in_features"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, variance of g and variance of y: :meth:`moments` without the observation noise and with it."""
+        """Mean, variance of g and variance of y, see :meth:`moments`."""
         mean, variance = self.moments(x)
         return mean, variance, self.moments(x, observation=True)[1]
 

@@ -121,6 +121,9 @@ class MixtureResidual(ResidualLearner):
             mean, deviation, _ = self._standard(x)
             return Normal(mean, deviation * self.inflation.sqrt(), validate_args=False)
         each = [learner.both_moments(x) for learner in self.members]
+        found = self._judge.combine(self, x, each)
+        if found is not None:
+            return Normal(found[0], found[1], validate_args=False)
         mean, deviation, means = self._together([(m, v) for m, _, v in each])
         deviation = deviation * self.inflation.sqrt()
         variances = torch.stack([v for _, v, _ in each], dim=-1).to(x.dtype)

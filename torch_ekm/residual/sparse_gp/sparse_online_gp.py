@@ -202,7 +202,7 @@ class SparseOnlineGP(Host):
             with torch.no_grad():
                 for part in self._noting:
                     anew |= part.after_update(self, sample)
-        self.pending += 1.0 if on is None else on
+        self.pending.add_(1.0 if on is None else on)  # += would register the buffer again
         self.n_samples = n
         if anew:
             self.refresh()

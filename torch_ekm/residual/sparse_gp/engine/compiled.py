@@ -41,8 +41,9 @@ class CompiledEngine(ReferenceEngine):
         self._network: Embedding | None = None
         self._usable = False
         self._marks: list[int] = []  # versions of all tensors: torch changed something where they differ
-        self._age = 0  # changes so far
-        self._answer: tuple = -1, b"", False, False, ()  # the last one: its age, query, what was wanted, results
+        self._at: object = object()  # another one after each change
+        # the last one: when, query, whether with variance and with slopes, results
+        self._answer: tuple[object, bytes, bool, bool, tuple[Array, ...]] = None, b"", False, False, ()
 
     def __deepcopy__(self, memo: dict) -> CompiledEngine:
         return CompiledEngine()
@@ -69,14 +70,14 @@ class CompiledEngine(ReferenceEngine):
         return super().jacobians(gp, x) if found is None else MomentsWithJacobians(*map(_tensor, found))
 
     def accepts(self, gp: Host, x: Tensor, y: Tensor) -> bool:
-        if not self._takes(gp, x) or not _is_plain(y, (*self._batch, self._m)):
+        if not self._takes(gp, x) or not is_plain_one(y, (*self._batch, self._m)):
             return False
         x_, y_ = x.numpy().reshape(-1), y.numpy().reshape(-1)
         with np.errstate(over="ignore"):  # a number without a square is refused, not warned of
             return math.isfinite(x_.dot(x_) + y_.dot(y_))
 
     def absorb(self, gp: Host, x: Tensor, y: Tensor, on: Tensor | None) -> Absorbed:
-        if not self._takes(gp, x) or not _is_plain(y, (*self._batch, self._m)):
+        if not self._takes(gp, x) or not is_plain_one(y, (*self._batch, self._m)):
             return super().absorb(gp, x, y, on)
         posterior, flags, n_models, m = self._posterior, self._flags, self._n_models, self._m
         k, prior, mask = self._none2, self._none1, self._all
@@ -91,15 +92,15 @@ class CompiledEngine(ReferenceEngine):
             figures[2] = 1.0
         inputs = x.numpy().reshape(-1)
         if self._network is not None:
-            inputs = self._network.of(x, self._units_x, slopes=False)
-            self._network.keep(mask)
-        self._age += 1
+            z, inputs, _ = self._network.of(x, self._units_x, slopes=False)
+            self._network.keep(z, mask)
+        self._at = object()
         self._absorb(
             flags, mask, inputs, y.numpy().reshape(-1), k, prior, *self._state, *self._hyper,
             self._noise, *self._units, self._robust, self._levels,
             posterior.novelty_threshold, posterior.jitter, event, figures, errors,
         )  # fmt: skip
-        self._age += 1  # what another thread asked meanwhile is of neither state
+        self._at = object()  # what another thread asked meanwhile is of neither state
         batch = self._batch
         novelty, nis, weight, variance = torch.from_numpy(figures.reshape(4, *batch)).unbind()
         report = UpdateReport(torch.from_numpy(event.reshape(batch)), novelty, nis, weight)
@@ -108,40 +109,40 @@ class CompiledEngine(ReferenceEngine):
     def _ask(
         self, gp: Host, x: Tensor, *, variance: bool = False, slopes: bool = False
     ) -> tuple[Array, ...] | None:
-        """Moments and their slopes for one query per model, what is not wanted perhaps empty; None if torch must
-        do it. The last answer is kept: a learner is asked for mean, variance and slopes of one x in turn."""
+        """One query per model, what is not wanted perhaps being empty; None if torch must do it.
+
+        The last answer is kept: a learner is often asked for several things at the same x.
+        """
         if not self._takes(gp, x) or self._given:
             return None
-        age, query = self._age, x.numpy().tobytes()
+        at, query = self._at, x.numpy().tobytes()
         then, of, had_variance, had_slopes, found = self._answer
-        if then == age and of == query and had_variance >= variance and had_slopes >= slopes:
+        if then is at and of == query and had_variance >= variance and had_slopes >= slopes:
             return found
         n, d = self._n_models * self._m, self._width
         mean, v = np.empty(n), np.empty(n if variance else 0)
         J, dv = np.empty(n * d if slopes else 0), np.empty(n * d if slopes and variance else 0)
         basis, active, _, _, moments, vectors = self._state
-        network, inputs = self._network, x.numpy().reshape(-1)
+        network, inputs, by = self._network, x.numpy().reshape(-1), self._none1
         if network is not None:
-            inputs = network.of(x, self._units_x, slopes)
+            _, inputs, by = network.of(x, self._units_x, slopes)
         self._query(
             self._flags, inputs, basis, active, moments, vectors, *self._hyper, *self._units,
             variance, slopes, mean, v, J, dv,
         )  # fmt: skip
         if network is not None and slopes:
-            J, dv = network.by_x(J, self._n_models), network.by_x(dv, self._n_models) if variance else dv
+            J, dv = (network.by_x(a, by, self._units_x[1]) if a.size else a for a in (J, dv))
         one, two = (*self._batch, self._m), (*self._batch, self._m, self._d)
-        found = tuple(
-            a.reshape(shape) if a.size else a
-            for a, shape in zip((mean, v, J, dv), (one, one, two, two), strict=True)
-        )
-        self._answer = age, query, variance, slopes, found
+        shapes = zip((mean, v, J, dv), (one, one, two, two), strict=True)
+        found = tuple(a.reshape(shape) if a.size else a for a, shape in shapes)
+        self._answer = at, query, variance, slopes, found
         return found
 
     # -- what they work on ----------------------------------------------------------------------
 
     def _takes(self, gp: Host, x: Tensor) -> bool:
         """Whether this call is one for compiled loops; prepares the arrays."""
-        if torch.compiler.is_compiling() or not _is_plain(x, (*gp.batch_shape, gp.in_features)):
+        if torch.compiler.is_compiling() or not is_plain_one(x, (*gp.batch_shape, gp.in_features)):
             return False
         if load_loops() is None:
             return False
@@ -151,7 +152,7 @@ class CompiledEngine(ReferenceEngine):
             return False
         marks = [source[2]._version for source in self._sources]
         if marks != self._marks:
-            self._age += 1
+            self._at = object()
             if self._network is not None:
                 self._network.follow()
             self._marks = marks
@@ -224,7 +225,7 @@ def _tensor(kept: Array) -> Tensor:
     return torch.from_numpy(kept.copy())
 
 
-def _is_plain(x: Any, shape: tuple[int, ...]) -> bool:
+def is_plain_one(x: Any, shape: tuple[int, ...]) -> bool:
     """Whether x is an ordinary tensor of that shape, of which torch keeps no record."""
     if not is_plain(x) or x.shape != shape or not x.is_contiguous():
         return False
