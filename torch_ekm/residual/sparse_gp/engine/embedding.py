@@ -13,9 +13,6 @@ from ....typing import Array, Tensor
 from ...kernels.deep import DeepKernel
 from ..posterior import SparsePosterior
 
-# models from which on torch, all layers of all models in one call each, is faster than the loops
-_MANY = 8
-
 
 class Embedded(NamedTuple):
     """Inputs, one per model."""
@@ -69,11 +66,6 @@ class Embedding:
 
     def _embedded(self, x: Array, shift: Array, scale: Array, slopes: bool) -> Embedded:
         n, d = x.shape
-        if n >= _MANY and not slopes:
-            z = (x - shift) / scale
-            with torch.no_grad():
-                rows = torch.from_numpy(z).reshape(*self._posterior.batch_shape, 1, d)
-                return Embedded(z, self._kernel.embed(rows).numpy().reshape(-1), np.empty(0))
         z, found = np.empty((n, d)), np.empty((n, self.width))
         slope = np.empty((n, d, self.width - d) if slopes else (0, 0, 0))
         self._loops.embed_fleet(
