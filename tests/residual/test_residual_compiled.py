@@ -174,6 +174,18 @@ def test_an_answer_follows_samples_and_parameters(name):
 
 
 @numba_here
+def test_an_answer_that_was_given_away_may_be_changed():
+    gp = pair("plain")[1]
+    x, y = hard_stream(20)
+    gp.update(x, y)
+    for ask in (gp.forward, lambda q: gp.moments(q)[1], lambda q: gp.predict_with_jacobians(q)[3]):
+        first = ask(x[0])
+        kept = first.clone()
+        first.zero_()
+        assert torch.equal(ask(x[0]), kept)
+
+
+@numba_here
 def test_arrays_follow_buffers_that_are_replaced():
     x, y = hard_stream(60)
     gp = pair("all")[1]

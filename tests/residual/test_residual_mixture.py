@@ -251,7 +251,7 @@ def test_the_report_is_that_of_all_members() -> None:
 @pytest.mark.parametrize("fleet", [(), (3,)])
 def test_compiled_loops_judge_as_torch_does(fleet) -> None:
     made = [default_learner(3, 2, capacity=8, batch_shape=fleet, on_invalid="skip") for _ in range(2)]
-    made[1]._judge.judge = lambda *sample: None
+    made[1]._judge.judge = made[1]._judge.combine = lambda *given: None
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(45, *fleet, 3, generator=generator, dtype=torch.float64)
     y = torch.sin(x[..., :2]) + 0.1 * torch.randn(45, *fleet, 2, generator=generator, dtype=torch.float64)
@@ -263,6 +263,7 @@ def test_compiled_loops_judge_as_torch_does(fleet) -> None:
         torch.testing.assert_close(*[report.nis for report in reports], atol=1e-10, rtol=1e-8)
     for ask in ("forward", "predict_with_jacobians"):
         torch.testing.assert_close(*[getattr(g, ask)(x[0]) for g in made], atol=1e-10, rtol=1e-8)
+    torch.testing.assert_close(*[g.predict(x[0]).stddev for g in made], atol=1e-10, rtol=1e-8)
     laws = [g.predictive(x[0]).log_prob(y[0]) for g in made]
     torch.testing.assert_close(*laws, atol=1e-10, rtol=1e-8)
 

@@ -96,6 +96,11 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         law = self.predict(x, observation=observation)
         return law.mean, law.variance
 
+    def both_moments(self, x: Float[Tensor, "*any in_features"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean, variance of g and variance of y, see :meth:`moments`."""
+        mean, variance = self.moments(x)
+        return mean, variance, self.moments(x, observation=True)[1]
+
     def reset(self) -> None:
         """Forget all samples; hyperparameters stay as they are."""
         for buffer in self.buffers(recurse=False):

@@ -46,6 +46,10 @@ class LastResidual(ResidualLearner):
         """Those of f at x and the last sample."""
         return self.learner.moments(self._with_last(self.check_query(x)), observation=observation)
 
+    def both_moments(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Those of f at x and the last sample."""
+        return self.learner.both_moments(self._with_last(self.check_query(x)))
+
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean of f and its slope by x; that by the last sample is left out."""
         mean, slope = self.learner.linearize(self._with_last(self.check_query(x)))

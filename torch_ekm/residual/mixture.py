@@ -117,11 +117,16 @@ class MixtureResidual(ResidualLearner):
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """Moments of the mixture, or mean and running variance of y with ``observation=True``."""
         x = self.check_query(x)
-        mean, deviation, means = self._standard(x)
-        deviation = deviation * self.inflation.sqrt()
         if observation:
-            return Normal(mean, deviation, validate_args=False)
-        variances = torch.stack([learner.moments(x)[1] for learner in self.members], dim=-1).to(x.dtype)
+            mean, deviation, _ = self._standard(x)
+            return Normal(mean, deviation * self.inflation.sqrt(), validate_args=False)
+        each = [learner.both_moments(x) for learner in self.members]
+        found = self._judge.combine(self, x, each)
+        if found is not None:
+            return Normal(found[0], found[1], validate_args=False)
+        mean, deviation, means = self._together([(m, v) for m, _, v in each])
+        deviation = deviation * self.inflation.sqrt()
+        variances = torch.stack([v for _, v, _ in each], dim=-1).to(x.dtype)
         variance = self._spread(variances, self._apart(means, mean))
         # y is measured: experts that disagree by more than y scatters do not know less of g than of y
         return Normal(mean, torch.minimum(variance.sqrt(), deviation), validate_args=False)

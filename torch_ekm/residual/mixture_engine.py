@@ -9,7 +9,7 @@ import torch
 from torch.distributions import StudentT
 
 from ..typing import Array, Tensor
-from .sparse_gp.engine.compiled import sources_of
+from .sparse_gp.engine.compiled import is_plain_one, sources_of
 from .sparse_gp.engine.loading import load_loops
 
 
@@ -47,13 +47,7 @@ class CompiledJudge:
 
         None: torch must do it.
         """
-        if load_loops() is None:
-            return None
-        if any(owner.get(name) is not t or t.data_ptr() != at for owner, name, t, at in self._sources):
-            self._sources = []
-        if not self._sources:
-            self._bind(g)
-        if not self._usable:
+        if not self._takes(g):
             return None
         means, variances, far, ratio, figures = self._work
         rows = len(far)
@@ -79,6 +73,35 @@ class CompiledJudge:
             a["gain"], self._offset,
         )  # fmt: skip
         return torch.from_numpy(nis.reshape(tuple(g.batch_shape)))
+
+    def combine(self, g: Any, x: Tensor, each: list) -> Tensor | None:
+        """Mean and deviations of g and y, ``(3, *batch, out)``, given what the learners predict for one query
+        per model, see ``both_moments``.
+
+        None: torch must do it.
+        """
+        if torch.compiler.is_compiling() or not is_plain_one(x, (*g.batch_shape, g.in_features)):
+            return None
+        if any(t.requires_grad for one in each for t in one) or not self._takes(g):
+            return None
+        a, out = self._arrays, np.empty((3, self._offset.size))
+        rows = [np.array([t.numpy().reshape(-1) for t in part]) for part in zip(*each, strict=True)]
+        parts = [np.ascontiguousarray(part.T, dtype=np.float64) for part in rows]
+        self._loops.combine_fleet(
+            *parts, self._experts, a["gain"], a["mass"], a["shift"], a["spread"], self._offset,
+            self._inflation, out,
+        )  # fmt: skip
+        return torch.from_numpy(out.reshape(3, *g.offset.shape))
+
+    def _takes(self, g: Any) -> bool:
+        """Whether compiled loops can do it; prepares the arrays."""
+        if load_loops() is None:
+            return False
+        if any(owner.get(name) is not t or t.data_ptr() != at for owner, name, t, at in self._sources):
+            self._sources = []
+        if not self._sources:
+            self._bind(g)
+        return self._usable
 
     def _bind(self, g: Any) -> None:
         self._sources = sources_of(g, tuple(g.buffers(recurse=False)) + tuple(g.tails.buffers()))

@@ -181,3 +181,27 @@ def settle_fleet(on, p, experts, innovation, level, mass, shift, spread, gain, o
             mass[o, g], shift[o, g], spread[o, g] = held / total, middle, apart / total
             gain[o, g // n_shares] += held / total * h[g * each]
             offset[o] += carried / total
+
+
+@njit(types.void(_A2, _A2, _A2, _A2, _A2, _A2, _A2, _A2, _A1, _A1, _A2), **_COMMON)
+def combine_fleet(means, latent, noisy, experts, gain, mass, shift, spread, offset, inflation, out):
+    """Mean and deviations of g and of y in the rows of ``out``, see ``MixtureResidual.predict``.
+
+    Args:
+        means, latent, noisy: of the learners' predictions, variances of g and of y.
+    """
+    n_learners = means.shape[1]
+    n_shares, each = mass.shape[1] // n_learners, experts.shape[1] // mass.shape[1]
+    for o in range(means.shape[0]):
+        mean, variance, scatter = offset[o], 0.0, 0.0
+        for i in range(n_learners):
+            mean += gain[o, i] * means[o, i]
+        for i in range(n_learners):
+            for s in range(n_shares):
+                g = i * n_shares + s
+                h, p = experts[0, g * each], mass[o, g]
+                scatter += p * noisy[o, i]
+                variance += p * (h * h * latent[o, i] + (h * means[o, i] + shift[o, g] - mean) ** 2)
+                variance += spread[o, g]
+        scatter = math.sqrt(scatter) * math.sqrt(inflation[o])
+        out[0, o], out[1, o], out[2, o] = mean, min(math.sqrt(variance), scatter), scatter

@@ -12,6 +12,7 @@ from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..adam import Adam
 from ..kernels.kernel import is_shared
+from ..running_scale import write
 from .forgetting import ForgettingFactor, ProcessNoise
 from .monitor import DetectChanges, RobustWeight
 from .part import Host, Part, Sample
@@ -95,8 +96,9 @@ class LearnHyperparameters(Part):
         place, due = (n - learner.refresh_offset) % self.window, learner.is_due(n + 1)
         x, y, weight = sample.x, sample.y, sample.report.weight
         weight = weight if sample.mask is None else weight * sample.mask
-        self.window_x[..., place, :], self.window_y[..., place, :] = x, y
-        self.window_on[..., place] = weight
+        write(self.window_x, place, x)
+        write(self.window_y, place, y)
+        self.window_on.select(-1, place).copy_(weight)
         if self.past is not None:
             self.past.offer(x, y, weight)
         if due or ((place + 1) % self.stride == 0 and place + self.stride < self.window):

@@ -107,12 +107,13 @@ class DetectChanges(Part):
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Take a sample in; models that face another system start again."""
         place, mask = learner.n_samples % _MEMORY, sample.mask
-        step = RATE * ((sample.report.nis > _LARGE) * 1.0 - self.level)
-        self.level += step if mask is None else step * mask
+        large = (sample.report.nis > _LARGE).to(self.level.dtype)
+        self.level.lerp_(large, RATE) if mask is None else self.level.lerp_(large, RATE * mask)
         level = self.level if mask is None else self.level.where(mask > 0, math.inf)  # inf: no sample
-        self.inputs[place], self.targets[place], self.levels[place] = sample.x, sample.y, level
-        changed = self.level > _ALARM
-        if changed.any():
+        for kept, value in ((self.inputs, sample.x), (self.targets, sample.y), (self.levels, level)):
+            kept.select(0, place).copy_(value)
+        if float(self.level.amax()) > _ALARM:
+            changed = self.level > _ALARM
             self.level.masked_fill_(changed, _COOL)
             x, y, levels = (t.roll(-1 - place, 0) for t in (self.inputs, self.targets, self.levels))
             later = (levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0) > 0

@@ -6,6 +6,7 @@ from typing import Any
 from torch import nn
 
 from ...typing import Bool, Tensor
+from ..running_scale import write
 from .posterior import SparsePosterior
 
 
@@ -44,7 +45,9 @@ class ReplayMemory(nn.Module):
         self._n_offered += 1
         place = n if n < self.capacity else _scattered(n) % math.ceil(min(n + 1, self.horizon))
         if place < self.capacity:
-            self.x[..., place, :], self.y[..., place, :], self.weight[..., place] = x, y, weight
+            write(self.x, place, x)
+            write(self.y, place, y)
+            self.weight.select(-1, place).copy_(weight)
             self.absorbed[place], self.number[place] = 0.0, n
 
     def settle(self) -> None:

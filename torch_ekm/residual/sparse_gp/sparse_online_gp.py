@@ -132,6 +132,11 @@ class SparseOnlineGP(Host):
         """Mean and variance, with the observation noise on request."""
         return self.engine.observed(self, x) if observation else self.engine.moments(self, x)
 
+    def both_moments(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean, latent variance, and the same with the observation noise."""
+        mean, variance = self.engine.moments(self, x)
+        return mean, variance, variance + self.noise_variance.to(self.dtype)
+
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and its derivative, ``(alpha'k, alpha' dk/dx)``, in closed form."""
         return self.engine.linearize(self, x)
@@ -197,7 +202,7 @@ class SparseOnlineGP(Host):
             with torch.no_grad():
                 for part in self._noting:
                     anew |= part.after_update(self, sample)
-        self.pending += 1.0 if on is None else on
+        self.pending.add_(1.0 if on is None else on)  # += would register the buffer again
         self.n_samples = n
         if anew:
             self.refresh()

@@ -41,6 +41,9 @@ class CompiledEngine(ReferenceEngine):
         self._network: Embedding | None = None
         self._usable = False
         self._marks: list[int] = []  # versions of all tensors: torch changed something where they differ
+        self._at: object = object()  # another one after each change
+        # the last one: when, query, whether with variance and with slopes, results
+        self._answer: tuple[object, bytes, bool, bool, tuple[Array, ...]] = None, b"", False, False, ()
 
     def __deepcopy__(self, memo: dict) -> CompiledEngine:
         return CompiledEngine()
@@ -51,29 +54,30 @@ class CompiledEngine(ReferenceEngine):
     # -- calls ----------------------------------------------------------------------------------
 
     def mean(self, gp: Host, x: Tensor) -> Tensor:
-        return super().mean(gp, x) if (found := self._ask(gp, x)) is None else found[0]
+        found = self._ask(gp, x)
+        return super().mean(gp, x) if found is None else _tensor(found[0])
 
     def moments(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
         found = self._ask(gp, x, variance=True)
-        return super().moments(gp, x) if found is None else found[:2]
+        return super().moments(gp, x) if found is None else (_tensor(found[0]), _tensor(found[1]))
 
     def linearize(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
         found = self._ask(gp, x, slopes=True)
-        return super().linearize(gp, x) if found is None else (found[0], found[2])
+        return super().linearize(gp, x) if found is None else (_tensor(found[0]), _tensor(found[2]))
 
     def jacobians(self, gp: Host, x: Tensor) -> MomentsWithJacobians:
         found = self._ask(gp, x, variance=True, slopes=True)
-        return super().jacobians(gp, x) if found is None else found
+        return super().jacobians(gp, x) if found is None else MomentsWithJacobians(*map(_tensor, found))
 
     def accepts(self, gp: Host, x: Tensor, y: Tensor) -> bool:
-        if not self._takes(gp, x) or not _is_plain(y, (*self._batch, self._m)):
+        if not self._takes(gp, x) or not is_plain_one(y, (*self._batch, self._m)):
             return False
         x_, y_ = x.numpy().reshape(-1), y.numpy().reshape(-1)
         with np.errstate(over="ignore"):  # a number without a square is refused, not warned of
             return math.isfinite(x_.dot(x_) + y_.dot(y_))
 
     def absorb(self, gp: Host, x: Tensor, y: Tensor, on: Tensor | None) -> Absorbed:
-        if not self._takes(gp, x) or not _is_plain(y, (*self._batch, self._m)):
+        if not self._takes(gp, x) or not is_plain_one(y, (*self._batch, self._m)):
             return super().absorb(gp, x, y, on)
         posterior, flags, n_models, m = self._posterior, self._flags, self._n_models, self._m
         k, prior, mask = self._none2, self._none1, self._all
@@ -88,13 +92,15 @@ class CompiledEngine(ReferenceEngine):
             figures[2] = 1.0
         inputs = x.numpy().reshape(-1)
         if self._network is not None:
-            inputs = self._network.of(x, self._units_x, slopes=False)
-            self._network.keep(mask)
+            z, inputs, _ = self._network.of(x, self._units_x, slopes=False)
+            self._network.keep(z, mask)
+        self._at = object()
         self._absorb(
             flags, mask, inputs, y.numpy().reshape(-1), k, prior, *self._state, *self._hyper,
             self._noise, *self._units, self._robust, self._levels,
             posterior.novelty_threshold, posterior.jitter, event, figures, errors,
         )  # fmt: skip
+        self._at = object()  # what another thread asked meanwhile is of neither state
         batch = self._batch
         novelty, nis, weight, variance = torch.from_numpy(figures.reshape(4, *batch)).unbind()
         report = UpdateReport(torch.from_numpy(event.reshape(batch)), novelty, nis, weight)
@@ -102,33 +108,41 @@ class CompiledEngine(ReferenceEngine):
 
     def _ask(
         self, gp: Host, x: Tensor, *, variance: bool = False, slopes: bool = False
-    ) -> MomentsWithJacobians | None:
-        """One query per model, what is not wanted being empty; None if torch must do it."""
+    ) -> tuple[Array, ...] | None:
+        """One query per model, what is not wanted perhaps being empty; None if torch must do it.
+
+        The last answer is kept: a learner is often asked for several things at the same x.
+        """
         if not self._takes(gp, x) or self._given:
             return None
-        n, nd = self._n_models * self._m, self._n_models * self._m * self._width
+        at, query = self._at, x.numpy().tobytes()
+        then, of, had_variance, had_slopes, found = self._answer
+        if then is at and of == query and had_variance >= variance and had_slopes >= slopes:
+            return found
+        n, d = self._n_models * self._m, self._width
         mean, v = np.empty(n), np.empty(n if variance else 0)
-        J, dv = np.empty(nd if slopes else 0), np.empty(nd if slopes and variance else 0)
+        J, dv = np.empty(n * d if slopes else 0), np.empty(n * d if slopes and variance else 0)
         basis, active, _, _, moments, vectors = self._state
-        network, inputs = self._network, x.numpy().reshape(-1)
+        network, inputs, by = self._network, x.numpy().reshape(-1), self._none1
         if network is not None:
-            inputs = network.of(x, self._units_x, slopes)
+            _, inputs, by = network.of(x, self._units_x, slopes)
         self._query(
             self._flags, inputs, basis, active, moments, vectors, *self._hyper, *self._units,
             variance, slopes, mean, v, J, dv,
         )  # fmt: skip
         if network is not None and slopes:
-            J, dv = network.by_x(J, self._n_models), network.by_x(dv, self._n_models) if variance else dv
+            J, dv = (network.by_x(a, by, self._units_x[1]) if a.size else a for a in (J, dv))
         one, two = (*self._batch, self._m), (*self._batch, self._m, self._d)
-        shapes = one, one if variance else (0,), two if slopes else (0,), two if slopes and variance else (0,)
-        found = zip((mean, v, J, dv), shapes, strict=True)
-        return MomentsWithJacobians(*(torch.from_numpy(a.reshape(s)) for a, s in found))
+        shapes = zip((mean, v, J, dv), (one, one, two, two), strict=True)
+        found = tuple(a.reshape(shape) if a.size else a for a, shape in shapes)
+        self._answer = at, query, variance, slopes, found
+        return found
 
     # -- what they work on ----------------------------------------------------------------------
 
     def _takes(self, gp: Host, x: Tensor) -> bool:
         """Whether this call is one for compiled loops; prepares the arrays."""
-        if torch.compiler.is_compiling() or not _is_plain(x, (*gp.batch_shape, gp.in_features)):
+        if torch.compiler.is_compiling() or not is_plain_one(x, (*gp.batch_shape, gp.in_features)):
             return False
         if load_loops() is None:
             return False
@@ -138,6 +152,7 @@ class CompiledEngine(ReferenceEngine):
             return False
         marks = [source[2]._version for source in self._sources]
         if marks != self._marks:
+            self._at = object()
             if self._network is not None:
                 self._network.follow()
             self._marks = marks
@@ -205,7 +220,12 @@ class CompiledEngine(ReferenceEngine):
         self._usable = True
 
 
-def _is_plain(x: Any, shape: tuple[int, ...]) -> bool:
+def _tensor(kept: Array) -> Tensor:
+    """A copy: what is kept must not change with what was given away."""
+    return torch.from_numpy(kept.copy())
+
+
+def is_plain_one(x: Any, shape: tuple[int, ...]) -> bool:
     """Whether x is an ordinary tensor of that shape, of which torch keeps no record."""
     if not is_plain(x) or x.shape != shape or not x.is_contiguous():
         return False

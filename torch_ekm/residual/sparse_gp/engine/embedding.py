@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,6 +12,14 @@ import torch
 from ....typing import Array, Tensor
 from ...kernels.deep import DeepKernel
 from ..posterior import SparsePosterior
+
+
+class Embedded(NamedTuple):
+    """Inputs, one per model."""
+
+    z: Array  #: in the learner's units, ``(models, d)``
+    found: Array  #: embedded, the models' one after the other
+    slope: Array  #: ``(d net/dz)'``, ``(models, d, features)``; empty where it was not wanted
 
 
 class Embedding:
@@ -31,11 +40,11 @@ class Embedding:
         self.basis = np.empty((n, M, self.width))
         self._lengthscale = kernel.base.log_lengthscale.detach().numpy().reshape(-1, d)
         self._network = np.empty((len(self._lengthscale), 0))
-        self._z, self._slope = np.empty((n, d)), np.empty((n, d, widths[-1]))
-        self._scale = np.empty((1, d))
+        self._last: tuple[bytes, Embedded] | None = None
 
     def follow(self) -> None:
-        """Embed the basis again if it or a parameter changed without :meth:`keep`."""
+        """Embed the basis again if it or a parameter changed without :meth:`keep`; units may have changed."""
+        self._last = None
         marks = [tensor._version for tensor in self._tensors]
         if marks != self._marks:
             with torch.no_grad():
@@ -46,25 +55,33 @@ class Embedding:
             self._network = np.concatenate([p.detach().numpy().reshape(rows, -1) for p in layers], axis=1)
             self._marks = marks
 
-    def of(self, x: Tensor, units: tuple[Array, ...], slopes: bool) -> Array:
-        """One input per model, embedded, the models' one after the other."""
-        shift, self._scale = units
-        found = np.empty((len(self.basis), self.width))
+    def of(self, x: Tensor, units: tuple[Array, ...], slopes: bool) -> Embedded:
+        """One input per model, embedded. The last one is kept: it is asked for, then learned."""
+        query, last = x.numpy().tobytes(), self._last
+        if last is None or last[0] != query or (slopes and not last[1].slope.size):
+            shift, scale = units
+            last = query, self._embedded(x.numpy().reshape(len(self.basis), -1), shift, scale, slopes)
+            self._last = last
+        return last[1]
+
+    def _embedded(self, x: Array, shift: Array, scale: Array, slopes: bool) -> Embedded:
+        n, d = x.shape
+        z, found = np.empty((n, d)), np.empty((n, self.width))
+        slope = np.empty((n, d, self.width - d) if slopes else (0, 0, 0))
         self._loops.embed_fleet(
-            self._widths, self._network, self._lengthscale, shift, self._scale, x.numpy().reshape(-1), slopes,
-            self._z, found, self._slope,
+            self._widths, self._network, self._lengthscale, shift, scale, x.reshape(-1), slopes, z, found,
+            slope,
         )  # fmt: skip
-        return found.reshape(-1)
+        return Embedded(z, found.reshape(-1), slope)
 
-    def keep(self, on: np.ndarray) -> None:
-        """Write the last inputs into the free slots of the basis of the models ``on``."""
+    def keep(self, z: Array, on: np.ndarray) -> None:
+        """Write inputs into the free slots of the basis of the models ``on``."""
         models = np.flatnonzero(on)
-        self._raw[models, self._slot[models]] = self._z[models]
+        self._raw[models, self._slot[models]] = z[models]
 
-    def by_x(self, slope: Array, models: int) -> Array:
-        """Slopes by the last input from those by what was made of it, ``(models, rows, d)``."""
-        slope = slope.reshape(models, -1, self.width)
+    def by_x(self, by: Array, slope: Array, scale: Array) -> Array:
+        """Derivatives by an input, ``(models, rows, d)``, from those by what was made of it."""
+        by = by.reshape(len(self.basis), -1, self.width)
         d = self._raw.shape[-1]
         w = np.exp(-self._lengthscale)[:, None]
-        by_z = slope[..., :d] * w + slope[..., d:] @ self._slope.swapaxes(-1, -2)
-        return by_z / self._scale[:, None]
+        return (by[..., :d] * w + by[..., d:] @ slope.swapaxes(-1, -2)) / scale[:, None]
