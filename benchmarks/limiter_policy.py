@@ -12,351 +12,218 @@ function and the pace that follows from evidence, around the same E-KM. Policy a
 
 from __future__ import annotations
 
-import dataclasses
-import json
+import hashlib
+import itertools
 import math
-import queue
-import threading
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import numpy as np
-import torch
-from any_hand import ANGLES, WARM_UP, Turns, count_of, records_by
+from any_hand import ANGLES, WARM_UP, count_of
 from command_line import study_parser
+from model_rig import ModelBench, drawn_plant
+from step_policy import DECISIONS, LONGEST, LOST, MISSED, POLICY_FILE, ChosenPace, policy_in, train
 
-from torch_ekm._extras import require
 from torch_ekm._terminal import progress
-from torch_ekm.control import LimitingFunction, ModelHand, Pace, PaceOptions, StepBound
-from torch_ekm.exceptions import GraspError
+from torch_ekm.control import LimitingFunction, Pace, PaceOptions, StepBound, StoppingRule
 from torch_ekm.experiments.config import Setting, digest, object_name
 from torch_ekm.experiments.jobs import run_jobs
-from torch_ekm.experiments.records import Trial, TrialRecord
+from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
+from torch_ekm.experiments.reporting.trials import trial_frame
 from torch_ekm.experiments.runner import Bench
-from torch_ekm.kinematics import GraspState
-from torch_ekm.model import KinematicModel, Linearization
-from torch_ekm.simulation import PRESETS, PlantParameters, SimulatedHand, preset
-from torch_ekm.simulation.mechanism.servo import Servo
+from torch_ekm.simulation import ENGINES, preset
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
-    from torch_ekm.control import Situation
-    from torch_ekm.typing import Array, Tensor
 
 _DEG = math.pi / 180
-LONGEST = 6.0  # [deg] that one step can ask for
-SHORTEST = 0.05  # of it
-#: Figures of a hand for training, each uniform between the presets "none" and "hostile".
-DRAWN = (
-    "moment_arm", "spring", "servo_stiffness", "friction", "mass", "actuator_bias", "actuator_error", "dead_zone",
-    "backlash",
-)  # fmt: skip
-TURNS = 6  # with one hand, its E-KM empty before the first
-SIZES = (5.0, 30.0)  # [deg] of a turn for training
-LOST, MISSED = 50.0, 20.0  # motions that such an end is worth
-DECISIONS = 20_000  # of the training, which ends earlier after
-MINUTES = 25.0
-SETTLED = 0.5  # [deg]
-_FEATURES = 14
+_FIRST_WARM_UP = 1000  # number of the first training grasp: never one that is tested
 PAPER, LONG, PACE, POLICY = "limiting function", "limiting function, 6 deg", "pace", "policy"
+SYSTEMS = (PAPER, LONG, PACE, POLICY)
+ON_MODEL = "kinematic model"
 
 
-class Choice(NamedTuple):
-    """A step that the policy chose."""
-
-    error: float
-    """Focused error before it [deg]."""
-    asked: float
-    """[deg]"""
-    rho: float
-
-
-class ChosenPace(Pace):
-    """``|dx_d| = phi min(|e|, 6 deg)``, phi chosen by a policy from what the controller has at hand.
-
-    Grips that are too weak still wait, as with every :class:`Pace`.
+def bench_of(system: str, setting: Setting, item: str, model: bool, policy: Path) -> Bench:
+    """The E-KM with one way to choose the length of a step.
 
     Args:
-        choose: features -> action in [-1, 1].
+        model: the hand is a :class:`ModelRig`.
+        policy: its file.
+    """
+    bench = (ModelBench if model else Bench)(setting, item, "E-KM")
+    if system == POLICY:
+        bench.pace = ChosenPace(policy_in(policy))
+    elif system != PACE:
+        size = LONGEST if system == LONG else 2.5
+        limiting = LimitingFunction(step=size * _DEG, contact_travel=None)
+        bench.pace = Pace(PaceOptions(limiting, StepBound(least=math.inf)), adapts=False)
+    return bench
+
+
+def session(
+    system: str, setting: Setting, item: str, model: bool, seed: int, policy: Path
+) -> list[dict[str, Any]]:
+    """Warm-up, then the turns: how each ended."""
+    bench = bench_of(system, setting, item, model, policy)
+    for k in range(WARM_UP):
+        bench.trial(seed, _FIRST_WARM_UP + k, float(np.median(ANGLES)), "warm-up")
+    turns = [bench.trial(seed, k, angle).to_json() for k, angle in enumerate(ANGLES)]
+    bench.close()
+    return turns
+
+
+class Outcome:
+    """Turns by place and system, and the training.
+
+    Args:
+        trials: of :func:`trial_frame`, with the columns place and system.
+        training: of :func:`train`.
     """
 
-    def __init__(self, choose: Callable[[Array], float]) -> None:
-        limiting = LimitingFunction(gain=1.0, step=LONGEST * _DEG, contact_travel=None)
-        super().__init__(PaceOptions(limiting, StepBound(least=math.inf)), adapts=False)
-        self._choose = choose
-        self.begin(0.0)
+    def __init__(self, trials: DataFrame, training: dict[str, Any]) -> None:
+        held = trials[trials["grasped"].astype(bool)].astype({"lost": bool, "not_reached": bool})
+        self.trials = held.assign(reached=~(held["lost"] | held["not_reached"]))
+        self.training = training
+        self.places = list(dict.fromkeys(self.trials["place"]))
 
-    def begin(self, last: float) -> None:
-        """A new turn."""
-        self._last: Choice | None = None
-        self._error, self._motions, self._alarms = 0.0, 0, 0
+    def of(self, place: str, system: str) -> DataFrame:
+        """The turns of a system."""
+        return self.trials[(self.trials["place"] == place) & (self.trials["system"] == system)]
 
-    def ask(self, error: Tensor, travel: float = 0.0, measures: bool = True) -> tuple[Tensor, float]:
-        self._error = float(torch.linalg.vector_norm(error)) / _DEG
-        return super().ask(error, travel, measures)
-
-    def cut(
-        self, lin: Linearization, delta_a: Tensor, predicted: Tensor, seen: Situation, share: float
-    ) -> float:
-        whole = super().cut(lin, delta_a, predicted, seen, share)
-        if self._error < 1e-6:  # a motion that only grips
-            return whole
-        features = self.features(lin, delta_a, predicted, seen)
-        phi = share_of(self._choose(features))
-        self._last = Choice(self._error, phi * min(self._error, LONGEST), math.nan)
-        return min(phi, whole)
-
-    def judge(self, disagreement: float, share: float = 1.0) -> None:
-        self.count += 1
-        self._motions += 1
-        if self._last is not None:
-            self._last = self._last._replace(rho=disagreement)
-
-    def restart(self) -> None:
-        self._alarms += 1
-
-    def features(self, lin: Linearization, delta_a: Tensor, predicted: Tensor, seen: Situation) -> Array:
-        """What the policy sees ``(14,)``, each about 1, cut at 5.
-
-        Error and what a whole step asks for, both of 10 deg; the last step in 6 deg, what came of it over
-        what was asked, and rho; least friction margin now and after a whole step [N]; rotation off the axis
-        now and by a whole step, of 5 deg; grip over the wanted one, and of the finger that bears least;
-        motions of this turn and of all, in tens; signs of a loss.
-        """
-        last = self._last
-        came = 1.0 if last is None else (last.error - self._error) / max(last.asked, 0.2)
-        rho = 1.0 if last is None or math.isnan(last.rho) else last.rho
-        off = seen.focus.off_rotation(predicted) / (5 * _DEG)
-        force, margins = seen.normal_force(lin), (lin.margins, lin.margins_after(delta_a))
-        solved = lin.forces.solved and force is not None
-        grip = float(force.max()) / seen.grip if solved and seen.grip else 1.0
-        weakest = float(force.min() * (len(force) - 1)) / seen.grip if solved and seen.grip else 1.0
-        found = [
-            self._error / 10, min(self._error, LONGEST) / 10, 0.0 if last is None else last.asked / LONGEST,
-            came, rho, *(float(margin.min()) if solved else 0.0 for margin in margins),
-            seen.focus.off_rotation(seen.error) / (5 * _DEG), off, grip, weakest,
-            self._motions / 10, int(self.count) / 10, float(self._alarms),
-        ]  # fmt: skip
-        return np.clip(np.nan_to_num(np.array(found, np.float32)), -5, 5)
-
-
-def share_of(action: float) -> float:
-    """phi, from 0.05 to 1, of an action in [-1, 1]."""
-    return SHORTEST + (1 - SHORTEST) * (min(max(action, -1.0), 1.0) + 1) / 2
-
-
-class ModelRig:
-    """The hand of a :class:`SimulatedHand` as a kinematic model of its true figures moves it, no engine.
-
-    Motions are those of :class:`ModelHand`: contacts stick, slide, open and close. Servos and sensors are
-    the simulation's; joint friction, weight of the links and creep are left out.
-    """
-
-    transmission: Any = None
-
-    def __init__(self, plant: SimulatedHand) -> None:
-        hand, obj = plant.true_descriptions()
-        self._model, self._parameters = KinematicModel(hand, obj), plant.parameters
-        self.scene, self.transmission = self, self  # one object stands for the parts of a simulated hand
-        limits = plant.hand.actuator_lower, plant.hand.actuator_upper
-        self.servo = Servo(*limits, plant.parameters, plant.config.relative_to)
-
-    def grasp(self, plan: Any) -> None:
-        """In the planned equilibrium."""
-        state = GraspState(*map(torch.tensor, (plan.q, plan.position, plan.rotation)))
-        along = -(plan.forces * plan.normals).sum(-1)
-        force = torch.zeros(len(self._model.hand.pads), dtype=torch.float64)
-        force[self._model.hand.pad_indices(plan.pads)] = torch.from_numpy(along)
-        self.servo.place(plan.motor)
-        self._moves = ModelHand(self._model, state, torch.tensor(plan.motor), force)
-
-    def move(self, goal: Array) -> None:
-        """The tendons follow the motors, but for the play."""
-        before = self.servo.output
-        self._moves.command(torch.from_numpy(self.servo.move_to(goal) - before))
-
-    def actuator_torque(self, q: Array, output: Array) -> Array:
-        """Of no interest here."""
-        return np.zeros_like(output)
-
-    @property
-    def q(self) -> Array:
-        return self._moves.state.q.numpy()
-
-    @property
-    def object_pose(self) -> tuple[Array, Array]:
-        return self._moves.state.position.numpy(), self._moves.state.rotation.numpy()
-
-    @property
-    def normal(self) -> Array:
-        return self._moves.force.numpy()
-
-    @property
-    def fingers(self) -> int:
-        """Pads that bear; none of a grasp that has failed."""
-        return 0 if self._moves.failure else int((self.normal > 0).sum())
-
-    @property
-    def time(self) -> float:
-        return 0.3 * self._moves.time
-
-
-class ModelBench(Bench):
-    """A :class:`Bench` whose simulated hand is a kinematic model."""
-
-    def __init__(self, setting: Setting, object: str, controller: str) -> None:
-        super().__init__(setting, object, controller)
-        self.hand._rig = ModelRig(self.hand)
-
-    def grasp_again(self) -> GraspState:
-        """In the same place, for planning a pinch takes as long as a turn."""
-        self.hand._rig.grasp(self.hand.plan)
-        self.hand._sensors.forget()
-        return self.plant.observe().state
-
-
-def drawn_plant(draw: np.random.Generator) -> PlantParameters:
-    """A used hand: each figure of DRAWN between those of "none" and "hostile", sensors as in "nominal"."""
-    new, old = PRESETS["none"], PRESETS["hostile"]
-    figures = {name: draw.uniform(*sorted((getattr(new, name), getattr(old, name)))) for name in DRAWN}
-    return preset("nominal").replace(**figures, hardware_seed=int(draw.integers(2**31)))
-
-
-class Abandoned(Exception):
-    """A turn that nobody goes on with."""
-
-
-class TargetSteps(gymnasium.Env):
-    """Turn an object by choosing how long each step shall be; the hand is a :class:`ModelRig`.
-
-    The closed loop of the E-KM runs in a thread of its own and waits in each decision for the action. An
-    episode is one turn; TURNS of them are made with one drawn hand, object and grasp, its E-KM empty before
-    the first.
-
-    **Action** ``(1,)`` in [-1, 1]: see :func:`share_of`. **Observation** ``(14,)``: see
-    :meth:`ChosenPace.features`. **Reward**: -0.1 for each motion, those that grip or go back included; at the
-    end -5 for a lost object, -2 and a tenth of the error [deg] for another end than the target.
-    """
-
-    def __init__(self, objects: Sequence[str]) -> None:
-        self.observation_space = gymnasium.spaces.Box(-5.0, 5.0, (_FEATURES,), np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
-        self._objects, self._turns = objects, 0
-        self._bench: ModelBench | None = None
-        self._actions: queue.Queue[float | None] = queue.Queue()
-        self._found: queue.Queue[Any] = queue.Queue()
-        self._thread: threading.Thread | None = None
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict]:
-        super().reset(seed=seed)
-        self.close()
-        while True:
-            bench, start = self._grasped()
-            size, number = float(self.np_random.uniform(*SIZES)), int(self.np_random.integers(2**31))
-            self._thread = threading.Thread(target=self._turn, args=(bench, start, size, number), daemon=True)
-            self._thread.start()
-            self._moved = bench.disturbed.count
-            found = self._found.get()
-            if isinstance(found, np.ndarray):
-                return found, {}
-            self._ended(found)  # before any decision
-
-    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        assert self._bench is not None
-        self._actions.put(float(action[0]))
-        found = self._found.get()
-        moved, self._moved = self._moved, self._bench.disturbed.count
-        reward = moved - self._moved
-        if isinstance(found, np.ndarray):
-            return found, 0.1 * reward, False, False, {}
-        done = self._ended(found)
-        reward -= LOST * done.lost + done.not_reached * (MISSED + done.true_error_deg)
-        info = {"motions": done.steps, "lost": done.lost, "reached": not (done.lost or done.not_reached)}
-        return np.zeros(_FEATURES, np.float32), 0.1 * reward, True, False, info
-
-    def close(self) -> None:
-        """Abandon the turn."""
-        if self._thread is not None:
-            self._actions.put(None)
-            self._thread.join()
-            self._thread, self._actions, self._found = None, queue.Queue(), queue.Queue()
-
-    def _grasped(self) -> tuple[Bench, GraspState]:
-        """The grasp of this session once more, or one of a new hand."""
-        if self._bench is not None and self._turns < TURNS:
-            self._turns += 1
-            return self._bench, self._bench.grasp_again()
-        while True:
-            draw, self._turns = self.np_random, 1
-            plant, item = drawn_plant(draw), str(draw.choice(self._objects))
-            self._bench = ModelBench(Setting(plant=plant), item, "E-KM")
-            self._bench.pace = ChosenPace(self._choose)
-            if (start := self._bench.grasp(int(draw.integers(2**31)), 0)) is not None:
-                return self._bench, start
-
-    def _ended(self, found: TrialRecord | Exception) -> TrialRecord:
-        """The thread is over."""
-        assert self._thread is not None
-        self._thread.join()
-        self._thread = None
-        if isinstance(found, Exception):
-            raise found
-        return found
-
-    def _choose(self, features: Array) -> float:
-        self._found.put(features)
-        action = self._actions.get()
-        if action is None:
-            raise Abandoned
-        return action
-
-    def _turn(self, bench: Bench, start: GraspState, size: float, number: int) -> None:
-        try:
-            self._found.put(bench.turn(Trial(bench.name, "training", "E-KM", 0, number, size), start))
-        except Abandoned:
-            pass
-        except Exception as failed:
-            self._found.put(failed)
-
-
-def train(folder: Path, objects: Sequence[str], decisions: int, seed: int = 0) -> dict[str, Any]:
-    """The policy in ``folder/policy.zip``, and how each turn of its training ended."""
-    kept, policy = folder / "training.json", folder / "policy.zip"
-    if kept.exists() and policy.exists():
-        return json.loads(kept.read_text(encoding="utf-8"))
-    baselines = require("stable_baselines3", "rl")
-    torch.manual_seed(seed)
-    env, began, ended = TargetSteps(objects), time.monotonic(), []
-
-    def note(known: dict[str, Any], unused: Any) -> bool:
-        """After each decision."""
-        ended.extend(
-            {"decision": learner.num_timesteps, **{name: info[name] for name in ("motions", "lost", "reached")}}
-            for info in known["infos"]
-            if "motions" in info
+    def ratio(self, place: str, other: str) -> float:
+        """Motions of the policy over those of another system, of the turns that both reached."""
+        key = ["object", "seed", "trial"]
+        mine, theirs = (
+            turns[turns["reached"]].set_index(key)["motions"]
+            for turns in (self.of(place, POLICY), self.of(place, other))
         )
-        return time.monotonic() - began < 60 * MINUTES
+        both = mine.index.intersection(theirs.index)
+        return float(mine[both].sum() / theirs[both].sum()) if len(both) else math.nan
 
-    learner = baselines.PPO(
-        "MlpPolicy", env, n_steps=min(256, decisions), batch_size=64, learning_rate=1e-3, gamma=1.0,
-        policy_kwargs={"net_arch": [32, 32], "log_std_init": -0.5}, device="cpu", seed=seed,
+    def table(self, place: str, name: str, about: str) -> Table:
+        """A row for each system."""
+        rows: list[list[Cell]] = []
+        for system in SYSTEMS:
+            turns = self.of(place, system)
+            if not len(turns):
+                continue
+            reached = turns[turns["reached"]]
+            means = reached["motions"].mean(), reached["settle"].mean(), turns["error_deg"].mean()
+            ends = count_of(turns[~turns["reached"]]["reason"])
+            rows.append(
+                [system, len(turns), int(turns["lost"].sum()), len(reached), *map(float, means), ends]
+            )
+        columns: list[str | Column] = [
+            "steps by", "turns", "lost", "reached", Column("motions", ".1f"), Column("settled after", ".1f"),
+            "error [deg]", "other ends",
+        ]  # fmt: skip
+        ratios = (f"{self.ratio(place, other):.2f} of {other}" for other in SYSTEMS if other != POLICY)
+        note = (
+            "Means: motions, and motions until the measured error stays within 0.5 deg, of turns that"
+            " reached the target; true error at the end, lost objects with the whole angle. Motions of the"
+            f" policy over those of turns that both reached: {', '.join(ratios)}."
+        )
+        return Table(name, about, columns, rows, note)
+
+    @property
+    def verdict(self) -> str:
+        """The last line."""
+        place, parts = self.places[-1], []
+        for system in (POLICY, PAPER, PACE):
+            turns = self.of(place, system)
+            motions = turns[turns["reached"]]["motions"].mean()
+            parts.append(f"{system} lost {turns['lost'].sum()} of {len(turns)}, {motions:.1f} motions")
+        return "; ".join(parts)
+
+    def picture(self) -> Figure:
+        """Motions during the training, and errors and steps of the turns that are tested."""
+        figure, (learning, errors, steps) = new_figure(9.5, 3.0, 3)
+        turns = self.training["turns"]
+        costs = [
+            one["motions"] + LOST * one["lost"] + MISSED * (not (one["lost"] or one["reached"]))
+            for one in turns
+        ]
+        for values, label, colour in (
+            ([one["motions"] for one in turns], "motions", COLOURS["E-KM"]),
+            (costs, "with losses and misses", COLOURS["limit"]),
+        ):
+            width = min(50, len(values))
+            means = np.convolve(values, np.full(width, 1 / width), "valid")
+            learning.plot([one["decision"] for one in turns][width - 1 :], means, color=colour, label=label)
+        learning.set(xlabel="decisions of the training", ylabel="motions of a turn", ylim=(0, None))
+        learning.legend(frameon=False, fontsize=8)
+        shown = self.trials[self.trials["place"] == self.places[-1]]
+        for system, colour in zip(SYSTEMS, ("KM", "KM+I", "E-KM", "limit"), strict=True):
+            mine = shown[shown["system"] == system]
+            longest = mine[mine["angle_deg"] == max(ANGLES)]["errors_deg"]
+            most = max(map(len, longest), default=0)
+            held = [[*errors, *[errors[-1]] * (most - len(errors))] for errors in longest]
+            if held:
+                errors.plot(np.median(held, axis=0), color=COLOURS[colour], label=system)
+            pairs = [pair for found in mine["errors_deg"] for pair in pairwise(found)]
+            if pairs:
+                before, after = np.array(pairs).T
+                bins = np.arange(0, 28, 3)
+                at = np.digitize(before, bins)
+                made = [(bins[k - 1] + 1.5, (before - after)[at == k].mean()) for k in np.unique(at)]
+                steps.plot(*zip(*made, strict=True), "o-", ms=3, color=COLOURS[colour])
+        errors.set(xlabel=f"motions of a turn of {max(ANGLES):g} deg", ylabel="error [deg]", xlim=(0, 20))
+        errors.legend(frameon=False, fontsize=8)
+        steps.set(xlabel="error before a motion [deg]", ylabel="what it brings [deg]")
+        return figure
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = study_parser(
+        __doc__, "limiter_policy", objects="box,can", seeds="1000:1004", engine="sapien",
+        quick="64 decisions of training, one object and seed",
     )  # fmt: skip
-    learner.learn(decisions, callback=note)
-    env.close()
-    folder.mkdir(parents=True, exist_ok=True)
-    learner.save(policy)
-    figures = {"decisions": learner.num_timesteps, "minutes": (time.monotonic() - began) / 60, "turns": ended}
-    kept.write_text(json.dumps(figures) + "\n", encoding="utf-8")
-    return figures
+    given = parser.parse_args(arguments)
+    objects, seeds, decisions = given.objects.split(","), given.seeds, DECISIONS
+    if given.quick:
+        objects, seeds, decisions = objects[:1], seeds[:1], 64
+    training = train(given.out, objects, decisions)
+    policy = given.out / POLICY_FILE
+    own, todo, where = hashlib.sha256(policy.read_bytes()).hexdigest(), {}, {}
+    for seed, item, system in itertools.product(seeds, objects, SYSTEMS):
+        for place in (ON_MODEL, given.engine):
+            model = place == ON_MODEL
+            plant = drawn_plant(np.random.default_rng(seed)) if model else preset("nominal")
+            setting = Setting(plant=plant, engine=given.engine).hardware_instance(seed)
+            mark = digest(setting, (item,), ANGLES, WARM_UP, system, own if system == POLICY else "")
+            name = system.replace(" ", "_").replace(",", "")
+            job = f"{object_name(item)}_{name}_{place.replace(' ', '_')}_{mark}_{seed}"
+            todo[job], where[job] = (system, setting, item, model, seed, policy), (place, system)
+    with progress("running", len(todo)) as advance:
+        results = run_jobs(session, todo, given.out, given.jobs, advance)
+    records = {job: [TrialRecord.from_json(one) for one in turns] for job, turns in results.items()}
+    trials = trial_frame(records, StoppingRule().max_steps)
+    trials["place"], trials["system"] = (trials["job"].map(lambda job, k=k: where[job][k]) for k in (0, 1))
+    outcome = Outcome(trials, training)
+    caption = (
+        "Left: means over 50 turns of the training. Middle: median measured error in the simulated hand."
+        " Right: by how much a motion lessens the error there, mean."
+    )
+    shown = save_figure(outcome.picture(), given.out, "limiter_policy", caption)
+    tables = [
+        outcome.table(given.engine, "simulated", f"In {ENGINES[given.engine]}, preset nominal"),
+        outcome.table(ON_MODEL, "model", "On kinematic models like those of the training"),
+    ]
+    summary = (
+        f"{outcome.verdict[0].upper()}{outcome.verdict[1:]}. Training: {training['decisions']} decisions,"
+        f" {len(training['turns'])} turns, {training['minutes']:.0f} min on one core that others use, too."
+    )
+    report = Report("A policy for the length of a step", summary, tables, [shown])
+    report.write(given.out)
+    print(report.markdown())
+    print(outcome.verdict)
 
 
-def policy_in(path: Path) -> Callable[[Array], float]:
-    """The mean action of a trained policy."""
-    learner = require("stable_baselines3", "rl").PPO.load(path, device="cpu")
-    return lambda features: float(learner.predict(features, deterministic=True)[0][0])
+if __name__ == "__main__":
+    main()
