@@ -45,7 +45,8 @@ if TYPE_CHECKING:
 _DEG = math.pi / 180
 _FIRST_WARM_UP = 1000  # number of the first training grasp: never one that is tested
 PAPER, LONG, PACE, POLICY = "limiting function", "limiting function, 6 deg", "pace", "policy"
-SYSTEMS = (PAPER, LONG, PACE, POLICY)
+#: What chooses the length of a step -> its colour.
+SYSTEMS = {PAPER: COLOURS["KM"], LONG: COLOURS["KM+I"], PACE: COLOURS["E-KM"], POLICY: COLOURS["limit"]}
 ON_MODEL = "kinematic model"
 
 
@@ -159,20 +160,20 @@ class Outcome:
         learning.set(xlabel="decisions of the training", ylabel="motions of a turn", ylim=(0, None))
         learning.legend(frameon=False, fontsize=8)
         shown = self.trials[self.trials["place"] == self.places[-1]]
-        for system, colour in zip(SYSTEMS, ("KM", "KM+I", "E-KM", "limit"), strict=True):
+        for system, colour in SYSTEMS.items():
             mine = shown[shown["system"] == system]
             longest = mine[mine["angle_deg"] == max(ANGLES)]["errors_deg"]
             most = max(map(len, longest), default=0)
             held = [[*errors, *[errors[-1]] * (most - len(errors))] for errors in longest]
             if held:
-                errors.plot(np.median(held, axis=0), color=COLOURS[colour], label=system)
+                errors.plot(np.median(held, axis=0), color=colour, label=system)
             pairs = [pair for found in mine["errors_deg"] for pair in pairwise(found)]
             if pairs:
                 before, after = np.array(pairs).T
                 bins = np.arange(0, 28, 3)
                 at = np.digitize(before, bins)
                 made = [(bins[k - 1] + 1.5, (before - after)[at == k].mean()) for k in np.unique(at)]
-                steps.plot(*zip(*made, strict=True), "o-", ms=3, color=COLOURS[colour])
+                steps.plot(*zip(*made, strict=True), "o-", ms=3, color=colour)
         errors.set(xlabel=f"motions of a turn of {max(ANGLES):g} deg", ylabel="error [deg]", xlim=(0, 20))
         errors.legend(frameon=False, fontsize=8)
         steps.set(xlabel="error before a motion [deg]", ylabel="what it brings [deg]")

@@ -148,16 +148,19 @@ class TargetSteps(gymnasium.Env):
         self._actions: queue.Queue[float | None] = queue.Queue()
         self._found: queue.Queue[Any] = queue.Queue()
         self._thread: threading.Thread | None = None
+        self._moved = 0  # commands until the last decision
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict]:
         super().reset(seed=seed)
         self.close()
+        if seed is not None:  # the same seed, the same hands
+            self._bench = None
         while True:
             bench, start = self._grasped()
             size, number = float(self.np_random.uniform(*SIZES)), int(self.np_random.integers(2**31))
             self._thread = threading.Thread(target=self._turn, args=(bench, start, size, number), daemon=True)
-            self._thread.start()
             self._moved = bench.disturbed.count
+            self._thread.start()
             found = self._found.get()
             if isinstance(found, np.ndarray):
                 return found, {}
