@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,7 @@ import numpy as np
 from any_hand import ANGLES, WARM_UP, count_of
 from command_line import study_parser
 from model_rig import ModelBench, drawn_plant
-from step_policy import DECISIONS, LONGEST, LOST, MISSED, POLICY_FILE, ChosenPace, policy_in, train
+from step_policy import DECISIONS, LONGEST, LOST, MISSED, POLICY_FILE, ChosenPace, asked_of, policy_in, train
 
 from torch_ekm._terminal import progress
 from torch_ekm.control import LimitingFunction, Pace, PaceOptions, StepBound, StoppingRule
@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
+    from torch_ekm.typing import Array
+
 
 _DEG = math.pi / 180
 _FIRST_WARM_UP = 1000  # number of the first training grasp: never one that is tested
@@ -48,6 +50,8 @@ PAPER, LONG, PACE, POLICY = "limiting function", "limiting function, 6 deg", "pa
 #: What chooses the length of a step -> its colour.
 SYSTEMS = {PAPER: COLOURS["KM"], LONG: COLOURS["KM+I"], PACE: COLOURS["E-KM"], POLICY: COLOURS["limit"]}
 ON_MODEL = "kinematic model"
+#: Errors [deg], and margins now and after a whole step [N], at which the policy is asked.
+ERRORS, MARGINS = (25.0, 15.0, 8.0, 5.0, 3.0, 1.0), ((1.5, 0.5), (0.0, -1.0), (0.0, -4.0))
 MODEL_SEEDS = 2  # of those that are given, on kinematic models
 
 
@@ -181,6 +185,22 @@ class Outcome:
         return figure
 
 
+def policy_table(policy: Callable[[Array], float]) -> Table:
+    """What the policy asks for at some errors."""
+    rows: list[list[Cell]] = [
+        [error, *(asked_of(policy, error, *margins) for margins in MARGINS)] for error in ERRORS
+    ]
+    columns: list[str | Column] = [
+        Column("error [deg]", "g"),
+        *(Column(f"margins {now:g} and {after:g} N [deg]", ".2f") for now, after in MARGINS),
+    ]
+    note = (
+        "In a grip as it is wanted, when the last step went as asked; margins: the least friction margin now"
+        " and after a whole step."
+    )
+    return Table("policy", "The step that the policy asks for", columns, rows, note)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = study_parser(
         __doc__, "limiter_policy", objects="box,can", seeds="1000:1004", engine="sapien",
@@ -216,6 +236,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     tables = [
         outcome.table(given.engine, "simulated", f"In {ENGINES[given.engine]}, preset nominal"),
         outcome.table(ON_MODEL, "model", "On kinematic models like those of the training"),
+        policy_table(policy_in(policy)),
     ]
     summary = (
         f"{outcome.verdict[0].upper()}{outcome.verdict[1:]}. Training: {training['decisions']} decisions,"

@@ -262,3 +262,15 @@ def policy_in(path: Path) -> Callable[[Array], float]:
     """The mean action of a trained policy."""
     learner = require("stable_baselines3", "rl").PPO.load(path, device="cpu")
     return lambda features: float(learner.predict(features, deterministic=True)[0][0])
+
+
+def asked_of(policy: Callable[[Array], float], error: float, margin: float, after: float) -> float:
+    """The step [deg] that a policy asks for in a grip as it is wanted, when the last step went as asked.
+
+    Args:
+        error: [deg].
+        margin, after: least friction margin now and after a whole step [N].
+    """
+    most = min(error, LONGEST)
+    features = [error / 10, most / 10, 0.6, 1.0, 0.7, margin, after, 0.1, 0.1, 1.0, 0.85, 0.5, 3.0, 0.0]
+    return share_of(policy(np.array(features, np.float32))) * most

@@ -16,7 +16,7 @@ import limiter_policy
 import step_policy
 from limiter_policy import PAPER, POLICY, Outcome
 from model_rig import DRAWN, ModelBench, drawn_plant
-from step_policy import LONGEST, SHORTEST, TargetSteps, share_of
+from step_policy import LONGEST, SHORTEST, TargetSteps, asked_of, share_of
 
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.records import TrialRecord
@@ -96,6 +96,12 @@ def test_the_end_of_a_turn_is_rewarded() -> None:
     assert info["reached"]
     assert not info["lost"]
     assert total == pytest.approx(-0.1 * info["motions"])
+
+
+def test_a_policy_is_asked_at_an_error_and_margins() -> None:
+    assert asked_of(lambda _: 1.0, 25.0, 1.0, 0.0) == LONGEST
+    assert asked_of(lambda _: -1.0, 3.0, 1.0, 0.0) == pytest.approx(3 * SHORTEST)
+    assert asked_of(lambda features: float(features[6]), 3.0, 1.0, -0.5) == pytest.approx(3 * share_of(-0.5))
 
 
 def record(system: str, angle: float, motions: int, reason: str = "reached") -> TrialRecord:
