@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
     from torch_ekm.typing import Array
 
-
 _DEG = math.pi / 180
 _FIRST_WARM_UP = 1000  # number of the first training grasp: never one that is tested
 PAPER, LONG, PACE, POLICY = "limiting function", "limiting function, 6 deg", "pace", "policy"
@@ -239,8 +238,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ended, place = training["turns"], outcome.places[0]
     ratios = (f"{outcome.ratio(place, other):.2f} of {other}" for other in SYSTEMS if other != POLICY)
     summary = (
-        f"{outcome.verdict[0].upper()}{outcome.verdict[1:]}. Motions of the policy over those of turns that both"
-        f" reached: {', '.join(ratios)}. Training: {training['decisions']} decisions in {len(ended)} turns,"
+        f"{outcome.verdict[0].upper()}{outcome.verdict[1:]}. Motions of the policy over those of turns that"
+        f" both reached: {', '.join(ratios)}. Training: {training['decisions']} decisions in {len(ended)} turns,"
         f" {sum(one['lost'] for one in ended)} of them lost, {training['minutes']:.0f} min."
     )
     report = Report("A policy for the length of a step", summary, tables, [shown])
