@@ -6,7 +6,8 @@
 from the minimal-force problem alone, no fingertip is read; least motor increments that meet the limited error
 within the motors' ranges; a plain sparse online GP of [q; p; da] with commanded da. It has no servo inverse,
 no grip or force limits, no pace, no retreat, no gates on what teaches, and no figures of the hand. "With
-tasks" adds this package's tasks of grip and off-axis motion, on estimated forces. Grasps, targets, hands and
+tasks" adds this package's tasks of grip and off-axis motion, on estimated forces; "J_m as misprinted" takes
+the printed K letter by letter. Grasps, targets, hands and
 stopping rule are those of the other systems. Finished sessions stay in ``--out``: an interrupted run goes on
 where it stopped.
 """
@@ -16,7 +17,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,12 +26,14 @@ from any_hand import Turns, records_by
 from command_line import study_parser
 
 from torch_ekm._terminal import progress
+from torch_ekm.contact.contact_kinematics import ContactKinematics
 from torch_ekm.control import (
     DEFAULT_TASKS,
     ActuatorLimit,
     Caution,
     ClosedLoop,
     EffortTask,
+    FocusedPose,
     FocusTask,
     Guards,
     LimitingFunction,
@@ -48,7 +51,9 @@ from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting import statistics as stats
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
 from torch_ekm.experiments.runner import Bench
-from torch_ekm.model import Linearization
+from torch_ekm.kinematics.se3 import hat
+from torch_ekm.model import KinematicModel, Linearization
+from torch_ekm.model.stiffness.potential import posture_stiffness
 from torch_ekm.plant import Observation, Plant
 from torch_ekm.simulation import PRESETS, preset
 
@@ -85,13 +90,43 @@ class PrintedBench(Bench):
         super().__init__(setting, object, controller, **options)
         self.pace = Pace(setting.pace, adapts=False)
 
-    def look_and_move(self) -> LookAndMoveController:
-        setting, axis = self.setting, self.hand.rotation_axis
-        return PrintedController(self._predictor, axis, setting.tasks, setting.limits, self.pace)
+    def look_and_move(self, focus: FocusedPose | None = None) -> LookAndMoveController:
+        setting, focused = self.setting, self.hand.rotation_axis if focus is None else focus
+        return PrintedController(self._predictor, focused, setting.tasks, setting.limits, self.pace)
 
-    def closed_loop(self, plant: Plant, *, learn: bool = True) -> ClosedLoop:
+    def closed_loop(
+        self,
+        plant: Plant,
+        focus: FocusedPose | None = None,
+        *,
+        learn: bool = True,
+        decline: bool = False,
+    ) -> ClosedLoop:
         known = {"knowledge": self.knowledge, "safety": self.setting.safety}
-        return PrintedLoop(plant, self.look_and_move(), **known, learn=learn, decline=False)
+        return PrintedLoop(plant, self.look_and_move(focus), **known, learn=learn, decline=decline)
+
+
+class MisprintedModel(KinematicModel):
+    """``D = [[V_qq + S, 0], [T, V_pp]]``, ``T = + dG/dtheta mu``: the printed K, letter by letter.
+
+    It is that of pinned contacts which the fingers carry, with the wrong sign of T. Grasps that it takes for
+    unstable are turned all the same.
+    """
+
+    def load_stiffness(self, kin: ContactKinematics, force: Any, spin_moment: Any) -> Any:
+        D, n_q, plain = 0 * super().load_stiffness(kin, force, spin_moment), self.hand.n_q, kin.point_jacobian
+        D[..., :n_q, :n_q] = posture_stiffness(force, plain.mT, kin.axis, self.precedes)
+        D[..., n_q + 3 :, :n_q] = -(hat(force) @ plain).sum(-3)
+        return D
+
+
+class MisprintedBench(PrintedBench):
+    """The system as printed, with J_m by the printed K."""
+
+    def __init__(self, setting: Setting, object: Any, controller: str, **options: Any) -> None:
+        super().__init__(setting, object, controller, **options)
+        flagged = replace(setting.model, on_unstable="flag", rolling=False)
+        self.model = MisprintedModel(self.hand.hand, self.hand.object, flagged)
 
 
 @dataclass(frozen=True)
@@ -99,6 +134,13 @@ class Printed(Generalize):
     """The paper's experiment with the paper's system."""
 
     bench: ClassVar[type[Bench]] = PrintedBench
+
+
+@dataclass(frozen=True)
+class Misprinted(Generalize):
+    """The same by the printed K."""
+
+    bench: ClassVar[type[Bench]] = MisprintedBench
 
 
 def without_fingertips(setting: Setting) -> Setting:
@@ -136,12 +178,21 @@ SYSTEMS: dict[str, tuple[type[Generalize], str, Callable[[Setting], Setting]]] =
     "KM": (Generalize, "KM", Setting.replace),
     "E-KM": (Generalize, "E-KM", Setting.replace),
     "E-KM without fingertips": (Generalize, "E-KM", without_fingertips),
+    "KM, J_m as misprinted": (Misprinted, "KM", as_printed),
+    "E-KM, J_m as misprinted": (Misprinted, "E-KM", as_printed),
+}
+#: What is run together.
+GROUPS = {
+    "all": [name for name in SYSTEMS if "misprinted" not in name],
+    "fingertips": ["E-KM", "E-KM without fingertips"],
+    "misprinted": [name for name in SYSTEMS if "printed" in name],
 }
 #: Each E-KM and its KM.
 _BESIDE = {
     "E-KM, as printed": "KM, as printed",
     "E-KM, with tasks": "KM, with tasks",
     "E-KM": "KM",
+    "E-KM, J_m as misprinted": "KM, J_m as misprinted",
 }
 
 
@@ -235,8 +286,11 @@ class Systems:
             f" {len(self.of(name).records)}"
             for name in self.names
         )
-        beside = [f"{ratio:.0f} %" for name in _BESIDE if (ratio := self._ratio(name)) is not None]
-        told = f"; E-KM:KM as printed, with tasks, and here {', '.join(beside)}" if len(beside) > 1 else ""
+        ratios = {name: ratio for name in _BESIDE if (ratio := self._ratio(name)) is not None}
+        beside = (
+            f"{name.removeprefix('E-KM').strip(', ') or 'here'} {x:.0f} %" for name, x in ratios.items()
+        )
+        told = f"; E-KM:KM {', '.join(beside)}" if len(ratios) > 1 else ""
         return f"{'; '.join(parts)}{told}"
 
 
@@ -245,19 +299,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         __doc__, "as_printed", objects=",".join(TABLE_I), seeds="1000:1010", engine="sapien",
         quick="one object, seed and angle",
     )  # fmt: skip
-    parser.add_argument(
-        "--systems",
-        default="all",
-        choices=("all", "fingertips"),
-        help="fingertips: E-KM with and without",
-    )
+    parser.add_argument("--systems", default="all", choices=GROUPS, help="what is compared")
     parser.add_argument("--preset", default="nominal", choices=list(PRESETS))
     given = parser.parse_args(arguments)
     objects, seeds, angles = given.objects.split(","), given.seeds, None
     if given.quick:
         objects, seeds, angles = objects[:1], seeds[:1], (5.0,)
     base = Setting(preset=given.preset, plant=preset(given.preset), engine=given.engine)
-    names = list(SYSTEMS) if given.systems == "all" else ["E-KM", "E-KM without fingertips"]
+    names = GROUPS[given.systems]
     todo, keys = {}, {}
     for seed, item, name in itertools.product(seeds, objects, names):
         setting = SYSTEMS[name][2](base)

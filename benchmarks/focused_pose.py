@@ -23,10 +23,8 @@ from command_line import study_parser
 
 from torch_ekm._terminal import progress
 from torch_ekm.control import (
-    ClosedLoop,
     Direction,
     FocusedPose,
-    LookAndMoveController,
     PoseTarget,
     StopReason,
 )
@@ -157,13 +155,11 @@ def target_of(start: GraspState, parts: Sequence[Part], axes: dict[str, Tensor])
 
 def ask(bench: Bench, start: GraspState, parts: Sequence[Part]) -> dict[str, Any]:
     """How a loop ended that declines what is not reachable."""
-    setting, axes = bench.setting, axes_of(bench)
+    axes = axes_of(bench)
     focus = FocusedPose(
         [Direction(axes[axis], unit, tolerance=STRICTER * WITHIN[unit]) for unit, axis, _ in parts]
     )
-    assert bench.enhanced is not None
-    controller = LookAndMoveController(bench.enhanced, focus, setting.tasks, setting.limits, bench.pace)
-    loop = ClosedLoop(bench.plant, controller, knowledge=bench.knowledge, safety=setting.safety)
+    loop = bench.closed_loop(bench.plant, focus, decline=True)
     done = loop.run(target := target_of(start, parts, axes))
     wrong = (focus.matrix @ target.error(true_state(done.stop.final))).abs().tolist()
     errors: dict[str, float] = {}

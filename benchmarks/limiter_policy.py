@@ -240,7 +240,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     summary = (
         f"{outcome.verdict[0].upper()}{outcome.verdict[1:]}. Motions of the policy over those of turns that"
         f" both reached: {', '.join(ratios)}. Training: {training['decisions']} decisions,"
-        f" {len(ended)} turns, {sum(one['lost'] for one in ended)} of them lost, {training['minutes']:.0f} min."
+        f" {len(ended)} turns, {sum(one['lost'] for one in ended)} of them lost,"
+        f" {training['minutes']:.0f} min."
     )
     report = Report("A policy for the length of a step", summary, tables, [shown])
     report.write(given.out)

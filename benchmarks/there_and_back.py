@@ -4,15 +4,17 @@
 
 With every object and hand an E-KM has three turns of warm-up. Then it turns one grasp to +15 deg and back to
 0, twenty times, and another one to ten random targets within 15 deg of where it began, each from where the
-last ended. Turns of the same sizes from fresh grasps stand beside them. Drift: how far the object has moved
-since the grasp, each time that it is back. Poses are true plus noise. Finished sessions stay in ``--out``: an
-interrupted run goes on where it stopped.
+last ended. The first series is made twice: what asks for the turn alone, and what also asks, on the way back,
+that the object come back along the grip. Turns of the same sizes from fresh grasps stand beside them. Drift:
+how far the object has moved since the grasp, each time that it is back. Poses are true plus noise. Finished
+sessions stay in ``--out``: an interrupted run goes on where it stopped.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +24,7 @@ from command_line import study_parser
 from focused_pose import axes_of
 
 from torch_ekm._terminal import progress
+from torch_ekm.control import Direction, FocusedPose
 from torch_ekm.exceptions import EKMError
 from torch_ekm.experiments.config import Setting, digest
 from torch_ekm.experiments.jobs import run_jobs
@@ -42,9 +45,10 @@ LEAST = 4.0  # [deg] of a random turn
 FRESH = 5  # grasps for each sign of a turn of THERE
 WARM_UP = (9.0, -9.0, 15.0)  # [deg]
 _FIRST_WARM_UP = 1000  # number of the first training grasp: never one that is tested
-BACK, RANDOM = "there and back", "random targets"
+WITHIN = 0.4  # [mm] along the grip, where that is asked for
+BACK, UNDONE, RANDOM = "there and back", "there and back, shift undone", "random targets"
 #: Series -> the turns of the same sizes from fresh grasps.
-BESIDE = {BACK: "fresh, 15 deg", RANDOM: "fresh, random"}
+BESIDE = {BACK: "fresh, 15 deg", UNDONE: "fresh, 15 deg", RANDOM: "fresh, random"}
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ class Turn:
     @property
     def returned(self) -> bool:
         """It ends where the series began."""
-        return self.part == BACK and self.size < 0
+        return self.part in (BACK, UNDONE) and self.size < 0
 
 
 def random_sizes(seed: int) -> list[float]:
@@ -89,7 +93,7 @@ def random_sizes(seed: int) -> list[float]:
 
 def sizes_of(part: str, seed: int) -> list[float]:
     """The turns of a part [deg]."""
-    if part == BACK:
+    if part in (BACK, UNDONE):
         return [THERE, -THERE] * TIMES
     return [THERE, -THERE] * FRESH if part == BESIDE[BACK] else random_sizes(seed)
 
@@ -109,7 +113,8 @@ def session(
                 continue
             before = bench.hand.observe()
         at += size
-        done = bench.turn(Trial(bench.name, part, "E-KM", seed, k, at), start)
+        focus = _with_place(bench) if part == UNDONE and size < 0 else None
+        done = bench.turn(Trial(bench.name, part, "E-KM", seed, k, at), start, focus=focus)
         assert bench.last is not None
         assert before is not None
         states = true_state(before), true_state(bench.last.stop.final)
@@ -118,6 +123,12 @@ def session(
             break
     bench.close()
     return turns
+
+
+def _with_place(bench: Bench) -> FocusedPose:
+    """The turn, and where the object is along the grip."""
+    axes = axes_of(bench)
+    return FocusedPose([Direction(axes["a"], "deg"), Direction(axes["b"], "mm", tolerance=WITHIN)])
 
 
 def _shift(bench: Bench, before: GraspState, after: GraspState) -> tuple[float, float, float]:
@@ -167,10 +178,10 @@ class Outcome:
         known = [(mine, fresh) for mine, fresh in pairs if mine is not None and fresh is not None]
         return sum(mine for mine, _ in known) / sum(fresh for _, fresh in known) if known else None
 
-    def drift(self, item: str | None = None) -> dict[int, np.ndarray]:
-        """Return, from 1 -> shift of the object along axis, grip, across both, and of its contacts [mm];
-        a row for each series."""
-        back = [turn for turn in self.of(BACK, item) if turn.returned and not turn.lost]
+    def drift(self, part: str, item: str | None = None) -> dict[int, np.ndarray]:
+        """Return of a series, from 1 -> shift of the object along axis, grip, across both, and of its
+        contacts [mm]; a row for each series."""
+        back = [turn for turn in self.of(part, item) if turn.returned and not turn.lost]
         returns = sorted({turn.number for turn in back})
         return {
             (number + 1) // 2: np.array([(*turn.shift, turn.slid) for turn in back if turn.number == number])
@@ -182,17 +193,20 @@ class Outcome:
         """The last line."""
         series = [turn for part in BESIDE for turn in self.of(part)]
         ratios = [ratio for part in BESIDE if (ratio := self.ratio(part)) is not None]
-        drift = self.drift()
-        moved = float(np.abs(drift[max(drift)][:, 1]).mean()) if drift else float("nan")
+        moved = [
+            float(np.abs(drift[max(drift)][:, 1]).mean())
+            for part in (BACK, UNDONE)
+            if (drift := self.drift(part))
+        ]
         return (
             f"lost {sum(turn.lost for turn in series)} of {len(series)}; motions {np.mean(ratios):.2f} times"
-            f" those of fresh grasps; drift {moved:.1f} mm"
+            f" those of fresh grasps; drift {' mm, undone '.join(f'{mm:.1f}' for mm in moved)} mm"
         )
 
     def table(self) -> Table:
         """A row for each part and direction."""
         rows: list[list[Cell]] = []
-        for part in (*BESIDE, *BESIDE.values()):
+        for part in dict.fromkeys((*BESIDE, *BESIDE.values())):
             for sign in (1, -1):
                 if turns := self.of(part, sign=sign):
                     counts = len(turns), sum(turn.lost for turn in turns), sum(turn.reached for turn in turns)
@@ -214,12 +228,14 @@ class Outcome:
     def drift_table(self) -> Table:
         """Where each object is after some returns."""
         rows: list[list[Cell]] = []
-        for item in self.objects:
-            drift = self.drift(item)
-            for number in (n for n in (1, 5, 10, 15, 20) if n in drift):
+        for part, item in product((BACK, UNDONE), self.objects):
+            drift = self.drift(part, item)
+            for number in (n for n in (1, TIMES) if n in drift):
                 grip, rest = drift[number][:, 1], np.abs(drift[number][:, [0, 2, 3]]).mean(axis=0)
                 largest = grip[np.abs(grip).argmax()]
-                rows.append([item, number, len(grip), *map(float, (grip.mean(), largest, *rest))])
+                rows.append(
+                    [f"{item}, {part}", number, len(grip), *map(float, (grip.mean(), largest, *rest))]
+                )
         columns: list[str | Column] = [
             "object", "return", "series", "along the grip [mm]", "the largest [mm]", "along the axis [mm]",
             "across both [mm]", "contacts [mm]",
@@ -236,10 +252,12 @@ class Outcome:
         for k, item in enumerate(self.objects):
             colour, label = colours[k % len(colours)], item.replace("_", " ")
             for seed in dict.fromkeys(turn.seed for turn in self.turns):
-                back = [t for t in self.of(BACK, item) if t.returned and not t.lost and t.seed == seed]
-                line = [0.0, *(turn.shift[1] for turn in back)]
-                drift.plot([0, *((t.number + 1) // 2 for t in back)], line, color=colour, label=label)
-                label = None
+                for part, style in ((BACK, "-"), (UNDONE, ":")):
+                    back = [t for t in self.of(part, item) if t.returned and not t.lost and t.seed == seed]
+                    line = [0.0, *(turn.shift[1] for turn in back)]
+                    at = [0, *((t.number + 1) // 2 for t in back)]
+                    drift.plot(at, line, style, color=colour, label=label)
+                    label = None
             by: dict[int, list[Turn]] = {}
             for turn in self.of(BACK, item):
                 by.setdefault(turn.number + 1, []).append(turn)
@@ -247,7 +265,7 @@ class Outcome:
             motions.plot(*zip(*means, strict=True), "o-", ms=3, color=colour, label=item.replace("_", " "))
             if (fresh := _motions(self.of(BESIDE[BACK], item))) is not None:
                 motions.axhline(fresh, color=colour, linestyle="--", linewidth=1)
-        drift.set(xlabel="return", ylabel="along the grip [mm]")
+        drift.set(xlabel="return (dotted: shift undone)", ylabel="along the grip [mm]")
         motions.set(xlabel="turn of the series (dashed: fresh grasps)", ylabel="motions", ylim=(0, None))
         drift.legend(frameon=False)
         return figure
@@ -272,7 +290,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     setting, todo = Setting(preset=given.preset, plant=preset(given.preset), engine=given.engine), {}
     for seed in seeds:
         for item in objects:
-            for part in (*BESIDE, *BESIDE.values()):
+            for part in dict.fromkeys((*BESIDE, *BESIDE.values())):
                 sizes = sizes_of(part, seed)[:most]
                 mark = digest(setting, (item,), WARM_UP, part, sizes)
                 job = f"{Path(item).stem}_{part.replace(' ', '_').replace(',', '')}_{mark}_{seed}"

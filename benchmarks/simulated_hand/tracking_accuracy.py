@@ -86,7 +86,7 @@ def measure_tracking(
     board_errors, twists, chi2, clock = [], [], [], np.zeros(2)
     for k in range(n_frames):
         rng = np.random.default_rng(seed + k)
-        poses = [_random_pose(rng, side * 0.048, max_tilt_deg) for side in (-1, 1)]
+        poses = [random_pose(rng, side * 0.048, max_tilt_deg) for side in (-1, 1)]
         start = time.process_time()
         scene = CardScene(tuple(PlacedCard(*pair) for pair in zip(boards, poses, strict=True)))
         image = camera.render(scene, rng)
@@ -128,7 +128,7 @@ def measure_tracking(
     )
 
 
-def _random_pose(rng: np.random.Generator, x: float, max_tilt_deg: float) -> Array:
+def random_pose(rng: np.random.Generator, x: float, max_tilt_deg: float) -> Array:
     """A board near ``x`` [m] whose normal is up to ``max_tilt_deg`` off the line of sight."""
     position = np.array([x + rng.uniform(-0.015, 0.015), rng.uniform(-0.05, 0.05), 0.0])
     position[2] = np.sqrt(rng.uniform(0.35, 0.45) ** 2 - position @ position)

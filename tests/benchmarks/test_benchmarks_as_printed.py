@@ -10,10 +10,11 @@ import torch
 pytest.importorskip("as_printed", reason="the benchmarks are not part of this installation")
 
 import as_printed
-from as_printed import SYSTEMS, PrintedBench, Systems
+from as_printed import SYSTEMS, MisprintedBench, PrintedBench, Systems
 
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.records import Trial, TrialRecord
+from torch_ekm.model import KinematicModel
 
 
 def record(error: float, reason: str = "reached") -> TrialRecord:
@@ -37,7 +38,7 @@ def test_a_lost_object_counts_with_the_whole_angle() -> None:
     assert rows["E-KM, in the paper"][1:3] == ["0.64", "40"]
     assert rows["E-KM, as printed"][2:5] == ["350", "1", "1"]  # 10.5 of 3 deg
     assert rows["E-KM"][2] == "25"
-    assert "as printed, with tasks, and here 350 %, 100 %, 25 %" in found.verdict
+    assert "E-KM:KM as printed 350 %, with tasks 100 %, here 25 %" in found.verdict
 
 
 def test_some_systems_alone_are_told_without_the_others() -> None:
@@ -46,6 +47,28 @@ def test_some_systems_alone_are_told_without_the_others() -> None:
     assert found.verdict == "E-KM 0.10 deg, lost 0 of 1; E-KM without fingertips 0.20 deg, lost 0 of 1"
     assert [row[0] for row in found.summary().text()][2:] == ["E-KM", "E-KM without fingertips"]
     assert found.ends().text() == [["reached", "1", "1"]]
+
+
+def test_the_misprinted_stiffness_is_the_papers_letter_by_letter() -> None:
+    """``D_oq dq = sum_i (J_i dq) x f_i``, the printed sign of T; the object's own columns are empty."""
+    pytest.importorskip("mujoco")
+    bench = MisprintedBench(as_printed.as_printed(Setting(engine="mujoco")), "box", "KM")
+    state = bench.grasp(3, 0)
+    assert state is not None
+    kin = bench.model.contact_kinematics(state, bench.model.contacts(state))
+    random = torch.Generator().manual_seed(0)
+    force = torch.randn(len(kin.point_jacobian), 3, generator=random, dtype=torch.float64)
+    D, n_q = bench.model.load_stiffness(kin, force, torch.zeros(len(force))), len(state.q)
+    dq = torch.linspace(-1, 1, n_q, dtype=torch.float64)
+    moment = torch.linalg.cross(kin.point_jacobian @ dq, force).sum(0)
+    torch.testing.assert_close(D[n_q + 3 :, :n_q] @ dq, moment)
+    assert not D[:, n_q:].any()
+    assert not D[n_q : n_q + 3].any()
+    right = KinematicModel.load_stiffness(bench.model, kin, force, torch.zeros(len(force)))
+    torch.testing.assert_close(D[:n_q, :n_q], right[:n_q, :n_q])  # pinned contacts: S
+    step = bench.trial(3, 0, 3.0).steps
+    assert step > 0
+    bench.close()
 
 
 def test_the_system_has_what_the_paper_prints_and_no_more() -> None:

@@ -11,7 +11,7 @@ pytest.importorskip("there_and_back", reason="the benchmarks are not part of thi
 
 import there_and_back
 import workspace
-from there_and_back import BACK, BESIDE, LEAST, RANDOM, THERE, Outcome, Turn, random_sizes
+from there_and_back import BACK, BESIDE, LEAST, RANDOM, THERE, UNDONE, Outcome, Turn, random_sizes
 
 
 def turn(part: str, number: int, size: float, motions: int = 6, **other) -> Turn:
@@ -36,6 +36,8 @@ def test_losses_motions_and_drift_are_those_of_the_series() -> None:
             turn(BACK, 1, -15.0, motions=8, shift=(0.1, -1.0, 0.2), slid=0.3),
             turn(BACK, 2, 15.0, motions=6),
             turn(BACK, 3, -15.0, motions=8, shift=(0.1, -2.0, 0.2)),
+            turn(UNDONE, 0, 15.0, motions=7),
+            turn(UNDONE, 1, -15.0, motions=7, shift=(0.1, 0.1, 0.2)),
             turn(RANDOM, 0, 8.0, motions=6),
             turn(RANDOM, 1, -8.0, motions=40, **away),
             turn(BESIDE[BACK], 0, 15.0, motions=7),
@@ -45,26 +47,30 @@ def test_losses_motions_and_drift_are_those_of_the_series() -> None:
     )
     assert outcome.ratio(BACK) == pytest.approx(1.0)
     assert outcome.ratio(RANDOM) == pytest.approx(1.2)
-    assert outcome.verdict == "lost 1 of 6; motions 1.10 times those of fresh grasps; drift 2.0 mm"
+    assert (
+        outcome.verdict
+        == "lost 1 of 8; motions 1.07 times those of fresh grasps; drift 2.0 mm, undone 0.1 mm"
+    )
     rows = {row[0]: row[1:] for row in outcome.table().text()}
     assert rows["random targets, -"] == ["1", "1", "0", "-", "-", "1 object lost"]
     drift = outcome.drift_table().text()
-    assert [row[1:] for row in drift] == [["1", "1", "-1.00", "-1.00", "0.10", "0.20", "0.30"]]
+    assert drift[0] == ["box, there and back", "1", "1", "-1.00", "-1.00", "0.10", "0.20", "0.30"]
+    assert drift[1][:4] == ["box, there and back, shift undone", "1", "1", "0.10"]
     outcome.picture()
 
 
 def test_a_quick_run_prints_its_verdict_and_is_kept(tmp_path: Path, monkeypatch, capsys) -> None:
     pytest.importorskip("mujoco")
     monkeypatch.setattr(there_and_back, "WARM_UP", ())
-    monkeypatch.setattr(there_and_back, "BESIDE", {BACK: BESIDE[BACK]})
+    monkeypatch.setattr(there_and_back, "BESIDE", {BACK: BESIDE[BACK], UNDONE: BESIDE[UNDONE]})
     monkeypatch.setattr(there_and_back, "THERE", 5.0)
     words = ["--quick", "--seeds", "6:7", "--jobs", "1", "--out", str(tmp_path)]
     there_and_back.main(words)
     first = capsys.readouterr().out.splitlines()[-1]
-    assert first.startswith("lost 0 of 2; motions ")
+    assert first.startswith("lost 0 of 4; motions ")
     assert (tmp_path / "there_and_back.svg").exists()
     kept = {path: path.stat().st_mtime_ns for path in tmp_path.glob("box_*.json")}
-    assert len(kept) == 2
+    assert len(kept) == 3
     there_and_back.main(words)
     assert capsys.readouterr().out.splitlines()[-1] == first
     assert kept == {path: path.stat().st_mtime_ns for path in kept}

@@ -6,10 +6,12 @@ import dataclasses
 import math
 
 import pytest
+import torch
 from obedient_plant import Fault, Obedient
 
 from torch_ekm.control import (
     ClosedLoop,
+    Guards,
     LookAndMoveController,
     Manipulation,
     PoseTarget,
@@ -17,6 +19,7 @@ from torch_ekm.control import (
     StoppingRule,
 )
 from torch_ekm.control import StopReason as Reason
+from torch_ekm.control.safety.watch import Watch
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.plant import Observation
 
@@ -42,7 +45,7 @@ def more(field: str, place: int, size: float) -> Fault:
 
 OFF = {  # 5 mm, 17 deg: less than what is called a jump
     "pose": (more("position", 0, 0.005), "the object went along x", "fingertips press (thumb)"),
-    "joint": (more("q", 6, -17 * DEG), "joint 'index_2' turned", "'index_distal' and its joints (index_2,"),
+    "joint": (more("q", 6, -17 * DEG), "joint 'index_2' turned", "fingertips press (index)"),
 }  # fmt: skip
 
 
@@ -55,6 +58,20 @@ def test_a_sensor_that_is_off_is_named(held, sensor, since) -> None:
     assert contradicts in done.stop.message
     assert "look after these sensors" in done.stop.message
     assert (went in done.stop.message) is (since > 0)
+    joints = "encoder 'index_distal' and its joints (index_2, index_3) differ" in done.stop.message
+    assert joints is (sensor == "joint" and since > 0)  # in the first reading it may be moment arms
+
+
+def test_moment_arms_that_are_not_as_described_are_no_fault_of_a_sensor(held) -> None:
+    seen, _, model = held
+    watch = Watch(Guards(), model, lambda lin, moved: None)
+    watch.first(seen, lambda: seen)
+    J_a = model.hand.actuation_jacobian
+    turned = 30 * DEG * (J_a[model.hand.actuator_names.index("index_distal")] > 0)
+    way = J_a @ turned
+    for arms, blamed in ((1.0, False), (1.3, False), (2.5, True)):
+        q, a = seen.q + torch.from_numpy(turned), seen.a + torch.from_numpy(arms * way)
+        assert ("'index_distal'" in watch.suspects(dataclasses.replace(seen, q=q, a=a))) is blamed
 
 
 def test_a_reading_that_is_one_joint_short_ends_the_loop_with_its_name(held) -> None:

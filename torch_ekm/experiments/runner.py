@@ -13,6 +13,7 @@ import torch
 from ..control import (
     ActuatorLimit,
     ClosedLoop,
+    FocusedPose,
     HandKnowledge,
     LimitingFunction,
     LookAndMoveController,
@@ -143,6 +144,7 @@ class Bench:
         events: Sequence[Tug | PlantChange] = (),
         blind_deg: float = 0.0,
         poses: bool = False,
+        focus: FocusedPose | None = None,
         **blind: Any,
     ) -> TrialRecord:
         """Turn the object that is held.
@@ -153,6 +155,7 @@ class Bench:
             events: what happens on the way; ``at`` counts this trial's commands from 0.
             blind_deg: the camera is off for this last part of the turn [deg]; infinite: for all of it.
             poses: keep the true poses, for pictures.
+            focus: what of the turned pose is to be reached; None: the rotation about the hand's axis.
             blind: options of :class:`~torch_ekm.foresight.BlindPose`; its ``touch`` is off.
         """
         now = self.disturbed.count
@@ -169,7 +172,7 @@ class Bench:
                 switch_off=lambda seen: abs(float(axis @ target.error(seen.state)[3:])) <= blind_deg * _DEG,
                 **{"touch": False, **blind},
             )
-        self.last = _whole(self.closed_loop(plant, learn=learn).run(target))
+        self.last = _whole(self.closed_loop(plant, focus, learn=learn).run(target))
         return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
 
     def long_step(self, seed: int, trial: int, step_deg: float) -> Record:
@@ -211,15 +214,22 @@ class Bench:
     def _predictor(self) -> KinematicModel | EnhancedModel:
         return self.model if self.enhanced is None else self.enhanced
 
-    def look_and_move(self) -> LookAndMoveController:
-        """The controller of the next turn: about the hand's axis, by what is known now."""
-        setting, axis = self.setting, self.hand.rotation_axis
-        return LookAndMoveController(self._predictor, axis, setting.tasks, setting.limits, self.pace)
+    def look_and_move(self, focus: FocusedPose | None = None) -> LookAndMoveController:
+        """The controller of the next turn, by what is known now; None: about the hand's axis."""
+        setting, focused = self.setting, self.hand.rotation_axis if focus is None else focus
+        return LookAndMoveController(self._predictor, focused, setting.tasks, setting.limits, self.pace)
 
-    def closed_loop(self, plant: Plant, *, learn: bool = True) -> ClosedLoop:
-        """The loop of the next turn; no target is declined."""
+    def closed_loop(
+        self,
+        plant: Plant,
+        focus: FocusedPose | None = None,
+        *,
+        learn: bool = True,
+        decline: bool = False,
+    ) -> ClosedLoop:
+        """The loop of the next turn."""
         known = {"knowledge": self.knowledge, "safety": self.setting.safety}
-        return ClosedLoop(plant, self.look_and_move(), **known, learn=learn, decline=False)
+        return ClosedLoop(plant, self.look_and_move(focus), **known, learn=learn, decline=decline)
 
     def _prepare_learner(self, start: GraspState) -> None:
         setting = self.setting

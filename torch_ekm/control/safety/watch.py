@@ -12,7 +12,7 @@ import torch
 
 from ...exceptions import GraspError
 from ...plant import Observation, PlantStatus
-from ...typing import Tensor
+from ...typing import Array, Tensor
 from ..decision import Decision, Expectation, StopReason
 from .fingertips import FingertipWatch
 from .grip import GripWatch
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 _DEG = math.pi / 180
 _STILL = 0.05 * _DEG  # an encoder that moves less stands
 _STRETCH = 12 * _DEG  # tendons stretch by less
+_ARMS = 0.35  # and moment arms that are not as described change it by this share of the way
 _ASKED = 0.5 * _DEG  # a smaller command to a motor that was stuck before does not show whether it still is
 
 
@@ -71,6 +72,7 @@ class Watch:
         """How the object has slid in the last motion, farther than the guards let a pose jump; or empty."""
         self._still = torch.zeros(self.hand.n_a, dtype=torch.long)
         self._tolerance, self._away = tolerance, 0
+        self._begun: Observation | None = None
 
     def first(self, seen: Observation, look: Callable[[], Observation]) -> Verdict:
         """The reading before the first motion; further ones from ``look`` where it is in doubt."""
@@ -81,6 +83,7 @@ class Watch:
                 break
             seen = look()
         self.readings.follow(None, seen)
+        self._begun = seen
         self.blind = int(seen.status is PlantStatus.NOT_SEEN)
         return Verdict(seen, doubt is None, doubt)
 
@@ -188,9 +191,12 @@ class Watch:
     def suspects(self, seen: Observation) -> str:
         """Which sensors contradict each other where the model refuses a state."""
         hand, found = self.hand, ""
-        off = seen.a.numpy() - hand.actuator_offset - hand.actuation_jacobian @ seen.q.numpy()
-        i = int(abs(off).argmax())
-        if abs(off[i]) > _STRETCH:
+        off, way = self._stretch(seen), seen.a.numpy() - hand.actuator_offset
+        if self._begun is not None and not torch.equal(self._begun.a, seen.a):  # since the beginning
+            off, way = off - self._stretch(self._begun), (seen.a - self._begun.a).numpy()
+        most = _STRETCH + _ARMS * abs(way)
+        i = int((abs(off) - most).argmax())
+        if abs(off[i]) > most[i]:
             joints = zip(hand.joint_names, hand.actuation_jacobian[i], strict=True)
             names = ", ".join(name for name, arm in joints if arm)
             found = f"; encoder '{hand.actuator_names[i]}' and its joints ({names}) differ by {deg(off[i])}"
@@ -204,6 +210,12 @@ class Watch:
             if away:
                 found += f"; fingertips press ({away}) where pose and joints have them off the object"
         return found and f"{found}: look after these sensors, and the pose"
+
+    def _stretch(self, seen: Observation) -> Array:
+        """``a - a_0 - J_a q`` [rad]."""
+        hand = self.hand
+        stretch: Array = seen.a.numpy() - hand.actuator_offset - hand.actuation_jacobian @ seen.q.numpy()
+        return stretch
 
     def forget(self) -> None:
         """Signs of a loss are heeded: the hand goes back."""
