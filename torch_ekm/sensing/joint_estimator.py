@@ -13,6 +13,7 @@ from .hall.calibration import HallCalibration
 # s_a, by how much an encoder and J_a q + a_0 differ [rad]: at the motors of a loaded hand, behind cables that
 # stretch by degrees in a pinch of 5 N; encoders at the joints are good to half a degree
 ENCODER_STD = 0.0436
+ARM_STD = 0.3  # and by this share of the encoder's way, where moment arms are not as described
 COUPLING_STD = 5e-4  # s_c, play of a rigid coupling [rad]
 
 
@@ -34,8 +35,10 @@ class JointEstimator:
     r"""``min_q sum_k ((q_k - h_k) / s_k)^2 + |(J_a q + a_0 - a) / s_a|^2 + |C q / s_c|^2``.
 
     Hall channels know single joints, encoders sums of them, rigid couplings differences: together they cover
-    joints without a channel, or with one that is saturated or stuck. q stays within the range that such a
-    channel leaves open, whatever cables say. A weak prior, uniform over each joint's range, keeps it finite.
+    joints without a channel, or with one that is saturated. q stays within the range that such a channel
+    leaves open, whatever cables say. Where every joint of an actuator has a valid channel, its encoder counts
+    for less: its moment arms may be wrong, ``s_a^2 + (0.3 (a - a_0))^2``. A weak prior, uniform over each
+    joint's range, keeps q finite.
 
     Args:
         hand: joints, actuation Jacobian and couplings; ``C q = 0`` is taken to hold, not just ``C dq = 0``.
@@ -59,8 +62,7 @@ class JointEstimator:
         # a locked joint has no range: a small one keeps the information finite
         prior = 12 / (upper - lower).clamp(min=1e-3) ** 2
         self._middle = prior * (lower + upper) / 2
-        encoders, couplings = self._J_a.mT @ self._J_a / ENCODER_STD**2, C.mT @ C / COUPLING_STD**2
-        self._fixed = torch.diag(prior) + encoders + couplings
+        self._fixed = torch.diag(prior) + C.mT @ C / COUPLING_STD**2
 
     def __call__(
         self, readings: Float[Tensor, "*batch n_channels"], actuators: Float[Tensor, "*batch n_a"]
@@ -76,9 +78,12 @@ class JointEstimator:
         hall = self.calibration.estimate(readings)
         weight = hall.std**-2
         S = self._select
-        information = self._fixed + S.mT @ (weight[..., None] * S)
-        encoder = (actuators.to(torch.float64) - self._offset) / ENCODER_STD**2
-        right = self._middle + (weight * hall.q) @ S + encoder @ self._J_a
+        J_a, way = self._J_a, actuators.to(torch.float64) - self._offset
+        unread = 1 - hall.valid.to(J_a.dtype) @ S
+        blind = unread @ J_a.mT.abs() > 0  # a joint of the actuator has no valid channel
+        trust = 1 / (ENCODER_STD**2 + torch.where(blind, 0.0, ARM_STD * way) ** 2)
+        information = self._fixed + S.mT @ (weight[..., None] * S) + J_a.mT @ (trust[..., None] * J_a)
+        right = self._middle + (weight * hall.q) @ S + (trust * way) @ J_a
         factor = torch.linalg.cholesky(information)
         q = torch.cholesky_solve(right[..., None], factor)[..., 0]
         q[..., self._joints] = q[..., self._joints].clamp(*hall.within)
