@@ -293,6 +293,20 @@ def test_joint_estimates_of_a_whole_hand(hand, generator, monkeypatch):
     assert bool(((chi2 > 0.4) & (chi2 < 2.0)).all())
 
 
+def test_wrong_moment_arms_do_not_draw_joints_that_have_channels(hand, generator) -> None:
+    """Cables that move joints by a quarter less than described: J_a q + a_0 and a are 20 to 40 deg apart."""
+    sensors = HallSensors(hand, seed=1)
+    q = random_posture(hand, 200, generator)
+    a = encoders(hand, q, generator)
+    offset = torch.from_numpy(hand.actuator_offset)
+    worn = offset + 1.3 * (a - offset)
+    worn[:, :2], worn[:, -1] = a[:, :2], a[:, -1]
+    error = (JointEstimator(hand, calibrated(sensors))(sensors.read(q, generator), worn).q - q) / DEG
+    mean = error.mean(0).abs()
+    for joint in ("index_2", "index_3", "middle_2", "middle_3", "thumb_2", "thumb_3"):
+        assert float(mean[hand.joint_names.index(joint)]) < 0.2
+
+
 def test_encoders_stand_in_for_a_stuck_channel(hand, generator, monkeypatch):
     monkeypatch.setattr(joint_estimator, "ENCODER_STD", 0.5 * DEG)
     sensors = HallSensors(hand, seed=1)

@@ -36,9 +36,9 @@ class JointEstimator:
 
     Hall channels know single joints, encoders sums of them, rigid couplings differences: together they cover
     joints without a channel, or with one that is saturated. q stays within the range that such a channel
-    leaves open, whatever cables say. Where every joint of an actuator has a valid channel, its encoder counts
-    for less: its moment arms may be wrong, ``s_a^2 + (0.3 (a - a_0))^2``. A weak prior, uniform over each
-    joint's range, keeps q finite.
+    leaves open, whatever cables say. Where every joint of an actuator has a channel that says more, its
+    encoder counts for less: its moment arms may be wrong, ``s_a^2 + (0.3 (a - a_0))^2``. A weak prior,
+    uniform over each joint's range, keeps q finite.
 
     Args:
         hand: joints, actuation Jacobian and couplings; ``C q = 0`` is taken to hold, not just ``C dq = 0``.
@@ -79,8 +79,8 @@ class JointEstimator:
         weight = hall.std**-2
         S = self._select
         J_a, way = self._J_a, actuators.to(torch.float64) - self._offset
-        unread = 1 - hall.valid.to(J_a.dtype) @ S
-        blind = unread @ J_a.mT.abs() > 0  # a joint of the actuator has no valid channel
+        unread = 1 - (hall.std < ENCODER_STD).to(J_a.dtype) @ S
+        blind = unread @ J_a.mT.abs() > 0  # a joint of the actuator has no channel that says more
         trust = 1 / (ENCODER_STD**2 + torch.where(blind, 0.0, ARM_STD * way) ** 2)
         information = self._fixed + S.mT @ (weight[..., None] * S) + J_a.mT @ (trust[..., None] * J_a)
         right = self._middle + (weight * hall.q) @ S + (trust * way) @ J_a
