@@ -16,6 +16,7 @@ from typing import Any
 import torch_ekm
 
 _ALSO = [
+    "torch_ekm.testing",
     "torch_ekm.exceptions",
     "torch_ekm.typing",
 ]  # public modules that are no packages
