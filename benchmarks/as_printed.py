@@ -241,7 +241,8 @@ class Systems:
             Column("motions", ".1f"), Column("first motion errs [deg]", ".2f"),
         ]  # fmt: skip
         note = (
-            f"Of {len(self.of(self.names[-1]).records)} turns. Mean steady-state error, with 95 % intervals over"
+            f"Of {len(self.of(self.names[-1]).records)} turns. Mean steady-state error, with 95 % intervals"
+            " over"
             " pairs of object and seed. A lost object counts with the whole angle. Motions of turns that"
             " reached the target. The paper's are means over its five objects."
         )
