@@ -242,8 +242,7 @@ class Systems:
         ]  # fmt: skip
         note = (
             f"Of {len(self.of(self.names[-1]).records)} turns. Mean steady-state error, with 95 % intervals"
-            " over"
-            " pairs of object and seed. A lost object counts with the whole angle. Motions of turns that"
+            " over pairs of object and seed. A lost object counts with the whole angle. Motions of turns that"
             " reached the target. The paper's are means over its five objects."
         )
         return Table("systems", "The paper's system and this package's", columns, rows, note)
