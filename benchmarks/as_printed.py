@@ -33,7 +33,6 @@ from torch_ekm.control import (
     Caution,
     ClosedLoop,
     EffortTask,
-    FocusedPose,
     FocusTask,
     Guards,
     LimitingFunction,
@@ -54,7 +53,7 @@ from torch_ekm.experiments.runner import Bench
 from torch_ekm.kinematics.se3 import hat
 from torch_ekm.model import KinematicModel, Linearization
 from torch_ekm.model.stiffness.potential import posture_stiffness
-from torch_ekm.plant import Observation, Plant
+from torch_ekm.plant import Observation
 from torch_ekm.simulation import PRESETS, preset
 
 WARM_UP = 3
@@ -86,24 +85,12 @@ class PrintedBench(Bench):
         setting: of :func:`as_printed`.
     """
 
+    controllers = PrintedController
+    loops = PrintedLoop
+
     def __init__(self, setting: Setting, object: Any, controller: str, **options: Any) -> None:
         super().__init__(setting, object, controller, **options)
         self.pace = Pace(setting.pace, adapts=False)
-
-    def look_and_move(self, focus: FocusedPose | None = None) -> LookAndMoveController:
-        setting, focused = self.setting, self.hand.rotation_axis if focus is None else focus
-        return PrintedController(self._predictor, focused, setting.tasks, setting.limits, self.pace)
-
-    def closed_loop(
-        self,
-        plant: Plant,
-        focus: FocusedPose | None = None,
-        *,
-        learn: bool = True,
-        decline: bool = False,
-    ) -> ClosedLoop:
-        known = {"knowledge": self.knowledge, "safety": self.setting.safety}
-        return PrintedLoop(plant, self.look_and_move(focus), **known, learn=learn, decline=decline)
 
 
 class MisprintedModel(KinematicModel):

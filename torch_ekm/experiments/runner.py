@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -60,6 +60,9 @@ class Bench:
         controller: one of ``CONTROLLERS``.
         keep_images: with sensing, the camera's last image stays in ``info["raw"]["image"]``.
     """
+
+    controllers: ClassVar[type[LookAndMoveController]] = LookAndMoveController
+    loops: ClassVar[type[ClosedLoop]] = ClosedLoop
 
     def __init__(
         self, setting: Setting, object: str | ObjectDescription, controller: str, *, keep_images: bool = False
@@ -217,7 +220,7 @@ class Bench:
     def look_and_move(self, focus: FocusedPose | None = None) -> LookAndMoveController:
         """The controller of the next turn, by what is known now; None: about the hand's axis."""
         setting, focused = self.setting, self.hand.rotation_axis if focus is None else focus
-        return LookAndMoveController(self._predictor, focused, setting.tasks, setting.limits, self.pace)
+        return self.controllers(self._predictor, focused, setting.tasks, setting.limits, self.pace)
 
     def closed_loop(
         self,
@@ -229,7 +232,7 @@ class Bench:
     ) -> ClosedLoop:
         """The loop of the next turn."""
         known = {"knowledge": self.knowledge, "safety": self.setting.safety}
-        return ClosedLoop(plant, self.look_and_move(focus), **known, learn=learn, decline=decline)
+        return self.loops(plant, self.look_and_move(focus), **known, learn=learn, decline=decline)
 
     def _prepare_learner(self, start: GraspState) -> None:
         setting = self.setting

@@ -35,9 +35,9 @@ class JointEstimator:
     r"""``min_q sum_k ((q_k - h_k) / s_k)^2 + |(J_a q + a_0 - a) / s_a|^2 + |C q / s_c|^2``.
 
     Hall channels know single joints, encoders sums of them, rigid couplings differences: together they cover
-    joints without a channel, or with one that is saturated. q stays within the range that such a channel
-    leaves open, whatever cables say. Where every joint of an actuator has a channel that says more, its
-    encoder counts for less: its moment arms may be wrong, ``s_a^2 + (0.3 (a - a_0))^2``. A weak prior,
+    joints without a channel, or with one that is saturated or stuck. q stays within the range that such a
+    channel leaves open, whatever cables say. Where every joint of an actuator has a channel that says more,
+    its encoder counts for less: its moment arms may be wrong, ``s_a^2 + (0.3 (a - a_0))^2``. A weak prior,
     uniform over each joint's range, keeps q finite.
 
     Args:
