@@ -54,7 +54,7 @@ def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None)
     _check_filled_in(path, data)
     top = TomlTable(path, "top level", data, TABLES)
     if not isinstance(data.get("notes", {}), dict):
-        raise top.error("'notes' must be a table, of text that is for people alone")
+        raise top.error("'notes' must be a table of text, which no program reads")
     joints = urdf.moving_joints
     names = tuple(joint.name for joint in joints)
     if not names:
