@@ -113,7 +113,9 @@ def compare(
     ] = "",
     observation: Annotated[str, Option(help="Columns whose next increments are predicted.")] = "",
     run_column: Annotated[str, Option("--run", help="Column with one number in each run.")] = "",
-    clock: Annotated[str | None, Option(help="Of a ROS bag or MCAP: the topic that sets the rhythm.")] = None,
+    clock: Annotated[
+        str | None, Option(help="Of a ROS bag or MCAP: the topic whose messages set the rows.")
+    ] = None,
     out: Annotated[Path, Option(help="Folder for tables and figures.")] = Path("compare_output"),
     limit: Annotated[
         int, Option(min=0, help="Rows of a file or recording that are used, its first; 0: all.")

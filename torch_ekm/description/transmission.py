@@ -1,4 +1,4 @@
-"""Read a transmission file: what a URDF cannot say about a hand.
+"""Read a transmission file: what a URDF cannot describe of a hand.
 
 Actuators and their moment arms (J_a), rigid couplings (C dq = 0), joint springs and friction,
 contact pads, Hall sensors. The format is documented in ``docs/reference/file_formats.md``.

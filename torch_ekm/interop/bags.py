@@ -38,7 +38,7 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
 
     Args:
         path: a folder of rosbag2, a single ``.mcap`` or ``.db3`` file, or a ``.bag`` of ROS 1.
-        clock: the topic that sets the rhythm, such as that of the commands.
+        clock: the topic whose messages set the rows, such as that of the commands.
         topics: those that are read; all of them by default.
 
     Raises:
