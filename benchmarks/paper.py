@@ -77,7 +77,8 @@ def tables_of(source: Path) -> Tables:
     if source.is_dir():
         found = {table.caption: [table.header, *table.rows] for table in read_report(source).tables}
     elif source.is_file():
-        parts = re.split(r"^#+ (.*)$", source.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
+        heading = r"^(?:#+ |<summary>)(.*?)(?:</summary>)?$"
+        parts = re.split(heading, source.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
         found = {caption: _cells(text) for caption, text in zip(parts[::2], parts[1::2], strict=True)}
     else:
         raise SystemExit(f"no page and no folder of a report: {source}")

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pandas
-from page import ROOT, commit, provenance
+from page import ROOT, Section, commit, page_text, provenance
 
 from torch_ekm.experiments.reporting.report import FigureFile, Report, Table
 
@@ -126,7 +126,7 @@ def report_body(folder: Path, name: str, pictures: tuple[str, ...]) -> str:
 
 def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:
     """A page, and the pictures that it shows."""
-    lines = []
+    sections = []
     for k, part in enumerate(parts_of(name)):
         folder = out / name / str(k)
         found = measure(part, folder, quick, keep)
@@ -136,13 +136,13 @@ def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:
         elif part.reports:
             body = report_body(folder / "report", name, part.pictures)
         how = f"`{part.spoken()}`: commit {found['commit']}, {found['date']}, {found['minutes']} min."
-        lines += [f"## {part.title}", "", part.see, "", how, "", body, ""]
+        sections.append(Section(part.title, part.see, body, how))
         for picture in part.pictures:
             (page.parent / name).mkdir(exist_ok=True)
             shutil.copy(folder / "report" / f"{picture}.svg", page.parent / name)
-    head = provenance(f"python benchmarks/write_pages.py {name}")
+    written = provenance(f"python benchmarks/write_pages.py {name}")
     page.parent.mkdir(parents=True, exist_ok=True)
-    page.write_text("\n".join([f"# {PLAN[name]['title']}", "", *head, *lines]), encoding="utf-8")
+    page.write_text(page_text(PLAN[name]["title"], sections, written), encoding="utf-8")
     print(f"{page}", flush=True)
 
 

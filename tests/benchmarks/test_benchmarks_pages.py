@@ -13,6 +13,7 @@ pytest.importorskip("write_pages", reason="the benchmarks are not part of this i
 
 import write_pages
 from bars import Target, targets_table
+from page import Section, page_text
 
 
 def _plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
@@ -102,6 +103,27 @@ def test_a_report_comes_with_its_headings_below_the_pages(
     assert "Left out" not in text
     assert (tmp_path / "out" / "one" / "shown.svg").exists()
     assert sys.executable not in text
+
+
+def test_results_come_first_and_long_tables_are_folded() -> None:
+    def table(rows: int) -> str:
+        return "\n".join(["| a |", "|---|", *(f"| {k} |" for k in range(rows))])
+
+    picture = "![Seen.](a.svg)\n\n*Seen.*"
+    legend = "- **KM**: the model"
+    body = f"Answer.\n\n{legend}\n\n{picture}\n\n### Short\n\n{table(8)}\n\nNote.\n\n### Other\n\n{table(2)}"
+    text = page_text("Page", [Section("Part", "See.", body, "`run`: commit 1.")], ["Written by it."])
+    folded = f"<details>\n<summary>Other</summary>\n\n{table(2)}\n\n</details>"
+    shown = ["Answer.", picture, f"### Short\n\n{table(8)}\n\nNote.", "See.", legend, folded]
+    made = "## Commands and versions\n\n- Part: `run`: commit 1.\n\nWritten by it."
+    assert text == "\n\n".join(["# Page\n\n## Part", *shown, made])
+    long = page_text("Page", [Section("Part", "See.", body.replace(table(8), table(9)), "")], [])
+    assert f"<summary>Short</summary>\n\n{table(9)}" in long
+    bare = page_text("Page", [Section("Part", "See.", table(16), "")], [])  # no picture shows what is in it
+    assert "<details>" not in bare
+    assert "<summary>Table of 17 rows</summary>" in page_text(
+        "Page", [Section("P", "See.", table(17), "")], []
+    )
 
 
 def test_targets_say_by_how_much_they_are_missed() -> None:
