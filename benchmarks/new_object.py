@@ -152,7 +152,7 @@ class Comparison:
             f" of the first object ({first}): KM {self.early(self.contenders[0], 'km', first, 'first'):.2f},"
             f" {before} deg."
         )
-        return Table("objects", "Objects that the hand has never held", columns, rows, note)
+        return Table("objects", "Objects that are new to the hand", columns, rows, note)
 
     def picture(self) -> Figure:
         """One-step error against the number of motions with a new object."""
@@ -172,7 +172,7 @@ class Comparison:
         """Table, picture and verdict, in ``folder``."""
         caption = "Mean one-step error about the axis, all new objects and seeds."
         shown = save_figure(self.picture(), folder, "new_object", caption)
-        report = Report("Objects that the hand has never held", f"{self.verdict}.", [self.table()], [shown])
+        report = Report("Objects that are new to the hand", f"{self.verdict}.", [self.table()], [shown])
         report.write(folder)
         return report
 

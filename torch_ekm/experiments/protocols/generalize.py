@@ -305,7 +305,7 @@ def new_object_table(trials: DataFrame) -> Table:
         "The E-KM after its warm-up with each object, and without one (new), where the hand has made thirty "
         "motions with another object. First motion: error of its prediction, by the truth."
     )
-    return Table("new_objects", "Objects that the hand has never held", columns, rows, note)
+    return Table("new_objects", "Objects that are new to the hand", columns, rows, note)
 
 
 def probe_table(trials: DataFrame) -> Table:
