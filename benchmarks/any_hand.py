@@ -268,7 +268,7 @@ class Survey:
 
     def report(self, folder: Path, engine: str) -> Report:
         """Table, picture and verdict, in ``folder``."""
-        caption = "What became of the turns on each plant; filled: lost, pale: the target was not reached."
+        caption = "Ends of the turns on each plant; filled: lost, pale: the target was not reached."
         shown = save_figure(self.picture(), folder, f"any_hand_{engine}", caption)
         report = Report("Hands of other kinds", f"{self.verdict}.", [self.table()], [shown])
         report.write(folder)

@@ -182,7 +182,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with progress("running", len(todo)) as advance:
         results = run_jobs(session, todo, given.out, given.jobs, advance)
     ranges = Ranges([Way(**way) for ways in results.values() for way in ways])
-    caption = "From end to end, a bar for each grasp; marks: the ends that were foreseen."
+    caption = "From end to end, a bar for each grasp; marks: the predicted ends."
     shown = save_figure(ranges.picture(), given.out, "both_ways", caption)
     report = Report("One grasp, both ways", f"{ranges.verdict}.", [ranges.table()], [shown])
     report.write(given.out)

@@ -192,10 +192,10 @@ def policy_table(policy: Callable[[Array], float]) -> Table:
         *(Column(f"margins {now:g} and {after:g} N [deg]", ".2f") for now, after in MARGINS),
     ]
     note = (
-        "In a grip as it is wanted, when the last step went as asked; margins: the least friction margin now"
+        "With the required grip, after a last step as commanded; margins: the least friction margin now"
         " and after a whole step."
     )
-    return Table("policy", "The step that the policy asks for", columns, rows, note)
+    return Table("policy", "Step of the policy", columns, rows, note)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

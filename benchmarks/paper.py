@@ -61,7 +61,7 @@ COUPLED = (
 SIX = "In place of Fig. 3e: the six objects at one scale, with their centres of mass."
 APPLIER = (
     "In place of Fig. 4: the applier, from the grasp to the largest angle about the axis that the E-KM "
-    "reaches in this grasp; more is asked for than the hand can turn."
+    "reaches in this grasp; the target lies beyond it."
 )
 _TABLE_II = "The paper's Table II"
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e-?\d+)?")

@@ -68,8 +68,8 @@ def controller_table(trials: DataFrame) -> Table:
     }
     note = (
         "Mean and 95 % bootstrap interval over pairs of object and seed; steady-state errors by the "
-        "simulation's truth. A lost object counts with the whole angle that was asked for; 'survivors' "
-        "leaves it out. Not reached: the object is in the hand, but not where it was to be. Intervals of "
+        "simulation's truth. A lost object counts with the whole angle of the target; 'survivors' "
+        "leaves it out. Not reached: the object is in the hand, but not at its target. Intervals of "
         "rates are Wilson's."
     )
     items = by_controller(trials)
