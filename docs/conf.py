@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -37,6 +38,8 @@ suppress_warnings = ["toc.empty_glob"]  # a benchmark that has not been measured
 
 html_theme = "furo"
 html_title = f"torch_ekm {version}"
+if versions := os.environ.get("TORCH_EKM_VERSIONS"):  # address of the page that links the sites of all versions
+    html_theme_options = {"announcement": f'torch_ekm {version}. <a href="{versions}">Other versions</a>'}
 html_show_sphinx = False
 html_copy_source = False
 add_module_names = False
