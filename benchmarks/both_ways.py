@@ -150,7 +150,7 @@ class Ranges:
         """A bar for each grasp, from end to end, with the ends that were foreseen."""
         grasps = sorted(self.grasps(), key=lambda one: (self.objects.index(one[0].object), self.range(one)))
         figure, (axes,) = new_figure(6.5, 0.8 + 0.17 * len(grasps))
-        colours = (COLOURS["E-KM"], COLOURS["KM+I"], COLOURS["KM+S"], COLOURS["KM"])
+        colours = (COLOURS["E-KM"], COLOURS["KM+I"], COLOURS["KM+S"], COLOURS["limit"])
         for k, grasp in enumerate(grasps):
             ends = [0.0, *(way.reached for way in grasp)]
             colour = colours[self.objects.index(grasp[0].object) % len(colours)]

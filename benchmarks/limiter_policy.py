@@ -47,7 +47,7 @@ _DEG = math.pi / 180
 _FIRST_WARM_UP = 1000  # number of the first training grasp: never one that is tested
 PAPER, LONG, PACE, POLICY = "limiting function", "limiting function, 6 deg", "pace", "policy"
 #: What chooses the length of a step -> its colour.
-SYSTEMS = {PAPER: COLOURS["KM"], LONG: COLOURS["KM+I"], PACE: COLOURS["E-KM"], POLICY: COLOURS["limit"]}
+SYSTEMS = {PAPER: "#CC79A7", LONG: COLOURS["KM+I"], PACE: COLOURS["E-KM"], POLICY: COLOURS["limit"]}
 ON_MODEL = "kinematic model"
 #: Errors [deg], and margins now and after a whole step [N], at which the policy is asked.
 ERRORS, MARGINS = (25.0, 15.0, 8.0, 5.0, 3.0, 1.0), ((1.5, 0.5), (0.0, -1.0), (0.0, -4.0))
