@@ -126,7 +126,7 @@ def said(
 
 
 def foreseen(model: KinematicModel, way: list[Observation], axis: torch.Tensor) -> dict[str, float]:
-    """Errors of a whole turn that is foreseen from its first state [deg]."""
+    """Errors of a whole turn that is predicted from its first state [deg]."""
     first, last = way[0], way[-1]
     start = _linearized(model, first)
     moved = [b.a - a.a for a, b in itertools.pairwise(way)]
