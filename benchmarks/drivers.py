@@ -289,7 +289,7 @@ def main() -> None:
             parts.append(f"{bus.kind} {agree}/{n_turns}")
             killed, of = killed + stood, of + n
     print(
-        "|bus|turns as in process, at most apart|spoilt messages|commands beyond limits"
+        "|bus|turns as in process, at most apart|corrupted messages|commands beyond limits"
         "|process killed: stood within 100 ms, longest|cable pulled: typed stop, object held"
         "|added to a motion, median and 90 % [ms]|"
     )

@@ -36,7 +36,7 @@ class JointEstimator:
 
     Hall channels know single joints, encoders sums of them, rigid couplings differences: together they cover
     joints without a channel, or with one that is saturated or stuck. q stays within the range that such a
-    channel leaves open, whatever cables say. Where every joint of an actuator has a channel that says more,
+    channel leaves open, independent of cables. Where every joint of an actuator has a channel that says more,
     its encoder counts for less: its moment arms may be wrong, ``s_a^2 + (0.3 (a - a_0))^2``. A weak prior,
     uniform over each joint's range, keeps q finite.
 

@@ -68,7 +68,7 @@ class SensedPlant(PlantWrapper):
         palm = MarkerBoard(0, mount=ICUB_PALM_MOUNT)
         self.boards = palm, MarkerBoard(palm.n_markers, mount=obj.marker_transform)
         self.tracker = MarkerTracker(self.camera.camera, *self.boards)
-        """Finds the boards: it knows the lens and the mounts exactly."""
+        """Finds the boards, with the exact lens and mounts."""
         self.hall, self.joints = hall, None
         if hall is not None:
             sweep = hall.sweep(181, torch.Generator().manual_seed(0))
