@@ -99,7 +99,7 @@ def test_camera_faces_both_cards(obj, pose_of):
     away[:3, :3] = palm[:3, :3] @ np.diag([1.0, -1, -1])
     with pytest.raises(ParameterError, match="160 deg"):
         GraspView.facing(palm, away)
-    with pytest.raises(ParameterError, match="beside"):
+    with pytest.raises(ParameterError, match="to the side"):
         GraspView.facing(palm, palm)
 
 
