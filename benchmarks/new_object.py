@@ -3,20 +3,21 @@
     python benchmarks/new_object.py --first box --then can,bottle,jar --seeds 1000:1003
 
 The hand makes thirty motions with the first object. Then it turns each of the others by 9, 19 and 27 deg,
-without any warm-up on it. Poses come from camera images, joint angles from Hall counts. Finished sessions
-stay in ``--out``: an interrupted run goes on where it stopped.
+without any warm-up on it. Poses come from camera images, joint angles from Hall counts. ``--preset`` takes
+the presets, the families of any_hand.py as FAMILY:STRENGTH, and "strong" for all of them; several give a row
+each. Finished sessions stay in ``--out``: an interrupted run goes on where it stopped.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from any_hand import Turns, records_by
+from any_hand import Turns, plants, records_by
 
 from torch_ekm._terminal import progress
 from torch_ekm.cli._app import parse_seeds
@@ -25,8 +26,9 @@ from torch_ekm.experiments.jobs import run_jobs
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
+from torch_ekm.experiments.reporting.statistics import Estimate, bootstrap_ratio
 from torch_ekm.experiments.runner import Bench
-from torch_ekm.simulation import ENGINES, PRESETS
+from torch_ekm.simulation import ENGINES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -64,7 +66,7 @@ def session(setting: Setting, first: str, then: Sequence[str], seed: int) -> lis
 class Comparison:
     """Turns of all sessions, by contender, seed and object in the order in which they were made."""
 
-    def __init__(self, results: dict[tuple[str, int], list[TrialRecord]]) -> None:
+    def __init__(self, results: Mapping[tuple[str, Any], list[TrialRecord]]) -> None:
         self.results = results
         self.contenders = list(dict.fromkeys(name for name, _ in results))
         self.objects = list(dict.fromkeys(one.object for records in results.values() for one in records))
@@ -88,7 +90,7 @@ class Comparison:
         Args:
             which: "km" or "ekm".
         """
-        found: dict[tuple[int, str], list[float]] = defaultdict(list)
+        found: dict[tuple[Any, str], list[float]] = defaultdict(list)
         for (name, seed), records in self.results.items():
             for one in records:
                 if name == contender and one.kind == kind and item in (None, one.object):
@@ -120,6 +122,27 @@ class Comparison:
             f" learned hand {self.early(best, 'ekm'):.2f} deg;"
             f" first motion {self.first_motion(best, 'ekm'):.2f} deg; lost {ours.lost} of {len(ours.records)}"
         )
+
+    @property
+    def ratio(self) -> Estimate:
+        """One-step error with the learned hand over that with nothing, all motions of all new objects; pairs
+        are a seed's."""
+        both = [
+            {seed: _mean([e for one in records if one.kind == "turn" for e in one.true_prediction_ekm_deg])
+             for (name, seed), records in self.results.items() if name == contender}
+            for contender in ("learned hand", "empty")
+        ]  # fmt: skip
+        seeds = sorted(both[0].keys() & both[1].keys())
+        return bootstrap_ratio(*(np.array([means[seed] for seed in seeds]) for means in both))
+
+    @property
+    def cost(self) -> float:
+        """Median time of a decision and of learning from its motion, over that with nothing learned."""
+        ours, theirs = (
+            np.median([t for one in self.turns(name).records for t in one.seconds])
+            for name in ("learned hand", "empty")
+        )
+        return float(ours / theirs)
 
     def tables(self) -> list[Table]:
         """A row for each contender, then one for each object and contender."""
@@ -156,7 +179,8 @@ class Comparison:
             "One-step errors of the rotation about the axis against what really happened, predicted before"
             " the model learns from the motion; motions of turns that reached the target. First five motions"
             f" of the first object ({first}): KM {self.early(self.contenders[0], 'km', first, 'first'):.2f},"
-            f" {before} deg."
+            f" {before} deg. All motions: learned hand over empty {self.ratio:.2f}. A decision with learning"
+            f" takes {self.cost:.2f} times the time of empty (median)."
         )
         return Table(key, caption, columns, rows, note)
 
@@ -183,6 +207,44 @@ class Comparison:
         return report
 
 
+def hands_table(found: dict[str, Comparison]) -> Table:
+    """A row for each hand."""
+    rows: list[list[Cell]] = []
+    for name, one in found.items():
+        empty, ours = (one.turns(contender) for contender in ("empty", "learned hand"))
+        rows.append(
+            [
+                name, one.early("learned hand", "km"), one.early("empty", "ekm"),
+                one.early("learned hand", "ekm"), f"{one.ratio:.2f}", f"{empty.lost}, {ours.lost}",
+                f"{empty.reached}, {ours.reached} of {len(ours.records)}",
+                f"{empty.motions:.1f}, {ours.motions:.1f}",
+            ]
+        )  # fmt: skip
+    columns = [
+        "hand", Column("KM, first 5 [deg]", ".2f"), Column("empty, first 5 [deg]", ".2f"),
+        Column("learned hand, first 5 [deg]", ".2f"), "learned over empty, all motions", "lost", "reached",
+        "motions",
+    ]  # fmt: skip
+    note = "Pairs of figures: empty, learned hand. Ratios with 95 % bootstrap intervals over seeds."
+    return Table("hands", "New objects, hand by hand", columns, rows, note)
+
+
+def hands_picture(found: dict[str, Comparison]) -> Figure:
+    """First five motions of each hand."""
+    figure, (axes,) = new_figure(6.0, 0.6 + 0.24 * len(found))
+    at = np.arange(len(found))[::-1]
+    for label, contender, which in (
+        ("KM", "learned hand", "km"), ("empty", "empty", "ekm"), ("learned hand", "learned hand", "ekm")
+    ):  # fmt: skip
+        values = [one.early(contender, which) for one in found.values()]
+        axes.plot(values, at, "o", ms=4, color=_COLOURS[label], label=label)
+    axes.set_yticks(at, list(found))
+    axes.set_xlabel("one-step error, first five motions [deg]")
+    axes.set_xlim(0, None)
+    axes.legend(frameon=False, fontsize=8)
+    return figure
+
+
 def _mean(values: Sequence[float]) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
 
@@ -193,7 +255,7 @@ def main() -> None:
     parser.add_argument("--first", default="box", help="name or path of the object that the hand learns with")
     parser.add_argument("--then", default="can,bottle,jar", help="names or paths")
     parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1003"), help="FIRST:END")
-    parser.add_argument("--preset", default="nominal", choices=list(PRESETS))
+    parser.add_argument("--preset", default="nominal", help="hands, see above; several give a row each")
     parser.add_argument("--engine", default="sapien", choices=ENGINES)
     parser.add_argument("--jobs", type=int, default=2, help="processes at once")
     parser.add_argument("--out", type=Path, default=Path("new_object_output"), help="keeps what is finished")
@@ -202,17 +264,38 @@ def main() -> None:
     then, seeds = given.then.split(","), given.seeds
     if given.quick:
         then, seeds = then[:1], seeds[:1]
+    hands = plants(given.preset.split(","))
     todo, where = {}, {}
-    for name, changes in CONTENDERS.items():
-        setting = Setting(preset=given.preset, engine=given.engine, sensing=not given.quick, **changes)
-        for seed in seeds:
-            key = f"{object_name(given.first)}_{digest(setting, (given.first, *then), ANGLES)}_{seed}"
-            todo[key], where[key] = (setting, given.first, then, seed), (name, seed)
+    for hand, plant in hands.items():
+        for name, changes in list(CONTENDERS.items())[: 3 if len(hands) == 1 else 2]:
+            setting = Setting(plant=plant, engine=given.engine, sensing=not given.quick, **changes)
+            for seed in seeds:
+                key = f"{object_name(given.first)}_{digest(setting, (given.first, *then), ANGLES)}_{seed}"
+                todo[key], where[key] = (
+                    (setting, given.first, then, seed),
+                    (" ".join(hand).strip(), name, seed),
+                )
     with progress("running", len(todo)) as advance:
         results = run_jobs(session, todo, given.out, given.jobs, advance)
-    comparison = Comparison(records_by(where, results))
-    print(comparison.report(given.out).markdown())
-    print(comparison.verdict)
+    found: dict[str, dict[tuple[str, int], list[TrialRecord]]] = defaultdict(dict)
+    for (hand_name, name, seed), records in records_by(where, results).items():
+        found[hand_name][name, seed] = records
+    comparisons = {name: Comparison(records) for name, records in found.items()}
+    together = Comparison(
+        {
+            (name, (hand_name, seed)): records
+            for hand_name, one in found.items()
+            for (name, seed), records in one.items()
+        }
+    )
+    report = together.report(given.out)
+    if len(hands) > 1:
+        caption = "First five motions of new objects, hand by hand."
+        shown = save_figure(hands_picture(comparisons), given.out, "hands", caption)
+        report = Report(report.title, report.summary, [hands_table(comparisons), *report.tables], [shown])
+        report.write(given.out)
+    print(report.markdown())
+    print(together.verdict)
 
 
 if __name__ == "__main__":

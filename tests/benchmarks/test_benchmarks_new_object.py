@@ -47,6 +47,11 @@ def test_first_motions_are_those_of_an_object_and_of_a_turn(tmp_path: Path) -> N
     assert [row[0] for row in together.text()] == ["all"] * 3
     row = each.text()[1]
     assert row == ["can", "learned hand", "0.50", "0.20", "0.30", "0.25 (50 %)", "0, 2 of 2", "3.0"]
+    # mean of the can's six motions and the jar's one, learned hand over empty
+    assert found.ratio.mean == pytest.approx((0.9 + 0.4 + 0.1) / (1.8 + 0.5 + 0.2))
+    assert found.cost == pytest.approx(1.0)
+    (row,) = new_object.hands_table({"worn": found}).text()
+    assert row == ["worn", "0.50", "0.37", "0.18", "0.56", "1, 1", "2, 2 of 3", "3.0, 3.0"]
     found.report(tmp_path)
     assert verdict in (tmp_path / "report.md").read_text(encoding="utf-8")
     assert (tmp_path / "new_object.svg").exists()
