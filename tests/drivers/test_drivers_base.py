@@ -161,6 +161,25 @@ def test_a_message_that_is_wrong_is_not_confirmed_by_itself(driver) -> None:
     assert driver.written[-1][0] == pytest.approx([1600.0, 2400.0])
 
 
+def test_an_old_message_is_not_confirmed_by_a_reading_of_before_the_motion(driver) -> None:
+    """The motion before was broken off by the bus: the motors stand elsewhere than at the last look."""
+    driver.command(radians(0.05, 0.0))
+
+    def breaks(reading):
+        if driver.motors.goal[0] > 1630.0:
+            raise BusError("bus", "noise")
+        return reading
+
+    driver.spoil = breaks
+    with pytest.raises(BusError, match="noise"):
+        driver.command(radians(0.05, 0.0))
+    old = iter([[1630.0, 2400.0]])
+    driver.spoil = lambda reading: dataclasses.replace(reading, motors=next(old, reading.motors))
+    time.sleep(0.02)
+    driver.command(radians(-0.01, 0.0))
+    assert driver.written[-1][0] == pytest.approx([1654.0, 2400.0])
+
+
 def test_holding_takes_the_middle_of_three_readings(driver) -> None:
     driver.spoil = Published()
     driver.hold()

@@ -212,7 +212,8 @@ class HandDriver(ABC):
 
     def _stands(self) -> Tensor:
         """Where the motors are, by two readings that agree: one alone may be wrong, or an old packet."""
-        last = self._last or self._read()
+        # what was seen before the last motion confirms nothing: an old message would agree with it
+        last, self._last = self._last or self._read(), None
         for _ in range(_TRIES):
             reading = self._another(last)
             a = self._a(reading)
