@@ -74,7 +74,8 @@ PYTHONS ?= 3.11 3.12 3.13
 release: install
 	@test -n "$(REPOSITORY)" || { echo 'give its address: make release REPOSITORY=https://...'; exit 1; }
 	grep -q '^\[project.urls\]' pyproject.toml || printf '\n[project.urls]\nRepository = "$(REPOSITORY)"\n' >> pyproject.toml
-	grep -q "^## $$($(BIN)/python -c 'import torch_ekm; print(torch_ekm.__version__)')" CHANGELOG.md
+	v=$$($(BIN)/python -c 'import torch_ekm; print(torch_ekm.__version__)'); grep -q "^## $$v" CHANGELOG.md \
+		&& grep -q "^version: $$v" CITATION.cff && grep -q "version: \"$$v\"" recipe/recipe.yaml
 	$(BIN)/python -m pip install --quiet build twine
 	rm -rf dist && $(BIN)/python -m build --outdir dist .
 	$(BIN)/python -m twine check --strict dist/*

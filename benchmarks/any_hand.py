@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -214,6 +214,17 @@ class Survey:
             for name, one in (("E-KM", ours), ("KM+I", theirs))
         )
 
+    def totals(self) -> Table:
+        """A row for each controller."""
+        columns: dict[Column, Callable[[Turns], Cell]] = {
+            Column("turns"): lambda turns: len(turns.records),
+            Column("lost"): lambda turns: turns.lost,
+            Column("reached"): lambda turns: turns.reached,
+            Column("motions", ".1f"): lambda turns: turns.motions,
+        }
+        all_turns = {name: self.of(name) for name in self.controllers}
+        return Table.of("totals", "All plants", "controller", all_turns, columns)
+
     def table(self) -> Table:
         """A row for each plant."""
         rows: list[list[Cell]] = []
@@ -268,9 +279,9 @@ class Survey:
 
     def report(self, folder: Path, engine: str) -> Report:
         """Table, picture and verdict, in ``folder``."""
-        caption = "What became of the turns on each plant; filled: lost, pale: the target was not reached."
+        caption = "Ends of the turns on each plant; filled: lost, pale: the target was not reached."
         shown = save_figure(self.picture(), folder, f"any_hand_{engine}", caption)
-        report = Report("Hands of other kinds", f"{self.verdict}.", [self.table()], [shown])
+        report = Report("Hands of other kinds", f"{self.verdict}.", [self.totals(), self.table()], [shown])
         report.write(folder)
         return report
 

@@ -225,7 +225,7 @@ class Systems:
             rows.append([name, error, ratio, turns.lost, turns.reached, turns.motions, float(np.mean(first))])
         columns: list[str | Column] = [
             "system", Column("error [deg]", ".2f"), Column("E-KM:KM [%]", ".0f"), "lost", "reached",
-            Column("motions", ".1f"), Column("first motion errs [deg]", ".2f"),
+            Column("motions", ".1f"), Column("error of the first motion [deg]", ".2f"),
         ]  # fmt: skip
         note = (
             f"Of {len(self.of(self.names[-1]).records)} turns. Mean steady-state error, with 95 % intervals"

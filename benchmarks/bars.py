@@ -34,5 +34,5 @@ def targets_table(targets: Sequence[Target]) -> Table:
         Column("missed by", ".3g"): lambda target: target.missed_by,
     }
     missed = {target.what: target for target in targets if target.missed_by > 0}
-    note = f"Of {len(targets)} bars, set before the figures were known, these are missed."
+    note = f"Of {len(targets)} bars, set before the measurements, these are missed."
     return Table.of("targets", "Missed bars", "figure", missed, columns, note)

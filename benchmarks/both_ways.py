@@ -150,7 +150,7 @@ class Ranges:
         """A bar for each grasp, from end to end, with the ends that were foreseen."""
         grasps = sorted(self.grasps(), key=lambda one: (self.objects.index(one[0].object), self.range(one)))
         figure, (axes,) = new_figure(6.5, 0.8 + 0.17 * len(grasps))
-        colours = (COLOURS["E-KM"], COLOURS["KM+I"], COLOURS["KM+S"], COLOURS["KM"])
+        colours = (COLOURS["E-KM"], COLOURS["KM+I"], COLOURS["KM+S"], COLOURS["limit"])
         for k, grasp in enumerate(grasps):
             ends = [0.0, *(way.reached for way in grasp)]
             colour = colours[self.objects.index(grasp[0].object) % len(colours)]
@@ -182,7 +182,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with progress("running", len(todo)) as advance:
         results = run_jobs(session, todo, given.out, given.jobs, advance)
     ranges = Ranges([Way(**way) for ways in results.values() for way in ways])
-    caption = "From end to end, a bar for each grasp; marks: the ends that were foreseen."
+    caption = "From end to end, a bar for each grasp; marks: the predicted ends."
     shown = save_figure(ranges.picture(), given.out, "both_ways", caption)
     report = Report("One grasp, both ways", f"{ranges.verdict}.", [ranges.table()], [shown])
     report.write(given.out)

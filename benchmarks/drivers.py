@@ -304,7 +304,7 @@ def main() -> None:
         median, tenth = kept(given.out, folder, nothing, alone, n)
         rows.append(f"|{nothing.kind}: {nothing.end}||||||{median:.1f}, {tenth:.1f}|")
     print(
-        "|bus|turns as in process, at most apart|spoilt messages|commands beyond limits"
+        "|bus|turns as in process, at most apart|corrupted messages|commands beyond limits"
         "|process killed: stood within 100 ms, longest|cable pulled: typed stop, object held"
         "|added to a motion, median and 90 % [ms]|"
     )

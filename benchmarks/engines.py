@@ -155,9 +155,9 @@ class Comparison:
             f"creep in {_REST:.0f} s [deg, mm]", Column("time of a command [s]", ".3f"),
         ]  # fmt: skip
         note = (
-            "Medians over grasps. Error of the kinematic model, which knows all of the hand, in a step of"
-            f" {_STEP / _DEG:g} deg, mean of up to {_STEPS}, until a contact may slide or a link touches; how"
-            " far an object moves that nobody moves; processor time of a command."
+            "Medians over grasps. Error of the kinematic model, with all figures of the hand, in a step of"
+            f" {_STEP / _DEG:g} deg, mean of up to {_STEPS}, until a contact may slide or a link touches;"
+            " drift of an object without commands; processor time of a command."
         )
         return Table("probes", "The kinematic model with nothing unknown, and creep", columns, rows, note)
 

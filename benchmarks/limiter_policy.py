@@ -47,7 +47,7 @@ _DEG = math.pi / 180
 _FIRST_WARM_UP = 1000  # number of the first training grasp: never one that is tested
 PAPER, LONG, PACE, POLICY = "limiting function", "limiting function, 6 deg", "pace", "policy"
 #: What chooses the length of a step -> its colour.
-SYSTEMS = {PAPER: COLOURS["KM"], LONG: COLOURS["KM+I"], PACE: COLOURS["E-KM"], POLICY: COLOURS["limit"]}
+SYSTEMS = {PAPER: "#CC79A7", LONG: COLOURS["KM+I"], PACE: COLOURS["E-KM"], POLICY: COLOURS["limit"]}
 ON_MODEL = "kinematic model"
 #: Errors [deg], and margins now and after a whole step [N], at which the policy is asked.
 ERRORS, MARGINS = (25.0, 15.0, 8.0, 5.0, 3.0, 1.0), ((1.5, 0.5), (0.0, -1.0), (0.0, -4.0))
@@ -192,10 +192,10 @@ def policy_table(policy: Callable[[Array], float]) -> Table:
         *(Column(f"margins {now:g} and {after:g} N [deg]", ".2f") for now, after in MARGINS),
     ]
     note = (
-        "In a grip as it is wanted, when the last step went as asked; margins: the least friction margin now"
+        "With the required grip, after a last step as commanded; margins: the least friction margin now"
         " and after a whole step."
     )
-    return Table("policy", "The step that the policy asks for", columns, rows, note)
+    return Table("policy", "Step of the policy", columns, rows, note)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

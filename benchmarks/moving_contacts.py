@@ -126,7 +126,7 @@ def said(
 
 
 def foreseen(model: KinematicModel, way: list[Observation], axis: torch.Tensor) -> dict[str, float]:
-    """Errors of a whole turn that is foreseen from its first state [deg]."""
+    """Errors of a whole turn that is predicted from its first state [deg]."""
     first, last = way[0], way[-1]
     start = _linearized(model, first)
     moved = [b.a - a.a for a, b in itertools.pairwise(way)]
@@ -211,7 +211,7 @@ class Comparison:
             Column("step, median [deg]", ".2f"), Column("step, largest [deg]", ".2f"),
         ]  # fmt: skip
         note = (
-            "Error of the rotation, all axes, at the end of a turn of 9 to 25 motions, foreseen from its"
+            "Error of the rotation, all axes, at the end of a turn of 9 to 25 motions, predicted from its"
             " first state and the motions of the encoders. The KM, whose contacts stick, is linearized after"
             " each motion."
         )
@@ -296,7 +296,7 @@ KINDS = {
     "no slip, no link": lambda one: one["slid"] <= SLIP and not one["links"],
     "slid 0.05 to 0.2 mm": lambda one: SLIP < one["slid"] <= 2e-4,
     "slid more than 0.2 mm": lambda one: one["slid"] > 2e-4,
-    "a link bears": lambda one: one["links"] > 0,
+    "a link touches": lambda one: one["links"] > 0,
     "all": lambda one: True,
 }
 

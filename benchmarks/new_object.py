@@ -121,11 +121,17 @@ class Comparison:
             f" first motion {self.first_motion(best, 'ekm'):.2f} deg; lost {ours.lost} of {len(ours.records)}"
         )
 
-    def table(self) -> Table:
-        """A row for each object and contender."""
+    def tables(self) -> list[Table]:
+        """A row for each contender, then one for each object and contender."""
+        _, *others = self.objects
+        names = ("all_objects", "All new objects"), ("objects", "Each object")
+        chosen: tuple[list[str | None], ...] = ([None], [*others])
+        return [self._table(*texts, items) for texts, items in zip(names, chosen, strict=True)]
+
+    def _table(self, key: str, caption: str, items: Sequence[str | None]) -> Table:
         rows: list[list[Cell]] = []
-        first, *others = self.objects
-        for item in [*others, None]:
+        first = self.objects[0]
+        for item in items:
             for name in self.contenders:
                 turns = self.turns(name, item)
                 first_km, first_ekm = (self.first_motion(name, which, item) for which in ("km", "ekm"))
@@ -152,7 +158,7 @@ class Comparison:
             f" of the first object ({first}): KM {self.early(self.contenders[0], 'km', first, 'first'):.2f},"
             f" {before} deg."
         )
-        return Table("objects", "Objects that the hand has never held", columns, rows, note)
+        return Table(key, caption, columns, rows, note)
 
     def picture(self) -> Figure:
         """One-step error against the number of motions with a new object."""
@@ -169,10 +175,10 @@ class Comparison:
         return figure
 
     def report(self, folder: Path) -> Report:
-        """Table, picture and verdict, in ``folder``."""
+        """Tables, picture and verdict, in ``folder``."""
         caption = "Mean one-step error about the axis, all new objects and seeds."
         shown = save_figure(self.picture(), folder, "new_object", caption)
-        report = Report("Objects that the hand has never held", f"{self.verdict}.", [self.table()], [shown])
+        report = Report("Objects that are new to the hand", f"{self.verdict}.", self.tables(), [shown])
         report.write(folder)
         return report
 

@@ -61,7 +61,7 @@ COUPLED = (
 SIX = "In place of Fig. 3e: the six objects at one scale, with their centres of mass."
 APPLIER = (
     "In place of Fig. 4: the applier, from the grasp to the largest angle about the axis that the E-KM "
-    "reaches in this grasp; more is asked for than the hand can turn."
+    "reaches in this grasp; the target lies beyond it."
 )
 _TABLE_II = "The paper's Table II"
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e-?\d+)?")
@@ -77,7 +77,8 @@ def tables_of(source: Path) -> Tables:
     if source.is_dir():
         found = {table.caption: [table.header, *table.rows] for table in read_report(source).tables}
     elif source.is_file():
-        parts = re.split(r"^#+ (.*)$", source.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
+        heading = r"^(?:#+ |<summary>)(.*?)(?:</summary>)?$"
+        parts = re.split(heading, source.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
         found = {caption: _cells(text) for caption, text in zip(parts[::2], parts[1::2], strict=True)}
     else:
         raise SystemExit(f"no page and no folder of a report: {source}")

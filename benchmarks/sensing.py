@@ -1,4 +1,4 @@
-"""Sensing beside the paper: Hall fit, camera calibration, position controller, and turns without the camera.
+"""The paper's sensing in simulation: Hall fit, camera calibration, position controller, blind turns.
 
     python benchmarks/sensing.py --objects box,can --seeds 1000:1004 --out FOLDER
 

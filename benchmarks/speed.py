@@ -77,7 +77,7 @@ class Speed:
         note = (
             f"Default learner of {IN} inputs and {OUT} outputs, each sample predicted before it is learned."
         )
-        return Table("speed", "What a user waits for", columns, rows, note)
+        return Table("speed", "Times that a user notices", columns, rows, note)
 
     def picture(self):
         """Cost of an update against the size of the basis."""

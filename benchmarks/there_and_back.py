@@ -248,7 +248,7 @@ class Outcome:
     def picture(self) -> Figure:
         """Drift along the grip, and motions, over the turns of each series."""
         figure, (drift, motions) = new_figure(8.5, 3.4, 2)
-        colours = (COLOURS["E-KM"], COLOURS["KM+I"], COLOURS["KM+S"], COLOURS["KM"])
+        colours = (COLOURS["E-KM"], COLOURS["KM+I"], COLOURS["KM+S"], COLOURS["limit"])
         for k, item in enumerate(self.objects):
             colour, label = colours[k % len(colours)], item.replace("_", " ")
             for seed in dict.fromkeys(turn.seed for turn in self.turns):

@@ -22,12 +22,15 @@ import subprocess
 import sys
 import time
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pandas
-from page import ROOT, commit, provenance
+from dots import dot_chart
+from page import ROOT, Section, commit, page_text, provenance
 
+from torch_ekm.experiments.reporting.plots import save_figure
 from torch_ekm.experiments.reporting.report import FigureFile, Report, Table
 
 HERE = Path(__file__).parent
@@ -50,6 +53,8 @@ class Part:
     """It prints text, not Markdown."""
     pictures: tuple[str, ...] = ()
     """Figures of its report that the page shows."""
+    dots: dict[str, Any] = field(default_factory=dict)
+    """Arguments of :func:`dots.dot_chart`, which draws the tables, and a ``caption``."""
 
     @property
     def reports(self) -> bool:
@@ -124,9 +129,21 @@ def report_body(folder: Path, name: str, pictures: tuple[str, ...]) -> str:
     return report.markdown(level=2).strip()
 
 
+def drawn(body: str, given: dict[str, Any], folder: Path, name: str) -> str:
+    """The body of a page with a picture of its tables behind the answer, or first where it has none."""
+    caption = given["caption"]
+    figure = dot_chart(body, **{key: value for key, value in given.items() if key != "caption"})
+    save_figure(figure, folder, name)
+    (folder / f"{name}.png").unlink()
+    answer, _, rest = body.partition("\n\n")
+    picture = f"![{caption}]({folder.name}/{name}.svg)\n\n*{caption}*"
+    order = [picture, body] if answer.startswith(("|", "### ")) else [answer, picture, rest]
+    return "\n\n".join(order)
+
+
 def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:
     """A page, and the pictures that it shows."""
-    lines = []
+    sections = []
     for k, part in enumerate(parts_of(name)):
         folder = out / name / str(k)
         found = measure(part, folder, quick, keep)
@@ -135,14 +152,16 @@ def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:
             body = f"```text\n{body}\n```"
         elif part.reports:
             body = report_body(folder / "report", name, part.pictures)
+        if part.dots:
+            body = drawn(body, part.dots, page.parent / name, f"dots_{k}")
         how = f"`{part.spoken()}`: commit {found['commit']}, {found['date']}, {found['minutes']} min."
-        lines += [f"## {part.title}", "", part.see, "", how, "", body, ""]
+        sections.append(Section(part.title, part.see, body, how))
         for picture in part.pictures:
             (page.parent / name).mkdir(exist_ok=True)
             shutil.copy(folder / "report" / f"{picture}.svg", page.parent / name)
-    head = provenance(f"python benchmarks/write_pages.py {name}")
+    written = provenance(f"python benchmarks/write_pages.py {name}")
     page.parent.mkdir(parents=True, exist_ok=True)
-    page.write_text("\n".join([f"# {PLAN[name]['title']}", "", *head, *lines]), encoding="utf-8")
+    page.write_text(page_text(PLAN[name]["title"], sections, written), encoding="utf-8")
     print(f"{page}", flush=True)
 
 

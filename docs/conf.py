@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -37,6 +38,9 @@ suppress_warnings = ["toc.empty_glob"]  # a benchmark that has not been measured
 
 html_theme = "furo"
 html_title = f"torch_ekm {version}"
+if "TORCH_EKM_VERSIONS" in os.environ:  # address of the page that links the sites of all versions
+    link = f'<a href="{os.environ["TORCH_EKM_VERSIONS"]}">Other versions</a>'
+    html_theme_options = {"announcement": f"torch_ekm {version}. {link}"}
 html_show_sphinx = False
 html_copy_source = False
 add_module_names = False

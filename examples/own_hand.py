@@ -21,7 +21,7 @@ print(f"{hand.name}: joints {', '.join(hand.joint_names)}; actuators {', '.join(
 print("J_a:\n" + np.array2string(hand.actuation_jacobian, precision=2))
 for row in check_hand(name, thing):  # what "torch-ekm check" prints
     if row.state != "ok":
-        print(f"{row.state}: {row.name}: {row.found}; {row.mend}")
+        print(f"{row.state}: {row.name}: {row.found}; {row.remedy}")
 
 plant = SimulatedHand(hand, thing, preset="nominal")
 seen = plant.reset(seed=0)

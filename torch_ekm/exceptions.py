@@ -306,7 +306,7 @@ class WorkerDiedError(EKMError):
         self.job, self.tries = job, tries
         super().__init__(
             f"the job '{job}' was run {tries} times, and its process was killed each time; look for "
-            "a lack of memory, or run it alone with one process"
+            "a lack of memory, or run it with one process"
         )
 
 

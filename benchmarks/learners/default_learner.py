@@ -83,7 +83,7 @@ def bars(n: int, seed: int) -> dict[str, tuple[float, float]]:
         found[name] = value, most
         print(f"| {name} | {value:.3f} | {most:g} |", flush=True)
 
-    print("\n| what the default learner is to bear | measured | aim: at most |\n|---|---|---|")
+    print("\n| test of the default learner | measured | aim: at most |\n|---|---|---|")
     samples = pure_noise(n, seed)
     half = n // 2
     error = ratio(run(default_learner, samples).mean[half:], samples.y[half:])

@@ -46,7 +46,7 @@ def write_report(result: RecordedHandResult, folder: str | Path) -> Report:
     """Tables as CSV, figures as SVG and PNG, and ``index.html`` with all of them, into ``folder``."""
     save = partial(save_figure, folder=Path(folder))
     names = [name for name in _PICTURED if name in result.paths] or result.reported[:3]
-    caption = "Recorded paths (grey) and where each model sees the object after five seconds."
+    caption = "Recorded paths (grey) and each model's prediction of the object after five seconds."
     figures = [
         save(plot_paths(result, names), name="paths", caption=caption),
         save(plot_horizons(result), name="horizons", caption="Error of the models alone, by horizon."),

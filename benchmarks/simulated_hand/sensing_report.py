@@ -199,7 +199,7 @@ class Outcome:
             "error of the prediction of one motion by the truth. Root mean squares: joint angles, measured "
             "rotation since the grasp. All sensed: lens from 20 pictures, Hall sensors, fingertips."
         )
-        return Table("turns", "What the readings are worth in turns", columns, rows, note)
+        return Table("turns", "Effect of the readings on turns", columns, rows, note)
 
     def hall_table(self) -> Table:
         """A row for each joint."""
@@ -253,7 +253,7 @@ class Outcome:
             Column("largest [deg]"): lambda e: float(e.max()),
             Column("within 1 deg [%]", ".0f", percent=True): lambda e: float((e <= 1).mean()),
         }
-        note = "Encoder's change less what was asked, of each motor in each motion that asks something of it."
+        note = "Encoder's change minus the command, of each motor in each motion that commands it."
         return Table.of("motors", "Position controller", "controller", items, columns, note)
 
     def blind_table(self) -> Table:
@@ -322,8 +322,8 @@ class Outcome:
     def report(self, folder: Path) -> Report:
         """All of it, in ``folder``."""
         caption = (
-            "Left: depth error of a board by how the lens is known, a dot for each lens. Middle: what motors "
-            "miss. Right: error of the estimated rotation without the camera."
+            "Left: depth error of a board by calibration of the lens, a dot for each lens. Middle: errors "
+            "of the motors. Right: error of the estimated rotation without the camera."
         )
         shown = save_figure(self.picture(), folder, "sensing", caption)
         parts = (
@@ -334,7 +334,7 @@ class Outcome:
             self.time_table(),
         )
         made = [table for table in (self.paper_table(), *parts, self.hall_table()) if table.rows]
-        report = Report("Sensing beside the paper", f"{self.verdict}.", made, [shown])
+        report = Report("The paper's sensing, in simulation", f"{self.verdict}.", made, [shown])
         report.write(folder)
         return report
 

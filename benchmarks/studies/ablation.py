@@ -209,7 +209,7 @@ class Ablation(Protocol):
         turned = dict.fromkeys(self._turned(group) for group in self.groups)
         summary = f"{self._answer(seeds, trials)} One change at a time; {'; '.join(turned)}. "
         summary += f"{which_seeds(seeds)}{warmed_up(self.warm_up)}"
-        title = "Ablations: what each part is worth"
+        title = "Ablations: the effect of each part"
         names = {c for v in self._variants() for c in v.controllers}
         explained = {name: line for name, line in LEGEND.items() if name in names}
         return Report(title, summary, shown, leading=2, legend=explained)
@@ -277,9 +277,9 @@ class Ablation(Protocol):
         ]  # fmt: skip
         name = f"ablation_{group.replace(' ', '_')}_motions"
         note = (
-            "Motions of a turn of the E-KM. First motion: by how much more or less it changed the error than "
-            "it was to. Errors of one-step predictions on its motions, as measured, and E-KM over KM by the "
-            "truth."
+            "Motions of a turn of the E-KM. First motion: deviation of its change of the error from the "
+            "commanded one. Errors of one-step predictions on its motions, as measured, and E-KM over KM by "
+            "the truth."
         )
         return Table(name, f"Ablation: {group}, motions of the E-KM", columns, rows, note)
 

@@ -153,11 +153,11 @@ def far_table(trials: DataFrame) -> Table:
         Column("lost"): lambda mine: stats.rate(mine["lost"]),
     }
     note = (
-        "The target is farther than any grasp goes; the largest true angle before the turn ended. How "
+        "The target is beyond the reach of all grasps; the largest true angle before the turn ended. How "
         "often two controllers end within 2 deg of each other on the same grasp bounds what can be predicted."
     )
     items = by_contender(trials, "far")
-    return Table.of("far", "As far as it goes", "contender", items, columns, note)
+    return Table.of("far", "To the end of the reach", "contender", items, columns, note)
 
 
 def reach_table(trials: DataFrame) -> Table:
@@ -257,7 +257,7 @@ def _reach_plot(turns: DataFrame, folder: Path) -> list[FigureFile]:
         axis.plot(real[mine], predicted[mine], "osD^v*PX"[k % 8], label=label, markersize=5)
     axis.set(xlabel="real end [deg]", ylabel="predicted end [deg]", xlim=(0, top), ylim=(0, top))
     axis.legend(frameon=False, fontsize=8)
-    caption = "Where the one-step E-KM's turns ended, and where the model said before anything moved."
+    caption = "Ends of the one-step E-KM's turns, and the model's predictions before the first motion."
     return [save_figure(figure, folder, "reach", caption)]
 
 
@@ -302,5 +302,7 @@ def _animation(setting: Setting, trials: DataFrame, folder: Path) -> list[Figure
     save_animation(scene, folder / "animation.html")
     what = f"{turn.object.replace('_', ' ')}, {turn.contender}, seed {turn.seed}"
     return [
-        FigureFile("animation.html", f"As far as it goes ({what}); see-through: as the model predicted it.")
+        FigureFile(
+            "animation.html", f"To the end of the reach ({what}); see-through: as the model predicted it."
+        )
     ]

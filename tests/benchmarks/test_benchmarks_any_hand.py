@@ -63,6 +63,7 @@ def test_lost_missed_and_motions_are_counted(tmp_path: Path) -> None:
     survey = Survey({("arms", "strong", "KM+I"): theirs, ("arms", "strong", "E-KM"): ours})
     verdict = "E-KM lost 1 of 4, reached 2, motions 7.0; KM+I lost 1 of 4, reached 3, motions 12.7"
     assert survey.verdict == verdict
+    assert survey.totals().text() == [["KM+I", "4", "1", "3", "12.7"], ["E-KM", "4", "1", "2", "7.0"]]
     row = survey.table().text()[0]
     assert row == ["arms strong", "4", "1, 3, 12.7", "1, 2, 7.0", "58", "1 stalled, 1 given up"]
     survey.report(tmp_path, "mujoco")

@@ -40,7 +40,7 @@ def test_slips_are_announced_and_false_alarms_counted(tmp_path: Path) -> None:
     assert rows["nominal", "step"] == ["67 % of 3", "0 % of 1", "100 % of 1", "100 % of 1"]
     assert rows["nominal", "margins of the KM"] == ["67 % of 3", "0 % of 1", "0 % of 1", "0 % of 1"]
     kinds = {row[0]: row[1:] for row in found.errors().text()}
-    assert kinds["a link bears"] == ["1", "1.000", "1.000", "0.200", "0.200"]
+    assert kinds["a link touches"] == ["1", "1.000", "1.000", "0.200", "0.200"]
     found.report(tmp_path)
     assert (tmp_path / "moving_contacts.svg").exists()
 

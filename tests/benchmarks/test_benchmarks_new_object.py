@@ -43,7 +43,9 @@ def test_first_motions_are_those_of_an_object_and_of_a_turn(tmp_path: Path) -> N
         "first five motions KM 0.50, empty 0.37, learned hand 0.18 deg; first motion 0.20 deg; lost 1 of 3"
     )
     assert found.verdict == verdict
-    row = found.table().text()[1]
+    together, each = found.tables()
+    assert [row[0] for row in together.text()] == ["all"] * 3
+    row = each.text()[1]
     assert row == ["can", "learned hand", "0.50", "0.20", "0.30", "0.25 (50 %)", "0, 2 of 2", "3.0"]
     found.report(tmp_path)
     assert verdict in (tmp_path / "report.md").read_text(encoding="utf-8")

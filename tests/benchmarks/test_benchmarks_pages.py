@@ -13,6 +13,10 @@ pytest.importorskip("write_pages", reason="the benchmarks are not part of this i
 
 import write_pages
 from bars import Target, targets_table
+from dots import dot_chart
+from page import Section, page_text
+
+from torch_ekm.experiments.reporting.plots import COLOURS
 
 
 def _plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
@@ -102,6 +106,59 @@ def test_a_report_comes_with_its_headings_below_the_pages(
     assert "Left out" not in text
     assert (tmp_path / "out" / "one" / "shown.svg").exists()
     assert sys.executable not in text
+
+
+def test_results_come_first_and_long_tables_are_folded() -> None:
+    def table(rows: int) -> str:
+        return "\n".join(["| a |", "|---|", *(f"| {k} |" for k in range(rows))])
+
+    picture = "![Seen.](a.svg)\n\n*Seen.*"
+    legend = "- **KM**: the model"
+    body = f"Answer.\n\n{legend}\n\n{picture}\n\n### Short\n\n{table(8)}\n\nNote.\n\n### Other\n\n{table(2)}"
+    text = page_text("Page", [Section("Part", "See.", body, "`run`: commit 1.")], ["Written by it."])
+    folded = f"<details>\n<summary>Other</summary>\n\n{table(2)}\n\n</details>"
+    shown = ["Answer.", picture, f"### Short\n\n{table(8)}\n\nNote.", "See.", legend, folded]
+    made = "## Commands and versions\n\n- Part: `run`: commit 1.\n\nWritten by it."
+    assert text == "\n\n".join(["# Page\n\n## Part", *shown, made])
+    long = page_text("Page", [Section("Part", "See.", body.replace(table(8), table(9)), "")], [])
+    assert f"<summary>Short</summary>\n\n{table(9)}" in long
+    bare = page_text("Page", [Section("Part", "See.", table(16), "")], [])  # no picture shows what is in it
+    assert "<details>" not in bare
+    assert "<summary>Table of 17 rows</summary>" in page_text(
+        "Page", [Section("P", "See.", table(17), "")], []
+    )
+
+
+TABLES = """Answer.
+
+### Errors: one
+
+| what | KM [deg] | E-KM [deg] | lost |
+|---|---|---|---|
+| plain | 1.00 [0.50, 2.00] | 0.10 | 0 |
+| other | - | 0.20 [0.1, 0.3] | 1 |
+| nothing | - | - | 2 |
+
+### Others
+
+| what | time |
+|---|---|
+| **ours** | 3 |
+"""
+
+
+def test_tables_are_drawn_with_their_intervals(tmp_path: Path) -> None:
+    given = {"columns": ["KM [deg]", "E-KM [deg]"], "label": "error [deg]", "caption": "All errors."}
+    body = write_pages.drawn(TABLES, given, tmp_path / "one", "dots_0")
+    assert body.startswith("Answer.\n\n![All errors.](one/dots_0.svg)\n\n*All errors.*\n\n### Errors: one")
+    assert [path.name for path in (tmp_path / "one").iterdir()] == ["dots_0.svg"]
+    (panel,) = dot_chart(TABLES, given["columns"], "error [deg]").axes
+    assert [text.get_text() for text in panel.get_yticklabels()] == ["plain", "other"]
+    dots = [(line.get_color(), *line.get_xdata()) for line in panel.lines]
+    km, ekm = COLOURS["KM"], COLOURS["E-KM"]
+    assert dots == [(km, 1.0), (km, 0.5, 2.0), (ekm, 0.1), (ekm, 0.2), (ekm, 0.1, 0.3)]
+    (single,) = dot_chart(TABLES, ["time"], "time", captions="Oth").axes
+    assert single.lines[0].get_color() != km  # ours, in bold
 
 
 def test_targets_say_by_how_much_they_are_missed() -> None:

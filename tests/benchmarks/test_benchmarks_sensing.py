@@ -1,4 +1,4 @@
-"""Sensing beside the paper: the lens, its calibration, what is counted, and that it runs."""
+"""The paper's sensing, in simulation: the lens, its calibration, what is counted, and that it runs."""
 
 from __future__ import annotations
 

@@ -259,7 +259,7 @@ FAULTS = {
     "encoder of +50 rad": (one_more("a", 2, 50.0), {}, Reason.OUT_OF_RANGE, "encoder 'thumb_proximal'"),
     "encoder that jumps": (one_more("a", 2, 0.3), {}, Reason.ENCODER_JUMP, "encoder 'thumb_proximal'"),
     "joint that jumps": (one_more("q", 5, 0.5), {}, Reason.JOINT_JUMP, "joint '"),
-    "dead Hall sensors": (dead_joints, {}, Reason.JOINT_JUMP, "look after its sensor"),
+    "dead Hall sensors": (dead_joints, {}, Reason.JOINT_JUMP, "check its sensor"),
     "pose that jumps": (one_more("position", 0, 0.2), {}, Reason.POSE_JUMP, "camera and markers"),
     "saturated fingertips": (saturated([0, 1, 2]), {}, Reason.FINGERTIP_FAULT, "joints and springs"),
     "too much force": (
@@ -302,7 +302,7 @@ def test_one_saturated_fingertip_is_left_out_and_the_grip_stays(held) -> None:
     run = Run(held, saturated([0]), angle=12.0)
     assert run.reason is Reason.REACHED
     note = run.done.steps[2].note
-    assert "reads 15.00 N where joints and springs speak for" in note
+    assert "reads 15.00 N, joints and springs give" in note
     assert "the model's estimate stands in" in note
     assert float(run.done.steps[2].after.fingertip_force[0]) == 0.0
 
@@ -313,7 +313,7 @@ def test_dead_fingertips_are_told_and_do_not_end_the_turn(held) -> None:
 
     run = Run(held, dead)
     assert run.reason is Reason.REACHED
-    assert "where the model has" in run.done.steps[2].note
+    assert "the model predicts" in run.done.steps[2].note
 
 
 def test_a_fingertip_that_repeats_itself_is_frozen(held) -> None:

@@ -134,7 +134,7 @@ def test_a_target_out_of_reach_is_declined_and_the_object_stays(grasp) -> None:
     done = loop.run(far)
     assert done.reason is StopReason.OUT_OF_REACH
     assert not done.steps
-    assert "deg nothing speaks against it" in done.stop.message
+    assert "deg it is safe" in done.stop.message
     assert done.stop.final.status is PlantStatus.HELD
     assert loop.run(near).reason is StopReason.REACHED
     plant.reset(0)

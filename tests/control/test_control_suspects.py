@@ -56,7 +56,7 @@ def test_a_sensor_that_is_off_is_named(held, sensor, since) -> None:
     done = run(held, fault, since)
     assert done.reason is (Reason.GIVEN_UP if since else Reason.UNSTABLE_GRASP)
     assert contradicts in done.stop.message
-    assert "look after these sensors" in done.stop.message
+    assert "check these sensors" in done.stop.message
     assert (went in done.stop.message) is (since > 0)
     joints = "encoder 'index_distal' and its joints (index_2, index_3) differ" in done.stop.message
     assert joints is (sensor == "joint" and since > 0)  # in the first reading it may be moment arms
@@ -90,7 +90,7 @@ def test_fingertips_that_read_half_are_told(held, scale) -> None:
 
     done = run(held, scaled, since=0)
     assert done.reason is Reason.REACHED
-    told = [k for k, step in enumerate(done.steps) if "where joints and springs speak for" in step.note]
+    told = [k for k, step in enumerate(done.steps) if "joints and springs give" in step.note]
     assert told == ([] if scale == 1 else [0])
     if told:
-        assert "look after their scale" in done.steps[0].note
+        assert "check their scale" in done.steps[0].note

@@ -79,8 +79,8 @@ def test_nothing_learned_is_the_description(held) -> None:
     lin, same = followed.linearize(state), model.linearize(state)
     torch.testing.assert_close(lin.manipulation_jacobian, same.manipulation_jacobian, rtol=0, atol=1e-13)
     assert model.figures is None
-    assert "not told" in str(figures)
-    assert not any(figure.told for figure in figures.figures)
+    assert "not identified" in str(figures)
+    assert not any(figure.identified for figure in figures.figures)
 
 
 def test_motions_that_were_not_seen_are_predicted(held, other, learned) -> None:
@@ -92,11 +92,11 @@ def test_motions_that_were_not_seen_are_predicted(held, other, learned) -> None:
 def test_what_motions_tell_is_found_and_the_rest_is_said_to_be_unknown(learned) -> None:
     found = {one.name: one for one in learned.figures}
     arm = found["moment arm of index_proximal at index_1"]
-    assert arm.told
+    assert arm.identified
     assert arm.factor == pytest.approx(1.5, abs=0.15)
-    assert not found["spring of little_1"].told  # the finger does not touch
+    assert not found["spring of little_1"].identified  # the finger does not touch
     assert f"moment arm of index_proximal at index_1: {arm.factor:.2f} times" in str(learned)
-    assert "spring of little_1" in str(learned).split("not told")[1]
+    assert "spring of little_1" in str(learned).split("not identified")[1]
 
 
 def test_a_tendon_that_is_replaced_is_named(held, other, learned) -> None:

@@ -103,14 +103,14 @@ def test_each_fault_has_its_row(fault, files, monkeypatch):
     rows = [row for row in check_hand(str(files[0])) if row.name == name]
     assert [row.state for row in rows] == [state]
     assert re.search(text, rows[0].found)
-    assert bool(rows[0].mend) == (state != "ok")
+    assert bool(rows[0].remedy) == (state != "ok")
 
 
 def test_a_pad_that_the_urdf_lacks_is_printed_to_be_pasted(files):
     urdf, transmission = files
     transmission.write_text(transmission.read_text().replace("radius = 0.006", "radius = 0.009", 1))
     (row,) = [row for row in module._pads(load_hand(urdf)) if row.state != "ok"]
-    pasted = row.mend[row.mend.index("<collision>") :]
+    pasted = row.remedy[row.remedy.index("<collision>") :]
     link = f'<link name="{load_hand(urdf).pads[0].link}">'
     text = re.sub(r"<collision>.*?</collision>", "", urdf.read_text(), flags=re.DOTALL)
     urdf.write_text(text.replace(link, link + pasted))
@@ -212,7 +212,7 @@ def test_springs_too_soft_for_the_usual_force_are_told_which_one_they_bear(monke
     rows = {row.name: row for row in check_hand("mine", "can")}
     assert rows["pinch"].state == "error"
     assert "sound at 2 N" in rows["pinch force"].found
-    assert "pinch_force = 2 under [hand]" in rows["pinch force"].mend
+    assert "pinch_force = 2 under [hand]" in rows["pinch force"].remedy
     gentle = dataclasses.replace(hand, pinch_force=2.0)
     rows = {row.name: row for row in module._pinch(gentle, load_object("can"), None, PlantConfig())}
     assert rows["pinch"].state == "ok"

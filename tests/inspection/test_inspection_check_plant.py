@@ -124,7 +124,7 @@ def test_a_wrong_wiring_is_refused_with_the_line_to_change(name, tmp_path) -> No
     found = errors(check_plant(plant, HAND))
     assert [one.name for one in found][:1] == [row]
     assert words in found[0].found
-    for number, which, named in re.findall(r"wrong.toml:(\d+): (\w+) of '(\w+)'", found[0].mend):
+    for number, which, named in re.findall(r"wrong.toml:(\d+): (\w+) of '(\w+)'", found[0].remedy):
         assert which == key
         lines = (tmp_path / "wrong.toml").read_text().splitlines()[: int(number)]
         assert lines[-1].startswith(f"{key} = ")
@@ -151,7 +151,7 @@ def test_a_dead_joint_sensor_and_a_dead_motor(tmp_path) -> None:
     plant.dead["left_1"] = plant.true.joints[1].bus(float(plant.map.joints(plant.a)[1]))
     found = errors(check_plant(plant, HAND))
     assert "joint 'left_1'" in [one.name for one in found]
-    assert any("the same, bit by bit" in one.found and "wrong.toml:24" in one.mend for one in found)
+    assert any("the same, bit by bit" in one.found and "wrong.toml:24" in one.remedy for one in found)
     plant = bench(tmp_path)
     plant.dead_zone = 10 * DEG
     found = errors(check_plant(plant, HAND))
@@ -186,7 +186,7 @@ def test_a_pose_in_another_frame(tmp_path) -> None:
     found = errors(check_plant(WithPose(plant, by_camera), HAND))
     assert [one.name for one in found] == ["pose"]
     assert "another frame" in found[0].found
-    assert "WithPose(frame=" in found[0].mend
+    assert "WithPose(frame=" in found[0].remedy
 
 
 def test_a_driver_of_ones_own_that_commands_the_wrong_way_or_in_degrees(tmp_path) -> None:

@@ -136,7 +136,7 @@ def test_identify_servo_over_the_bus(bus, tmp_path, monkeypatch, capsys) -> None
     assert servo.bias.tolist() == pytest.approx([3 / TICKS, -3 / TICKS], abs=0.06 * DEG)
     said = capsys.readouterr().out
     assert "left: d=0.7" in said
-    assert "no joint sensor tells its play" in said
+    assert "no joint sensor measures its play" in said
 
 
 class WithJoints(HandDriver):

@@ -102,7 +102,7 @@ def test_learners_are_compared_on_a_recording(tmp_path: Path) -> None:
     (file,) = bag.glob("*.mcap")
     moves = load_recording(file, None, ["/q.position[0]"], clock="/commands", inputs=columns["inputs"])
     assert moves.y.shape == (44, 1)
-    with pytest.raises(ParameterError, match="a topic that sets the rhythm"):
+    with pytest.raises(ParameterError, match="a topic whose messages set the rows"):
         load_recording(file, **columns)
 
 

@@ -281,6 +281,7 @@ def encoders(hand, q, generator, std=0.5 * DEG):
 
 def test_joint_estimates_of_a_whole_hand(hand, generator, monkeypatch):
     monkeypatch.setattr(joint_estimator, "ENCODER_STD", 0.5 * DEG)
+    monkeypatch.setattr(joint_estimator, "ARM_STD", 0.0)
     sensors = HallSensors(hand, seed=1)
     estimator = JointEstimator(hand, calibrated(sensors))
     q = random_posture(hand, 400, generator)
@@ -307,8 +308,23 @@ def test_wrong_moment_arms_do_not_draw_joints_that_have_channels(hand, generator
         assert float(mean[hand.joint_names.index(joint)]) < 0.2
 
 
+def test_a_joint_without_a_channel_is_as_uncertain_as_its_moment_arm(hand, generator) -> None:
+    estimator = JointEstimator(hand, calibrated(sensors := HallSensors(hand, seed=1)))
+    q = random_posture(hand, 20, generator)
+    a = encoders(hand, q, generator)
+    estimate, k = estimator(sensors.read(q, generator), a), hand.joint_names.index("thumb_0")
+    way = (a - torch.from_numpy(hand.actuator_offset))[:, 1]
+    prior = 12 / float(hand.joint_upper[k] - hand.joint_lower[k]) ** 2
+    assert torch.allclose(
+        estimate.std[:, k] ** -2,
+        prior + 1 / (2.5 * DEG) ** 2 / (1 + (way * 0.3 / (2.5 * DEG)) ** 2),
+        rtol=2e-3,
+    )
+
+
 def test_encoders_stand_in_for_a_stuck_channel(hand, generator, monkeypatch):
     monkeypatch.setattr(joint_estimator, "ENCODER_STD", 0.5 * DEG)
+    monkeypatch.setattr(joint_estimator, "ARM_STD", 0.0)
     sensors = HallSensors(hand, seed=1)
     sensors.stuck[4] = 255.0  # index_2, which the encoder of index_distal covers with index_3
     estimator = JointEstimator(hand, calibrated(sensors))

@@ -7,6 +7,7 @@ import math
 
 import pytest
 import torch
+from torch import Tensor
 
 from torch_ekm.plant import Observation, PlantWrapper
 from torch_ekm.sensing import ContactAligned
@@ -16,15 +17,25 @@ from torch_ekm.simulation import SimulatedHand
 class Blurred(PlantWrapper):
     """A simulated hand whose encoder-known joint is read wrong."""
 
-    def __init__(self, plant: SimulatedHand, joint: int, error: float, numb: bool = False) -> None:
+    def __init__(
+        self,
+        plant: SimulatedHand,
+        joint: int,
+        error: float,
+        numb: bool = False,
+        covariance: Tensor | None = None,
+    ) -> None:
         super().__init__(plant)
-        self.joint, self.error, self.numb = joint, error, numb
+        self.joint, self.error, self.numb, self.covariance = joint, error, numb, covariance
 
     def observation(self, seen: Observation) -> Observation:
         q = seen.q.clone()
         q[self.joint] += self.error
         force = None if self.numb else seen.fingertip_force
-        return dataclasses.replace(seen, q=q, fingertip_force=force)
+        info = dict(seen.info)
+        if self.covariance is not None:
+            info["estimate"] = {"joint_covariance": self.covariance}
+        return dataclasses.replace(seen, q=q, fingertip_force=force, info=info)
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +51,19 @@ def test_touch_corrects_the_joint_that_no_sensor_reads(hand: SimulatedHand, erro
     off = torch.rad2deg(seen.q - seen.truth.q).abs()
     assert float(off[thumb]) < 1.0
     assert float(off[[i for i in range(len(off)) if i != thumb]].max()) < 0.5  # the others are let alone
+
+
+def test_the_joint_that_is_least_certain_is_corrected(hand: SimulatedHand) -> None:
+    """Not the abduction, which hardly moves the fingertip towards the object, though no sensor reads it."""
+    names = hand.hand.joint_names
+    index_0, index_2 = names.index("index_0"), names.index("index_2")
+    std = torch.full((len(names),), math.radians(0.3), dtype=torch.float64)
+    std[index_0], std[index_2] = math.radians(2.0), math.radians(8.0)
+    blurred = Blurred(hand, index_2, math.radians(-6.0), covariance=torch.diag(std**2))
+    seen = ContactAligned(blurred, hand.hand, hand.object).reset(0)
+    off = torch.rad2deg(seen.q - seen.truth.q).abs()
+    assert float(off[index_2]) < 0.5
+    assert float(off[index_0]) < 0.5
 
 
 def test_hand_without_fingertip_sensors_keeps_its_joints(hand: SimulatedHand) -> None:

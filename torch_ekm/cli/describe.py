@@ -74,7 +74,7 @@ def check(
 
     Files, pads, axes, limits, tendons, and a pinch of the object in simulation and model. With --plant:
     signs, units, order, zeros and sensors of a real hand, by motions of 1 deg (up to 4 where its motors
-    stick), one motor after the other. Each row says what was found and what to mend. Ends with 1 if there is
+    stick), one motor after the other. Each row has what was found and the remedy. Ends with 1 if there is
     an error, with 0 if not.
     """
     from ..inspection.row import Check

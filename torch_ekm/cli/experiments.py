@@ -26,12 +26,12 @@ def demo(
     hand: Hand = "icub_right",
     seeds: Annotated[str, Option(help="FIRST:END, e.g. 1000:1008; each seed is one grasp.")] = "1000:1008",
     jobs: Jobs = 2,
-    quick: Annotated[bool, Option(help="Two grasps, two angles: to see that it works.")] = False,
+    quick: Annotated[bool, Option(help="Two grasps, two angles: a trial run.")] = False,
 ) -> None:
     """Turn an object with the KM and with the E-KM, and report.
 
     Eight instances of the simulated hand, five turns from new grasps with each controller: two to three
-    minutes on two cores; half a minute with --quick. Interrupted, it goes on where it stopped.
+    minutes on two cores; half a minute with --quick. Interrupted, it continues where it stopped.
     """
     from ..experiments.config import Setting
     from ..experiments.protocols.demo import Demo
@@ -49,7 +49,7 @@ def reproduce(
     seeds: Annotated[str, Option(help="FIRST:END; each seed is an independent run.")] = "1000:1020",
     jobs: Jobs = 2,
     out: Annotated[Path | None, Option(help="Folder for the report [reproduce_<experiment>].")] = None,
-    quick: Annotated[bool, Option(help="Two seeds, small turns: to see that it works.")] = False,
+    quick: Annotated[bool, Option(help="Two seeds, small turns: a trial run.")] = False,
     objects: Annotated[
         str, Option(help="Names separated by commas, or a folder with URDF files (generalize).")
     ] = "",
@@ -68,7 +68,7 @@ def reproduce(
 ) -> None:
     """Repeat the paper's experiments.
 
-    Every controller has the same seeds and grasps. Interrupted, it goes on where it stopped, and ends with
+    Every controller has the same seeds and grasps. Interrupted, it continues where it stopped, and ends with
     the same report. With 20 seeds, on two cores:
 
     \b
@@ -108,10 +108,14 @@ def compare(
     ] = "",
     targets: Annotated[str, Option("--targets", "--measured", help="To predict; else y, y1, ...")] = "",
     inputs: Annotated[str, Option(help="Columns to predict from; all others if left out.")] = "",
-    predicted: Annotated[str, Option(help="What your model says of each of these: y is the rest.")] = "",
+    predicted: Annotated[
+        str, Option(help="Columns with your model's predictions of these: y is the difference.")
+    ] = "",
     observation: Annotated[str, Option(help="Columns whose next increments are predicted.")] = "",
     run_column: Annotated[str, Option("--run", help="Column with one number in each run.")] = "",
-    clock: Annotated[str | None, Option(help="Of a ROS bag or MCAP: the topic that sets the rhythm.")] = None,
+    clock: Annotated[
+        str | None, Option(help="Of a ROS bag or MCAP: the topic whose messages set the rows.")
+    ] = None,
     out: Annotated[Path, Option(help="Folder for tables and figures.")] = Path("compare_output"),
     limit: Annotated[
         int, Option(min=0, help="Rows of a file or recording that are used, its first; 0: all.")
@@ -122,7 +126,7 @@ def compare(
 
     Each learner predicts every sample, is scored, and then learns it, in the order of time. A CSV file needs
     the extra 'plots' only. One learner takes seconds to a minute for 1500 rows, all of them a few minutes on
-    two cores. Interrupted, it goes on where it stopped.
+    two cores. Interrupted, it continues where it stopped.
 
     Recordings: simulated_hand (extra 'sim'); in the folder that TORCH_EKM_DATA names: t42 (Sintov et al.,
     GitHub avishais/t42_autonomous_system), icub_grasp (Soh et al., clear-nus/icub_grasp_dataset), sarcos

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 @app.command()
 @needs("experiments")
 def record(
-    log: Annotated[Path, Argument(help="Folder of the log; one that is there goes on.")],
+    log: Annotated[Path, Argument(help="Folder of the log; an existing one is continued.")],
     object: Annotated[str, Option(help=AN_OBJECT)] = "box",
     hand: Hand = "icub_right",
     angles: Annotated[str, Option(help="Turns [deg], e.g. 10,20.")] = "10,20",
@@ -32,7 +32,7 @@ def record(
 ) -> None:
     """Turn an object in the simulated hand, and log all of it.
 
-    One HDF5 file for each turn. Interrupted or killed, it goes on where it stopped, and ends with the same
+    One HDF5 file for each turn. Interrupted or killed, it continues where it stopped, and ends with the same
     files.
     """
     from ..experiments.config import Setting
@@ -62,7 +62,7 @@ def show(
     """Write a page that shows a hand, a grasp or a log in any browser.
 
     A hand closes and opens each actuator in turn. In a grasp each actuator is moved by 5 deg, in simulation,
-    and the table says what that does to the object. A log is played.
+    and the table shows the effect on the object. A log is played.
     """
     from ..inspection.view import view
 

@@ -13,7 +13,9 @@ import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
 
 Wired = Annotated[Path, Option("--plant", metavar="TOML", help="The hand's wiring file.")]
-Learned = Annotated[Path | None, Option(metavar="EKM", help="File of what a closed loop knows of the hand.")]
+Learned = Annotated[
+    Path | None, Option(metavar="EKM", help="File of what a closed loop has learned of the hand.")
+]
 
 
 @app.command()
@@ -69,7 +71,7 @@ def health(
     hand: Annotated[str, Option(help="The hand; else the one that the first log names.")] = "",
     knowledge: Learned = None,
 ) -> None:
-    """Say which actuator of a hand changed, by how much and since when.
+    """Report which actuator of a hand changed, by how much and since when.
 
     Read from ordinary motions in its trial logs: what tendons pass on, dead zones and biases of the servos.
     With --knowledge: also the figures that a closed loop learned. Ends with 1 if something changed.

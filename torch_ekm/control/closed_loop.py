@@ -57,8 +57,8 @@ class ClosedLoop:
         safety: when it looks again, goes back, stops and gives up.
         learn: False leaves the learner as it is.
         decline: a target out of :meth:`reachability` ends as out of reach before anything moves. So does,
-            once an enhanced model knows the hand's figures from 15 motions, a turn of 25 deg or more that is
-            5 deg beyond :meth:`reach`, or another target of 4 steps that the model misses. False: tried.
+            once an enhanced model has found the hand's figures in 15 motions, a turn of 25 deg or more
+            that is 5 deg beyond :meth:`reach`, or another target of 4 steps that the model misses.
 
     Raises:
         ParameterError: the knowledge is of another hand.
@@ -111,10 +111,10 @@ class ClosedLoop:
 
     def reach(self, *, sign: int = 1, limit: float = math.radians(90)) -> Reach:
         """``max |angle|`` of this loop on a :class:`ModelHand`: its programs, limits and signs of a loss, and
-        a controller that knows the description, with f + g in place of the plant. Nothing moves, and nothing
+        a controller that uses the description, with f + g in place of the plant. Nothing moves, and nothing
         is learned.
 
-        It is no better than the model's contacts and forces, and knows nothing of noise. ::
+        It is as good as the model's contacts and forces, and leaves noise out. ::
 
             reach = loop.reach()
             loop.run(PoseTarget.turned(plant.observe().state, axis, reach.safe / DEG))
@@ -132,7 +132,7 @@ class ClosedLoop:
 
     def reachability(self, target: PoseTarget) -> Reachability:
         """Whether the motors can bring the object to ``target``: rank and conditioning of the focused rows of
-        J_m, ranges of the motors, rotation off the focus. To first order: it knows no slip and no link.
+        J_m, ranges of the motors, rotation off the focus. To first order: without slip and links that touch.
 
         Raises:
             GraspError: the model refuses the grasp as it is.
@@ -140,8 +140,8 @@ class ClosedLoop:
         return reachability(self.controller, self.safety.caution, self.plant.observe(), target)
 
     def _rehearsal(self, hand: Plant, target: PoseTarget) -> Generator[Step, None, Stop]:
-        """On a hand that does what was learned, with a controller that knows the description alone: what it
-        gets wrong stands for what no model knows of states that nobody has seen."""
+        """On a hand that does what was learned, with a controller that uses the description alone: its
+        errors stand for those of any model in states that were never visited."""
         controller = copy.copy(self.controller)
         controller.pace = copy.deepcopy(controller.pace)
         known = HandKnowledge.of(controller.kinematic.hand, learns=False, adapts=False)

@@ -1,4 +1,4 @@
-"""Look-and-move: from a pose error to the motor increment that the (enhanced) model predicts will mend it."""
+"""Look-and-move: from a pose error to the motor increment that corrects it by the (enhanced) model."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class LookAndMoveController:
     searching along the model's own direction instead turns the object off axis.
 
     Where no pad measures, or one reads less than ``ForceOptions.normal_std`` and may be dead, the model's
-    estimate without it stands in: joints, springs and the other pads tell what it bears.
+    estimate without it stands in: joints, springs and the other pads determine what it bears.
 
     Args:
         model: a :class:`KinematicModel`, or an :class:`EnhancedModel` around one.

@@ -56,14 +56,14 @@ class Grip(NamedTuple):
     least: Float[Tensor, " n_c"]
     """What each should bear at least, see :class:`~torch_ekm.control.NormalForceLimit` [N]."""
     std: Float[Tensor, " n_c"]
-    """How far predictions of it are off [N]; 0 where nobody knows."""
+    """How far predictions of it are off [N]; 0 where it is unknown."""
     wanted: float
     """Of the finger that opposes the others, see :class:`~torch_ekm.control.GripForceTask` [N]; 0: none."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What the controller wants done, what it expects, and how sure the numbers are."""
+    """The motion that the controller chose, what it predicts, and with which uncertainty."""
 
     delta_a: Float[Tensor, " n_a"]
     """Increment to command, relative to the encoders [rad]."""

@@ -83,7 +83,7 @@ class Direction:
     step: float | None = None
     """Largest of a motion at pace 1; None: 2.5 deg or 2 mm."""
     weight: float = 1.0
-    """Of what a step leaves unmet, beside the other directions."""
+    """Of what a step leaves unmet, relative to the other directions."""
 
     def __post_init__(self) -> None:
         if self.unit not in _SI:

@@ -20,7 +20,7 @@ from .force_sensitivity import ForceSensitivity
 
 
 class HandKnowledge(Recorded, nn.Module):
-    """What a closed loop has learned of its hand, whatever it holds: dead zones and biases of the servos, how
+    """What a closed loop has learned of its hand, for any object: dead zones and biases of the servos, how
     the forces of the fingers answer to them, the figures by which it moves an object, and its last pace.
 
     Hand it to the next loop with the same hand, and keep it between sessions::

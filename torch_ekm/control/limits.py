@@ -86,7 +86,7 @@ class NormalForceLimit:
 
         least_i = max(minimum, share f*_i)
 
-    f*_i is what :class:`GripForceTask` wants of the finger, which follows from load and friction: no finger
+    f*_i is what :class:`GripForceTask` wants of a finger, which follows from load and friction: no finger
     fades.
 
     A finger that measures more than ``maximum`` is loosened; where no pad measures, the estimate counts. One

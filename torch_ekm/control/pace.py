@@ -193,7 +193,7 @@ class TrustRegion:
         rho = max(rms_i z_i over twist and normal forces, |z_i| of each finger)
         z_i = (dx_i - predicted_i) / sqrt(noise_i^2 + (0.12 |predicted|)^2)
 
-    with a quarter of what a finger bears in the place of 12 % of the motion. 1 is an error that the sensors'
+    with a quarter of a finger's force in place of 12 % of the motion. 1 is an error that the sensors'
     noise (0.3 mm, 0.3 deg, 0.5 N) and these shares explain. Each finger counts alone, too: the mean would let
     one fade while the rest is predicted well.
 

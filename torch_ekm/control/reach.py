@@ -134,7 +134,7 @@ class Reachability:
     """``M_c D E_p J_m = U diag(gains) V^T``: what J_m says of a target; D counts 0.8 mm as 1 deg."""
 
     gains: Float[Tensor, " n_x"]
-    """Turn of the object for a turn of the motors, the largest first: they tell rank and conditioning."""
+    """Turn of the object for a turn of the motors, the largest first: they give rank and conditioning."""
     reason: str = ""
     """Why the target is not reachable; empty: it is."""
 
@@ -167,9 +167,11 @@ def reachability(
     left = float(np.abs(solution.slack).max()) / max(focus.error(target, seen.state), 1e-9)
     off = focus.off_rotation(lin.object_jacobian @ torch.from_numpy(solution.u))
     if left > _LEFT:
-        reason = f"motors at the ends of their ranges leave {100 * left:.0f} % of the way. Ask for less"
+        reason = (
+            f"motors at the ends of their ranges leave {100 * left:.0f} % of the way; choose a nearer target"
+        )
     elif off > caution.off_rotation + caution.off_further:
-        reason = f"the object turns {off / _DEG:.0f} deg off the focus on the way. Ask for less"
+        reason = f"the object turns {off / _DEG:.0f} deg off the focus on the way; choose a nearer target"
     return Reachability(gains, reason)
 
 
@@ -206,7 +208,7 @@ def out_of_reach(
         return ""
     return (
         f"{asked / _DEG:.1f} deg are out of reach: this grasp turns {reach}; up to "
-        f"{reach.safe / _DEG:.1f} deg nothing speaks against it. Ask for less, or grasp it again"
+        f"{reach.safe / _DEG:.1f} deg it is safe. Choose a nearer target, or another grasp"
     )
 
 

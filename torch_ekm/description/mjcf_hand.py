@@ -41,7 +41,7 @@ class MjcfHand:
 
 
 def read_mjcf(path: str | Path) -> MjcfHand:
-    """Read the hand at ``path``; the tree stands on the world, whatever carries it there.
+    """Read the hand at ``path``; the tree stands on the world, without what carries it there.
 
     Raises:
         DescriptionError: as :func:`~torch_ekm.description.mjcf.compile_mjcf`; a joint that slides or is a

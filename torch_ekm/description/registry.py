@@ -37,17 +37,17 @@ def urdf_folder() -> Path:
 
 
 def list_hands() -> tuple[str, ...]:
-    """The names of hands that :func:`load_hand` knows without a path."""
+    """The names of hands that :func:`load_hand` takes in place of a path."""
     return tuple(_HANDS)
 
 
 def list_objects() -> tuple[str, ...]:
-    """The everyday objects that experiments take; :func:`load_object` knows the cylinders too."""
+    """The everyday objects of the experiments; :func:`load_object` also takes the cylinders."""
     return _OBJECTS
 
 
 def list_cylinders() -> tuple[str, ...]:
-    """Cylinders by diameter, which :func:`load_object` knows: those that a Yale T42 was recorded with."""
+    """Cylinders by diameter, which :func:`load_object` takes: those that a Yale T42 was recorded with."""
     return _CYLINDERS
 
 

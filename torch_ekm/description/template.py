@@ -19,7 +19,7 @@ from .urdf import UrdfModel, read_urdf
 _ROUND = ("capsule", "sphere")
 _ONE_PLANE = 1e-3  # [m]
 _HEAD = """\
-# What {urdf} cannot say about this hand. Begun by 'torch-ekm hands --new'.
+# What {urdf} cannot describe of this hand. Begun by 'torch-ekm hands --new'.
 # Put a figure wherever "TODO" stands; 'torch-ekm check {urdf}' lists what is missing.
 # Angles in rad, or in deg where the key ends in _deg; lengths in m; torques in N m.
 # A joint that closes its finger with negative angles has a negative moment arm.
@@ -32,7 +32,7 @@ base_link = {base}  # the hand frame: poses, contacts and Jacobians are expresse
 gravity = [0.0, 0.0, 9.81]  # [m/s^2] in the hand frame; as it stands, the palm faces down
 """
 _MJCF_HEAD = """\
-# What transmits the motors of {mjcf}, as read by 'torch-ekm hands --new'; it is this file that is used now.
+# Transmission of {mjcf}, as read by 'torch-ekm hands --new'; this file takes precedence from now on.
 # Put a figure wherever "TODO" stands; 'torch-ekm check {mjcf}' lists what is missing.
 # Angles in rad, or in deg where the key ends in _deg; lengths in m; torques in N m.
 # All keys: docs/reference/file_formats.md

@@ -1,4 +1,4 @@
-"""Read a transmission file: what a URDF cannot say about a hand.
+"""Read a transmission file: what a URDF cannot describe of a hand.
 
 Actuators and their moment arms (J_a), rigid couplings (C dq = 0), joint springs and friction,
 contact pads, Hall sensors. The format is documented in ``docs/reference/file_formats.md``.
@@ -54,7 +54,7 @@ def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None)
     _check_filled_in(path, data)
     top = TomlTable(path, "top level", data, TABLES)
     if not isinstance(data.get("notes", {}), dict):
-        raise top.error("'notes' must be a table, of text that is for people alone")
+        raise top.error("'notes' must be a table of text, which no program reads")
     joints = urdf.moving_joints
     names = tuple(joint.name for joint in joints)
     if not names:

@@ -34,7 +34,7 @@ class BusReading:
     taken: float
     """When the motors were read."""
     moving: bool = False
-    """The bus says that a motor moves; False: it does not, or does not tell."""
+    """The bus reports that a motor moves; False: it does not, or does not report it."""
     joints: Sequence[float] = ()
     joints_taken: float = math.inf
     fingertips: Sequence[float] = ()
@@ -317,7 +317,7 @@ class HandDriver(ABC):
         return StaleReadingError(
             f"{name} of {self.wiring.path.name}",
             f"the newest reading is {time.monotonic() - at:.3g} s old, [limits] period allows "
-            f"{2 * self.limits.period:.3g} s: look after the sensor's cable or node",
+            f"{2 * self.limits.period:.3g} s: check the sensor's cable or node",
         )
 
     def _within(self, start: Array, goal: Array) -> Array:
@@ -329,7 +329,9 @@ class HandDriver(ABC):
         if not beyond[k] <= _BEYOND:
             at, low, high = (f"{math.degrees(x):.4g}" for x in (start[k], lower[k], upper[k]))
             motor, place = self.wiring.motors[k], f"{self.wiring.path}:{self.wiring.motors[k].line}"
-            problem = f"it reads {at} deg, its range is {low} to {high} deg: mend 'zero' or 'range' ({place})"
+            problem = (
+                f"it reads {at} deg, its range is {low} to {high} deg: correct 'zero' or 'range' ({place})"
+            )
             raise CommandRefusedError(f"motor '{motor.name}'", problem)
         return np.clip(goal, np.minimum(lower, start), np.maximum(upper, start))
 

@@ -198,7 +198,7 @@ class DynamixelPlant(HandDriver):
     def _check(self, result: int, what: str) -> None:
         sdk = self._sdk
         if result == sdk.COMM_RX_TIMEOUT:
-            raise BusError(what, "no answer: look after cable and power")
+            raise BusError(what, "no answer: check cable and power")
         if result == sdk.COMM_RX_CORRUPT:
             raise BusError(what, "a packet with a wrong checksum: noise, or two servos with one id")
         if result != sdk.COMM_SUCCESS:
@@ -221,4 +221,4 @@ class DynamixelPlant(HandDriver):
         except EKMError:
             raise
         except Exception as error:  # termios, serial, and what a spoilt packet does to the SDK
-            raise BusError(self.port, f"{type(error).__name__}: {error}; look after the cable") from error
+            raise BusError(self.port, f"{type(error).__name__}: {error}; check the cable") from error

@@ -80,7 +80,7 @@ class WithPose(PlantWrapper):
             sighting, status = self._last, PlantStatus.NOT_SEEN
         if sighting is None:
             raise ObjectLostError(
-                f"the object is not seen within {self.patience:g} s: look after camera, light, markers"
+                f"the object is not seen within {self.patience:g} s: check camera, light, markers"
             )
         self._last = sighting
         if self.lost is not None and self.lost(sighting):
@@ -123,7 +123,7 @@ class MarkerPose:
 
     Args:
         grab: takes a picture ``(h, w)`` or ``(h, w, 3)``, uint8; None: the camera gave none.
-        tracker: knows lens and boards; its poses are in the hand frame.
+        tracker: has lens and boards; its poses are in the hand frame.
     """
 
     def __init__(self, grab: Callable[[], np.ndarray | None], tracker: MarkerTracker) -> None:

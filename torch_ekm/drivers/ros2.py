@@ -96,7 +96,7 @@ class Ros2Plant(HandDriver):
             end = time.monotonic() + _TIMEOUT
             while not self.dry_run and self._publisher.get_subscription_count() == 0:
                 if time.monotonic() > end:
-                    raise BusError(topic, "nobody listens to commands: is the controller running?")
+                    raise BusError(topic, "no node subscribes to it: is the controller running?")
                 time.sleep(0.01)
         except BaseException:
             self._release()
@@ -148,8 +148,8 @@ class Ros2Plant(HandDriver):
         if self.wiring.fingertips:
             array, force_taken = self._first("fingertips", "no fingertips are received")
             force = self._forces(array.data)
-        told = len(message.effort) == len(message.name)
-        load = [float(message.effort[at[one.id]]) for one in self.wiring.motors] if told else []
+        has_load = len(message.effort) == len(message.name)
+        load = [float(message.effort[at[one.id]]) for one in self.wiring.motors] if has_load else []
         joints_taken = taken if joints else math.inf
         return BusReading(motors, taken, moving, joints, joints_taken, force, force_taken, load)
 
@@ -177,7 +177,7 @@ class Ros2Plant(HandDriver):
             message = self._messages["sensor"].JointState(name=names, position=goal)
             message.header.stamp = self.node.get_clock().now().to_msg()
         if self._publisher.get_subscription_count() == 0:
-            raise BusError(self._publisher.topic_name, "nobody listens to commands any more")
+            raise BusError(self._publisher.topic_name, "no node subscribes to it any more")
         self._publisher.publish(message)
 
     def _release(self) -> None:

@@ -74,7 +74,7 @@ class YarpPlant(HandDriver):
             motors, moving = [encoders[k] for k in self._axes], not all(done[k] for k in self._axes)
         except IndexError:
             raise BusError(
-                self.part, f"has {len(encoders)} axes, [[motors]] asks for {max(self._axes)}"
+                self.part, f"has {len(encoders)} axes, [[motors]] needs {max(self._axes)}"
             ) from None
         read = {kind: self._stream(kind) for kind in self._streams}
         joints, joints_taken = read.get("joints", ((), math.inf))
@@ -88,7 +88,7 @@ class YarpPlant(HandDriver):
         channels = getattr(self.wiring, kind)
         last = max(int(one.id) + one.count for one in channels)
         if len(numbers) < last:
-            raise BusError(stream.name, f"sends {len(numbers)} numbers, [[{kind}]] asks for {last}")
+            raise BusError(stream.name, f"sends {len(numbers)} numbers, [[{kind}]] needs {last}")
         return [sum(numbers[int(one.id) : int(one.id) + one.count]) for one in channels], taken
 
     def _write(self, goal: Sequence[float], seconds: float) -> None:

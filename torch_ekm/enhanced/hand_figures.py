@@ -28,7 +28,7 @@ KINDS = ("springs", "moment_arms", "stiffness", "backlash")
 _COMMON, _OWN = 1.0, 0.4
 _PLAY = 0.5  # of the prior of a backlash: its width where none is described, and how sure it is
 _FURTHEST = 5.0  # priors: bounds
-_TOLD = 0.7  # of the variance that a figure of its kind has of which nothing was seen
+_IDENTIFIED = 0.7  # of the variance of a figure of its kind without observations
 # [m], [rad], [rad]: what no figures explain of a motion of the object and of a joint; and its share of it
 _POSITION_STD, _ROTATION_STD, _JOINT_STD = 0.3e-3, math.radians(0.2), math.radians(0.5)
 _RELATIVE = 0.08
@@ -43,8 +43,8 @@ class Figure(NamedTuple):
     """Of the described figure; of a backlash its width [rad]."""
     std: float
     """Standard deviation of the factor."""
-    told: bool
-    """Motions tell it; else it stands where the prior and the others put it."""
+    identified: bool
+    """Motions determine it; otherwise it stays where the prior and the other figures put it."""
 
 
 class Change(NamedTuple):
@@ -103,12 +103,12 @@ class HandFigures(ParameterFilter):
     twist and the joints of the fingers that touch. ``theta`` are logarithms of factors of the description,
     in units of their priors (.5 of springs, .3 of moment arms, .7 of stiffnesses), which are common to all
     of a kind for the most part. Contact forces are those that were found with the description: motions do
-    not tell the scale that forces need.
+    not determine the scale that forces need.
 
     :class:`~torch_ekm.kinematics.Play` of each drive takes up what its motor does first after a grasp and a
     reversal, which encoders do not show. Where none is described it is thought to be 0.5 deg wide.
 
-    The figures belong to the hand, whatever it holds. :class:`~torch_ekm.model.KinematicModel.with_figures`
+    The figures belong to the hand, not to the object. :class:`~torch_ekm.model.KinematicModel.with_figures`
     gives a model that follows them.
 
     Args:
@@ -303,15 +303,15 @@ class HandFigures(ParameterFilter):
     def _told(self) -> Tensor:
         """Of which figures motions say more than they say of all of the kind."""
         variance = self.covariance.diagonal()
-        told = torch.zeros(len(self), dtype=torch.bool)
+        identified = torch.zeros(len(self), dtype=torch.bool)
         for k in range(len(KINDS)):
             own = torch.from_numpy(self._kind == k)
             n = int(own.sum())
             if n:
                 common = (self.covariance[own][:, own].sum() - variance[own].sum()) / max(n * (n - 1), 1)
                 alone = self.prior.diagonal()[own] * _OWN**2 / (_COMMON**2 + _OWN**2)
-                told[own] = variance[own] < _TOLD * (common.clamp(min=0.0) + alone)
-        return told
+                identified[own] = variance[own] < _IDENTIFIED * (common.clamp(min=0.0) + alone)
+        return identified
 
     @property
     def changes(self) -> tuple[Change, ...]:
@@ -334,11 +334,11 @@ class HandFigures(ParameterFilter):
             if play
             else f"{one.name}: {one.factor:.2f} times the description, +-{one.std:.2f}"
             for one, play in zip(figures, self._is_play.tolist(), strict=True)
-            if one.told
+            if one.identified
         ]
-        rest = [one.name for one in figures if not one.told]
+        rest = [one.name for one in figures if not one.identified]
         if rest:
-            lines.append(f"not told: {', '.join(rest)}")
+            lines.append(f"not identified: {', '.join(rest)}")
         lines += [
             f"{one.name}: changed after {one.motion} motions, to {one.factor:.2f} times its value"
             for one in self.changes

@@ -42,7 +42,7 @@ class ParameterFilter(Recorded, nn.Module):
         m <- m + K r                                   within the bounds
         P <- (I - K phi) P (I - K phi)' + K (R / w) K'
 
-    One motion costs the same time and memory however many came before. What motions do not tell returns to
+    One motion costs the same time and memory however many came before. What is not identified returns to
     the start m_0 and its covariance P_0. A motion that the present uncertainty does not explain, as where a
     contact slides, counts less; two of them in succession are taken for a change of the plant, and P is P_0
     again.

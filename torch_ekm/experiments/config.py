@@ -91,7 +91,7 @@ class Setting:
     @property
     def follows(self) -> bool:
         """Whether f of the E-KM follows the figures of the hand. Motions of other figures than those of the
-        forces let a grip slide that nobody feels."""
+        forces let a grip slide where no pad measures."""
         return self.adapts and self.parameters.force_sensors
 
     def hardware_instance(self, seed: int) -> Setting:

@@ -40,7 +40,7 @@ def run_jobs(
 ) -> dict[str, Any]:
     """``{name: function(*arguments)}`` for all jobs, each result kept in ``folder/name.json``.
 
-    A job whose file exists is not run again, so an interrupted run goes on where it stopped. A file appears
+    A job whose file exists is not run again, so an interrupted run continues where it stopped. A file appears
     whole or not at all, and is written here, wherever the job ran; it has the job's name and a digest in it,
     and one that is not what it should be is named in a warning, and the job run again. When a job fails, its
     exception has the job's name as a note, and what has not begun is cancelled, as it is when the caller

@@ -86,7 +86,7 @@ def reproduce(
 ) -> Report:
     """Run what has not been run yet, and write the report into ``folder``.
 
-    Killed, it goes on where it stopped when it is called again, and ends with the report of an
+    Killed, it continues where it stopped when it is called again, and ends with the report of an
     unbroken run: a job's result depends on nothing but its configuration and its seed.
 
     Args:

@@ -50,7 +50,7 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
             the object, which hides them, is left out.
 
     Returns:
-        The checks in the order in which they are best mended. A fault ends in a row, never in an error.
+        The checks in the order in which faults are best corrected. A fault ends in a row, never in an error.
     """
     try:
         description = load_hand(hand)
@@ -79,15 +79,15 @@ def _pads(hand: HandDescription) -> Iterator[Check]:
         shapes, lack = hand.urdf.link(pad.link).collisions, direction_unmet(hand, pad)
         ends = np.array([pad.start, pad.end])
         depth = -signed_distance(shapes, ends)[0] if shapes else np.zeros(2)
-        name, mend = f"pad '{pad.name}'", f"paste into <link name='{pad.link}'>: {_collision(pad)}"
+        name, remedy = f"pad '{pad.name}'", f"paste into <link name='{pad.link}'>: {_collision(pad)}"
         if lack is not None:
             yield Check(name, "error", f"{found}; {lack.problem}", lack.remedy)
         elif not shapes:
-            yield Check(name, "error", f"{found}; its link has no primitive <collision>", mend)
+            yield Check(name, "error", f"{found}; its link has no primitive <collision>", remedy)
         elif any(shape.kind == "box" and (signed_distance((shape,), ends)[0] < 0).all() for shape in shapes):
-            yield Check(name, "warning", f"{found}; in a <collision> box, whose edges touch first", mend)
+            yield Check(name, "warning", f"{found}; in a <collision> box, whose edges touch first", remedy)
         elif np.abs(depth - pad.radius).max() > _SURFACE:
-            yield Check(name, "warning", f"{found}; not the <collision> of its link", mend)
+            yield Check(name, "warning", f"{found}; not the <collision> of its link", remedy)
         else:
             yield Check(name, "ok", found)
 
@@ -114,20 +114,20 @@ def _tensions(hand: HandDescription) -> Iterator[Check]:
     for k, actuator in enumerate(hand.actuators):
         if not actuator.tendon:
             continue
-        name, mend = (
+        name, remedy = (
             f"tendon '{actuator.name}'",
             "check its springs' stiffness and rest angles, and its range",
         )
         most = tension[:, k].max()
         if most <= _TAUT:
-            yield Check(name, "error", "slack over its whole range: no spring opposes it", mend)
+            yield Check(name, "error", "slack over its whole range: no spring opposes it", remedy)
         else:
             first = _first_taut(tension[:, k])
             at = f"{np.degrees(lower[k] + first * (upper[k] - lower[k])):.0f} deg"
             rest = "slack at rest, " if first > _LEAST_SLACK else ""
             state: State = "warning" if first > 0.5 else "ok"
             found = f"{rest}taut from {at}, up to {most:.2g} N m in free motion"
-            yield Check(name, state, found, mend if state == "warning" else "")
+            yield Check(name, state, found, remedy if state == "warning" else "")
 
 
 def _first_taut(tension: Array) -> float:
@@ -168,8 +168,8 @@ def _gentler(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     smaller = [force for force in _GENTLER if force < hand.pinch_force]
     for force in smaller:
         if not any(row.state == "error" for row in _pinch(hand, obj, None, PlantConfig(pinch_force=force))):
-            mend = f"write pinch_force = {force:g} under [hand], or stiffer springs"
-            yield Check("pinch force", "warning", f"too high: the pinch is sound at {force:g} N", mend)
+            remedy = f"write pinch_force = {force:g} under [hand], or stiffer springs"
+            yield Check("pinch force", "warning", f"too high: the pinch is sound at {force:g} N", remedy)
             return
     if smaller:
         tried = ", ".join(f"{force:g}" for force in smaller)
@@ -178,7 +178,7 @@ def _gentler(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
 
 def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     """How far the model turns the pinched object: a pinch that holds may be at the edge of its friction."""
-    mend = "stiffer springs, another 'pinch_force', more friction, wider limits"
+    remedy = "stiffer springs, another 'pinch_force', more friction, wider limits"
     try:
         plant = SimulatedHand(hand, obj)
         plant.reset(0)
@@ -189,11 +189,11 @@ def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     except MissingExtraError:
         return
     except EKMError as error:
-        yield Check("turn", "warning", str(error), mend)
+        yield Check("turn", "warning", str(error), remedy)
         return
     found = ", ".join(f"{math.degrees(end.angle):+.0f} deg ({end.ends_by})" for end in ends)
     little = min(abs(end.angle) for end in ends) < _LITTLE_TURN
-    yield Check("turn", "warning" if little else "ok", f"predicted: {found}", mend if little else "")
+    yield Check("turn", "warning" if little else "ok", f"predicted: {found}", remedy if little else "")
 
 
 def _disturbed(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
@@ -208,8 +208,8 @@ def _disturbed(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]
             failures.append(str(error))
     found = f"{_DISTURBED - len(failures)} of {_DISTURBED} held with the usual faults"
     if failures:
-        mend = "stiffer springs, a smaller 'pinch_force' in [hand], more friction"
-        yield Check("pinch, preset nominal", "warning", f"{found}; {failures[0]}", mend)
+        remedy = "stiffer springs, a smaller 'pinch_force' in [hand], more friction"
+        yield Check("pinch, preset nominal", "warning", f"{found}; {failures[0]}", remedy)
     else:
         yield Check("pinch, preset nominal", "ok", found)
 
@@ -247,8 +247,8 @@ def _sides(hand: HandDescription, contacts: ContactSet, poses: LinkPoses) -> Ite
     for finger, normal in zip(contacts.finger, contacts.normal.numpy(), strict=True):
         pad = pads[finger]
         if float(normal @ poses.of(pad.link)[:3, :3].numpy() @ pad.direction) > 0:
-            mend = f"'direction' of pad '{finger}', or the limits of its joints"
-            yield Check("contact sides", "error", f"'{finger}' touches with its back", mend)
+            remedy = f"'direction' of pad '{finger}', or the limits of its joints"
+            yield Check("contact sides", "error", f"'{finger}' touches with its back", remedy)
 
 
 def _grasp(hand: HandDescription, lin: Linearization) -> Iterator[Check]:
@@ -257,8 +257,8 @@ def _grasp(hand: HandDescription, lin: Linearization) -> Iterator[Check]:
     found = f"{stability:.2g} N m/rad with locked actuators; the model's status: {lin.status.value}"
     few = len(lin.contacts.finger) < 2  # the simulation lets any link hold, the model pads alone
     state: State = "error" if few or stability < _STABLE else "ok" if good else "warning"
-    mend = "" if state == "ok" else "stiffer springs, less force, pads that touch"
-    yield Check("stability", state, found, mend)
+    remedy = "" if state == "ok" else "stiffer springs, less force, pads that touch"
+    yield Check("stability", state, found, remedy)
     answer = float(lin.normal_force_sensitivity.abs().max())
     if answer > _CONTRADICT:
         found = f"rigid actuators contradict each other: {answer:.1g} N/rad"
@@ -266,8 +266,8 @@ def _grasp(hand: HandDescription, lin: Linearization) -> Iterator[Check]:
     relative = lin.forces.relative_margin
     found = ", ".join(f"{n} {v:.2f}" for n, v in zip(lin.contacts.finger, relative.tolist(), strict=True))
     low = bool(relative.min() < _LOW_MARGIN)
-    mend = "a higher friction, or wider pads" if low else ""
-    yield Check("friction margins", "warning" if low else "ok", f"{found} (1: no tangential load)", mend)
+    remedy = "a higher friction, or wider pads" if low else ""
+    yield Check("friction margins", "warning" if low else "ok", f"{found} (1: no tangential load)", remedy)
     stopped = [name for name, held in zip(hand.joint_names, lin.held_joints, strict=True) if held]
     if stopped:
         found = f"a stop holds: {', '.join(stopped)}"
@@ -280,8 +280,8 @@ def _grasp(hand: HandDescription, lin: Linearization) -> Iterator[Check]:
         if actuator.tendon and arms[used].any() and -float(lam) <= 1e-4
     ]
     if slack:
-        mend = "stiffer springs or other rest angles"
-        yield Check("tendons in the pinch", "warning", f"slack: {', '.join(slack)}", mend)
+        remedy = "stiffer springs or other rest angles"
+        yield Check("tendons in the pinch", "warning", f"slack: {', '.join(slack)}", remedy)
 
 
 def _draw(hand: HandDescription, lin: Linearization | None, path: Path) -> Path:

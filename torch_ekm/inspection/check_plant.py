@@ -49,7 +49,7 @@ def check_plant(
         object: what it holds; its pose is then checked, and signs where joints have no sensors.
 
     Returns:
-        A row for each thing; with "error" where it must be mended, and how.
+        A row for each thing; with "error" and a remedy where it is wrong.
     """
     return list(_Checked(plant, description, object).rows())
 
@@ -65,7 +65,7 @@ class _Checked:
         try:
             seen = self._look()
         except EKMError as error:
-            yield Check("sensors", "error", str(error), "mend this first")
+            yield Check("sensors", "error", str(error), "correct this first")
             return
         yield from self._clock(seen)
         yield self._dtype(seen)
@@ -79,11 +79,11 @@ class _Checked:
         if (self.test.misfit(readings) > _FITS).any():
             yield from self._explained(readings)
             return
-        blind = [n for n, told in zip(self.hand.actuator_names, self.test.rows, strict=True) if not told]
+        blind = [n for n, found in zip(self.hand.actuator_names, self.test.rows, strict=True) if not found]
         if blind and (self.object is None or seen.status is not PlantStatus.HELD):
-            mend = "look which way each goes, or hold an object, see it, and give its description"
+            remedy = "look which way each goes, or hold an object, see it, and give its description"
             yield Check(
-                "signs", "warning", f"not checked: no sensors at the joints of {', '.join(blind)}", mend
+                "signs", "warning", f"not checked: no sensors at the joints of {', '.join(blind)}", remedy
             )
         yield Check("at rest", "ok", f"encoders and {int(self.sensed.sum())} joint sensors agree")
         motions, rows = self._motions(seen)
@@ -123,7 +123,7 @@ class _Checked:
             return [
                 Check("pose", "warning", "the object is not seen: its pose is not checked", "WithPose(...)")
             ]
-        mend = "give WithPose(frame=<pose of the camera's frame in the hand frame>), or mend it"
+        remedy = "give WithPose(frame=<pose of the camera's frame in the hand frame>), or correct it"
         links = HandKinematics(self.hand)(seen.q.double())
         points = []
         for pad in self.hand.pads:
@@ -135,13 +135,13 @@ class _Checked:
             found = (
                 f"the object is {1e3 * away:.0f} mm away from the nearest pad: the pose is in another frame"
             )
-            return [Check("pose", "error", f"{found}, or in mm", mend)]
+            return [Check("pose", "error", f"{found}, or in mm", remedy)]
         if self.object is None:
             return [Check("pose", "ok", f"the object is {1e3 * away:.0f} mm from the nearest pad")]
         try:
             self.model.linearize(_double(seen).state)
         except GraspError as error:
-            return [Check("pose", "error", f"no grasp at this pose: {error}", mend)]
+            return [Check("pose", "error", f"no grasp at this pose: {error}", remedy)]
         return [Check("pose", "ok", "pads touch the object where the pose has it")]
 
     @property
@@ -168,7 +168,7 @@ class _Checked:
                 motion, row, pose = self._motion(i)
             except EKMError as error:
                 rows.append(
-                    Check(f"motor '{actuator.name}'", "error", str(error), self._mend("motors", i, ""))
+                    Check(f"motor '{actuator.name}'", "error", str(error), self._remedy("motors", i, ""))
                 )
                 break
             rows += [row] if row is not None else []
@@ -210,20 +210,20 @@ class _Checked:
         k, row = int(np.argmax(others)), None
         if others[k] > max(_MOVED, abs(went)):
             found = f"encoder '{self.hand.actuator_names[k]}' moves in its place: two motors are swapped"
-            row = Check(name, "error", found, self._mend("motors", i, "id"))
+            row = Check(name, "error", found, self._remedy("motors", i, "id"))
         elif went < -_STANDS:
             found = f"its encoder went {went / _DEG:.3g} deg where {step / _DEG:.3g} deg were commanded"
             found += ": the sign of commands or of the encoder is wrong"
-            row = Check(name, "error", found, self._mend("motors", i, "sign"))
+            row = Check(name, "error", found, self._remedy("motors", i, "sign"))
         elif went > 3 * step + _MOVED:
             found = f"its encoder went {went / _DEG:.3g} deg where {step / _DEG:.3g} deg were commanded"
             row = Check(
-                name, "error", f"{found}: commands have another unit", self._mend("motors", i, "per_rad")
+                name, "error", f"{found}: commands have another unit", self._remedy("motors", i, "per_rad")
             )
         elif went < _STANDS:
             moved = np.abs(self.hand.actuation_jacobian[i] @ motion.q) > _MOVED and self.test.rows[i]
             found = "its encoder stands still while its joints move" if moved else "it does not move"
-            row = Check(name, "error", f"{found} (4 deg commanded)", self._mend("motors", i, "id"))
+            row = Check(name, "error", f"{found} (4 deg commanded)", self._remedy("motors", i, "id"))
             return None, row, pose
         if row is None:
             delta[i] = -motion.a[i]
@@ -231,12 +231,12 @@ class _Checked:
         return motion, row, pose
 
     def _by_pose(self, i: int, predicted: Array, pose: Array) -> list[Check]:
-        """Where no joint tells a motor's sign, the object does."""
+        """Where no joint sensor shows a motor's sign, the object does."""
         if self.test.rows[i] or self._cosine(predicted, pose) > -0.5:
             return []
         found = "the object moves against what the model predicts: sign reversed"
         name = f"motor '{self.hand.actuator_names[i]}'"
-        return [Check(name, "error", found, self._mend("motors", i, "sign"))]
+        return [Check(name, "error", found, self._remedy("motors", i, "sign"))]
 
     def _frame(self, along: list[tuple[Array, Array]]) -> list[Check]:
         predicted, pose = (np.concatenate(list(part)) for part in zip(*along, strict=True))
@@ -244,7 +244,7 @@ class _Checked:
         if cosine > _ANGLE:
             return [Check("pose's motions", "ok", f"as the model predicts (cosine {cosine:.2f})")]
         found = f"the object moves otherwise than the model predicts (cosine {cosine:.2f}): another frame"
-        return [Check("pose's motions", "error", found, "give WithPose(frame=...), or mend it")]
+        return [Check("pose's motions", "error", found, "give WithPose(frame=...), or correct it")]
 
     @staticmethod
     def _cosine(predicted: Array, pose: Array) -> float:
@@ -267,9 +267,9 @@ class _Checked:
         least = min(score for score, _ in found)
         for _, one in sorted((pair for pair in found if pair[0] <= least + _NEAR), key=lambda pair: pair[0]):
             at = [getattr(self.hand, _NAMES[one.kind]).index(name) for name in one.names]
-            mend = "; ".join(self._mend(one.kind, k, one.key) for k in at)
+            remedy = "; ".join(self._remedy(one.kind, k, one.key) for k in at)
             name = f"{one.kind[:-1]} " + " and ".join(f"'{name}'" for name in one.names)
-            yield Check(name, "error", one.what, mend)
+            yield Check(name, "error", one.what, remedy)
 
     def _unexplained(self, readings: Readings) -> Check:
         off = readings.a - self.hand.actuator_offset - self.hand.actuation_jacobian @ readings.q
@@ -278,8 +278,10 @@ class _Checked:
         found = (
             f"its encoder and the sensors of its joints differ by {off[i] / _DEG:.3g} deg, or move otherwise"
         )
-        mend = self._mend("motors", i, "zero") + ", or the zeros of its joints; several entries may be wrong"
-        return Check(f"motor '{name}'", "error", found, mend)
+        remedy = (
+            self._remedy("motors", i, "zero") + ", or the zeros of its joints; several entries may be wrong"
+        )
+        return Check(f"motor '{name}'", "error", found, remedy)
 
     def _constant(self, motions: tuple[Motion, ...]) -> Iterator[Check]:
         """Joint sensors that read the same, bit by bit, while motors moved: left out from here on."""
@@ -290,8 +292,8 @@ class _Checked:
         dead = (read == read[0]).all(0).numpy() & self.sensed & (moves > _STANDS)
         for j in np.flatnonzero(dead):
             found = "its sensor reads the same, bit by bit, while its motor moves"
-            mend = self._mend("joints", int(j), "id") + ", or its cable"
-            yield Check(f"joint '{self.hand.joint_names[j]}'", "error", found, mend)
+            remedy = self._remedy("joints", int(j), "id") + ", or its cable"
+            yield Check(f"joint '{self.hand.joint_names[j]}'", "error", found, remedy)
         self.test = WiringTest(self.hand, self.sensed & ~dead, self._channel)
 
     # -- inside -------------------------------------------------------------------------------------
@@ -312,7 +314,7 @@ class _Checked:
         name = getattr(self.hand, _NAMES[kind])[i]
         return next((one for one in getattr(self.wiring, kind) if one.name == name), None)
 
-    def _mend(self, kind: str, i: int, key: str) -> str:
+    def _remedy(self, kind: str, i: int, key: str) -> str:
         name = getattr(self.hand, _NAMES[kind])[i]
         if self.wiring is None:
             return f"{key or 'wiring'} of '{name}' in the driver"

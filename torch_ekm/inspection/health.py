@@ -88,14 +88,14 @@ def _motions(
             raise ParameterError(f"trial {trial}", f"{q.shape[1]} joints, {a.shape[1]} actuators", valid)
         v, w = np.stack([one.numpy() for one in log.commands]), np.diff(a, axis=0)
         pulled, s = np.diff(q, axis=0) @ hand.actuation_jacobian.T, np.sign(v)
-        told = (np.abs(v) > ServoModel.resolution) & (a[1:] > low) & (a[1:] < high)
+        moved = (np.abs(v) > ServoModel.resolution) & (a[1:] > low) & (a[1:] < high)
         held = [one.status is not PlantStatus.LOST for one in log.observations]
         for k in range(len(v)):
             motion = {}
             for i, name in enumerate(hand.actuator_names):
                 stood = bool(abs(w[k, i]) <= ServoModel.moved_from)
                 motion[name, "tendon"] = w[k, [i]], float(pulled[k, i]), stood
-                if told[k, i]:
+                if moved[k, i]:
                     x = np.array([1.0, -s[k, i]])
                     motion[name, "servo"] = x, float(s[k, i] * (v[k, i] - w[k, i])), stood
             yield (trial, k), held[k] and not held[k + 1], motion

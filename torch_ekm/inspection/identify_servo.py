@@ -18,7 +18,7 @@ _SIZES = tuple(math.radians(x) for x in (0.4, 0.8, 1.2, 1.6, 2.0))  # one after 
 _SWING, _REVERSALS = math.radians(5), 6
 _MOTIONS = 60  # of a motor at most
 _WIDEST = math.radians(4)  # play; less than a swing
-_LEFT = 0.1  # share of the joints' motion that play may leave unexplained, else they do not tell it
+_LEFT = 0.1  # share of the joints' motion that play may leave unexplained, else they do not determine it
 
 
 class IdentifiedServos(NamedTuple):
@@ -27,14 +27,14 @@ class IdentifiedServos(NamedTuple):
     servo: ServoModel
     """Dead zones and biases, for a :class:`~torch_ekm.control.HandKnowledge`."""
     play: tuple[tuple[float, float] | None, ...]
-    """Width of the play of each drive, and its standard deviation [rad]; None: no joint sensor tells."""
+    """Width of the play of each drive, and its standard deviation [rad]; None: no sensor measures it."""
 
     def __str__(self) -> str:
         lines = [self.servo.extra_repr(), "", "# in the hand's transmission file:"]
         for name, play in zip(self.servo.names, self.play, strict=True):
             figures = "backlash_deg = {:.2f}  # +-{:.2f}".format(*map(math.degrees, play or (0, 0)))
             lines.append(f'[[actuators]]  # name = "{name}"')
-            lines.append(figures if play else "# no joint sensor tells its play")
+            lines.append(figures if play else "# no joint sensor measures its play")
         return "\n".join(lines)
 
 

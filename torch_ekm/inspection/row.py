@@ -8,9 +8,9 @@ State = Literal["ok", "warning", "error"]
 
 
 class Check(NamedTuple):
-    """One row of the table: what was looked at, how it is, what was found, and what mends it."""
+    """One row of the table: what was checked, its state, what was found, and the remedy."""
 
     name: str
     state: State
     found: str
-    mend: str = ""
+    remedy: str = ""

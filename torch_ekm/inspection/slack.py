@@ -38,7 +38,7 @@ def find_slack(driver: HandDriver, on_step: Callable[[str], object] = lambda tex
     it stands than its range is long; each goes back. Motors that shape the hand are left out.
 
     Raises:
-        DeviceError: the bus tells no loads; a tendon is taut from the start, or never; a motor does not move.
+        DeviceError: the bus reports no load; a tendon is taut from the start or never; a motor does not move.
     """
     hand, given = driver.hand, driver.wiring
     at_rest = np.clip(hand.spring_rest, hand.joint_lower, hand.joint_upper)
@@ -114,7 +114,7 @@ def _close(driver: HandDriver, i: int, on_step: Callable[[str], object]) -> tupl
 def _position_and_load(driver: HandDriver, i: int) -> tuple[float, float]:
     seen = [driver.observe() for _ in range(_LOOKS)]
     if not seen[-1].info["load"]:
-        raise DeviceError(driver.wiring.path.name, "the bus tells no loads of the motors: set zeros by hand")
+        raise DeviceError(driver.wiring.path.name, "the bus reports no motor loads: set the zeros by hand")
     return float(seen[-1].a[i]), float(np.mean([abs(float(one.info["load"][i])) for one in seen]))
 
 

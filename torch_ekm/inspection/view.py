@@ -58,7 +58,7 @@ def view(what: str, object: str | None = None, seed: int = 0, *, reach: bool = F
         if not path.exists():
             raise UnknownNameError("hand or log", what, (*list_hands(), "a URDF file", "a log's folder"))
         if object is not None:
-            raise ParameterError("object", object, "left out with a log, which knows its own")
+            raise ParameterError("object", object, "left out with a log, which names its own")
         return view_log(path)
     if object is None:
         if reach:

@@ -31,7 +31,7 @@ class Motion:
     q: Array
     """Change of the joints ``(n_q,)``."""
     gain: Array | None
-    """dq/da as predicted ``(n_q, n_a)``; None: nobody knows, the hand holds something."""
+    """dq/da as predicted ``(n_q, n_a)``; None: unknown, since the hand holds an object."""
     noise: Array
     """Standard deviation of ``q`` [rad]."""
 

@@ -38,7 +38,7 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
 
     Args:
         path: a folder of rosbag2, a single ``.mcap`` or ``.db3`` file, or a ``.bag`` of ROS 1.
-        clock: the topic that sets the rhythm, such as that of the commands.
+        clock: the topic whose messages set the rows, such as that of the commands.
         topics: those that are read; all of them by default.
 
     Raises:
@@ -77,7 +77,9 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
         raise DescriptionError(path, f"this recording cannot be read: {error}") from error
     complete = [(stamp, row) for stamp, row in rows if len(row) == len(heard)]
     if not complete:
-        raise DescriptionError(path, f"no message of '{clock}' comes after every other topic was heard")
+        raise DescriptionError(
+            path, f"no message of '{clock}' comes after the first message of every other topic"
+        )
     first = complete[0][0]
     time = np.array([1e-9 * (stamp - first) for stamp, _ in complete])
     return BagTable(tuple(heard), time, np.array([[row[name] for name in heard] for _, row in complete]))

@@ -74,7 +74,7 @@ def two_stage(
 
     Raises:
         SingularGraspError: a motion without stiffness and constraint, or rigid actuators that
-            contradict each other; the direction comes along. Whatever ``on_unstable`` says.
+            contradict each other; the direction comes along. Independent of ``on_unstable``.
         UnstableGraspError: N^T D N has a negative eigenvalue: the grasp buckles.
     """
     if isinstance(D, Tensor) and (D.requires_grad or E.requires_grad):

@@ -22,7 +22,7 @@ class ModelOptions:
     """Use the actuators' series stiffness K_a where it is finite. False: all rigid."""
     slack_tension: float | None = 0.0
     """A tendon that pulls with at most this much [N, or N m for a in rad] is slack: it moves nothing. None:
-    all stay taut, as rods do, whatever the forces say."""
+    all stay taut, as rods do, at any force."""
     contact_margin: float = 0.002
     """Gap up to which the detector takes a pad for touching [m]; more for noisy poses."""
     max_overlap: float = 0.005

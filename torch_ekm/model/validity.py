@@ -32,7 +32,7 @@ class ModelStatus(Enum):
     REUSED_FORCES = "reused_forces"
     """The force problem had no answer; D uses the forces of the previous step."""
     LINK_TOUCHES = "link_touches"
-    """A link that is no pad touches the object: the model knows nothing of its force."""
+    """A link that is no pad touches the object: the model leaves its force out."""
     UNEXPLAINED_TORQUE = "unexplained_torque"
     """Springs, weight and contacts do not explain the torques at the joints."""
     CONTACT_DROPPED = "contact_dropped"

@@ -13,7 +13,7 @@ from ..typing import Float, Tensor
 
 
 class PlantStatus(Enum):
-    """What a plant knows about its object."""
+    """Whether a plant holds its object, and sees it."""
 
     HELD = "held"
     LOST = "lost"  # dropped, thrown, or out of the fingers
@@ -22,7 +22,7 @@ class PlantStatus(Enum):
 
 @dataclass(frozen=True)
 class Truth:
-    """What a simulation knows, hand frame.
+    """The true state of a simulation, hand frame.
 
     For reports and for sensors that are simulated; a :class:`Trajectory` stores it. Nothing that controls,
     senses or learns may read it (held by a test).

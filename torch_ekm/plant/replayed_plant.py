@@ -7,7 +7,7 @@ from .trajectory import Trajectory
 
 
 class ReplayedPlant:
-    """Gives the recorded observations one by one, whatever is commanded; implements :class:`Plant`.
+    """Gives the recorded observations one by one, independent of the commands; implements :class:`Plant`.
 
     A driver of a real hand has the same methods: send the increment, wait until it is done, read the sensors.
 

@@ -25,9 +25,8 @@ _GROUPS = ("raw", "estimate")  # what is kept of Observation.info, and "events"
 class Trajectory:
     """Commands and observations of one grasp: ``n`` commands, ``n + 1`` observations.
 
-    Besides readings and truth it keeps of ``Observation.info`` the named arrays in "raw" (Hall counts, marker
-    corners, perhaps images) and "estimate" (what else was estimated, such as covariances), and what
-    is in "events", as text.
+    It also keeps of ``Observation.info`` the named arrays in "raw" (Hall counts, marker corners, images) and
+    "estimate" (what else was estimated, such as covariances), and what is in "events", as text.
     """
 
     seed: int = 0

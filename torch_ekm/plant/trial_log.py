@@ -46,7 +46,7 @@ class TrialLog:
     nothing else; started again it asks for :meth:`missing` trials and ends with the same bytes as a run
     that was never stopped, if a trial depends on its configuration and seeds alone. Each file has a digest
     of all its bytes; one that is damaged gives a warning, is renamed to ``trial_000012.h5.damaged``, and
-    missing. The index is made from the files, whatever it says.
+    missing. The index is made again from the files.
 
     One writer at a time: a log is locked until :meth:`close`, the end of a ``with``, or of its process.
 

@@ -81,7 +81,7 @@ def _index(folder: Path, entries: Mapping[int, TrialEntry], n_trials: int) -> Fi
     complete = len(listed) == n_trials and {*right.splitlines()} <= {*written.splitlines()}
     if complete and len(entries) < n_trials:
         return Finding(INDEX, "ok", f"lists {n_trials} trials, the damaged ones too")
-    return Finding(INDEX, "wrong", "does not say what the files say; the next run makes it from them")
+    return Finding(INDEX, "wrong", "disagrees with the files; the next run makes it from them")
 
 
 def _sources(configuration: Mapping[str, Any]) -> list[Finding]:

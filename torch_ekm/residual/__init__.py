@@ -1,4 +1,4 @@
-"""Learners g(x) of a model's residual; nothing here knows about robots."""
+"""Learners g(x) of a model's residual, for any model."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         """N(E[g(x)], Var[g(x)]), or the law of y = g(x) + noise with ``observation=True``."""
 
     def predictive(self, x: Float[Tensor, "*any in_features"]) -> Distribution:
-        """Law of y, for log densities: ``predict`` with noise, unless a learner knows a better one.
+        """Law of y, for log densities: ``predict`` with noise, unless a learner has a better one.
 
         ``log_prob(y)`` has the shape of y. Learners of heavy-tailed noise override it.
         """
@@ -305,7 +305,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
 
 
 class DoubleStateLearner(ResidualLearner):
-    """A learner whose state is float64 whatever the dtype of its inputs and outputs.
+    """A learner whose state is float64 for any dtype of its inputs and outputs.
 
     Device moves take all along; a change of dtype is one of the interface only: float32 cannot hold the
     inverse of a smooth kernel's matrix.

@@ -65,5 +65,5 @@ def default_learner(
 
 
 def _long(d: int, fleet: dict[str, Any]) -> Matern32:
-    """A kernel that reaches twice as far as that of the others: nobody knows how smooth g is."""
+    """A kernel that reaches twice as far as that of the others: the smoothness of g is unknown."""
     return Matern32(d, lengthscale=2.0 * math.sqrt(d), **fleet)

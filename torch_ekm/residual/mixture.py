@@ -181,7 +181,7 @@ class MixtureResidual(ResidualLearner):
 
     @property
     def weights(self) -> Float[Tensor, "*batch out learners"]:
-        """Posterior probability of each learner, at whatever share."""
+        """Posterior probability of each learner, independent of its share."""
         return self.mass.sum(-1)
 
     @property

@@ -9,23 +9,27 @@ from ..contact.detector import ContactDetector
 from ..description import HandDescription, ObjectDescription
 from ..kinematics import HandKinematics
 from ..plant import Observation, Plant, PlantWrapper
+from ..typing import Float, Tensor
 
-_STEP = math.radians(2.0)
-_LIMIT = math.radians(25.0)
-_LEAST_SLOPE = 5e-3  # [m/rad]: joints that hardly change the gap are not to blame for it
-_ITERATIONS = 4
-_CLOSED = 5e-5  # [m]
+_SENSED_STD = math.radians(0.5)  # of a joint with a Hall sensor, where the plant states no covariance
+_UNSENSED_STD = math.radians(10.0)  # of the others: behind a tendon that stretches
+_GAP_STD = 1e-4  # [m]: what the object's pose and both shapes leave open
 _LEAST_FORCE = 0.5  # [N]: a pad that measures less says nothing
+_ITERATIONS = 4
 
 
 class ContactAligned(PlantWrapper):
-    """``gap_i(q + delta_u e_u) = 0`` for each pad i that measures 0.5 N, u its joint without a Hall sensor.
+    r"""``min_q (q - q_seen)^T P^-1 (q - q_seen) + sum_i (gap_i(q) / s_g)^2`` over pads i that measure 0.5 N.
 
-    The angle of such a joint is known from the motor's encoder alone, through a tendon with another
+    Encoders alone give the angle of a joint without a Hall sensor, through a tendon with another
     pulley radius than the model's that stretches under load: on the iCub the thumb's opposition is
     off by 10 deg, the thumb then seems to be millimetres away from the object that it presses, and no
     kinematic model can be made of the grasp. But where camera and fingertip agree that there is a
-    contact, the gap is known, and with it the angle. Solved by the secant method, at every observation.
+    contact, the gap is known. Each joint takes as much of what is missing as its deviation allows.
+
+    P is ``info["estimate"]["joint_covariance"]`` [rad^2] where the plant states it, else 0.5 deg for joints
+    with a Hall sensor and 10 deg for others. Solved by Gauss-Newton, at every observation, within the joints'
+    ranges.
 
     Args:
         plant: gives estimates of joints, pose and fingertip forces.
@@ -36,48 +40,40 @@ class ContactAligned(PlantWrapper):
         super().__init__(plant)
         self.hand = hand
         self._detector = ContactDetector(hand, obj, margin=math.inf)
-        kinematics = HandKinematics(hand)
+        self._kinematics = HandKinematics(hand)
+        self._range = tuple(torch.from_numpy(x.copy()) for x in (hand.joint_lower, hand.joint_upper))
         sensed = {sensor.joint for sensor in hand.hall_sensors}
-        free = torch.tensor([name not in sensed for name in hand.joint_names])
-        free &= torch.from_numpy(hand.joint_upper > hand.joint_lower)
-        upstream = kinematics.upstream[[kinematics.link_index(pad.link) for pad in hand.pads]]
-        self._joints: list[list[int]] = [torch.nonzero(row & free).flatten().tolist() for row in upstream]
-        self._delta = torch.zeros(hand.n_q, dtype=torch.float64)
-
-    def reset(self, seed: int) -> Observation:
-        """Grasp again, with no correction of any joint known."""
-        self._delta.zero_()
-        return super().reset(seed)
+        std = [_SENSED_STD if name in sensed else _UNSENSED_STD for name in hand.joint_names]
+        moves = self._range[1] > self._range[0]
+        self._covariance = torch.diag(torch.tensor(std, dtype=torch.float64) ** 2 * moves)
 
     def observation(self, seen: Observation) -> Observation:
         """``seen`` with joints that agree with the contacts."""
         forces = [] if seen.fingertip_force is None else seen.fingertip_force.tolist()
-        for i, force in enumerate(forces):
-            if force >= _LEAST_FORCE:
-                for j in self._joints[i]:
-                    self._close_gap(seen, self.hand.pads[i].name, j)
-        return dataclasses.replace(seen, q=seen.q + self._delta)
+        pads = zip(self.hand.pads, forces, strict=False)
+        touching = [pad.name for pad, force in pads if force >= _LEAST_FORCE]
+        return dataclasses.replace(seen, q=self._aligned(seen, touching)) if touching else seen
 
-    def _close_gap(self, seen: Observation, pad: str, joint: int) -> None:
-        """Secant steps on one joint's error, from its last known value."""
-
-        def gap(delta: float) -> float:
-            q = seen.q + self._delta
-            q[joint] = seen.q[joint] + delta
-            contacts = self._detector(q, seen.position, seen.rotation)
-            return float(contacts.gap[contacts.finger.index(pad)])
-
-        old = float(self._delta[joint])
-        new = old + _STEP
-        before, after = gap(old), gap(new)
+    def _aligned(self, seen: Observation, pads: list[str]) -> Float[Tensor, " n_q"]:
+        P = seen.info.get("estimate", {}).get("joint_covariance", self._covariance)
+        R = _GAP_STD**2 * torch.eye(len(pads), dtype=P.dtype)
+        q = seen.q
         for _ in range(_ITERATIONS):
-            slope = (after - before) / (new - old) if new != old else 0.0
-            if abs(slope) < _LEAST_SLOPE:
-                return
-            old, before, new = new, after, new - after / slope
-            if abs(new) > _LIMIT:
-                return
-            after = gap(new)
-            if abs(after) < _CLOSED:
-                break
-        self._delta[joint] = new
+            gap, H = self._gaps(seen, q, pads)
+            missing = gap + H @ (seen.q - q)
+            q = (seen.q - P @ H.mT @ torch.linalg.solve(H @ P @ H.mT + R, missing)).clamp(*self._range)
+        return q
+
+    def _gaps(
+        self, seen: Observation, q: Float[Tensor, " n_q"], pads: list[str]
+    ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n n_q"]]:
+        """Gaps of pads [m] and ``d gap_i / dq = n_i^T J_v,i`` [m/rad]."""
+        contacts = self._detector(q, seen.position, seen.rotation)
+        contacts = contacts.select([contacts.finger.index(pad) for pad in pads])
+        poses = self._kinematics(q)
+        rows = []
+        for link, point, normal in zip(contacts.link, contacts.point, contacts.normal, strict=True):
+            T = poses.of(link)
+            J = self._kinematics.jacobian(poses, link, (point - T[:3, 3]) @ T[:3, :3])
+            rows.append(normal @ J[:3])
+        return contacts.gap, torch.stack(rows)

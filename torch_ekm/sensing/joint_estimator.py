@@ -36,9 +36,9 @@ class JointEstimator:
 
     Hall channels know single joints, encoders sums of them, rigid couplings differences: together they cover
     joints without a channel, or with one that is saturated or stuck. q stays within the range that such a
-    channel leaves open, whatever cables say. Where every joint of an actuator has a channel that says more,
-    its encoder counts for less: its moment arms may be wrong, ``s_a^2 + (0.3 (a - a_0))^2``. A weak prior,
-    uniform over each joint's range, keeps q finite.
+    channel leaves open, independent of cables. Where every joint of an actuator has a channel that says more,
+    its encoder counts for less: its moment arms may be wrong, ``s_a^2 + (0.3 (a - a_0))^2``. The covariance
+    has this deviation of every encoder. A weak prior, uniform over each joint's range, keeps q finite.
 
     Args:
         hand: joints, actuation Jacobian and couplings; ``C q = 0`` is taken to hold, not just ``C dq = 0``.
@@ -81,10 +81,13 @@ class JointEstimator:
         J_a, way = self._J_a, actuators.to(torch.float64) - self._offset
         unread = 1 - (hall.std < ENCODER_STD).to(J_a.dtype) @ S
         blind = unread @ J_a.mT.abs() > 0  # a joint of the actuator has no channel that says more
-        trust = 1 / (ENCODER_STD**2 + torch.where(blind, 0.0, ARM_STD * way) ** 2)
-        information = self._fixed + S.mT @ (weight[..., None] * S) + J_a.mT @ (trust[..., None] * J_a)
+        read = self._fixed + S.mT @ (weight[..., None] * S)
+        arms = 1 / (ENCODER_STD**2 + (ARM_STD * way) ** 2)
+        trust = torch.where(blind, ENCODER_STD**-2, arms)  # all that there is: no pull towards mid-range
+        information = read + J_a.mT @ (trust[..., None] * J_a)
         right = self._middle + (weight * hall.q) @ S + (trust * way) @ J_a
         factor = torch.linalg.cholesky(information)
         q = torch.cholesky_solve(right[..., None], factor)[..., 0]
         q[..., self._joints] = q[..., self._joints].clamp(*hall.within)
+        factor = torch.linalg.cholesky(read + J_a.mT @ (arms[..., None] * J_a))
         return JointEstimate(q, torch.cholesky_inverse(factor))

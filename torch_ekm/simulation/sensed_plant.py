@@ -68,7 +68,7 @@ class SensedPlant(PlantWrapper):
         palm = MarkerBoard(0, mount=ICUB_PALM_MOUNT)
         self.boards = palm, MarkerBoard(palm.n_markers, mount=obj.marker_transform)
         self.tracker = MarkerTracker(self.camera.camera, *self.boards)
-        """Finds the boards: it knows the lens and the mounts exactly."""
+        """Finds the boards, with the exact lens and mounts."""
         self.hall, self.joints = hall, None
         if hall is not None:
             sweep = hall.sweep(181, torch.Generator().manual_seed(0))
@@ -117,13 +117,13 @@ class SensedPlant(PlantWrapper):
         elif status is PlantStatus.HELD:
             status = PlantStatus.NOT_SEEN
         q, raw = seen.q, {"corners": self._corners(track)}
+        unknown = torch.full((6, 6), torch.nan, dtype=torch.float64)
+        estimate = {"pose_covariance": unknown if track.covariance is None else track.covariance}
         if self.keep_images:
             raw["image"] = torch.from_numpy(image)
         if self.hall is not None and self.joints is not None:
             raw["hall"] = self.hall.read(truth.q, self._generator)
-            q = self.joints(raw["hall"], seen.a).q
-        unknown = torch.full((6, 6), torch.nan, dtype=torch.float64)
-        estimate = {"pose_covariance": unknown if track.covariance is None else track.covariance}
+            q, estimate["joint_covariance"] = self.joints(raw["hall"], seen.a)
         position, rotation, taken = self._last
         stamps = seen.taken._replace(pose=taken)
         info = {**seen.info, "track": track, "raw": raw, "estimate": estimate}

@@ -1,4 +1,4 @@
-"""Which readings a closed loop believes, and when it looks again, goes back, stops or gives up."""
+"""Which readings a closed loop accepts, and when it reads again, retreats, stops or gives up."""
 
 from __future__ import annotations
 

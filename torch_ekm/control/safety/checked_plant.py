@@ -29,7 +29,7 @@ class CheckedPlant(PlantWrapper):
         hand: gives the lengths.
 
     Raises:
-        PlantFailedError: by :meth:`observe` and :meth:`command`, whatever the plant raises.
+        PlantFailedError: by :meth:`observe` and :meth:`command`, for any error of the plant.
     """
 
     def __init__(self, plant: Plant, hand: HandDescription) -> None:

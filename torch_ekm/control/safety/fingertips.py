@@ -90,19 +90,19 @@ class FingertipWatch:
         for i in high:
             other = alone.get(i)
             if other is not None and self._contradicts(float(force[i]), other):
-                faults[i] = f"reads {float(force[i]):.2f} N where joints and springs speak for {other:.2f} N"
+                faults[i] = f"reads {float(force[i]):.2f} N, joints and springs give {other:.2f} N"
             elif force[i] > ceiling:
                 return Fingertips(force, halt=self._too_hard(self.pads[i], float(force[i]), "as measured"))
         faulty = [f"fingertip '{self.pads[i]}' {problem}" for i, problem in sorted(faults.items())]
         if len(faults) > self.guards.faulty_pads:
             said = "; ".join(faulty)
             message = (
-                f"{said} (Guards.faulty_pads is {self.guards.faulty_pads}): look after range "
-                "and cable of the fingertips, or of the joints' sensors if several fingertips disagree"
+                f"{said} (Guards.faulty_pads is {self.guards.faulty_pads}): check range "
+                "and cable of the fingertips, or those of the joint sensors if several fingertips disagree"
             )
             return Fingertips(force, halt=Objection(StopReason.FINGERTIP_FAULT, message))
         faulty += [
-            f"fingertip '{self.pads[i]}' reads {float(force[i]):.2f} N where the model has {other:.2f} N"
+            f"fingertip '{self.pads[i]}' reads {float(force[i]):.2f} N, the model predicts {other:.2f} N"
             for i, other in expected.items()
             if other > _PRESSED and force[i] < self.least
         ]
@@ -113,13 +113,13 @@ class FingertipWatch:
         return Fingertips(force, "; ".join(notes))
 
     def _scale(self, seen: Observation, force: Tensor) -> list[str]:
-        """All fingertips together read much more or less than joints and springs speak for."""
+        """All fingertips together read much more or less than joints and springs give."""
         alone = {i: other for i, other in self._by_joints(seen).items() if force[i] > self.least}
-        felt, other = float(force[list(alone)].sum()), sum(alone.values())
-        if len(alone) < 2 or felt / _SCALE < other < felt * _SCALE:
+        measured, other = float(force[list(alone)].sum()), sum(alone.values())
+        if len(alone) < 2 or measured / _SCALE < other < measured * _SCALE:
             return []
-        mend = "look after their scale, or the description's springs"
-        return [f"the fingertips read {felt:.1f} N where joints and springs speak for {other:.1f} N: {mend}"]
+        remedy = "check their scale, and the description's springs"
+        return [f"the fingertips read {measured:.1f} N, joints and springs give {other:.1f} N: {remedy}"]
 
     def _frozen(self, force: Tensor, moved: float) -> list[int]:
         """Pads that read the same again and again while the encoders move."""

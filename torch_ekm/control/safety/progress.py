@@ -127,7 +127,7 @@ class Progress:
     def leapt(self, off: float, note: str) -> None:
         """The object has turned by ``off`` [rad] more than predicted, and what a guard says of it."""
         found = f"in motion {len(self.errors) - 1} {note}"
-        self.surprise = self.surprise or f"; {found}: if the object did not slide, look after that sensor"
+        self.surprise = self.surprise or f"; {found}: if the object did not slide, check that sensor"
         if off > _LEAP and not self.leap:
             self.leap = (
                 f"{found}: if the camera was moved, or took one marker for another, the target is off by as "

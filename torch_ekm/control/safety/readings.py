@@ -70,9 +70,7 @@ class ReadingTests:
         """Stale, repeated or missing readings."""
         taken, repeats = seen.taken, self._repeats(seen, before)
         if before is not None and all(self._same(seen).values()) and torch.equal(seen.a, before.a):
-            message = (
-                "encoders, joints and pose are the same bit by bit after a motion: look after the driver"
-            )
+            message = "encoders, joints and pose are the same bit by bit after a motion: check the driver"
             return Objection(StopReason.STALE_SENSOR, message)
         for k, sensor in enumerate(taken._fields[:3]):  # fingertips: another reading stands in
             age, oldest = seen.time - taken[k], self.guards.max_age[k]
@@ -89,7 +87,7 @@ class ReadingTests:
             elif abs(age) > oldest:
                 problem = f"is {age:.3f} s old, Guards.max_age is {oldest:g} s"
             if problem:
-                message = f"{_NAMES[k]} {problem}: look after its driver or its time stamps"
+                message = f"{_NAMES[k]} {problem}: check its driver or its time stamps"
                 return Objection(
                     StopReason.STALE_SENSOR, message, blind=sensor == "pose" and before is not None
                 )
@@ -114,7 +112,7 @@ class ReadingTests:
             if beyond[i] > self.guards.beyond:
                 message = (
                     f"{what} '{names[i]}' reads {deg(value[i])}, its range is {deg(lower[i])} "
-                    f"to {deg(upper[i])} (Guards.beyond is {deg(self.guards.beyond)}): look after it"
+                    f"to {deg(upper[i])} (Guards.beyond is {deg(self.guards.beyond)}): check it"
                 )
                 return Objection(StopReason.OUT_OF_RANGE, message)
         return None
@@ -127,7 +125,7 @@ class ReadingTests:
         if away[i] > self.guards.encoder_jump:
             message = (
                 f"encoder '{names[i]}' went {deg(moved[i])} where {deg(v[i])} were commanded "
-                f"(Guards.encoder_jump is {deg(self.guards.encoder_jump)}): look after its cable and zero"
+                f"(Guards.encoder_jump is {deg(self.guards.encoder_jump)}): check its cable and zero"
             )
             return Objection(StopReason.ENCODER_JUMP, message)
         return None
@@ -151,7 +149,7 @@ class ReadingTests:
         if abs(off[i]) > guards.joint_jump:
             message = (
                 f"joint '{self.hand.joint_names[i]}' turned {deg(ds[i])} where {deg(predicted[i])} "
-                f"were predicted (Guards.joint_jump is {deg(guards.joint_jump)}): look after its sensor"
+                f"were predicted (Guards.joint_jump is {deg(guards.joint_jump)}): check its sensor"
             )
             return Objection(StopReason.JOINT_JUMP, message)
         way, turn = (math.sqrt(part @ part) for part in (off[-6:-3], off[-3:]))
@@ -159,7 +157,7 @@ class ReadingTests:
             message = (
                 f"the pose is {1e3 * way:.1f} mm and {deg(turn)} away from what was predicted, while "
                 f"the fingertips hold the object (Guards allow jumps of {1e3 * guards.translation_jump:g} mm "
-                f"and {deg(guards.rotation_jump)}): look after camera and markers"
+                f"and {deg(guards.rotation_jump)}): check camera and markers"
             )
             return Objection(StopReason.POSE_JUMP, message)
         return None

@@ -88,14 +88,14 @@ class Watch:
         return Verdict(seen, doubt is None, doubt)
 
     def command(self, decision: Decision, seen: Observation) -> Objection | None:
-        """What speaks against a motion before it is made; None: nothing."""
+        """Why a motion is refused before it is made; None: it is not."""
         size = decision.delta_a.abs()
         i = int(size.argmax())
         if size[i] <= self.guards.increment:
             return self.fingertips.before(decision, seen)
         message = (
             f"a command of {deg(size[i])} to actuator '{self.hand.actuator_names[i]}', Guards.increment is "
-            f"{deg(self.guards.increment)}: mend the controller, or allow more"
+            f"{deg(self.guards.increment)}: correct the controller, or raise the limit"
         )
         return Objection(StopReason.COMMAND_CEILING, message)
 
@@ -209,7 +209,7 @@ class Watch:
             away = ", ".join(name for name in pressed if name not in touching)
             if away:
                 found += f"; fingertips press ({away}) where pose and joints have them off the object"
-        return found and f"{found}: look after these sensors, and the pose"
+        return found and f"{found}: check these sensors, and the pose"
 
     def _stretch(self, seen: Observation) -> Array:
         """``a - a_0 - J_a q`` [rad]."""
@@ -240,7 +240,7 @@ class Watch:
         if not bool(found.any()):
             return None
         names = ", ".join(f"'{self.hand.actuator_names[i]}'" for i in found.nonzero().flatten().tolist())
-        message = f"actuator {names} does not move however it is commanded: look after motor and tendon"
+        message = f"actuator {names} does not move however it is commanded: check motor and tendon"
         return Objection(StopReason.ACTUATOR_STUCK, message)
 
     @staticmethod

@@ -72,7 +72,7 @@ def load_own(
         path: the file, or the folder of rosbag2; rows in the order of time.
         columns: which column is what.
         model: f; None: nothing moves.
-        clock: in a recording of ROS, the topic that sets the rhythm, such as that of the commands.
+        clock: in a recording of ROS, the topic whose messages set the rows, such as that of the commands.
         every: rows k in one motion: at a high rate the increment over one row is noise.
 
     Raises:

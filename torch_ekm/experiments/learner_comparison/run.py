@@ -56,9 +56,9 @@ def compare(
         predicted: columns with what the model says of the targets, which are then what was measured.
         observation: in place of targets: columns whose increments are predicted, as :func:`load_own` does.
         run: a column with one number in each run.
-        clock: the topic that sets the rhythm, in a recording of ROS.
+        clock: the topic whose messages set the rows, in a recording of ROS.
         limit: only the first so many samples of a file or recording; None: all.
-        folder: keeps what is finished, so that an interrupted comparison goes on where it stopped. A result
+        folder: keeps what is finished, so that an interrupted comparison continues where it stopped. A result
             is read again if the samples are the same, and a learner of that name is made with the same
             arguments and says the same of the first 40 samples. A change of code that shows later only is
             not noticed: use another folder.

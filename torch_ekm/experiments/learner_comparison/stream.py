@@ -91,7 +91,7 @@ def load_table(
         inputs: columns to predict from; all others if none is named.
         predicted: what the model says of each target: y is target - predicted, and 0 is the model alone.
         run: a column with one number in each run.
-        clock: the topic that sets the rhythm, in a recording of ROS.
+        clock: the topic whose messages set the rows, in a recording of ROS.
 
     Raises:
         DescriptionError: the file cannot be used; the message names line and column. No target is named,

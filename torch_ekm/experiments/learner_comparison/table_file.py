@@ -41,7 +41,9 @@ def open_table(path: Path, clock: str | None = None) -> tuple[Names, Read]:
     kind = path.suffix.lower()
     if kind not in readers and (path.is_dir() or kind in _BAGS):
         if clock is None:
-            raise ParameterError("clock", clock, "a topic that sets the rhythm, such as that of the commands")
+            raise ParameterError(
+                "clock", clock, "a topic whose messages set the rows, such as that of the commands"
+            )
         heard, _, values = interop.read_bag(path, clock)
         return heard, lambda wanted: values[:, [heard.index(name) for name in wanted]]
     if not path.is_file():

@@ -141,7 +141,7 @@ class Generalize(Protocol):
         return records
 
     def _new_object(self, object: str, seed: int) -> list[Record]:
-        """All angles with an object that a hand that knows itself has never held."""
+        """All angles with a new object, by a hand whose figures are known."""
         setting = self.setting.hardware_instance(seed)
         other = self.bench(setting, "can" if object == "box" else "box", "E-KM")
         records = other.learn_hand(seed)
@@ -288,7 +288,7 @@ def ends_table(trials: DataFrame) -> Table:
 
 
 def new_object_table(trials: DataFrame) -> Table:
-    """The E-KM after its warm-up, and without one on a hand that knows itself from another object."""
+    """The E-KM after its warm-up, and without one on a hand whose figures are known from another object."""
     figures = ("error_deg", "first_motion", "motions")
     rows: list[list[Cell]] = []
     mine = select(trials, controller="E-KM")
@@ -305,7 +305,7 @@ def new_object_table(trials: DataFrame) -> Table:
         "The E-KM after its warm-up with each object, and without one (new), where the hand has made thirty "
         "motions with another object. First motion: error of its prediction, by the truth."
     )
-    return Table("new_objects", "Objects that the hand has never held", columns, rows, note)
+    return Table("new_objects", "Objects that are new to the hand", columns, rows, note)
 
 
 def probe_table(trials: DataFrame) -> Table:

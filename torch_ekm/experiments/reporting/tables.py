@@ -29,11 +29,11 @@ _MEANINGS = {
     StopReason.STALLED.value: "the error falls no further",
     StopReason.STEP_LIMIT.value: "all motions are used up",
     StopReason.ACTUATOR_LIMITS.value: "the motors that are needed are at the ends of their ranges",
-    StopReason.UNSTABLE_GRASP.value: "the model says that the grasp buckles, or cannot be held",
+    StopReason.UNSTABLE_GRASP.value: "the model predicts that the grasp buckles, or cannot be held",
     StopReason.GIVEN_UP.value: "the grasp came too near to a loss, and the way back did not help",
     StopReason.WEAK_GRASP.value: "declined: a finger bore less than the object needs",
     StopReason.OUT_OF_REACH.value: "declined before anything moved",
-    StopReason.OBJECT_LOST.value: "the object was dropped, or turned off the axis beyond help",
+    StopReason.OBJECT_LOST.value: "the object was dropped, or turned too far off the axis",
     StopReason.FORCE_CEILING.value: "a fingertip pressed harder than the guard allows",
     NotGrasped.reason: "no pinch held the object",
 }
@@ -68,8 +68,8 @@ def controller_table(trials: DataFrame) -> Table:
     }
     note = (
         "Mean and 95 % bootstrap interval over pairs of object and seed; steady-state errors by the "
-        "simulation's truth. A lost object counts with the whole angle that was asked for; 'survivors' "
-        "leaves it out. Not reached: the object is in the hand, but not where it was to be. Intervals of "
+        "simulation's truth. A lost object counts with the whole angle of the target; 'survivors' "
+        "leaves it out. Not reached: the object is in the hand, but not at its target. Intervals of "
         "rates are Wilson's."
     )
     items = by_controller(trials)

@@ -17,7 +17,7 @@ from .residuals import GROUPS, Evidence, Residuals
 from .result import Calibration
 
 _SMALLEST_NOISE = 1e-3  # of the standard deviations at the start: below, the model's own error is left
-_UNSENSED = 0.5  # of the force problem's standard deviations, where no sensor tells their scale
+_UNSENSED = 0.5  # of the force problem's standard deviations, where no sensor measures their scale
 _INSIDE = 0.1  # [priors] of its bound a search begins
 _ROUNDS, _SETTLED = 8, 0.2  # of estimating the noise, at most; relative change at which it is known
 

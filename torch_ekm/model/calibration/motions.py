@@ -1,4 +1,4 @@
-"""What a recording tells the calibration: states at rest and the motors' increments between them."""
+"""What the calibration takes of a recording: states at rest and the motors' increments between them."""
 
 from __future__ import annotations
 

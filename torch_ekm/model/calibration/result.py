@@ -74,9 +74,9 @@ class Calibration:
         width = max(len(row.label) for row in self.parameters)
         lines = [f"{'':{width}}  described      found  standard error"]
         for row in self.parameters:
-            told = "" if row.identifiable else "  (not told)"
+            mark = "" if row.identifiable else "  (not identified)"
             figures = f"{row.described:10.4g} {row.value:10.4g} {row.standard_error:15.2g}"
-            lines.append(f"{row.label:{width}} {figures}{told}")
+            lines.append(f"{row.label:{width}} {figures}{mark}")
         for name, scale, unit in (("rotation", 180 / np.pi, "deg"), ("position", 1e3, "mm")):
             rows = slice(-3, None) if name == "rotation" else slice(-6, -3)
             sizes = [

@@ -18,9 +18,9 @@ _INITIAL_SCALE = 0.3  # of the features at the start, relative to an ordinary in
 class DeepKernel(Kernel):
     """``k(x, z) = v phi(|x - z|^2_L + |net(x) - net(z)|^2)``.
 
-    The features stand next to the inputs, not in their place: with a network that says nothing the
-    kernel is the plain one, and it stays positive definite on distinct inputs whatever the network
-    does, so features cannot collapse the basis. The network is a multilayer perceptron with tanh;
+    The features stand next to the inputs, not in their place: with a constant network the
+    kernel is the plain one, and with any network it stays positive definite on distinct inputs,
+    so features cannot collapse the basis. The network is a multilayer perceptron with tanh;
     its last layer starts small, so the learner starts as the plain GP (Wilson et al., Deep kernel
     learning, AISTATS 2016, learned here by the lagged prequential loss).
 

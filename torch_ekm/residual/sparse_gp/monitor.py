@@ -1,4 +1,4 @@
-"""What innovations say: can this sample be believed, is the noise right, is the system still the same?"""
+"""Tests of innovations: is the sample an outlier, is the noise right, has the system changed?"""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class CalibrateNoise(Part):
         log c_j += 0.2 ([|i_j| > 1.645 sqrt(v + c_j s2_j)] - 0.1)
 
     Adaptive conformal inference (Gibbs & Candes, NeurIPS 2021): the long-run share of misses is 10 %
-    whatever the law of the noise, per output, without touching the mean or the gain.
+    for any distribution of the noise, per output, without touching the mean or the gain.
     """
 
     def bind(self, learner: Host) -> None:

@@ -160,7 +160,7 @@ def posterior_from_natural(
 
     ``L^-T A^-1 L^-1`` is the posterior covariance of ``K^-1 f``: the difference keeps its relative
     accuracy when W is large (many repeats), where ``T'T - W`` loses all of it. Factorised in double
-    precision whatever the dtype: a float32 state is limited by its storage, not by this step.
+    precision for any dtype: a float32 state is limited by its storage, not by this step.
     """
     L = torch.linalg.cholesky_ex(K.double())[0]
     W, h = W.double(), h.double()

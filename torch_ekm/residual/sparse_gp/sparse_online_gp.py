@@ -35,7 +35,7 @@ class SparseOnlineGP(Host):
 
     The state is kept in natural form and the caches that predict are rebuilt from it by Cholesky every
     ``refresh_every`` samples: the textbook recursion, which never rebuilds, ends in NaN on smooth
-    trajectories. The state is float64 whatever ``dtype`` says, which is that of inputs and outputs: float32
+    trajectories. The state is always float64; ``dtype`` is that of inputs and outputs: float32
     cannot hold K^-1 of a smooth kernel.
 
     The outputs share the basis and one noise-to-signal ratio in the gain; each has its own scale and

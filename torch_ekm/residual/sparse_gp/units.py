@@ -24,7 +24,7 @@ class Standardize(Part):
     of the first that lies far out is judged by those that follow.
 
     Args:
-        output_offset: ``"zero"``: g is 0 far from all samples, as a model's residual wants it;
+        output_offset: ``"zero"``: g is 0 far from all samples, as a model's residual needs it;
             ``"learned"``: the mean of y.
 
     Raises:

@@ -85,7 +85,7 @@ class GraspView:
         right = obj[:3, 3] - palm[:3, 3]
         right = right - (right @ forward) * forward
         if np.linalg.norm(right) < 1e-3:
-            raise ParameterError("obj", obj[:3, 3].tolist(), "beside the palm's card, seen from the camera")
+            raise ParameterError("obj", obj[:3, 3].tolist(), "to the side of the palm's card in the image")
         right /= np.linalg.norm(right)
         pose = np.eye(4)
         pose[:3, 0], pose[:3, 1], pose[:3, 2] = right, np.cross(forward, right), forward

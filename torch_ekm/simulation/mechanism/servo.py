@@ -14,7 +14,7 @@ class Servo:
 
         u+ = clip(m + da)                       increments relative to the encoders, or
         u+ = clip(u + da)                       accumulated on the set-point (``relative_to``)
-        e  = u+ + bias + fresh - m              what the controller believes is left to do
+        e  = u+ + bias + fresh - m              what is left to do by the controller's measurement
         m+ = m + e - sign(e) min(|e|, dead)     Coulomb dead zone: it stops short by the dead band
         x+ = clip(x, m+ - play, m+ + play)      backlash between the motor and its tendon
 

@@ -24,7 +24,7 @@ class Transmission:
     A rigid coupling (index, ring and little spread alike) is a spring ``k_c`` from the joints that follow
     to those that lead, and the actuators act on the joints that lead alone: ``J_a`` above stands for
     ``J_a S`` with ``S q`` the posture whose followers obey the couplings. So a coupled joint that leads
-    is as stiff as if the coupling were rigid, whatever ``k_c`` is.
+    is as stiff as if the coupling were rigid, for any ``k_c``.
 
     PhysX integrates a joint drive implicitly and an external torque explicitly, which is unstable
     for tendons as stiff as these. So each joint gets one drive, whose stiffness is the diagonal of
