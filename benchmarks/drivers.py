@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,10 +31,11 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent / "buses"))
 
 from far_end import BUSES, OBJECT, SPEED, UNITS, Bus, opened, simulated, wiring
+from no_bus import FakeDriver
 
 from torch_ekm.control import ClosedLoop, LookAndMoveController, Manipulation, PoseTarget, StopReason
 from torch_ekm.description import HandDescription, load_object
-from torch_ekm.drivers import Channel, WithPose, dynamixel, yarp
+from torch_ekm.drivers import Channel, HandDriver, WithPose, dynamixel, yarp
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import DeviceError
 from torch_ekm.model import KinematicModel
@@ -172,13 +174,23 @@ def pulls(bus: Bus, folder: Path, n: int) -> int:
 
 def added(bus: Bus, folder: Path, n: int) -> tuple[float, float]:
     """What a motion of 3 deg takes beyond its distance and the time it must be at rest: median, 90 % [ms]."""
-    took, way = [], 3 * DEG
     with opened(bus, folder, str(SPEED), rate_deg=30.0) as (_, path), bus.driver(path) as driver:
-        for k in range(n):
-            delta = torch.full((driver.hand.n_a,), way if k % 2 else -way, dtype=torch.float64)
-            began = time.monotonic()
-            driver.command(delta)
-            took.append(1e3 * (time.monotonic() - began - way / SPEED - driver.limits.still_for))
+        return beyond_way(driver, n)
+
+
+def alone(bus: Bus, folder: Path, n: int) -> tuple[float, float]:
+    """The same of a driver without a bus."""
+    path = wiring(BUSES[0], folder, "none", rate_deg=30.0)
+    return beyond_way(bus.driver(path, speed=600 * SPEED), n)
+
+
+def beyond_way(driver: HandDriver, n: int) -> tuple[float, float]:
+    took, way = [], 3 * DEG
+    for k in range(n):
+        delta = torch.full((driver.hand.n_a,), way if k % 2 else -way, dtype=torch.float64)
+        began = time.monotonic()
+        driver.command(delta)
+        took.append(1e3 * (time.monotonic() - began - way / SPEED - driver.limits.still_for))
     return float(np.median(took)), float(np.quantile(took, 0.9))
 
 
@@ -288,6 +300,9 @@ def main() -> None:
             )
             parts.append(f"{bus.kind} {agree}/{n_turns}")
             killed, of = killed + stood, of + n
+        nothing = Bus("none", FakeDriver, "torch", "motors of the same process")
+        median, tenth = kept(given.out, folder, nothing, alone, n)
+        rows.append(f"|{nothing.kind}: {nothing.end}||||||{median:.1f}, {tenth:.1f}|")
     print(
         "|bus|turns as in process, at most apart|corrupted messages|commands beyond limits"
         "|process killed: stood within 100 ms, longest|cable pulled: typed stop, object held"

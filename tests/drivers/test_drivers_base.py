@@ -9,7 +9,8 @@ import time
 import numpy as np
 import pytest
 import torch
-from wirings import T42, FakeDriver, write
+from no_bus import FakeDriver
+from wirings import T42, write
 
 from torch_ekm.drivers import MarkerPose, Sighting, WithPose
 from torch_ekm.exceptions import (
@@ -96,14 +97,18 @@ def test_goals_stay_in_the_range_and_are_never_turned_round(driver) -> None:
 
 
 def test_a_long_motion_goes_out_in_pieces_of_80_ms_at_the_rate(tmp_path) -> None:
-    driver = FakeDriver(write(tmp_path, change="rate_deg = 200|rate_deg = 50"))
+    """The next one comes before the motors stand."""
+    driver, stood = FakeDriver(write(tmp_path, change="rate_deg = 200|rate_deg = 50")), []
+    driver.motors.speed, send = 600 * 50 * DEG, driver.motors.send
+    driver.motors.send = lambda goal: stood.append(not driver.motors.moving) or send(goal)
     began = time.monotonic()
     driver.command(radians(-10 * DEG, 10 * DEG))
+    assert stood == [True, False, False]
     assert time.monotonic() - began > 0.19  # at 50 deg/s
     steps = np.diff([1600.0, *(goal[0] for goal, _ in driver.written)]) / 600 / DEG
     assert len(steps) == 3
     assert steps == pytest.approx([-10 / 3] * 3)
-    assert all(seconds <= 0.08 for _, seconds in driver.written)
+    assert all(seconds <= 0.086 for _, seconds in driver.written)
 
 
 def test_a_motion_that_does_not_end_is_a_typed_error_and_the_hand_holds(driver) -> None:
@@ -157,8 +162,27 @@ class Published:
 def test_a_message_that_is_wrong_is_not_confirmed_by_itself(driver) -> None:
     """It is the newest one at the first look, and at the second."""
     driver.spoil = Published()
-    driver._write(driver._bus(driver._stands().numpy()), 0.0)
+    driver._write(driver._bus(driver._stands()), 0.0)
     assert driver.written[-1][0] == pytest.approx([1600.0, 2400.0])
+
+
+def test_an_old_message_is_not_confirmed_by_a_reading_of_before_the_motion(driver) -> None:
+    """The motion before was broken off by the bus: the motors stand elsewhere than at the last look."""
+    driver.command(radians(0.05, 0.0))
+
+    def breaks(reading):
+        if driver.motors.goal[0] > 1630.0:
+            raise BusError("bus", "noise")
+        return reading
+
+    driver.spoil = breaks
+    with pytest.raises(BusError, match="noise"):
+        driver.command(radians(0.05, 0.0))
+    old = iter([[1630.0, 2400.0]])
+    driver.spoil = lambda reading: dataclasses.replace(reading, motors=next(old, reading.motors))
+    time.sleep(0.02)
+    driver.command(radians(-0.01, 0.0))
+    assert driver.written[-1][0] == pytest.approx([1654.0, 2400.0])
 
 
 def test_holding_takes_the_middle_of_three_readings(driver) -> None:
@@ -188,11 +212,12 @@ def test_close_holds_and_releases_even_where_the_bus_is_dead(driver) -> None:
 
 
 def test_a_watchdog_that_runs_out_begins_the_motion_again(driver, monkeypatch) -> None:
-    cut = [True, False]
-    monkeypatch.setattr(driver, "_cut_short", lambda: cut.pop(0))
-    driver.command(radians(0.05, 0.0))
-    assert len(driver.written) == 2
+    goes, send = [False, True], driver.motors.send
+    driver.motors.send = lambda goal: goes.pop(0) and send(goal)
     monkeypatch.setattr(driver, "_cut_short", lambda: True)
+    torch.testing.assert_close(driver.command(radians(0.05, 0.0)).a, radians(1.05, 1.0), atol=1e-6, rtol=0)
+    assert len(driver.written) == 2
+    goes += [False] * 5
     with pytest.raises(BusError, match="watchdog has stopped a motion 5 times"):
         driver.command(radians(0.05, 0.0))
 

@@ -1,14 +1,8 @@
-"""Wiring files for tests, and a bus with nothing behind it."""
+"""Wiring files for tests."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
 from pathlib import Path
-
-from motors import Motors
-
-from torch_ekm.drivers import BusReading, HandDriver, Wiring
 
 T42 = """\
 [hand]
@@ -47,24 +41,3 @@ def write(folder: Path, text: str = T42, port: str = "none", **changes: str) -> 
     path = folder / "my_hand.toml"
     path.write_text(text.replace("PORT", port))
     return path
-
-
-class FakeDriver(HandDriver):
-    """A bus that is a list of motors; ``spoil`` changes what it reads."""
-
-    def __init__(self, path: Path, **options) -> None:
-        super().__init__(Wiring.read(path, "dynamixel", 600.0, ("port", "baud")), **options)
-        self.motors = Motors([1600.0, 2400.0], 4000.0)
-        self.written: list[tuple[list[float], float]] = []
-        self.spoil = lambda reading: reading
-        self.released = False
-
-    def _read(self) -> BusReading:
-        return self.spoil(BusReading(self.motors.now(), time.monotonic(), moving=self.motors.moving))
-
-    def _write(self, goal: Sequence[float], seconds: float) -> None:
-        self.written.append((list(goal), seconds))
-        self.motors.send(goal)
-
-    def _release(self) -> None:
-        self.released = True

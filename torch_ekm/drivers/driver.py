@@ -18,7 +18,9 @@ from .posture import Posture
 from .wiring import Channel, Wiring
 
 _REACH = 0.08  # [s] a motion goes out in pieces of so much: a hand whose computer dies goes no farther
-_POLL = 0.001  # [s]
+_LEAD = 0.005  # [s] a piece is sent before the end of the one under way: the motors do not stop in between
+_POLL = 0.00025  # [s] where something new is awaited
+_LOOK = 0.001  # [s] between two looks at what goes on
 _TRIES = 5  # of a motion that a watchdog stops, of readings that disagree
 _BEYOND = math.radians(15)  # a motor that reads farther outside its range is not sent anywhere
 _SLACK = 1e-6  # [rad] of a limit: sums of floats
@@ -128,14 +130,14 @@ class HandDriver(ABC):
             BusError: a device does not answer.
             StaleReadingError: a sensor sends nothing new.
         """
-        reading = self._fresh()
+        return self._observation(self._fresh(self._read()))
+
+    def _observation(self, reading: BusReading) -> Observation:
         now, a = time.monotonic(), self._a(reading)
         read = torch.tensor(list(reading.joints), dtype=torch.float64)
         force = self._values(self.wiring.fingertips, reading.fingertips)
-        joints_taken, forces_taken = (
-            min(reading.joints_taken, reading.taken),
-            min(reading.fingertips_taken, now),
-        )
+        joints_taken = min(reading.joints_taken, reading.taken)
+        forces_taken = min(reading.fingertips_taken, now)
         return Observation(
             q=self._joints(read, a),
             a=a,
@@ -172,7 +174,7 @@ class HandDriver(ABC):
                 f"a command of {math.degrees(float(delta[worst])):.3g} deg, [limits] increment in "
                 f"{self.wiring.path} is {most:.3g} deg: make smaller motions, or allow more",
             )
-        start = self._stands().numpy()
+        start = self._stands()
         goal = self._within(start, start + delta.numpy())
         if self.dry_run:
             shown = zip(self.wiring.motors, self._bus(goal), strict=True)
@@ -181,7 +183,7 @@ class HandDriver(ABC):
             self._move(start, goal)
         else:
             self.hold()
-        return self.observe()
+        return self._observation(self._fresh(self._last or self._read()))
 
     def hold(self) -> None:
         """Command the motors to stay where they are: at the median of three readings, one may be wrong.
@@ -210,13 +212,14 @@ class HandDriver(ABC):
 
     # -- inside -------------------------------------------------------------------------------------
 
-    def _stands(self) -> Tensor:
+    def _stands(self) -> Array:
         """Where the motors are, by two readings that agree: one alone may be wrong, or an old packet."""
-        last = self._last or self._read()
+        # what was seen before the last motion confirms nothing: an old message would agree with it
+        last, self._last = self._last or self._read(), None
         for _ in range(_TRIES):
             reading = self._another(last)
-            a = self._a(reading)
-            if float((a - self._a(last)).abs().max()) <= self.limits.still:
+            a = self._a(reading).numpy()
+            if np.abs(a - self._a(last).numpy()).max() <= self.limits.still:
                 return a
             last = reading
         problem = (
@@ -236,66 +239,63 @@ class HandDriver(ABC):
     def _move(self, start: Array, goal: Array) -> None:
         """Send a motion piece by piece, and wait for its end."""
         for _ in range(_TRIES):
-            pieces = max(1, math.ceil(float(np.abs(goal - start).max()) / (self.limits.rate * _REACH) - 1e-9))
-            seconds = float(np.abs(goal - start).max()) / pieces / self.limits.rate
+            way = float(np.abs(goal - start).max()) / self.limits.rate  # [s]
+            pieces = max(1, math.ceil(way / _REACH - 1e-9))
+            end = -math.inf
             with self._moving():
                 for k in range(1, pieces + 1):
-                    self._write(self._bus(start + k / pieces * (goal - start)), seconds)
+                    now = time.monotonic()
+                    end = max(end, now) + way / pieces
+                    self._write(self._bus(start + k / pieces * (goal - start)), end - now)
                     if k < pieces:
-                        self._wait(seconds)
-                self._rest(seconds)
-                cut_short = self._cut_short()
-            if not cut_short:
-                return
-            start = self._a(self._read()).numpy()
+                        self._wait(end - _LEAD)
+                arrived = np.abs(self._rest(end) - goal) <= self.limits.still
+                if arrived.all() or not self._cut_short():
+                    return
+            start = self._stands()
         problem = f"the watchdog has stopped a motion {_TRIES} times: this process is too slow for it"
         raise BusError(self.wiring.path.name, problem)
 
-    def _wait(self, seconds: float) -> None:
-        """Read until so much time is over: a bus with a watchdog is kept awake."""
-        end = time.monotonic() + seconds
+    def _wait(self, end: float) -> None:
+        """Read until that time: a bus with a watchdog is kept awake."""
         while (left := end - time.monotonic()) > 0:
-            if left > 5 * _POLL:  # else a slow bus would answer after the end
+            if left > 5 * _LOOK:  # else a slow bus would answer after the end
                 self._read()
-            time.sleep(min(_POLL, max(0.0, end - time.monotonic())))
+            time.sleep(min(_LOOK, max(0.0, end - time.monotonic())))
 
-    def _rest(self, seconds: float) -> None:
-        began, seen = time.monotonic(), []
-        while True:
+    def _rest(self, end: float) -> Array:
+        """Read until the motors have stood for ``still_for``; they arrive by ``end``. Where they stand."""
+        began, since, seen = time.monotonic(), math.inf, []
+        while (now := time.monotonic()) - end <= self.limits.timeout:
             reading = self._read()
             if reading.taken > (seen[-1][0] if seen else began):
-                seen.append((reading.taken, self._a(reading), reading.moving))
-            now = time.monotonic()
+                seen.append((reading.taken, self._a(reading).numpy()))
+                since = math.inf if reading.moving else min(since, reading.taken)
             while len(seen) > 1 and seen[1][0] <= seen[-1][0] - self.limits.still_for:
                 seen.pop(0)
-            spans = bool(seen) and seen[-1][0] - seen[0][0] >= self.limits.still_for
-            if spans and not any(one[2] for one in seen) and not any(self._spread(seen)):
-                self._after = seen[0][0]
-                return
-            if now - began > seconds + self.limits.timeout:
-                break
-            left = seen[0][0] + self.limits.still_for - now if seen else _POLL
-            time.sleep(left if 0 < left < _POLL else _POLL)
+            if seen and seen[-1][0] - since >= self.limits.still_for and not any(self._spread(seen)):
+                self._after, self._last = seen[0][0], reading
+                return seen[-1][1]
+            left = since + self.limits.still_for - time.monotonic()
+            time.sleep(left if 0 < left < 3 * _LOOK else _POLL if math.isinf(left) else _LOOK)
         with contextlib.suppress(Exception):
             self.hold()
         names = [m.name for m, way in zip(self.wiring.motors, self._spread(seen), strict=True) if way]
         what = f"motor '{', '.join(names)}'" if names else str(self.wiring.path)
         raise NeverAtRestError(
             what,
-            f"does not come to rest within {seconds + self.limits.timeout:.3g} s of a command: it swings "
+            f"does not come to rest within {now - began:.3g} s of a command: it swings "
             "([limits] still, timeout), or sends nothing new",
         )
 
-    def _spread(self, seen: list[tuple[float, Tensor, bool]]) -> list[bool]:
+    def _spread(self, seen: list[tuple[float, Array]]) -> list[bool]:
         """Which motors moved within the last readings."""
-        if not seen:
-            return [False] * self.hand.n_a
-        way = torch.stack([one[1] for one in seen])
-        return (~(way.amax(0) - way.amin(0) <= self.limits.still)).tolist()
+        way = np.ptp([a for _, a in seen] or [np.zeros(self.hand.n_a)], axis=0)
+        return (~(way <= self.limits.still)).tolist()
 
-    def _fresh(self) -> BusReading:
+    def _fresh(self, reading: BusReading) -> BusReading:
         """A reading whose sensors are all newer than the last motion, and no older than two periods."""
-        began, reading = time.monotonic(), self._read()
+        began = time.monotonic()
         while True:
             old = {
                 "motors": reading.taken,
