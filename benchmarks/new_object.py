@@ -266,10 +266,11 @@ def main() -> None:
         then, seeds = then[:1], seeds[:1]
     hands = plants(given.preset.split(","))
     todo, where = {}, {}
+    contenders = list(CONTENDERS.items())[: 3 if len(hands) == 1 else 2]
     for hand, plant in hands.items():
-        for name, changes in list(CONTENDERS.items())[: 3 if len(hands) == 1 else 2]:
-            setting = Setting(plant=plant, engine=given.engine, sensing=not given.quick, **changes)
-            for seed in seeds:
+        for seed in seeds:
+            for name, changes in contenders:  # side by side: their times are compared
+                setting = Setting(plant=plant, engine=given.engine, sensing=not given.quick, **changes)
                 key = f"{object_name(given.first)}_{digest(setting, (given.first, *then), ANGLES)}_{seed}"
                 todo[key], where[key] = (
                     (setting, given.first, then, seed),
