@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from foresight_report import foresight_report
 from foresight_turn import ForesightTurn
 from oracle import OracleBench
