@@ -9,10 +9,10 @@ import pytest
 
 pytest.importorskip("paper", reason="the benchmarks are not part of this installation")
 
-from paper import Objects, mean_text, tables_of
 from paper_overview import RATIOS
 from paper_pictures import Coupled, FarTurn, _cropped, largest_difference
 
+from paper import Objects, mean_text, tables_of
 from torch_ekm.experiments.protocols.generalize import TABLE_II
 from torch_ekm.experiments.reporting.report import Column, Report, Table
 from torch_ekm.experiments.reporting.statistics import Estimate

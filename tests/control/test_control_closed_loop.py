@@ -165,6 +165,13 @@ def test_observation_that_is_one_joint_short_is_named(held) -> None:
     assert len(done.steps) == 1
 
 
+def test_a_rotation_that_is_none_ends_the_loop_with_its_steps(held) -> None:
+    done, _ = drive(held, lambda seen: dataclasses.replace(seen, rotation=2 * seen.rotation))
+    assert done.reason is Reason.PLANT_FAILED
+    assert "ParameterError: rotation" in done.stop.message
+    assert len(done.steps) == 1
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_readings_in_float32_are_taken(held) -> None:
     seen, axis, _ = held

@@ -94,3 +94,11 @@ def test_fingertips_that_read_half_are_told(held, scale) -> None:
     assert told == ([] if scale == 1 else [0])
     if told:
         assert "check their scale" in done.steps[0].note
+
+
+def test_readings_without_a_date_are_told_once(held) -> None:
+    """Nothing ends: readings that repeat bit by bit still show."""
+    done = run(held, lambda plant, seen: dataclasses.replace(seen, time=0.0, stamps=None), since=0)
+    assert done.reason is Reason.REACHED
+    told = [k for k, step in enumerate(done.steps) if "Observation.time" in step.note]
+    assert told == [0]

@@ -138,6 +138,22 @@ def test_a_servo_that_has_switched_off_says_why(bus, tmp_path) -> None:
         bus.tables[2][70] = 0
 
 
+@pytest.mark.parametrize(
+    ("change", "line", "words"),
+    [
+        ("baud =|mode = 1\nbaud =", 7, "'mode' must be 3, 4 or 5 (positions), got 1"),
+        ("baud =|current_ma = 6000\nbaud =", 7, "'current_ma' must be at most 5506, got 6000"),
+        ("id = 1|id = 253", 17, "[[motors]] 'left': 'id' must be at most 252, got 253"),
+        ("[limits]|[[joints]]\nname = 'left_0'\nid = 3\n[limits]", 20, "servos report no [[joints]]"),
+    ],
+)
+def test_what_no_servo_has_is_named_before_anything_is_sent(change, line, words, bus, tmp_path) -> None:
+    with pytest.raises(DescriptionError, match=rf"my_hand.toml:{line}: .*{re.escape(words)}"):
+        open_at(bus, tmp_path, change=change)
+    assert bus.goals == []
+    assert bus.tables[1][11] == bus.tables[2][11] == 0
+
+
 def test_two_servos_with_one_id(bus, tmp_path) -> None:
     """Both answer at once: bytes of one and of the other."""
     bus.spoil = lambda packet: packet[:6] + bytes(x ^ 0x14 for x in packet[6:]) if packet[4] == 1 else packet

@@ -12,6 +12,7 @@ import torch
 pytest.importorskip("rclpy", reason="rclpy is not here: source a ROS 2, or install the extra 'ros2'")
 
 from far_end import BUSES, End
+from wirings import of_page, write
 
 from torch_ekm.drivers import Ros2Plant, RosPose, WithPose
 from torch_ekm.exceptions import BusError, DescriptionError, NeverAtRestError, StaleReadingError
@@ -97,6 +98,15 @@ def test_a_motion_a_pose_and_faults_over_ros(hand, path) -> None:
         with pytest.raises(StaleReadingError, match=r"motors of hand.toml"):
             driver.hold()
         hand.ask("plug")
+
+
+def test_the_file_of_the_how_to_moves_a_hand(hand, tmp_path) -> None:
+    """Topic and names are those of the test's hand."""
+    text = of_page("ros2").replace("/hand_controller/", "/hand/").replace("_motor", "")
+    with Ros2Plant(write(tmp_path, text)) as driver:
+        seen = driver.reset(seed=0)
+        after = driver.command(radians(0.05, 0.02))
+        torch.testing.assert_close(after.a - seen.a, radians(0.05, 0.02), atol=1e-6, rtol=0)
 
 
 def test_what_is_not_there_is_named(path, monkeypatch) -> None:

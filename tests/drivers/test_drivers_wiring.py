@@ -49,6 +49,7 @@ FAULTS = {  # what is changed; line, words
     "id of half": ("id = 1|id = 1.5", 17, "whole number"),
     "negative rate": ("rate_deg = 200|rate_deg = -1", 22, "must be positive"),
     "text for a number": ("zero = 1000|zero = '1000'", 18, "must be a finite number"),
+    "no such hand": ('"yale_t42"|"yale_t43"', 3, "unknown hand 'yale_t43'; valid are: icub_right"),
     "another driver": ('"dynamixel"|"yarp"', 2, "this is the driver 'dynamixel'"),
 }  # fmt: skip
 

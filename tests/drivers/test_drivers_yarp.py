@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from spoiling import Spoiler
+from wirings import of_page, write
 from yarp_golden import GoldenYarp
 
 from torch_ekm.description import load_hand
@@ -64,6 +65,15 @@ def test_axes_7_to_15_are_the_hand_and_the_arm_is_left_alone(yarp, tmp_path) -> 
         assert after.taken.joints > seen.time
     axes = {int(text.split()[2]) for text in yarp.commands if "[pos]" in text and "cmod" not in text}
     assert axes == set(range(7, 16))
+
+
+def test_the_file_of_the_how_to_moves_an_icub(yarp, tmp_path) -> None:
+    text = of_page("yarp").replace("icub-head:10000", f"127.0.0.1:{yarp.server}")
+    with YarpPlant(write(tmp_path, text)) as plant:
+        seen = plant.reset(seed=0)
+        delta = increment(index_distal=2 * DEG)
+        torch.testing.assert_close(plant.command(delta).a - seen.a, delta, atol=1e-6, rtol=0)
+    assert [text for text in yarp.commands if "[pos] 12 " in text]
 
 
 def test_a_port_that_is_not_there_is_named(yarp, tmp_path) -> None:

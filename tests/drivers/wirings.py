@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 T42 = """\
@@ -30,6 +31,14 @@ rate_deg = 200
 still_for = 0.05
 timeout = 0.5
 """
+
+
+def of_page(driver: str) -> str:
+    """The wiring file for a driver that the how-to shows."""
+    page = Path(__file__).parents[2] / "docs" / "how_to" / "drive_over_yarp_or_ros2.md"
+    shown = re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    (found,) = (text for text in shown if f'driver = "{driver}"' in text)
+    return found
 
 
 def write(folder: Path, text: str = T42, port: str = "none", **changes: str) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,14 @@ def test_help_tells_all_of_every_option(name: str) -> None:
     for parameter in COMMANDS[name].params:
         assert said(parameter.help or "") in said(shown.output), parameter.name
     assert said(COMMANDS[name].help) in said(shown.output)
+
+
+def test_python_runs_the_package_as_the_command(monkeypatch, capsys) -> None:
+    monkeypatch.setattr("sys.argv", ["torch-ekm", "hands"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_module("torch_ekm.cli", run_name="__main__")
+    assert end.value.code == 0
+    assert "yale_t42" in capsys.readouterr().out
 
 
 def test_the_help_tells_how_much_there_is_to_run() -> None:

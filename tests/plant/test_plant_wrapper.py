@@ -8,7 +8,7 @@ import pytest
 import torch
 from fakes import FakePlant
 
-from torch_ekm.exceptions import NonFiniteError
+from torch_ekm.exceptions import NonFiniteError, ParameterError
 from torch_ekm.plant import Observation, Plant, PlantWrapper, Truth
 
 EYE, ORIGIN = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
@@ -69,3 +69,12 @@ def test_states_of_an_observation() -> None:
     assert torch.equal(seen.truth.state.q, seen.q - 10)
     with pytest.raises(NonFiniteError, match=r"Observation\.q"):
         dataclasses.replace(seen, q=seen.q * torch.nan)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_an_array_where_a_tensor_is_expected_is_named() -> None:
+    seen = Counter().reset(1)
+    for value in (seen.q.numpy(), seen.q.tolist(), None):
+        with pytest.raises(ParameterError, match=r"Observation\.q = .*it must be a torch tensor"):
+            dataclasses.replace(seen, q=value)
+    assert dataclasses.replace(seen, fingertip_force=None).fingertip_force is None

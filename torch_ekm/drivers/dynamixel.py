@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from .._extras import require
 from ..description import HandDescription
-from ..exceptions import BusError, EKMError
+from ..exceptions import BusError, DescriptionError, EKMError
 from .driver import BusReading, HandDriver
 from .wiring import Wiring
 
@@ -27,6 +27,8 @@ _STATE = (122, 14)  # moving 122, current 126 (int16), position 132 (int32)
 _FAULTS = {0: "the voltage is wrong", 2: "overheated", 3: "the encoder is dead", 4: "electrical shock",
            5: "overload"}  # fmt: skip
 _BUS = ("port", "baud", "mode", "current_ma")
+_MODES = (3, 4, 5)  # that take positions
+_UNIT_MA, _MOST_MA, _LAST_ID = 2.69, 5506, 252
 
 
 def _patient(sdk: Any) -> type[Any]:
@@ -65,6 +67,7 @@ class DynamixelPlant(HandDriver):
         self._sdk, self._packets = sdk, sdk.PacketHandler(2.0)
         self._ids: list[int] = [int(one.id) for one in self.wiring.motors]
         self.port = bus.text("port")
+        mode, current_ma = self._allowed()
         baud, self._handler = bus.whole("baud", 57600), _patient(sdk)(self.port)
         with self._told(), contextlib.redirect_stdout(None):
             if not self._handler.setBaudRate(baud):
@@ -74,10 +77,30 @@ class DynamixelPlant(HandDriver):
             for one in self.wiring.motors:
                 self._ping(int(one.id), f"motor '{one.name}', id {one.id} ({self.wiring.path}:{one.line})")
             if not self.dry_run:
-                self._start(bus.whole("mode", 5), bus.number("current_ma", 0.0, minimum=0.0))
+                self._start(mode, current_ma)
         except BaseException:
             self._release()
             raise
+
+    def _allowed(self) -> tuple[int, float]:
+        """Mode and current; what servos do not have is refused."""
+        wiring, bus = self.wiring, self.wiring.bus
+        mode, current_ma = bus.whole("mode", 5), bus.number("current_ma", 0.0, minimum=0.0)
+        if mode not in _MODES:
+            raise bus.error(f"'mode' must be 3, 4 or 5 (positions), got {mode}")
+        if current_ma > _MOST_MA:
+            raise bus.error(f"'current_ma' must be at most {_MOST_MA}, got {current_ma:g}")
+        for one in wiring.motors:
+            if int(one.id) > _LAST_ID:
+                place = f"{wiring.path}:{wiring.line('motors', one.name, 'id')}"
+                problem = f"[[motors]] '{one.name}': 'id' must be at most {_LAST_ID}, got {one.id}"
+                raise DescriptionError(place, problem)
+        for kind, found in (("joints", wiring.joints), ("fingertips", wiring.fingertips)):
+            if found:
+                remedy = "remove it, or read them in a driver of your own"
+                problem = f"[[{kind}]] '{found[0].name}': servos report no [[{kind}]]: {remedy}"
+                raise DescriptionError(f"{wiring.path}:{found[0].line}", problem)
+        return mode, current_ma
 
     def _start(self, mode: int, current_ma: float) -> None:
         """Mode, profile, torque; a servo that is in its mode keeps its torque, and what it holds."""
@@ -89,7 +112,7 @@ class DynamixelPlant(HandDriver):
             speed = self.limits.rate * one.per_unit / _TICKS
             self._set(servo, _PROFILE, max(1, round(speed / _VELOCITY)))
             if current_ma:
-                self._set(servo, _CURRENT, round(current_ma / 2.69))
+                self._set(servo, _CURRENT, round(current_ma / _UNIT_MA))
         self._write(self._read().motors, 0.0)
         for servo in self._ids:
             self._set(servo, _TORQUE, 1)

@@ -10,7 +10,7 @@ from typing import Any
 from .._checks import check_positive
 from ..description import Actuator, HandDescription, load_hand
 from ..description._toml import TomlTable, read_toml
-from ..exceptions import DescriptionError, ParameterError
+from ..exceptions import DescriptionError, ParameterError, UnknownNameError
 
 _TABLES = ("hand", "bus", "motors", "joints", "fingertips", "limits")
 _HAND = ("driver", "description")
@@ -154,7 +154,10 @@ class Wiring:
         if hand is None:
             name = head.text("description")
             beside = path.parent / name
-            hand = load_hand(beside if beside.suffix == ".urdf" else name)
+            try:
+                hand = load_hand(beside if beside.suffix == ".urdf" else name)
+            except UnknownNameError as error:
+                raise head.error(f"'description': {error}") from None
 
         def at(kind: str, k: int) -> dict[str, int]:
             return lines.get(f"{kind} {k}", {})

@@ -86,6 +86,9 @@ class _Checked:
                 "signs", "warning", f"not checked: no sensors at the joints of {', '.join(blind)}", remedy
             )
         yield Check("at rest", "ok", f"encoders and {int(self.sensed.sum())} joint sensors agree")
+        if getattr(self.plant, "dry_run", False):
+            yield self._rehearsed(seen)
+            return
         motions, rows = self._motions(seen)
         yield from rows
         if motions and seen.dated and not self.looks[-1].time > seen.time:
@@ -95,7 +98,8 @@ class _Checked:
         if (self.test.misfit(readings) > _FITS).any():
             yield from self._explained(readings)
         elif not any(row.state == "error" for row in rows):
-            yield Check("wiring", "ok", f"{len(motions)} motors go as commanded, and joints with them")
+            joints = ", and joints with them" if self.sensed.any() else ""
+            yield Check("wiring", "ok", f"{len(motions)} motors go as commanded{joints}")
 
     # -- single readings ----------------------------------------------------------------------------
 
@@ -151,6 +155,18 @@ class _Checked:
 
     # -- motions ------------------------------------------------------------------------------------
 
+    def _rehearsed(self, seen: Observation) -> Check:
+        """A dry run has the first motion of each motor printed; nothing shows how they go."""
+        for i, a in enumerate(seen.a.tolist()):
+            delta = torch.zeros(self.hand.n_a, dtype=torch.float64)
+            delta[i] = self._sign(i, a) * _DEG
+            self.plant.command(delta)
+        return Check("motors", "warning", "not checked: a dry run moves nothing", "once more, without it")
+
+    def _sign(self, i: int, a: float) -> float:
+        """Where a motor has room."""
+        return 1.0 if self.hand.actuator_upper[i] - a > 2 * _STEPS[-1] else -1.0
+
     def _motions(self, seen: Observation) -> tuple[tuple[Motion, ...], list[Check]]:
         motions, rows, jacobian = [], [], None
         held = seen.status is PlantStatus.HELD
@@ -192,8 +208,7 @@ class _Checked:
         """A motor goes as little as shows, and back; what speaks against it at once."""
         before = self._look()
         a0, q0 = self._mean()
-        name, upper = f"motor '{self.hand.actuator_names[i]}'", self.hand.actuator_upper[i]
-        sign = 1.0 if upper - a0[i] > 2 * _STEPS[-1] else -1.0
+        name, sign = f"motor '{self.hand.actuator_names[i]}'", self._sign(i, a0[i])
         delta = torch.zeros(self.hand.n_a, dtype=torch.float64)
         for step in _STEPS:
             delta[i] = sign * step

@@ -7,7 +7,10 @@ from enum import Enum
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import torch
+
 from .._checks import check_finite
+from ..exceptions import ParameterError
 from ..kinematics import GraspState
 from ..typing import Float, Tensor
 
@@ -70,6 +73,7 @@ class Observation:
 
     Raises:
         NonFiniteError: any entry is NaN or infinite.
+        ParameterError: one that is no tensor.
     """
 
     q: Float[Tensor, " n_q"]
@@ -94,8 +98,11 @@ class Observation:
 
     def __post_init__(self) -> None:
         for name in ("q", "a", "position", "rotation", "fingertip_force"):
-            if (value := getattr(self, name)) is None:  # the forces
+            value = getattr(self, name)
+            if value is None and name == "fingertip_force":
                 continue
+            if not isinstance(value, torch.Tensor):
+                raise ParameterError(f"Observation.{name}", value, "a torch tensor")
             check_finite(f"Observation.{name}", value)
 
     @property

@@ -51,6 +51,7 @@ class CheckedPlant(PlantWrapper):
 
         Raises:
             ShapeError: it is of another hand, or part of it is missing.
+            ParameterError: its rotation is none.
         """
         hand, shapes = self._hand, {"position": (3,), "rotation": (3, 3)}
         shapes |= {"q": (hand.n_q,), "a": (hand.n_a,), "fingertip_force": (len(hand.pads),)}
@@ -62,7 +63,9 @@ class CheckedPlant(PlantWrapper):
             check_shape(f"Observation.{name}", value, shape, f"the hand is '{hand.name}'")
             if value.dtype != torch.float64:
                 changed[name] = value.double()
-        return dataclasses.replace(seen, **changed) if changed else seen
+        seen = dataclasses.replace(seen, **changed) if changed else seen
+        _ = seen.state  # kept by the reading
+        return seen
 
     def _checked(self, read: Callable[[], Observation]) -> Observation:
         try:

@@ -26,6 +26,7 @@ _DEG = math.pi / 180
 _STILL = 0.05 * _DEG  # an encoder that moves less stands
 _STRETCH = 12 * _DEG  # tendons stretch by less
 _ARMS = 0.35  # and moment arms that are not as described change it by this share of the way
+_UNDATED = "readings have no date, so their age is not checked: give Observation.time, or stamps"
 _ASKED = 0.5 * _DEG  # a smaller command to a motor that was stuck before does not show whether it still is
 
 
@@ -73,6 +74,8 @@ class Watch:
         self._still = torch.zeros(self.hand.n_a, dtype=torch.long)
         self._tolerance, self._away = tolerance, 0
         self._begun: Observation | None = None
+        self._undated = ""
+        """That readings have no date, until it is said."""
 
     def first(self, seen: Observation, look: Callable[[], Observation]) -> Verdict:
         """The reading before the first motion; further ones from ``look`` where it is in doubt."""
@@ -84,6 +87,7 @@ class Watch:
             seen = look()
         self.readings.follow(None, seen)
         self._begun = seen
+        self._undated = "" if seen.dated else _UNDATED
         self.blind = int(seen.status is PlantStatus.NOT_SEEN)
         return Verdict(seen, doubt is None, doubt)
 
@@ -147,7 +151,8 @@ class Watch:
         self.blind = 0
         if doubt is None:
             self.gated = 0
-            return Verdict(seen, measured and halt is None, halt, tips.note, expected)
+            note, self._undated = "; ".join(filter(None, (self._undated, tips.note))), ""
+            return Verdict(seen, measured and halt is None, halt, note, expected)
         self.gated += 1  # what is seen again and again is the truth, and the model is wrong
         again = self.gated > self.guards.blind_motions and not self.slid
         return Verdict(seen, measured and again and halt is None, halt, doubt.message, expected)
