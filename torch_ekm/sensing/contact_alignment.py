@@ -15,17 +15,19 @@ _SENSED_STD = math.radians(0.5)  # of a joint with a Hall sensor, where the plan
 _UNSENSED_STD = math.radians(10.0)  # of the others: behind a tendon that stretches
 _GAP_STD = 1e-4  # [m]: what the object's pose and both shapes leave open
 _LEAST_FORCE = 0.5  # [N]: a pad that measures less says nothing
+_GATE = 3.0  # deviations of a gap, up to which a pad of a hand without fingertip sensors is in contact
 _ITERATIONS = 4
 
 
 class ContactAligned(PlantWrapper):
-    r"""``min_q (q - q_seen)^T P^-1 (q - q_seen) + sum_i (gap_i(q) / s_g)^2`` over pads i that measure 0.5 N.
+    r"""``min_q (q - q_seen)^T P^-1 (q - q_seen) + sum_i (gap_i(q) / s_g)^2`` over pads i in contact.
 
     Encoders alone give the angle of a joint without a Hall sensor, through a tendon with another
     pulley radius than the model's that stretches under load: on the iCub the thumb's opposition is
     off by 10 deg, the thumb then seems to be millimetres away from the object that it presses, and no
-    kinematic model can be made of the grasp. But where camera and fingertip agree that there is a
-    contact, the gap is known. Each joint takes as much of what is missing as its deviation allows.
+    kinematic model can be made of the grasp. But where a pad is in contact, the gap is known. It is where it
+    measures 0.5 N or, on a hand without fingertip sensors, where its gap is within three deviations. Each
+    joint takes as much of what is missing as its deviation allows.
 
     P is ``info["estimate"]["joint_covariance"]`` [rad^2] where the plant states it, else 0.5 deg for joints
     with a Hall sensor and 10 deg for others. Solved by Gauss-Newton, at every observation, within the joints'
@@ -49,20 +51,28 @@ class ContactAligned(PlantWrapper):
 
     def observation(self, seen: Observation) -> Observation:
         """``seen`` with joints that agree with the contacts."""
-        forces = [] if seen.fingertip_force is None else seen.fingertip_force.tolist()
-        pads = zip(self.hand.pads, forces, strict=False)
-        touching = [pad.name for pad, force in pads if force >= _LEAST_FORCE]
-        return dataclasses.replace(seen, q=self._aligned(seen, touching)) if touching else seen
-
-    def _aligned(self, seen: Observation, pads: list[str]) -> Float[Tensor, " n_q"]:
         P = seen.info.get("estimate", {}).get("joint_covariance", self._covariance)
+        pads = self._touching(seen, P)
         R = _GAP_STD**2 * torch.eye(len(pads), dtype=P.dtype)
         q = seen.q
-        for _ in range(_ITERATIONS):
+        for _ in range(_ITERATIONS if pads else 0):
             gap, H = self._gaps(seen, q, pads)
             missing = gap + H @ (seen.q - q)
             q = (seen.q - P @ H.mT @ torch.linalg.solve(H @ P @ H.mT + R, missing)).clamp(*self._range)
-        return q
+        return dataclasses.replace(seen, q=q)
+
+    def _touching(self, seen: Observation, P: Float[Tensor, "n_q n_q"]) -> list[str]:
+        """Pads that are in contact: by their force, or else by a gap that the joints' deviations explain."""
+        names = [pad.name for pad in self.hand.pads]
+        if seen.fingertip_force is not None:
+            return [
+                name
+                for name, f in zip(names, seen.fingertip_force.tolist(), strict=True)
+                if f >= _LEAST_FORCE
+            ]
+        gap, H = self._gaps(seen, seen.q, names)
+        std = ((H @ P * H).sum(-1) + _GAP_STD**2).sqrt()
+        return [name for name, near in zip(names, (gap.abs() < _GATE * std).tolist(), strict=True) if near]
 
     def _gaps(
         self, seen: Observation, q: Float[Tensor, " n_q"], pads: list[str]
