@@ -226,8 +226,8 @@ def hands_table(found: dict[str, Comparison]) -> Table:
     ]  # fmt: skip
     cost = float(np.median([one.cost for one in found.values() if one.turns("empty").motions > 0]))
     note = (
-        "Pairs of figures: empty, learned hand. Ratios with 95 % bootstrap intervals over seeds. A decision with"
-        f" learning takes {cost:.2f} times the time of empty (median of the hands)."
+        "Pairs of figures: empty, learned hand. Ratios with 95 % bootstrap intervals over seeds. A decision"
+        f" with learning takes {cost:.2f} times the time of empty (median of the hands)."
     )
     return Table("hands", "New objects, hand by hand", columns, rows, note)
 
