@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
+from ..._arrays import in_torch, of_fields
 from ...contact.detector import ContactDetector
 from ...exceptions import GraspEndsError, NoContactError
 from ...kinematics.grasp_state import GraspState
+from ...kinematics.se3 import exp
 from ...typing import Array, Float, Tensor
 from .contact_laws import Response, StepSolution, solve
 from .mode_linearization import mode_linearization
@@ -131,10 +133,11 @@ class ContactMotion:
     ) -> None:
         self.model, self.state = model, start.state
         drives = model.reduction.drives
-        self._springs = torch.zeros(model.hand.n_q, dtype=torch.float64)
+        self._springs = np.zeros(model.hand.n_q)
         figures, equations = model.figures, start.equations
         if figures is not None and equations is not None and figures.solve(equations) is not None:
-            self._springs, drives = figures.present(drives)
+            springs, drives = figures.present(drives)
+            self._springs = springs.detach().double().numpy()
         self._laws = laws = HandLaws(model, drives)
         self._placed: PlacedGrasp | None = None
         self.loads = _loads(start)
@@ -246,7 +249,7 @@ class ContactMotion:
         way = Way(here, loads.pull, da, np.zeros(self._laws.S.shape[1]))
         for correction in range(_CORRECTIONS):
             done = self._solve(here, loads, way)
-            if done is None or _farthest(done.state.minus(self.state)) > _FARTHEST:
+            if done is None or self._farthest(way.total + done.answer.z) > _FARTHEST:
                 return None
             size, doing = float(np.abs(done.answer.z).max()), done.doing
             if correction and (size < _SAME or (size < _FINE and doing == was)):
@@ -260,11 +263,12 @@ class ContactMotion:
     def _fall(self, da: Array) -> _Substep | None:
         """A motion after which no equilibrium is near: the grasp moves on, damped, until it finds one.
         None: it finds none."""
-        begin, slid = self.state, dict[str, float]()
+        slid, still = dict[str, float](), np.zeros(self._laws.S.shape[1])
+        fallen = still
         for _ in range(_FALLS):
-            way = Way(self._grasp, self.loads.pull, da, np.zeros(self._laws.S.shape[1]))
+            way = Way(self._grasp, self.loads.pull, da, still)
             done = self._solve(self._grasp, self.loads, way, _DAMPING)
-            if done is None or _farthest(done.state.minus(begin)) > _FARTHEST:
+            if done is None or self._farthest(fallen := fallen + done.answer.z) > _FARTHEST:
                 return None
             self._stand(done.state, None, done.loads)
             da = np.zeros(len(da))
@@ -291,8 +295,14 @@ class ContactMotion:
         if answer is None:
             return None
         after = self._laws.loads(here, program, answer, way)
-        state = here.state.plus(torch.from_numpy(self._laws.S @ answer.z))
+        state = _moved(here.state, self._laws.S @ answer.z)
         return _Solved(contacts.finger, program, answer, after, state)
+
+    def _farthest(self, z: Array) -> float:
+        """Largest entry of the increment, translations in units of L."""
+        joints = self._laws.joints
+        n_y = joints.shape[1]
+        return max(float(np.abs(joints @ z[:n_y]).max()), float(np.abs(z[n_y:]).max()))
 
     def _report(
         self, before: GraspState, names: tuple[str, ...], last: _Substep, slid: dict[str, float]
@@ -338,10 +348,11 @@ class ContactMotion:
         return GraspEndsError(f"{why}no equilibrium is near after this motion; the object slips away")
 
 
-def _farthest(increment: Tensor) -> float:
-    """Largest entry, translations in units of L."""
-    *joints, x, y, z, a, b, c = increment.abs().tolist()
-    return max(*joints, x / L, y / L, z / L, a, b, c)
+def _moved(state: GraspState, ds: Array) -> GraspState:
+    """``s (+) ds`` of finite numbers, not checked again."""
+    dq, do, dphi = np.split(ds, [len(ds) - 6, len(ds) - 3])
+    q, position, rotation = state.q.numpy() + dq, state.position.numpy() + do, exp(dphi) @ state.rotation.numpy()
+    return in_torch(of_fields(GraspState, q=q, position=position, rotation=rotation))
 
 
 def _slides(done: _Solved) -> dict[str, float]:
