@@ -144,7 +144,7 @@ class ContactDetector:
     def _of_pads(
         self, frames: Array, solids: list[tuple[Solid, Array]], margin: float, *, measured: bool
     ) -> tuple[list[tuple[int, PadContact]], list[NearMiss]]:
-        """Pads within the margin, by their place in the hand, and the others, with their gaps if ``measured``."""
+        """Pads within the margin, by their place in the hand, and the others; gaps only if ``measured``."""
         found, missed = [], []
         for k, (pad, link) in enumerate(zip(self._pads, self._links, strict=True)):
             contact = self._nearest(pad, frames[link], solids, margin, measured)

@@ -10,7 +10,6 @@ from ..description import ContactPad, Shape
 from ..typing import Array
 from .signed_distance import point_distance, surface_curvature, tangents
 
-
 _EYE = np.eye(3)
 
 

@@ -167,7 +167,7 @@ class _NaturalMaps:
     """Residual F of the equations at ``x = [z; y]``, ``y = [lam; t]``, and its generalised Jacobian.
 
     ```
-    F = [D z + load - E^T lam + T^T t;  y - P(y - rho s)]        s = [w; -v], P clips or projects onto the disc
+    F = [D z + load - E^T lam + T^T t;  y - P(y - rho s)]      s = [w; -v], P clips or projects onto the disc
     ```
     """
 

@@ -370,8 +370,8 @@ class ContactMotion:
 
 def _moved(state: GraspState, ds: Array) -> GraspState:
     """``s (+) ds`` of finite numbers, not checked again."""
-    dq, do, dphi = np.split(ds, [len(ds) - 6, len(ds) - 3])
-    q, position, rotation = state.q.numpy() + dq, state.position.numpy() + do, exp(dphi) @ state.rotation.numpy()
+    q, position = state.q.numpy() + ds[:-6], state.position.numpy() + ds[-6:-3]
+    rotation = exp(ds[-3:]) @ state.rotation.numpy()
     return in_torch(of_fields(GraspState, q=q, position=position, rotation=rotation))
 
 
