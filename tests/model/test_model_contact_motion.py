@@ -144,6 +144,33 @@ def test_two_halves_are_a_whole(held) -> None:
     assert step.state.minus(halves.state).norm() < 0.02 * step.increment.norm()
 
 
+def test_a_motion_goes_on_as_from_contacts_that_are_found_anew(held) -> None:
+    """After a small correction the next motion begins with its matrices: the reference places the grasp."""
+    model, start, _, axis = held
+    w, went_on = turning(start, axis, 1.0 * DEG), 0
+    motion, reference = ContactMotion(model, start), ContactMotion(model, start)
+    for _ in range(5):
+        went_on += motion._placed is None and motion._near is not None
+        reference._near = None
+        ends = [one.move(w).state for one in (motion, reference)]
+        assert float(ends[0].minus(ends[1]).abs().max()) < 1e-5
+    assert went_on >= 2
+
+
+def test_what_is_left_out_by_its_distance_is_beyond_the_margin(held) -> None:
+    model, start, _, _ = held
+    near, state = model.detector.near, start.state
+    way = torch.ones(state.n_s, dtype=F64)
+    way[-6:-3] = 0.05
+    for k in range(-8, 9):
+        posed = state.plus(0.03 * k * way)
+        place = posed.q, posed.position, posed.rotation
+        every, some = near(*place, torch.inf), near(*place, 0.01)
+        kept = [i for i, gap in enumerate(every.gap.tolist()) if gap <= 0.01]
+        assert some.finger == tuple(every.finger[i] for i in kept)
+        torch.testing.assert_close(some.point, every.point[kept], rtol=0, atol=0)
+
+
 def test_a_shift_by_nothing_changes_nothing(held) -> None:
     model, start, _, axis = held
     w = turning(start, axis, 1.0 * DEG)

@@ -97,7 +97,7 @@ class ContactDetector:
             NonFiniteError: an entry is NaN or infinite.
         """
         frames, solids = self._placed(q, position, rotation)
-        found, missed = self._of_pads(frames, solids, self.margin)
+        found, missed = self._of_pads(frames, solids, self.margin, measured=True)
         missed += self._other_links.touching(frames, solids)
         return self._contact_set(found, missed, position.dtype, position.device)
 
@@ -116,7 +116,7 @@ class ContactDetector:
             ShapeError, NonFiniteError: as of a call.
         """
         frames, solids = self._placed(q, position, rotation)
-        found, _ = self._of_pads(frames, solids, margin)
+        found, _ = self._of_pads(frames, solids, margin, measured=False)
         links = self._other_links.contacts(frames, solids, margin, CROWN_RADIUS)
         return self._contact_set(found, [], position.dtype, position.device, links)
 
@@ -142,12 +142,12 @@ class ContactDetector:
         return frames, solids
 
     def _of_pads(
-        self, frames: Array, solids: list[tuple[Solid, Array]], margin: float
+        self, frames: Array, solids: list[tuple[Solid, Array]], margin: float, *, measured: bool
     ) -> tuple[list[tuple[int, PadContact]], list[NearMiss]]:
-        """Pads within the margin, by their place in the hand, and the others."""
+        """Pads within the margin, by their place in the hand, and the others; gaps only if ``measured``."""
         found, missed = [], []
         for k, (pad, link) in enumerate(zip(self._pads, self._links, strict=True)):
-            contact = self._nearest(pad, frames[link], solids, margin)
+            contact = self._nearest(pad, frames[link], solids, margin, measured)
             if isinstance(contact, PadContact):
                 found.append((k, contact))
             else:
@@ -155,7 +155,7 @@ class ContactDetector:
         return found, missed
 
     def _nearest(
-        self, pad: Pad, T_link: Array, solids: list[tuple[Solid, Array]], margin: float
+        self, pad: Pad, T_link: Array, solids: list[tuple[Solid, Array]], margin: float, measured: bool
     ) -> PadContact | float:
         """The contact with the smallest gap over the object's primitives (the first one of equals), or else
         that gap."""
@@ -163,13 +163,13 @@ class ContactDetector:
         best: PadContact | None = None
         least = math.inf
         for solid, T_solid in solids:
-            if math.isfinite(margin):
+            if measured and math.isfinite(margin):
                 coarse = self._coarse_distance(pad, T_pad, solid, T_solid)
                 least = min(least, coarse)
                 if coarse > margin:
                     continue
-            contact = pad_contact(pad, T_pad, solid, T_solid, CROWN_RADIUS)
-            if contact.gap <= margin and (best is None or contact.gap < best.gap):
+            contact = pad_contact(pad, T_pad, solid, T_solid, CROWN_RADIUS, margin)
+            if contact is not None and (best is None or contact.gap < best.gap):
                 best = contact
         return least if best is None else best
 

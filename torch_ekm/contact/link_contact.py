@@ -68,10 +68,10 @@ class LinkShapes:
             index, link, shape = self._shapes[place]
             capsule, T_link = self._round[place], frames[index] @ shape.shape.transform
             if capsule is not None:
-                one = pad_contact(capsule, T_link, solid, T, crown_radius)
+                one = pad_contact(capsule, T_link, solid, T, crown_radius, margin)
             else:
                 one = flat_contact(self._coal, shape, T_link, solid, T)
-            if one.gap <= margin and (link not in found or one.gap < found[link].gap):
+            if one is not None and one.gap <= margin and (link not in found or one.gap < found[link].gap):
                 found[link] = one
         return [
             (link, found[link])

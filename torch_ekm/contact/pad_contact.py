@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from math import sqrt
+
 import numpy as np
 
 from ..description import ContactPad, Shape
 from ..typing import Array
 from .signed_distance import point_distance, surface_curvature, tangents
+
+_EYE = np.eye(3)
 
 
 class Pad:
@@ -82,38 +86,46 @@ def _curvature(principal: list, rotation: Array) -> Array:
     K = np.zeros((3, 3))
     for curvature, direction in principal:
         e = rotation @ direction
-        K += curvature * np.outer(e, e)
+        K += curvature * e[:, None] * e
     return K
 
 
-def pad_contact(pad: Pad | LinkCapsule, T_pad: Array, solid: Solid, T_solid: Array, R: float) -> PadContact:
+def pad_contact(
+    pad: Pad | LinkCapsule, T_pad: Array, solid: Solid, T_solid: Array, R: float, margin: float
+) -> PadContact | None:
     """The contact of a pad with one primitive; the equations are those of ``ContactDetector``.
 
     Args:
         T_pad, T_solid: poses in the hand frame, ``(4, 4)``.
         R: crown radius of the pad [m]; infinite: no crown.
+        margin: None where the gap is above it [m].
     """
     rotation = T_solid[:3, :3]
     m = tuple((rotation.T @ (T_pad[:3, 3] - T_solid[:3, 3])).tolist())
     t = tuple((rotation.T @ T_pad[:3, 2]).tolist())
     s = crown = 0.0
     if pad.half > 0:
+        d, n = solid.distance(*m)  # d is convex: no point of the axis is nearer than its tangent plane says
+        if d - pad.half * abs(n[0] * t[0] + n[1] * t[1] + n[2] * t[2]) - pad.radius > margin:
+            return None
         s, crown = _along(solid, m, t, pad.half, 1 / R)
     c = (m[0] + s * t[0], m[1] + s * t[1], m[2] + s * t[2])
     d, n_local = solid.distance(*c)
     gap = d - pad.radius
+    if gap > margin:
+        return None
     principal, sharp = surface_curvature(solid.shape, c, n_local)
 
     n = rotation @ n_local
     K_o = _curvature(principal, rotation)
-    K_f = (np.eye(3) - np.outer(n, n)) / pad.radius
+    K_f = (_EYE - n[:, None] * n) / pad.radius
     lean = float(n @ T_pad[:3, 2])
     # On the side: the crown instead of 1/rho along the axis. There |lean| <= half crown, except deep inside a
     # body on a ridge of d, where no side is touched.
     if abs(s) < pad.half and abs(lean) < 2 * pad.half * crown + 1e-6:
         e = T_pad[:3, 2] - n * lean
-        e /= np.linalg.norm(e)
-        K_f += (crown - 1 / pad.radius) * np.outer(e, e)
+        e /= sqrt(e @ e)
+        K_f += (crown - 1 / pad.radius) * e[:, None] * e
     point = T_pad[:3, 3] + s * T_pad[:3, 2] - (pad.radius + gap / 2) * n
     return PadContact(point, n, gap, K_f, K_o, sharp)
 

@@ -140,7 +140,8 @@ def solve(problem: StepProblem, lam: Array, t: Array) -> StepSolution | None:
 def _newton(problem: StepProblem, z: Array, lam: Array, t: Array) -> StepSolution | None:
     n_z, m, shape = len(z), len(lam), t.shape
     x = np.concatenate([z, lam, t.ravel()])
-    F, J, active, slides = _residual(problem, x)
+    maps = _NaturalMaps(problem)
+    F, J, active, slides = maps(x)
     for _ in range(_NEWTON):
         if np.abs(F).max() < _TOLERANCE:
             z, lam, t = np.split(x, [n_z, n_z + m])
@@ -152,7 +153,7 @@ def _newton(problem: StepProblem, z: Array, lam: Array, t: Array) -> StepSolutio
         share, size = 1.0, F @ F
         while True:
             trial = x + share * way
-            found = _residual(problem, trial)
+            found = maps(trial)
             if found[0] @ found[0] < size:
                 break
             share *= 0.5
@@ -162,51 +163,48 @@ def _newton(problem: StepProblem, z: Array, lam: Array, t: Array) -> StepSolutio
     return None
 
 
-def _residual(p: StepProblem, x: Array) -> tuple[Array, Array, Mask, Mask]:
-    """F, its generalised Jacobian, which laws bear and which contacts slide."""
-    (m, n_z), (n_c, d), rho = p.E.shape, p.way.shape, _RHO_NEWTON
-    z, lam, t = x[:n_z], x[n_z : n_z + m], x[n_z + m :].reshape(n_c, d)
-    w, v = p.gaps(z, lam), p.slides(z, t)
-    flat = p.T.reshape(-1, n_z)
-    pressed = lam - rho * w
-    active = ~p.one_sided | (pressed > 0)
-    radius = p.mu_s * pressed[:n_c].clip(min=0.0)
-    y = t + rho * v
-    length = np.sqrt((y * y).sum(1))
-    bears = radius > 0
-    slides = bears & (length > radius)
-    F = np.concatenate(
-        [
-            p.D @ z + p.load - p.E.T @ lam + flat.T @ t.ravel(),
-            np.where(active, rho * w, lam),
-            np.zeros(n_c * d),
-        ]
-    )
-    J = np.zeros((len(x), len(x)))
-    J[:n_z, :n_z], J[:n_z, n_z : n_z + m], J[:n_z, n_z + m :] = p.D, -p.E.T, flat.T
-    law = n_z + np.arange(m)
-    J[law, :n_z] = np.where(active[:, None], rho * p.E, 0.0)
-    J[law, law] = np.where(active, rho * p.compliance, 1.0)
+class _NaturalMaps:
+    """Residual F of the equations at ``x = [z; y]``, ``y = [lam; t]``, and its generalised Jacobian.
 
-    eye = np.eye(d)
-    direction = y / np.where(length > 0, length, 1.0)[:, None]
-    shrink = np.where(slides, radius / np.where(slides, length, 1.0), 0.0)
-    P = shrink[:, None, None] * (eye - direction[:, :, None] * direction[:, None, :])
-    stick = (bears & ~slides)[:, None] & (np.abs(p.T).max(2) > 0)  # a row that a contact lacks bears nothing
-    projected = np.where(stick, y, (shrink[:, None] * y))
-    F[n_z + m :] = (t - projected).ravel()
-    P = np.where(stick[:, :, None], eye, P)
-    mu = np.where(slides, p.mu_s, 0.0)
-    J[n_z + m :, :n_z] = (
-        -rho * P @ p.T + (rho * mu)[:, None, None] * direction[:, :, None] * p.E[:n_c, None, :]
-    ).reshape(-1, n_z)
-    own = eye - (1 + rho * p.tangential_compliance) * P
-    normal = -(mu * (1 - rho * p.compliance[:n_c]))[:, None] * direction
-    for i in range(n_c):
-        rows = slice(n_z + m + i * d, n_z + m + (i + 1) * d)
-        J[rows, rows] = own[i]
-        J[rows, n_z + i] = normal[i]
-    return F, J, active, slides
+    ```
+    F = [D z + load - E^T lam + T^T t;  y - P(y - rho s)]      s = [w; -v], P clips or projects onto the disc
+    ```
+    """
+
+    def __init__(self, p: StepProblem) -> None:
+        (m, n_z), (n_c, d) = p.E.shape, p.way.shape
+        self.p, flat = p, p.T.reshape(-1, n_z)
+        self.J = np.zeros((n_z + m + n_c * d,) * 2)
+        self.J[:n_z] = np.concatenate([p.D, -p.E.T, flat.T], axis=1)
+        c = np.concatenate([p.compliance, np.full(n_c * d, -p.tangential_compliance)])
+        way = p.tangential_compliance * p.t_before - p.way
+        self.rho_s = _RHO_NEWTON * np.concatenate([p.gap - p.compliance * p.before, way.ravel()])
+        self.rho_G, self.own = _RHO_NEWTON * np.concatenate([p.E, -flat]), 1 - _RHO_NEWTON * c
+        self.transmits = np.abs(p.T).max(2, initial=0.0) > 0  # a row that a contact lacks bears nothing
+        self.diagonal = np.arange(n_z, len(self.J))
+
+    def __call__(self, x: Array) -> tuple[Array, Array, Mask, Mask]:
+        """F, J, which laws bear and which contacts slide."""
+        p, rho = self.p, _RHO_NEWTON
+        (m, n_z), (n_c, d) = p.E.shape, p.way.shape
+        y = x[n_z:]
+        moved = self.own * y - self.rho_G @ x[:n_z] - self.rho_s  # y - rho s
+        active = ~p.one_sided | (moved[:m] > 0)
+        ahead = moved[m:].reshape(n_c, d)
+        radius, length = p.mu_s * moved[:n_c].clip(min=0.0), np.sqrt((ahead * ahead).sum(1))
+        slides = (radius > 0) & (length > radius)
+        shrink = np.divide(radius, length, out=(radius > 0).astype(np.float64), where=slides)
+        kept = np.concatenate([active, (shrink[:, None] * self.transmits).ravel()])
+        F = np.concatenate([self.J[:n_z] @ x + p.load, y - kept * moved])
+        J = self.J.copy()
+        J[n_z:, :n_z] = kept[:, None] * self.rho_G
+        J[self.diagonal, self.diagonal] = 1 - kept * self.own
+        for i in np.flatnonzero(slides):
+            rows, e, mu = slice(n_z + m + i * d, n_z + m + (i + 1) * d), ahead[i] / length[i], p.mu_s[i]
+            J[rows, :n_z] += np.outer(e, rho * (shrink[i] * (e @ p.T[i]) + mu * p.E[i]))
+            J[rows, rows] += (1 + rho * p.tangential_compliance) * shrink[i] * np.outer(e, e)
+            J[rows, n_z + i] = -mu * self.own[i] * e
+        return F, J, active, slides
 
 
 def _split(p: StepProblem, lam: Array, t: Array, rho: float) -> tuple[Array, Array, Array] | None:

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
+from ..._arrays import in_torch, of_fields
 from ...contact.detector import ContactDetector
 from ...exceptions import GraspEndsError, NoContactError
 from ...kinematics.grasp_state import GraspState
+from ...kinematics.se3 import exp
 from ...typing import Array, Float, Tensor
 from .contact_laws import Response, StepSolution, solve
 from .mode_linearization import mode_linearization
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 NEAR = 0.004
 """Gap [m] up to which a pad or a link may close in a motion."""
 _FINE = 2e-3  # [rad] a correction this small is the last: what is left is its square
+_CLOSE = 3e-4  # [rad] after one this small the next motion begins with the matrices that are there
 _SAME = 1e-6  # [rad] or this small, whatever the contacts do
 _CORRECTIONS = 8
 _LARGEST = 0.1  # [rad] of an actuator in one substep
@@ -83,6 +86,14 @@ class _Solved(NamedTuple):
         return self.names, self.answer.active.tolist(), self.answer.slides.tolist()
 
 
+class _Start(NamedTuple):
+    grasp: PlacedGrasp
+    loads: ContactLoads
+    """There."""
+    z: Array
+    """From the present state to it."""
+
+
 class _Substep(NamedTuple):
     last: _Solved
     rates: Response
@@ -131,12 +142,14 @@ class ContactMotion:
     ) -> None:
         self.model, self.state = model, start.state
         drives = model.reduction.drives
-        self._springs = torch.zeros(model.hand.n_q, dtype=torch.float64)
+        self._springs = np.zeros(model.hand.n_q)
         figures, equations = model.figures, start.equations
         if figures is not None and equations is not None and figures.solve(equations) is not None:
-            self._springs, drives = figures.present(drives)
+            springs, drives = figures.present(drives)
+            self._springs = springs.detach().double().numpy()
         self._laws = laws = HandLaws(model, drives)
         self._placed: PlacedGrasp | None = None
+        self._near: _Start | None = None
         self.loads = _loads(start)
         if a is not None:
             stretch = a.numpy() - model.hand.actuator_offset - laws.J_a @ start.state.q.numpy()
@@ -158,8 +171,17 @@ class ContactMotion:
             self._placed = self._place(self.state)
         return self._placed
 
-    def _stand(self, state: GraspState, placed: PlacedGrasp | None, loads: ContactLoads) -> None:
-        self.state, self._placed, self.loads = state, placed, loads
+    @property
+    def _start(self) -> _Start:
+        """Where the next motion is linearized first: here, or close by where the last correction was."""
+        if self._placed is None and self._near is not None:
+            return self._near
+        return _Start(self._grasp, self.loads, np.zeros(self._laws.S.shape[1]))
+
+    def _stand(
+        self, state: GraspState, placed: PlacedGrasp | None, loads: ContactLoads, near: _Start | None = None
+    ) -> None:
+        self.state, self._placed, self.loads, self._near = state, placed, loads, near
 
     def move(self, delta_a: Float[Tensor, " n_a"]) -> ContactStep:
         """The state after the encoders moved by ``delta_a`` [rad]; the next motion begins there.
@@ -168,8 +190,8 @@ class ContactMotion:
             NoContactError: nothing touches the object any more.
             GraspEndsError: no equilibrium is found: the object slips away. The motion stands where it began.
         """
-        before = self.state, self._grasp, self.loads
-        names = self._grasp.contacts.finger
+        start = self._start
+        before, names = (self.state, self._placed, self.loads, self._near), start.grasp.contacts.finger
         way, slid = delta_a.detach().double().numpy(), dict[str, float]()
         share = 1 / max(1, math.ceil(float(np.abs(way).max(initial=0.0)) / _LARGEST))
         done = 0.0
@@ -242,15 +264,16 @@ class ContactMotion:
 
     def _substep(self, da: Array) -> _Substep | None:
         """Newton on the state: equilibrium, gaps and cones of the end. None: no convergence."""
-        here, loads, was = self._grasp, self.loads, None
-        way = Way(here, loads.pull, da, np.zeros(self._laws.S.shape[1]))
+        (here, loads, total), was = self._start, None
+        way = Way(here, self.loads.pull, da, total)
         for correction in range(_CORRECTIONS):
             done = self._solve(here, loads, way)
-            if done is None or _farthest(done.state.minus(self.state)) > _FARTHEST:
+            if done is None or self._farthest(way.total + done.answer.z) > _FARTHEST:
                 return None
             size, doing = float(np.abs(done.answer.z).max()), done.doing
             if correction and (size < _SAME or (size < _FINE and doing == was)):
-                self._stand(done.state, None, done.loads)
+                near = _Start(here, loads, -done.answer.z) if size < _CLOSE else None
+                self._stand(done.state, None, done.loads, near)
                 rates = self._laws.response(done.program.problem, done.answer)
                 return _Substep(done, rates, _slides(done))
             loads, here, was = done.loads, self._place(done.state), doing
@@ -260,11 +283,12 @@ class ContactMotion:
     def _fall(self, da: Array) -> _Substep | None:
         """A motion after which no equilibrium is near: the grasp moves on, damped, until it finds one.
         None: it finds none."""
-        begin, slid = self.state, dict[str, float]()
+        slid, still = dict[str, float](), np.zeros(self._laws.S.shape[1])
+        fallen = still
         for _ in range(_FALLS):
-            way = Way(self._grasp, self.loads.pull, da, np.zeros(self._laws.S.shape[1]))
+            way = Way(self._grasp, self.loads.pull, da, still)
             done = self._solve(self._grasp, self.loads, way, _DAMPING)
-            if done is None or _farthest(done.state.minus(begin)) > _FARTHEST:
+            if done is None or self._farthest(fallen := fallen + done.answer.z) > _FARTHEST:
                 return None
             self._stand(done.state, None, done.loads)
             da = np.zeros(len(da))
@@ -291,8 +315,14 @@ class ContactMotion:
         if answer is None:
             return None
         after = self._laws.loads(here, program, answer, way)
-        state = here.state.plus(torch.from_numpy(self._laws.S @ answer.z))
+        state = _moved(here.state, self._laws.S @ answer.z)
         return _Solved(contacts.finger, program, answer, after, state)
+
+    def _farthest(self, z: Array) -> float:
+        """Largest entry of the increment, translations in units of L."""
+        joints = self._laws.joints
+        n_y = joints.shape[1]
+        return max(float(np.abs(joints @ z[:n_y]).max()), float(np.abs(z[n_y:]).max()))
 
     def _report(
         self, before: GraspState, names: tuple[str, ...], last: _Substep, slid: dict[str, float]
@@ -338,10 +368,11 @@ class ContactMotion:
         return GraspEndsError(f"{why}no equilibrium is near after this motion; the object slips away")
 
 
-def _farthest(increment: Tensor) -> float:
-    """Largest entry, translations in units of L."""
-    *joints, x, y, z, a, b, c = increment.abs().tolist()
-    return max(*joints, x / L, y / L, z / L, a, b, c)
+def _moved(state: GraspState, ds: Array) -> GraspState:
+    """``s (+) ds`` of finite numbers, not checked again."""
+    q, position = state.q.numpy() + ds[:-6], state.position.numpy() + ds[-6:-3]
+    rotation = exp(ds[-3:]) @ state.rotation.numpy()
+    return in_torch(of_fields(GraspState, q=q, position=position, rotation=rotation))
 
 
 def _slides(done: _Solved) -> dict[str, float]:

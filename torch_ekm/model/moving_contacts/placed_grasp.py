@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-import torch
 
+from ..._arrays import in_numpy
 from ...contact.contact_kinematics import ContactKinematics, full_grasp_matrix, full_hand_jacobian
 from ...contact.contact_model import ContactModel
 from ...contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet, Detector
@@ -22,6 +22,8 @@ from ..reduction import Reduction
 from ..sensitivity import normal_motion
 
 L = CHARACTERISTIC_LENGTH
+_LENGTHS = np.array([L, L, L, 1.0, 1.0, 1.0])[:, None]
+_NONE = np.zeros(3)
 
 
 @runtime_checkable
@@ -72,23 +74,23 @@ class PlacedGrasp:
     """
 
     def __init__(
-        self, model: GraspModel, state: GraspState, contacts: ContactSet, poses: LinkPoses, springs: Tensor
+        self, model: GraspModel, state: GraspState, contacts: ContactSet, poses: LinkPoses, springs: Array
     ) -> None:
         self.state, self.contacts = state, contacts
-        self.kin: ContactKinematics = model.contact_kinematics(state, contacts, poses=poses)
+        at, near = in_numpy(state), in_numpy(contacts)
+        self.kin: ContactKinematics = model.contact_kinematics(at, near, poses=poses)
         self._model = model
-        kin, S = self.kin, model.reduction.scaled_basis
-        A = torch.cat([full_hand_jacobian(kin), -full_grasp_matrix(kin).mT], dim=-1) @ S
-        A = A.unflatten(-2, (contacts.n_c, 6)).numpy() / np.array([L, L, L, 1.0, 1.0, 1.0])[:, None]
+        kin, S = self.kin, model.reduction.scaled_basis.numpy()
+        A = np.concatenate([full_hand_jacobian(kin), -full_grasp_matrix(kin).mT], axis=-1) @ S
+        A = A.reshape(contacts.n_c, 6, -1) / _LENGTHS
         self.normal_rate = A[:, 0]  # how fast the finger nears the object
-        mu_s, gamma = contacts.friction.numpy(), contacts.torsional_friction.numpy()
-        self.frame = kin.frame.numpy()
+        mu_s, gamma, self.frame = near.friction, near.torsional_friction, kin.frame
         # where a contact slides, its point moves over the object by M K_f v and over the finger by -M K_o v
         slide = L * self.frame[:, :, 1:] @ A[:, 1:3]  # v of hand axes, (n_c, 3, n_z)
-        mobility, K_o = kin.mobility.numpy(), contacts.object_curvature.numpy()
-        self._object_run = mobility @ contacts.finger_curvature.numpy() @ slide
+        mobility, K_o = kin.mobility, near.object_curvature
+        self._object_run = mobility @ near.finger_curvature @ slide
         self._finger_run = -mobility @ K_o @ slide
-        turn = normal_motion(kin, S).numpy() + K_o @ self._object_run  # (n_c, 3, n_z)
+        turn = normal_motion(kin, S) + K_o @ self._object_run  # (n_c, 3, n_z)
         d = max([len(one.rows) - 1 for one in kin.models], default=0)
         n_c, n_z = contacts.n_c, S.shape[1]
         self.mu_s, self.T, self.turn = mu_s, np.zeros((n_c, d, n_z)), np.zeros((n_c, d, n_z))
@@ -100,24 +102,24 @@ class PlacedGrasp:
                 self.spin_scale[i] = gamma[i] / (mu_s[i] * L)
                 self.T[i, 2] *= self.spin_scale[i]
             self.turn[i, : min(n, 2)] = self.frame[i, :, 1 : 1 + min(n, 2)].T @ turn[i]
-        V_s, self._V_ss = model.potential(state)
+        V_s, self._V_ss = model.potential(at)
         n_q = len(springs)
-        V_s[:n_q] += springs * (state.q - model.spring_rest)
-        self._V_ss[:n_q, :n_q] += torch.diag(springs)
-        self.torque = (V_s @ S).numpy()
+        V_s[:n_q] += springs * (at.q - model.spring_rest.numpy())
+        self._V_ss[:n_q, :n_q] += np.diag(springs)
+        self.torque = V_s @ S
 
     def stiffness(self, loads: ContactLoads) -> Array:
         """``Z^T D Z`` at these forces, which turn with the normals."""
         contacts, model = self.contacts, self._model
-        force = torch.from_numpy(np.stack([loads.force.get(name, np.zeros(3)) for name in contacts.finger]))
-        spin = torch.tensor([loads.spin.get(name, 0.0) for name in contacts.finger], dtype=torch.float64)
-        S = model.reduction.scaled_basis
+        force = np.array([loads.force.get(name, _NONE) for name in contacts.finger])
+        spin = np.array([loads.spin.get(name, 0.0) for name in contacts.finger])
+        S = model.reduction.scaled_basis.numpy()
         D = model.load_stiffness(self.kin, force, spin) + self._V_ss
-        D = (S.mT @ D @ S).numpy()
-        f_hat = hat(force).numpy()
-        spin_f = (self.kin.spin_jacobian.numpy() @ S.numpy()[: model.hand.n_q]).swapaxes(1, 2)
+        D = S.T @ D @ S
+        f_hat = hat(force)
+        spin_f = (self.kin.spin_jacobian @ S[: model.hand.n_q]).swapaxes(1, 2)
         D -= (spin_f @ f_hat @ self._finger_run).sum(0)
-        D += S.numpy()[-3:].T @ (f_hat @ self._object_run).sum(0)
+        D += S[-3:].T @ (f_hat @ self._object_run).sum(0)
         lam, t = self.components(loads)
         inward = (t[:, :, None] * self.turn).sum(1)
         D += self.normal_rate.T @ inward
