@@ -151,9 +151,9 @@ class HandKinematics(nn.Module):
     ) -> tuple[Float[Tensor, "*batch n_q 3"], Float[Tensor, "*batch n_q 3"]]:
         """``z_j = R_j e_j`` and a point ``o_j`` [m] on it, of every joint, in the hand frame."""
         poses = poses_or_q if isinstance(poses_or_q, LinkPoses) else self(poses_or_q)
-        transforms, at, axes = poses.transforms, self._child_of_joint, self._axes
-        if plain := is_plain(transforms, axes):
-            transforms, at, axes = (x.numpy() for x in (transforms, at, axes))
+        used: tuple[Any, ...] = poses.transforms, self._child_of_joint, self._axes
+        plain = is_plain(poses.transforms, self._axes)
+        transforms, at, axes = (x.numpy() for x in used) if plain else used
         child = transforms[..., at, :, :]
         axis, origin = (child[..., :3, :3] @ axes[..., None])[..., 0], child[..., :3, 3]
         return (torch.from_numpy(axis), torch.from_numpy(origin)) if plain else (axis, origin)

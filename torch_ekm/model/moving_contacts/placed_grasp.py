@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ...description.hand import HandDescription
 from ...kinematics.grasp_state import GraspState
 from ...kinematics.link_poses import Kinematics, LinkPoses
 from ...kinematics.se3 import hat
-from ...typing import Array, Tensor
+from ...typing import AnyArray, Array, Tensor
 from ..linearization import FollowedFigures
 from ..options import ModelOptions
 from ..reduction import Reduction
@@ -42,9 +42,9 @@ class GraspModel(Protocol):
         self, state: GraspState, contacts: ContactSet, *, poses: LinkPoses | None = None
     ) -> ContactKinematics: ...
 
-    def potential(self, state: GraspState) -> tuple[Tensor, Tensor]: ...
+    def potential(self, state: GraspState) -> tuple[Any, Any]: ...
 
-    def load_stiffness(self, kin: ContactKinematics, force: Tensor, spin_moment: Tensor) -> Tensor: ...
+    def load_stiffness(self, kin: ContactKinematics, force: AnyArray, spin_moment: AnyArray) -> Any: ...
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class PlacedGrasp:
         A = np.concatenate([full_hand_jacobian(kin), -full_grasp_matrix(kin).mT], axis=-1) @ S
         A = A.reshape(contacts.n_c, 6, -1) / _LENGTHS
         self.normal_rate = A[:, 0]  # how fast the finger nears the object
-        mu_s, gamma, self.frame = near.friction, near.torsional_friction, kin.frame
+        mu_s, gamma, self.frame = (np.asarray(x) for x in (near.friction, near.torsional_friction, kin.frame))
         # where a contact slides, its point moves over the object by M K_f v and over the finger by -M K_o v
         slide = L * self.frame[:, :, 1:] @ A[:, 1:3]  # v of hand axes, (n_c, 3, n_z)
         mobility, K_o = kin.mobility, near.object_curvature
