@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -30,6 +32,12 @@ def test_every_command_is_there() -> None:
             script = part.words(Path("out"), quick=True)[1]
             assert script.startswith("-") or Path(script).exists(), script
             assert part.see.endswith(".")
+
+
+def test_no_picture_of_a_page_is_written_over_by_another() -> None:
+    for name in write_pages.PLAN:
+        pictures = [picture for part in write_pages.parts_of(name) for picture in part.pictures]
+        assert len(pictures) == len(set(pictures)), name
 
 
 def test_a_page_keeps_what_was_measured_and_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,3 +191,19 @@ SCRIPTS = [path for path in write_pages.HERE.glob("**/*.py") if path.parent.name
 def test_every_script_can_be_imported(script: Path) -> None:
     """What nobody runs in a test still follows the package's names."""
     importlib.import_module(script.stem)
+
+
+@pytest.mark.parametrize(
+    "script",
+    sorted(
+        path for path in SCRIPTS if path.parent.name == "studies" and "__main__" in path.read_text("utf-8")
+    ),
+    ids=lambda path: path.stem,
+)
+def test_studies_start_from_the_command_line(script: Path) -> None:
+    """Where their own folder alone is on the path, and not those that the tests add."""
+    environment = {**os.environ, "PYTHONPATH": str(write_pages.ROOT)}
+    done = subprocess.run(
+        [sys.executable, str(script), "--help"], capture_output=True, text=True, env=environment, check=False
+    )
+    assert done.returncode == 0, done.stderr
