@@ -22,7 +22,6 @@ from torch_ekm.description import load_object
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel
 from torch_ekm.model.stiffness.geometric import geometric_stiffness
-from torch_ekm.model.stiffness.potential import gravity_gradient, spring_torque
 
 BATCH = 1024
 
@@ -68,9 +67,8 @@ def test_forces(benchmark, grasp):
     state = at.state
     kin = model.contact_kinematics(state, at.contacts)
     A = constraint_matrix(kin)
-    V_q = spring_torque(state.q, model.spring_stiffness, model.spring_rest)
-    V_p = gravity_gradient(model.weight, state.rotation @ model.com)
-    assert benchmark(model.balance, state.q, kin, A, V_q, V_p, [], None, None).solved
+    V_s, _ = model.potential(state)
+    assert benchmark(model.balance, state.q, kin, A, V_s).solved
 
 
 def test_stiffness(benchmark, grasp):
