@@ -197,16 +197,20 @@ class Comparison:
         axes.legend(frameon=False, fontsize=8)
         return figure
 
-    def report(self, folder: Path) -> Report:
-        """Tables, picture and verdict, in ``folder``."""
+    def report(self, folder: Path, hands: Mapping[str, Comparison] | None = None) -> Report:
+        """Tables, picture and verdict, in ``folder``; of several hands each of them first."""
+        tables, picture, name = self.tables(), self.picture(), "new_object"
         caption = "Mean one-step error about the axis, all new objects and seeds."
-        shown = save_figure(self.picture(), folder, "new_object", caption)
-        report = Report("Objects that are new to the hand", f"{self.verdict}.", self.tables(), [shown])
+        if hands and len(hands) > 1:
+            tables, picture, name = [hands_table(hands), *tables], hands_picture(hands), "hands"
+            caption = "First five motions of new objects, hand by hand."
+        shown = save_figure(picture, folder, name, caption)
+        report = Report("Objects that are new to the hand", f"{self.verdict}.", tables, [shown])
         report.write(folder)
         return report
 
 
-def hands_table(found: dict[str, Comparison]) -> Table:
+def hands_table(found: Mapping[str, Comparison]) -> Table:
     """A row for each hand."""
     rows: list[list[Cell]] = []
     for name, one in found.items():
@@ -232,7 +236,7 @@ def hands_table(found: dict[str, Comparison]) -> Table:
     return Table("hands", "New objects, hand by hand", columns, rows, note)
 
 
-def hands_picture(found: dict[str, Comparison]) -> Figure:
+def hands_picture(found: Mapping[str, Comparison]) -> Figure:
     """First five motions of each hand."""
     figure, (axes,) = new_figure(6.0, 0.6 + 0.24 * len(found))
     at = np.arange(len(found))[::-1]
@@ -275,30 +279,17 @@ def main() -> None:
             for name, changes in contenders:  # side by side: their times are compared
                 setting = Setting(plant=plant, engine=given.engine, sensing=not given.quick, **changes)
                 key = f"{object_name(given.first)}_{digest(setting, (given.first, *then), ANGLES)}_{seed}"
-                todo[key], where[key] = (
-                    (setting, given.first, then, seed),
-                    (" ".join(hand).strip(), name, seed),
-                )
+                todo[key] = setting, given.first, then, seed
+                where[key] = name, (" ".join(hand).strip(), seed)
     with progress("running", len(todo)) as advance:
         results = run_jobs(session, todo, given.out, given.jobs, advance)
-    found: dict[str, dict[tuple[str, int], list[TrialRecord]]] = defaultdict(dict)
-    for (hand_name, name, seed), records in records_by(where, results).items():
-        found[hand_name][name, seed] = records
-    comparisons = {name: Comparison(records) for name, records in found.items()}
-    together = Comparison(
-        {
-            (name, (hand_name, seed)): records
-            for hand_name, one in found.items()
-            for (name, seed), records in one.items()
-        }
-    )
-    report = together.report(given.out)
-    if len(hands) > 1:
-        caption = "First five motions of new objects, hand by hand."
-        shown = save_figure(hands_picture(comparisons), given.out, "hands", caption)
-        report = Report(report.title, report.summary, [hands_table(comparisons), *report.tables], [shown])
-        report.write(given.out)
-    print(report.markdown())
+    found = records_by(where, results)
+    together = Comparison(found)
+    by_hand = {
+        hand: Comparison({key: records for key, records in found.items() if key[1][0] == hand})
+        for hand in dict.fromkeys(hand for _, (hand, _) in found)
+    }
+    print(together.report(given.out, by_hand).markdown())
     print(together.verdict)
 
 

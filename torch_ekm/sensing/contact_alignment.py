@@ -5,6 +5,7 @@ import math
 
 import torch
 
+from ..contact.contact_kinematics import contact_kinematics
 from ..contact.detector import ContactDetector
 from ..description import HandDescription, ObjectDescription
 from ..kinematics import HandKinematics
@@ -80,10 +81,7 @@ class ContactAligned(PlantWrapper):
         """Gaps of pads [m] and ``d gap_i / dq = n_i^T J_v,i`` [m/rad]."""
         contacts = self._detector(q, seen.position, seen.rotation)
         contacts = contacts.select([contacts.finger.index(pad) for pad in pads])
-        poses = self._kinematics(q)
-        rows = []
-        for link, point, normal in zip(contacts.link, contacts.point, contacts.normal, strict=True):
-            T = poses.of(link)
-            J = self._kinematics.jacobian(poses, link, (point - T[:3, 3]) @ T[:3, :3])
-            rows.append(normal @ J[:3])
-        return contacts.gap, torch.stack(rows)
+        links = [self._kinematics.link_index(link) for link in contacts.link]
+        axes, upstream = self._kinematics.joint_axes(q), self._kinematics.upstream[links]
+        kin = contact_kinematics(contacts, seen.position, *axes, upstream, rolling=False)
+        return contacts.gap, (contacts.normal[:, None] @ kin.point_jacobian)[:, 0]
