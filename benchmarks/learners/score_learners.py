@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from gpytorch_svgp import GPyTorchSVGP
 from krls_tracker import KRLSTracker
+from network_peers import BayesianLastLayer, LowRankKalman
 from stream_scores import load_split, score_objects, score_split
 
 from torch_ekm.enhanced.grasp_learner import NOISE_VARIANCE
@@ -82,6 +83,8 @@ STREAMS: dict[str, Factory] = {
     "deep SOGP 300": chosen("SOGP deep", parts=(), robust=None, capacity=300),
     "KRLS-T 100": krls(),
     "GPyTorch SVGP 100": GPyTorchSVGP,
+    "Bayesian last layer (VBLL), replayed": BayesianLastLayer,
+    "network by a low-rank Kalman filter": LowRankKalman,
     "river, adaptive random forest": chosen("river forest"),
     "ensemble of four networks, all replayed": chosen("MLP ensemble", members=4, memory=10_000),
 }
