@@ -56,7 +56,7 @@ def default_learner(
     wanders = [RobustWeight(3.0), ProcessNoise(0.003), LearnHyperparameters()]
     forgets = [RobustWeight(3.0), DetectChanges(), ForgettingFactor(0.99), LearnHyperparameters()]
     members = [
-        DeepKernelSOGP(d, m, base=_long(d, fleet), **late[0]),
+        DeepKernelSOGP(d, m, base=_long(d, fleet), parts=[RobustWeight(3.0), DetectChanges()], **late[0]),
         DeepKernelSOGP(d, m, parts=[DetectChanges()], **late[2]),
         SparseOnlineGP(d, m, parts=wanders, **late[1]),
         LastResidual(SparseOnlineGP(d + m, m, kernel=_long(d + m, fleet), parts=forgets, **late[3])),

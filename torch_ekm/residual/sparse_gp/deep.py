@@ -10,7 +10,7 @@ from ..kernels.stationary import Matern32, StationaryKernel
 from .defaults import fleet_options
 from .forgetting import ProcessNoise
 from .hyperparameters import LearnHyperparameters
-from .monitor import DetectChanges, RobustWeight
+from .monitor import CalibrateNoise, DetectChanges, RobustWeight
 from .part import copy_parts
 from .sparse_online_gp import SparseOnlineGP
 
@@ -39,14 +39,15 @@ def DeepKernelSOGP(  # noqa: N802  a kind of learner, called like the others
         hidden, features: of the network; (64, 64) and 16, or (32, 32) and 6 without a memory.
         seed: of its weights.
         base: kernel on inputs and features, Matern 3/2 by default.
-        parts: as of SparseOnlineGP, by default ``[RobustWeight(3.0), DetectChanges()]``;
+        parts: as of SparseOnlineGP, by default ``[RobustWeight(3.0), DetectChanges(), CalibrateNoise()]``;
             ``LearnHyperparameters`` is added if it is not among them.
         options: see SparseOnlineGP (without ``kernel``).
 
     Raises:
         ParameterError: from SparseOnlineGP and DeepKernel.
     """
-    own = [RobustWeight(3.0), DetectChanges()] if parts is None else copy_parts(parts)
+    calibrated = [RobustWeight(3.0), DetectChanges(), CalibrateNoise()]
+    own = calibrated if parts is None else copy_parts(parts)
     learning = next((part for part in own if isinstance(part, LearnHyperparameters)), None)
     if learning is None:
         wanders = any(isinstance(part, ProcessNoise) for part in own)

@@ -10,14 +10,15 @@ from torch import nn
 from ..._checks import check_counts
 from .forgetting import ProcessNoise
 from .hyperparameters import LearnHyperparameters
-from .monitor import DetectChanges, RobustWeight
+from .monitor import CalibrateNoise, DetectChanges, RobustWeight
 from .part import Part, copy_parts
 from .units import Standardize
 
 
 def default_parts() -> list[Part]:
-    """What bears outliers, slow and abrupt changes, and learns kernel and noise."""
-    return [RobustWeight(3.0), DetectChanges(), ProcessNoise(0.001), LearnHyperparameters()]
+    """What bears outliers, slow and abrupt changes, holds its intervals, and learns kernel and noise."""
+    wandering = ProcessNoise(0.001)
+    return [RobustWeight(3.0), DetectChanges(), wandering, CalibrateNoise(), LearnHyperparameters()]
 
 
 def fleet_options(options: Mapping[str, Any]) -> dict[str, Any]:
