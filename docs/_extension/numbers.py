@@ -9,7 +9,7 @@ from docutils import nodes
 
 #: Numbers with signs, brackets and units of up to three letters.
 _NUMBERS = re.compile(
-    r"[-+(]?\d[\d.,:;/+\-()\[\]%* ]*(?:\b(?:of|to|e|deg|mm|ms|us|s|N|m)\b[\d.,:;/+\-()\[\]%* ]*)*"
+    r"[-+(]?\d[\de.,:;/+\-()\[\]%* ]*(?:\b(?:of|to|deg|mm|ms|us|s|N|m)\b[\de.,:;/+\-()\[\]%* ]*)*"
 )
 
 
