@@ -69,13 +69,16 @@ imports: install
 
 check: lint types imports test
 
-# sdist and wheel, checked in fresh environments by README's first two examples: the light core, then extra "sim"
+# dates the changelog; sdist and wheel, checked in fresh environments by README's first two examples: the light core,
+# then extra "sim"
 PYTHONS ?= 3.11 3.12 3.13
 release: install
 	@test -n "$(REPOSITORY)" || { echo 'give its address: make release REPOSITORY=https://...'; exit 1; }
 	grep -q '^\[project.urls\]' pyproject.toml || printf '\n[project.urls]\nRepository = "$(REPOSITORY)"\n' >> pyproject.toml
-	v=$$($(BIN)/python -c 'import torch_ekm; print(torch_ekm.__version__)'); grep -q "^## $$v" CHANGELOG.md \
-		&& grep -q "^version: $$v" CITATION.cff && grep -q "version: \"$$v\"" recipe/recipe.yaml
+	v=$$($(BIN)/python -c 'import torch_ekm; print(torch_ekm.__version__)'); d=$$(date +%F); \
+		sed -i.old "s/^## Unreleased$$/## $$v ($$d)/" CHANGELOG.md && rm CHANGELOG.md.old; \
+		sed -i.old "s/^date-released: .*/date-released: $$d/" CITATION.cff && rm CITATION.cff.old; \
+		grep -q "^## $$v" CHANGELOG.md && grep -q "^version: $$v" CITATION.cff && grep -q "version: \"$$v\"" recipe/recipe.yaml
 	$(BIN)/python -m pip install --quiet build twine
 	rm -rf dist && $(BIN)/python -m build --outdir dist .
 	$(BIN)/python -m twine check --strict dist/*

@@ -208,10 +208,10 @@ class Outcome:
     def table(self) -> Table:
         """A row for each group."""
         rows: list[list[Cell]] = []
-        for group in (*self.groups, None):
+        for group in self.groups:
             asked = self._of(group)
             called = [one for one in asked if not one.declined]
-            n = "" if group is None else len(next(iter(TARGETS[group].values())))
+            n = len(next(iter(TARGETS[group].values())))
             errors = (
                 float(np.median(found))
                 if (found := [e.errors[unit] for e in called if unit in e.errors])
@@ -219,8 +219,8 @@ class Outcome:
                 for unit in ("deg", "mm")
             )
             counts = len(asked), len(called), sum(one.near for one in called)
-            row = [f"{group or 'all'} ({n})" if group else "all", *counts, *errors]
-            rows.append([*row, self._motions(called), sum(one.lost for one in called)])
+            lost = sum(one.lost for one in called)
+            rows.append([f"{group} ({n})", *counts, *errors, self._motions(called), lost])
         columns: list[str | Column] = [
             "target (directions)", "asked", "called reachable", "within", Column("turn [deg]", ".2f"),
             Column("shift [mm]", ".2f"), Column("motions", ".1f"), "lost",

@@ -198,11 +198,15 @@ class Comparison:
         return figure
 
     def report(self, folder: Path, hands: Mapping[str, Comparison] | None = None) -> Report:
-        """Tables, picture and verdict, in ``folder``; of several hands each of them first."""
+        """Tables, picture and verdict, in ``folder``; of several hands each of them, too."""
         tables, picture, name = self.tables(), self.picture(), "new_object"
         caption = "Mean one-step error about the axis, all new objects and seeds."
         if hands and len(hands) > 1:
-            tables, picture, name = [hands_table(hands), *tables], hands_picture(hands), "hands"
+            tables, picture, name = (
+                [tables[0], hands_table(hands), *tables[1:]],
+                hands_picture(hands),
+                "hands",
+            )
             caption = "First five motions of new objects, hand by hand."
         shown = save_figure(picture, folder, name, caption)
         report = Report("Objects that are new to the hand", f"{self.verdict}.", tables, [shown])

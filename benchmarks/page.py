@@ -18,7 +18,7 @@ PACKAGES = (
     "gpytorch", "scikit-learn", "river", "capymoa",
 )  # fmt: skip
 
-_MOST_ROWS = 8  # of a table that is not folded; twice as many where no picture shows what is in it
+_MOST_ROWS = {True: 10, False: 16}  # of a table that is not folded, with a picture of it and without
 _MOST_LINES = 24  # of printed text that is not folded
 
 
@@ -51,7 +51,7 @@ def _laid_out(see: str, body: str) -> list[str]:
     lead, *tables = re.split(r"^### ", body.strip(), flags=re.MULTILINE)
     blocks = [block for block in re.split(r"\n{2,}", lead.strip()) if block] if "```" not in lead else [lead]
     first, rest = [], []
-    most = _MOST_ROWS if "![" in lead else 2 * _MOST_ROWS
+    most = _MOST_ROWS["![" in lead]
     while blocks:
         block = blocks.pop(0).strip()
         if block.startswith("!["):  # and its caption

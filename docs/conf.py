@@ -31,7 +31,7 @@ extensions = [
     "_extension",
 ]
 bibtex_bibfiles = ["references.bib"]
-exclude_patterns = ["_build", "_extension", "_templates"]
+exclude_patterns = ["_build", "_extension", "_static", "_templates"]
 templates_path = ["_templates"]
 nitpicky = True
 suppress_warnings = ["toc.empty_glob"]  # a benchmark that has not been measured
@@ -42,6 +42,9 @@ if "TORCH_EKM_VERSIONS" in os.environ:  # address of the page that links the sit
     link = f'<a href="{os.environ["TORCH_EKM_VERSIONS"]}">Other versions</a>'
     html_theme_options = {"announcement": f"torch_ekm {version}. {link}"}
 html_show_sphinx = False
+html_static_path = ["_static"]
+html_css_files = ["torch_ekm.css"]
+smartquotes_action = "qe"  # quotes and ellipses: two hyphens of an option stay
 html_copy_source = False
 add_module_names = False
 python_maximum_signature_line_length = 100

@@ -23,7 +23,7 @@ def rms_ratio(run: Prequential, start: int = 0) -> float:
 
 
 def median_ratio(run: Prequential, start: int = 0) -> float:
-    """The same of the median absolute values: blind to outliers."""
+    """The same of the median absolute values: insensitive to outliers."""
     return float(run.error[start:].abs().median() / run.y[start:].abs().median())
 
 

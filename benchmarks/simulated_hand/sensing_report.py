@@ -30,6 +30,7 @@ READINGS: dict[str, tuple[str | None, bool]] = {
 }
 #: What measures a blind turn.
 BLIND_BY = {"camera on": None, "touch": True, "prediction alone": False}
+_COLOURS = ("#CC79A7", "#0072B2", "#E69F00")  # no controllers: not the KM's grey
 
 
 @dataclass(frozen=True)
@@ -303,18 +304,18 @@ class Outcome:
             depth.plot([k] * len(values), values, "o", ms=5, alpha=0.7, color=COLOURS["E-KM"])
         depth.set_xticks(range(len(LENSES)), [name.replace(" ", "\n") for name in LENSES], fontsize=8)
         depth.set(yscale="log", ylabel="depth, rms [mm]", xlabel="lens", xlim=(-0.5, len(LENSES) - 0.5))
-        for (name, errors), colour in zip(self.motors.items(), (COLOURS["KM"], COLOURS["E-KM"]), strict=True):
+        for (name, errors), colour in zip(self.motors.items(), _COLOURS, strict=False):
             if errors:
                 motors.ecdf(np.abs(errors), color=colour, label=name)
         motors.axvline(1.0, color=COLOURS["limit"], linestyle="--", label="the paper's ±1 deg")
         motors.set(xlabel="error of a motor [deg]", ylabel="share of the motions", xlim=(0, 2))
         motors.legend(loc="lower right", frameon=False, fontsize=7)
-        for name, who in zip(BLIND_BY, ("KM", "E-KM", "KM+I"), strict=True):
+        for name, colour in zip(BLIND_BY, _COLOURS, strict=True):
             most = max((len(one["motions"]) for one in self.blind if one["by"] == name), default=0)
             numbers = range(1, most + 1)
-            dark.plot(numbers, [self.dark(name, n, "error") for n in numbers], color=COLOURS[who], label=name)
+            dark.plot(numbers, [self.dark(name, n, "error") for n in numbers], color=colour, label=name)
             stated = [self.dark(name, n, "sd") for n in numbers]
-            dark.plot(numbers, stated, "--", lw=1, color=COLOURS[who])
+            dark.plot(numbers, stated, "--", lw=1, color=colour)
         dark.set(xlabel="motions, camera off (dashed: stated)", ylabel="rotation, rms [deg]")
         dark.legend(frameon=False, fontsize=7)
         return figure

@@ -122,14 +122,14 @@ def test_results_come_first_and_long_tables_are_folded() -> None:
 
     picture = "![Seen.](a.svg)\n\n*Seen.*"
     legend = "- **KM**: the model"
-    body = f"Answer.\n\n{legend}\n\n{picture}\n\n### Short\n\n{table(8)}\n\nNote.\n\n### Other\n\n{table(2)}"
+    body = f"Answer.\n\n{legend}\n\n{picture}\n\n### Short\n\n{table(10)}\n\nNote.\n\n### Other\n\n{table(2)}"
     text = page_text("Page", [Section("Part", "See.", body, "`run`: commit 1.")], ["Written by it."])
     folded = f"<details>\n<summary>Other</summary>\n\n{table(2)}\n\n</details>"
-    shown = ["Answer.", picture, f"### Short\n\n{table(8)}\n\nNote.", "See.", legend, folded]
+    shown = ["Answer.", picture, f"### Short\n\n{table(10)}\n\nNote.", "See.", legend, folded]
     made = "## Commands and versions\n\n- Part: `run`: commit 1.\n\nWritten by it."
     assert text == "\n\n".join(["# Page\n\n## Part", *shown, made])
-    long = page_text("Page", [Section("Part", "See.", body.replace(table(8), table(9)), "")], [])
-    assert f"<summary>Short</summary>\n\n{table(9)}" in long
+    long = page_text("Page", [Section("Part", "See.", body.replace(table(10), table(11)), "")], [])
+    assert f"<summary>Short</summary>\n\n{table(11)}" in long
     bare = page_text("Page", [Section("Part", "See.", table(16), "")], [])  # no picture shows what is in it
     assert "<details>" not in bare
     assert "<summary>Table of 17 rows</summary>" in page_text(

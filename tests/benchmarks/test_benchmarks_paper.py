@@ -12,7 +12,7 @@ pytest.importorskip("paper", reason="the benchmarks are not part of this install
 from paper_overview import RATIOS
 from paper_pictures import Coupled, FarTurn, _cropped, largest_difference
 
-from paper import Objects, mean_text, tables_of
+from paper import Objects, mean_text, table_ii, tables_of
 from torch_ekm.experiments.protocols.generalize import TABLE_II
 from torch_ekm.experiments.reporting.report import Column, Report, Table
 from torch_ekm.experiments.reporting.statistics import Estimate
@@ -60,6 +60,21 @@ def test_numbers_are_those_of_the_run(run: Objects) -> None:
     assert run.errors == {"weighted_box": (1.0, 0.1), "box": (2.0, 0.4)}
     assert run.ends() == "the same; E-KM: 10 lost, 20 not reached"
     assert run.cells() == [("box", 0.75, 0.13), ("can", 0.5, 0.04), ("can", 0.4, 0.41)]
+
+
+def test_table_ii_has_a_row_for_each_object_its_mean_and_the_system_as_printed(run: Objects) -> None:
+    rows = table_ii(
+        {"generalize": run, "worn": Objects({}, "wear"), "as_printed": Objects({}, "print")}
+    ).text()
+    assert rows[1] == ["box", "2.8; 0.8; 28.5 %", run.table_ii("box"), "measured by `wear`"]
+    assert [row[0].partition(",")[0] for row in rows[5:]] == ["mean of the five", "mean"]
+    assert rows[6][2] == "measured by `print`"
+
+
+def test_of_two_commands_on_a_page_the_first_counts(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("### Same\n\n| a |\n|---|\n| 1 |\n\n### Same\n\n| a |\n|---|\n| 2 |\n", encoding="utf-8")
+    assert tables_of(page) == {"Same": [{"a": "1"}]}
 
 
 def test_what_is_not_there_names_its_command(run: Objects) -> None:

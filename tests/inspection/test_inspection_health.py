@@ -36,9 +36,11 @@ class Made:
         return Observation(q, torch.from_numpy(self.a.copy()), torch.zeros(3).double(), torch.eye(3).double(),
                            None, status=status)  # fmt: skip
 
-    def move(self, n: int = 1, gave: tuple = (0.0, 0.0), status: PlantStatus = PlantStatus.HELD) -> None:
+    def move(
+        self, n: int = 1, gave: tuple = (0.0, 0.0), status: PlantStatus = PlantStatus.HELD, size: float = 2.5
+    ) -> None:
         for _ in range(n):
-            v = self.draw.normal(0, 2.5 * DEG, 2) - 0.3 * (self.a - [0.9, 0.8])
+            v = self.draw.normal(0, size * DEG, 2) - 0.3 * (self.a - [0.9, 0.8])
             error = v + self.draw.normal(0, 0.05 * DEG, 2)
             w = error - np.clip(error, -self.dead, self.dead)
             self.a, self.x = self.a + w, self.x + self.gain * w + np.array(gave) * DEG
@@ -53,6 +55,15 @@ def test_healthy_hands_are_left_alone() -> None:
         made.move(250)
         changes += hand_health(HAND, [(0, made.log)])
     assert changes == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_motors_that_begin_within_their_dead_zone_have_not_changed(seed: int) -> None:
+    made = Made(seed)
+    made.dead[:] = 1.5 * DEG
+    made.move(25, size=0.3)  # a motor that stands shows a bound of its dead zone alone
+    made.move(60)
+    assert hand_health(HAND, [(0, made.log)]) == []
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -40,8 +40,7 @@ _LARGEST_SEED = 2**31
 
 @app.callback(invoke_without_command=True)
 def root(
-    context: typer.Context,
-    version: Annotated[bool, Option("--version", help="Print the version.")] = False,
+    context: typer.Context, version: Annotated[bool, Option("--version", help="Print the version.")] = False
 ) -> None:
     """Kinematic models of underactuated hands, corrected by online learners."""
     if version:

@@ -65,8 +65,7 @@ def check(
     object: Annotated[str, Argument(help=AN_OBJECT)] = "box",
     picture: Annotated[Path, Option(help="Picture of pads and contact frames.")] = Path("check.png"),
     plant: Annotated[
-        Path | None,
-        Option(metavar="TOML", help="A real hand's wiring file: its motors move by 1 deg."),
+        Path | None, Option(metavar="TOML", help="A real hand's wiring file: its motors move by 1 deg.")
     ] = None,
     dry_run: Annotated[bool, Option(help="With --plant: print the commands, move nothing.")] = False,
 ) -> None:

@@ -87,11 +87,7 @@ Rehearsal = Callable[[Plant, PoseTarget], Generator[Step, None, Stop]]
 
 @torch.no_grad()
 def follow_to_the_end(
-    rehearsal: Rehearsal,
-    controller: LookAndMoveController,
-    seen: Observation,
-    sign: int,
-    limit: float,
+    rehearsal: Rehearsal, controller: LookAndMoveController, seen: Observation, sign: int, limit: float
 ) -> Reach:
     """See :meth:`~torch_ekm.control.ClosedLoop.reach`."""
     if sign not in (1, -1):

@@ -80,10 +80,7 @@ class LinearizedModel:
 
     @classmethod
     def about(
-        cls,
-        action: Float[Tensor, " n_a"],
-        kinematic: Linearization,
-        enhanced: EnhancedModel | None = None,
+        cls, action: Float[Tensor, " n_a"], kinematic: Linearization, enhanced: EnhancedModel | None = None
     ) -> LinearizedModel:
         """``(f + g)(a + d) ~ value + J d = (value - J a) + J (a + d)`` about one action a."""
         J = kinematic.manipulation_jacobian

@@ -10,11 +10,5 @@ from .parameter_filter import ParameterFilter
 from .saving import load, save
 
 __all__ = [
-    "AdaptiveModel",
-    "EnhancedModel",
-    "GraspEncoding",
-    "ParameterFilter",
-    "grasp_learner",
-    "load",
-    "save",
-]
+    "AdaptiveModel", "EnhancedModel", "GraspEncoding", "ParameterFilter", "grasp_learner", "load", "save",
+]  # fmt: skip

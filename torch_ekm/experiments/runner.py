@@ -223,12 +223,7 @@ class Bench:
         return self.controllers(self._predictor, focused, setting.tasks, setting.limits, self.pace)
 
     def closed_loop(
-        self,
-        plant: Plant,
-        focus: FocusedPose | None = None,
-        *,
-        learn: bool = True,
-        decline: bool = False,
+        self, plant: Plant, focus: FocusedPose | None = None, *, learn: bool = True, decline: bool = False
     ) -> ClosedLoop:
         """The loop of the next turn."""
         known = {"knowledge": self.knowledge, "safety": self.setting.safety}

@@ -125,8 +125,9 @@ class _Watch:
     def see(self, at: tuple[int, int], x: Array, y: float, stood: bool, excused: float) -> None:
         """Judge a motion and learn from it; errors up to ``excused`` are none."""
         error = self.error(x, y)
-        if not math.isfinite(error) or (self.part == "servo" and stood and error < 0):
-            return  # nothing was read; within the dead zone
+        bound = self.part == "servo" and stood and (error < 0 or self.count < _BASELINE)
+        if not math.isfinite(error) or bound:
+            return  # nothing was read; a motor that stands within its dead zone does not show how wide it is
         spread = 1 + float(x @ self.P @ x)
         z2 = max(0.0, abs(error) - excused) ** 2 / (self.squares / self.weight * spread)
         if self.count >= _BASELINE:

@@ -7,9 +7,5 @@ from .scene import Scene, make_scene
 from .web import save_animation
 
 __all__ = [
-    "Picture",
-    "Scene",
-    "make_scene",
-    "save_animation",
-    "save_picture",
-]
+    "Picture", "Scene", "make_scene", "save_animation", "save_picture",
+]  # fmt: skip

@@ -16,12 +16,6 @@ from .vision.track import Track, TrackStatus
 from .vision.tracker import MarkerTracker
 
 __all__ = [
-    "HallCalibration",
-    "JointEstimator",
-    "MarkerBoard",
-    "MarkerTracker",
-    "PinholeCamera",
-    "ContactAligned",
-    "Track",
-    "TrackStatus",
-]
+    "HallCalibration", "JointEstimator", "MarkerBoard", "MarkerTracker", "PinholeCamera", "ContactAligned",
+    "Track", "TrackStatus",
+]  # fmt: skip

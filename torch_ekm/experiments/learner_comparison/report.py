@@ -75,7 +75,7 @@ def score_table(comparison: Comparison, stream: str) -> Table:
     note = f"On {one.used}, of which {n} are scored{f' in {parts} parts' if parts else ''}; "
     note += f"{one.x.shape[1]} inputs, {one.y.shape[1]} outputs. * best; below 1 a learner helps. "
     note += f"95 % intervals; {measure} / best is paired: above 1 where its interval is. "
-    note += "Median: of the absolute errors, blind to outliers; it decides where a hundredth of the "
+    note += "Median: of the absolute errors, insensitive to outliers; it decides where a hundredth of the "
     note += "rows makes more than half of the squared error. NLL: per sample and output. "
     note += "Time: one prediction and one update."
     return Table.of(f"scores_{stream}", f"{stream}: {one.about}", "learner", items, columns, note)

@@ -31,7 +31,7 @@ class Score:
     rms: Estimate
     """rms error over that of the model alone: below 1 the learner helps; 95 % block bootstrap."""
     median: Estimate
-    """The same of the median absolute errors: blind to outliers."""
+    """The same of the median absolute errors: insensitive to outliers."""
     nll: float
     """Negative log density per sample and output [nats]."""
     coverage: float

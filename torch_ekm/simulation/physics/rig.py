@@ -66,11 +66,7 @@ class Rig:
         self.remember, self.engine, self.native = remember, engine, native
         self.transmission = make_transmission(hand, parameters)
         self.servo = Servo(
-            hand.actuator_lower,
-            hand.actuator_upper,
-            parameters,
-            config.relative_to,
-            hand.actuator_backlash,
+            hand.actuator_lower, hand.actuator_upper, parameters, config.relative_to, hand.actuator_backlash
         )
         self.time = 0.0
         """[s] since the fingers closed."""
@@ -85,12 +81,7 @@ class Rig:
         p = self.parameters
         obj, step = true_object(self.obj, p), self.config.time_step
         self.scene = make_scene(
-            self.engine,
-            self.hand,
-            obj,
-            step,
-            p.contact_stiffness,
-            self.transmission if self.native else None,
+            self.engine, self.hand, obj, step, p.contact_stiffness, self.transmission if self.native else None
         )
         thumb, _ = opposing_pads(self.hand, self.config)
         pad = next(pad.link for pad in self.hand.pads if pad.name == thumb)
