@@ -49,8 +49,8 @@ def plant() -> SimulatedHand:
 @pytest.mark.parametrize(
     ("share", "seed", "most", "reason"),
     [
-        (None, 0, 6.0, StopReason.REACHED),
-        (0.0, 3, 6.0, StopReason.REACHED),
+        (None, 0, 8.0, StopReason.REACHED),
+        (0.0, 3, 8.0, StopReason.REACHED),
         ([1.0, 0, 1, 1, 1], 2, 6.0, StopReason.REACHED),
         (0.3, 2, 10.5, StopReason.STALLED),  # it waits for a grip that it never feels
     ],
@@ -92,6 +92,9 @@ def test_model_stands_in_where_no_pad_measures(situation) -> None:
     force[1] = torch.nan
     mixed = dataclasses.replace(at, fingertip_force=force).normal_force(model.kinematic)
     np.testing.assert_array_equal(mixed, [force[0], estimated[1], force[2]])
+    felt = dataclasses.replace(at, fingertip_force=seen.fingertip_force)
+    measured, blind = (GripForceTask().wanted(model.kinematic, each) for each in (felt, at))
+    assert blind == pytest.approx(measured + 2.0), "an estimate of a finger is wrong by 1 N"
     failed = dataclasses.replace(model.kinematic.forces, status=(ForceStatus.FAILED,))
     lost = dataclasses.replace(model, kinematic=dataclasses.replace(model.kinematic, forces=failed))
     assert GripForceTask().rows(lost, at) is NormalForceLimit().rows(lost, at) is None

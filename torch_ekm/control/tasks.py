@@ -17,6 +17,8 @@ from .situation import LinearizedModel, Situation, grip_shares
 if TYPE_CHECKING:
     from ..model import Linearization
 
+_UNMEASURED = 2.0  # [N]
+
 
 @runtime_checkable
 class Task(Protocol):
@@ -78,6 +80,9 @@ class GripForceTask:
     with the lever r of the contacts about the axis, with a ``1/safety`` of its friction::
 
         f = clip(safety/mu (m g/2 + turning_load r), least, most)
+
+    Where no pad measures, 2 N more are wanted than that: estimates of single fingers are wrong by 1 N, and
+    one that bears less than it seems to lets a heavy object turn off the axis.
     """
 
     force: float | None = None
@@ -111,7 +116,8 @@ class GripForceTask:
         turning = (row for row in seen.focus.matrix if bool(row[3:].any()))
         lever = max((contact_travel(row, arms) for row in turning), default=0)
         force = self.safety / mu * (seen.weight / 2 + self.turning_load * lever)
-        return min(max(force, self.least) + seen.tighter, self.most)
+        more = seen.tighter + (_UNMEASURED if seen.fingertip_force is None else 0.0)
+        return min(max(force, self.least) + more, self.most)
 
 
 @dataclass(frozen=True)
