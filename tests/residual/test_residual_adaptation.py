@@ -83,7 +83,8 @@ def of_kind(kind: type[Kernel], fleet: tuple[int, ...]) -> Kernel:
 @pytest.mark.parametrize("fleet", [(), (3,)])
 @pytest.mark.parametrize("kind", [SquaredExponential, Matern32, Matern52, DeepKernel])
 def test_kernels_carry_derivatives_back_as_autograd_does(kind, fleet):
-    kernel, generator = of_kind(kind, fleet), torch.Generator().manual_seed(0)
+    kernel: Any = of_kind(kind, fleet)
+    generator = torch.Generator().manual_seed(0)
     for p in kernel.parameters():
         p.data += 0.3 * torch.randn(p.shape, generator=generator, dtype=torch.float64)
     x, by, by_diagonal = (
