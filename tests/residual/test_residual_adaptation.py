@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from torch_ekm.residual import (
     DetectChanges,
     ForgettingFactor,
     LearnHyperparameters,
+    Matern32,
     Matern52,
     ProcessNoise,
     RobustWeight,
@@ -24,6 +26,7 @@ from torch_ekm.residual import (
     SquaredExponential,
     Standardize,
 )
+from torch_ekm.residual.kernels.kernel import Kernel
 from torch_ekm.residual.sparse_gp.prequential_loss import Queries
 from torch_ekm.residual.sparse_gp.replay import ReplayMemory
 
@@ -71,14 +74,42 @@ def loss_by_dense_algebra(gp: SparseOnlineGP, queries: Queries, robust: float | 
     return (density * on).sum(-1) / on.sum(-1)
 
 
+def of_kind(kind: type[Kernel], fleet: tuple[int, ...]) -> Kernel:
+    if kind is not DeepKernel:
+        return kind(4, batch_shape=fleet)
+    return DeepKernel(SquaredExponential(4, batch_shape=fleet), hidden=(8, 8), features=3)
+
+
+@pytest.mark.parametrize("fleet", [(), (3,)])
+@pytest.mark.parametrize("kind", [SquaredExponential, Matern32, Matern52, DeepKernel])
+def test_kernels_carry_derivatives_back_as_autograd_does(kind, fleet):
+    kernel: Any = of_kind(kind, fleet)
+    generator = torch.Generator().manual_seed(0)
+    for p in kernel.parameters():
+        p.data += 0.3 * torch.randn(p.shape, generator=generator, dtype=torch.float64)
+    x, by, by_diagonal = (
+        torch.randn(*shape, generator=generator, dtype=torch.float64)
+        for shape in ((3, 9, 4), (3, 5, 9), (3, 9))  # one kernel for three models, or one for each
+    )
+    ours: Any = kernel.with_pullback(x, 5)
+    theirs: Any = Kernel.with_pullback(kernel, x, 5)
+    by.diagonal(dim1=-2, dim2=-1).zero_()  # what says how k(x, x) counts is by_diagonal
+    both = zip(
+        (*ours[:2], *ours[2](by, by_diagonal)), (*theirs[:2], *theirs[2](by, by_diagonal)), strict=True
+    )
+    for mine, expected in both:
+        assert expected is not None
+        assert float(expected.abs().max()) > 1e-3
+        torch.testing.assert_close(mine, expected, atol=1e-12, rtol=1e-9)
+    assert not any(p.requires_grad for p in kernel.parameters())
+
+
 @pytest.mark.parametrize("fleet", [(), (3,)])
 @pytest.mark.parametrize("robust", [None, 3.0])
 @pytest.mark.parametrize("fading", [[], [ForgettingFactor(0.98)]])
 @pytest.mark.parametrize("kind", [SquaredExponential, Matern52, DeepKernel])
 def test_gradients_in_closed_form_are_those_of_autograd(kind, robust, fleet, fading):
-    kernel = SquaredExponential(4, batch_shape=fleet) if kind is DeepKernel else kind(4, batch_shape=fleet)
-    if kind is DeepKernel:
-        kernel = DeepKernel(kernel, hidden=(8, 8), features=3)
+    kernel = of_kind(kind, fleet)
     weight = [] if robust is None else [RobustWeight(robust)]
     gp = sogp(
         4, 2, capacity=20, kernel=kernel, noise_variance=0.05, refresh_every=16, batch_shape=fleet,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.learner_comparison.prequential import run_prequential
 from torch_ekm.residual import (
     LastResidual,
+    LearnHyperparameters,
     MixtureResidual,
     ProcessNoise,
     RecursiveLeastSquares,
@@ -286,15 +288,25 @@ def test_variance_and_slopes_are_those_of_all_experts() -> None:
     torch.testing.assert_close(law.variance, torch.minimum(expected, limit))
 
 
-def test_learners_rebuild_at_different_samples(monkeypatch) -> None:
-    g, rebuilt = default_learner(3, 2, capacity=8), []
+def test_learners_rebuild_and_descend_at_different_samples(monkeypatch) -> None:
+    g, t = default_learner(3, 2, capacity=8), 0
+    rebuilt: list[tuple[int, int]] = []
+    descended: list[tuple[int, int]] = []
     for i, member in enumerate(g.members):
-        gp = member.learner if isinstance(member, LastResidual) else member
-        monkeypatch.setattr(
-            gp, "refresh", lambda i=i, gp=gp, own=gp.refresh: (rebuilt.append((i, gp.n_samples)), own())
-        )
-    x = torch.randn(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    g.update(x, x[:, :2])
-    late = [n for _, n in rebuilt if 130 < n <= 200]
-    assert len(late) == len({*late}) >= 8
-    assert {n % 8 for n in late} == {0}
+        gp: Any = member.learner if isinstance(member, LastResidual) else member
+        learning = gp.part(LearnHyperparameters)
+        for of, name, seen in ((gp, "refresh", rebuilt), (learning, "descend", descended)):
+            own = getattr(of, name)
+
+            def call(*given, i=i, own=own, seen=seen, **options):
+                seen.append((t, i))
+                return own(*given, **options)
+
+            monkeypatch.setattr(of, name, call)
+    x = torch.randn(192, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for t in range(192):
+        g.update(x[t], x[t, :2])
+    late = {pair for pair in rebuilt + descended if pair[0] >= 128}
+    assert len(late) == 12  # four rebuilds in 32 samples, and halfway a step of the two deep ones
+    assert len({t for t, _ in late}) == 12
+    assert len({t for t, _ in rebuilt if t >= 128}) == 8

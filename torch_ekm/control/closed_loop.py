@@ -12,10 +12,12 @@ from collections.abc import Generator
 
 import torch
 
+from .._extras import require
 from ..enhanced.hand_figures import DescribedFigures, HandFigures
 from ..model import Linearization
 from ..plant import Observation, Plant, PlantStatus, ServoInverse
 from ..residual import UpdateReport
+from ..residual.sparse_gp.engine.loading import load_loops
 from ..typing import Tensor
 from .controller import LookAndMoveController
 from .decision import Decision, Expectation, StopReason
@@ -88,6 +90,9 @@ class ClosedLoop:
         self.controller, self.learn, self.decline = controller, learn, decline
         self.safety = Safety() if safety is None else safety
         self._stop = threading.Event()
+        require("qpsolvers")  # now, not within the first motion; so with the learner's loops
+        if learn and controller.enhanced is not None:
+            load_loops()
 
     def __enter__(self) -> ClosedLoop:
         return self

@@ -132,6 +132,7 @@ class HandFigures(ParameterFilter):
         self._is_play, self._unit = play.numpy(), Play(torch.full((int(play.sum()),), 2.0).double())
         self._play: PlayState | None = None  # in units of half the widths
         self._a = torch.empty(0)  # encoders at the last commit
+        self._solved: tuple[MotionEquations | None, Array, Motion | None] = None, np.empty(0), None
         self.hand, self._entries, self._kind = hand, tuple(found), kind.numpy()
         self._described = np.array([one.nominal for one in found])
         self._prior_std = np.array([one.prior for one in found])
@@ -224,11 +225,17 @@ class HandFigures(ParameterFilter):
         return torch.from_numpy(pull), 0.5 * (pulled - at_end * w), after
 
     def solve(self, equations: MotionEquations) -> Motion | None:
-        """J_m with the present figures; None where the grasp would buckle with them."""
+        """J_m with the present figures, kept until these change; None where the grasp would buckle so."""
+        of, mean, motion = self._solved
+        if of is equations and np.array_equal(mean, self.mean.numpy()):
+            return motion
         try:
-            return equations.solve(*self.present(equations.reduction.drives))
+            motion = equations.solve(*self.present(equations.reduction.drives))
         except GraspError:
             return None
+        if not motion.jacobian.requires_grad:  # a graph serves once
+            self._solved = equations, self.mean.numpy().copy(), motion
+        return motion
 
     def present(self, described: Drives) -> tuple[Float[Tensor, " n_q"], Drives]:
         """Change of the springs against the description [N m/rad] and the drives, both as known now."""

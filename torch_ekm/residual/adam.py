@@ -50,7 +50,7 @@ class Adam(nn.Module):
         else:
             first.copy_(torch.where(mask, b1 * first + (1 - b1) * gradient, first))
             second.copy_(torch.where(mask, b2 * second + (1 - b2) * gradient**2, second))
-        step = rate * first / (second.sqrt() + 1e-8)
+        step = (rate * first).div_(second.sqrt().add_(1e-8))
         p.sub_(step if mask is None else step.where(mask, 0.0))
 
     def reset(self) -> None:

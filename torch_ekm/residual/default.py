@@ -47,18 +47,19 @@ def default_learner(
         raise UnknownNameError("option", unknown[0], ("capacity", "output_offset", *_OPTIONS))
     d, m = in_features, out_features
     units = Standardize(output_offset=output_offset)
-    every = 32  # samples between two rebuilds, of one of the four after every eighth
+    every = 32  # samples between two rebuilds
     common: dict[str, Any] = {
         "capacity": capacity, "standardize": units, "refresh_every": every, **options
     }  # fmt: skip
-    late = [{**common, "refresh_offset": i * every // 4} for i in range(4)]
+    # no two rebuilds fall together, nor one and the step that a deep kernel takes halfway between its own
+    late = [{**common, "refresh_offset": offset} for offset in (0, 12, 6, 22)]
     fleet = fleet_options(options)
     wanders = [RobustWeight(3.0), ProcessNoise(0.003), LearnHyperparameters()]
     forgets = [RobustWeight(3.0), DetectChanges(), ForgettingFactor(0.99), LearnHyperparameters()]
     members = [
         DeepKernelSOGP(d, m, base=_long(d, fleet), parts=[RobustWeight(3.0), DetectChanges()], **late[0]),
-        DeepKernelSOGP(d, m, parts=[DetectChanges()], **late[2]),
-        SparseOnlineGP(d, m, parts=wanders, **late[1]),
+        DeepKernelSOGP(d, m, parts=[DetectChanges()], **late[1]),
+        SparseOnlineGP(d, m, parts=wanders, **late[2]),
         LastResidual(SparseOnlineGP(d + m, m, kernel=_long(d + m, fleet), parts=forgets, **late[3])),
     ]
     return MixtureResidual(members, levels=(0.0, 0.03, 0.1, 1.0), trends=(0.0, 0.5), **options)

@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import numpy as np
 import torch
 from torch import nn
 
-from ..typing import Float, Tensor
+from .._arrays import is_plain, namespace
+from ..typing import AnyArray, Float, Tensor
 
 BLOCK = 32  #: samples of a block; those before the first one is full count from the first on
 _TRIMMED = (8.0, 4.0)  # an eighth, or a fourth of a block
@@ -87,8 +91,8 @@ class RunningScale(nn.Module):
         row.fill_(1.0) if on is None else row.copy_(on.unsqueeze(-1))
         if place == BLOCK - 1:
             pooled = self.weight, self.centre, self.spread, self.large
-            for buffer, found in zip(pooled, self._pooled(), strict=True):
-                buffer.copy_(found)
+            for buffer, found in zip(pooled, _pooled(self), strict=True):
+                buffer.copy_(torch.as_tensor(found))
 
     def settle(self, *, young: bool = False, settled: float = 0.1) -> tuple[Tensor, Tensor]:
         """Adopt what was found; returns the change as ``(offset, ratio)``: new z = (old z + offset) * ratio.
@@ -97,7 +101,8 @@ class RunningScale(nn.Module):
             young: the block that is not yet full counts, and every change is worth new units.
             settled: relative change of a scale (of a shift in units of it) that is not worth new units.
         """
-        weight, centre, spread = self._pooled()[:3] if young else (self.weight, self.centre, self.spread)
+        found = _pooled(self) if young else (self.weight, self.centre, self.spread)
+        weight, centre, spread = map(torch.as_tensor, found[:3])
         floor = 100 * torch.finfo(spread.dtype).eps * centre.abs()
         usable = (spread > floor) & (spread > torch.finfo(spread.dtype).tiny)
         scale = torch.where(usable, spread, 1.0)
@@ -109,62 +114,6 @@ class RunningScale(nn.Module):
         self.shift.copy_(shift)
         self.scale.copy_(scale)
         return offset, ratio
-
-    def _pooled(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Weight, centre, spread and large samples of the past and the block together."""
-        count, centre, spread, large = self._of_block()
-        share, drop = _REST
-        past = self.spread.where((spread == 0) | (spread > ALIEN * self.spread), 0.0)
-        count = count * torch.where(spread < share * past, drop, 1.0)
-        before = self.weight.clamp_max(self.memory).where(past == self.spread, 0.0)
-        weight = before + count
-        part = count / weight.clamp_min(torch.finfo(count.dtype).tiny)
-        gap = (centre - self.centre).where(before > 0, 0.0)
-        most = torch.stack([gap.abs(), past, spread]).amax(0).clamp_min(torch.finfo(count.dtype).tiny)
-        # mean of roots: a block full of outliers does not decide either
-        inside = (1.0 - part) * (past / most).sqrt() + part * (spread / most).sqrt()
-        variance = inside.pow(4) + (1.0 - part) * part * (gap / most).square()
-        start = torch.where(before > 0, self.centre, centre)
-        return weight, start + part * gap, most * variance.sqrt(), large
-
-    def _of_block(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Number of samples, centre and spread of the block without its outliers; large ones up to now."""
-        on = self.block_on > 0
-        count = self.block_on.sum(-2)
-        last = (count.to(torch.int64) - 1).clamp_min(0)
-        ordered = torch.where(on, self.block, torch.inf).sort(dim=-2).values
-        middle = ordered.gather(-2, (last // 2).unsqueeze(-2).expand_as(ordered[..., :1, :]))
-        middle = middle.where(self.shifted * count.unsqueeze(-2) > 0, 0.0)
-        away = torch.where(on, self.block - middle, 0.0)
-        most = away.abs().amax(-2, keepdim=True).clamp_min(torch.finfo(away.dtype).tiny)
-        away = away / most
-        # those farthest out are left out of the measure by which they are cut
-        squares = torch.where(on, away.square(), -1.0).sort(dim=-2, descending=True).values
-        rank, n = torch.arange(BLOCK, device=away.device).unsqueeze(-1), count.unsqueeze(-2)
-        few, many = (
-            ((squares * kept).sum(-2) / kept.sum(-2).clamp_min(1.0)).sqrt().unsqueeze(-2)
-            for kept in ((rank >= (n / part).ceil()) & (squares >= 0) for part in _TRIMMED)
-        )
-        typical = torch.where(many > _SPIKES * few, many, few)
-        bound = torch.where(typical > 0, _CLIP * typical, 1.0)
-        large, bursts = self._in_company(away.abs() > bound, count)
-        bound = bound * torch.where(bursts, _BURST_CLIP, 1.0).unsqueeze(-2)
-        away = torch.minimum(torch.maximum(away, -bound), bound)
-        n = count.clamp_min(1.0)
-        mean = (away.sum(-2) / n) * self.shifted
-        spread = ((away - mean.unsqueeze(-2)).square() * self.block_on).sum(-2) / n
-        most, middle = most.squeeze(-2), middle.squeeze(-2)
-        return count.expand_as(mean), middle + most * mean, most * spread.sqrt(), large
-
-    def _in_company(self, large: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-        """Counts of large samples with those of this block, and whether they come in bursts."""
-        padded = torch.nn.functional.pad(large, (0, 0, 1, 1))
-        alone = large & ~(padded[..., :-2, :] | padded[..., 2:, :])
-        found = torch.stack([large.sum(-2), alone.sum(-2)], dim=-1).to(self.large)
-        counts = self.large * (1.0 - BLOCK / self.memory) + found
-        share = counts[..., 0] / (self.weight.clamp_max(self.memory) + count)
-        by_chance = (1.0 - share.clamp_max(1.0)).square()
-        return counts, counts[..., 1] + _DOUBT < _COMPANY * by_chance * (counts[..., 0] + _DOUBT)
 
     def reset(self) -> None:
         """Forget all samples: shift 0 and scale 1 again."""
@@ -178,3 +127,73 @@ class RunningScale(nn.Module):
             return f"features={self.scale.shape[-1]}"
         shift, scale = ([float(f"{v:.3g}") for v in b.flatten().tolist()] for b in (self.shift, self.scale))
         return f"shift={shift}, scale={scale}"
+
+
+def _pooled(scale: RunningScale) -> tuple[AnyArray, ...]:
+    """Weight, centre, spread and large samples of the past and the block together."""
+    names = "block", "block_on", "shifted", "weight", "centre", "spread", "large"
+    buffers = [scale.get_buffer(name) for name in names]
+    # in numpy, see _arrays, where these are numbers alone
+    kept = [t.numpy() for t in buffers] if is_plain(*buffers) else buffers
+    at = SimpleNamespace(memory=scale.memory, **dict(zip(names, kept, strict=True)))
+    xp, tiny = namespace(at.block), torch.finfo(scale.block.dtype).tiny
+    count, centre, spread, large = _of_block(at, tiny)
+    share, *drop = _REST[0], *(xp.asarray(value, dtype=xp.float32) for value in (_REST[1], 1.0))
+    past = xp.where((spread == 0) | (spread > ALIEN * at.spread), at.spread, 0.0)
+    count = count * xp.where(spread < share * past, *drop)
+    before = xp.where(past == at.spread, at.weight.clip(None, at.memory), 0.0)
+    weight = before + count
+    part = count / weight.clip(tiny)
+    gap = xp.where(before > 0, centre - at.centre, 0.0)
+    most = xp.maximum(xp.maximum(abs(gap), past), spread).clip(tiny)
+    # mean of roots: a block full of outliers does not decide either
+    inside = (1.0 - part) * (past / most) ** 0.5 + part * (spread / most) ** 0.5
+    variance = inside**4 + (1.0 - part) * part * (gap / most) ** 2
+    start = xp.where(before > 0, at.centre, centre)
+    return weight, start + part * gap, most * variance**0.5, large
+
+
+def _of_block(at: SimpleNamespace, tiny: float) -> tuple[AnyArray, ...]:
+    """Number of samples, centre and spread of the block without its outliers; large ones up to now."""
+    xp, on = namespace(at.block), at.block_on > 0
+    count = at.block_on.sum(-2)
+    n, rank = count[..., None, :], xp.arange(BLOCK, device=at.block.device)[:, None]
+    ordered = _sorted(xp.where(on, at.block, xp.inf))
+    middle = xp.where(rank == (n - 1.0).clip(0.0) // 2, ordered, 0.0).sum(-2)
+    middle = xp.where(at.shifted * count > 0, middle, 0.0)
+    away = xp.where(on, at.block - middle[..., None, :], 0.0)
+    most = xp.amax(abs(away), -2).clip(tiny)
+    away = away / most[..., None, :]
+    # those farthest out are left out of the measure by which they are cut
+    squares = _sorted(xp.where(on, away**2, xp.inf))
+    few, many = (
+        (xp.where(kept, squares, 0.0).sum(-2) / kept.sum(-2).clip(1)) ** 0.5
+        for kept in (rank < n - xp.ceil(n / part) for part in _TRIMMED)
+    )
+    typical = xp.where(many > _SPIKES * few, many, few)
+    bound = xp.where(typical > 0, _CLIP * typical, 1.0)
+    large, bursts = _in_company(at, abs(away) > bound[..., None, :], count)
+    bound = (bound * xp.where(bursts, _BURST_CLIP, 1.0))[..., None, :]
+    away = xp.minimum(xp.maximum(away, -bound), bound)
+    n = count.clip(1.0)
+    mean = (away.sum(-2) / n) * at.shifted
+    spread = ((away - mean[..., None, :]) ** 2 * at.block_on).sum(-2) / n
+    return count + 0 * mean, middle + most * mean, most * spread**0.5, large
+
+
+def _in_company(at: SimpleNamespace, large: AnyArray, count: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Counts of large samples with those of this block, and whether they come in bursts."""
+    xp = namespace(large)
+    near = xp.zeros_like(large)
+    near[..., 1:, :] = large[..., :-1, :]
+    near[..., :-1, :] |= large[..., 1:, :]
+    found = xp.stack([large.sum(-2), (large & ~near).sum(-2)], -1)
+    counts = at.large * (1.0 - BLOCK / at.memory) + found
+    share = counts[..., 0] / (at.weight.clip(None, at.memory) + count).clip(1.0)
+    by_chance = (1.0 - share.clip(None, 1.0)) ** 2
+    return counts, counts[..., 1] + _DOUBT < _COMPANY * by_chance * (counts[..., 0] + _DOUBT)
+
+
+def _sorted(x: AnyArray) -> AnyArray:
+    """Each column in order."""
+    return x.sort(-2).values if isinstance(x, Tensor) else np.sort(x, -2)

@@ -9,7 +9,8 @@ learner's own adaptation moves them (a plain optimiser would leave its caches st
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
 from torch import nn
@@ -17,6 +18,9 @@ from torch import nn
 from ..._recorded import Recorded
 from ...exceptions import ParameterError
 from ...typing import Float, Tensor
+
+#: derivatives by :meth:`~torch.nn.Module.parameters` from those by ``k(x_i, x_j)`` and ``k(x_i, x_i)``
+Pullback = Callable[[Tensor, Tensor], Sequence[Tensor | None]]
 
 
 class Kernel(Recorded, nn.Module, ABC):
@@ -40,6 +44,23 @@ class Kernel(Recorded, nn.Module, ABC):
         """d k(x, x)/dx of one point per model; 0 here, where the same prior variance holds everywhere."""
         return torch.zeros_like(x)
 
+    def with_pullback(
+        self, x: Float[Tensor, "*batch n d"], rows: int
+    ) -> tuple[Float[Tensor, "*batch rows n"], Float[Tensor, "*batch n"], Pullback]:
+        """``k(x_i, x_j)`` of the first points with all, ``k(x_i, x_i)``, and how derivatives go back.
+
+        Here by autograd; a kernel with a closed form overrides it.
+        """
+        with _differentiable(self):
+            found = self(x[..., :rows, :], x), self.diagonal_of_set(x)
+
+        def pullback(by_matrix: Tensor, by_diagonal: Tensor) -> Sequence[Tensor | None]:
+            with _differentiable(self):
+                by, parameters = [by_matrix, by_diagonal], list(self.parameters())
+                return torch.autograd.grad(found, parameters, by, allow_unused=True)
+
+        return found[0].detach(), found[1].detach(), pullback
+
     def vector(self, x: Float[Tensor, "*batch d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
         """k(x, z_j) for one query per model, ``(*batch, m)``."""
         return self(x.unsqueeze(-2), z).squeeze(-2)
@@ -51,6 +72,17 @@ class Kernel(Recorded, nn.Module, ABC):
     def shift_invariant(self, in_features: int) -> list[bool]:
         """Columns of x whose origin does not matter; a normaliser may centre these and no others."""
         return [False] * in_features
+
+
+@contextmanager
+def _differentiable(kernel: Kernel) -> Iterator[None]:
+    """Inside, the kernel's parameters carry a graph."""
+    try:
+        kernel.requires_grad_(True)
+        with torch.enable_grad():
+            yield
+    finally:
+        kernel.requires_grad_(False)
 
 
 def log_parameter(

@@ -102,10 +102,9 @@ class LearnHyperparameters(Part):
         if self.past is not None:
             self.past.offer(x, y, weight)
         if due or ((place + 1) % self.stride == 0 and place + self.stride < self.window):
-            if due and self.steps > 1:
+            if moved := due and self.steps > 1:
                 self._move(learner)
-                self.loss.state.rebuild(learner.kernel, learner.shared_noise())
-            self.descend(learner)
+            self.descend(learner, moved=moved)
         if due:
             self._move(learner)
         return False
@@ -147,29 +146,33 @@ class LearnHyperparameters(Part):
     def _theta(self, learner: Host) -> dict[str, Tensor]:
         return {**dict(learner.kernel.named_parameters()), "log_noise": learner.log_noise_variance}
 
-    def descend(self, learner: Host) -> None:
+    def descend(self, learner: Host, *, moved: bool = False) -> None:
         """A step of Adam on the loss, model by model; one without samples or finite gradient stays as it is.
 
-        The parameters move at the next rebuild: until then the caches are those of the old ones.
+        The parameters move at the next rebuild: until then the caches are those of the old ones. ``moved``:
+        those of the past state are to be made again.
         """
         kernel, log_noise, parameters = learner.kernel, learner.log_noise_variance, self._theta(learner)
-        _, gradients = self.loss.with_gradients(kernel, log_noise, self.queries(learner))
+        _, gradients = self.loss.with_gradients(kernel, log_noise, self.queries(learner), anew=moved)
         on = (self.window_on.sum(-1) > 0).to(self.n_steps.dtype)
         self.n_steps += on
         n = self.n_steps.clamp_min(1.0)
-        correction = self.adam.correction(n) * _shrink(n)
-        noise = on * parameters["log_noise"].mean(-1).exp().clamp_max(1.0)
+        correction, decay = self.adam.correction(n) * _shrink(n), _NETWORK_DECAY * _shrink(n)
+        decay = decay * on * parameters["log_noise"].mean(-1).exp().clamp_max(1.0)
+        alone = on.is_cpu and not on.dim() and bool(on)  # one model, which needs no masks
+        if alone := alone and all(g is None or bool(g.isfinite().all()) for g in gradients):
+            correction, decay = float(correction), float(decay)
         for i, ((name, p), gradient) in enumerate(zip(parameters.items(), gradients, strict=True)):
             if gradient is None:
                 continue
             logarithm = name.split(".")[-1].startswith("log_")
             shared = self.shared_kernel and name != "log_noise"
-            good = gradient.isfinite() & (_spread(on, p, shared) > 0)
+            good = None if alone else gradient.isfinite() & (_spread(on, p, shared) > 0)
             rate = (self.rate if logarithm else _NETWORK_RATE) * _spread(correction, p, shared)
             move = self.get_buffer(f"move_{i}")
             if not logarithm:
-                move.sub_(_NETWORK_DECAY * _spread(noise * _shrink(n), p, shared) * p)
-            self.adam.move(i, move, gradient.where(good, 0.0), rate, good)
+                move.sub_(_spread(decay, p, shared) * p)
+            self.adam.move(i, move, gradient if good is None else gradient.where(good, 0.0), rate, good)
 
     def _move(self, learner: Host) -> None:
         """The parameters as the steps since the last rebuild want them."""
@@ -186,8 +189,10 @@ def _shrink(n: Tensor) -> Tensor:
     return (1.0 + n / 30.0).rsqrt().clamp_min(0.1)
 
 
-def _spread(value: Float[Tensor, "*batch"], like: Tensor, shared: bool) -> Tensor:
+def _spread(value: Float[Tensor, "*batch"] | float, like: Tensor, shared: bool) -> Tensor | float:
     """A value per model against a parameter; one shared by the fleet takes the mean."""
+    if not isinstance(value, Tensor):
+        return value
     if shared or like.shape[: value.dim()] != value.shape:
         return value.mean()
     return value[(..., *(None,) * (like.dim() - value.dim()))]

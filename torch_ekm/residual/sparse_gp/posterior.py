@@ -98,16 +98,15 @@ class SparsePosterior(nn.Module):
 
     def gram(self, kernel: Kernel) -> Float[Tensor, "*batch slots slots"]:
         """K(X, X) with ``jitter k**`` on the diagonal; the identity at free slots. Differentiable."""
-        return self.as_gram(kernel(self.basis, self.basis), kernel)
+        return self.as_gram(kernel(self.basis, self.basis), kernel.diagonal_of_set(self.basis))
 
     def as_gram(
-        self, K: Float[Tensor, "*batch slots slots"], kernel: Kernel
+        self, K: Float[Tensor, "*batch slots slots"], diagonal: Float[Tensor, "*batch slots"]
     ) -> Float[Tensor, "*batch slots slots"]:
-        """See :meth:`gram`; K is the kernel between the basis and itself."""
+        """See :meth:`gram`; K is the kernel between the basis and itself, which has that diagonal."""
         on = self.active.unsqueeze(-1)
         K = K * (on * on.mT)
-        diagonal = kernel.diagonal_of_set(self.basis) * (1.0 + self.jitter)
-        diagonal = torch.where(self.active > 0, diagonal, 1.0)
+        diagonal = torch.where(self.active > 0, diagonal * (1.0 + self.jitter), 1.0)
         return (0.5 * (K + K.mT)).diagonal_scatter(diagonal, dim1=-2, dim2=-1)
 
     def drift(self, kernel: Kernel, s2: Float[Tensor, "*batch"]) -> float:
@@ -143,7 +142,7 @@ class SparsePosterior(nn.Module):
         Q, C, alpha = posterior_from_natural(K, self.precision / s2, self.information / s2)
         # a free slot has K = 1, so Q = 1 there: it must be 0 like the rest of its row
         self.covariance.copy_(C)
-        self.moments[..., 1, :, :] = Q * (on * on.mT)
+        torch.mul(Q, on * on.mT, out=self.moments.select(-3, 1))
         self.alpha.copy_(alpha)
 
 
@@ -164,11 +163,12 @@ def posterior_from_natural(
     """
     L = torch.linalg.cholesky_ex(K.double())[0]
     W, h = W.double(), h.double()
+    A = L.mT @ W @ L
+    A.diagonal(dim1=-2, dim2=-1).add_(1.0)
+    La = torch.linalg.cholesky_ex(A)[0]  # which reads its lower half alone
     eye = torch.eye(K.shape[-1], dtype=L.dtype, device=L.device)
-    A = eye + L.mT @ W @ L
-    La = torch.linalg.cholesky_ex(0.5 * (A + A.mT))[0]
     L_inv = torch.linalg.solve_triangular(L, eye.expand_as(L), upper=False)
     G = torch.linalg.solve_triangular(La, L_inv, upper=False)
     Q = L_inv.mT @ L_inv
     alpha = G.mT @ torch.linalg.solve_triangular(La, L.mT @ h, upper=False)
-    return Q.to(K.dtype), (G.mT @ G - Q).to(K.dtype), alpha.to(K.dtype)
+    return Q.to(K.dtype), (G.mT @ G).sub_(Q).to(K.dtype), alpha.to(K.dtype)

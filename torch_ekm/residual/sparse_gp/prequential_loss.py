@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
@@ -77,37 +75,34 @@ class PrequentialLoss(nn.Module):
             old.copy_(new)
 
     def with_gradients(
-        self, kernel: Kernel, log_noise: Tensor, queries: Queries
+        self, kernel: Kernel, log_noise: Tensor, queries: Queries, *, anew: bool = False
     ) -> tuple[Tensor, list[Tensor | None]]:
         """Loss of each model ``(*batch_shape)`` [nats per sample and output], derivatives of their sum.
 
         The derivatives are those by ``[*kernel.parameters(), log_noise]``, at the values by which the old
-        state's caches were made.
+        state's caches were made, or, with ``anew``, are made here.
         """
-        with _differentiable(kernel):
-            K, k, prior = outcome = self._covariances(kernel, queries.x)
-            K_, k_ = K.detach(), k.detach()
-            C, Q, alpha = self.state.covariance, self.state.moments[..., 1, :, :], self.state.alpha
-            E, F = C @ k_, Q @ k_
-            kE, u, mean = (k_ * E).sum(-2), (k_ * F).sum(-2), k_.mT @ alpha
-            loss, by = self._density(mean, prior.detach() + kE, u + kE, u, log_noise, queries)
+        M, alpha = self.state.basis.shape[-2], self.state.alpha
+        both, diagonal, pullback = kernel.with_pullback(torch.cat([self.state.basis, queries.x], dim=-2), M)
+        K, k = self.state.as_gram(both[..., :M], diagonal[..., :M]), both[..., M:]
+        if anew:
+            self.state.rebuild_from(K, log_noise.mean(-1).exp())
+        E, F = (self.state.moments[..., :2, :, :] @ k.unsqueeze(-3)).unbind(-3)
+        kE, u, mean = (k * E).sum(-2), (k * F).sum(-2), k.mT @ alpha
+        loss, by = self._density(mean, diagonal[..., M:] + kE, u + kE, u, log_noise, queries)
 
-            E_g, F_g = E * (by.variance + by.p).unsqueeze(-2), F * (by.p + by.u).unsqueeze(-2)
-            by_K = (E @ by.mean) @ alpha.mT + E_g @ E.mT - F_g @ F.mT
-            by_k = alpha @ by.mean.mT + 2.0 * (E_g + F_g)
-            by_s2 = (by.mean * (mean + E.mT @ (K_ @ alpha))).sum((-1, -2))
-            by_s2 = by_s2 + (E_g * (k_ + K_ @ E)).sum((-1, -2))
-            by_noise = by.log_noise - by_s2.unsqueeze(-1) / log_noise.shape[-1]
-            parameters = list(kernel.parameters())
-            by_kernel = torch.autograd.grad(outcome, parameters, [by_K, by_k, by.variance], allow_unused=True)
+        E_g, F_g = E * (by.variance + by.p).unsqueeze(-2), F * (by.p + by.u).unsqueeze(-2)
+        by_K = (E @ by.mean) @ alpha.mT + E_g @ E.mT
+        by_s2 = (by.mean * mean).sum((-1, -2)) + (E_g * k).sum((-1, -2)) + (by_K * K).sum((-1, -2))
+        by_noise = by.log_noise - by_s2.unsqueeze(-1) / log_noise.shape[-1]
+        by_K -= F_g @ F.mT
+        by_k = alpha @ by.mean.mT + 2.0 * (E_g + F_g)
+        # rows of free slots are 0 in all of these; the diagonal of K has the jitter on it
+        by_own = by_K.diagonal(dim1=-2, dim2=-1)
+        by_diagonal = torch.cat([by_own * (1.0 + self.state.jitter), by.variance], dim=-1)
+        by_own.zero_()
+        by_kernel = pullback(torch.cat([by_K, by_k], dim=-1), by_diagonal)
         return loss, [*by_kernel, by_noise]
-
-    def _covariances(self, kernel: Kernel, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """K at the old basis, k and k** of the queries, from one evaluation of the kernel."""
-        basis, M = self.state.basis, self.state.basis.shape[-2]
-        both = kernel(basis, torch.cat([basis, x], dim=-2))
-        k = both[..., M:] * self.state.active.unsqueeze(-1)
-        return self.state.as_gram(both[..., :M], kernel), k, kernel.diagonal_of_set(x)
 
     def _density(
         self, mean: Tensor, v: Tensor, p: Tensor, u: Tensor, log_noise: Tensor, queries: Queries
@@ -141,14 +136,3 @@ class PrequentialLoss(nn.Module):
         by_log_noise = (by_variance * noise).sum(-2) + by_s2 / m
         by_p = by_left * (c - 1.0) + by_exact - by_most * most
         return loss, _Slopes(-pull * factor, by_left, by_p, by_most, by_log_noise)
-
-
-@contextmanager
-def _differentiable(kernel: Kernel) -> Iterator[None]:
-    """Inside, the kernel's parameters carry a graph."""
-    try:
-        kernel.requires_grad_(True)
-        with torch.enable_grad():
-            yield
-    finally:
-        kernel.requires_grad_(False)

@@ -184,12 +184,11 @@ class SparseOnlineGP(Host):
                     return self.absorb(x, y, None)
         return super().update(x, y, mask)
 
+    @torch.no_grad()
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         on = None if mask is None else mask.to(x.dtype)
-        if self._preparing:
-            with torch.no_grad():
-                for part in self._preparing:
-                    part.before_update(self, x, y, on)
+        for part in self._preparing:
+            part.before_update(self, x, y, on)
         done = self.engine.absorb(self, x, y, on)
         n = self.n_samples + 1
         if self._rebuilding or self.device.type != "cpu":  # on a GPU looking would mean waiting
@@ -199,9 +198,8 @@ class SparseOnlineGP(Host):
             anew = n % every == 0 and self._is_stale(n)
         if self._noting:
             sample = Sample(x, y, on, done.innovation, done.variance, done.report)
-            with torch.no_grad():
-                for part in self._noting:
-                    anew |= part.after_update(self, sample)
+            for part in self._noting:
+                anew |= part.after_update(self, sample)
         self.pending.add_(1.0 if on is None else on)  # += would register the buffer again
         self.n_samples = n
         if anew:
