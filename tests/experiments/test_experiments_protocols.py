@@ -26,6 +26,7 @@ from torch_ekm.experiments.protocols.generalize import (
 from torch_ekm.experiments.protocols.online import Online
 from torch_ekm.experiments.records import NotGrasped, TrialRecord
 from torch_ekm.experiments.runner import Bench
+from torch_ekm.simulation import preset
 
 ONLINE = Online(trials=2, angle_range_deg=(4.0, 5.0), dislocations=(2,), tendons_replaced=2)
 
@@ -196,6 +197,15 @@ def test_a_long_step_of_a_true_model_ends_where_it_was_to() -> None:
     step = bench.long_step(0, 0, 5.0)
     assert isinstance(step, TrialRecord)
     assert step.true_error_deg < 0.3
+
+
+def test_an_object_that_is_larger_than_described_is_held_and_not_modelled() -> None:
+    """The model sees a gap where the pads press: the object is not lost, its description is wrong."""
+    setting = Setting(engine="mujoco", plant=preset("nominal").replace(object_scale=1.15))
+    turned = Bench(setting, "can", "E-KM").trial(0, 0, 9.0)
+    assert isinstance(turned, TrialRecord)
+    assert (turned.reason, turned.steps) == ("unstable grasp", 0)
+    assert "check the object's size" in turned.message
 
 
 def test_a_new_object_begins_with_the_hand_of_another(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -187,8 +187,12 @@ class LookAndMoveController:
         try:
             lin = self._linearize(state, a, fingertip_force)
         except GraspError as failure:
-            lost = isinstance(failure, NoContactError)
-            return self._none(StopReason.OBJECT_LOST if lost else StopReason.UNSTABLE_GRASP, failure, focused)
+            if not isinstance(failure, NoContactError):
+                return self._none(StopReason.UNSTABLE_GRASP, failure, focused)
+            if self._previous is not None or fingertip_force is None:
+                return self._none(StopReason.OBJECT_LOST, failure, focused)
+            held = NoContactError(f"{failure}; but pads measure forces: check the object's size and pose")
+            return self._none(StopReason.UNSTABLE_GRASP, held, focused)
 
         travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
         desired, share = self._ask(focused, travel, fingertip_force is not None)

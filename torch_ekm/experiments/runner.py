@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -24,7 +25,7 @@ from ..control import (
 from ..description import ObjectDescription
 from ..enhanced import EnhancedModel, GraspEncoding
 from ..enhanced.grasp_learner import SMALL_ACTION_VARIANCE
-from ..exceptions import EquilibriumError, GraspError
+from ..exceptions import EquilibriumError, GraspError, NoContactError
 from ..foresight import BlindPose
 from ..kinematics import GraspState
 from ..model import KinematicModel
@@ -114,7 +115,8 @@ class Bench:
                 continue
             self._ever_held = True
             if self.learns and self.enhanced is None:
-                self._prepare_learner(start)
+                with contextlib.suppress(NoContactError):  # by the model alone: the loop ends with it
+                    self._prepare_learner(start)
             return start
         self._failed += 1
         return None
