@@ -233,7 +233,7 @@ def _is_turn(focus: FocusedPose) -> bool:
 
 def _model_hand(controller: LookAndMoveController, seen: Observation) -> ModelHand:
     model = controller.kinematic if controller.enhanced is None else controller.enhanced
-    return ModelHand(model, seen.state, seen.a, seen.fingertip_force)
+    return ModelHand(model, seen.state, seen.a, seen.fingertip_force, controller.forces)
 
 
 def _end(

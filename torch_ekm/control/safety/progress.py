@@ -39,6 +39,8 @@ class Progress:
     """The largest turn of the object that no motion explains, of those that were believed."""
     surprise = ""
     """The first reading that was believed though no motion explains it."""
+    off = False
+    """A sign was that the object has turned off the focus."""
     alarms = 0
     """How often a sign of a loss was heeded."""
 
@@ -85,6 +87,7 @@ class Progress:
         turned, bearing = self._off_rotation(seen), _bearing(decision, self.safety.caution.link_gap)
         self._bearing = bearing if self._bearing is None else self._bearing
         if turned > self._off_allowed:
+            self.off = True
             return f"the object has turned {math.degrees(turned):.1f} deg off the focus"
         return "" if bearing <= self._bearing else _bears(min(bearing - self._bearing))
 
