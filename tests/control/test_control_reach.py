@@ -157,7 +157,8 @@ def test_forces_answer_as_they_were_learned_to(grasp) -> None:
     target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=10)
     da = controller.decide(seen.state, seen.a, target, seen.fingertip_force).delta_a
     change, learned = (
-        ModelHand(*begins, forces).command(da).fingertip_force - seen.fingertip_force for forces in (None, known)
+        ModelHand(*begins, forces).command(da).fingertip_force - seen.fingertip_force
+        for forces in (None, known)
     )
     assert float(change.abs().max()) > 0.2
     torch.testing.assert_close(learned, 0.25 * change)
