@@ -152,12 +152,12 @@ def test_forces_answer_as_they_were_learned_to(grasp) -> None:
     seen = plant.reset(0)
     known = ForceSensitivity(len(plant.hand.pads), plant.hand.n_a)
     known.theta[:, 0] = -0.75
-    begins = controller.kinematic, seen.state, seen.a, seen.fingertip_force
     controller.reset()
     target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=10)
     da = controller.decide(seen.state, seen.a, target, seen.fingertip_force).delta_a
+    model, force = controller.kinematic, seen.fingertip_force
     change, learned = (
-        ModelHand(*begins, forces).command(da).fingertip_force - seen.fingertip_force
+        ModelHand(model, seen.state, seen.a, force, forces).command(da).fingertip_force - force
         for forces in (None, known)
     )
     assert float(change.abs().max()) > 0.2
