@@ -31,7 +31,6 @@ from .safety.checked_plant import CheckedPlant, PlantFailedError
 from .safety.progress import Progress
 from .safety.watch import Watch
 
-NORETRY = False
 _KNOWN = 15  # motions from which the figures of a hand are learned
 _GRIP_SHARE = 0.5  # of a motion that only grips: too little for the pace to grow
 
@@ -227,14 +226,14 @@ class ClosedLoop:
                 return Stop(over.reason, seen, over.message)
             seen, decision, sign, seconds = self._decide(seen, progress, watch)
             if sign and progress.way and decision.status is not StopReason.OBJECT_LOST:
-                progress.alarm(seen)
+                progress.alarms += 1
                 watch.forget()
                 seen, clear = yield from self._go_back(seen, decision, progress, watch)
                 if progress.halt is not None:
                     continue
                 if progress.lost(seen):
                     return Stop(StopReason.OBJECT_LOST, seen, sign)
-                if not clear or (progress.off and NORETRY) or progress.alarms > self.safety.caution.retreats:
+                if not clear or progress.alarms > self.safety.caution.retreats:
                     return Stop(StopReason.GIVEN_UP, seen, sign + progress.surprise + watch.suspects(seen))
                 self.controller.tighter += self.safety.caution.tighten
                 self.controller.pace.restart()
@@ -295,12 +294,14 @@ class ClosedLoop:
             back = -progress.way.pop()
             step = self._move(seen, self.controller.retreat(decision, back), progress, watch)
             yield step
-            seen = step.after
+            before, seen = seen, step.after
             if seen.status is PlantStatus.LOST or progress.halt is not None:
                 break
             seen, decision, sign, _ = self._decide(seen, progress, watch)
             if not sign:
                 return seen, True
+            if progress.stays_off(before, seen):
+                break
         return seen, False
 
     def _return_to_best(
