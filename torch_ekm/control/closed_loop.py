@@ -298,10 +298,8 @@ class ClosedLoop:
             if seen.status is PlantStatus.LOST or progress.halt is not None:
                 break
             seen, decision, sign, _ = self._decide(seen, progress, watch)
-            if not sign:
-                return seen, True
-            if progress.stays_off(before, seen):
-                break
+            if not sign or progress.stays_off(before, seen):
+                return seen, not sign
         return seen, False
 
     def _return_to_best(
@@ -374,8 +372,7 @@ class ClosedLoop:
         felt: ForceSurprise | None,
         fades: bool,
     ) -> UpdateReport | None:
-        enhanced = self.controller.enhanced
-        if enhanced is None:
+        if (enhanced := self.controller.enhanced) is None:
             return None
         if not self.knowledge.servo.learns:  # then the dead zones are g's to learn
             moved = decision.delta_a
