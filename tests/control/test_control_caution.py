@@ -164,6 +164,9 @@ def test_a_step_is_cut_in_proportion_to_what_is_predicted_to_go_wrong(held) -> N
     # contacts that slide no farther than they may need no margin
     far = [bound.share(lin, slides, predicted, at, 1.0, lambda x=x: x * bound.slide) for x in (0.9, 1.1)]
     assert far == [1.0, at_once[1]]
+    away = dataclasses.replace(at, error=2.0 * DEG * off)  # off its axis it may slide half as far
+    far = [bound.share(lin, slides, predicted, away, 1.0, lambda x=x: x * bound.slide) for x in (0.45, 0.55)]
+    assert far == [1.0, at_once[1]]
     for turned, room in ((1.0, 1.0), (2.0, 0.5), (3.0, 0.0)):
         away = dataclasses.replace(at, error=turned * DEG * off)
         share = at_once[0] + room * (at_once[2] - at_once[0])

@@ -109,7 +109,7 @@ class StepBound:
     """Margin that may be missing where friction and weight are equal [N]."""
     slide: float = 1e-3
     """Margins are forecast as if contacts stuck, and may then be missing by newtons. A step in which none
-    slides farther than this, by the model's contacts, is not cut for them [m]."""
+    slides farther than r of this, by the model's contacts, is not cut for them [m]."""
     even: float = 0.85
     """Of the mean of the fingers that oppose the strongest one, what each of them should bear."""
     least: float = 0.35
@@ -154,7 +154,7 @@ class StepBound:
         spare = self.creep * (1 + max(asked - 1.0, 0.0) * room) * friction / max(seen.weight, 1e-3)
         before, after = lin.margins.numpy(), lin.margins_after(delta_a).numpy()
         missing = after < -spare
-        if missing.any() and (slides is None or slides() > self.slide):
+        if missing.any() and (slides is None or slides() > self.slide * room):
             allowed = (before[missing] + spare) / (before[missing] - after[missing])
             phi = min(phi, float(np.clip(allowed, 0.0, 1.0).min()))
         return phi
