@@ -161,12 +161,6 @@ def test_a_step_is_cut_in_proportion_to_what_is_predicted_to_go_wrong(held) -> N
     slides *= 40.0 / float(slides.square().sum())  # [N] that the margin falls by
     at_once = [bound.share(lin, slides, predicted, at, asked) for asked in (0.5, 1.0, 2.0)]
     assert at_once[0] == at_once[1] < at_once[2] < 1.0  # what was predicted well may slide by more
-    # contacts that slide no farther than they may need no margin
-    far = [bound.share(lin, slides, predicted, at, 1.0, lambda x=x: x * bound.slide) for x in (0.9, 1.1)]
-    assert far == [1.0, at_once[1]]
-    away = dataclasses.replace(at, error=2.0 * DEG * off)  # off its axis it may slide half as far
-    far = [bound.share(lin, slides, predicted, away, 1.0, lambda x=x: x * bound.slide) for x in (0.45, 0.55)]
-    assert far == [1.0, at_once[1]]
     for turned, room in ((1.0, 1.0), (2.0, 0.5), (3.0, 0.0)):
         away = dataclasses.replace(at, error=turned * DEG * off)
         share = at_once[0] + room * (at_once[2] - at_once[0])
@@ -204,25 +198,6 @@ def test_a_grip_that_is_too_weak_is_tightened_and_not_turned(held) -> None:
     assert 0.0 < decision.share < 0.1
     change = decision.linearization.normal_force_sensitivity @ decision.delta_a
     assert float(change[0]) > 0.3  # [N]
-
-
-def test_a_step_is_judged_by_how_far_the_contacts_of_the_model_slide_in_it(held) -> None:
-    plant, _, seen = held
-
-    class Asks(Pace):
-        def cut(self, lin, delta_a, predicted, seen, share, slides) -> float:
-            self.far = slides()
-            return 1.0
-
-    model = KinematicModel(plant.hand, dataclasses.replace(plant.object, friction=0.25))
-    controller = LookAndMoveController(model, plant.rotation_axis, pace=Asks(adapts=False))
-    target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0)
-    decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
-    step = model.step(seen.state, decision.delta_a, fingertip_force=seen.fingertip_force)
-    assert controller.pace.far == step.farthest_slide > 0
-    away = torch.zeros(plant.hand.n_a, dtype=torch.float64)
-    away[plant.hand.actuator_names.index("middle_proximal")] = -0.3
-    assert controller._slide(decision.linearization, away, seen.fingertip_force) == math.inf
 
 
 def test_the_bound_shortens_the_step_that_is_made(held) -> None:

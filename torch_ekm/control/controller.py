@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +14,7 @@ from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
 from ..exceptions import EKMError, GraspError, NoContactError, ParameterError, SolverError
 from ..kinematics import GraspState
-from ..model import ContactMode, ModelStatus
+from ..model import ModelStatus
 from ..typing import Float, Tensor
 from .decision import Decision, Expectation, Grip, StopReason
 from .focus import FocusedPose, PoseTarget
@@ -210,8 +208,7 @@ class LookAndMoveController:
         try:
             start = LinearizedModel.about(a.new_zeros(hand.n_a), lin, self.enhanced)
             da, predicted, problem, solution = self._solve(lin, seen, start)
-            slides = partial(self._slide, lin, da, fingertip_force)
-            phi = self.pace.cut(lin, da, predicted, seen, share, slides)
+            phi = self.pace.cut(lin, da, predicted, seen, share)
             if phi < 1:
                 desired, share = phi * desired, phi * share
                 seen = dataclasses.replace(seen, desired=desired)
@@ -226,15 +223,6 @@ class LookAndMoveController:
         return Decision(
             da, StopReason.RUNNING, desired, predicted, nominal, share, limited, slack, lin, grip=grip
         )
-
-    def _slide(self, lin: Linearization, da: Tensor, fingertip_force: Tensor | None) -> float:
-        """How far a contact slides in a motion [m]; infinite where a pad opens, or the grasp ends."""
-        try:
-            step = self.kinematic.step(lin.state, da, fingertip_force=fingertip_force)
-        except GraspError:
-            return math.inf
-        opens = any(step.modes[pad] is ContactMode.OPEN for pad in lin.contacts.finger)
-        return math.inf if opens else step.farthest_slide
 
     def _grip(self, lin: Linearization, seen: Situation) -> Grip | None:
         """What the fingers bear and should bear; None where nothing is known or asked of it."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -107,16 +106,13 @@ class StepBound:
     """[m]"""
     creep: float = 1.0
     """Margin that may be missing where friction and weight are equal [N]."""
-    slide: float = 1e-3
-    """Margins are forecast as if contacts stuck, and may then be missing by newtons. A step in which none
-    slides farther than r of this, by the model's contacts, is not cut for them [m]."""
     even: float = 0.85
     """Of the mean of the fingers that oppose the strongest one, what each of them should bear."""
     least: float = 0.35
     """Infinite: steps are cut by a measured grip alone."""
 
     def __post_init__(self) -> None:
-        for name in ("off_rotation", "off_travel", "creep", "slide", "even", "least"):
+        for name in ("off_rotation", "off_travel", "creep", "even", "least"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "greater than 0")
 
@@ -127,14 +123,12 @@ class StepBound:
         predicted: Float[Tensor, " n_s"],
         seen: Situation,
         asked: float = 1.0,
-        slides: Callable[[], float] | None = None,
     ) -> float:
         """phi of a step.
 
         Args:
             predicted: increment that the corrected model predicts for ``delta_a``.
             asked: p, size of the step in units of the largest at pace 1.
-            slides: how far a contact slides in it [m], asked for where margins are missing; None: unknown.
         """
         off = (seen.focus.off_matrix @ predicted[-6:]).numpy()
         translation = seen.focus.off_translation.numpy()
@@ -154,7 +148,7 @@ class StepBound:
         spare = self.creep * (1 + max(asked - 1.0, 0.0) * room) * friction / max(seen.weight, 1e-3)
         before, after = lin.margins.numpy(), lin.margins_after(delta_a).numpy()
         missing = after < -spare
-        if missing.any() and (slides is None or slides() > self.slide * room):
+        if missing.any():
             allowed = (before[missing] + spare) / (before[missing] - after[missing])
             phi = min(phi, float(np.clip(allowed, 0.0, 1.0).min()))
         return phi
@@ -303,18 +297,16 @@ class Pace(nn.Module):
         predicted: Float[Tensor, " n_s"],
         seen: Situation,
         share: float,
-        slides: Callable[[], float],
     ) -> float:
         """phi, see :class:`StepBound`: which part of the step that was asked for is made.
 
         Args:
             predicted: increment that the corrected model predicts for ``delta_a``.
             share: of the largest step that was asked for.
-            slides: how far a contact slides in the step [m], infinite where the grasp ends.
         """
         bound, asked = self.options.bound, share * self.factor
         grip = bound.grip_share(lin, seen)
-        phi = min(bound.share(lin, delta_a, predicted, seen, asked, slides), grip)
+        phi = min(bound.share(lin, delta_a, predicted, seen, asked), grip)
         phi = max(phi, min(1.0, bound.least / max(asked, 1e-9)))
         return phi if seen.fingertip_force is None else min(phi, grip)  # an estimate is no reason to wait
 
