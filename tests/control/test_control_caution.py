@@ -64,7 +64,7 @@ def slide(held, off: list[float], caution: Caution):
     return loop.run(PoseTarget.turned(seen.state, axis, degrees=20.0)), sliding, loop
 
 
-CAREFUL = Caution(off_rotation=1.0 * DEG, off_further=0.5 * DEG, retreats=1, tighten=0.5)
+CAREFUL = Caution(off_rotation=1.0 * DEG, retreats=1, tighten=0.5)
 
 
 def test_a_sign_of_a_loss_sends_the_hand_back_and_a_second_one_ends_the_turn(held) -> None:
@@ -80,22 +80,28 @@ def test_a_sign_of_a_loss_sends_the_hand_back_and_a_second_one_ends_the_turn(hel
 
 
 def test_the_way_back_is_gone_as_far_as_it_helps(held) -> None:
-    done, sliding, _ = slide(held, [0.0, 0.0, 0.0, 1.2, 1.8, 0.9, 0.0], CAREFUL)
+    done, sliding, _ = slide(held, [0.0, 0.0, 0.0, 1.8, 1.2, 0.9, 0.0], CAREFUL)
     assert [step.retreat for step in done.steps][:5] == [False, False, False, True, True]
     torch.testing.assert_close(sliding.commands[3], -sliding.commands[2])
     torch.testing.assert_close(sliding.commands[4], -sliding.commands[1])
 
 
 def test_an_object_that_is_lost_on_the_way_back_is_not_called_given_up(held) -> None:
-    done, _, _ = slide(held, [0.0, 0.0, 1.2, 1.8, 31.0, 31.0], CAREFUL)
+    done, _, _ = slide(held, [0.0, 0.0, 1.8, 1.2, 31.0, 31.0], CAREFUL)
     assert done.lost
     assert "off the focus" in done.stop.message
 
 
 def test_where_going_back_does_not_help_the_turn_is_given_up_at_once(held) -> None:
-    done, _, _ = slide(held, [0.0, 0.0, 1.2, 1.8, 1.9, 1.9], CAREFUL)
+    done, _, _ = slide(held, [0.0, 0.0, 1.9, 1.8, 1.7, 1.7], CAREFUL)
     assert done.reason is Reason.GIVEN_UP
     assert [step.retreat for step in done.steps] == [False, False, True, True]
+
+
+def test_an_object_that_slid_is_not_turned_on(held) -> None:
+    done, _, _ = slide(held, [0.0, 0.0, 1.2, 1.3, 0.0, 0.0], CAREFUL)
+    assert done.reason is Reason.GIVEN_UP
+    assert [step.retreat for step in done.steps] == [False, False, True]
 
 
 def test_a_refused_state_is_looked_at_again(held) -> None:

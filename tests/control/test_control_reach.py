@@ -12,6 +12,7 @@ import torch
 from torch_ekm.control import (
     ClosedLoop,
     FocusedPose,
+    ForceSensitivity,
     LookAndMoveController,
     ModelHand,
     PoseTarget,
@@ -144,6 +145,33 @@ def test_a_target_out_of_reach_is_declined_and_the_object_stays(grasp) -> None:
     plant.reset(0)  # a model that follows nothing of what was learned is not asked
     loop = ClosedLoop(plant, plain, knowledge=loop.knowledge)
     assert next(loop.steps(far)).after.status is PlantStatus.HELD
+
+
+def test_forces_answer_as_they_were_learned_to(grasp) -> None:
+    plant, _, controller = grasp
+    seen = plant.reset(0)
+    known = ForceSensitivity(len(plant.hand.pads), plant.hand.n_a)
+    known.theta[:, 0] = -0.75
+    controller.reset()
+    target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=10)
+    da = controller.decide(seen.state, seen.a, target, seen.fingertip_force).delta_a
+    model, force = controller.kinematic, seen.fingertip_force
+    change, learned = (
+        ModelHand(model, seen.state, seen.a, force, forces).command(da).fingertip_force - force
+        for forces in (None, known)
+    )
+    assert float(change.abs().max()) > 0.2
+    torch.testing.assert_close(learned, 0.25 * change)
+
+
+def test_the_pace_of_the_rehearsal_grows_as_that_of_the_loop(grasp) -> None:
+    plant, _, _ = grasp
+    seen = plant.reset(0)
+    ekm = EnhancedModel.for_grasp(KinematicModel(plant.hand, plant.object), seen.state)
+    controller = LookAndMoveController(ekm, plant.rotation_axis)
+    controller.pace.restart()
+    slowest = controller.pace.factor * controller.pace.options.limiting.step
+    assert len(ClosedLoop(plant, controller).reach(limit=10 * DEG).path) < 10 * DEG / slowest
 
 
 def test_what_cannot_be_asked_is_refused(grasp) -> None:

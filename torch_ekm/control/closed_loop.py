@@ -84,12 +84,13 @@ class ClosedLoop:
                 knowledge.figures = followed
         knowledge.check(hand)
         controller.follow(knowledge.figures)
+        controller.forces = None if controller.enhanced is None else knowledge.forces
         self._figures = DescribedFigures() if controller.enhanced is None else knowledge.figures
         self._checked = CheckedPlant(plant, hand)
         self.plant, self.knowledge = ServoInverse(self._checked, hand, knowledge.servo), knowledge
         self.controller, self.learn, self.decline = controller, learn, decline
         self.safety = Safety() if safety is None else safety
-        self._stop = threading.Event()
+        self._stop, self._rehearses = threading.Event(), False
         require("qpsolvers")  # now, not within the first motion; so with the learner's loops
         if learn and controller.enhanced is not None:
             load_loops()
@@ -115,9 +116,8 @@ class ClosedLoop:
             self.plant.command(still)
 
     def reach(self, *, sign: int = 1, limit: float = math.radians(90)) -> Reach:
-        """``max |angle|`` of this loop on a :class:`ModelHand`: its programs, limits and signs of a loss, and
-        a controller that uses the description, with f + g in place of the plant. Nothing moves, and nothing
-        is learned.
+        """``max |angle|`` of this loop on a :class:`ModelHand`: its programs, limits, pace and signs of a
+        loss, with f + g in place of the plant. Nothing moves, and nothing is learned.
 
         It is as good as the model's contacts and forces, and leaves noise out. ::
 
@@ -145,13 +145,13 @@ class ClosedLoop:
         return reachability(self.controller, self.safety.caution, self.plant.observe(), target)
 
     def _rehearsal(self, hand: Plant, target: PoseTarget) -> Generator[Step, None, Stop]:
-        """On a hand that does what was learned, with a controller that uses the description alone: its
-        errors stand for those of any model in states that were never visited."""
+        """On a hand that does what was learned and has no play; the pace alone adapts."""
         controller = copy.copy(self.controller)
         controller.pace = copy.deepcopy(controller.pace)
         known = HandKnowledge.of(controller.kinematic.hand, learns=False, adapts=False)
-        controller.enhanced, controller.kinematic = None, controller.kinematic.with_figures(known.figures)
+        known.figures, known.forces = self.knowledge.figures, copy.deepcopy(self.knowledge.forces)
         loop = ClosedLoop(hand, controller, knowledge=known, safety=self.safety, learn=False, decline=False)
+        loop._figures, loop._rehearses = DescribedFigures(), True
         return loop.steps(target)
 
     def run(self, target: PoseTarget) -> Manipulation:
@@ -200,7 +200,6 @@ class ClosedLoop:
         self.controller.reset()
         self.knowledge.forces.begin()
         self._figures.begin(seen.a)
-        self.controller.forces = None if self.controller.enhanced is None else self.knowledge.forces
         progress = Progress(self.safety, target, self.controller.focus, seen)
         progress.halt = first.halt
         known = self.controller.enhanced is not None and int(self.knowledge.figures.count) >= _KNOWN
@@ -227,7 +226,7 @@ class ClosedLoop:
                 return Stop(over.reason, seen, over.message)
             seen, decision, sign, seconds = self._decide(seen, progress, watch)
             if sign and progress.way and decision.status is not StopReason.OBJECT_LOST:
-                progress.alarm(seen)
+                progress.alarms += 1
                 watch.forget()
                 seen, clear = yield from self._go_back(seen, decision, progress, watch)
                 if progress.halt is not None:
@@ -295,12 +294,12 @@ class ClosedLoop:
             back = -progress.way.pop()
             step = self._move(seen, self.controller.retreat(decision, back), progress, watch)
             yield step
-            seen = step.after
+            before, seen = seen, step.after
             if seen.status is PlantStatus.LOST or progress.halt is not None:
                 break
             seen, decision, sign, _ = self._decide(seen, progress, watch)
-            if not sign:
-                return seen, True
+            if not sign or progress.stays_off(before, seen):
+                return seen, not sign
         return seen, False
 
     def _return_to_best(
@@ -340,7 +339,7 @@ class ClosedLoop:
             felt = watch.grip.surprise(lin, seen, expected.moved, after)
             # what a guard objects to may be a faulty pad
             fades = decision.share > 0 and not verdict.note and watch.grip.follow(decision, felt)
-            if verdict.teaches and self.learn:
+            if verdict.teaches and (self.learn or self._rehearses):
                 report = self._learn(seen, decision, lin, moved, increment, expected, felt, fades)
             if turns and decision.share > 0 and self.controller.enhanced is not None:
                 # moved otherwise than predicted, it slides, or turns out of the grip
@@ -373,16 +372,17 @@ class ClosedLoop:
         felt: ForceSurprise | None,
         fades: bool,
     ) -> UpdateReport | None:
-        enhanced = self.controller.enhanced
-        if enhanced is None:
+        if (enhanced := self.controller.enhanced) is None:
             return None
         if not self.knowledge.servo.learns:  # then the dead zones are g's to learn
             moved = decision.delta_a
             expected = self._expect(lin, moved)
-        if felt is not None:
-            self._learn_forces(lin, expected.moved, felt)
         rho = math.inf if fades else self._disagreement(lin, ds, expected, felt)
         self.controller.pace.judge(rho, decision.share)
+        if not self.learn:
+            return None
+        if felt is not None:
+            self._learn_forces(lin, expected.moved, felt)
         self._figures.learn(lin, moved, ds)
         pull = self._figures.pulled(moved)
         nominal = self.controller.kinematic.followed(lin).step(pull)  # g learns what they leave

@@ -15,6 +15,7 @@ from ..kinematics import GraspState
 from ..model import ContactMotion, KinematicModel, Linearization
 from ..plant import Observation, PlantStatus
 from ..typing import Float, Tensor
+from .force_sensitivity import ForceSensitivity
 
 _NEAR_END = math.radians(0.1)
 
@@ -30,6 +31,7 @@ class ModelHand:
     Args:
         model: predicts the motions.
         state, a, fingertip_force: where it begins, as measured [rad, m, N].
+        forces: how the pads' forces answer, as learned; None: as the model says.
     """
 
     failure: str
@@ -41,7 +43,9 @@ class ModelHand:
         state: GraspState,
         a: Float[Tensor, " n_a"],
         fingertip_force: Float[Tensor, " n_pads"] | None = None,
+        forces: ForceSensitivity | None = None,
     ) -> None:
+        self._forces = forces
         self.kinematic, self._enhanced = kinematic_and_enhanced(model)
         self.hand = hand = self.kinematic.hand
         self._start = state, a, fingertip_force
@@ -57,14 +61,7 @@ class ModelHand:
         self._linearization: Linearization | None = None
         self._way = self.a.new_zeros(self.hand.n_a)
         self.force = self.a.new_zeros(len(self.hand.pads)) if force is None else force
-        try:
-            contacts = self.kinematic.touching(self.state)
-            lin = self.kinematic.linearize(self.state, contacts, fingertip_force=force, on_unstable="flag")
-            if not lin.forces.solved:
-                self.failure = str(lin.doubts[0])
-            self._motion, self._linearization = ContactMotion(self.kinematic, lin), lin
-        except GraspError as error:
-            self.failure = str(error)
+        self._begin(force)
         return self.observe()
 
     def observe(self) -> Observation:
@@ -107,6 +104,17 @@ class ModelHand:
         ends = (self.a <= self._a_min + _NEAR_END) | (self.a >= self._a_max - _NEAR_END)
         return [self.hand.actuator_names[i] for i in torch.nonzero(ends).flatten().tolist()]
 
+    def _begin(self, force: Tensor | None) -> None:
+        """Go on from the state as from a reading with these normal forces [N]."""
+        try:
+            contacts = self.kinematic.touching(self.state)
+            lin = self.kinematic.linearize(self.state, contacts, fingertip_force=force, on_unstable="flag")
+            if not lin.forces.solved:
+                self.failure = str(lin.doubts[0])
+            self._motion, self._linearization = ContactMotion(self.kinematic, lin), lin
+        except GraspError as error:
+            self.failure = str(error)
+
     def _move(self, w: Tensor, motion: ContactMotion) -> None:
         correction = None
         if self._enhanced is not None:
@@ -122,4 +130,11 @@ class ModelHand:
         self._motion, self._linearization, self._way = motion, None, w
         self.state, self.a = motion.state, self.a + w
         pads = [pad.name for pad in self.hand.pads]
-        self.force = self.force.new_tensor([step.normal.get(pad, 0.0) for pad in pads])
+        before, force = self.force, self.force.new_tensor([step.normal.get(pad, 0.0) for pad in pads])
+        self.force = force
+        if self._forces is not None:
+            least = self.kinematic.options.forces.normal_std
+            bear = (before > least) & (force > least)
+            learned = before + self._forces.scale * (force - before) + self._forces.correction @ w
+            self.force = force.where(~bear, learned.clamp(min=least))
+            self._begin(self.force)

@@ -166,7 +166,7 @@ def reachability(
         reason = (
             f"motors at the ends of their ranges leave {100 * left:.0f} % of the way; choose a nearer target"
         )
-    elif off > caution.off_rotation + caution.off_further:
+    elif off > 1.5 * caution.off_rotation:
         reason = f"the object turns {off / _DEG:.0f} deg off the focus on the way; choose a nearer target"
     return Reachability(gains, reason)
 
@@ -233,7 +233,7 @@ def _is_turn(focus: FocusedPose) -> bool:
 
 def _model_hand(controller: LookAndMoveController, seen: Observation) -> ModelHand:
     model = controller.kinematic if controller.enhanced is None else controller.enhanced
-    return ModelHand(model, seen.state, seen.a, seen.fingertip_force)
+    return ModelHand(model, seen.state, seen.a, seen.fingertip_force, controller.forces)
 
 
 def _end(

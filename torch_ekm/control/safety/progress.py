@@ -52,7 +52,6 @@ class Progress:
         self._best = self.errors[0], 0  # the smallest of them, and the motions until then
         self._start = seen.state
         self._judged: tuple[Observation, tuple[float, float]] | None = None
-        self._off_allowed = safety.caution.off_rotation
         self._bearing: set[str] | None = None  # links without a pad that bear on the object at the start
 
     def over(self, seen: Observation, stopped: bool) -> Objection | None:
@@ -84,7 +83,7 @@ class Progress:
             return decision.message
         turned, bearing = self._off_rotation(seen), _bearing(decision, self.safety.caution.link_gap)
         self._bearing = bearing if self._bearing is None else self._bearing
-        if turned > self._off_allowed:
+        if turned > self.safety.caution.off_rotation:
             return f"the object has turned {math.degrees(turned):.1f} deg off the focus"
         return "" if bearing <= self._bearing else _bears(min(bearing - self._bearing))
 
@@ -108,11 +107,10 @@ class Progress:
         found += [d.message for d in lin.doubts if d.kind is ModelStatus.SENSORS_DISAGREE]
         return "; ".join(found)
 
-    def alarm(self, seen: Observation) -> None:
-        """A sign is heeded: an object that has slid off the focus may stay there, and turn a little more."""
-        self.alarms += 1
-        further = self._off_rotation(seen) + self.safety.caution.off_further
-        self._off_allowed = max(self._off_allowed, further)
+    def stays_off(self, before: Observation, seen: Observation) -> bool:
+        """The object has turned off the focus, and a motion back has not turned it back."""
+        off = self._off_rotation(seen)
+        return off > max(self.safety.caution.off_rotation, self._off_rotation(before))
 
     def add(self, after: Observation, blind: bool) -> None:
         """One more motion.

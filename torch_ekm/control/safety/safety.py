@@ -81,15 +81,13 @@ class Caution:
     the hand goes back along the way that was come, motion by motion, until the signs are gone, for these
     states are known to hold. It grips by ``tighten`` more and tries again at a smaller pace, ``retreats``
     times; at the next sign it goes back once more and gives up. Where going back does not help, it gives up
-    at once.
+    at once: an object that has slid off the focus does not come back, and turned on it slips out.
     """
 
     looks: int = 2
     """Further readings before a sign is believed."""
     off_rotation: float = 8 * _DEG
     """[rad]"""
-    off_further: float = 4 * _DEG
-    """An object that has slid does not come back: after a sign it may turn so much further [rad]."""
     link_gap: float = 0.2e-3
     """A link without a pad as near to the object as this counts, unless it was so near at the start [m]."""
     retreats: int = 1
