@@ -127,8 +127,9 @@ def test_the_grip_follows_from_weight_friction_and_lever(held) -> None:
     plant, model, seen = held
     lin = model.linearize(seen.state)
     task, axis = GripForceTask(least=1.0), LookAndMoveController(model, plant.rotation_axis).focus
+    force = seen.fingertip_force
     at = Situation(
-        plant.hand, axis, seen.state, seen.a, None, torch.zeros(6), torch.zeros(1), weight=0.08 * 9.81
+        plant.hand, axis, seen.state, seen.a, force, torch.zeros(6), torch.zeros(1), weight=0.08 * 9.81
     )
     arm = torch.linalg.cross(plant.rotation_axis.expand(3, 3), lin.contacts.point - seen.position)
     lever = float(torch.linalg.vector_norm(arm, dim=-1).max())

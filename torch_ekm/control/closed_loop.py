@@ -45,11 +45,10 @@ class ClosedLoop:
                 print(step.increment)
 
     What the plant raises, and Ctrl-C, end the manipulation with a :class:`Stop` that has it as its cause: no
-    step is lost. Whatever ends it early (these, another exception, a ``break``), the hand is commanded to
-    hold its position. At the end of a ``with`` block the plant is closed, after it holds if the block failed.
+    step is lost. Whatever ends it early, a ``break`` too, the hand is commanded to hold its position. At the
+    end of a ``with`` block the plant is closed.
 
-    Commands go through a :class:`~torch_ekm.plant.ServoInverse`, and the model learns from what the encoders
-    did; with servos that are taken for ideal both are the increments that were decided.
+    Commands go through a :class:`~torch_ekm.plant.ServoInverse`; the model learns from what the encoders did.
 
     Args:
         plant: with a grasped object (already reset).
@@ -111,15 +110,12 @@ class ClosedLoop:
 
     def hold(self) -> None:
         """Command the hand to stay where it is; what the plant raises here is ignored."""
-        still = torch.zeros(self.controller.kinematic.hand.n_a, dtype=torch.float64)
         with contextlib.suppress(Exception):
-            self.plant.command(still)
+            self.plant.command(torch.zeros(self.controller.kinematic.hand.n_a, dtype=torch.float64))
 
     def reach(self, *, sign: int = 1, limit: float = math.radians(90)) -> Reach:
         """``max |angle|`` of this loop on a :class:`ModelHand`: its programs, limits, pace and signs of a
-        loss, with f + g in place of the plant. Nothing moves, and nothing is learned.
-
-        It is as good as the model's contacts and forces, and leaves noise out. ::
+        loss, with f + g in place of the plant, without noise. Nothing moves, and nothing is learned. ::
 
             reach = loop.reach()
             loop.run(PoseTarget.turned(plant.observe().state, axis, reach.safe / DEG))
@@ -129,8 +125,7 @@ class ClosedLoop:
             limit: farthest angle that is tried [rad].
 
         Raises:
-            ParameterError: a focus that is no single rotation, a sign that is none, or an angle outside 0 to
-                170 deg.
+            ParameterError: no single rotation in focus, a sign that is none, an angle outside 0 to 170 deg.
             GraspError: the model refuses the grasp as it is.
         """
         return follow_to_the_end(self._rehearsal, self.controller, self.plant.observe(), sign, limit)
@@ -398,8 +393,8 @@ class ClosedLoop:
     def _learn_forces(self, lin: Linearization, moved: Tensor, felt: ForceSurprise) -> None:
         """Pads that touched and measured before and after teach how their forces answer."""
         forces, pads = self.knowledge.forces, list(felt.pads)
-        change = torch.full((len(forces.scale),), torch.nan, dtype=torch.float64)
-        change[pads] = (felt.after - felt.before).where(~felt.surprise.isnan(), torch.nan)
         described = torch.zeros_like(forces.correction)
+        change = torch.full_like(described[:, 0], torch.nan)
+        change[pads] = (felt.after - felt.before).where(~felt.surprise.isnan(), torch.nan)
         described[pads] = lin.described_normal_sensitivity
         forces.update(moved, change, described)
