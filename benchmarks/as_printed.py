@@ -59,7 +59,7 @@ from torch_ekm.simulation import PRESETS, preset
 WARM_UP = 3
 CAPACITY = 60  # basis vectors; the paper gives no figure
 #: Nothing is undone, tightened, gated or watched for; readings that cannot be are still refused.
-NO_CAUTION = Caution(0, math.inf, 0.0, -math.inf, 0, 0, 0.0, 0.0, 0)
+NO_CAUTION = Caution(0, math.inf, -math.inf, 0, 0, 0.0, 0.0, 0)
 NO_GUARDS = Guards(gate=math.inf, force_ceiling=math.inf, stuck_command=math.inf, wrong_way=10**6)
 
 
