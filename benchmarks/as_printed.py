@@ -170,7 +170,7 @@ SYSTEMS: dict[str, tuple[type[Generalize], str, Callable[[Setting], Setting]]] =
 }
 #: What is run together.
 GROUPS = {
-    "all": [name for name in SYSTEMS if "misprinted" not in name],
+    "all": [name for name in SYSTEMS if "misprinted" not in name and "without" not in name],
     "fingertips": ["E-KM", "E-KM without fingertips"],
     "misprinted": [name for name in SYSTEMS if "printed" in name],
 }

@@ -103,5 +103,5 @@ def test_quick_run_prints_its_verdict(tmp_path: Path, monkeypatch, capsys) -> No
     as_printed.main(["--quick", "--seeds", "6:7", "--jobs", "1", "--out", str(tmp_path)])
     line = capsys.readouterr().out.splitlines()[-1]
     assert line.startswith("KM, as printed ")
-    assert "E-KM without fingertips" in line
+    assert "E-KM, with tasks " in line
     assert (tmp_path / "index.html").exists()
