@@ -267,10 +267,13 @@ def test_grasp_that_is_gone_is_a_status(grasp) -> None:
     _, _, seen, state = grasp
     away = GraspState(state.q, state.position + 0.5, state.rotation)
     target = PoseTarget(state.position, state.rotation)
-    decision = controller(grasp).decide(away, seen.a, target, seen.fingertip_force)
+    decision = controller(grasp).decide(away, seen.a, target, 0.0 * seen.fingertip_force)
     assert decision.status is StopReason.OBJECT_LOST
     assert float(decision.delta_a.abs().max()) == 0
     assert "touches" in decision.message
+    decision = controller(grasp).decide(away, seen.a, target, seen.fingertip_force)
+    assert decision.status is StopReason.UNSTABLE_GRASP
+    assert "check the object's size and pose" in decision.message
 
 
 def test_bad_observations_are_refused(grasp) -> None:

@@ -124,10 +124,10 @@ def test_a_cable_that_is_pulled_is_a_typed_error(yarp, tmp_path) -> None:
 
 
 def test_garbled_messages_send_no_axis_beyond_its_limits(yarp, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("torch_ekm.drivers.yarp._TIMEOUT", 0.1)
+    monkeypatch.setattr("torch_ekm.drivers.yarp._TIMEOUT", 0.3)
     draw = random.Random(1)
     plant, failed, moved = YarpPlant(wiring(tmp_path, yarp.server, HALL, ANALOG)), 0, 0
-    yarp.spoil = Spoiler(0.1, seed=1)
+    yarp.spoil = Spoiler(0.05, seed=1)
     for _ in range(25):
         while yarp.motors.moving:
             time.sleep(0.005)
