@@ -42,8 +42,24 @@ except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
 
 __all__ = [
-    "DeepKernelSOGP", "DetectChanges", "EKMError", "EnhancedModel", "ForgettingFactor",
-    "LearnHyperparameters", "MixtureResidual", "ProcessNoise", "RecursiveLeastSquares", "ResidualLearner",
-    "RobustWeight", "SparseOnlineGP", "Standardize", "ZeroResidual", "__version__", "default_learner",
-    "exceptions", "load", "save", "warm_up",
-]  # fmt: skip
+    "DeepKernelSOGP",
+    "DetectChanges",
+    "EKMError",
+    "EnhancedModel",
+    "ForgettingFactor",
+    "LearnHyperparameters",
+    "MixtureResidual",
+    "ProcessNoise",
+    "RecursiveLeastSquares",
+    "ResidualLearner",
+    "RobustWeight",
+    "SparseOnlineGP",
+    "Standardize",
+    "ZeroResidual",
+    "__version__",
+    "default_learner",
+    "exceptions",
+    "load",
+    "save",
+    "warm_up",
+]

@@ -18,7 +18,16 @@ from .grasp_analysis import analyse
 from .signed_distance import signed_distance
 
 __all__ = [
-    "ContactDetector", "ContactKinematics", "ContactSet", "ForceOptions", "ForceStatus", "analyse",
-    "constraint_matrix", "contact_forces", "contact_kinematics", "grasp_matrix", "hand_jacobian",
+    "ContactDetector",
+    "ContactKinematics",
+    "ContactSet",
+    "ForceOptions",
+    "ForceStatus",
+    "analyse",
+    "constraint_matrix",
+    "contact_forces",
+    "contact_kinematics",
+    "grasp_matrix",
+    "hand_jacobian",
     "signed_distance",
-]  # fmt: skip
+]

@@ -10,6 +10,15 @@ from .template import write_template
 from .transmission_file import write_transmission
 
 __all__ = [
-    "Actuator", "ContactPad", "HandDescription", "ObjectDescription", "Shape", "list_hands", "list_objects",
-    "load_hand", "load_object", "write_template", "write_transmission",
-]  # fmt: skip
+    "Actuator",
+    "ContactPad",
+    "HandDescription",
+    "ObjectDescription",
+    "Shape",
+    "list_hands",
+    "list_objects",
+    "load_hand",
+    "load_object",
+    "write_template",
+    "write_transmission",
+]

@@ -14,6 +14,17 @@ from .wiring import Channel, Limits, Wiring
 from .yarp import YarpPlant
 
 __all__ = [
-    "BusReading", "Channel", "DynamixelPlant", "HandDriver", "Limits", "MarkerPose", "Ros2Plant", "RosPose",
-    "Sighting", "WithPose", "Wiring", "YarpPlant", "open_driver",
-]  # fmt: skip
+    "BusReading",
+    "Channel",
+    "DynamixelPlant",
+    "HandDriver",
+    "Limits",
+    "MarkerPose",
+    "Ros2Plant",
+    "RosPose",
+    "Sighting",
+    "WithPose",
+    "Wiring",
+    "YarpPlant",
+    "open_driver",
+]

@@ -10,5 +10,11 @@ from .parameter_filter import ParameterFilter
 from .saving import load, save
 
 __all__ = [
-    "AdaptiveModel", "EnhancedModel", "GraspEncoding", "ParameterFilter", "grasp_learner", "load", "save",
-]  # fmt: skip
+    "AdaptiveModel",
+    "EnhancedModel",
+    "GraspEncoding",
+    "ParameterFilter",
+    "grasp_learner",
+    "load",
+    "save",
+]

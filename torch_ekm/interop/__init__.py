@@ -39,6 +39,12 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
-    "OnlineRegressor", "RiverResidual", "as_river", "log_to_lerobot", "log_to_mcap", "log_to_rerun",
-    "read_bag", "to_casadi",
-]  # fmt: skip
+    "OnlineRegressor",
+    "RiverResidual",
+    "as_river",
+    "log_to_lerobot",
+    "log_to_mcap",
+    "log_to_rerun",
+    "read_bag",
+    "to_casadi",
+]

@@ -14,6 +14,17 @@ from .verification import verify_log
 from .wrapper import PlantWrapper
 
 __all__ = [
-    "FramesAtRest", "Observation", "Plant", "PlantStatus", "PlantWrapper", "RecordingPlant",
-    "ReplayedPlant", "ServoInverse", "Stamps", "Trajectory", "TrialLog", "Truth", "verify_log",
-]  # fmt: skip
+    "FramesAtRest",
+    "Observation",
+    "Plant",
+    "PlantStatus",
+    "PlantWrapper",
+    "RecordingPlant",
+    "ReplayedPlant",
+    "ServoInverse",
+    "Stamps",
+    "Trajectory",
+    "TrialLog",
+    "Truth",
+    "verify_log",
+]

@@ -7,5 +7,9 @@ from .scene import Scene, make_scene
 from .web import save_animation
 
 __all__ = [
-    "Picture", "Scene", "make_scene", "save_animation", "save_picture",
-]  # fmt: skip
+    "Picture",
+    "Scene",
+    "make_scene",
+    "save_animation",
+    "save_picture",
+]

@@ -16,6 +16,12 @@ from .vision.track import Track, TrackStatus
 from .vision.tracker import MarkerTracker
 
 __all__ = [
-    "HallCalibration", "JointEstimator", "MarkerBoard", "MarkerTracker", "PinholeCamera", "ContactAligned",
-    "Track", "TrackStatus",
-]  # fmt: skip
+    "HallCalibration",
+    "JointEstimator",
+    "MarkerBoard",
+    "MarkerTracker",
+    "PinholeCamera",
+    "ContactAligned",
+    "Track",
+    "TrackStatus",
+]

@@ -13,6 +13,17 @@ from .sensed_plant import SensedPlant
 from .simulated_hand import SimulatedHand
 
 __all__ = [
-    "ENGINES", "PlantChange", "DisturbedPlant", "HallSensors", "ImageQuality", "PlantConfig",
-    "PlantParameters", "PRESETS", "SensedPlant", "SimulatedCamera", "SimulatedHand", "Tug", "preset",
-]  # fmt: skip
+    "ENGINES",
+    "PlantChange",
+    "DisturbedPlant",
+    "HallSensors",
+    "ImageQuality",
+    "PlantConfig",
+    "PlantParameters",
+    "PRESETS",
+    "SensedPlant",
+    "SimulatedCamera",
+    "SimulatedHand",
+    "Tug",
+    "preset",
+]
