@@ -6,18 +6,16 @@ from typing import Any
 
 import gpytorch
 import torch
+from peer import Peer
 from torch import nn
-from torch.distributions import Normal
 
 from torch_ekm._checks import check_count
-from torch_ekm.residual.base import SingleLearner
-from torch_ekm.residual.report import UpdateReport
 from torch_ekm.typing import Tensor
 
 _RATE = 0.01  # of Adam
 
 
-class GPyTorchSVGP(SingleLearner):
+class GPyTorchSVGP(Peer):
     """GPyTorch's variational GP on inducing points, an Adam step on each sample and a replay.
 
     Independent outputs share inducing points that start as the first distinct samples. The bound's data
@@ -75,9 +73,11 @@ class GPyTorchSVGP(SingleLearner):
         parameters = [*model.parameters(), *likelihood.parameters()]
         return model, likelihood, torch.optim.Adam(parameters, lr=_RATE)
 
-    def _learn(self, place: int) -> None:
-        """The sample at this place of the memory is new."""
+    def _learn(self, x: Tensor, y: Tensor) -> None:
         model, likelihood, optimizer = self._peer
+        place = self._count % len(self.inputs)
+        self.inputs[place], self.targets[place] = x, y
+        self._count += 1
         objective = gpytorch.mlls.VariationalELBO(likelihood, model, num_data=self._count)
         generator = torch.Generator().manual_seed(self._count - 1)
         model.train()
@@ -96,38 +96,15 @@ class GPyTorchSVGP(SingleLearner):
         model.eval()
         optimizer.load_state_dict(optimizer.state_dict())  # casts its averages
 
-    def reset(self) -> None:
-        """An empty memory and a new model."""
-        super().reset()
+    def _begin(self) -> None:
         self._count = 0
         self._peer = self._build()
         self._settle()
 
-    def _law(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        x = self.check_query(x)
-        law = self._peer[0](x.reshape(-1, self.in_features))
-        shape = (*x.shape[:-1], self.out_features)
-        return law.mean.reshape(shape), law.stddev.square().clamp_min(1e-12).reshape(shape)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """The posterior mean; 0 before the first sample."""
-        return self._law(x)[0]
-
-    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
-        """The posterior law, plus the likelihood's noise on request."""
-        with torch.no_grad():
-            mean, variance = self._law(x)
-            variance = variance + self._peer[1].task_noises if observation else variance
-        return Normal(mean, variance.sqrt(), validate_args=False)
-
-    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        law = self.predict(x, observation=True)
-        nis = ((y - law.mean) / law.stddev).square().mean(-1)
-        place = self._count % len(self.inputs)
-        self.inputs[place], self.targets[place] = x, y
-        self._count += 1
-        self._learn(place)
-        return UpdateReport.of(nis, mask)
+    def _law(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        model, likelihood, _ = self._peer
+        law = model(x)
+        return law.mean, law.stddev.square().clamp_min(1e-12), likelihood.task_noises
 
     def _apply(self, fn, recurse=True):
         super()._apply(fn, recurse)

@@ -10,13 +10,11 @@ import math
 from typing import Any, NamedTuple
 
 import torch
+from peer import Peer
 from torch import nn
-from torch.distributions import Normal
 from torch.func import functional_call, jacrev, vmap
 
 from torch_ekm._checks import check_count
-from torch_ekm.residual.base import SingleLearner
-from torch_ekm.residual.report import UpdateReport
 from torch_ekm.typing import Tensor
 
 _HIDDEN = (64, 64)
@@ -30,50 +28,7 @@ def features(in_features: int) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-class _Network(SingleLearner):
-    """What both have in common: the law is a network's."""
-
-    def __init__(self, in_features: int, out_features: int, **options: Any) -> None:
-        super().__init__(in_features, out_features, **options)
-        self.reset()
-
-    def reset(self) -> None:
-        super().reset()
-        torch.manual_seed(0)
-        self._begin()
-
-    def _begin(self) -> None:
-        """A network that has seen nothing."""
-        raise NotImplementedError
-
-    def _law(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, variance of g and of the noise at x ``(n, in)``."""
-        raise NotImplementedError
-
-    def _learn(self, x: Tensor, y: Tensor) -> None:
-        """One sample more."""
-        raise NotImplementedError
-
-    def forward(self, x: Tensor) -> Tensor:
-        """The mean."""
-        return self.predict(x).mean
-
-    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
-        """The law of g, plus noise on request."""
-        x = self.check_query(x)
-        with torch.no_grad():
-            mean, variance, noise = self._law(x.reshape(-1, self.in_features))
-        variance = variance + noise if observation else variance
-        shape = (*x.shape[:-1], self.out_features)
-        return Normal(mean.reshape(shape), variance.sqrt().reshape(shape), validate_args=False)
-
-    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        law = self.predict(x, observation=True)
-        self._learn(x, y)
-        return UpdateReport.of(((y - law.mean) / law.stddev).square().mean(-1), mask)
-
-
-class BayesianLastLayer(_Network):
+class BayesianLastLayer(Peer):
     """Variational Bayesian last layer of a network (Harrison et al., ICLR 2024; the authors' ``vbll``).
 
     Each sample brings a step of AdamW on itself and 31 of the last ``memory`` samples.
@@ -84,8 +39,9 @@ class BayesianLastLayer(_Network):
     """
 
     def __init__(self, in_features: int, out_features: int, *, memory: int = 10_000, **options: Any) -> None:
-        self.memory = check_count("memory", memory)
         super().__init__(in_features, out_features, **options)
+        self.memory = check_count("memory", memory)
+        self.reset()
 
     def _begin(self) -> None:
         from vbll import Regression
@@ -125,7 +81,7 @@ class _Weights(NamedTuple):
     last: Tensor
 
 
-class LowRankKalman(_Network):
+class LowRankKalman(Peer):
     """Extended Kalman filter of a network's weights, without replay (HiLoFi)::
 
         S = H_l P H_l' + (C H_h')' (C H_h') + R,   K_l = P H_l' S^-1,   K_h = C'C H_h' S^-1
@@ -143,8 +99,9 @@ class LowRankKalman(_Network):
     drift = 1e-6  #: share of its prior by which the last layer's covariance grows
 
     def __init__(self, in_features: int, out_features: int, *, rank: int = 20, **options: Any) -> None:
-        self.rank = check_count("rank", rank)
         super().__init__(in_features, out_features, **options)
+        self.rank = check_count("rank", rank)
+        self.reset()
 
     def _begin(self) -> None:
         self.body = features(self.in_features).to(self._like).requires_grad_(False)
@@ -184,14 +141,14 @@ class LowRankKalman(_Network):
         with torch.no_grad():
             phi, mean, slope = self._both(x)
             error, seen = y - mean, self._factor @ slope.mT  # (r, m)
-            shared = phi @ self._last_cov @ phi
+            towards = self._last_cov @ phi
+            shared = phi @ towards
             inner = shared * torch.eye(len(y)).to(slope) + seen.mT @ seen
             S = inner + self._noise.diag()
             gain = torch.linalg.solve(S, self._factor.mT @ seen, left=False)  # (n, m)
-            of_last = self._last_cov @ phi / (shared + self._noise.mean())
             pull = torch.linalg.solve(S, error)
-            self._weights = _Weights(hidden + gain @ error, last + torch.outer(pull, self._last_cov @ phi))
-            self._last_cov = self._last_cov - torch.outer(of_last, phi @ self._last_cov)
+            self._weights = _Weights(hidden + gain @ error, last + torch.outer(pull, towards))
+            self._last_cov = self._last_cov - torch.outer(towards, towards) / (shared + self._noise.mean())
             self._last_cov.diagonal().add_(self.drift * self._prior)
             rows = torch.cat([self._factor - seen @ gain.mT, self._noise.sqrt().unsqueeze(-1) * gain.mT])
             _, s, V = torch.linalg.svd(rows, full_matrices=False)

@@ -46,7 +46,7 @@ class ClosedLoop:
 
     What the plant raises, and Ctrl-C, end the manipulation with a :class:`Stop` that has it as its cause: no
     step is lost. Whatever ends it early, a ``break`` too, the hand is commanded to hold its position. At the
-    end of a ``with`` block the plant is closed.
+    end of a ``with`` block the plant is closed, after it holds if the block failed.
 
     Commands go through a :class:`~torch_ekm.plant.ServoInverse`; the model learns from what the encoders did.
 
@@ -393,8 +393,8 @@ class ClosedLoop:
     def _learn_forces(self, lin: Linearization, moved: Tensor, felt: ForceSurprise) -> None:
         """Pads that touched and measured before and after teach how their forces answer."""
         forces, pads = self.knowledge.forces, list(felt.pads)
-        described = torch.zeros_like(forces.correction)
-        change = torch.full_like(described[:, 0], torch.nan)
+        change = torch.full((len(forces.scale),), torch.nan, dtype=torch.float64)
         change[pads] = (felt.after - felt.before).where(~felt.surprise.isnan(), torch.nan)
+        described = torch.zeros_like(forces.correction)
         described[pads] = lin.described_normal_sensitivity
         forces.update(moved, change, described)

@@ -186,13 +186,13 @@ class LookAndMoveController:
         focused = self.focus.matrix @ error
         try:
             lin = self._linearize(state, a, fingertip_force)
-        except GraspError as failure:
-            if not isinstance(failure, NoContactError):
-                return self._none(StopReason.UNSTABLE_GRASP, failure, focused)
+        except NoContactError as failure:
             if self._previous is not None or fingertip_force is None:
                 return self._none(StopReason.OBJECT_LOST, failure, focused)
             held = NoContactError(f"{failure}; but pads measure forces: check the object's size and pose")
             return self._none(StopReason.UNSTABLE_GRASP, held, focused)
+        except GraspError as failure:
+            return self._none(StopReason.UNSTABLE_GRASP, failure, focused)
 
         travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
         desired, share = self._ask(focused, travel, fingertip_force is not None)
