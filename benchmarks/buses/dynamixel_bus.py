@@ -51,6 +51,7 @@ class DynamixelBus:
         self.port = os.ttyname(self._slave)
         """Name of the pseudo terminal."""
         self._open = True
+        self._idle = 0  # rounds in which nothing was left to obey
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
@@ -70,11 +71,18 @@ class DynamixelBus:
             with contextlib.suppress(OSError):
                 os.close(end)
 
+    def catch_up(self) -> None:
+        """Wait until all is obeyed that was sent: nobody answers a broadcast."""
+        until = self._idle + 2
+        while self._idle < until:
+            time.sleep(0.002)
+
     def _serve(self) -> None:
         data = b""
         while self._open:
             self._watch()
             if not select.select([self._master], [], [], 0.002)[0]:
+                self._idle += 1
                 continue
             with contextlib.suppress(OSError):
                 data += os.read(self._master, 4096)

@@ -253,11 +253,13 @@ def test_the_command_checks_a_hand_on_a_bus(tmp_path) -> None:
         assert "no sensors at the joints of left" in done.output
         assert "2 motors go as commanded" in done.output
         assert "and joints with them" not in done.output  # none has a sensor
+        bus.catch_up()
         bus.goals.clear()
         done = CliRunner().invoke(app, ["check", "--plant", str(path), "--dry-run"])
         assert done.exit_code == 0, done.output
         assert done.output.count("dry run: ") == 2  # a motion of each motor
         assert "does not move" not in done.output
+        bus.catch_up()
         assert bus.goals == []
         path.write_text(text.replace("zero = 1900", "zero = 5000"))
         done = CliRunner().invoke(app, ["check", "--plant", str(path)])
