@@ -1,5 +1,4 @@
-"""Speed of the learners: ``pytest bench_learners.py``, or ``python bench_learners.py``
-for a table of everything measured in one run with its ratios.
+"""Speed of the learners: tables of everything measured in one run, with its ratios.
 
 Twenty inputs, one thread, float64, a full basis with a point added and one pruned at every sample. Plain C,
 compiled on the spot, is the limit; GPyTorch, scikit-learn and river take part where they are installed. What
@@ -14,18 +13,15 @@ import functools
 import importlib.util
 import itertools
 import math
-import os
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import pytest
 import torch
 
 from torch_ekm.residual import (
@@ -41,7 +37,6 @@ from torch_ekm.residual import (
     Standardize,
     default_learner,
 )
-from torch_ekm.residual.sparse_gp.engine import recursion
 from torch_ekm.residual.sparse_gp.engine.reference import ReferenceEngine
 
 D = 20
@@ -94,12 +89,12 @@ def predictions(gp: SparseOnlineGP, m: int, shape: tuple[int, ...] = ()) -> Time
 
 
 class PlainC:
-    """The textbook recursion in C; None if there is no compiler."""
+    """The textbook recursion in C."""
 
     def __init__(self, capacity: int, m: int) -> None:
         compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
         if compiler is None:
-            pytest.skip("no C compiler")
+            raise SystemExit("no C compiler: cc, gcc or clang")
         library = Path(tempfile.mkdtemp()) / "reference.so"
         flags = ["-O3", "-march=native", "-ffast-math", "-fPIC", "-c"]
         subprocess.run([compiler, *flags, str(SOURCE), "-o", f"{library}.o"], check=True)
@@ -113,7 +108,7 @@ class PlainC:
         self.w = np.full(D, 1.0 / D)
         # fill it from the learner itself: the same state, so the same work and the same answers
         gp = filled(capacity, m, refresh_every=10**9)
-        p = gp.posterior
+        p, self.noise = gp.posterior, ctypes.c_double(float(gp.noise_variance[0]))
         self.free = int(p.slot)
         self.X[:], self.alpha[:] = p.basis.numpy(), p.alpha.numpy()
         self.C[:], self.Q[:] = p.covariance.numpy(), p.moments[1].numpy()
@@ -128,7 +123,7 @@ class PlainC:
         p = self._p
         self.free = self.lib.update(
             self.n, D, self.m, p(self.X), p(self.C), p(self.Q), p(self.alpha), self.free,
-            p(x), p(y), p(self.w), ctypes.c_double(0.01), p(self.work),
+            p(x), p(y), p(self.w), self.noise, p(self.work),
         )  # fmt: skip
 
     def predict(self, x: np.ndarray) -> float:
@@ -145,12 +140,13 @@ class PlainC:
         state = [p(a) for a in (self.X, self.C, self.Q, self.alpha)]
         px, py, pw, work = p(x[0]), p(y[0]), p(self.w), p(self.work)
         out = [p(self.mean), p(self.jac), p(self.slope)]
-        s2 = ctypes.c_double(0.01)
         for _ in range(5):
             begin = time.perf_counter()
             if which == "update":
                 for _ in range(repeats):
-                    self.free = self.lib.update(self.n, D, self.m, *state, self.free, px, py, pw, s2, work)
+                    self.free = self.lib.update(
+                        self.n, D, self.m, *state, self.free, px, py, pw, self.noise, work
+                    )
             else:
                 for _ in range(repeats):
                     self.lib.predict(
@@ -162,7 +158,8 @@ class PlainC:
 
 def gpytorch_fantasy(capacity: int, m: int) -> Callable:
     """One sample as a fantasy of an exact GP, then a prediction: GPyTorch's constant-kernel update."""
-    gpytorch = pytest.importorskip("gpytorch")
+    import gpytorch
+
     x, y = stream(capacity, m)
     shape = torch.Size([m])
 
@@ -195,7 +192,6 @@ def gpytorch_fantasy(capacity: int, m: int) -> Callable:
 
 def gpytorch_svgp(capacity: int, m: int) -> Callable:
     """One variational step on one sample."""
-    pytest.importorskip("gpytorch")
     from gpytorch_svgp import GPyTorchSVGP
 
     return Timed(GPyTorchSVGP(D, m, inducing=capacity).update, *stream(64, m))
@@ -203,7 +199,8 @@ def gpytorch_svgp(capacity: int, m: int) -> Callable:
 
 def sklearn_refit(capacity: int, m: int) -> Callable:
     """scikit-learn has no update: a fit on the window, hyperparameters fixed."""
-    gp = pytest.importorskip("sklearn.gaussian_process")
+    import sklearn.gaussian_process as gp
+
     kernel = gp.kernels.RBF(D**0.5) + gp.kernels.WhiteKernel(0.01)
     x, y = (a.numpy() for a in stream(capacity, m))
     model = gp.GaussianProcessRegressor(kernel, optimizer=None)
@@ -212,7 +209,6 @@ def sklearn_refit(capacity: int, m: int) -> Callable:
 
 def river_forest(capacity: int, m: int) -> Callable:
     """river's adaptive random forest, one per output."""
-    pytest.importorskip("river")
     from torch_ekm.interop import RiverResidual
 
     learner = RiverResidual(D, m)
@@ -221,66 +217,11 @@ def river_forest(capacity: int, m: int) -> Callable:
 
 
 PEERS = {
-    "gpytorch fantasy + predict": gpytorch_fantasy,
-    "gpytorch SVGP step": gpytorch_svgp,
+    "GPyTorch fantasy + predict": gpytorch_fantasy,
+    "GPyTorch SVGP step": gpytorch_svgp,
     "scikit-learn refit + predict": sklearn_refit,
     "river ARF update": river_forest,
 }
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.mark.parametrize("m", [6, 26])
-@pytest.mark.parametrize("capacity", [30, 100, 300])
-@pytest.mark.parametrize("what", ["update", "predict"])
-def test_one_model(benchmark, what, capacity, m):
-    gp = filled(capacity, m)
-    benchmark(updates(gp, m) if what == "update" else predictions(gp, m))
-
-
-@pytest.mark.parametrize("capacity", [30, 100])
-@pytest.mark.parametrize("what", ["update", "predict"])
-def test_fleet_of_256(benchmark, what, capacity):
-    gp = filled(capacity, 6, (256,))
-    call = updates(gp, 6, (256,)) if what == "update" else predictions(gp, 6, (256,))
-    benchmark.pedantic(call, rounds=5, warmup_rounds=1)
-
-
-@pytest.mark.parametrize("peer", PEERS)
-def test_peers(benchmark, peer):
-    call = PEERS[peer](100, 6)
-    benchmark.pedantic(call, rounds=10, warmup_rounds=2)
-
-
-def test_plain_c_gives_the_same_numbers(monkeypatch):
-    reference = PlainC(30, 6)
-    xs, ys = stream(40, 6, seed=5)
-    gp = reference.gp
-    # the C code prunes by the loss in the mean, the first term of ours
-
-    def loss_in_the_mean(posterior, c, q, w):
-        return posterior.alpha.square().sum(-1) / (c + q)
-
-    monkeypatch.setattr(recursion, "pruning_loss", loss_in_the_mean)
-    monkeypatch.setattr(gp, "_loops", None)
-    for x, y in zip(xs, ys, strict=True):
-        reference.update(np.ascontiguousarray(x.numpy()), np.ascontiguousarray(y.numpy()))
-        gp.update(x, y)
-    x = xs[0] + 0.1
-    v = reference.predict(np.ascontiguousarray(x.numpy()))
-    ours = gp.predict_with_jacobians(x)
-    np.testing.assert_allclose(reference.mean, ours.mean.numpy(), atol=1e-5)
-    np.testing.assert_allclose(reference.jac, ours.mean_jacobian.numpy(), atol=1e-5)
-    assert v == pytest.approx(float(ours.variance[0]), abs=1e-5)
-
-
-# -- the table ------------------------------------------------------------------------------------
 
 
 def microseconds(call: Callable, budget: float = 0.6) -> float:
@@ -316,116 +257,118 @@ def all_of(gp: SparseOnlineGP, m: int, shape: tuple[int, ...], n: int) -> Callab
     return call
 
 
-FIRST_CALL = """import time, torch
-from torch_ekm.residual import SparseOnlineGP
-from torch_ekm.residual.sparse_gp.engine import recursion
-from torch_ekm.residual.sparse_gp.engine.reference import ReferenceEngine
-gp, begin = SparseOnlineGP(20, 6), time.perf_counter()
-gp.update(torch.zeros(20).double(), torch.zeros(6).double())
-print(time.perf_counter() - begin)"""
-
-
-def first_call(cache: Path) -> float:
-    """Seconds of the first update in a new process."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
-    command = [sys.executable, "-c", FIRST_CALL]
-    return float(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
-
-
 #: Compiled loops where they can, or torch alone.
 ENGINES = ("auto", "torch")
 
 
-def against_c(b: int, m: int) -> list[tuple[str, float, float]]:
-    """(what, microseconds, times plain C), C and each engine in turns."""
-    reference = PlainC(b, m)
+class Table(NamedTuple):
+    """A heading, the columns, and rows of a name and numbers."""
+
+    title: str
+    columns: str
+    rows: list[tuple[str, *tuple[float, ...]]]
+
+    def markdown(self) -> str:
+        head = [f"### {self.title}", "", f"| {self.columns} |", "|---" * (self.columns.count("|") + 1) + "|"]
+        rows = [
+            [name, *("" if math.isnan(value) else f"{value:.1f}" for value in values)]
+            for name, *values in self.rows
+        ]
+        return "\n".join([*head, *(f"| {' | '.join(row)} |" for row in rows), ""])
+
+
+def against_c() -> Table:
+    """An update, and a prediction with Jacobians, in C and by each engine in turns."""
     rows = []
-    for what, make in (("update", updates), ("predict", predictions)):
-        calls = {name: make(filled(b, m, engine=name), m) for name in ENGINES}
-        rounds = []
-        for _ in range(5):
-            limit = reference.microseconds(what)
-            rounds.append([limit, *(microseconds(call, 0.3) for call in calls.values())])
-        limit, *found = np.median(rounds, axis=0)
-        ratios = np.median(np.array(rounds) / np.array(rounds)[:, :1], axis=0)[1:]
-        name = "predict + jacobians" if what == "predict" else what
-        rows.append((f"{name} b={b} m={m}: plain C", limit, 1.0))
-        for label, us, ratio in zip(calls, found, ratios, strict=True):
-            rows.append((f"{name} b={b} m={m}: {label}", us, ratio))
-    return rows
-
-
-def table() -> list[tuple[str, float, float]]:
-    """(what, microseconds, ratio to the row named in it or nan)."""
-    rows: list[tuple[str, float, float]] = []
     for b, m in ((30, 6), (100, 6), (300, 6), (100, 26)):
-        rows += against_c(b, m)
+        reference = PlainC(b, m)
+        for what, make in (("update", updates), ("predict", predictions)):
+            calls = [make(filled(b, m, engine=name), m) for name in ENGINES]
+            rounds = np.array(
+                [
+                    [reference.microseconds(what), *(microseconds(call, 0.3) for call in calls)]
+                    for _ in range(5)
+                ]
+            )
+            ratios = np.median(rounds[:, 1:] / rounds[:, :1], axis=0)
+            rows.append((f"{what}, {b} points, {m} outputs", *np.median(rounds, axis=0), *ratios))
+    columns = "what | plain C [us] | compiled [us] | torch [us] | compiled : C | torch : C"
+    return Table("A sparse online GP beside plain C", columns, rows)
+
+
+def of_fleets() -> Table:
+    """256 models at once, time of one."""
+    rows, shape, m = [], (256,), 6
     for b in (30, 100):
-        shape = (256,)
-        fleets = {name: filled(b, 6, shape, name) for name in ENGINES}
-        calls: dict[str, Callable] = {}
-        for name, gp in fleets.items():
-            calls[f"update b={b}, 256 models, per model: {name}"] = updates(gp, 6, shape)
-            calls[f"predict b={b}, 256 models, per model: {name}"] = predictions(gp, 6, shape)
-        found = alternately(calls, rounds=3)
-        rows += [(name, us / 256, math.nan) for name, us in found.items()]
-        begin = all_of(fleets["auto"], 6, shape, 256)
-        whole = f"update b={b}, 256 models, per model: auto, mean with rebuilds"
-        rows.append((whole, microseconds(begin, 0.0) / 256**2, math.nan))
+        fleets = [filled(b, m, shape, name) for name in ENGINES]
+        for what, make in (("update", updates), ("predict", predictions)):
+            calls = dict(zip(ENGINES, (make(gp, m, shape) for gp in fleets), strict=True))
+            found = alternately(calls, rounds=3)
+            rows.append((f"{what}, {b} points", *(us / 256 for us in found.values())))
+        means = [microseconds(all_of(gp, m, shape, 64), 0.0) / (64 * 256) for gp in fleets]
+        rows.append((f"update, {b} points, mean with rebuilds", *means))
+    default = default_learner(D, m, batch_shape=shape)
+    for _ in range(2):  # the basis is full then
+        microseconds(all_of(default, m, shape, 64), 0.0)
+    mean = microseconds(all_of(default, m, shape, 64), 0.0) / (64 * 256)
+    rows.append(("default learner, update, mean", mean, math.nan))
+    return Table("Fleets of 256, per model", "what | compiled [us] | torch [us]", rows)
+
+
+def of_parts() -> Table:
+    """What a learner learns besides the residual."""
+    rows = []
     for learned, parts in (
         ("units", [Standardize()]),
         ("robust, forgets", [RobustWeight(3.0), ForgettingFactor(0.99)]),
         ("calibrated, detects changes", [CalibrateNoise(), DetectChanges()]),
         ("learns its kernel", [LearnHyperparameters()]),
     ):
-        gps = {name: filled(100, 6, engine=name, parts=parts) for name in ENGINES}
-        calls = {engine: all_of(gp, 6, (), 64) for engine, gp in gps.items()}
+        calls = {name: all_of(filled(100, 6, engine=name, parts=parts), 6, (), 64) for name in ENGINES}
         for _ in range(17):  # units stand still after a thousand samples
             [call() for call in calls.values()]
         found = alternately(calls, rounds=3)
-        for engine, us in found.items():
-            rows.append((f"update b=100 m=6, {learned}, mean: {engine}", us / 64, math.nan))
-    for name, make in (("SparseOnlineGP(d, m)", SparseOnlineGP), ("default_learner(d, m)", default_learner)):
+        rows.append((learned, *(us / 64 for us in found.values())))
+    return Table("Parts of a learner: update, mean", "what | compiled [us] | torch [us]", rows)
+
+
+def of_whole_learners() -> Table:
+    """Learners as they are made from two sizes."""
+    rows = []
+    for name, make in (("SparseOnlineGP", SparseOnlineGP), ("default_learner", default_learner)):
         learner, times = make(D, 6), []
         for x, y in zip(*stream(1500, 6, seed=1), strict=True):
             begin = time.perf_counter()
             learner.update(x, y)
             times.append(1e6 * (time.perf_counter() - begin))
-        for which, us in (("median", np.median(times[500:])), ("slowest of 1000", max(times[500:]))):
-            rows.append((f"update of {name}, m=6, {which}", float(us), math.nan))
+        rows.append((name, float(np.median(times[500:])), max(times[500:])))
     deep = SparseOnlineGP(D, 6, kernel=DeepKernel(SquaredExponential(D))), DeepKernelSOGP(D, 6)
     for gp in deep:
         gp.update(*stream(2110, 6, seed=1))  # a memory is full then
     cost = [microseconds(functools.partial(gp.update, *stream(64, 6)), 2.0) / 64 for gp in deep]
-    rows.append(("adaptation of the deep kernel, per sample", cost[1] - cost[0], math.nan))
+    rows.append(("adaptation of the deep kernel", cost[1] - cost[0], math.nan))
+    return Table("Whole learners: update", "what | median [us] | slowest of 1000 [us]", rows)
+
+
+def of_peers() -> Table:
+    """Other libraries, ours in turns with each."""
+    rows = []
     for name, make in PEERS.items():
         module = name.split()[0].replace("scikit-learn", "sklearn")
-        if importlib.util.find_spec(module) is not None:
+        if importlib.util.find_spec(module.lower()) is not None:
             gp = filled(100, 6)
             ours = Timed(lambda x, y, gp=gp: (gp.update(x, y), gp.predict(x + 0.1)), *stream(64, 6))
             found = alternately({"peer": make(100, 6), "ours": ours}, rounds=3)
-            rows.append(
-                (f"{name} b=100 m=6, over our update + predict", found["peer"], found["peer"] / found["ours"])
-            )
-    if importlib.util.find_spec("numba") is not None:
-        with tempfile.TemporaryDirectory() as cache:
-            for which in ("without", "with"):
-                name = f"first update of a process, {which} cache [s]"
-                rows.append((name, first_call(Path(cache)), math.nan))
-    return rows
+            rows.append((name, found["peer"], found["ours"], found["peer"] / found["ours"]))
+    columns = "what, 100 points, 6 outputs | peer [us] | update and prediction here [us] | ratio"
+    return Table("Other libraries", columns, rows)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--output", type=Path, help="write the table as Markdown here")
-    options, _ = parser.parse_args(), torch.set_num_threads(1)
-    lines = ["| what | us | ratio |", "|---|---|---|"]
-    for name, value, ratio in table():
-        lines.append(f"| {name} | {value:.1f} | {'' if math.isnan(ratio) else f'{ratio:.1f}'} |")
-    text = "\n".join(lines)
-    print(text)
-    if options.output:
-        options.output.write_text(text + "\n")
+    argparse.ArgumentParser(description=__doc__).parse_args()
+    torch.set_num_threads(1)
+    for measure in (against_c, of_fleets, of_parts, of_whole_learners, of_peers):
+        print(measure().markdown(), flush=True)
 
 
 if __name__ == "__main__":

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("sapien")
 pytest.importorskip("gpytorch")
@@ -14,7 +16,11 @@ pytest.importorskip("river")
 pytest.importorskip("numba")
 pytest.importorskip("speed", reason="the benchmarks are not part of this installation")
 
+import bench_learners
 import speed
+
+from torch_ekm.residual.sparse_gp.engine import recursion
+from torch_ekm.residual.sparse_gp.engine.reference import ReferenceEngine
 
 
 def test_what_is_said_of_times() -> None:
@@ -37,3 +43,30 @@ def test_it_runs(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     rows = (tmp_path / "speed.csv").read_text().splitlines()
     assert len(rows) == 10
     assert np.finfo(float).tiny / np.array([4.0]) > 0  # subnormal numbers are as they were
+
+
+@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler")
+def test_plain_c_gives_the_same_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    reference = bench_learners.PlainC(30, 6)
+    xs, ys = bench_learners.stream(40, 6, seed=5)
+    gp = reference.gp
+
+    def loss_in_the_mean(posterior, c, q, w) -> torch.Tensor:  # the C code prunes by the first term of ours
+        return posterior.alpha.square().sum(-1) / (c + q)
+
+    monkeypatch.setattr(recursion, "pruning_loss", loss_in_the_mean)
+    monkeypatch.setattr(gp, "engine", ReferenceEngine())  # it asks for the loss by its name
+    for x, y in zip(xs, ys, strict=True):
+        reference.update(np.ascontiguousarray(x.numpy()), np.ascontiguousarray(y.numpy()))
+        gp.update(x, y)
+    x = xs[0] + 0.1
+    variance = reference.predict(np.ascontiguousarray(x.numpy()))
+    ours = gp.predict_with_jacobians(x)
+    np.testing.assert_allclose(reference.mean, ours.mean.numpy(), atol=1e-5)
+    np.testing.assert_allclose(reference.jac, ours.mean_jacobian.numpy(), atol=1e-5)
+    assert variance == pytest.approx(float(ours.variance[0]), abs=1e-5)
+
+
+def test_tables_of_learners_are_markdown() -> None:
+    table = bench_learners.Table("Times", "what | one [us] | two [us]", [("a", 1.25, float("nan"))])
+    assert table.markdown() == "### Times\n\n| what | one [us] | two [us] |\n|---|---|---|\n| a | 1.2 |  |\n"
