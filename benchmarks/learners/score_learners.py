@@ -98,9 +98,9 @@ def hand(names: list[str], half: str, quick: bool, kept: bool) -> None:
     d, m = objects[0].x.shape[1], objects[0].y.shape[1]
     print(f"{half} half: {len(objects)} objects, {sum(len(o.x) for o in objects)} samples, kept: {kept}\n")
     head = "learner | rms | median | rms, worst object | NLL, normal | NLL, own law | 90 % coverage | [ms]"
-    print(f"| {head} |\n|---|---|---|---|---|---|---|---|")
-    for name in names:
-        for title, wrap in ((name, lambda learner: learner), (f"{name}, in a mixture", MixtureResidual)):
+    for title, wrap in (("Learners alone", lambda learner: learner), ("In a mixture", MixtureResidual)):
+        print(f"### {title}\n\n| {head} |\n|---|---|---|---|---|---|---|---|")
+        for name in names:
 
             def make(wrap=wrap, name=name) -> ResidualLearner:
                 torch.manual_seed(0)
@@ -116,26 +116,30 @@ def hand(names: list[str], half: str, quick: bool, kept: bool) -> None:
             worst = max(s.winsorised_second_half for s in scores)
             coverage = np.mean([s.coverage for s in scores], axis=0)
             print(
-                f"| {title} | {mean('winsorised_second_half'):.3f} | {mean('median_second_half'):.3f} "
+                f"| {name} | {mean('winsorised_second_half'):.3f} | {mean('median_second_half'):.3f} "
                 f"| {worst:.3f} | {mean('nll'):.2f} | {mean('predictive_nll'):.2f} "
                 f"| {' '.join(f'{c:.2f}' for c in coverage)} | {cost:.1f} |",
                 flush=True,
             )
+        print()
 
 
 def streams(names: list[str], which: list[str], seed: int, quick: bool) -> None:
     """One pass, a tenth held out, targets of unit variance, nothing tuned per set."""
-    print("| learner | stream | test RMSE | NLL [nats] | time of a sample [µs] |\n|---|---|---|---|---|")
-    for stream_name in which:
-        split = load_split(stream_name, seed)
-        if quick:
-            split = split._replace(x=split.x[:200], y=split.y[:200])
-        for name in names:
+    splits = [load_split(stream_name, seed) for stream_name in which]
+    if quick:
+        splits = [split._replace(x=split.x[:200], y=split.y[:200]) for split in splits]
+    titles = [split.name for split in splits]
+    columns = ["learner", *titles, *(f"NLL, {title} [nats]" for title in titles), "time of a sample [µs]"]
+    print("| " + " | ".join(columns) + " |\n" + "|---" * len(columns) + "|")
+    for name in names:
+        scores = []
+        for split in splits:
             torch.manual_seed(seed)
-            s = score_split(STREAMS[name], split)
-            print(
-                f"| {name} | {split.name} | {s.rmse:.4f} | {s.nll:.2f} | {s.microseconds:.0f} |", flush=True
-            )
+            scores.append(score_split(STREAMS[name], split))
+        time_of_all = float(np.mean([s.microseconds for s in scores]))
+        cells = [*(f"{s.rmse:.3f}" for s in scores), *(f"{s.nll:.2f}" for s in scores), f"{time_of_all:.0f}"]
+        print("| " + " | ".join([name, *cells]) + " |", flush=True)
 
 
 def main() -> None:
