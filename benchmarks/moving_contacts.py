@@ -1,16 +1,16 @@
 """Contacts that slide, open and close, and links that bear: a motion as the equilibrium after it.
 
-    python benchmarks/moving_contacts.py --objects box,carton,tea_tin --seeds 1000:1003
+    python benchmarks/moving_contacts.py --objects box,carton,tea_tin --seeds 1000:1003 --engine mujoco
 
 A look-and-move controller turns each object by more than it bears. Before every motion the kinematic model,
-whose contacts stick, and ``KinematicModel.step`` say where it ends, whether a contact slides, and where the
-whole turn ends. On the hand as described they know the true state; slips are announced on hands with noisy
-sensors ("sensed": as described; "nominal": a used hand). Finished sessions stay in ``--out``.
+whose contacts stick, and ``KinematicModel.step`` predict where it ends, whether a contact slides, and where
+the whole turn ends. On the hand as described from the true state; slips are announced on hands with noisy
+sensors ("sensed": as described; "nominal": a used hand). Friction in MuJoCo is a round cone, in SAPIEN
+(PhysX) a pyramid. Finished sessions stay in ``--out``.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import itertools
 import sys
@@ -24,10 +24,10 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent / "kinematic_model"))
 
+from command_line import study_parser
 from slip_announcement import RELEASE, SLIP, STILL, Witness, own_objects, plant_parameters
 
 from torch_ekm._terminal import progress
-from torch_ekm.cli._app import parse_seeds
 from torch_ekm.control import (
     FocusedPose,
     LimitingFunction,
@@ -57,12 +57,12 @@ _FAR = 40.0  # [deg] more than most grasps bear
 _SLIDES = 1.2 * SLIP  # predicted slide that is announced; chosen on seeds 0 to 2
 
 
-def session(item: str, seed: int, plant: str) -> dict[str, Any]:
+def session(item: str, seed: int, plant: str, engine: str) -> dict[str, Any]:
     """One turn: what was said of each motion and what came of it; of the hand as described the whole turn."""
     torch.set_num_threads(1)
     obj = own_objects().get(item) or load_object(item)
     parameters = preset("none") if plant == "described" else plant_parameters(plant, seed)
-    hand = SimulatedHand("icub_right", obj, parameters=parameters.replace(hardware_seed=seed))
+    hand = SimulatedHand("icub_right", obj, parameters=parameters.replace(hardware_seed=seed), engine=engine)
     try:
         seen = hand.reset(seed)
     except EKMError:
@@ -281,11 +281,10 @@ class Comparison:
             f" a step {_median(x['ms'] for x in every):.1f} ms"
         )
 
-    def report(self, folder: Path) -> Report:
+    def report(self, folder: Path, engine: str) -> Report:
         """Tables, picture and verdict, in ``folder``."""
-        shown = save_figure(
-            self.picture(), folder, "moving_contacts", "Each motion of the hand as described."
-        )
+        caption = "Each motion of the hand as described."
+        shown = save_figure(self.picture(), folder, f"moving_contacts_{engine}", caption)
         tables = [self.errors(), self.turns(), self.slips()]
         report = Report("Contacts that slide, open and close", f"{self.verdict}.", tables, [shown])
         report.write(folder)
@@ -326,16 +325,10 @@ def _mean(values) -> float:
 
 
 def main() -> None:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
-    parser.add_argument("--objects", default="box,can,bottle,carton,tea_tin", help="names or paths")
-    parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1003"), help="FIRST:END")
-    parser.add_argument("--jobs", type=int, default=2, help="processes at once")
-    parser.add_argument(
-        "--out", type=Path, default=Path("moving_contacts_output"), help="keeps what is finished"
-    )
-    parser.add_argument("--quick", action="store_true", help="one object, one seed, the hand as described")
-    given = parser.parse_args()
+    given = study_parser(
+        __doc__, "moving_contacts", objects="box,can,bottle,carton,tea_tin", seeds="1000:1003",
+        engine="mujoco", quick="one object, one seed, the hand as described",
+    ).parse_args()  # fmt: skip
     items, seeds, plants = given.objects.split(","), given.seeds, PLANTS
     if given.quick:
         items, seeds, plants = items[:1], seeds[:1], PLANTS[:1]
@@ -343,12 +336,12 @@ def main() -> None:
     for item in items:
         for seed in seeds:
             for plant in plants:
-                key = f"{object_name(item)}_{plant}_{seed}"
-                todo[key], where[key] = (item, seed, plant), (item, seed, plant)
+                key = f"{given.engine}_{object_name(item)}_{plant}_{seed}"
+                todo[key], where[key] = (item, seed, plant, given.engine), (item, seed, plant)
     with progress("running", len(todo)) as advance:
         results = run_jobs(session, todo, given.out, given.jobs, advance)
     comparison = Comparison({where[key]: found for key, found in results.items()})
-    print(comparison.report(given.out).markdown())
+    print(comparison.report(given.out, given.engine).markdown())
     print(comparison.verdict)
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from pathlib import Path
 
 from torch_ekm._terminal import print_report, progress
 from torch_ekm.cli._app import parse_seeds
 from torch_ekm.experiments.protocols.protocol import Protocol
 from torch_ekm.experiments.reproduce import REPORTED_SEEDS, Experiment, reproduce
+from torch_ekm.simulation import ENGINES
 
 
 def run_study(protocol: Protocol, about: str | None) -> None:
@@ -24,7 +26,11 @@ def run_study(protocol: Protocol, about: str | None) -> None:
     )
     parser.add_argument("--jobs", type=int, default=2, help="processes at once")
     parser.add_argument("--quick", action="store_true", help="small turns: to see that it works")
+    parser.add_argument("--engine", default=protocol.setting.engine, choices=ENGINES)
     options = parser.parse_args()
+    protocol = dataclasses.replace(
+        protocol, setting=dataclasses.replace(protocol.setting, engine=options.engine)
+    )
     planned = Experiment(protocol, options.seeds)
     if options.quick:
         planned = Experiment(protocol.quick(), options.seeds[: protocol.quick_seeds], quick=True)

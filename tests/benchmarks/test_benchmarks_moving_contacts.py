@@ -41,12 +41,12 @@ def test_slips_are_announced_and_false_alarms_counted(tmp_path: Path) -> None:
     assert rows["nominal", "margins of the KM"] == ["67 % of 3", "0 % of 1", "0 % of 1", "0 % of 1"]
     kinds = {row[0]: row[1:] for row in found.errors().text()}
     assert kinds["a link touches"] == ["1", "1.000", "1.000", "0.200", "0.200"]
-    found.report(tmp_path)
-    assert (tmp_path / "moving_contacts.svg").exists()
+    found.report(tmp_path, "mujoco")
+    assert (tmp_path / "moving_contacts_mujoco.svg").exists()
 
 
 def test_a_session_runs(tmp_path: Path, monkeypatch, capsys) -> None:
-    pytest.importorskip("sapien")
+    pytest.importorskip("mujoco")
     monkeypatch.setattr(moving_contacts, "MOTIONS", 3)
     words = ["moving_contacts.py", "--quick", "--objects", "box", "--seeds", "7:8", "--jobs", "1"]
     monkeypatch.setattr("sys.argv", [*words, "--out", str(tmp_path)])
