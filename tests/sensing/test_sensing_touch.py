@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 
@@ -76,3 +77,22 @@ def test_without_fingertip_sensors_pads_touch_whose_gaps_the_joints_explain(hand
     assert float(off[[i for i in range(len(off)) if i != thumb]].max()) < 0.5
     lifted = ContactAligned(Blurred(hand, index_2, -0.15, numb=True), hand.hand, hand.object).reset(0)
     assert float(lifted.q[index_2] - lifted.truth.q[index_2]) == pytest.approx(-0.15, abs=2e-3)
+
+
+def test_the_error_of_a_cable_lasts() -> None:
+    """On a narrow object the thumb has two angles without a gap; and no angle where it does not touch."""
+    with contextlib.closing(SimulatedHand("icub_right", "flashlight")) as hand:
+        thumb = hand.hand.joint_names.index("thumb_0")
+        blurred = Blurred(hand, thumb, -0.17)
+        plant = ContactAligned(blurred, hand.hand, hand.object)
+        plant.reset(0)
+        blurred.error = -0.36  # past the angle at which the gap is smallest
+        near = pytest.approx(0.0, abs=math.radians(2.0))
+        assert float((seen := plant.observe()).q[thumb] - seen.truth.q[thumb]) == near
+        read = blurred.observe()
+        fresh = ContactAligned(blurred, hand.hand, hand.object).observation(read)
+        assert float(fresh.q[thumb] - fresh.truth.q[thumb]) < -math.radians(20.0)
+        free = plant.observation(dataclasses.replace(read, fingertip_force=torch.zeros(len(hand.hand.pads))))
+        assert float(free.q[thumb] - free.truth.q[thumb]) == near
+        blurred.error = 0.0
+        assert float((seen := plant.reset(0)).q[thumb] - seen.truth.q[thumb]) == near  # a new grasp

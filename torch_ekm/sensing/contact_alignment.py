@@ -15,6 +15,8 @@ from ..typing import Float, Tensor
 _SENSED_STD = math.radians(0.5)  # of a joint with a Hall sensor, where the plant states no covariance
 _UNSENSED_STD = math.radians(10.0)  # of the others: behind a tendon that stretches
 _GAP_STD = 1e-4  # [m]: what the object's pose and both shapes leave open
+_LASTING_STD = math.radians(2.0)  # a joint that is less certain is known through a cable, whose error lasts
+_CHANGE = 0.2  # share of its deviation by which such an error changes between two observations
 _LEAST_FORCE = 0.5  # [N]: a pad that measures less says nothing
 _GATE = 3.0  # deviations of a gap, up to which a pad of a hand without fingertip sensors is in contact
 _ITERATIONS = 4
@@ -29,6 +31,9 @@ class ContactAligned(PlantWrapper):
     kinematic model can be made of the grasp. But where a pad is in contact, the gap is known. It is where it
     measures 0.5 N or, on a hand without fingertip sensors, where its gap is within three deviations. Each
     joint takes as much of what is missing as its deviation allows.
+
+    What a joint known to 2 deg or worse took at the last observation is expected again, to a fifth of its
+    deviation: where a joint moves its pad along the object, two angles explain the same gap.
 
     P is ``info["estimate"]["joint_covariance"]`` [rad^2] where the plant states it, else 0.5 deg for joints
     with a Hall sensor and 10 deg for others. Solved by Gauss-Newton, at every observation, within the joints'
@@ -48,21 +53,36 @@ class ContactAligned(PlantWrapper):
         sensed = {sensor.joint for sensor in hand.hall_sensors}
         std = [_SENSED_STD if name in sensed else _UNSENSED_STD for name in hand.joint_names]
         moves = self._range[1] > self._range[0]
+        self._offset: Float[Tensor, " n_q"] | None = None
         self._covariance = torch.diag(torch.tensor(std, dtype=torch.float64) ** 2 * moves)
+
+    def reset(self, seed: int) -> Observation:
+        """A new grasp, of which nothing is known."""
+        self._offset = None
+        return super().reset(seed)
 
     def observation(self, seen: Observation) -> Observation:
         """``seen`` with joints that agree with the contacts."""
         P = seen.info.get("estimate", {}).get("joint_covariance", self._covariance)
-        pads = self._touching(seen, P)
+        expected = seen.q
+        if self._offset is not None:
+            lasts = P.diagonal().sqrt() > _LASTING_STD
+            share = torch.where(lasts, _CHANGE, 1.0).to(P)
+            P, expected = share[:, None] * P * share, seen.q + self._offset * lasts
+        pads = self._touching(seen, expected, P)
         R = _GAP_STD**2 * torch.eye(len(pads), dtype=P.dtype)
-        q = seen.q
+        q = expected
         for _ in range(_ITERATIONS if pads else 0):
             gap, H = self._gaps(seen, q, pads)
-            missing = gap + H @ (seen.q - q)
-            q = (seen.q - P @ H.mT @ torch.linalg.solve(H @ P @ H.mT + R, missing)).clamp(*self._range)
+            missing = gap + H @ (expected - q)
+            q = (expected - P @ H.mT @ torch.linalg.solve(H @ P @ H.mT + R, missing)).clamp(*self._range)
+        if pads:
+            self._offset = q - seen.q
         return dataclasses.replace(seen, q=q)
 
-    def _touching(self, seen: Observation, P: Float[Tensor, "n_q n_q"]) -> list[str]:
+    def _touching(
+        self, seen: Observation, q: Float[Tensor, " n_q"], P: Float[Tensor, "n_q n_q"]
+    ) -> list[str]:
         """Pads that are in contact: by their force, or else by a gap that the joints' deviations explain."""
         names = [pad.name for pad in self.hand.pads]
         if seen.fingertip_force is not None:
@@ -71,7 +91,7 @@ class ContactAligned(PlantWrapper):
                 for name, f in zip(names, seen.fingertip_force.tolist(), strict=True)
                 if f >= _LEAST_FORCE
             ]
-        gap, H = self._gaps(seen, seen.q, names)
+        gap, H = self._gaps(seen, q, names)
         std = ((H @ P * H).sum(-1) + _GAP_STD**2).sqrt()
         return [name for name, near in zip(names, (gap.abs() < _GATE * std).tolist(), strict=True) if near]
 
