@@ -106,7 +106,8 @@ def make(described: Any, known: Mapping[str, Any]) -> Any:
         return torch.tensor(described["tensor"], dtype=dtype) if "tensor" in described else dtype
     name = str(described.get("class", described.get("named")))
     if name not in known:
-        raise ParameterError("class", name, f"one of {', '.join(sorted(known))}; pass others as `classes`")
+        valid = f"one of {', '.join(sorted(known))}"
+        raise ParameterError("class", name, f"passed as classes=[{name}] if it is your own, else {valid}")
     if "named" in described:
         return known[name]
     arguments = {key: make(value, known) for key, value in described["arguments"].items()}

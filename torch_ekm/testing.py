@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Normal
 
-from .exceptions import EKMError, NonFiniteError, NoStateError, ShapeError, StateMismatchError
+from .exceptions import EKMError, NonFiniteError, NoStateError, ParameterError, ShapeError, StateMismatchError
 from .residual.base import ResidualLearner, UpdateReport
 
 __all__ = ["check_residual_learner"]
@@ -43,8 +43,12 @@ def check_residual_learner(
             pickled only.
 
     Raises:
-        AssertionError: naming the clause.
+        AssertionError: naming the first clause that is violated.
+        ParameterError: ``factory`` is a learner.
     """
+    if isinstance(factory, ResidualLearner):
+        valid = f"a factory: lambda **options: {type(factory).__name__}(3, 2, **options)"
+        raise ParameterError("factory", factory, valid)
     for dtype in dtypes:
         learner = factory(dtype=dtype)
         x, y = _stream(learner, n_samples)
@@ -139,6 +143,10 @@ def _check_gradients(learner: ResidualLearner, x: Tensor) -> None:
     query = x[0].clone().requires_grad_(True)
     jacobian = learner.linearize(query)[1].detach()
     value = learner(query)
+    message = (
+        "no gradient of forward reaches x: add 0.0 * x[..., :1] for a slope of 0, or differentiable=False"
+    )
+    assert value.requires_grad, message
     for j in range(learner.out_features):
         (row,) = torch.autograd.grad(value[..., j].sum(), query, retain_graph=True)
         error = float((row - jacobian[..., j, :]).abs().max())
@@ -170,7 +178,7 @@ def _check_bad_input(learner: ResidualLearner, x: Tensor, y: Tensor, has_state: 
                 pair = [x[:3].clone(), y[:3].clone()]
                 pair[which][2, ..., -1] = value  # the last of a block: the first must not stay
                 _raises(lambda p=pair: learner.update(*p), NonFiniteError, f"{value} in a sample")
-    _raises(lambda: learner(x[0][..., :-1]), ShapeError, "width of a query")
+    _raises(lambda: learner(x[0][..., :-1]), ShapeError, "width of a query (self.check_query)")
     assert _same(before, _figures(learner, has_state)), "a refused sample changed the state"
 
 
@@ -224,7 +232,8 @@ def _check_persistence(
     original = copy.deepcopy(learner)
     original.update(x, y)
     for name, other in copies.items():
-        assert torch.equal(other(x), learner(x)), f"{name}: the mean is not bit for bit the same"
+        same = torch.equal(other(x), learner(x))
+        assert same, f"{name}: the mean is not bit for bit the same; is all that is learned in buffers?"
         assert torch.equal(other.predict(x).stddev, learner.predict(x).stddev), f"{name}: another deviation"
         other.update(x, y)
         assert torch.equal(other(x), original(x)), f"{name}: the stream does not continue identically"

@@ -155,6 +155,11 @@ class _WrongPrior(RecursiveLeastSquares):
         return super().forward(x) + 1e-12
 
 
+class _NoGradient(RecursiveLeastSquares):
+    def forward(self, x):
+        return super().forward(x).detach()
+
+
 class _WrongSlope(RecursiveLeastSquares):
     def linearize(self, x):
         mean, slope = super().linearize(x)
@@ -231,6 +236,7 @@ class _RemembersDeviations(RecursiveLeastSquares):
 
 BROKEN = {
     "prior": _WrongPrior,
+    "no gradient of forward": _NoGradient,
     "linearize": _WrongSlope,
     "state_dict": _StateOutside,
     "train": _Modal,
@@ -249,3 +255,10 @@ BROKEN = {
 def test_a_broken_learner_is_caught(clause):
     with pytest.raises(AssertionError, match=clause):
         check_residual_learner(lambda **o: BROKEN[clause](3, 2, batch_shape=(3,), **o))
+
+
+def test_a_learner_in_the_place_of_its_factory_is_refused():
+    with pytest.raises(
+        torch_ekm.exceptions.ParameterError, match=r"a factory: lambda.*RecursiveLeastSquares"
+    ):
+        check_residual_learner(RecursiveLeastSquares(3, 2))

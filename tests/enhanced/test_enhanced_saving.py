@@ -83,8 +83,11 @@ def test_a_fleet_of_single_learners_and_a_learner_of_ones_own(tmp_path: Path) ->
 
     torch_ekm.save(Mine(3, 2, slope=0.5), tmp_path / "mine")
     assert torch_ekm.load(tmp_path / "mine", classes=[Mine]).slope == 0.5
-    with pytest.raises(exceptions.ParameterError, match="Mine"):
+    with pytest.raises(exceptions.ParameterError, match=r"passed as classes=\[Mine\]"):
         torch_ekm.load(tmp_path / "mine")
+    torch.save(Mine(3, 2, slope=0.5).state_dict(), tmp_path / "state.pt")
+    with pytest.raises(exceptions.FileFormatError, match=r"not written by torch_ekm\.save"):
+        torch_ekm.load(tmp_path / "state.pt")
 
 
 def test_an_enhanced_model_with_its_encoding(tmp_path: Path) -> None:

@@ -31,6 +31,8 @@ BROKEN = {
     "text": ("a,b,y\n1,2,3\n4,wood,6\n", r"line 3, column 'b': 'wood' is no number"),
     "missing": ("a,b,y\n1,2,3\n4,,6\n", r"line 3, column 'b' is empty"),
     "nan": ("a,b,y\n1,2,3\n4,nan,6\n", r"line 3, column 'b': 'nan' is not finite"),
+    "decimal comma": ("a;b;y\n1,5;2;3\n" * 2, r"line 2, column 'a': '1,5' has a decimal comma"),
+    "holes": ("a,b,y\n1,,3\n4,5,6\n7,8,nan\n", r"line 2, column 'b' is empty.* 2 of 3 lines have"),
     "one row": ("a,b,y\n1,2,3\n", r"it has 1 samples; at least 40"),
     "header only": ("a,b,y\n", r"it has 0 samples"),
     "no header": ("1,2,3\n4,5,6\n", r"line 1 holds numbers only; the first line must name"),
@@ -116,7 +118,8 @@ def test_columns_that_are_not_asked_for_may_hold_anything(kind: str, tmp_path: P
         parquet, pyarrow = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("pyarrow")
         columns = {"day": ["monday"] * 60, **dict(zip("abcy", values.T, strict=True)), "note": [None] * 60}
         parquet.write_table(pyarrow.table(columns), path)
-    chosen, given = load_table(path, inputs=["c", "a"]), in_own_units("a", values[:, [2, 0]], values[:, 3:])
+    chosen = load_table(path, inputs=["c", "a"])
+    given = in_own_units("a", values[:, [2, 0]], values[:, 3:], centre_y=False)
     torch.testing.assert_close(chosen.x, given.x)
     torch.testing.assert_close(chosen.y, given.y)
     with pytest.raises(DescriptionError, match="column 'day'"):
@@ -144,6 +147,31 @@ def test_y_is_measured_less_predicted_and_runs_stand_for_themselves(tmp_path: Pa
     assert result.exit_code == 0, result.output
     assert "in 6 parts" in " ".join(result.output.split())
     assert isinstance(CliRunner().invoke(app, arguments).exception, ParameterError)
+
+
+def test_zero_is_the_model_for_a_residual_in_any_form(tmp_path: Path) -> None:
+    values = table() + 5.0  # a model that is wrong by a constant
+    path = write(
+        tmp_path / "a.csv", np.column_stack([values, values[:, 3] + 1, np.ones(60)]), "a,b,c,y,seen,said"
+    )
+    inputs = ["a", "b", "c"]
+    residual, pair = (
+        load_table(path, inputs=inputs),
+        load_table(path, "seen", inputs=inputs, predicted=["said"]),
+    )
+    torch.testing.assert_close(residual.y, pair.y)
+    assert float(residual.y.mean()) > 3
+    assert [one.about.split("; ")[1] for one in (residual, pair)] == ["alone: 0", "alone: said"]
+    raw = load_table(path, "seen", inputs=inputs)
+    assert abs(float(raw.y[:20].mean())) < 1e-9
+    assert raw.about.endswith("alone: the mean of the first tenth")
+
+
+def test_increments_are_not_mixed_with_targets(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", table())
+    with pytest.raises(ParameterError, match="without targets and run"):
+        load_recording(path, observation=["a"], targets=["y"], run="b")
+    assert load_recording(path, observation=["a"], targets=[], run="").y.shape == (59, 1)
 
 
 def test_a_clock_among_the_inputs_is_suspected(tmp_path: Path) -> None:

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 import torch
 
+from torch_ekm import residual
+from torch_ekm._recorded import describe, differences
 from torch_ekm.exceptions import UnknownNameError
-from torch_ekm.experiments.learners import N_OUT, make_learner
+from torch_ekm.experiments.learners import COMPARED, LEARNERS, N_OUT, make_learner
+
+PAGE = Path(__file__).parents[2] / "docs" / "how_to" / "choose_a_learner.md"
 
 N_S, N_A, ZONE = 4, 3, 0.65  # dead zone of 1.3 deg in units of 2 deg
 
@@ -38,3 +45,25 @@ def test_one_learner_takes_up_a_dead_zone_and_the_default_leaves_it_to_the_servo
 def test_unknown_learner_is_answered_with_the_known_ones() -> None:
     with pytest.raises(UnknownNameError, match="action-linear, rbf"):
         make_learner("oracle", N_S, N_A, 20)
+
+
+@pytest.mark.skipif(not PAGE.is_file(), reason="the documentation is not part of this installation")
+def test_the_page_has_the_call_of_each_name() -> None:
+    section = PAGE.read_text(encoding="utf-8").split("## Names in")[1].split("\n## ")[0]
+    rows = [row.strip("| ").split(" | ") for row in section.splitlines() if "`" in row and row[0] == "|"]
+    calls = dict(
+        pair
+        for names, text in rows
+        for pair in zip(names.split(", "), re.findall("`(.*?)`", text), strict=False)
+    )
+    assert calls.keys() == {*COMPARED}
+    del calls["SOGP mixture"]  # in words
+    for name, call in calls.items():
+        if call.startswith("parts="):
+            call = f"SparseOnlineGP(d, m, kernel=SquaredExponential(d), {call})"
+        if "parts=" in call:
+            call = f"{call[:-1]}, standardize=False)"
+        written = describe(eval(call, {**vars(residual), "d": 3, "m": 2}))
+        made = describe(LEARNERS[name](3, 2))
+        assert made["class"] == written["class"]
+        assert not differences(made, written, {}), name

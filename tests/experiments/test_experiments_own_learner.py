@@ -93,11 +93,15 @@ def test_what_makes_no_learner_is_refused_by_name_before_anything_runs(tmp_path:
         (lambda d, m: RecursiveLeastSquares(m, d), "of 2 inputs, 3 outputs"),
         (lambda d, m: RecursiveLeastSquares(d, m, batch_shape=(4,)), r"batch_shape \(4,\)"),
         (lambda d: RecursiveLeastSquares(d, 1), "it raised TypeError"),
-        (RecursiveLeastSquares(3, 2), "it raised|it returned"),
+        (RecursiveLeastSquares(3, 2), "a factory, such as RecursiveLeastSquares"),
     ):
         with pytest.raises(ParameterError, match=rf"(?s)learners\['bad'\].*{problem}"):
             compare(stream(), {**good, "bad": factory}, folder=tmp_path)
     assert not list(tmp_path.glob("*.json"))
+    unnamed: list = [RecursiveLeastSquares, [RecursiveLeastSquares]]
+    for learners in unnamed:
+        with pytest.raises(ParameterError, match=r"names, or \{name: factory"):
+            compare(stream(), learners)
 
 
 def test_nothing_of_the_caller_is_left_changed() -> None:

@@ -111,7 +111,9 @@ def compare(
     predicted: Annotated[
         str, Option(help="Columns with your model's predictions of these: y is the difference.")
     ] = "",
-    observation: Annotated[str, Option(help="Columns whose next increments are predicted.")] = "",
+    observation: Annotated[
+        str, Option(help="In place of targets: columns whose next increments are predicted, from --inputs.")
+    ] = "",
     run_column: Annotated[str, Option("--run", help="Column with one number in each run.")] = "",
     clock: Annotated[
         str | None, Option(help="Of a ROS bag or MCAP: the topic whose messages set the rows.")

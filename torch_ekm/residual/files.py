@@ -59,6 +59,8 @@ def read(path: str | os.PathLike) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
+            if _HEADER not in archive.namelist():
+                raise FileFormatError(path, "not written by torch_ekm.save")
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
                 raise FileFormatError(path, "compressed entries, which no learner's file has")
             if archive.getinfo(_HEADER).file_size > _LARGEST_HEADER:

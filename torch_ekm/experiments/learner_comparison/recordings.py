@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from ..._extras import require
-from ...exceptions import DescriptionError, EKMError, UnknownNameError
+from ...exceptions import DescriptionError, EKMError, ParameterError, UnknownNameError
 from ...typing import Array
 from .own_recording import Columns, load_own
 from .stream import Stream, in_own_units, load_table
@@ -41,6 +41,7 @@ def load_recording(
     Raises:
         UnknownNameError: neither a known name nor a file.
         DescriptionError: the folder or the file is missing, or cannot be used.
+        ParameterError: observation together with targets, predicted or run.
     """
     if name == "simulated_hand":
         from .simulated_stream import record_simulated_hand  # needs the simulator
@@ -55,6 +56,8 @@ def load_recording(
             problem = f"the recording '{name}' there is damaged: {error}"
             raise DescriptionError(os.environ["TORCH_EKM_DATA"], problem) from None
     if observation:
+        if other := [key for key in ("targets", "predicted", "run") if columns.get(key)]:
+            raise ParameterError("observation", observation, f"given without {' and '.join(other)}")
         which = Columns(columns.get("inputs") or observation, (), observation)
         return load_own(name, which, clock=columns.get("clock")).stream(limit)
     if Path(name).suffix or columns.get("clock"):

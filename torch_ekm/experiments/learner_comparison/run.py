@@ -51,10 +51,12 @@ def compare(
             --help``), streams; of different names.
         learners: name -> ``factory(in_features, out_features)``, lambdas and classes of a notebook included;
             or names of the package's own. By default all of these but those of other libraries.
-        targets: columns of the files to predict; ``y``, ``y1``, ``y2``, ... if none is named.
+        targets: columns of the files to predict; ``y``, ``y1``, ``y2``, ..., if none is named. For these 0 is
+            the model alone; for others, without ``predicted``, the mean of their first tenth.
         inputs: columns of the files to predict from; all others if none is named.
         predicted: columns with what the model says of the targets, which are then what was measured.
-        observation: in place of targets: columns whose increments are predicted, as :func:`load_own` does.
+        observation: in place of targets: columns whose increments are predicted, as :func:`load_own` does;
+            from ``inputs``, or from themselves if none is named.
         run: a column with one number in each run.
         clock: the topic whose messages set the rows, in a recording of ROS.
         limit: only the first so many samples of a file or recording; None: all.
@@ -128,13 +130,17 @@ def run_one(stream: Stream, factory: Factory) -> dict[str, Any]:
 def _factories(learners: Mapping[str, Factory] | Sequence[str] | None) -> dict[str, Factory]:
     if isinstance(learners, Mapping):
         return dict(learners)
-    names = COMPARED if learners is None else (learners,) if isinstance(learners, str) else learners
+    names = (learners,) if isinstance(learners, str) else COMPARED if learners is None else learners
+    if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
+        raise ParameterError("learners", learners, "names, or {name: factory(in_features, out_features)}")
     return {name: learner_factory(name) for name in names}
 
 
 def _made(name: str, factory: Factory, stream: Stream) -> ResidualLearner:
     """A learner as it begins, of the sizes of the stream; whatever else comes is refused by name."""
     d, m = stream.x.shape[1], stream.y.shape[1]
+    if isinstance(factory, ResidualLearner):
+        raise ParameterError(f"learners[{name!r}]", factory, f"a factory, such as {type(factory).__name__}")
     valid = f"a factory (in_features, out_features) -> ResidualLearner; called with ({d}, {m}) it "
     try:
         with torch.random.fork_rng(devices=[]):

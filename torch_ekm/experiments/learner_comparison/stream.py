@@ -86,7 +86,8 @@ def load_table(
 
     Args:
         path: the file; rows in the order of time.
-        targets: columns to predict; those called ``y``, ``y1``, ``y2``, ... if none is named.
+        targets: columns to predict; those called ``y``, ``y1``, ``y2``, ... if none is named. These are
+            residuals: 0 is the model alone; for others without ``predicted``, their mean at first.
         limit: only the first so many rows.
         inputs: columns to predict from; all others if none is named.
         predicted: what the model says of each target: y is target - predicted, and 0 is the model alone.
@@ -104,7 +105,7 @@ def load_table(
     chosen, outputs, model, runs = (find_columns(columns, names) for columns in wanted)
     if model and len(model) != len(outputs):
         raise ParameterError("predicted", model, f"one for each measured column, {len(outputs)}")
-    outputs = outputs or [name for name in names if name == "y" or (name[:1] == "y" and name[1:].isdigit())]
+    outputs = outputs or [name for name in names if _is_residual(name)]
     if not outputs:
         problem = "no column is called 'y' (or y1, y2, ...); name the targets: targets=, or --targets"
         raise DescriptionError(path, f"{problem}. The columns are {', '.join(names)}")
@@ -113,17 +114,27 @@ def load_table(
         raise DescriptionError(path, "all columns are targets; at least one must be an input")
     if both := [name for name in chosen if name in outputs]:
         raise DescriptionError(path, f"column '{both[0]}' cannot be both input and target")
-    x, y = read(chosen), read(outputs) - (read(model) if model else 0.0)
+    groups = [chosen, outputs, model, runs]  # read at once, so that holes are counted in all of them
+    values = np.split(
+        read([name for one in groups for name in one]), np.cumsum([len(one) for one in groups[:-1]]), axis=1
+    )
+    x, y = values[0], values[1] - (values[2] if model else 0.0)
     if len(x) < LEAST:
         raise DescriptionError(path, f"it has {len(x)} samples; at least {LEAST} are needed to compare")
-    about = f"{', '.join(outputs)} from {len(chosen)} columns of {Path(path).name}"
-    number = np.pad(read(runs)[:limit].sum(1), 1, constant_values=np.nan)  # zeros without runs
+    zero_is_model = bool(model) or all(map(_is_residual, outputs))
+    alone = ", ".join(model) if model else "0" if zero_is_model else "the mean of the first tenth"
+    about = f"{', '.join(outputs)} from {len(chosen)} columns of {Path(path).name}; alone: {alone}"
+    number = np.pad(values[3][:limit].sum(1), 1, constant_values=np.nan)  # zeros without runs
     parts = np.diff(np.flatnonzero(np.diff(number))).tolist()
     grows = (np.diff(x, axis=0) <= 0).sum(0) < len(parts)  # but for the starts of runs
     clocks = ", ".join(name for name, clock in zip(chosen, grows, strict=True) if clock)
     notes = f" {clocks} only grows, like a clock or the number of a row: leave it out." if clocks else ""
-    stream = in_own_units(Path(path).stem, x, y, about, limit, centre_y=not model)
+    stream = in_own_units(Path(path).stem, x, y, about, limit, centre_y=not zero_is_model)
     return dataclasses.replace(stream, segments=tuple(parts) if runs else (), notes=notes)
+
+
+def _is_residual(name: str) -> bool:
+    return name == "y" or (name[:1] == "y" and name[1:].isdigit())
 
 
 def in_own_units(

@@ -60,14 +60,16 @@ def open_table(path: Path, clock: str | None = None) -> tuple[Names, Read]:
     return names, read
 
 
-def find_columns(wanted: Sequence[str], names: Sequence[str]) -> list[str]:
+def find_columns(wanted: str | Sequence[str], names: Sequence[str]) -> list[str]:
     """Names of the columns, in the order in which they are asked for; ``begin*``: all that begin so.
+
+    A single name stands for a list of one.
 
     Raises:
         UnknownNameError: there is no such column; the message lists the columns.
     """
     found: list[str] = []
-    for pattern in wanted:
+    for pattern in [wanted] if isinstance(wanted, str) else wanted:
         begin = pattern.removesuffix("*")
         fits = [name for name in names if name == pattern or (begin != pattern and name.startswith(begin))]
         if not fits:
@@ -101,20 +103,24 @@ def _csv(path: Path) -> tuple[Names, Read]:
 def _csv_values(
     path: Path, names: list[str], rows: list[tuple[int, list[str]]], columns: Sequence[str]
 ) -> Array:
-    values = np.empty((len(rows), len(columns)))
     places = [names.index(name) for name in columns]
-    for i, (line, row) in enumerate(rows):
-        for j, place in enumerate(places):
-            field = row[place]
-            value = _number(field)
-            if value is None or not np.isfinite(value):
-                problem = f": '{field}' is not finite; fill it in, or leave the whole line out"
-                if value is None:
-                    problem = f": '{field}' is no number; encode it, or leave the column or the line out"
-                if not field:
-                    problem = " is empty; fill it in, or leave the whole line out"
-                raise DescriptionError(path, f"line {line}, column '{names[place]}'{problem}")
-            values[i, j] = value
+    values = np.array([[_number(row[place]) for place in places] for _, row in rows], dtype=np.float64)
+    values = values.reshape(len(rows), len(places))  # np.float64 makes a NaN of None
+    bad = ~np.isfinite(values)
+    if bad.any():
+        i, j = np.argwhere(bad)[0]
+        line, row = rows[i]
+        field = row[places[j]]
+        problem = f": '{field}' is not finite; fill it in, or leave the whole line out"
+        if _number(field) is None:
+            problem = f": '{field}' is no number; encode it, or leave the column or the line out"
+        if _number(field.replace(",", ".", 1)) is not None and "," in field:
+            problem = f": '{field}' has a decimal comma; write a point"
+        if not field:
+            problem = " is empty; fill it in, or leave the whole line out"
+        n = int(bad.any(1).sum())
+        more = f". {n} of {len(rows)} lines have a field that is no finite number" if n > 1 else ""
+        raise DescriptionError(path, f"line {line}, column '{columns[j]}'{problem}{more}")
     return values
 
 
