@@ -262,7 +262,7 @@ def table(lifts: Sequence[Lift]) -> Table:
     rows: list[list[Cell]] = []
     for case in dict.fromkeys(one.case for one in lifts):
         some = [one for one in lifts if one.case == case]
-        off = [one.off for one in some if not one.lost] or [math.nan]
+        off = [one.off for one in some if not one.lost]
         foreseen = [one.foreseen for one in some if not math.isnan(one.foreseen)]
         again = list(filter(set_again, some))
         shifts = f"{len(again)} ({np.median([one.shift for one in again]):.1f} mm)" if again else "0"
@@ -270,7 +270,7 @@ def table(lifts: Sequence[Lift]) -> Table:
             [
                 case, f"{sum(one.regular for one in some)} of {len(some)}",
                 f"{np.median(foreseen):.0f} ({len(foreseen)})" if foreseen else "none",
-                sum(one.lost for one in some), f"{np.median(off):.0f} (to {max(off):.0f})",
+                sum(one.lost for one in some), f"{np.median(off):.0f} (to {max(off):.0f})" if off else math.nan,
                 _median(one.moved for one in some if not one.lost), shifts,
                 _median(one.remains for one in again),
             ]
