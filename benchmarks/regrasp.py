@@ -270,7 +270,8 @@ def table(lifts: Sequence[Lift]) -> Table:
             [
                 case, f"{sum(one.regular for one in some)} of {len(some)}",
                 f"{np.median(foreseen):.0f} ({len(foreseen)})" if foreseen else "none",
-                sum(one.lost for one in some), f"{np.median(off):.0f} (to {max(off):.0f})" if off else math.nan,
+                sum(one.lost for one in some),
+                f"{np.median(off):.0f} (to {max(off):.0f})" if off else math.nan,
                 _median(one.moved for one in some if not one.lost), shifts,
                 _median(one.remains for one in again),
             ]
