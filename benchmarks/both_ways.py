@@ -1,9 +1,9 @@
-"""How far one grasp turns an object in all: back to the end that is foreseen as safe, then forth to another.
+"""How far one grasp turns an object in all: forth to the end that is foreseen as safe, then back to another.
 
     python benchmarks/both_ways.py --objects can,box --seeds 1000:1010 --out FOLDER
 
 With every object and hand an E-KM has three turns of warm-up. Then the model is asked how far a new grasp
-turns back, the hand goes there, and the same forth, from where the first turn ended. Poses are true plus
+turns forth, the hand goes there, and the same back, from where the first turn ended. Poses are true plus
 noise. Finished sessions stay in ``--out``: an interrupted run goes on where it stopped.
 """
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 GOAL = 60.0  # [deg] in all
 WARM_UP = (15.0, -9.0, 15.0)  # [deg]
+ORDER = (1, -1)  # signs of the turns: a box that was turned forth turns farther back
 _FIRST_WARM_UP, _GRASP = 1000, 3000  # numbers of the grasps
 _DEG = math.pi / 180
 
@@ -64,7 +65,7 @@ def session(setting: Setting, item: str, seed: int, limit: float) -> list[dict[s
     start = bench.grasp(seed, _GRASP)
     if start is not None:
         begun, axis = true_state(bench.hand.observe()), bench.hand.rotation_axis
-        for sign in (-1, 1):
+        for sign in ORDER:
             here = float(axis @ bench.plant.observe().state.minus(start)[-3:]) / _DEG
             try:
                 loop, farthest = bench.closed_loop(bench.plant), (limit - sign * here) * _DEG
@@ -174,8 +175,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.quick:
         objects, seeds, limit = objects[:1], seeds[:1], 5.0
     setting = Setting(engine=given.engine)
+    figures = WARM_UP, ORDER, limit
     todo = {
-        f"{Path(item).stem}_{digest(setting, (item,), WARM_UP, limit)}_{seed}": (setting, item, seed, limit)
+        f"{Path(item).stem}_{digest(setting, (item,), *figures)}_{seed}": (setting, item, seed, limit)
         for seed in seeds
         for item in objects
     }
