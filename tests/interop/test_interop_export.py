@@ -24,6 +24,7 @@ from torch_ekm.exceptions import ParameterError
 from torch_ekm.interop import to_casadi
 from torch_ekm.residual import (
     ActionLinearKernel,
+    LinearKernel,
     Matern32,
     Matern52,
     RecursiveLeastSquares,
@@ -46,6 +47,7 @@ LEARNERS = {
     "matern32": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=Matern32(3), parts=[Standardize()]),
     "matern52": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=Matern52(3)),
     "action-linear": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=ActionLinearKernel(3, 1)),
+    "linear": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=LinearKernel(3, slope_variance=2.0)),
     "squared exponential": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=SquaredExponential(3)),
     "deep": deep,
     "default": lambda: default_learner(3, 2, capacity=12),

@@ -12,6 +12,7 @@ from as_published import sogp
 from torch_ekm.residual import (
     ActionLinearKernel,
     ForgettingFactor,
+    LinearKernel,
     Matern32,
     Matern52,
     ProcessNoise,
@@ -349,6 +350,7 @@ KERNELS = {
     "se": lambda: SquaredExponential(D, lengthscale=[0.7, 1.0, 1.5, 2.0]),
     "matern32": lambda: Matern32(D),
     "matern52": lambda: Matern52(D),
+    "linear": lambda: LinearKernel(D, slope_variance=[0.5, 1.0, 2.0, 4.0], variance=0.7),
     "action": lambda: ActionLinearKernel(D, 2, state_kernel=Matern52(2), action_variance=[0.5, 2.0]),
 }
 

@@ -10,7 +10,15 @@ import numpy as np
 
 from .._extras import require
 from ..exceptions import ParameterError
-from ..residual import ActionLinearKernel, DeepKernel, Kernel, Matern32, Matern52, SquaredExponential
+from ..residual import (
+    ActionLinearKernel,
+    DeepKernel,
+    Kernel,
+    LinearKernel,
+    Matern32,
+    Matern52,
+    SquaredExponential,
+)
 from ..typing import Array, Tensor
 
 if TYPE_CHECKING:
@@ -61,6 +69,8 @@ def covariance(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> t
     """
     if isinstance(kernel, ActionLinearKernel):
         return _action_linear(kernel, basis, inputs)
+    if isinstance(kernel, LinearKernel):
+        return _linear(kernel, basis, inputs)
     if isinstance(kernel, DeepKernel):
         phi, base = _phi(kernel.base), kernel.base
         points = inputs.take("embedded", lambda: kernel.embed(basis()))
@@ -73,7 +83,7 @@ def covariance(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> t
         def embed(z: ca.SX, /) -> ca.SX:
             return z * w
     else:
-        valid = "squared exponential, Matern, action-linear or deep"
+        valid = "squared exponential, Matern, action-linear, linear or deep"
         raise ParameterError("kernel", type(kernel).__name__, valid)
     v = inputs.take("variance", lambda: base.log_variance.exp())
 
@@ -108,6 +118,16 @@ def _action_linear(
     return (
         lambda z: state(z[:n]) * (actions @ (variance * z[n:])),
         lambda z: of_state(z[:n]) * ca.sum1(variance * z[n:] * z[n:]),
+    )
+
+
+def _linear(kernel: LinearKernel, basis: Callable[[], Tensor], inputs: Inputs) -> tuple[_Function, _Function]:
+    points = inputs.take("points", basis)
+    v = inputs.take("variance", lambda: kernel.variance)
+    slopes = inputs.take("slope_variance", lambda: kernel.slope_variance)
+    return (
+        lambda z: v * (1.0 + points @ (slopes * z)),
+        lambda z: v * (1.0 + ca.sum1(slopes * z * z)),
     )
 
 

@@ -10,6 +10,7 @@ from .default import default_learner
 from .kernels.action_linear import ActionLinearKernel, action_covariance
 from .kernels.deep import DeepKernel
 from .kernels.kernel import Kernel
+from .kernels.linear import LinearKernel
 from .kernels.stationary import Matern32, Matern52, SquaredExponential
 from .last_residual import LastResidual
 from .mixture import MixtureResidual
@@ -32,6 +33,7 @@ __all__ = [
     "ForgettingFactor",
     "Kernel",
     "LearnHyperparameters",
+    "LinearKernel",
     "LastResidual",
     "Matern32",
     "Matern52",

@@ -4,12 +4,12 @@ import math
 from typing import Any, Literal
 
 from ..exceptions import UnknownNameError
+from .kernels.linear import LinearKernel
 from .kernels.stationary import Matern32
-from .last_residual import LastResidual
 from .mixture import MixtureResidual
 from .sparse_gp.deep import DeepKernelSOGP
 from .sparse_gp.defaults import fleet_options
-from .sparse_gp.forgetting import ForgettingFactor, ProcessNoise
+from .sparse_gp.forgetting import ProcessNoise
 from .sparse_gp.hyperparameters import LearnHyperparameters
 from .sparse_gp.monitor import DetectChanges, RobustWeight
 from .sparse_gp.sparse_online_gp import SparseOnlineGP
@@ -29,8 +29,8 @@ def default_learner(
     """The recommended learner where nothing is known of the data: a mixture of four, in constant memory.
 
     Two learners keep the past and learn features, of which one distrusts large samples and one does not (rare
-    ones may be outliers, or what is worth learning); one lets g wander; one forgets and has the last residual
-    among its inputs. The model alone, and the last residual alone, are among the experts. Evidence decides,
+    ones may be outliers, or what is worth learning); one lets g wander; one is linear in x.
+    The model alone, and the last residual alone, are among the experts. Evidence decides,
     for each output. It predicts the *next* sample: see MixtureResidual.
 
     Args:
@@ -55,12 +55,12 @@ def default_learner(
     late = [{**common, "refresh_offset": offset} for offset in (0, 12, 6, 22)]
     fleet = fleet_options(options)
     wanders = [RobustWeight(3.0), ProcessNoise(0.003), LearnHyperparameters()]
-    forgets = [RobustWeight(3.0), DetectChanges(), ForgettingFactor(0.99), LearnHyperparameters()]
+    keeps = [RobustWeight(3.0), LearnHyperparameters()]
     members = [
         DeepKernelSOGP(d, m, base=_long(d, fleet), parts=[RobustWeight(3.0), DetectChanges()], **late[0]),
         DeepKernelSOGP(d, m, parts=[DetectChanges()], **late[1]),
         SparseOnlineGP(d, m, parts=wanders, **late[2]),
-        LastResidual(SparseOnlineGP(d + m, m, kernel=_long(d + m, fleet), parts=forgets, **late[3])),
+        SparseOnlineGP(d, m, kernel=LinearKernel(d, **fleet), parts=keeps, **late[3]),
     ]
     return MixtureResidual(members, levels=(0.0, 0.03, 0.1, 1.0), trends=(0.0, 0.5), **options)
 

@@ -16,6 +16,7 @@ from ....typing import Array, Tensor
 from ...kernels.action_linear import ActionLinearKernel
 from ...kernels.deep import DeepKernel
 from ...kernels.kernel import Kernel
+from ...kernels.linear import LinearKernel
 from ...kernels.stationary import Matern32, Matern52, SquaredExponential
 from ...report import MomentsWithJacobians, UpdateReport
 from ..monitor import RobustWeight
@@ -239,6 +240,10 @@ _KINDS, _GIVEN = {SquaredExponential: 0, Matern32: 1, Matern52: 2}, 3
 
 def _known(kernel: Kernel, batch: tuple[int, ...]) -> tuple[tuple[int, int], list[Tensor]] | None:
     """(kind, width of the action) and the parameters of a kernel that the loops know themselves."""
+    if type(kernel) is LinearKernel:  # action-linear without a state
+        slopes, variance = kernel.log_slope_variance, kernel.log_variance
+        alike = slopes.shape[:-1] == variance.shape and variance.shape in ((), batch)
+        return ((0, slopes.shape[-1]), [slopes[..., :0], variance, slopes]) if alike else None
     inner = {ActionLinearKernel: "state_kernel", DeepKernel: "base"}.get(type(kernel))
     state = kernel if inner is None else getattr(kernel, inner)
     kind = _KINDS.get(type(state))  # a subclass may compute something else

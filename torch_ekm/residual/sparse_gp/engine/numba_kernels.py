@@ -59,6 +59,7 @@ def _kernel(flags, z, basis, active, log_lengthscale, log_variance, log_action, 
     """k (and with ``slopes`` dk) between z and the basis; returns k(z, z)."""
     kind, n_a = flags[KIND], flags[ACTIONS]
     n_s = z.shape[0] - n_a
+    start = 0.0 if n_s > 0 else 1.0  # without a state it is a LinearKernel, which has a constant
     variance, w, lam = math.exp(log_variance), np.exp(-log_lengthscale), np.exp(log_action)
     for i in range(basis.shape[0]):
         if active[i] == 0.0:
@@ -73,7 +74,7 @@ def _kernel(flags, z, basis, active, log_lengthscale, log_variance, log_action, 
         phi, psi = _phi_psi(kind, d2)
         phi, psi, inner = variance * phi, variance * psi, 1.0
         if n_a > 0:
-            inner = 0.0
+            inner = start
             for j in range(n_a):
                 inner += z[n_s + j] * lam[j] * basis[i, n_s + j]
         k[i] = phi * inner
@@ -85,7 +86,7 @@ def _kernel(flags, z, basis, active, log_lengthscale, log_variance, log_action, 
                 dk[i, n_s + j] = phi * lam[j] * basis[i, n_s + j]
     if n_a == 0:
         return variance
-    norm = 0.0
+    norm = start
     for j in range(n_a):
         norm += z[n_s + j] * z[n_s + j] * lam[j]
     return variance * norm
