@@ -64,8 +64,6 @@ OPTIONS = {
     "linear": lambda shape: {
         "kernel": LinearKernel(D, slope_variance=[0.5, 1.0, 2.0, 4.0], variance=0.7, batch_shape=shape),
         "parts": [Standardize(), RobustWeight(3.0)],
-        "capacity": D
-        + 1,  # more points say the same: the kernel's matrix would be singular but for its jitter
     },
     "deep": lambda shape: {
         "kernel": DeepKernel(SquaredExponential(D), hidden=(8,)),
