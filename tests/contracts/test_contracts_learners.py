@@ -19,8 +19,8 @@ from torch_ekm.residual import (
     DeepKernelSOGP,
     DetectChanges,
     ForgettingFactor,
-    LastResidual,
     LearnHyperparameters,
+    LinearKernel,
     MixtureResidual,
     ProcessNoise,
     RandomFeatureRLS,
@@ -56,7 +56,7 @@ LEARNERS = {
     "ensemble": lambda **o: ReplayMLP(3, 2, hidden=(8,), members=3, **o),
     "sogp": sogp,
     "default": lambda **o: default_learner(3, 2, capacity=8, **o),
-    "last_residual": lambda **o: LastResidual(SparseOnlineGP(5, 2, capacity=8, **o)),
+    "linear": lambda **o: SparseOnlineGP(3, 2, capacity=8, kernel=LinearKernel(3), **o),
     "rls_as_given": lambda **o: RecursiveLeastSquares(3, 2, standardize=False, **o),
     "sogp_all": lambda **o: sogp(
         refresh_every=4,

@@ -9,7 +9,7 @@ import numpy as np
 
 from .._extras import require
 from ..exceptions import ParameterError
-from ..residual import LastResidual, MixtureResidual, ResidualLearner, SparseOnlineGP
+from ..residual import MixtureResidual, ResidualLearner, SparseOnlineGP
 from ..typing import Array
 from .casadi_kernels import Inputs, covariance
 
@@ -72,9 +72,6 @@ def _build(learner: ResidualLearner, inputs: Inputs, variance: bool) -> _Express
         return _mixture(learner, inputs, variance)
     if isinstance(learner, SparseOnlineGP):
         return _sparse(learner, inputs, variance)
-    if isinstance(learner, LastResidual):
-        inner, last = _build(learner.learner, inputs, variance), inputs.take("last", lambda: learner.last)
-        return lambda x: inner(ca.vertcat(x, last))
     raise ParameterError("learner", type(learner).__name__, "a SparseOnlineGP or a MixtureResidual of such")
 
 
@@ -136,8 +133,6 @@ def _weighted(weights: ca.SX, columns: list[ca.SX]) -> ca.SX:
 
 def _noise(learner: ResidualLearner) -> Any:
     """Observation noise variance ``(out,)``; of a mixture in a mixture there is no such thing."""
-    if isinstance(learner, LastResidual):
-        return _noise(learner.learner)
     if not isinstance(learner, SparseOnlineGP):
         valid = "SparseOnlineGPs, where the variance is wanted"
         raise ParameterError("learners", type(learner).__name__, valid)

@@ -12,7 +12,6 @@ from .kernels.deep import DeepKernel
 from .kernels.kernel import Kernel
 from .kernels.linear import LinearKernel
 from .kernels.stationary import Matern32, Matern52, SquaredExponential
-from .last_residual import LastResidual
 from .mixture import MixtureResidual
 from .mixture_engine import warm_up
 from .report import UpdateEvent, UpdateReport
@@ -34,7 +33,6 @@ __all__ = [
     "Kernel",
     "LearnHyperparameters",
     "LinearKernel",
-    "LastResidual",
     "Matern32",
     "Matern52",
     "MixtureResidual",
