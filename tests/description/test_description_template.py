@@ -76,6 +76,12 @@ def test_a_mimic_becomes_a_coupling(tmp_path: Path) -> None:
         load_hand(urdf)
 
 
+def test_the_pad_of_a_thumb_is_called_so(tmp_path: Path) -> None:
+    urdf = tmp_path / "mine.urdf"
+    urdf.write_text(MIMIC.replace("distal", "thumb_tip"))
+    assert 'name = "thumb_1"' in write_template(urdf).read_text()
+
+
 def test_what_no_template_is_written_for(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="urdf"):
         write_template(tmp_path / "hand.json")

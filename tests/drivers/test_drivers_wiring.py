@@ -48,6 +48,8 @@ FAULTS = {  # what is changed; line, words
     "no id": ("id = 1\n|", 15, "the key 'id' is missing"),
     "id of half": ("id = 1|id = 1.5", 17, "whole number"),
     "negative rate": ("rate_deg = 200|rate_deg = -1", 22, "must be positive"),
+    "limit in deg": ("increment_deg = 20|increment = 20", 21, "must be at most 3.14 rad, got 20"),
+    "rest in deg": ("rate_deg = 200|still = 0.2", 22, "'still' must be at most 0.1 rad"),
     "text for a number": ("zero = 1000|zero = '1000'", 18, "must be a finite number"),
     "no such hand": ('"yale_t42"|"yale_t43"', 3, "unknown hand 'yale_t43'; valid are: icub_right"),
     "another driver": ('"dynamixel"|"yarp"', 2, "this is the driver 'dynamixel'"),

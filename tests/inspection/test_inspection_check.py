@@ -117,6 +117,52 @@ def test_a_pad_that_the_urdf_lacks_is_printed_to_be_pasted(files):
     assert next(module._pads(load_hand(urdf))).state == "ok"
 
 
+def test_what_is_pasted_is_printed_on_one_line(files, monkeypatch):
+    urdf, transmission = files
+    transmission.write_text(transmission.read_text().replace("radius = 0.006", "radius = 0.009", 1))
+    rows = list(module._pads(load_hand(urdf)))
+    monkeypatch.setattr(module, "check_hand", lambda *_: rows)
+    said = CliRunner().invoke(app, ["check", str(urdf)])
+    (row,) = [row for row in rows if row.remedy]
+    assert row.remedy[row.remedy.index("<collision>") :] in said.output.splitlines()
+
+
+UNITS = {"rad": ("range_deg", "range"), "m": ("left_0 = 1.0, left_1 = 0.8", "left_0 = 0.010, left_1 = 0.008")}
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_ranges_and_moment_arms_in_another_unit_are_named(unit, files):
+    urdf, transmission = files
+    assert not list(module._ranges(load_hand(urdf)))
+    old, new = UNITS[unit]
+    text = transmission.read_text()
+    assert old in text
+    transmission.write_text(text.replace(old, new, 1))
+    (row,) = module._ranges(load_hand(urdf))
+    assert (row.name, row.state) == ("range of 'left'", "warning")
+    assert "are ratios of radii" in row.remedy
+
+
+def test_a_grasp_width_that_is_not_the_objects_is_named():
+    can = load_object("can")
+    assert not list(module._width(can))
+    (row,) = module._width(dataclasses.replace(can, grasp_width=0.02))
+    assert row.found.startswith("half of grasp_width = 0.02 m is 10 mm off")
+
+
+@pytest.mark.usefixtures("brief")
+def test_where_the_files_have_a_fault_no_other_force_is_tried(files, monkeypatch):
+    tried = []
+    monkeypatch.setattr(module, "_gentler", lambda *of: tried.append(of) or ())
+    monkeypatch.setattr(module, "_pinch", lambda *_: [module.Check("pinch", "error", "not tried")])
+    urdf, transmission = files
+    check_hand(str(urdf), "can")
+    assert len(tried) == 1
+    transmission.write_text(transmission.read_text().replace("[0.0, -1.0, 0.0]", "[0.0, 1.0, 0.0]", 1))
+    check_hand(str(urdf), "can")
+    assert len(tried) == 1
+
+
 def test_which_pad_opposes_which_is_said():
     (row,) = module._reach(load_hand("icub_right"), load_object("box"))
     assert row.found == "pad thumb opposes index and middle, 30 mm between them"

@@ -143,7 +143,13 @@ def test_the_command_reads_logs(tmp_path: Path, monkeypatch, capsys) -> None:
     with TrialLog(logs[0], {"hand": "yale_t42"}) as log:
         log.write(0, made.log, {})
         log.write(1, Trajectory(1), {})
-    assert run(logs[0]) == (0, "No actuator changed.\n")
+    assert run(logs[0]) == (0, "No actuator changed in 30 motions.\n")
+    early = Made(1)
+    early.move(6)
+    with TrialLog(tmp_path / "early", {"hand": "yale_t42"}) as log:
+        log.write(0, early.log, {})
+    few = "No actuator changed in 6 motions. An actuator is judged after 12 motions.\n"
+    assert run(str(tmp_path / "early")) == (0, few)
     later = Made(2)
     later.move(5)
     later.move(gave=(0.0, 25.0))

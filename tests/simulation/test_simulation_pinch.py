@@ -16,7 +16,12 @@ from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
 from torch_ekm.simulation.grasp_planning import pinch
-from torch_ekm.simulation.grasp_planning.pinch import opposing_pads, pinch_problem, plan_pinch
+from torch_ekm.simulation.grasp_planning.pinch import (
+    opposing_pads,
+    pinch_problem,
+    plan_pinch,
+    turning_axis,
+)
 from torch_ekm.simulation.grasp_planning.pinch_problem import PinchRequest
 from torch_ekm.simulation.mechanism.assembly import make_transmission
 
@@ -35,6 +40,13 @@ def plan_for(name, request=None, **changes):
 def contacts_of(hand, obj, plan):
     parts = (torch.from_numpy(part) for part in (plan.q, plan.position, plan.rotation))
     return ContactDetector(hand, obj)(*parts)
+
+
+@pytest.mark.parametrize(("name", "axis"), [("icub_left", (0, 1, 0)), ("yale_t42", (0, 0, 1))])
+def test_an_object_lies_along_the_axis_about_which_fingers_bend(name, axis):
+    hand = dataclasses.replace(load_hand(name), planar_normal=None)
+    np.testing.assert_array_equal(turning_axis(hand, PlantConfig()), axis)
+    np.testing.assert_allclose(turning_axis(hand, PlantConfig(along=(2, 0, 0))), (1, 0, 0))
 
 
 @pytest.mark.parametrize("name", ["toothpaste", "applier", "bottle", "can", "pen_case", "carton"])

@@ -67,7 +67,9 @@ def check(
     plant: Annotated[
         Path | None, Option(metavar="TOML", help="A real hand's wiring file: its motors move by 1 deg.")
     ] = None,
-    dry_run: Annotated[bool, Option(help="With --plant: print the commands, move nothing.")] = False,
+    dry_run: Annotated[
+        bool, Option(help="With --plant: read the bus, print the commands, move nothing.")
+    ] = False,
 ) -> None:
     """Check a hand, from its files to a pinch of an object; or the wiring of a real one.
 
@@ -95,7 +97,13 @@ def check(
             raise ParameterError("file", str(picture), "a name that ends in .png, .jpg, .jpeg")
         with console.status("Checking: some seconds, a minute or two where the pinch fails"):
             rows = check_hand(hand, object, picture)
-    print_table(Check._fields, rows, hand if plant is None else str(plant))
+    # a table breaks lines, and what is pasted must have none
+    parts = [row.remedy.partition(": <collision>") for row in rows]
+    shown = [row._replace(remedy=part[0]) for row, part in zip(rows, parts, strict=True)]
+    print_table(Check._fields, shown, hand if plant is None else str(plant))
+    for row, (where, shape, rest) in zip(rows, parts, strict=True):
+        if shape:
+            say(f"{row.name}: {where}:\n{shape[2:]}{rest}")
     if any(row.state == "error" for row in rows):
         raise typer.Exit(1)
 

@@ -74,22 +74,26 @@ def health(
     """Report which actuator of a hand changed, by how much and since when.
 
     Read from ordinary motions in its trial logs: what tendons pass on, dead zones and biases of the servos.
-    With --knowledge: also the figures that a closed loop learned. Ends with 1 if something changed.
+    With --knowledge: also the figures that a closed loop learned. Tendons show at measured joints only. Ends
+    with 1 if something changed.
     """
     from ..control import HandKnowledge
     from ..description import load_hand
-    from ..inspection.health import HealthChange, hand_health
+    from ..inspection.health import BASELINE, HealthChange, hand_health
     from ..plant import TrialLog
 
     opened = [TrialLog.open(log) for log in logs]
     name = hand or opened[0].configuration.get("hand")
     if not name:
         raise ParameterError("hand", name, "--hand NAME: the log names none")
-    found = hand_health(load_hand(name), ((k, log.read(k)) for log in opened for k in log.trials))
+    trials = [(k, log.read(k)) for log in opened for k in log.trials]
+    found = hand_health(load_hand(name), trials)
     if found:
         print_table(HealthChange._fields, found, str(name))
     if knowledge is not None:
         say(HandKnowledge.load(knowledge).figures)
     if found:
         raise typer.Exit(1)
-    say("No actuator changed.")
+    motions = sum(len(trial.commands) for _, trial in trials)
+    few = "" if motions > BASELINE else f" An actuator is judged after {BASELINE} motions."
+    say(f"No actuator changed in {motions} motions.{few}")

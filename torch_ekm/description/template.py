@@ -53,7 +53,7 @@ _PADS = """
 # The parts that touch objects, as capsules in the link's frame: all points within radius [m] of the segment
 # from start to end [m]. direction: outward, the middle of the side that touches. Pads that are simulated need
 # the same shape as <collision> in the URDF: a cylinder with a ball on either end, or a sphere.
-# A pinch in simulation is of the first pad, or one called thumb, against all others.
+# A pinch in simulation is of the pad whose name begins with thumb, else of the first, against all others.
 """
 
 
@@ -112,7 +112,8 @@ def template(model: UrdfModel) -> str:
 def _pads(model: UrdfModel) -> Iterator[str]:
     yield _PADS.rstrip("\n")
     for k, finger in enumerate(_fingers(model), start=1):
-        yield from _pad(model, _fingertip(model, finger[-1]), f"tip_{k}")
+        thumb = any("thumb" in link.lower() for link in finger)
+        yield from _pad(model, _fingertip(model, finger[-1]), f"thumb_{k}" if thumb else f"tip_{k}")
 
 
 def _joints(model: UrdfModel) -> Iterator[str]:

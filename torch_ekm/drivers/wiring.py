@@ -18,6 +18,7 @@ _CHANNEL = ("name", "id", "sign", "zero", "per_rad")
 _MOTOR = (*_CHANNEL, "range", "range_deg")
 _FINGERTIP = ("name", "id", "count", "zero", "per_newton")
 _ANGLES = ("increment", "rate", "still")  # of the limits
+_MOST = {"increment": math.pi, "rate": 30.0, "still": 0.1}  # [rad, rad/s]; more was meant in deg
 _HEADER = re.compile(r"^\s*(\[\[?)\s*([\w.-]+)\s*\]")
 _KEY = re.compile(r"""^\s*["']?([\w-]+)["']?\s*=""")
 _QUOTED = re.compile(r"'([\w-]+)'")
@@ -187,6 +188,11 @@ class Wiring:
         given = LinedTable(path, "[limits]", data.get("limits", {}), valid, lines.get("limits", {}))
         read = {key: given.angle if key in _ANGLES else given.number for key in known}
         figures = {key: read[key](key, default) for key, default in known.items()}
+        for key, most in _MOST.items():
+            if figures[key] > most:
+                rad = "rad/s" if key == "rate" else "rad"
+                problem = f"'{key}' must be at most {most:.3g} {rad}, got {figures[key]:.4g}"
+                raise given.error(f"{problem}; '{key}_deg' is in deg")
         try:
             limits = Limits(**figures)
         except ParameterError as error:

@@ -27,7 +27,8 @@ from ..simulation.physics.sapien_bodies import x_axis_to
 from ..typing import Array
 from .row import Check, State
 
-_SURFACE = 2e-4  # [m] between a pad and its link's collision shape
+_SURFACE = 2e-4  # [m] between a pad and its link's collision shape, and of an object from its grasp_width
+_RANGES = (0.05, 5.0)  # of what the joints allow; beyond them a figure has another unit
 _LOW_MARGIN = 0.1  # of the friction cone
 _CONTRADICT = 1e4  # [N/rad]: 100 N for 0.6 deg; soft actuators have some hundreds
 _GENTLER = (3.0, 2.0, 1.0)  # [N] pinch forces that are tried where the usual one is too high
@@ -58,16 +59,18 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
         return [Check("hand's files", "error", str(error), "see docs/reference/file_formats.md")]
     rows = [Check("hand's files", "ok", f"{description.n_q} joints, {description.n_a} actuators")]
     rows += [Check("MJCF", "warning", note) for note in description.notes]
-    rows += [*_pads(description), *_tensions(description)]
+    rows += [*_pads(description), *_ranges(description), *_tensions(description)]
     try:
         obj = load_object(object)
     except (EKMError, OSError) as error:
         return [*rows, Check("object's files", "error", str(error), "see docs/reference/file_formats.md")]
-    rows += [*_rigid(description), *_reach(description, obj)]
+    rows += [*_width(obj), *_rigid(description), *_reach(description, obj)]
+    unfit = any(row.state == "error" for row in rows)
     pinch = list(_pinch(description, obj, picture, PlantConfig()))
     faulty = any(row.state == "error" for row in pinch)
     if faulty:
-        return [*rows, *pinch, *_gentler(description, obj)]
+        # another force cures no fault of the files, and takes minutes to try
+        return [*rows, *pinch, *(() if unfit else _gentler(description, obj))]
     return [*rows, *pinch, *_turn(description, obj), *_disturbed(description, obj)]
 
 
@@ -102,6 +105,33 @@ def _collision(pad: ContactPad) -> str:
     parts += [(ends.mean(axis=0), rpy, rod)] if len(parts) > 1 else []
     form = '<collision><origin xyz="{:.6g} {:.6g} {:.6g}" rpy="{}"/><geometry>{}</geometry></collision>'
     return "".join(form.format(*at, turned, body) for at, turned, body in parts)
+
+
+def _ranges(hand: HandDescription) -> Iterator[Check]:
+    """``a = offset + J_a q`` of the joints' ranges is about the actuator's range."""
+    for actuator, arms in zip(hand.actuators, hand.actuation_jacobian, strict=True):
+        pulled = arms != 0
+        ends = arms[pulled] * np.stack([hand.joint_lower, hand.joint_upper])[:, pulled]
+        lower, upper = (actuator.offset + bound.sum() for bound in (ends.min(axis=0), ends.max(axis=0)))
+        share = (actuator.upper - actuator.lower) / (upper - lower) if upper > lower else math.nan
+        if share < _RANGES[0] or share > _RANGES[1]:  # not of joints without limits
+            own, free = (
+                "{:.3g} to {:.3g} deg".format(*np.degrees(pair))
+                for pair in ((actuator.lower, actuator.upper), (lower, upper))
+            )
+            found = f"range {own}; its joints and moment arms allow {free}"
+            remedy = "'range' is in rad, 'range_deg' in deg; moment arms are ratios of radii, not m or mm"
+            yield Check(f"range of '{actuator.name}'", "warning", found, remedy)
+
+
+def _width(obj: ObjectDescription) -> Iterator[Check]:
+    """The object's surface is half of ``grasp_width`` from the origin, along ``grasp_axis``."""
+    ends = 0.5 * obj.grasp_width * np.stack([obj.grasp_axis, -obj.grasp_axis])
+    off = float(np.abs(signed_distance(obj.shapes, ends)[0]).max())
+    if off > _SURFACE:
+        found = f"half of grasp_width = {obj.grasp_width:g} m is {1e3 * off:.3g} mm off its <collision>"
+        remedy = "its thickness [m] along grasp_axis, through the origin of the object's frame"
+        yield Check("object's width", "warning", found, remedy)
 
 
 def _tensions(hand: HandDescription) -> Iterator[Check]:
@@ -191,7 +221,7 @@ def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     except EKMError as error:
         yield Check("turn", "warning", str(error), remedy)
         return
-    found = ", ".join(f"{math.degrees(end.angle):+.0f} deg ({end.ends_by})" for end in ends)
+    found = ", ".join(f"{round(math.degrees(end.angle)):+d} deg ({end.ends_by})" for end in ends)
     little = min(abs(end.angle) for end in ends) < _LITTLE_TURN
     yield Check("turn", "warning" if little else "ok", f"predicted: {found}", remedy if little else "")
 
@@ -234,7 +264,7 @@ def _pinch(
         yield Check("pinch", "warning", f"not tried: {error}")
     except EKMError as error:
         what = "pinch" if seen is None else "model"
-        yield Check(what, "error", str(error), "as found")
+        yield Check(what, "error", str(error), "see docs/reference/errors.md")
     if picture is not None:
         try:
             yield Check("picture", "ok", str(_draw(hand, lin, picture).resolve()))

@@ -81,11 +81,12 @@ class _Checked:
             return
         blind = [n for n, found in zip(self.hand.actuator_names, self.test.rows, strict=True) if not found]
         if blind and (self.object is None or seen.status is not PlantStatus.HELD):
-            remedy = "look which way each goes, or hold an object, see it, and give its description"
+            remedy = "look which way each goes, or check_plant(WithPose(...), hand, object) with an object"
             yield Check(
                 "signs", "warning", f"not checked: no sensors at the joints of {', '.join(blind)}", remedy
             )
-        yield Check("at rest", "ok", f"encoders and {int(self.sensed.sum())} joint sensors agree")
+        sensors = f"encoders and {int(self.sensed.sum())} joint sensors agree"
+        yield Check("at rest", "ok", sensors if self.sensed.any() else "encoders are within their ranges")
         if getattr(self.plant, "dry_run", False):
             yield self._rehearsed(seen)
             return
@@ -125,7 +126,12 @@ class _Checked:
         """The object is between the pads."""
         if seen.status is not PlantStatus.HELD:
             return [
-                Check("pose", "warning", "the object is not seen: its pose is not checked", "WithPose(...)")
+                Check(
+                    "pose",
+                    "warning",
+                    "the object is not seen: its pose is not checked",
+                    "in Python, check_plant(WithPose(driver, camera), hand, object)",
+                )
             ]
         remedy = "give WithPose(frame=<pose of the camera's frame in the hand frame>), or correct it"
         links = HandKinematics(self.hand)(seen.q.double())

@@ -15,7 +15,7 @@ from ..plant import PlantStatus, Trajectory
 from ..typing import Array
 
 _DEG = math.pi / 180
-_BASELINE = 12  # motions before an actuator is judged
+BASELINE = 12  # motions before an actuator is judged
 _DRIFT, _ALARM = 1.5, 18.0  # of the sum of z^2 / 2: taken off at each motion; what is a change
 _OUTLIER = 4.0  # z of motions that nothing is learned from
 _GAVE = 5.0  # [deg] a tendon that gives more in one motion does not hold
@@ -125,16 +125,16 @@ class _Watch:
     def see(self, at: tuple[int, int], x: Array, y: float, stood: bool, excused: float) -> None:
         """Judge a motion and learn from it; errors up to ``excused`` are none."""
         error = self.error(x, y)
-        bound = self.part == "servo" and stood and (error < 0 or self.count < _BASELINE)
+        bound = self.part == "servo" and stood and (error < 0 or self.count < BASELINE)
         if not math.isfinite(error) or bound:
             return  # nothing was read; a motor that stands within its dead zone does not show how wide it is
         spread = 1 + float(x @ self.P @ x)
         z2 = max(0.0, abs(error) - excused) ** 2 / (self.squares / self.weight * spread)
-        if self.count >= _BASELINE:
+        if self.count >= BASELINE:
             before = [] if z2 / 2 - _DRIFT > _ALARM else self.misfits  # this motion alone is enough
             self.sum = max(0.0, self.sum + z2 / 2 - _DRIFT)
             self.misfits = [*before, (at, x, y)] if self.sum else []
-        if not excused and (self.count < _BASELINE or z2 < _OUTLIER**2):
+        if not excused and (self.count < BASELINE or z2 < _OUTLIER**2):
             self.learn(x, y)
 
     def against(self, new: _Watch) -> str:

@@ -30,7 +30,8 @@ class PlantConfig:
     """Opposing pads; None: index and middle where there are such, else all others."""
     along: tuple[float, float, float] | None = None
     """Direction in the hand of the object's long axis, within 5 deg, about which a pinch can turn it. None:
-    the normal of a planar hand, else y, square to the planes in which the iCub's fingers bend."""
+    the normal of a planar hand, else the axis about which most pads' last joints turn, or that of the hand
+    frame within 15 deg of it; y where the fingers stand on a circle."""
     spread: float = 1.0
     """Factor on how far points and tilts of the grasps are drawn from the middle of the object; 0: all are
     centred."""

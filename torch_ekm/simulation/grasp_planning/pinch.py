@@ -18,7 +18,7 @@ from ...exceptions import EquilibriumError, ParameterError
 from ...kinematics import HandKinematics
 from ...typing import Array
 from ..config import PlantConfig
-from ..mechanism.assembly import make_transmission, true_object
+from ..mechanism.assembly import chain, make_transmission, true_object
 from ..parameters import PlantParameters
 from .graspable import half_extent
 from .pinch_problem import PinchGeometry, PinchProblem, PinchRequest, opposition
@@ -28,6 +28,8 @@ _FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across an
 _POSTURES = 4096  # random ones, of which the best are first guesses
 _GUESSES = 5  # first guesses that are tried before giving up
 _STIFF_STEP = 0.002  # [s]; at 4 ms a hand with rigid actuators moves by 7 to 55 % another way
+_UNDECIDED = 0.9  # of the largest eigenvalue: fingers on a circle bend about no common axis
+_NEAR_AN_AXIS = np.cos(np.radians(15))  # the iCub's fingers bend about y to within 5 deg
 _CLOSING_POSTURES = 9  # from open to closed, in which pads are asked which one opposes the others
 _WIDER = np.pi / 4  # [rad] by which limits are moved to see which ones are in the way
 _GOOD_COST = 20.0  # half a sum of squares; the wishes of a good pinch cost about 0.3
@@ -277,6 +279,19 @@ def _most_opposed(hand: HandDescription) -> int:
 
 
 def turning_axis(hand: HandDescription, config: PlantConfig) -> Array:
-    """Unit vector along which the object's long axis is held, hand frame."""
-    along = np.array(config.along or hand.planar_normal or (0.0, 1.0, 0.0))
-    return along / np.linalg.norm(along)
+    """Unit vector along which the object's long axis is held, hand frame: see :class:`PlantConfig`.
+
+    The first eigenvector of the sum of ``z z^T`` over the axes z of the pads' last joints.
+    """
+    given = config.along or hand.planar_normal
+    if given is not None:
+        return np.array(given) / np.linalg.norm(given)
+    kinematics = HandKinematics(hand)
+    axes = kinematics.joint_axes(kinematics(torch.from_numpy(hand.spring_rest)))[0].numpy()
+    last = axes[[joints[0] for pad in hand.pads if (joints := chain(hand, pad.link))]]
+    weights, vectors = np.linalg.eigh(last.T @ last)
+    along, nearest = vectors[:, 2], np.eye(3)[np.abs(vectors[:, 2]).argmax()]
+    if weights[1] > _UNDECIDED * weights[2]:
+        return np.array([0.0, 1.0, 0.0])
+    along = along * np.sign(along @ nearest)
+    return nearest if along @ nearest > _NEAR_AN_AXIS else along
