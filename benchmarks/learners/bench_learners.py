@@ -236,6 +236,13 @@ def microseconds(call: Callable, budget: float = 0.6) -> float:
     return float(np.median(times) * 1e6)
 
 
+def seconds(call: Callable) -> float:
+    """Time of one call that is long."""
+    begin = time.perf_counter()
+    call()
+    return time.perf_counter() - begin
+
+
 def alternately(calls: dict[str, Callable], rounds: int = 5, budget: float = 0.3) -> dict[str, float]:
     """Medians of calls that take turns, so that what else the machine does falls on all of them."""
     times: dict[str, list[float]] = {name: [] for name in calls}
@@ -305,12 +312,11 @@ def of_fleets() -> Table:
             calls = dict(zip(ENGINES, (make(gp, m, shape) for gp in fleets), strict=True))
             found = alternately(calls, rounds=3)
             rows.append((f"{what}, {b} points", *(us / 256 for us in found.values())))
-        means = [microseconds(all_of(gp, m, shape, 64), 0.0) / (64 * 256) for gp in fleets]
+        means = [1e6 * seconds(all_of(gp, m, shape, 64)) / (64 * 256) for gp in fleets]
         rows.append((f"update, {b} points, mean with rebuilds", *means))
-    default = default_learner(D, m, batch_shape=shape)
-    for _ in range(2):  # the basis is full then
-        microseconds(all_of(default, m, shape, 64), 0.0)
-    mean = microseconds(all_of(default, m, shape, 64), 0.0) / (64 * 256)
+    default = all_of(default_learner(D, m, batch_shape=shape), m, shape, 64)
+    default(), default()  # the bases are full then
+    mean = 1e6 * seconds(default) / (64 * 256)
     rows.append(("default learner, update, mean", mean, math.nan))
     return Table("Fleets of 256, per model", "what | compiled [us] | torch [us]", rows)
 
