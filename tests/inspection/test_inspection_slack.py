@@ -151,7 +151,7 @@ class WithJoints(HandDriver):
     def _read(self) -> BusReading:
         now = time.monotonic()
         q = [0.7 * self.x[0], 0.6 * self.x[0], 0.9 * self.x[1], 0.4 * self.x[1]]
-        joints = [float(x) + self.draw.gauss(0, 0.1 * DEG) for x in q]
+        joints = [float(x) + self.draw.gauss(0, 0.05 * DEG) for x in q]
         motors = [one.bus(float(x)) for one, x in zip(self.wiring.motors, self.a, strict=True)]
         return BusReading(motors, now, joints=joints, joints_taken=now)
 
