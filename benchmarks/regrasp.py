@@ -104,9 +104,9 @@ class Regrasp:
     def lost(self) -> bool:
         return self.seen.status is PlantStatus.LOST
 
-    def off_axis(self, state: GraspState, start: GraspState) -> float:
-        """Rotation since ``start`` but for that about the axis [deg]."""
-        turned, axis = state.minus(start)[-3:], self.plant.rotation_axis
+    def off_axis(self, state: GraspState) -> float:
+        """Rotation since the start but for that about the axis [deg]."""
+        turned, axis = state.minus(self.start)[-3:], self.plant.rotation_axis
         return float((turned - (axis @ turned) * axis).norm()) / _DEG
 
     def place(self, finger: str, state: GraspState) -> float:
@@ -189,7 +189,7 @@ def lift(grasp: Regrasp, item: str, seed: int, fingers: tuple[str, ...], support
         grasp.go(grasp.motors(finger, place, CLEAR, 0.0))
         now = true_state(grasp.seen)
         if not grasp.lost:  # where it fell says nothing
-            off = max(off, grasp.off_axis(now, grasp.start))
+            off = max(off, grasp.off_axis(now))
             moved = max(moved, 1e3 * float((now.position - grasp.start.position).norm()))
         if grasp.lost or off > AXIS:
             return Lift(*about, off, moved, grasp.lost)
@@ -207,7 +207,7 @@ def lift(grasp: Regrasp, item: str, seed: int, fingers: tuple[str, ...], support
     shift = min(
         1e3 * (grasp.place(finger, grasp.seen.state) - place) for finger, (place, _) in before.items()
     )
-    remains = grasp.off_axis(true_state(grasp.seen), grasp.start)
+    remains = grasp.off_axis(true_state(grasp.seen))
     return Lift(*about, off, moved, False, shift, min(map(grasp.force, fingers)), remains)
 
 
@@ -227,7 +227,7 @@ def _foreseen(grasp: Regrasp, finger: str, place: float) -> tuple[bool, float]:
         step = model.step(seen.state, delta, fingertip_force=seen.fingertip_force)
     except GraspError:  # no equilibrium is near
         return regular, math.nan
-    return regular, grasp.off_axis(step.state, grasp.start)
+    return regular, grasp.off_axis(step.state)
 
 
 def session(
@@ -300,7 +300,9 @@ def picture(lifts: Sequence[Lift]) -> Figure:
     cases = list(dict.fromkeys(one.case for one in lifts))
     top = 1.1 * max((one.off for one in lifts if not one.lost), default=AXIS)
     objects = list(dict.fromkeys(one.object for one in lifts))
-    for k, (item, colour) in enumerate(zip(objects, list(COLOURS.values()), strict=False)):
+    colours = COLOURS["E-KM"], COLOURS["KM+I"], COLOURS["KM+S"]  # not the KM's
+    for k, item in enumerate(objects):
+        colour = colours[k % len(colours)]
         for lost, mark in ((False, "o"), (True, "x")):
             some = [one for one in lifts if one.object == item and one.lost == lost]
             at = [cases.index(one.case) + 0.2 * (k - 0.5) for one in some]

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,7 +23,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).with_name("learners")))
 
-from bench_learners import PlainC, alternately, filled, gpytorch_fantasy, river_forest, updates
+from bench_learners import PlainC, alternately, filled, gpytorch_fantasy, river_forest, timed, updates
 
 from torch_ekm import EnhancedModel, default_learner, warm_up
 from torch_ekm.control import ClosedLoop, LookAndMoveController, PoseTarget
@@ -94,12 +94,6 @@ class Speed:
         caption = f"Update of one sample, {IN} inputs, {OUT} outputs; medians of one run, in turns."
         shown = save_figure(self.picture(), folder, "speed", caption)
         Report("Speed", f"{self.verdict}.", [self.table()], [shown]).write(folder)
-
-
-def timed(call: Callable[[], object]) -> float:
-    begin = time.perf_counter()
-    call()
-    return time.perf_counter() - begin
 
 
 def of_learner(n: int) -> dict[str, list[float]]:

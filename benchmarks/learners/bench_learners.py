@@ -236,8 +236,8 @@ def microseconds(call: Callable, budget: float = 0.6) -> float:
     return float(np.median(times) * 1e6)
 
 
-def seconds(call: Callable) -> float:
-    """Time of one call that is long."""
+def timed(call: Callable) -> float:
+    """Seconds of one call."""
     begin = time.perf_counter()
     call()
     return time.perf_counter() - begin
@@ -312,11 +312,12 @@ def of_fleets() -> Table:
             calls = dict(zip(ENGINES, (make(gp, m, shape) for gp in fleets), strict=True))
             found = alternately(calls, rounds=3)
             rows.append((f"{what}, {b} points", *(us / 256 for us in found.values())))
-        means = [1e6 * seconds(all_of(gp, m, shape, 64)) / (64 * 256) for gp in fleets]
+        means = [1e6 * timed(all_of(gp, m, shape, 64)) / (64 * 256) for gp in fleets]
         rows.append((f"update, {b} points, mean with rebuilds", *means))
     default = all_of(default_learner(D, m, batch_shape=shape), m, shape, 64)
-    default(), default()  # the bases are full then
-    mean = 1e6 * seconds(default) / (64 * 256)
+    for _ in range(2):  # the bases are full then
+        default()
+    mean = 1e6 * timed(default) / (64 * 256)
     rows.append(("default learner, update, mean", mean, math.nan))
     return Table("Fleets of 256, per model", "what | compiled [us] | torch [us]", rows)
 
@@ -344,9 +345,7 @@ def of_whole_learners() -> Table:
     for name, make in (("SparseOnlineGP", SparseOnlineGP), ("default_learner", default_learner)):
         learner, times = make(D, 6), []
         for x, y in zip(*stream(1500, 6, seed=1), strict=True):
-            begin = time.perf_counter()
-            learner.update(x, y)
-            times.append(1e6 * (time.perf_counter() - begin))
+            times.append(1e6 * timed(functools.partial(learner.update, x, y)))
         rows.append((name, float(np.median(times[500:])), max(times[500:])))
     deep = SparseOnlineGP(D, 6, kernel=DeepKernel(SquaredExponential(D))), DeepKernelSOGP(D, 6)
     for gp in deep:

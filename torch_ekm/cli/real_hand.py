@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -80,20 +81,27 @@ def health(
     from ..control import HandKnowledge
     from ..description import load_hand
     from ..inspection.health import BASELINE, HealthChange, hand_health
-    from ..plant import TrialLog
+    from ..plant import Trajectory, TrialLog
 
     opened = [TrialLog.open(log) for log in logs]
     name = hand or opened[0].configuration.get("hand")
     if not name:
         raise ParameterError("hand", name, "--hand NAME: the log names none")
-    trials = [(k, log.read(k)) for log in opened for k in log.trials]
-    found = hand_health(load_hand(name), trials)
+    motions: list[int] = []
+
+    def trials() -> Iterator[tuple[int, Trajectory]]:  # one at a time: logs may be long
+        for log in opened:
+            for k in log.trials:
+                trial = log.read(k)
+                motions.append(len(trial.commands))
+                yield k, trial
+
+    found = hand_health(load_hand(name), trials())
     if found:
         print_table(HealthChange._fields, found, str(name))
     if knowledge is not None:
         say(HandKnowledge.load(knowledge).figures)
     if found:
         raise typer.Exit(1)
-    motions = sum(len(trial.commands) for _, trial in trials)
-    few = "" if motions > BASELINE else f" An actuator is judged after {BASELINE} motions."
-    say(f"No actuator changed in {motions} motions.{few}")
+    few = "" if sum(motions) > BASELINE else f" An actuator is judged after {BASELINE} motions."
+    say(f"No actuator changed in {sum(motions)} motions.{few}")

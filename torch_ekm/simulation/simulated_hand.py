@@ -15,7 +15,7 @@ from ..kinematics import GraspState
 from ..plant import Observation, PlantStatus, Stamps, Truth
 from ..typing import Array, Float, Tensor
 from .config import PlantConfig
-from .grasp_planning.pinch import PinchPlan, exists, pinch_hint, pinch_problem, plan_pinch, turning_axis
+from .grasp_planning.pinch import PinchPlan, exists, pinch_hint, pinch_problem, plan_pinch
 from .grasp_planning.pinch_problem import PinchRequest
 from .mechanism.assembly import true_hand, true_object
 from .parameters import PlantParameters
@@ -206,7 +206,7 @@ class SimulatedHand:
         points = self.plan.points
         across = points[1:].mean(axis=0) - points[0]
         across /= np.linalg.norm(across)
-        along = turning_axis(self.hand, self.config)
+        along = self._problem.along
         axis = points[-1] - points[1] if len(points) > 2 else along
         axis = axis - across * (axis @ across)
         axis *= np.sign(axis @ along) / np.linalg.norm(axis)
