@@ -128,7 +128,7 @@ class Witness:
             contacts = self.model.detector(poses, state.position, state.rotation)
             now = (state, poses, contacts)
             if before is not None:
-                for name, way in _sliding(before, now):
+                for name, way in sliding(before, now):
                     total[name] = total.get(name, 0.0) + way
             before = now
         self.frames = self.frames[-1:]
@@ -178,7 +178,7 @@ def plant_parameters(name: str, seed: int) -> PlantParameters:
     return preset("none").replace(hardware_seed=seed, **{n: getattr(nominal, n) for n in sensors})
 
 
-def _sliding(before, now) -> Iterator[tuple[str, torch.Tensor]]:
+def sliding(before, now) -> Iterator[tuple[str, torch.Tensor]]:
     """Tangential motion of finger relative to object at the contact point of each pad, in hand axes [m]."""
     (s1, poses1, c1), (s2, poses2, c2) = before, now
     for name in c1.finger:
