@@ -213,6 +213,13 @@ def test_errors_cross_process_boundaries_whole() -> None:
         assert vars(copy) == vars(error)
 
 
+def test_a_message_does_not_print_whole_matrices() -> None:
+    error = exceptions.ParameterError("A", [[1.0] * 100] * 100, "a number")
+    assert len(str(error)) < 400
+    assert str(error).endswith("... is not valid; it must be a number")
+    assert len(error.value) == 100
+
+
 def test_every_exported_name_exists() -> None:
     for info in pkgutil.walk_packages(torch_ekm.__path__, "torch_ekm."):
         module = importlib.import_module(info.name)

@@ -4,9 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import TypeVar
 
 from .exceptions import NonFiniteError, ParameterError, ShapeError
 from .typing import Tensor
+
+T = TypeVar("T")
+
+
+def check_kind(name: str, value: T, kind: type, valid: str = "") -> T:
+    """``value``, or ParameterError if it is no ``kind``."""
+    if not isinstance(value, kind):
+        raise ParameterError(name, value, valid or f"a {kind.__name__}")
+    return value
 
 
 def check_count(name: str, value: int, least: int = 1) -> int:

@@ -20,6 +20,7 @@ __all__ = [
 ]  # fmt: skip
 
 _LONGEST = 2000  # characters of a message
+_LONGEST_VALUE = 300  # of a value in one
 
 
 class EKMError(Exception):
@@ -151,7 +152,10 @@ class ParameterError(EKMError, ValueError):
 
     def __init__(self, name: str, value: object, valid: str) -> None:
         self.name, self.value, self.valid = name, value, valid
-        super().__init__(f"{name} = {value!r} is not valid; it must be {valid}")
+        shown = repr(value)
+        if len(shown) > _LONGEST_VALUE:  # a large tensor, a whole module
+            shown = f"{' '.join(shown.split())[:_LONGEST_VALUE]}..."
+        super().__init__(f"{name} = {shown} is not valid; it must be {valid}")
 
 
 # -- the grasp cannot be modelled -----------------------------------------------------------

@@ -23,7 +23,7 @@ from torch_ekm.control import StopReason as Reason
 from torch_ekm.control.qp import ControlProblem
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.exceptions import NonFiniteError, SolverError
+from torch_ekm.exceptions import NonFiniteError, ParameterError, SolverError
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, Plant, PlantStatus
@@ -170,6 +170,23 @@ def test_a_rotation_that_is_none_ends_the_loop_with_its_steps(held) -> None:
     assert done.reason is Reason.PLANT_FAILED
     assert "ParameterError: rotation" in done.stop.message
     assert len(done.steps) == 1
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_plant_that_returns_nothing_ends_the_loop_with_its_steps(held) -> None:
+    done, _ = drive(held, lambda seen: None)
+    assert done.reason is Reason.PLANT_FAILED
+    assert "must be an Observation" in done.stop.message
+    assert repr(done).startswith("<Manipulation: plant failed after 1 motions: ParameterError: ")
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_swapped_arguments_and_angles_as_targets_are_refused(held) -> None:
+    seen, _, loop = held
+    with pytest.raises(ParameterError, match="a LookAndMoveController"):
+        ClosedLoop(loop, FrozenPlant(seen))
+    with pytest.raises(ParameterError, match=r"PoseTarget\.turned"):
+        ClosedLoop(FrozenPlant(seen), loop).run(20.0)
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -183,12 +183,17 @@ def test_a_wish_and_a_limit_of_ones_own_have_effect(grasp, enhanced: bool) -> No
 
 @pytest.mark.usefixtures("unchecked")
 def test_wrong_tasks_and_limits_are_refused(grasp) -> None:
+    for wrong in ({"tasks": EffortTask()}, {"limits": 5 * DEG}):
+        with pytest.raises(ParameterError, match=r"must be a list .*rows\(model, seen\)"):
+            controller(grasp, **wrong)
+    with pytest.raises(ParameterError, match="a KinematicModel, or an EnhancedModel around one"):
+        LookAndMoveController(torch.sin, torch.ones(3))
     for wrong in ({"tasks": ["focus"]}, {"tasks": [EffortTask]}, {"limits": [5 * DEG]}):
         with pytest.raises(ParameterError, match=r"tasks, limits .*rows\(model, seen\)"):
             controller(grasp, **wrong)
     n_u = 3
     for rows, error, says in (
-        (np.eye(n_u), ParameterError, "Squares, Equality, Inequality, Bounds or None"),
+        (np.eye(n_u), ParameterError, "'ndarray' .* Squares, Equality, Inequality, Bounds or None"),
         (Squares(np.eye(n_u), np.zeros(n_u), -1.0), ParameterError, "weight"),
         (Squares(np.eye(2), np.zeros(2)), ShapeError, r"\(n, 3\)"),
         (Inequality(np.ones((1, 4)), np.zeros(1)), ShapeError, "rows of Inequality"),

@@ -56,8 +56,20 @@ def target(degrees: float = 0.0, millimetres: float = 0.0) -> PoseTarget:
         (lambda: Direction(X, "mm", step=math.nan), ParameterError, "step"),
         (lambda: Direction(X, "mm", weight=-1.0), ParameterError, "weight"),
         (lambda: FocusedPose([Direction(X, "mm"), Direction(-2 * X, "mm")]), ParameterError, "named once"),
-        (lambda: FocusedPose([Direction(X, "mm"), Direction(X + Y, "mm")]), ParameterError, "orthonormal"),
+        (lambda: FocusedPose([Direction(X, "mm"), Direction(X + Y, "mm")]), ParameterError, "perpendicular"),
         (lambda: FocusedPose([]), ParameterError, "one to six"),
+        (lambda: FocusedPose(Direction(X, "mm")), ParameterError, "a list of one to six Directions"),
+        (lambda: FocusedPose([X, Y]), ParameterError, "a list of one to six Directions"),
+        (lambda: FocusedPose(2.0 * torch.eye(6)[:1]), ParameterError, r"matrix = \[\[2.0, "),
+        (lambda: FocusedPose.rotation_about(Direction(X, "deg")), ParameterError, "FocusedPose"),
+        (lambda: Direction(X[:2], "deg"), ShapeError, "axis must have shape"),
+        (lambda: Direction("deg", "mm"), ParameterError, "axis = .* must be numbers"),
+        (lambda: Direction(X, "mm", tolerance="0.1"), ParameterError, "tolerance"),
+        (lambda: PoseTarget.turned(X, HERE, degrees=1), ParameterError, "axis"),
+        (lambda: PoseTarget(X, torch.ones(4)), ShapeError, "rotation"),
+        (lambda: PoseTarget(torch.eye(3), X), ShapeError, "position"),
+        (lambda: PoseTarget(X * math.nan, torch.eye(3)), NonFiniteError, "position"),
+        (lambda: PoseTarget(X, 2 * torch.eye(3)), ParameterError, "a rotation matrix"),
         (lambda: FocusedPose(torch.ones(1, 6) / 6**0.5), ParameterError, "turns or shifts"),
         (lambda: PoseTarget.moved(HERE, X, millimetres=math.inf), NonFiniteError, "millimetres"),
         (lambda: EffortTask(0.0), ParameterError, "positive"),
@@ -68,6 +80,14 @@ def target(degrees: float = 0.0, millimetres: float = 0.0) -> PoseTarget:
 def test_bad_input_is_refused(make, error, text: str) -> None:
     with pytest.raises(error, match=text):
         make()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_lists_and_single_precision_are_taken() -> None:
+    at, by = PoseTarget([0.1, 0.0, 0.0], torch.eye(3)), PoseTarget.turned(HERE, Z.float(), degrees=5)
+    focus = FocusedPose([Direction([0, 0, 1], "deg"), Direction(X.float(), "mm")])
+    assert focus.error(by, HERE) == TURN_AND_SHIFT.error(target(5.0), HERE)
+    assert focus.error(at, HERE) == pytest.approx(0.0, abs=1e-12)  # turned about y alone
 
 
 def test_a_turn_and_a_shift_are_named_by_their_units() -> None:

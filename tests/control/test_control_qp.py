@@ -14,7 +14,7 @@ from torch_ekm.control import (
     Squares,
 )
 from torch_ekm.control.qp import ControlSolution, build_qp
-from torch_ekm.exceptions import ParameterError
+from torch_ekm.exceptions import ParameterError, ShapeError
 
 DEG = math.pi / 180
 EFFORT = Squares(np.diag([1.0, 2.0]), np.zeros(2))  # u1^2 + 4 u2^2
@@ -84,8 +84,14 @@ def test_rows_that_ask_for_nothing() -> None:
 def test_bad_problem_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"lower\[0\].*upper\[0\] = -1"):
         build_qp(2, [Bounds(np.array([1.0, 0.0]), np.array([-1.0, 1.0]))])
-    with pytest.raises(ParameterError, match="finite"):
+    with pytest.raises(ParameterError, match=r"A, b of Equality .* finite"):
         build_qp(2, [Equality(np.array([[np.nan, 1.0]]), np.array([1.0]))])
+    with pytest.raises(ShapeError, match=r"b of Squares must have shape \(2,\), got \(1,\)"):
+        build_qp(2, [Squares(np.eye(2), np.zeros(1))])
+    with pytest.raises(ShapeError, match="h of Inequality"):
+        build_qp(2, [Inequality(np.eye(2), np.zeros((2, 1)))])
+    with pytest.raises(ParameterError, match="unit of Squares"):
+        build_qp(2, [Squares(np.eye(2), np.zeros(2), unit=0.0)])
 
 
 def test_without_slack_the_active_set_finds_what_piqp_finds() -> None:

@@ -11,6 +11,7 @@ import torch
 from torch_ekm.control import DescribedFigures
 from torch_ekm.description import load_hand
 from torch_ekm.enhanced import EnhancedModel, GraspEncoding, grasp_learner
+from torch_ekm.exceptions import ParameterError
 from torch_ekm.kinematics import GraspState, HandKinematics
 from torch_ekm.residual import SparseOnlineGP
 
@@ -48,6 +49,21 @@ def state(model: Held) -> GraspState:
     return GraspState(
         torch.full((model.hand.n_q,), 0.1, dtype=F64), torch.zeros(3, dtype=F64), torch.eye(3, dtype=F64)
     )
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("learner", [SparseOnlineGP, SparseOnlineGP(4, 6), "rbf", lambda n_s, n_a: None])
+def test_a_learner_of_another_size_is_refused(model: Held, state: GraspState, learner) -> None:
+    with pytest.raises(ParameterError, match="learner"):
+        EnhancedModel.for_grasp(model, state, learner)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_arguments_in_the_wrong_order_are_refused(model: Held, state: GraspState) -> None:
+    with pytest.raises(ParameterError, match="model"):
+        EnhancedModel.for_grasp(state, model)
+    with pytest.raises(ParameterError, match=r"observation\.state"):
+        EnhancedModel.for_grasp(model, state).encode(state.q)
 
 
 def test_it_sees_the_fingers_that_touch_and_knows_nothing_yet(model: Held, state: GraspState) -> None:

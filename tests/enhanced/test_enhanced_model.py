@@ -109,6 +109,7 @@ def test_predict_is_in_the_increments_unit(generator: torch.Generator) -> None:
     assert (law.stddev < 0.011).all()  # unit prior variance over a scale of 100
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_bad_samples_leave_the_learner_untouched(generator: torch.Generator) -> None:
     ekm = train(enhanced(), generator, 20)
     before = {name: value.clone() for name, value in ekm.learner.named_buffers()}
@@ -118,6 +119,10 @@ def test_bad_samples_leave_the_learner_untouched(generator: torch.Generator) -> 
         ekm.update(state[0], action[0], good * torch.nan)
     with pytest.raises(NonFiniteError, match="action"):
         ekm.update(state[0], action[0] * torch.inf, good, good)
+    with pytest.raises(ParameterError, match="action"):
+        ekm.update(state[0], action[0].tolist(), good)
+    with pytest.raises(ShapeError, match=r"action must have shape \(\*batch, 2\)"):
+        ekm.linearize(state[0], action[0][:1], torch.zeros(3, 2))
     with pytest.raises(ShapeError, match="increment"):
         ekm.update(state[0], action[0], good[:2])
     for name, value in ekm.learner.named_buffers():

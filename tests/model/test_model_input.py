@@ -111,6 +111,9 @@ WRONG = {
         DescriptionError,
         "left_0",
     ),
+    "name of a hand": (lambda: KinematicModel("icub_right", BOX), ParameterError, "load_hand"),
+    "name of an object": (lambda: KinematicModel(HAND, "box"), ParameterError, "load_object"),
+    "object and hand swapped": (lambda: KinematicModel(BOX, HAND), ParameterError, "load_hand"),
     "hand without pads": (
         lambda: KinematicModel(dataclasses.replace(HAND, pads=()), BOX),
         DescriptionError,

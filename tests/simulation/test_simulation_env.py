@@ -114,6 +114,9 @@ def test_forty_steps_are_the_end():
         ({"render_mode": "human"}, ParameterError),
         ({"parameters": "nasty"}, UnknownNameError),
         ({"step_limit": -1.0}, ParameterError),
+        ({"angles": (5.0, 25.0)}, ParameterError),  # degrees
+        ({"angles": 0.2}, ParameterError),
+        ({"angles": (0.4, 0.1)}, ParameterError),
         ({"object": "anvil"}, UnknownNameError),
     ],
 )
@@ -124,9 +127,12 @@ def test_wrong_options_are_refused(options, error):
         InHandRotation(**options)
 
 
-def test_a_target_that_is_no_number_is_refused(env):
-    with pytest.raises(ParameterError, match="angle"):
-        env.reset(options={"angle": float("nan")})
+def test_a_target_that_is_no_angle_is_refused(env):
+    for angle in (float("nan"), 8.0, "8", (0.1, 0.2)):
+        with pytest.raises(ParameterError, match="angle"):
+            env.reset(options={"angle": angle})
+    with pytest.raises(UnknownNameError, match="'angel'; valid are: angle"):
+        env.reset(options={"angel": 0.1})
 
 
 def test_it_is_vectorised_in_processes():

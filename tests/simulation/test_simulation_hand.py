@@ -246,11 +246,15 @@ def test_the_t42_pinches_and_turns_a_cylinder_as_its_model_says(name):
         assert float(moved[at]) == pytest.approx(float(expected[at]), rel=0.03)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_bad_commands_are_refused_and_move_nothing(plant, grasped):
     before = plant.restore(grasped)
     for bad, error in ((torch.zeros(8), ShapeError), (torch.full((9,), torch.nan), NonFiniteError)):
         with pytest.raises(error):
             plant.command(bad)
+    for seed in (-1, "a"):
+        with pytest.raises(ParameterError, match="seed"):
+            plant.reset(seed)
     assert torch.equal(plant.observe().truth.q, before.truth.q)
 
 
@@ -268,11 +272,14 @@ def test_errors_say_what_would_be_right(monkeypatch):
         SimulatedHand("planar_two_finger", "box", parameters=PlantParameters(object_scale=4.0)).reset(0)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_preset_is_given_by_name_or_as_parameters():
     assert SimulatedHand("icub_right", "box", preset="worn").parameters == preset("worn")
     assert SimulatedHand("icub_right", "box").parameters == preset("none") == PlantParameters()
     with pytest.raises(UnknownNameError, match="hostile"):
         SimulatedHand("icub_right", "box", preset="nasty")
+    with pytest.raises(ParameterError, match="a name goes to preset="):
+        SimulatedHand(parameters="nominal")
     with pytest.raises(ParameterError, match="preset"):
         SimulatedHand("icub_right", "box", parameters=PlantParameters(), preset="none")
 

@@ -25,7 +25,9 @@ app = typer.Typer(
 )
 
 Hand = Annotated[str, Option(help="A hand (see 'torch-ekm hands') or a path to a URDF.")]
-Preset = Annotated[str, Option(help="Faults of the simulated hand: none, nominal, worn or hostile.")]
+Preset = Annotated[
+    str, Option(help="Faults of the simulated hand: none, nominal, worn, hostile, or odd_1 to odd_5.")
+]
 Engine = Annotated[str, Option(help="Physics of the simulated hand: sapien or mujoco.")]
 Sensing = Annotated[bool, Option(help="Camera images and Hall counts, or truth plus noise.")]
 Jobs = Annotated[int, Option(min=1, help="Processes at once.")]

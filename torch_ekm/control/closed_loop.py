@@ -12,6 +12,7 @@ from collections.abc import Generator
 
 import torch
 
+from .._checks import check_kind
 from .._extras import require
 from ..enhanced.hand_figures import DescribedFigures, HandFigures
 from ..model import Linearization
@@ -62,7 +63,7 @@ class ClosedLoop:
             that is 5 deg beyond :meth:`reach`, or another target of 4 steps that the model misses.
 
     Raises:
-        ParameterError: the knowledge is of another hand.
+        ParameterError: no controller, or knowledge of another hand.
     """
 
     def __init__(
@@ -75,11 +76,10 @@ class ClosedLoop:
         learn: bool = True,
         decline: bool = True,
     ) -> None:
-        hand = controller.kinematic.hand
+        hand = check_kind("controller", controller, LookAndMoveController).kinematic.hand
         if knowledge is None:
             knowledge = HandKnowledge.of(hand, learns=controller.enhanced is not None)
-            followed = controller.kinematic.figures
-            if isinstance(followed, HandFigures | DescribedFigures):
+            if isinstance(followed := controller.kinematic.figures, HandFigures | DescribedFigures):
                 knowledge.figures = followed
         knowledge.check(hand)
         controller.follow(knowledge.figures)

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from .._checks import check_finite, check_shape
+from .._checks import check_finite, check_kind, check_shape
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
 from ..exceptions import EKMError, GraspError, NoContactError, ParameterError, SolverError
 from ..kinematics import GraspState
-from ..model import ModelStatus
+from ..model import KinematicModel, ModelStatus
 from ..typing import Float, Tensor
 from .decision import Decision, Expectation, Grip, StopReason
 from .focus import FocusedPose, PoseTarget
@@ -25,7 +25,7 @@ from .situation import LinearizedModel, Situation
 from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
 
 if TYPE_CHECKING:
-    from ..model import KinematicModel, Linearization
+    from ..model import Linearization
     from ..model.linearization import FollowedFigures
     from .force_sensitivity import ForceSensitivity
 
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 DEFAULT_TASKS: tuple[Task, ...] = (EffortTask(), OffAxisTask(), GripForceTask(), FocusTask())
 #: What a step must not do by default: limits of actuators, normal forces and joints.
 DEFAULT_LIMITS: tuple[Limit, ...] = (ActuatorLimit(), NormalForceLimit(), JointLimit())
+
+_LIST = "a list of objects with a method rows(model, seen)"
 
 # of the SQP for a model that is not linear in the action
 _ITERATIONS = 6
@@ -64,7 +66,7 @@ class LookAndMoveController:
         pace: how far a step goes; None: a new :class:`Pace`, which adapts if the model is an enhanced one.
 
     Raises:
-        ParameterError: a task or limit without a method ``rows``.
+        ParameterError: no kinematic model, or a task or limit without a method ``rows``.
     """
 
     def __init__(
@@ -76,9 +78,14 @@ class LookAndMoveController:
         pace: Pace | None = None,
     ) -> None:
         self.kinematic, self.enhanced = kinematic_and_enhanced(model)
+        check_kind(
+            "model", self.kinematic, KinematicModel, "a KinematicModel, or an EnhancedModel around one"
+        )
         self.focus = focus if isinstance(focus, FocusedPose) else FocusedPose.rotation_about(focus)
-        self.tasks = DEFAULT_TASKS if tasks is None else tuple(tasks)
-        self.limits = DEFAULT_LIMITS if limits is None else tuple(limits)
+        self.tasks = DEFAULT_TASKS if tasks is None else tuple(check_kind("tasks", tasks, Sequence, _LIST))
+        self.limits = (
+            DEFAULT_LIMITS if limits is None else tuple(check_kind("limits", limits, Sequence, _LIST))
+        )
         self.pace = Pace(adapts=self.enhanced is not None) if pace is None else pace
         self.forces: ForceSensitivity | None = None
         """What was learned of how the pads' forces answer; a :class:`ClosedLoop` sets it."""
@@ -86,7 +93,7 @@ class LookAndMoveController:
         """Grip force on top of the one that suits the object [N]."""
         for part in (*self.tasks, *self.limits):
             if isinstance(part, type) or not callable(getattr(part, "rows", None)):
-                raise ParameterError("tasks, limits", part, "objects with a method rows(model, seen)")
+                raise ParameterError("tasks, limits", part, _LIST)
         self._weight = float(torch.linalg.vector_norm(self.kinematic.weight))
         self._previous: tuple[Linearization, Tensor] | None = None
 

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 
 import torch
 
+from .._checks import check_finite, check_kind, check_positive, check_shape
 from ..exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
-from ..kinematics.grasp_state import GraspState
+from ..kinematics.grasp_state import GraspState, check_rotation
 from ..kinematics.null_space import null_space
 from ..kinematics.se3 import exp, log
+from ..kinematics.tensors import as_tensors
 from ..typing import Float, Tensor
 
 _SI = {"deg": math.pi / 180, "mm": 1e-3}
@@ -20,14 +22,27 @@ _USUAL = {"tolerance": {"deg": 0.25, "mm": 0.2}, "step": {"deg": 2.5, "mm": 2.0}
 
 @dataclass(frozen=True)
 class PoseTarget:
-    """Where the object shall be: point ``o_r`` [m] and orientation ``R_r``, hand frame."""
+    """Where the object shall be: point ``o_r`` [m] and orientation ``R_r``, hand frame.
+
+    Raises:
+        ShapeError, NonFiniteError, ParameterError: no point, or no rotation matrix.
+    """
 
     position: Float[Tensor, " 3"]
     rotation: Float[Tensor, "3 3"]
 
+    def __post_init__(self) -> None:
+        given = as_tensors(position=self.position, rotation=self.rotation)
+        for name, value, shape in zip(("position", "rotation"), given, ((3,), (3, 3)), strict=True):
+            check_shape(name, value, shape)
+            check_finite(name, value)
+            object.__setattr__(self, name, value.double())  # the dataclass is frozen
+        check_rotation(self.rotation)
+
     def error(self, state: GraspState) -> Float[Tensor, " 6"]:
         """``(o_r - o_f, Log(R_r R_f^T))`` [m, rad]: the twist that would bring the object home."""
-        return torch.cat([self.position - state.position, log(self.rotation @ state.rotation.mT)])
+        position, rotation = self.position.to(state.position), self.rotation.to(state.rotation)
+        return torch.cat([position - state.position, log(rotation @ state.rotation.mT)])
 
     @classmethod
     def turned(
@@ -49,8 +64,8 @@ class PoseTarget:
         angle = math.radians(degrees) if angle is None else angle  # type: ignore[arg-type]
         if not torch.isfinite(torch.as_tensor(angle)):
             raise NonFiniteError("angle")
-        axis = axis / torch.linalg.vector_norm(axis)
-        return cls(start.position, exp(axis * angle) @ start.rotation)
+        axis = _unit(axis)
+        return cls(start.position, exp(axis.to(start.position) * angle) @ start.rotation)
 
     @classmethod
     def moved(
@@ -63,8 +78,8 @@ class PoseTarget:
         """
         if not math.isfinite(millimetres):
             raise NonFiniteError("millimetres")
-        axis = axis / torch.linalg.vector_norm(axis)
-        return cls(start.position + 1e-3 * millimetres * axis, start.rotation)
+        axis = _unit(axis)
+        return cls(start.position + 1e-3 * millimetres * axis.to(start.position), start.rotation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +87,8 @@ class Direction:
     """A direction of a focused pose: turns about an axis of the hand frame, or shifts along it.
 
     Raises:
-        UnknownNameError, ParameterError: the unit is missing; no length of the axis, a figure not above 0.
+        UnknownNameError: the unit is missing, or another.
+        ShapeError, ParameterError: the axis is no vector with a length, or a figure is not above 0.
     """
 
     axis: Float[Tensor, " 3"]
@@ -88,17 +104,16 @@ class Direction:
     def __post_init__(self) -> None:
         if self.unit not in _SI:
             raise UnknownNameError("unit", self.unit, _SI)
-        if not torch.linalg.vector_norm(self.axis) > 1e-9:
-            raise ParameterError("axis", self.axis.tolist(), "a vector of non-zero length")
+        object.__setattr__(self, "axis", as_tensors(axis=self.axis)[0].double())  # the dataclass is frozen
+        _unit(self.axis)
         for name in ("tolerance", "step", "weight"):
-            figure = getattr(self, name)
-            if figure is not None and not 0 < figure < math.inf:
-                raise ParameterError(name, figure, "greater than 0")
+            if getattr(self, name) is not None:
+                check_positive(name, getattr(self, name))
 
     @property
     def row(self) -> Float[Tensor, " 6"]:
         """Of M_c."""
-        axis, none = self.axis / torch.linalg.vector_norm(self.axis), torch.zeros_like(self.axis)
+        axis, none = _unit(self.axis), torch.zeros_like(self.axis)
         return torch.cat([none, axis] if self.unit == "deg" else [axis, none])
 
     def scale(self, figure: str) -> float:
@@ -136,18 +151,23 @@ class FocusedPose:
                 raise ShapeError("matrix", "(n_x, 6)", directions.shape)
             shifts = zip(directions, (directions[:, :3].abs().sum(-1) > 1e-9).tolist(), strict=True)
             directions = [Direction(row[:3], "mm") if s else Direction(row[3:], "deg") for row, s in shifts]
-        self.directions = tuple(directions)
-        if not self.directions:
-            raise ParameterError("directions", directions, "one to six of them")
+        listed = "a list of one to six Directions"
+        if not check_kind("directions", directions, Sequence, listed):
+            raise ParameterError("directions", directions, listed)
+        self.directions = tuple(check_kind("directions", one, Direction, listed) for one in directions)
         matrix = self.matrix = torch.stack([one.row for one in self.directions])
         gram = matrix @ matrix.mT - torch.eye(len(matrix), dtype=matrix.dtype)
         twice = (gram.tril(-1).abs() > 1 - 1e-9).nonzero().tolist()
         if twice:
             raise ParameterError("directions", [str(self.directions[k]) for k in twice[0]], "named once each")
-        same = not isinstance(given, torch.Tensor) or torch.allclose(given, matrix, rtol=0, atol=1e-9)
-        if not (same and bool((gram.abs() < 1e-9).all())):
+        square = bool((gram.abs() < 1e-9).all())
+        if not isinstance(given, torch.Tensor):
+            if not square:
+                valid = "perpendicular to each other: turns to turns, shifts to shifts"
+                raise ParameterError("directions", [str(one) for one in self.directions], valid)
+        elif not (square and torch.allclose(given.to(matrix), matrix, rtol=0, atol=1e-9)):
             valid = "orthonormal rows (M_c M_c^T = I), each of which turns or shifts"
-            raise ParameterError("matrix", matrix.tolist(), valid)
+            raise ParameterError("matrix", given.tolist(), valid)
         self.tolerance_scale = matrix.new_tensor([one.scale("tolerance") for one in self.directions])
         self.step_scale = matrix.new_tensor([one.scale("step") for one in self.directions])
         self.weight = matrix.new_tensor([one.weight for one in self.directions])
@@ -157,7 +177,13 @@ class FocusedPose:
 
     @classmethod
     def rotation_about(cls, axis: Float[Tensor, " 3"]) -> FocusedPose:
-        """The rotation about one axis (hand frame), as in all experiments of the paper."""
+        """The rotation about one axis (hand frame), as in all experiments of the paper.
+
+        Raises:
+            ParameterError: no axis.
+        """
+        if isinstance(axis, Direction) or (isinstance(axis, Sequence) and isinstance(axis[0], Direction)):
+            raise ParameterError("axis", axis, "a vector; directions make a FocusedPose([...])")
         return cls([Direction(axis, "deg")])
 
     def error(self, target: PoseTarget, state: GraspState) -> float:
@@ -168,6 +194,16 @@ class FocusedPose:
         """Rotation off the focus in an increment [rad]."""
         rows = self.off_matrix[~self.off_translation]
         return float(torch.linalg.vector_norm(rows @ increment[-6:]))
+
+
+def _unit(axis: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
+    """The axis with length 1."""
+    axis = as_tensors(axis=axis)[0]
+    check_shape("axis", axis, (3,))
+    length = torch.linalg.vector_norm(axis)
+    if not 1e-9 < length < math.inf:
+        raise ParameterError("axis", axis.tolist(), "a vector of non-zero length")
+    return axis / length
 
 
 def _complement(matrix: Tensor, block: slice) -> Tensor:

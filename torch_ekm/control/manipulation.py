@@ -55,6 +55,10 @@ class Manipulation:
     steps: tuple[Step, ...]
     stop: Stop
 
+    def __repr__(self) -> str:
+        message = f": {self.stop.message}" if self.stop.message else ""
+        return f"<Manipulation: {self.reason.value} after {len(self.steps)} motions{message}>"
+
     @property
     def errors(self) -> list[float]:
         """``|e|`` before each motion and at the end, as measured and as a turn [rad]; the last is the

@@ -21,7 +21,7 @@ DEGREE = pi / 180  #: the program is solved for u in degrees: of the order of 1,
 
 
 class Squares(NamedTuple):
-    """``sum_j w_j ((A_j u - b_j) / unit_j)^2``: what is wanted, more or less."""
+    """``sum_j w_j ((A_j u - b_j) / unit_j)^2``: what is wanted, more or less; A ``(n, n_a)``, u [rad]."""
 
     A: Numbers
     b: Numbers
@@ -31,7 +31,7 @@ class Squares(NamedTuple):
 
 
 class Equality(NamedTuple):
-    """``rho |A u - b|_1 / (1 deg)``: what must be reached, if it can be."""
+    """``rho |A u - b|_1 / (1 deg)``: what must be reached, if it can be; A ``(n, n_a)``, u [rad]."""
 
     A: Numbers
     b: Numbers
@@ -39,7 +39,7 @@ class Equality(NamedTuple):
 
 
 class Inequality(NamedTuple):
-    """``C u <= h``, else ``rho max(0, C u - h) / unit``: what should hold, if it can."""
+    """``C u <= h``, else ``rho max(0, C u - h) / unit``: what should hold, if it can; C ``(n, n_a)``."""
 
     C: Numbers
     h: Numbers
@@ -153,8 +153,9 @@ def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
         rows: of each task and limit; None asks for nothing.
 
     Raises:
-        ParameterError: no rows, a negative weight, bounds that cross, or a figure that is not finite.
-        ShapeError: rows of another number of actuators.
+        ParameterError: no rows, a negative weight, a unit of 0, bounds that cross, or a figure that is not
+            finite.
+        ShapeError: rows of another number of actuators, or not one right side for each row.
     """
     P, q = np.zeros((n_u, n_u)), np.zeros(n_u)
     lower, upper = np.full(n_u, -np.inf), np.full(n_u, np.inf)
@@ -162,9 +163,9 @@ def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
     kept = reached.copy()
     for row in rows:
         if row is not None and not isinstance(row, Rows):
-            raise ParameterError("rows", row, "Squares, Equality, Inequality, Bounds or None")
-        if row is not None and as_array(row[0]).shape[-1:] not in ((), (n_u,)):
-            raise ShapeError(f"rows of {type(row).__name__}", f"(n, {n_u})", as_array(row[0]).shape)
+            raise ParameterError("rows", type(row).__name__, "Squares, Equality, Inequality, Bounds or None")
+        if row is not None:
+            _check(row, n_u)
         if isinstance(row, Squares):
             unit, weight = as_array(row.unit).reshape(-1, 1), as_array(row.weight).reshape(-1, 1)
             if (weight < 0).any():
@@ -193,6 +194,18 @@ def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
         if not np.isfinite(value).all():
             raise ParameterError(name, "NaN or infinity", "finite")
     return ControlProblem(P, q, (E, d, rho), (C, h, rho_t), (lower, upper))
+
+
+def _check(row: Rows, n_u: int) -> None:
+    kind, A, b = type(row).__name__, as_array(row[0]), as_array(row[1])
+    if A.shape[-1:] not in ((), (n_u,)):
+        raise ShapeError(f"rows of {kind}", f"(n, {n_u})", A.shape)
+    if not isinstance(row, Bounds) and b.shape not in ((), A.shape[:-1]):
+        raise ShapeError(f"{row._fields[1]} of {kind}", f"{A.shape[:-1]}", b.shape, "one entry for each row")
+    if isinstance(row, Squares | Inequality) and not (as_array(row.unit) > 0).all():
+        raise ParameterError(f"unit of {kind}", row.unit, "greater than 0")
+    if not (np.isfinite(A).all() and np.isfinite(b).all()) and not isinstance(row, Bounds):
+        raise ParameterError(f"{row._fields[0]}, {row._fields[1]} of {kind}", "NaN or infinity", "finite")
 
 
 def as_array(x: Numbers) -> Array:

@@ -71,7 +71,7 @@ class GripForceTask:
     """``f_n + (df_n/da) u + d = f``: f_n as the fingertips measure it, only its sensitivity by the model,
     corrected by what was learned of it; d is what the last motions left.
 
-    A grip force computed from a wrong model drops the object; a hand without fingertip sensors has no better.
+    A grip force that a wrong model computes may drop the object; without fingertip sensors there is no other.
 
     The finger that presses most opposes all others: it is regulated to ``force``, and the others to
     equal shares of it, so that no finger is left without a grip.

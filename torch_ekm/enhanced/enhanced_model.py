@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import nn
 
-from .._checks import check_finite, check_shape
+from .._checks import check_finite, check_kind, check_shape
 from .._recorded import Recorded, check_state, describe
-from ..exceptions import ParameterError
+from ..exceptions import ParameterError, ShapeError
 from ..kinematics import GraspState
 from ..residual.base import ResidualLearner, UpdateReport
 from ..residual.kernels.action_linear import ActionLinearKernel
@@ -99,16 +99,21 @@ class EnhancedModel(Recorded, nn.Module):
         Args:
             model: kinematic model of hand and object.
             state: of the grasp at the start.
-            learner: of ``[encode(s); da]``, or ``learner(n_s, n_a)`` that makes one for ``n_s`` features of
-                the state and ``n_a`` actuators; None: :func:`~torch_ekm.enhanced.grasp_learner`.
+            learner: of ``[encode(s); da]``, with 6 outputs, or a function ``(n_s, n_a)`` that makes one for
+                ``n_s`` features of the state and ``n_a`` actuators:
+                ``lambda n_s, n_a: SparseOnlineGP(n_s + n_a, 6)``.
+                None: :func:`~torch_ekm.enhanced.grasp_learner`.
             encode: what it sees of a state; None: of this grasp.
-            figures: of the hand, which f follows: :class:`~torch_ekm.control.HandFigures` that know it
-                already, or :class:`~torch_ekm.control.DescribedFigures`. None: those that the model follows,
+            figures: of the hand, which f follows: :class:`~torch_ekm.control.HandFigures` learned before,
+                or :class:`~torch_ekm.control.DescribedFigures`. None: those that the model follows,
                 or new ones. A :class:`~torch_ekm.control.ClosedLoop` brings those of its knowledge.
 
         Raises:
             NoContactError: nothing touches the object.
+            ParameterError: no model, or a learner of other inputs or outputs.
         """
+        if not hasattr(model, "hand"):
+            raise ParameterError("model", model, "a KinematicModel")
         n_q, n_a = state.q.shape[-1], model.hand.n_a
         if figures is None and model.figures is None:
             from .hand_figures import HandFigures  # the model is slow to import
@@ -119,7 +124,18 @@ class EnhancedModel(Recorded, nn.Module):
         if not isinstance(learner, ResidualLearner):
             adapts = model.figures is not None and model.figures.learns
             made = partial(grasp_learner, adapts=adapts) if learner is None else learner
+            if not callable(made):
+                raise ParameterError(
+                    "learner", made, "a ResidualLearner, or a function (n_s, n_a) that makes one"
+                )
             learner = made(encode.n_features, n_a)
+        check_kind(
+            "learner", learner, ResidualLearner, "a ResidualLearner, or a function (n_s, n_a) that makes one"
+        )
+        n_in, sizes = encode.n_features + n_a, (learner.in_features, learner.out_features)
+        if sizes != (n_in, 6):
+            valid = f"({n_in}, 6): inputs ({encode.n_features} of the state, {n_a} increments) and outputs"
+            raise ParameterError(f"size of the learner {type(learner).__name__}", sizes, valid)
         scale = torch.tensor([1e3] * 3 + [180 / math.pi] * 3, dtype=state.q.dtype)  # m -> mm, rad -> deg
         rows = list(range(n_q, n_q + 6))
         step = math.radians(2.0)
@@ -176,10 +192,9 @@ class EnhancedModel(Recorded, nn.Module):
             ShapeError: the increment has not the shape of the model's prediction.
             ParameterError: action or increment is no tensor.
         """
-        if not isinstance(increment, Tensor):
-            raise ParameterError(
-                "increment", type(increment).__name__, "a tensor: torch.as_tensor(increment)"
-            )
+        for name, value in (("action", action), ("increment", increment)):
+            if not isinstance(value, Tensor):
+                raise ParameterError(name, type(value).__name__, f"a tensor: torch.as_tensor({name})")
         finite = bool(increment.isfinite().all() and torch.as_tensor(action).isfinite().all())
         if nominal is None and finite and hasattr(self.model, "adapt"):  # else it is refused below
             self.model.adapt(state, action, increment)
@@ -230,6 +245,8 @@ class EnhancedModel(Recorded, nn.Module):
         if J is None and self.jacobian is None and hasattr(self.model, "linearize"):
             J = self.model.linearize(state).manipulation_jacobian
         if J is not None:
+            if action.shape[-1:] != J.shape[-1:]:
+                raise ShapeError("action", f"(*batch, {J.shape[-1]})", action.shape)
             return (J @ action.unsqueeze(-1)).squeeze(-1), J
         if self.jacobian is None:
             return differentiated(self.nominal, state, action)

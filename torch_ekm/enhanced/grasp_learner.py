@@ -17,7 +17,7 @@ def grasp_learner(n_s: int, n_a: int, capacity: int = 60, *, adapts: bool = Fals
     Args:
         n_s, n_a: features of the state (of the order of 1 cm or 0.3 rad), actuators (units of 2 deg).
         capacity: largest number of basis vectors.
-        adapts: f follows figures of the hand as they are learned, so g has less to say.
+        adapts: f follows figures of the hand as they are learned, so g has less to correct.
     """
     parts = [RobustWeight(3.0), ForgettingFactor(0.995)]
     kernel = grasp_kernel(n_s, n_a, SMALL_ACTION_VARIANCE if adapts else ACTION_VARIANCE)

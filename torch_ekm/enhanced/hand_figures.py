@@ -281,7 +281,7 @@ class HandFigures(ParameterFilter):
         """
         for name, value, like in (("moved", moved, lin.manipulation_jacobian[0]),
                                   ("increment", increment, lin.manipulation_jacobian[:, 0])):  # fmt: skip
-            check_shape(name, value, like.shape)
+            check_shape(name, value, like.shape, "of the motors" if name == "moved" else "")
             check_finite(name, value)
         if lin.equations is None or not bool(moved.any()):
             return None

@@ -53,7 +53,7 @@ class GraspState:
         if not math.isfinite(total):
             for name in given:
                 check_finite(name, getattr(self, name))
-        _check_rotation(self.rotation)
+        check_rotation(self.rotation)
 
     @property
     def n_s(self) -> int:
@@ -74,7 +74,7 @@ class GraspState:
         return torch.cat([self.q - earlier.q, self.position - earlier.position, dphi], dim=-1)
 
 
-def _check_rotation(R: Tensor) -> None:
+def check_rotation(R: Tensor) -> None:
     """``cof R = R``: every column is the cross product of the other two, which holds for rotations only."""
     rows = R.detach().numpy() if is_plain(R.detach()) else R.detach()
     y_z_x, z_x_y = (rows.mT[..., order, :] for order in ([1, 2, 0], [2, 0, 1]))  # columns of R

@@ -19,6 +19,15 @@ _LOWEST = -0.9
 """Readings below this [N] are no noise about zero: three standard deviations of a fingertip sensor."""
 
 
+def check_described(hand: Any, obj: Any) -> None:
+    """A hand and an object, not their names, and in this order."""
+    for name, value, needs in (("hand", hand, "joint_names"), ("obj", obj, "mass")):
+        if not hasattr(value, needs):
+            raise ParameterError(
+                name, value, f"a description: load_{'hand' if name == 'hand' else 'object'}(name)"
+            )
+
+
 def check_inertia(obj) -> None:
     """Of anything with a mass [kg], which may be 0, and a centre of mass [m]."""
     mass, com = float(obj.mass), [float(x) for x in obj.com]

@@ -17,7 +17,7 @@ from ..kinematics.grasp_state import GraspState
 from ..kinematics.hand_kinematics import HandKinematics
 from ..kinematics.link_poses import Kinematics, LinkPoses
 from ..typing import AnyArray, Bool, Float, Tensor
-from .checks import at_pads, check_contacts, check_inertia, check_state
+from .checks import at_pads, check_contacts, check_described, check_inertia, check_state
 from .force_balance import ForceBalance
 from .gradients import following, only_if_asked
 from .grasp_forces import ExpectedForces, GraspForces
@@ -59,7 +59,7 @@ class KinematicModel(nn.Module):
         dtype: float64 (default) or float32.
 
     Raises:
-        ParameterError: the object's mass or centre of mass is no number, or the mass negative.
+        ParameterError: no hand, no object, or its mass or centre of mass is no number, or the mass negative.
         DescriptionError: the hand has no pads for the detector.
     """
 
@@ -89,6 +89,7 @@ class KinematicModel(nn.Module):
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
+        check_described(hand, obj)
         check_inertia(obj)
         self.hand, self.obj, self.options = hand, obj, options or ModelOptions()
         self.kinematics = HandKinematics(hand, dtype=dtype) if kinematics is None else kinematics

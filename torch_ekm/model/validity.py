@@ -139,7 +139,7 @@ def _of_friction(contacts: ContactSet, forces: GraspForces) -> list[Doubt]:
         if float(least[i]) <= AT_LIMIT and float(contacts.friction[i]) > 0:
             message = (
                 f"pad '{pad}' is at its friction limit ({float(margin[i]):.2f} N to spare) and may slip; "
-                "grip harder or turn less; with fingertip_force and expected the forces are estimated"
+                "grip harder or turn less"
             )
             value = float(least[i])
             doubts.append(Doubt(ModelStatus.FRICTION_LIMIT, pad, value, AT_LIMIT, "mu_s f_n", message))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .._extras import require
 from ..description import HandDescription, ObjectDescription
-from ..exceptions import ParameterError
+from ..exceptions import ParameterError, UnknownNameError
 from ..kinematics.se3 import log
 from ..plant import Observation, PlantStatus
 from ..rendering import Picture, make_scene
@@ -88,8 +88,10 @@ class InHandRotation(gymnasium.Env):
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ParameterError("render_mode", render_mode, "None or 'rgb_array'")
-        if not (0 < step_limit < math.pi and angles[0] <= angles[1]):
-            raise ParameterError("step_limit, angles", (step_limit, angles), "positive and in order")
+        if not 0 < step_limit < math.pi:
+            raise ParameterError("step_limit", step_limit, "above 0 and below pi [rad]")
+        if np.shape(angles) != (2,) or not -math.pi < angles[0] <= angles[1] < math.pi:
+            raise ParameterError("angles", angles, "the least and the largest target [rad], below pi")
         if isinstance(parameters, str):
             parameters = preset(parameters)
         self.plant = SimulatedHand(hand, object, config, parameters, engine=engine)
@@ -113,13 +115,16 @@ class InHandRotation(gymnasium.Env):
         """Grasp the object again and draw a target.
 
         Raises:
-            ParameterError: ``options["angle"]`` is not a finite number.
+            ParameterError: ``options["angle"]`` is no angle below pi.
+            UnknownNameError: there is no such option.
         """
+        for name, value in (options or {}).items():
+            if name != "angle":
+                raise UnknownNameError("option", name, ["angle"])
+            if np.ndim(value) or not abs(float(value)) < math.pi:
+                raise ParameterError("options['angle']", value, "an angle below pi [rad]")
         super().reset(seed=seed)
-        angle = (options or {}).get("angle", self.np_random.uniform(*self.angles))
-        if not math.isfinite(angle):
-            raise ParameterError("options['angle']", angle, "a finite angle [rad]")
-        self._target = float(angle)
+        self._target = float((options or {}).get("angle", self.np_random.uniform(*self.angles)))
         self._start = self.plant.reset(int(self.np_random.integers(2**31)))
         self._axis = self.plant.rotation_axis
         return self._observation(self._start), self._info(self._start)

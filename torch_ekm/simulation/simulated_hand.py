@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from .._checks import check_count, check_kind
 from ..description import HandDescription, ObjectDescription, load_hand, load_object
 from ..exceptions import EquilibriumError, GraspError, ParameterError, UnknownNameError
 from ..kinematics import GraspState
@@ -83,6 +84,8 @@ class SimulatedHand:
         if parameters is not None and preset is not None:
             valid = "None with parameters: preset(name).replace(...) changes single figures of a preset"
             raise ParameterError("preset", preset, valid)
+        if parameters is not None:
+            check_kind("parameters", parameters, PlantParameters, "PlantParameters; a name goes to preset=")
         if engine not in ENGINES:
             raise UnknownNameError("engine", engine, ENGINES)
         self.engine = engine
@@ -106,10 +109,11 @@ class SimulatedHand:
         """Grasp the object again: plan a pinch, close on the held object, release it, let it settle.
 
         Raises:
+            ParameterError: the seed is no integer of at least 0.
             EquilibriumError: no pinch could be planned.
             GraspError: the planned pinches did not hold the object.
         """
-        self._generator = np.random.default_rng(seed)
+        self._generator = np.random.default_rng(check_count("seed", seed, least=0))
         if self._rig is None:
             self._rig = Rig(
                 self.hand,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import torch
 
-from ..._checks import check_shape
+from ..._checks import check_kind, check_shape
 from ...description import HandDescription
 from ...plant import Observation, Plant, PlantWrapper
 from ...typing import Tensor
@@ -51,8 +51,9 @@ class CheckedPlant(PlantWrapper):
 
         Raises:
             ShapeError: it is of another hand, or part of it is missing.
-            ParameterError: its rotation is none.
+            ParameterError: it is no reading, or its rotation is none.
         """
+        check_kind("the plant's reading", seen, Observation, "an Observation")
         hand, shapes = self._hand, {"position": (3,), "rotation": (3, 3)}
         shapes |= {"q": (hand.n_q,), "a": (hand.n_a,), "fingertip_force": (len(hand.pads),)}
         changed = {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from ..._checks import check_kind
 from ...model import ModelStatus
 from ...plant import Observation, PlantStatus
 from ...typing import Tensor
@@ -43,6 +44,9 @@ class Progress:
     """How often a sign of a loss was heeded."""
 
     def __init__(self, safety: Safety, target: PoseTarget, focus: FocusedPose, seen: Observation) -> None:
+        check_kind(
+            "target", target, PoseTarget, "a PoseTarget, e.g. PoseTarget.turned(state, axis, degrees=20)"
+        )
         self.safety, self.target, self.focus = safety, target, focus
         self.belief = Belief(focus, target, seen)
         self.errors = [focus.error(target, seen.state)]

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 import torch
 from torch import nn
 
+from ..._checks import check_kind
 from ..._recorded import Recorded
 from ...exceptions import ParameterError
 from ...typing import Float, Tensor
@@ -112,9 +113,10 @@ def check_kernel(kernel: Kernel, in_features: int, batch_shape: tuple[int, ...])
     Raises:
         ParameterError: it is none, or of another width or fleet.
     """
-    valid = f"a Kernel of {in_features} inputs, for one model or a fleet of {tuple(batch_shape)}"
-    if not isinstance(kernel, Kernel):
-        raise ParameterError("kernel", type(kernel).__name__, valid)
+    valid = f"a Kernel of {in_features} inputs"
+    if batch_shape:
+        valid += f", for one model or a fleet of {tuple(batch_shape)}"
+    check_kind("kernel", kernel, Kernel, valid)
     try:
         shape = _shape_of(kernel, in_features)
     except RuntimeError:
