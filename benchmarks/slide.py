@@ -53,7 +53,10 @@ WANTED = 3.0  # [mm]
 MOTIONS = 10  # at most
 _FAR = 4 * math.pi / 180  # [rad] of a motor in one motion
 _ROUNDS, _DRAWN, _BEST = 3, 24, 6  # of the cross-entropy method
-_LEAST, _MOST = 0.8, 5.0  # [N] of each finger
+_LEAST, _MOST = 1.0, 5.0  # [N] of each finger
+_MARGIN = 0.2  # [N] of those that do not slide
+_FARTHEST = 1.5  # [mm] in one motion
+OFF = 5.0  # [deg] of the object, beyond which the slide is given up
 _DEG = math.pi / 180
 
 
@@ -78,7 +81,7 @@ class Slide:
     moved: float
     """Of its position [mm]."""
     ended: str
-    """reached, motions, no motion or lost."""
+    """reached, motions, no motion, turned or lost."""
 
     @property
     def case(self) -> str:
@@ -164,12 +167,13 @@ class Slider:
         fingers = ("thumb", "index", "middle")
         force = np.array([step.normal.get(name, 0.0) for name in fingers])
         shear = 0.0  # share of friction in the wanted direction: it is full before the finger slides
-        if step.normal.get(self.finger, 0.0) > 0:
+        if step.normal.get(self.finger, 0.0) > _MARGIN:
             way = step.state.rotation.numpy() @ self._way
             shear = float(step.loads.force[self.finger] @ way) / step.normal[self.finger]
+        little = sum(max(0.0, _MARGIN - x) for name, x in step.margin.items() if name != self.finger)
         bearing = sum(x > 0 for name, x in step.normal.items() if name not in fingers)
         return float(
-            -3 * min(slid, missing) - 4 * shear + (off / 3) ** 2 + (away / 6) ** 2
+            -3 * min(slid, missing, _FARTHEST) - 4 * shear + (off / 2) ** 2 + (away / 6) ** 2 + 10 * little
             + (10 * (_LEAST - force).clip(min=0) + 2 * (force - _MOST).clip(min=0)).sum() + 3 * bearing
         )  # fmt: skip
 
@@ -179,7 +183,7 @@ class Slider:
 
 
 def slide(plant: SimulatedHand, model: KinematicModel, case: tuple[str, str, float], about: Any) -> Slide:
-    """Motions until the finger has slid as far as it should, by the readings; what came of it by the truth."""
+    """Motions until the finger has slid as far as it should, by the readings, and what came of them."""
     item, seed, name = about
     slider, seen, draw = Slider(plant, model, case), plant.observe(), np.random.default_rng(seed)
     exact, first = name == "described", true_state(plant.observe())
@@ -200,13 +204,14 @@ def slide(plant: SimulatedHand, model: KinematicModel, case: tuple[str, str, flo
         predicted.append(chosen[1])
         states = [true_state(x) if exact else x.state for x in (before, seen)]
         read += slider.slides(*states).get(slider.finger, 0.0)
-        if read >= WANTED:
-            ended = "reached"
+        off = float(states[1].minus(slider.start)[-3:].norm()) / _DEG
+        if off > OFF or read >= WANTED:
+            ended = "turned" if off > OFF else "reached"
             break
     moved = true_state(seen).minus(first)[-6:]
     others = max((abs(way) for finger, way in total.items() if finger != slider.finger), default=0.0)
-    off, away = float(moved[3:].norm()) / _DEG, 1e3 * float(moved[:3].norm())
-    return Slide(item, seed, name, *case, slid, predicted, others, off, away, ended)
+    turned, away = float(moved[3:].norm()) / _DEG, 1e3 * float(moved[:3].norm())
+    return Slide(item, seed, name, *case, slid, predicted, others, turned, away, ended)
 
 
 def session(
@@ -253,7 +258,7 @@ def table(slides: Sequence[Slide]) -> Table:
         )  # fmt: skip
     columns: list[str | Column] = [
         "hand, finger", "reached", "lost", Column("motions", ".0f"), Column("slid [mm]", ".1f"),
-        Column("error of one prediction [mm]", ".2f"), Column("other fingers slid [mm]", ".1f"), "object moved",
+        Column("error of one prediction [mm]", ".2f"), Column("other fingers [mm]", ".1f"), "object moved",
     ]  # fmt: skip
     note = (
         f"Reached: the finger slid {WANTED:g} mm in the wanted direction, by the readings, within {MOTIONS}"

@@ -96,3 +96,18 @@ def test_the_error_of_a_cable_lasts() -> None:
         assert float(free.q[thumb] - free.truth.q[thumb]) == near
         blurred.error = 0.0
         assert float((seen := plant.reset(0)).q[thumb] - seen.truth.q[thumb]) == near  # a new grasp
+
+
+def test_an_error_that_no_contact_shows_stays_uncertain(hand: SimulatedHand) -> None:
+    """A reading in which nothing touches leaves the next one as free as a first."""
+    thumb = hand.hand.joint_names.index("thumb_0")
+    blurred = Blurred(hand, thumb, 0.0)
+    blurred.reset(0)
+    blurred.error = math.radians(9.0)
+    read = blurred.observe()
+    plant = ContactAligned(blurred, hand.hand, hand.object)
+    plant.observation(dataclasses.replace(read, fingertip_force=torch.zeros(len(hand.hand.pads))))
+    q = plant.observation(read).q
+    fresh = ContactAligned(blurred, hand.hand, hand.object).observation(read).q
+    assert torch.allclose(q, fresh, rtol=0, atol=1e-9)
+    assert abs(float(q[thumb] - read.truth.q[thumb])) < math.radians(1.0)

@@ -15,7 +15,7 @@ from ..typing import Float, Tensor
 _SENSED_STD = math.radians(0.5)  # of a joint with a Hall sensor, where the plant states no covariance
 _UNSENSED_STD = math.radians(10.0)  # of the others: behind a tendon that stretches
 _GAP_STD = 1e-4  # [m]: what the object's pose and both shapes leave open
-_LASTING_STD = math.radians(2.0)  # a joint that is less certain is known through a cable, whose error lasts
+_LASTING_STD = math.radians(5.0)  # a joint that is less certain is known by a cable alone; its error lasts
 _CHANGE = 0.2  # share of its deviation by which such an error changes between two observations
 _LEAST_FORCE = 0.5  # [N]: a pad that measures less says nothing
 _GATE = 3.0  # deviations of a gap, up to which a pad of a hand without fingertip sensors is in contact
@@ -32,8 +32,9 @@ class ContactAligned(PlantWrapper):
     measures 0.5 N or, on a hand without fingertip sensors, where its gap is within three deviations. Each
     joint takes as much of what is missing as its deviation allows.
 
-    What a joint known to 2 deg or worse took at the last observation is expected again, to a fifth of its
-    deviation: where a joint moves its pad along the object, two angles explain the same gap.
+    What a joint known to 5 deg or worse took at the last observation is expected again, with the deviation
+    that the gaps left it and a fifth of its own: where a joint moves its pad along the object, two angles
+    explain the same gap.
 
     P is ``info["estimate"]["joint_covariance"]`` [rad^2] where the plant states it, else 0.5 deg for joints
     with a Hall sensor and 10 deg for others. Solved by Gauss-Newton, at every observation, within the joints'
@@ -54,6 +55,8 @@ class ContactAligned(PlantWrapper):
         std = [_SENSED_STD if name in sensed else _UNSENSED_STD for name in hand.joint_names]
         moves = self._range[1] > self._range[0]
         self._offset: Float[Tensor, " n_q"] | None = None
+        self._left = torch.zeros(len(std), dtype=torch.float64)
+        """Variance of each joint after the last observation [rad^2]."""
         self._covariance = torch.diag(torch.tensor(std, dtype=torch.float64) ** 2 * moves)
 
     def reset(self, seed: int) -> Observation:
@@ -66,18 +69,19 @@ class ContactAligned(PlantWrapper):
         P = seen.info.get("estimate", {}).get("joint_covariance", self._covariance)
         expected = seen.q
         if self._offset is not None:
-            lasts = P.diagonal().sqrt() > _LASTING_STD
-            share = torch.where(lasts, _CHANGE, 1.0).to(P)
+            own = P.diagonal()
+            lasts = own.sqrt() > _LASTING_STD
+            share = torch.where(lasts, self._left / own + _CHANGE**2, 1.0).clamp(max=1.0).sqrt()
             P, expected = share[:, None] * P * share, seen.q + self._offset * lasts
         pads = self._touching(seen, expected, P)
         R = _GAP_STD**2 * torch.eye(len(pads), dtype=P.dtype)
-        q = expected
+        q, self._left = expected, P.diagonal()
         for _ in range(_ITERATIONS if pads else 0):
             gap, H = self._gaps(seen, q, pads)
-            missing = gap + H @ (expected - q)
-            q = (expected - P @ H.mT @ torch.linalg.solve(H @ P @ H.mT + R, missing)).clamp(*self._range)
-        if pads:
-            self._offset = q - seen.q
+            gain = torch.linalg.solve(H @ P @ H.mT + R, H @ P).mT
+            q = (expected - gain @ (gap + H @ (expected - q))).clamp(*self._range)
+            self._left = (P - gain @ H @ P).diagonal()
+        self._offset = q - seen.q
         return dataclasses.replace(seen, q=q)
 
     def _touching(
