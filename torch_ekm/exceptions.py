@@ -253,7 +253,7 @@ class NoStateError(EKMError, TypeError):
 
     def __init__(self, learner: str, reason: str) -> None:
         self.learner = learner
-        super().__init__(f"{learner} has no state dict and cannot be saved: {reason}")
+        super().__init__(f"{learner} cannot be saved as plain figures: {reason}")
 
 
 class FileFormatError(EKMError, ValueError):

@@ -129,6 +129,24 @@ def test_bad_samples_leave_the_learner_untouched(generator: torch.Generator) -> 
         assert torch.equal(value, before[name]), name
 
 
+def test_wrong_kinds_and_widths_are_refused_by_name(generator: torch.Generator, unchecked) -> None:
+    state, action = sample(generator)
+    whole = torch.tensor([1, 2])
+    for call in ("forward", "predict", "linearize"):
+        with pytest.raises(ParameterError, match=r"torch\.int64.*floating-point"):  # f + g would be rounded
+            getattr(enhanced(), call)(state[0], whole)
+    with pytest.raises(ParameterError, match=r"floating-point"):
+        enhanced().update(state[0], whole, model(state[0], action[0]))
+    with pytest.raises(ParameterError, match="encode="):
+        EnhancedModel(lambda s, a: a, SparseOnlineGP(N_S + N_A, N_A))(state[0].tolist(), action[0])
+    with pytest.raises(ParameterError, match="indices"):
+        EnhancedModel(model, SparseOnlineGP(N_S + N_A, 1), outputs=1)
+    for learned, options in ((1, {}), (4, {}), (2, {"outputs": [1, 3]})):  # f has three entries
+        ekm = EnhancedModel(model, SparseOnlineGP(N_S + N_A, learned), **options)
+        with pytest.raises(ShapeError, match=r"f\(state, action\).*learner"):
+            ekm(state[0], action[0])
+
+
 @pytest.mark.parametrize("spoilt", ["state", "action", "increment"])
 def test_a_learner_that_skips_leaves_bad_samples_out_here_too(
     generator: torch.Generator, spoilt: str

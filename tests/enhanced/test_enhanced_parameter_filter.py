@@ -152,6 +152,20 @@ def test_any_model_with_parameters_adapts_in_an_enhanced_model() -> None:
     assert float(J[1, 0]) == pytest.approx(0.05 * 1.4, rel=0.1)
 
 
+@pytest.mark.parametrize(("width", "unused"), [(3, math.nan), (3, 1e200), (4, 0.0)])
+def test_what_the_learner_refuses_does_not_move_theta(width: int, unused: float) -> None:
+    theta = ParameterFilter(["gain"], [1.0], [0.5])
+    ekm = EnhancedModel(
+        AdaptiveModel(lambda s, a, theta: theta * a * s[:1], theta, 0.01), RecursiveLeastSquares(width, 1)
+    )
+    before = {name: value.clone() for name, value in ekm.named_buffers()}
+    state, action = torch.tensor([0.5, unused], dtype=F64), torch.ones(1, dtype=F64)
+    with pytest.raises((NonFiniteError, ShapeError)):
+        ekm.update(state, action, 2.0 * action)
+    for name, value in ekm.named_buffers():
+        assert torch.equal(value, before[name]), name
+
+
 def test_a_model_without_derivative_by_theta_is_refused() -> None:
     theta = ParameterFilter(["gain"], [1.0], [0.5])
     f = AdaptiveModel(lambda s, a, theta: a * float(theta), theta, 0.01)

@@ -13,8 +13,10 @@ from torch_ekm.cli import app
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
 from torch_ekm.experiments import compare
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
+from torch_ekm.experiments.learner_comparison.run import run_one
 from torch_ekm.experiments.learner_comparison.stream import in_own_units, load_table
 from torch_ekm.experiments.learner_comparison.table_file import open_table
+from torch_ekm.residual import UpdateReport, ZeroResidual
 
 
 def table(n: int = 60) -> np.ndarray:
@@ -178,8 +180,32 @@ def test_a_clock_among_the_inputs_is_suspected(tmp_path: Path) -> None:
     run = np.arange(60) // 20
     values = np.column_stack([np.arange(60) % 20, table()[:, 1:], run])
     stream = load_table(write(tmp_path / "a.csv", values, "time,b,c,y,run"), run="run")
-    assert "time only grows" in compare(stream, ("linear RLS",)).verdicts()[0]
+    assert "number of a row: time;" in compare(stream, ("linear RLS",)).verdicts()[0]
     assert not load_table(write(tmp_path / "b.csv", table())).notes
+    nameless = load_table(write(tmp_path / "c.csv", values, "time,b,c,y,run")).notes  # runs without --run
+    assert "number of a row: time;" in nameless
+    assert "number of a run: run;" in nameless
+    k, rest = np.arange(60), np.ones(60)
+    wheel = np.column_stack([np.mod(0.7 * k, 6.3), k >= 30, rest, table()[:, 3]])
+    assert not load_table(write(tmp_path / "d.csv", wheel, "angle,switch,load,y")).notes
+
+
+def test_a_run_begins_a_sequence(tmp_path: Path) -> None:
+    learned, begun = [], []
+
+    class Watched(ZeroResidual):
+        def absorb(self, x: torch.Tensor, y: torch.Tensor, mask: torch.Tensor | None) -> UpdateReport:
+            learned.append(y)
+            return super().absorb(x, y, mask)
+
+        def new_sequence(self) -> None:
+            begun.append(len(learned))
+
+    path = write(tmp_path / "a.csv", np.column_stack([table(), np.arange(60) // 20]), "a,b,c,y,run")
+    run_one(load_table(path, run="run"), Watched)
+    assert begun == [20, 40]
+    run_one(load_table(path), Watched)
+    assert begun == [20, 40]
 
 
 def test_rest_at_the_beginning_is_no_unit() -> None:

@@ -256,6 +256,31 @@ def test_each_output_finds_its_own_noise():
     assert 0.3 < float(found[1]) < 0.5
 
 
+class Periodic(Kernel):
+    """exp(-2 |sin(x - z)|^2): a kernel of a user's, without hyperparameters."""
+
+    def forward(self, x: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+        return (-2 * (x.unsqueeze(-2) - z.unsqueeze(-3)).sin().square().sum(-1)).exp()
+
+    def diagonal(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.ones_like(x[..., 0])
+
+    def with_gradient(self, x: torch.Tensor, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        k = self.vector(x, z)
+        return k, -2 * k.unsqueeze(-1) * (2 * (x.unsqueeze(-2) - z)).sin()
+
+
+def test_a_kernel_without_hyperparameters_learns_the_noise_alone():
+    gp = SparseOnlineGP(1, 1, kernel=Periodic(), standardize=False)
+    x = 9 * torch.rand(200, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    start = float(gp.noise_variance)
+    for one in x:  # six rebuilds
+        gp.update(one, (2 * one).cos())
+    assert float(gp.noise_variance) < start
+    assert float((gp(x + math.pi) - (2 * x).cos()).detach().square().mean().sqrt()) < 0.05
+    torch.testing.assert_close(gp.linearize(x[0])[1], torch.autograd.functional.jacobian(gp, x[0]))
+
+
 def test_deep_kernel_starts_as_the_plain_one_and_does_not_collapse():
     x, y = system(11, 600)
     errors = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -148,7 +148,10 @@ class EnhancedModel(Recorded, nn.Module):
 
     def features(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_x"]:
         """``x = [encode(s); action_scale * da]``."""
-        return torch.cat([self.encode(state), self.action_scale * action], dim=-1)
+        scaled, encoded = self.action_scale * _checked_action(action), self.encode(state)
+        if not isinstance(encoded, Tensor):
+            raise ParameterError("state", type(encoded).__name__, "a tensor, or what encode= makes one of")
+        return torch.cat([encoded, scaled], dim=-1)
 
     def forward(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_s"]:
         """``f(s, da) + g(s, da)``."""
@@ -160,11 +163,12 @@ class EnhancedModel(Recorded, nn.Module):
         """``f(s, da)``, as a tensor of the action's dtype.
 
         Raises:
-            ParameterError: the action is no tensor.
+            ParameterError: the action is no tensor of floating-point numbers.
+            ShapeError: f gives another number of entries than the learner corrects.
         """
-        if not isinstance(action, Tensor):
-            raise ParameterError("action", type(action).__name__, "a tensor: torch.as_tensor(action)")
-        return torch.as_tensor(self.model(state, action)).to(action)
+        nominal = torch.as_tensor(self.model(state, _checked_action(action))).to(action)
+        self._check_width("f(state, action)", nominal)
+        return nominal
 
     @torch.no_grad()
     def update(
@@ -190,14 +194,18 @@ class EnhancedModel(Recorded, nn.Module):
             NonFiniteError: an entry is NaN or infinite; nothing was changed. With ``on_invalid="skip"`` the
                 learner leaves the sample out instead and counts it in ``learner.n_refused``.
             ShapeError: the increment has not the shape of the model's prediction.
-            ParameterError: action or increment is no tensor.
+            ParameterError: state, action or increment is no tensor, or the action is one of integers.
         """
-        for name, value in (("action", action), ("increment", increment)):
-            if not isinstance(value, Tensor):
-                raise ParameterError(name, type(value).__name__, f"a tensor: torch.as_tensor({name})")
-        finite = bool(increment.isfinite().all() and torch.as_tensor(action).isfinite().all())
-        if nominal is None and finite and hasattr(self.model, "adapt"):  # else it is refused below
-            self.model.adapt(state, action, increment)
+        if not isinstance(increment, Tensor):
+            raise ParameterError(
+                "increment", type(increment).__name__, "a tensor: torch.as_tensor(increment)"
+            )
+        x = self.features(state, action)
+        if nominal is None and hasattr(self.model, "adapt"):  # what the learner refuses, f must not learn
+            self._check_width("increment", increment)
+            self.learner.check_query(x)
+            if all(math.isfinite(value.square().sum()) for value in (increment, x)):
+                self.model.adapt(state, action, increment)
         predicted = self.nominal(state, action) if nominal is None else nominal
         check_shape("increment", increment, predicted.shape, "as the prediction has")
         if self.learner.on_invalid == "raise":  # else the learner leaves such a sample out, and counts it
@@ -206,7 +214,7 @@ class EnhancedModel(Recorded, nn.Module):
             ):  # fmt: skip
                 check_finite(name, value)
         residual = self._gather(increment - predicted) * self.output_scale
-        return self.learner.update(self.features(state, action), residual)
+        return self.learner.update(x, residual)
 
     def new_sequence(self) -> None:
         """The next motion does not follow on the last one: a learner that carries its last error over (a
@@ -228,7 +236,7 @@ class EnhancedModel(Recorded, nn.Module):
             NoDerivativeError: f carries no derivative (numpy, ``no_grad``, a detached output).
             ShapeError: ``jacobian`` gave another shape.
         """
-        nominal, J = self._nominal_with_jacobian(state, action, nominal_jacobian)
+        nominal, J = self._nominal_with_jacobian(state, _checked_action(action), nominal_jacobian)
         mean, dmean = self.learner.linearize(self.features(state, action))
         value = nominal + self._scatter(mean / self.output_scale, nominal)
         dmean = dmean[..., -action.shape[-1] :]
@@ -307,6 +315,15 @@ class EnhancedModel(Recorded, nn.Module):
             check_state(self, state_dict)
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
+    def _check_width(self, name: str, increment: Tensor) -> None:
+        """ShapeError where the entries are not those that the learner corrects."""
+        least = self.learner.out_features if self.outputs is None else max(self.outputs) + 1
+        n_s = increment.shape[-1] if increment.dim() else 0
+        if n_s < least or (self.outputs is None and n_s > least):
+            expected = f"(*batch, {least})" if self.outputs is None else f"(*batch, {least} or more)"
+            hint = "the learner corrects all of it, or those that outputs= names"
+            raise ShapeError(name, expected, increment.shape, hint)
+
     def _gather(self, increment: Tensor) -> Tensor:
         return increment if self.outputs is None else increment[..., self.outputs]
 
@@ -325,6 +342,15 @@ def kinematic_and_enhanced(
     return (model.model, model) if isinstance(model, EnhancedModel) else (model, None)
 
 
+def _checked_action(action: Any) -> Tensor:
+    """Values have the action's dtype: of integers f + g would be rounded to such."""
+    if not isinstance(action, Tensor) or not action.is_floating_point():
+        kind = str(action.dtype) if isinstance(action, Tensor) else type(action).__name__
+        valid = "a tensor of floating-point numbers: torch.as_tensor(action, dtype=torch.float64)"
+        raise ParameterError("action", kind, valid)
+    return action
+
+
 def _check_arguments(model: Any, learner: Any, encode: Any, outputs: Any, jacobian: Any) -> None:
     checks = (
         ("model", model, callable(model), "a callable f(state, action) -> increment"),
@@ -339,7 +365,7 @@ def _check_arguments(model: Any, learner: Any, encode: Any, outputs: Any, jacobi
         if not good:
             raise ParameterError(name, value, valid)
     if outputs is not None:
-        indices = list(outputs)
+        indices = list(outputs) if isinstance(outputs, Iterable) else []  # refused, since a learner has one
         good = all(type(i) is int and i >= 0 for i in indices) and len(set(indices)) == len(indices)
         if not good or len(indices) != learner.out_features:
             valid = f"{learner.out_features} different indices, one for each output of the learner"

@@ -22,8 +22,8 @@ def save(learner: ResidualLearner | EnhancedModel, path: str | os.PathLike) -> N
     The file is a zip archive of a JSON header and arrays. It appears whole or not at all.
 
     Raises:
-        NoStateError: it holds something that is no plain figure, such as a function for ``encode`` or another
-            library's objects; the message names it.
+        NoStateError: it holds something that is no plain figure, such as a function for ``encode`` (save its
+            ``learner``) or another library's objects; the message names it.
         OutputError: the file cannot be written.
     """
     if isinstance(learner, EnhancedModel):
@@ -50,7 +50,8 @@ def load(
         The ResidualLearner or EnhancedModel.
 
     Raises:
-        FileFormatError: it is no such file, or damaged.
+        FileNotFoundError: there is no file.
+        FileFormatError: :func:`save` has not written it, or it is damaged.
         StateMismatchError: state and description do not go together.
         ParameterError: a class is not known, or f is missing (or given for a learner).
     """

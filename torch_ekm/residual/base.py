@@ -63,7 +63,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         self.out_features = check_count("out_features", out_features)
         self.batch_shape = torch.Size(check_counts("batch_shape", batch_shape))
         if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
-            raise ParameterError("dtype", dtype, "torch.float64 or torch.float32")
+            raise ParameterError("dtype", dtype, "a floating-point dtype such as torch.float64")
         if on_invalid not in ("raise", "skip"):
             raise ParameterError("on_invalid", on_invalid, "'raise' or 'skip'")
         self.on_invalid = on_invalid

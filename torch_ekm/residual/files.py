@@ -36,7 +36,10 @@ def write(path: str | os.PathLike, described: Mapping[str, Any], state: Mapping[
     """
     wrong = opaque_arguments(described)
     if wrong:
-        raise NoStateError(str(described.get("class")), f"no plain values: {', '.join(wrong)}")
+        raise NoStateError(
+            str(described.get("class")),
+            f"{', '.join(wrong)}; save the rest, such as ekm.learner, or its state_dict()",
+        )
     tensors: dict[str, torch.Tensor] = {}
     packed = {name: _pack(value, tensors, str(described.get("class"))) for name, value in state.items()}
     header = {"format": _FORMAT, "made_with": described, "state": packed}

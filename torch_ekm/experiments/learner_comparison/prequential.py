@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -43,12 +45,21 @@ class Prequential:
 
 
 def run_prequential(
-    learner: ResidualLearner, x: Float[Tensor, "n d"], y: Float[Tensor, "n m"]
+    learner: ResidualLearner,
+    x: Float[Tensor, "n d"],
+    y: Float[Tensor, "n m"],
+    segments: Sequence[int] = (),
 ) -> Prequential:
-    """Predict each sample with its deviation, then learn it, in the order of time."""
+    """Predict each sample with its deviation, then learn it, in the order of time.
+
+    It calls the learner's ``new_sequence`` between ``segments``, given by their lengths.
+    """
+    starts = set(itertools.accumulate(segments))
     means, deviations, densities, begin = [], [], [], time.perf_counter()
     heavy = type(learner).predictive is not ResidualLearner.predictive
     for t in range(len(x)):
+        if t in starts:
+            learner.new_sequence()
         law = learner.predict(x[t], observation=True)
         means.append(law.mean.detach())
         deviations.append(law.stddev.detach())

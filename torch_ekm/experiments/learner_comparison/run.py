@@ -57,7 +57,7 @@ def compare(
         predicted: columns with what the model says of the targets, which are then what was measured.
         observation: in place of targets: columns whose increments are predicted, as :func:`load_own` does;
             from ``inputs``, or from themselves if none is named.
-        run: a column with one number in each run.
+        run: a column with one number in each run; learners get ``new_sequence()`` between runs.
         clock: the topic whose messages set the rows, in a recording of ROS.
         limit: only the first so many samples of a file or recording; None: all.
         folder: keeps what is finished, so that an interrupted comparison continues where it stopped. A result
@@ -114,7 +114,7 @@ def run_one(stream: Stream, factory: Factory) -> dict[str, Any]:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             model = factory(stream.x.shape[1], stream.y.shape[1])
-            run = run_prequential(model, stream.x, stream.y)
+            run = run_prequential(model, stream.x, stream.y, stream.segments)
     finally:
         torch.set_num_threads(threads)
     start = stream.warm_up
@@ -164,7 +164,8 @@ def _job_name(stream: Stream, name: str, learner: ResidualLearner) -> str:
     """Named after what decides the result: samples, arguments, and what the learner does at first."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        made_with, first = describe(learner), run_prequential(learner, stream.x[:LEAST], stream.y[:LEAST])
+        made_with = describe(learner)
+        first = run_prequential(learner, stream.x[:LEAST], stream.y[:LEAST], stream.segments)
     said = [f"{value:.6g}" for value in torch.cat([first.mean, first.deviation]).flatten().tolist()]
     decides = hashlib.sha256(repr((name, stream.warm_up, stream.segments, made_with, said)).encode())
     for values in (stream.x, stream.y):

@@ -125,7 +125,8 @@ class Comparison:
             }
             level = [name for name, ratio in ratios.items() if ratio.low <= 1]
             found = f"{self.error(stream.name, best):.3f}"
-            text = f"{stream.name}: {best} is best, {found} of the model alone"
+            by = "by the median " if self.measure(stream.name) == "median" else ""
+            text = f"{stream.name}: {best} is best, {by}{found} of the model alone"
             if level:
                 text += f"; this recording does not distinguish it from {', '.join(level)}"
             behind = sorted((n for n in ratios if n not in level), key=lambda n: ratios[n].mean)
@@ -139,7 +140,7 @@ class Comparison:
                 text += " The inputs give y: is what was measured among them?"
             text += stream.notes
             if sure := [score.learner for score in self.row(stream.name) if score.nll > _ABSURD]:
-                text += f" Too certain by far (NLL): {', '.join(sure)}; do not use their variances."
+                text += f" Errors far beyond the variance (NLL): {', '.join(sure)}; use no density of theirs."
             sentences.append(text)
         return sentences
 

@@ -28,7 +28,7 @@ class Stream:
         x: inputs ``(n, d)``, of the order of 1.
         y: what the model at hand leaves over ``(n, m)``, of the order of 1; 0 is the model itself.
         warm_up: first samples that are learned but not scored: they gave the units.
-        segments: lengths of parts that stand for themselves (objects, grasps), for the statistics.
+        segments: lengths of parts that stand for themselves (objects, grasps, runs).
         about: what it is, and what "the model alone" predicts.
         available: samples of the file or recording, of which these are the first; 0: nobody counted.
         notes: what the user should look at, such as a clock among the inputs.
@@ -104,7 +104,7 @@ def load_table(
     wanted = inputs, targets, predicted, [run] if run else []
     chosen, outputs, model, runs = (find_columns(columns, names) for columns in wanted)
     if model and len(model) != len(outputs):
-        raise ParameterError("predicted", model, f"one for each measured column, {len(outputs)}")
+        raise ParameterError("predicted", model, f"one for each measured column; {len(outputs)} are named")
     outputs = outputs or [name for name in names if _is_residual(name)]
     if not outputs:
         problem = "no column is called 'y' (or y1, y2, ...); name the targets: targets=, or --targets"
@@ -126,11 +126,27 @@ def load_table(
     about = f"{', '.join(outputs)} from {len(chosen)} columns of {Path(path).name}; alone: {alone}"
     number = np.pad(values[3][:limit].sum(1), 1, constant_values=np.nan)  # zeros without runs
     parts = np.diff(np.flatnonzero(np.diff(number))).tolist()
-    grows = (np.diff(x, axis=0) <= 0).sum(0) < len(parts)  # but for the starts of runs
-    clocks = ", ".join(name for name, clock in zip(chosen, grows, strict=True) if clock)
-    notes = f" {clocks} only grows, like a clock or the number of a row: leave it out." if clocks else ""
+    notes = ""
+    if clocks := [name for name, column in zip(chosen, x.T, strict=True) if _is_clock(column, len(parts))]:
+        notes += f" Like a clock or the number of a row: {', '.join(clocks)}; leave it out."
+    if numbers := [name for name, column in zip(chosen, x.T, strict=True) if _is_number_of_run(column)]:
+        notes += f" Like the number of a run: {', '.join(numbers)}; name it by --run (run=), or leave it out."
     stream = in_own_units(Path(path).stem, x, y, about, limit, centre_y=not zero_is_model)
     return dataclasses.replace(stream, segments=tuple(parts) if runs else (), notes=notes)
+
+
+def _is_clock(column: Array, n_runs: int) -> bool:
+    """It grows, but for the starts of the runs, or for starts at one and the same value."""
+    starts = np.flatnonzero(np.diff(column) <= 0) + 1
+    again = 10 * len(starts) <= len(column) and bool((column[starts] == column[0]).all())
+    return again or len(starts) < n_runs
+
+
+def _is_number_of_run(column: Array) -> bool:
+    """Whole numbers that never fall, and rise twice or more (a switch does once), but rarely."""
+    step = np.diff(column)
+    rises = np.count_nonzero(step)
+    return bool((step >= 0).all() and (column == np.rint(column)).all() and 10 < 10 * rises < len(column))
 
 
 def _is_residual(name: str) -> bool:

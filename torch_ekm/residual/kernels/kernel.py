@@ -25,7 +25,11 @@ Pullback = Callable[[Tensor, Tensor], Sequence[Tensor | None]]
 
 
 class Kernel(Recorded, nn.Module, ABC):
-    """A covariance function k(x, z) of two points, with its derivative by the first."""
+    """A covariance function k(x, z) of two points, with its derivative by the first.
+
+    A kernel of your own implements ``forward``, ``diagonal`` and ``with_gradient``, and ``diagonal_gradient``
+    unless k(x, x) is constant. Its hyperparameters are Parameters without ``requires_grad``.
+    """
 
     @abstractmethod
     def forward(self, x: Float[Tensor, "*batch n d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
@@ -58,6 +62,8 @@ class Kernel(Recorded, nn.Module, ABC):
         def pullback(by_matrix: Tensor, by_diagonal: Tensor) -> Sequence[Tensor | None]:
             with _differentiable(self):
                 by, parameters = [by_matrix, by_diagonal], list(self.parameters())
+                if not parameters:
+                    return ()
                 return torch.autograd.grad(found, parameters, by, allow_unused=True)
 
         return found[0].detach(), found[1].detach(), pullback
