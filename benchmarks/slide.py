@@ -98,7 +98,7 @@ class Slider:
     """Chooses motions after which one finger has slid further and the object is where it was."""
 
     def __init__(self, plant: SimulatedHand, model: KinematicModel, case: tuple[str, str, float]) -> None:
-        self.plant, self.model, (self.finger, self.direction, self.side) = plant, model, case
+        self.model, (self.finger, self.direction, self.side) = model, case
         seen = plant.observe()
         self.start = seen.state
         axis = plant.rotation_axis.numpy()
