@@ -272,8 +272,8 @@ def table(lifts: Sequence[Lift]) -> Table:
                 f"{np.median(foreseen):.0f} ({len(foreseen)})" if foreseen else "none",
                 sum(one.lost for one in some),
                 f"{np.median(off):.0f} (to {max(off):.0f})" if off else math.nan,
-                _median(one.moved for one in some if not one.lost), shifts,
-                _median(one.remains for one in again),
+                median(one.moved for one in some if not one.lost), shifts,
+                median(one.remains for one in again),
             ]
         )  # fmt: skip
     columns: list[str | Column] = [
@@ -290,7 +290,8 @@ def table(lifts: Sequence[Lift]) -> Table:
     return Table("lifts", "Fingers lifted and set elsewhere", columns, rows, note)
 
 
-def _median(values: Iterable[float]) -> float:
+def median(values: Iterable[float]) -> float:
+    """NaN of none."""
     return float(np.median([*values] or [math.nan]))
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import copy
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,16 +25,18 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent / "kinematic_model"))
 
 from command_line import study_parser
+from regrasp import median
 from slip_announcement import sliding
 
 from torch_ekm._terminal import progress
+from torch_ekm.contact import ContactSet
 from torch_ekm.exceptions import GraspError
 from torch_ekm.experiments.config import Setting, digest
 from torch_ekm.experiments.jobs import run_jobs
 from torch_ekm.experiments.records import true_state
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
-from torch_ekm.kinematics import GraspState
+from torch_ekm.kinematics import GraspState, LinkPoses
 from torch_ekm.model import ContactMotion, ContactStep, KinematicModel
 from torch_ekm.plant import Observation, PlantStatus
 from torch_ekm.simulation import SimulatedHand
@@ -58,6 +60,8 @@ _MARGIN = 0.2  # [N] of those that do not slide
 _FARTHEST = 1.5  # [mm] in one motion
 OFF = 5.0  # [deg] of the object, beyond which the slide is given up
 _DEG = math.pi / 180
+
+Placed = tuple[GraspState, LinkPoses, ContactSet]
 
 
 @dataclass(frozen=True)
@@ -109,10 +113,10 @@ class Slider:
         self._free = np.array([name != "pinky" for name in names])  # ring and little finger stay open
         self._last, self._expected = np.zeros(len(names)), None
 
-    def slides(self, before: GraspState, after: GraspState) -> dict[str, float]:
+    def slides(self, before: Placed, after: GraspState) -> dict[str, float]:
         """How far each finger slides over the object in the wanted direction [mm]."""
         way = torch.from_numpy(after.rotation.numpy() @ self._way)
-        return {name: 1e3 * float(x @ way) for name, x in sliding(self._placed(before), self._placed(after))}
+        return {name: 1e3 * float(x @ way) for name, x in sliding(before, self.placed(after))}
 
     def choose(
         self, seen: Observation, missing: float, draw: np.random.Generator, *, exact: bool
@@ -134,14 +138,14 @@ class Slider:
             lin = self.model.linearize(state, self.model.touching(state), **known)
         except GraspError:  # a finger has left the object
             return None
-        begun = ContactMotion(self.model, lin, a=seen.a if exact else None)
+        begun, here = ContactMotion(self.model, lin, a=seen.a if exact else None), self.placed(state)
 
         def cost(da: Array) -> tuple[float, float]:
             try:
                 step = copy.copy(begun).move(torch.from_numpy(da))
             except GraspError:
                 return math.inf, 0.0
-            slid = self.slides(state, step.state).get(self.finger, 0.0)
+            slid = self.slides(here, step.state).get(self.finger, 0.0)
             return self._cost(step, slid, missing), slid
 
         middle, spread = 0.7 * self._last, np.full(len(self._last), _FAR / 2)
@@ -177,7 +181,8 @@ class Slider:
             + (10 * (_LEAST - force).clip(min=0) + 2 * (force - _MOST).clip(min=0)).sum() + 3 * bearing
         )  # fmt: skip
 
-    def _placed(self, state: GraspState) -> tuple[Any, ...]:
+    def placed(self, state: GraspState) -> Placed:
+        """Links and contacts there."""
         poses = self.model.kinematics(state.q)
         return state, poses, self.model.detector(poses, state.position, state.rotation)
 
@@ -198,13 +203,13 @@ def slide(plant: SimulatedHand, model: KinematicModel, case: tuple[str, str, flo
         if seen.status is PlantStatus.LOST:
             ended = "lost"
             break
-        for finger, way in slider.slides(true_state(before), true_state(seen)).items():
+        for finger, way in slider.slides(slider.placed(true_state(before)), true_state(seen)).items():
             total[finger] = total.get(finger, 0.0) + way
         slid.append(total.get(slider.finger, 0.0))
         predicted.append(chosen[1])
-        states = [true_state(x) if exact else x.state for x in (before, seen)]
-        read += slider.slides(*states).get(slider.finger, 0.0)
-        off = float(states[1].minus(slider.start)[-3:].norm()) / _DEG
+        then, now = (true_state(x) if exact else x.state for x in (before, seen))
+        read += slider.slides(slider.placed(then), now).get(slider.finger, 0.0)
+        off = float(now.minus(slider.start)[-3:].norm()) / _DEG
         if off > OFF or read >= WANTED:
             ended = "turned" if off > OFF else "reached"
             break
@@ -250,10 +255,10 @@ def table(slides: Sequence[Slide]) -> Table:
         rows.append(
             [
                 f"{name}: {case}", f"{sum(one.ended == 'reached' for one in some)} of {len(some)}",
-                sum(one.ended == "lost" for one in some), _median(len(one.slid) for one in kept),
-                _median(one.slid[-1] for one in kept if one.slid), _median(error),
-                _median(one.others for one in kept), f"{_median(one.off for one in kept):.1f} deg,"
-                f" {_median(one.moved for one in kept):.1f} mm",
+                sum(one.ended == "lost" for one in some), median(len(one.slid) for one in kept),
+                median(one.slid[-1] for one in kept if one.slid), median(error),
+                median(one.others for one in kept), f"{median(one.off for one in kept):.1f} deg,"
+                f" {median(one.moved for one in kept):.1f} mm",
             ]
         )  # fmt: skip
     columns: list[str | Column] = [
@@ -266,10 +271,6 @@ def table(slides: Sequence[Slide]) -> Table:
         " far the finger slides in one motion, before it."
     )
     return Table("slides", "One finger slides on purpose", columns, rows, note)
-
-
-def _median(values: Iterable[float]) -> float:
-    return float(np.median([*values] or [math.nan]))
 
 
 def picture(slides: Sequence[Slide]) -> Figure:

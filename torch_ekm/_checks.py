@@ -12,7 +12,7 @@ from .typing import Tensor
 T = TypeVar("T")
 
 
-def check_kind(name: str, value: T, kind: type, valid: str = "") -> T:
+def check_kind(name: str, value: object, kind: type[T], valid: str = "") -> T:
     """``value``, or ParameterError if it is no ``kind``."""
     if not isinstance(value, kind):
         raise ParameterError(name, value, valid or f"a {kind.__name__}")

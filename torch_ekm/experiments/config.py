@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from .._checks import check_kind
 from ..control import DEFAULT_LIMITS, DEFAULT_TASKS, Limit, PaceOptions, Safety, Task
 from ..description import list_hands
 from ..description.registry import file_digests
@@ -74,9 +75,7 @@ class Setting:
         kinds = {"plant": PlantParameters, "config": PlantConfig, "model": ModelOptions}
         kinds |= {"pace": PaceOptions, "safety": Safety}
         for name, kind in kinds.items():
-            value = self.parameters if name == "plant" else getattr(self, name)
-            if not isinstance(value, kind):
-                raise ParameterError(name, value, f"a {kind.__name__}")
+            check_kind(name, self.parameters if name == "plant" else getattr(self, name), kind)
 
     def __str__(self) -> str:
         seen = "camera images and Hall counts" if self.sensing else "true poses plus noise"

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from .._checks import check_finite
-from ..exceptions import ParameterError
+from .._checks import check_finite, check_kind
 from ..kinematics import GraspState
 from ..typing import Float, Tensor
 
@@ -101,9 +100,8 @@ class Observation:
             value = getattr(self, name)
             if value is None and name == "fingertip_force":
                 continue
-            if not isinstance(value, torch.Tensor):
-                raise ParameterError(f"Observation.{name}", value, "a torch tensor")
-            check_finite(f"Observation.{name}", value)
+            name = f"Observation.{name}"
+            check_finite(name, check_kind(name, value, torch.Tensor, "a torch tensor"))
 
     @property
     def taken(self) -> Stamps:

@@ -54,34 +54,34 @@ class ContactAligned(PlantWrapper):
         sensed = {sensor.joint for sensor in hand.hall_sensors}
         std = [_SENSED_STD if name in sensed else _UNSENSED_STD for name in hand.joint_names]
         moves = self._range[1] > self._range[0]
-        self._offset: Float[Tensor, " n_q"] | None = None
-        self._left = torch.zeros(len(std), dtype=torch.float64)
-        """Variance of each joint after the last observation [rad^2]."""
+        self._last: tuple[Float[Tensor, " n_q"], Float[Tensor, " n_q"]] | None = None
+        """What each joint took at the last observation [rad], and the variance that is left [rad^2]."""
         self._covariance = torch.diag(torch.tensor(std, dtype=torch.float64) ** 2 * moves)
 
     def reset(self, seed: int) -> Observation:
         """A new grasp, of which nothing is known."""
-        self._offset = None
+        self._last = None
         return super().reset(seed)
 
     def observation(self, seen: Observation) -> Observation:
         """``seen`` with joints that agree with the contacts."""
         P = seen.info.get("estimate", {}).get("joint_covariance", self._covariance)
         expected = seen.q
-        if self._offset is not None:
+        if self._last is not None:
+            took, left = self._last
             own = P.diagonal()
             lasts = own.sqrt() > _LASTING_STD
-            share = torch.where(lasts, self._left / own + _CHANGE**2, 1.0).clamp(max=1.0).sqrt()
-            P, expected = share[:, None] * P * share, seen.q + self._offset * lasts
+            share = torch.where(lasts, left / own + _CHANGE**2, 1.0).clamp(max=1.0).sqrt()
+            P, expected = share[:, None] * P * share, seen.q + took * lasts
         pads = self._touching(seen, expected, P)
         R = _GAP_STD**2 * torch.eye(len(pads), dtype=P.dtype)
-        q, self._left = expected, P.diagonal()
+        q, left = expected, P.diagonal()
         for _ in range(_ITERATIONS if pads else 0):
             gap, H = self._gaps(seen, q, pads)
             gain = torch.linalg.solve(H @ P @ H.mT + R, H @ P).mT
             q = (expected - gain @ (gap + H @ (expected - q))).clamp(*self._range)
-            self._left = (P - gain @ H @ P).diagonal()
-        self._offset = q - seen.q
+            left = (P - gain @ H @ P).diagonal()
+        self._last = q - seen.q, left
         return dataclasses.replace(seen, q=q)
 
     def _touching(
