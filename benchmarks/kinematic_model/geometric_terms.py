@@ -7,7 +7,7 @@ in units of 30 mm: of all rows, and of the object's alone. Median and range over
 
 from __future__ import annotations
 
-import sys
+import argparse
 
 import numpy as np
 import torch
@@ -50,4 +50,8 @@ def main(objects: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:] or ["box", "can"])
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("objects", nargs="*", default=["box", "can"], help="names or paths (%(default)s)")
+    main(parser.parse_args().objects)
