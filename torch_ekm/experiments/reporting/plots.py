@@ -140,7 +140,7 @@ def _draw_errors(axis: Any, turns: DataFrame, controllers: list[str]) -> None:
         axis.plot(at[~inside], [0.97 * top] * int((~inside).sum()), "x", color=colour)
         if values.mean() > top:
             note = {"xytext": (-9, 0), "textcoords": "offset points", "fontsize": 8, "ha": "right"}
-            axis.annotate(f"mean {values.mean():.1f}", (x, 0.9 * top), **note)
+            axis.annotate(f"{name}: mean {values.mean():.1f}", (x, (0.9 - 0.08 * j) * top), **note)
     axis.set_xticks(range(len(targets)), [f"{target:g}" for target in targets])
     axis.set(xlabel="target [deg]", ylim=(0, top if np.isfinite(top) else None))
 
