@@ -20,7 +20,7 @@ def test_a_lost_object_does_not_hide_the_others() -> None:
     assert axis.get_ylim()[1] < 2.0
     crosses = [line for line in axis.lines if line.get_marker() == "x"]
     assert sum(len(line.get_xdata()) for line in crosses) == 1
-    assert [text.get_text() for text in axis.texts] == [f"mean {np.mean(lost):.1f}"]
+    assert [text.get_text() for text in axis.texts] == [f"KM: mean {np.mean(lost):.1f}"]
     assert [label.get_text() for label in axis.get_xticklabels()] == ["23", "38"]
     assert axis.get_title(loc="left") == "box"
     (plain,) = plot_steady_state_error(turns[turns["error_deg"] < 2]).axes
