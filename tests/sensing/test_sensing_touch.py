@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import warnings
 
 import pytest
 import torch
 from torch import Tensor
 
+from torch_ekm.contact import ContactDetector
 from torch_ekm.plant import Observation, PlantWrapper
 from torch_ekm.sensing import ContactAligned
 from torch_ekm.simulation import SimulatedHand
@@ -111,3 +113,56 @@ def test_an_error_that_no_contact_shows_stays_uncertain(hand: SimulatedHand) -> 
     fresh = ContactAligned(blurred, hand.hand, hand.object).observation(read).q
     assert torch.allclose(q, fresh, rtol=0, atol=1e-9)
     assert abs(float(q[thumb] - read.truth.q[thumb])) < math.radians(1.0)
+
+
+@pytest.mark.parametrize(("joint", "error_deg"), [("index_1", -6.0), ("index_2", -10.0)])
+def test_a_dead_sensor_is_found_by_a_pad_that_presses(
+    hand: SimulatedHand, joint: str, error_deg: float
+) -> None:
+    """The abduction, known by a cable, moves to its stop, and the gap is open still. Joints of one tendon are
+    not always told apart."""
+    names = hand.hand.joint_names
+    dead, index_0 = names.index(joint), names.index("index_0")
+    std = torch.full((len(names),), math.radians(0.3), dtype=torch.float64)
+    std[names.index("thumb_0")], std[index_0] = math.radians(14.0), math.radians(3.0)
+    upper = hand.hand.joint_upper.copy()
+    upper[index_0] = math.radians(6.0)
+    stopped = dataclasses.replace(hand.hand, joint_upper=upper)
+    read = hand.reset(0)
+
+    def sensed(error_deg: float) -> Observation:
+        q = read.q.clone()
+        q[dead] += math.radians(error_deg)
+        return dataclasses.replace(read, q=q, info={"estimate": {"joint_covariance": torch.diag(std**2)}})
+
+    detector = ContactDetector(hand.hand, hand.object, margin=math.inf)
+
+    def gap_of(seen: Observation) -> float:
+        contacts = detector(seen.q, seen.position, seen.rotation)
+        return abs(float(contacts.gap[contacts.finger.index("index")]))
+
+    plant = ContactAligned(hand, stopped, hand.object)
+    with pytest.warns(UserWarning, match=f"'{joint}'.* contradicts pad 'index'"):
+        seen = plant.observation(sensed(error_deg))
+    assert gap_of(seen) < 1e-4
+    assert gap_of(sensed(error_deg)) > 4e-3
+    if joint == "index_1":
+        assert abs(float((seen.q - read.truth.q)[dead])) < math.radians(2.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # it is named once
+        assert gap_of(plant.observation(sensed(1.2 * error_deg))) < 1e-4
+    plant.reset(0)
+    believed = plant.observation(sensed(0.0))  # a new grasp begins without doubts
+    assert abs(float((believed.q - read.truth.q)[dead])) < math.radians(0.5)
+
+
+def test_a_finger_far_from_the_object_that_seems_to_press_has_no_dead_sensor(hand: SimulatedHand) -> None:
+    """It is its force that is wrong."""
+    read = hand.reset(0)
+    force = read.fingertip_force.clone()
+    force[[pad.name for pad in hand.hand.pads].index("ring")] = 2.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ContactAligned(hand, hand.hand, hand.object).observation(
+            dataclasses.replace(read, fingertip_force=force)
+        )

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 
 import torch
 
@@ -11,6 +12,7 @@ from ..description import HandDescription, ObjectDescription
 from ..kinematics import HandKinematics
 from ..plant import Observation, Plant, PlantWrapper
 from ..typing import Float, Tensor
+from .joint_estimator import ARM_STD, ENCODER_STD
 
 _SENSED_STD = math.radians(0.5)  # of a joint with a Hall sensor, where the plant states no covariance
 _UNSENSED_STD = math.radians(10.0)  # of the others: behind a tendon that stretches
@@ -20,6 +22,9 @@ _CHANGE = 0.2  # share of its deviation by which such an error changes between t
 _LEAST_FORCE = 0.5  # [N]: a pad that measures less says nothing
 _GATE = 3.0  # deviations of a gap, up to which a pad of a hand without fingertip sensors is in contact
 _ITERATIONS = 4
+_OPEN, _FAR = 7e-4, 1e-2  # [m]: gaps of a pad that measures force at which a joint's sensor may be wrong
+_ALIKE = 3.0  # nats: such joints are not distinguishable
+_WRONG_STD = math.radians(30.0)  # of a joint whose sensor is wrong
 
 
 class ContactAligned(PlantWrapper):
@@ -35,6 +40,11 @@ class ContactAligned(PlantWrapper):
     What a joint known to 5 deg or worse took at the last observation is expected again, with the deviation
     that the gaps left it and a fifth of its own: where a joint moves its pad along the object, two angles
     explain the same gap.
+
+    A pad that measures force and stays 0.7 to 10 mm away, since the joint that is to close the gap stands at
+    its stop, says that the sensor of another one is wrong, such as one that died after its calibration: the
+    one, known to 30 deg from then on, without which all gaps and encoders are likeliest. A warning names it;
+    the next grasp believes it again.
 
     P is ``info["estimate"]["joint_covariance"]`` [rad^2] where the plant states it, else 0.5 deg for joints
     with a Hall sensor and 10 deg for others. Solved by Gauss-Newton, at every observation, within the joints'
@@ -57,15 +67,18 @@ class ContactAligned(PlantWrapper):
         self._last: tuple[Float[Tensor, " n_q"], Float[Tensor, " n_q"]] | None = None
         """What each joint took at the last observation [rad], and the variance that is left [rad^2]."""
         self._covariance = torch.diag(torch.tensor(std, dtype=torch.float64) ** 2 * moves)
+        self._wrong = torch.zeros_like(self._covariance)
+        """Of joints whose sensors are wrong in this grasp [rad^2]."""
+        self._named: set[int] = set()
 
     def reset(self, seed: int) -> Observation:
         """A new grasp, of which nothing is known."""
-        self._last = None
+        self._last, self._wrong = None, torch.zeros_like(self._covariance)
         return super().reset(seed)
 
     def observation(self, seen: Observation) -> Observation:
         """``seen`` with joints that agree with the contacts."""
-        P = seen.info.get("estimate", {}).get("joint_covariance", self._covariance)
+        P = seen.info.get("estimate", {}).get("joint_covariance", self._covariance) + self._wrong
         expected = seen.q
         if self._last is not None:
             took, left = self._last
@@ -74,15 +87,68 @@ class ContactAligned(PlantWrapper):
             share = torch.where(lasts, left / own + _CHANGE**2, 1.0).clamp(max=1.0).sqrt()
             P, expected = share[:, None] * P * share, seen.q + took * lasts
         pads = self._touching(seen, expected, P)
-        R = _GAP_STD**2 * torch.eye(len(pads), dtype=P.dtype)
-        q, left = expected, P.diagonal()
-        for _ in range(_ITERATIONS if pads else 0):
-            gap, H = self._gaps(seen, q, pads)
-            gain = torch.linalg.solve(H @ P @ H.mT + R, H @ P).mT
-            q = (expected - gain @ (gap + H @ (expected - q))).clamp(*self._range)
-            left = (P - gain @ H @ P).diagonal()
+        q, left, gap = self._aligned(seen, expected, P, pads)
+        if seen.fingertip_force is not None and bool((gap.abs() > _OPEN).any()):
+            wrong = self._doubted(seen, expected, P, pads, gap)
+            q, left, _ = self._aligned(seen, expected, P + wrong, pads)
+            self._wrong = self._wrong + wrong
         self._last = q - seen.q, left
         return dataclasses.replace(seen, q=q)
+
+    def _aligned(
+        self, seen: Observation, expected: Float[Tensor, " n_q"], P: Float[Tensor, "n_q n_q"], pads: list[str]
+    ) -> tuple[Float[Tensor, " n_q"], Float[Tensor, " n_q"], Float[Tensor, " n"]]:
+        """Joints, the variance that the gaps leave them [rad^2], and the gaps that stay [m]."""
+        R = _GAP_STD**2 * torch.eye(len(pads), dtype=P.dtype)
+        q, left, gap = expected, P.diagonal(), P.new_zeros(0)
+        for _ in range(_ITERATIONS if pads else 0):
+            before, (gap, H) = q, self._gaps(seen, q, pads)
+            gain = torch.linalg.solve(H @ P @ H.mT + R, H @ P).mT
+            q = (expected - gain @ (gap + H @ (expected - q))).clamp(*self._range)
+            left, gap = (P - gain @ H @ P).diagonal(), gap + H @ (q - before)
+        return q, left, gap
+
+    def _doubted(
+        self,
+        seen: Observation,
+        expected: Float[Tensor, " n_q"],
+        P: Float[Tensor, "n_q n_q"],
+        pads: list[str],
+        gap: Float[Tensor, " n"],
+    ) -> Float[Tensor, "n_q n_q"]:
+        """What is added to P where gaps that stay open say that one more joint's sensor is wrong [rad^2]."""
+        at, H = self._gaps(seen, expected, pads)
+        J_a = torch.from_numpy(self.hand.actuation_jacobian)
+        way = seen.a - torch.from_numpy(self.hand.actuator_offset)
+        differs, M = torch.cat([-at, way - J_a @ expected]), torch.cat([H, J_a])
+        R = torch.cat([torch.full_like(at, _GAP_STD**2), ENCODER_STD**2 + (ARM_STD * way) ** 2])
+        for pad in ((gap.abs() > _OPEN) & (at.abs() < _FAR)).nonzero().flatten().tolist():
+            likely: dict[int, float] = {}
+            for joint in (H[pad] * (P.diagonal() < _LASTING_STD**2)).nonzero().flatten().tolist():
+                with_wrong = P + self._unknown(joint)
+                if abs(float(self._aligned(seen, expected, with_wrong, pads)[2][pad])) <= _OPEN:
+                    S = M @ with_wrong @ M.mT + torch.diag(R)
+                    likely[joint] = -0.5 * float(differs @ torch.linalg.solve(S, differs) + torch.logdet(S))
+            if likely:
+                most = max(likely, key=lambda joint: likely[joint])
+                self._warn(pads[pad], most, [j for j in likely if likely[j] > likely[most] - _ALIKE])
+                return self._unknown(most)
+        return torch.zeros_like(P)
+
+    def _unknown(self, joint: int) -> Float[Tensor, "n_q n_q"]:
+        wrong = torch.zeros_like(self._covariance)
+        wrong[joint, joint] = _WRONG_STD**2
+        return wrong
+
+    def _warn(self, pad: str, joint: int, alike: list[int]) -> None:
+        if joint not in self._named:
+            self._named.add(joint)
+            names = " or ".join(f"'{self.hand.joint_names[j]}'" for j in alike)
+            warnings.warn(
+                f"the sensor of joint {names} contradicts pad '{pad}', which presses; until the next grasp "
+                "contacts alone say where the joint is: check the sensor",
+                stacklevel=5,
+            )
 
     def _touching(
         self, seen: Observation, q: Float[Tensor, " n_q"], P: Float[Tensor, "n_q n_q"]
