@@ -24,6 +24,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -109,8 +110,9 @@ def spoilt(bus: Bus, folder: Path, n: int) -> tuple[int, int, int, int]:
     How many of the messages are spoilt is drawn before each motion, 0.3 to 60 %.
     """
     draw, motions, errors, beyond, count = random.Random(1000), 0, 0, 0, 0
-    dynamixel._PATIENCE_MS, yarp._TIMEOUT = 50.0, 0.05  # what is cut is waited for
     with (
+        patch.object(dynamixel, "_PATIENCE_MS", 50.0),  # what is cut is waited for
+        patch.object(yarp, "_TIMEOUT", 0.05),
         opened(bus, folder, str(SPEED), rate_deg=30.0, timeout=0.5) as (end, path),
         bus.driver(path) as driver,
     ):
