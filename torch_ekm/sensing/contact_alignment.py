@@ -67,18 +67,19 @@ class ContactAligned(PlantWrapper):
         self._last: tuple[Float[Tensor, " n_q"], Float[Tensor, " n_q"]] | None = None
         """What each joint took at the last observation [rad], and the variance that is left [rad^2]."""
         self._covariance = torch.diag(torch.tensor(std, dtype=torch.float64) ** 2 * moves)
-        self._wrong = torch.zeros_like(self._covariance)
-        """Of joints whose sensors are wrong in this grasp [rad^2]."""
+        self._wrong: set[int] = set()
+        """Joints whose sensors are wrong in this grasp."""
         self._named: set[int] = set()
 
     def reset(self, seed: int) -> Observation:
         """A new grasp, of which nothing is known."""
-        self._last, self._wrong = None, torch.zeros_like(self._covariance)
+        self._last, self._wrong = None, set()
         return super().reset(seed)
 
     def observation(self, seen: Observation) -> Observation:
         """``seen`` with joints that agree with the contacts."""
-        P = seen.info.get("estimate", {}).get("joint_covariance", self._covariance) + self._wrong
+        P = seen.info.get("estimate", {}).get("joint_covariance", self._covariance)
+        P = _without_sensors(P, self._wrong)
         expected = seen.q
         if self._last is not None:
             took, left = self._last
@@ -90,8 +91,9 @@ class ContactAligned(PlantWrapper):
         q, left, gap = self._aligned(seen, expected, P, pads)
         if seen.fingertip_force is not None and bool((gap.abs() > _OPEN).any()):
             wrong = self._doubted(seen, expected, P, pads, gap)
-            q, left, _ = self._aligned(seen, expected, P + wrong, pads)
-            self._wrong = self._wrong + wrong
+            if wrong is not None:
+                q, left, _ = self._aligned(seen, expected, _without_sensors(P, {wrong}), pads)
+                self._wrong.add(wrong)
         self._last = q - seen.q, left
         return dataclasses.replace(seen, q=q)
 
@@ -115,8 +117,8 @@ class ContactAligned(PlantWrapper):
         P: Float[Tensor, "n_q n_q"],
         pads: list[str],
         gap: Float[Tensor, " n"],
-    ) -> Float[Tensor, "n_q n_q"]:
-        """What is added to P where gaps that stay open say that one more joint's sensor is wrong [rad^2]."""
+    ) -> int | None:
+        """One more joint whose sensor is wrong, by gaps that stay open."""
         at, H = self._gaps(seen, expected, pads)
         J_a = torch.from_numpy(self.hand.actuation_jacobian)
         way = seen.a - torch.from_numpy(self.hand.actuator_offset)
@@ -125,20 +127,15 @@ class ContactAligned(PlantWrapper):
         for pad in ((gap.abs() > _OPEN) & (at.abs() < _FAR)).nonzero().flatten().tolist():
             likely: dict[int, float] = {}
             for joint in (H[pad] * (P.diagonal() < _LASTING_STD**2)).nonzero().flatten().tolist():
-                with_wrong = P + self._unknown(joint)
-                if abs(float(self._aligned(seen, expected, with_wrong, pads)[2][pad])) <= _OPEN:
-                    S = M @ with_wrong @ M.mT + torch.diag(R)
+                without = _without_sensors(P, {joint})
+                if abs(float(self._aligned(seen, expected, without, pads)[2][pad])) <= _OPEN:
+                    S = M @ without @ M.mT + torch.diag(R)
                     likely[joint] = -0.5 * float(differs @ torch.linalg.solve(S, differs) + torch.logdet(S))
             if likely:
                 most = max(likely, key=lambda joint: likely[joint])
                 self._warn(pads[pad], most, [j for j in likely if likely[j] > likely[most] - _ALIKE])
-                return self._unknown(most)
-        return torch.zeros_like(P)
-
-    def _unknown(self, joint: int) -> Float[Tensor, "n_q n_q"]:
-        wrong = torch.zeros_like(self._covariance)
-        wrong[joint, joint] = _WRONG_STD**2
-        return wrong
+                return most
+        return None
 
     def _warn(self, pad: str, joint: int, alike: list[int]) -> None:
         if joint not in self._named:
@@ -175,3 +172,10 @@ class ContactAligned(PlantWrapper):
         axes, upstream = self._kinematics.joint_axes(q), self._kinematics.upstream[links]
         kin = contact_kinematics(contacts, seen.position, *axes, upstream, rolling=False)
         return contacts.gap, (contacts.normal[:, None] @ kin.point_jacobian)[:, 0]
+
+
+def _without_sensors(P: Float[Tensor, "n_q n_q"], joints: set[int]) -> Float[Tensor, "n_q n_q"]:
+    """P with some joints known to 30 deg only."""
+    wrong = P.new_zeros(len(P))
+    wrong[list(joints)] = _WRONG_STD**2
+    return P + torch.diag(wrong)
