@@ -13,6 +13,8 @@ from fakes import HoldingPlant
 from torch_ekm.control import (
     Caution,
     ClosedLoop,
+    Direction,
+    FocusedPose,
     GripForceTask,
     LookAndMoveController,
     Pace,
@@ -26,6 +28,7 @@ from torch_ekm.control import (
 )
 from torch_ekm.control import StopReason as Reason
 from torch_ekm.control.pace import ForceSurprise
+from torch_ekm.control.safety.progress import Progress
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
@@ -102,6 +105,19 @@ def test_an_object_that_slid_is_not_turned_on(held) -> None:
     done, _, _ = slide(held, [0.0, 0.0, 1.2, 1.3, 0.0, 0.0], CAREFUL)
     assert done.reason is Reason.GIVEN_UP
     assert [step.retreat for step in done.steps] == [False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("off", "unit", "rehearsed", "far"),
+    [(1.4, "mm", False, False), (1.6, "mm", False, True), (1.4, "mm", True, True), (1.4, "deg", False, True)],
+)
+def test_shifts_may_turn_the_object_further(held, off: float, unit: str, rehearsed: bool, far: bool) -> None:
+    plant, _, seen = held
+    axis, target = plant.rotation_axis, PoseTarget(seen.state.position, seen.state.rotation)
+    across = torch.linalg.cross(axis, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    progress = Progress(Safety(RULE, CAREFUL), target, FocusedPose([Direction(axis, unit)]), seen, rehearsed)
+    after = dataclasses.replace(seen, rotation=PoseTarget.turned(seen.state, across, degrees=off).rotation)
+    assert progress.stays_off(seen, after) is far
 
 
 def test_a_refused_state_is_looked_at_again(held) -> None:

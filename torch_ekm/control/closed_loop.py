@@ -195,7 +195,7 @@ class ClosedLoop:
         self.controller.reset()
         self.knowledge.forces.begin()
         self._figures.begin(seen.a)
-        progress = Progress(self.safety, target, self.controller.focus, seen)
+        progress = Progress(self.safety, target, self.controller.focus, seen, self._rehearses)
         progress.halt = first.halt
         known = self.controller.enhanced is not None and int(self.knowledge.figures.count) >= _KNOWN
         if self.decline and progress.halt is None and seen.status is not PlantStatus.LOST:

@@ -190,6 +190,11 @@ class FocusedPose:
         """``|e| = max_i tolerance_scale_i |e_i|`` [rad], ``e = M_c`` times the twist from state to target."""
         return float((self.tolerance_scale * (self.matrix @ target.error(state))).abs().max())
 
+    @property
+    def turns(self) -> bool:
+        """One of its directions is a turn."""
+        return any(one.unit == "deg" for one in self.directions)
+
     def off_rotation(self, increment: Float[Tensor, " n_s"]) -> float:
         """Rotation off the focus in an increment [rad]."""
         rows = self.off_matrix[~self.off_translation]

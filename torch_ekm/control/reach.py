@@ -24,7 +24,7 @@ from .limits import ActuatorLimit
 from .manipulation import Step, Stop
 from .model_hand import ModelHand
 from .qp import as_array, build_qp
-from .safety.safety import Caution
+from .safety.safety import OFF_BY_SHIFTS, Caution
 from .situation import LinearizedModel, Situation
 from .tasks import EffortTask, FocusTask, OffAxisTask
 
@@ -166,7 +166,7 @@ def reachability(
         reason = (
             f"motors at the ends of their ranges leave {100 * left:.0f} % of the way; choose a nearer target"
         )
-    elif off > 1.5 * caution.off_rotation:
+    elif off > OFF_BY_SHIFTS * caution.off_rotation:
         reason = f"the object turns {off / _DEG:.0f} deg off the focus on the way; choose a nearer target"
     return Reachability(gains, reason)
 

@@ -13,7 +13,7 @@ from ..belief import Belief
 from ..decision import Decision, StopReason
 from ..focus import FocusedPose, PoseTarget
 from ..pace import FIRM
-from .safety import Objection, Safety
+from .safety import OFF_BY_SHIFTS, Objection, Safety
 
 if TYPE_CHECKING:
     from ...model import KinematicModel
@@ -30,6 +30,7 @@ class Progress:
         safety: figures.
         target, focus: what is to be reached.
         seen: the first reading.
+        rehearsed: on the model, from which the hand strays: the object may turn off shifts no further.
     """
 
     halt: Objection | None = None
@@ -43,7 +44,14 @@ class Progress:
     alarms = 0
     """How often a sign of a loss was heeded."""
 
-    def __init__(self, safety: Safety, target: PoseTarget, focus: FocusedPose, seen: Observation) -> None:
+    def __init__(
+        self,
+        safety: Safety,
+        target: PoseTarget,
+        focus: FocusedPose,
+        seen: Observation,
+        rehearsed: bool = False,
+    ) -> None:
         check_kind(
             "target", target, PoseTarget, "a PoseTarget, e.g. PoseTarget.turned(state, axis, degrees=20)"
         )
@@ -56,6 +64,8 @@ class Progress:
         self._best = self.errors[0], 0  # the smallest of them, and the motions until then
         self._start = seen.state
         self._judged: tuple[Observation, tuple[float, float]] | None = None
+        more = 1.0 if focus.turns or rehearsed else OFF_BY_SHIFTS
+        self._off_allowed = more * safety.caution.off_rotation
         self._bearing: set[str] | None = None  # links without a pad that bear on the object at the start
 
     def over(self, seen: Observation, stopped: bool) -> Objection | None:
@@ -87,7 +97,7 @@ class Progress:
             return decision.message
         turned, bearing = self._off_rotation(seen), _bearing(decision, self.safety.caution.link_gap)
         self._bearing = bearing if self._bearing is None else self._bearing
-        if turned > self.safety.caution.off_rotation:
+        if turned > self._off_allowed:
             return f"the object has turned {math.degrees(turned):.1f} deg off the focus"
         return "" if bearing <= self._bearing else _bears(min(bearing - self._bearing))
 
@@ -114,7 +124,7 @@ class Progress:
     def stays_off(self, before: Observation, seen: Observation) -> bool:
         """The object has turned off the focus, and a motion back has not turned it back."""
         off = self._off_rotation(seen)
-        return off > max(self.safety.caution.off_rotation, self._off_rotation(before))
+        return off > max(self._off_allowed, self._off_rotation(before))
 
     def add(self, after: Observation, blind: bool) -> None:
         """One more motion.

@@ -11,6 +11,7 @@ from ...plant import Stamps
 from ..decision import StopReason
 
 _DEG = math.pi / 180
+OFF_BY_SHIFTS = 1.5  # times off_rotation: a shift of 3 mm alone turns the object by 8 to 10 deg
 _MAX_AGE = Stamps(encoders=0.2, joints=0.2, pose=0.4, fingertips=0.4)
 
 
@@ -87,7 +88,7 @@ class Caution:
     looks: int = 2
     """Further readings before a sign is believed."""
     off_rotation: float = 8 * _DEG
-    """[rad]"""
+    """[rad]; ``OFF_BY_SHIFTS`` times as much where the focus holds no turn, a rehearsal apart"""
     link_gap: float = 0.2e-3
     """A link without a pad as near to the object as this counts, unless it was so near at the start [m]."""
     retreats: int = 1
