@@ -73,8 +73,8 @@ def reproduce(
 
     \b
     experiment  sessions  of                                       time
-    generalize       500  5 to 12 turns: 5 objects, 4 controllers  2 h
-    online            80  45 turns: 4 controllers                  1.5 h
+    generalize       500  5 to 12 turns: 5 objects, 4 controllers  0.7 to 2 h
+    online            80  45 turns: 4 controllers                  0.5 to 1.5 h
 
     Time grows with the number of seeds and objects. With --quick: one or two minutes.
     """

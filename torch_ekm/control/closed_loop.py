@@ -118,7 +118,7 @@ class ClosedLoop:
         loss, with f + g in place of the plant, without noise. Nothing moves, and nothing is learned. ::
 
             reach = loop.reach()
-            loop.run(PoseTarget.turned(plant.observe().state, axis, reach.safe / DEG))
+            loop.run(PoseTarget.turned(plant.observe().state, axis, reach.safe))
 
         Args:
             sign: 1 or -1, which way about the controller's focus.
