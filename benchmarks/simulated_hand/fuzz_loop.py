@@ -84,14 +84,16 @@ class Session:
     """[deg]"""
 
 
-def error_of_clean_turns(plant: SimulatedHand, ekm: EnhancedModel, grasps: tuple[int, ...] = CLEAN) -> float:
+def error_of_clean_turns(
+    plant: SimulatedHand, ekm: EnhancedModel, knowledge: HandKnowledge, grasps: tuple[int, ...] = CLEAN
+) -> float:
     """Rotation that f + g did not predict, by the truth, rms over the motions [deg]."""
     squares = []
     for grasp in grasps:
         seen = plant.reset(grasp)
         ekm.model = KinematicModel(plant.hand, plant.object)
         controller = LookAndMoveController(ekm, plant.rotation_axis)
-        loop = ClosedLoop(plant, controller, learn=False)
+        loop = ClosedLoop(plant, controller, knowledge=knowledge, learn=False)
         for step in loop.run(PoseTarget.turned(seen.state, plant.rotation_axis, degrees=18)).steps:
             lin, moved = step.decision.linearization, step.after.a - step.before.a
             true = step.after.truth.state.minus(step.before.truth.state)
@@ -148,8 +150,8 @@ def fuzz(seed: int, observations: int, chance: float = 0.15, clean: tuple[int, .
         return session
     for k in range(turns):
         session.dropped_unfaulted += turn(plant, plant, untaught, unfaulted, 1000 * seed + k, None)
-    session.error = error_of_clean_turns(plant.plant, ekm, clean)
-    session.unfaulted = error_of_clean_turns(plant.plant, untaught, clean)
+    session.error = error_of_clean_turns(plant.plant, ekm, knowledge, clean)
+    session.unfaulted = error_of_clean_turns(plant.plant, untaught, unfaulted, clean)
     return session
 
 

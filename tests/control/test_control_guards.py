@@ -224,6 +224,10 @@ def frozen_pose(plant: Obedient, seen: Observation) -> Observation:
     return dataclasses.replace(seen, position=old.position, rotation=old.rotation)
 
 
+def frozen_encoders(plant: Obedient, seen: Observation) -> Observation:
+    return dataclasses.replace(seen, a=plant.last[1].a)
+
+
 def late_pose(plant: Obedient, seen: Observation) -> Observation:
     return dataclasses.replace(seen, stamps=Stamps(seen.time, seen.time, seen.time - 0.7, seen.time))
 
@@ -253,6 +257,7 @@ def saturated(pads: list[int]):
 FAULTS = {
     "frozen driver": (frozen, {}, Reason.STALE_SENSOR, "encoders' reading was read at"),
     "frozen driver, running clock": (repeating, {}, Reason.STALE_SENSOR, "bit by bit after a motion"),
+    "frozen encoders": (frozen_encoders, {}, Reason.STALE_SENSOR, "while joints or object moved"),
     "frozen camera": (frozen_pose, {}, Reason.STALE_SENSOR, "pose is the same bit by bit"),
     "late camera": (late_pose, {}, Reason.STALE_SENSOR, "0.700 s old, Guards.max_age is 0.4 s"),
     "covered camera": (unseen, {}, Reason.BLIND, "blind_motions is 2"),

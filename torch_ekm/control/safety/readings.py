@@ -33,6 +33,7 @@ class ReadingTests:
     def __init__(self, guards: Guards, hand: HandDescription) -> None:
         self.guards, self.hand = guards, hand
         self._raw: Observation | None = None
+        self._still: Observation | None = None  # since which the encoders read the same, bit by bit
         self._path = {"joints": 0.0, "pose": 0.0}
         self._limits = [
             ("encoder", hand.actuator_names, hand.actuator_lower, hand.actuator_upper),
@@ -69,9 +70,13 @@ class ReadingTests:
     def _age(self, seen: Observation, before: Observation | None = None) -> Objection | None:
         """Stale, repeated or missing readings."""
         taken, repeats = seen.taken, self._repeats(seen, before)
-        if before is not None and all(self._same(seen).values()) and torch.equal(seen.a, before.a):
-            message = "encoders, joints and pose are the same bit by bit after a motion: check the driver"
-            return Objection(StopReason.STALE_SENSOR, message)
+        if before is not None and torch.equal(seen.a, before.a):
+            if all(self._same(seen).values()):
+                message = "encoders, joints and pose are the same bit by bit after a motion: check the driver"
+                return Objection(StopReason.STALE_SENSOR, message)
+            if self._still is not None and not agree(self._still, seen, self.guards):
+                message = "encoders are the same bit by bit while joints or object moved: check their driver"
+                return Objection(StopReason.STALE_SENSOR, message)
         for k, sensor in enumerate(taken._fields[:3]):  # fingertips: another reading stands in
             age, oldest = seen.time - taken[k], self.guards.max_age[k]
             problem = ""
@@ -210,6 +215,8 @@ class ReadingTests:
         """Remember a reading, and how far the encoders went since joints and pose changed."""
         same, moved = self._same(seen), 0.0 if before is None else float((seen.a - before.a).abs().max())
         self._path = {sensor: way + moved if same[sensor] else 0.0 for sensor, way in self._path.items()}
+        if self._still is None or not torch.equal(seen.a, self._still.a):
+            self._still = seen
         self._raw = seen
 
     def _same(self, seen: Observation) -> dict[str, bool]:
