@@ -176,6 +176,19 @@ def test_increments_are_not_mixed_with_targets(tmp_path: Path) -> None:
     assert load_recording(path, observation=["a"], targets=[], run="").y.shape == (59, 1)
 
 
+def test_predictions_in_another_order_are_noticed(tmp_path: Path) -> None:
+    draw = np.random.default_rng(0)
+    u, v = draw.normal(size=(2, 60, 1))
+    values = np.hstack(
+        [u, v, u + 0.1 * draw.normal(size=(60, 1)), v + 0.1 * draw.normal(size=(60, 1)), u * v]
+    )
+    path = write(tmp_path / "a.csv", values, "u,v,u_model,v_model,x")
+    told = [load_table(path, ["u", "v"], 60, ["x"], predicted=order).notes for order in
+            (["u_model", "v_model"], ["v_model", "u_model"])]  # fmt: skip
+    assert told[0] == ""
+    assert "u_model for u, v_model for v" in told[1]
+
+
 def test_a_clock_among_the_inputs_is_suspected(tmp_path: Path) -> None:
     run = np.arange(60) // 20
     values = np.column_stack([np.arange(60) % 20, table()[:, 1:], run])

@@ -239,6 +239,20 @@ def test_a_learner_made_in_inference_mode_is_named(make):
 
 
 @pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("make", [default_learner, SparseOnlineGP])
+def test_samples_of_a_model_with_parameters_are_taken_without_their_graph(make):
+    plain, given = make(3, 2), make(3, 2)
+    for x, y in zip(*stream(12), strict=True):
+        plain.update(x, y)
+        given.update(x.clone().requires_grad_(True), y.clone().requires_grad_(True))
+    assert torch.equal(plain(x), given(x))
+
+
+def test_a_width_of_the_default_learner_that_cannot_be_is_named():
+    with pytest.raises(ParameterError, match="in_features = -1"):
+        default_learner(-1, 2)
+
+
 def test_an_option_of_the_default_learner_that_there_is_not_is_named():
     with pytest.raises(UnknownNameError, match=r"'forgetting'; valid are: capacity, .*batch_shape"):
         default_learner(3, 2, forgetting=0.99)

@@ -176,7 +176,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
     def _update(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         if self._like.is_inference():  # torch refuses to change these later on
             raise ParameterError("learner", "made within torch.inference_mode()", "made outside of it")
-        x, y = self._cast(x), self._cast(y, "y")
+        x, y = self._cast(x).detach(), self._cast(y, "y").detach()
         if mask is not None and not isinstance(mask, Tensor):
             try:
                 mask = torch.as_tensor(mask, device=self.device)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from typing import Any, Literal
 
+from .._checks import check_count
 from ..exceptions import UnknownNameError
 from .kernels.linear import LinearKernel
 from .kernels.stationary import Matern32
@@ -45,7 +46,7 @@ def default_learner(
     unknown = [name for name in options if name not in _OPTIONS]
     if unknown:
         raise UnknownNameError("option", unknown[0], ("capacity", "output_offset", *_OPTIONS))
-    d, m = in_features, out_features
+    d, m = check_count("in_features", in_features), check_count("out_features", out_features)
     units = Standardize(output_offset=output_offset)
     every = 32  # samples between two rebuilds
     common: dict[str, Any] = {

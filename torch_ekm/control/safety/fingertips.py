@@ -148,6 +148,7 @@ class FingertipWatch:
     def _too_hard(self, pad: str, force: float, how: str) -> Objection:
         message = (
             f"fingertip '{pad}' presses with {force:.1f} N {how}, Guards.force_ceiling is "
-            f"{self.guards.force_ceiling:g} N: free the object, or lower GripForceTask.force"
+            f"{self.guards.force_ceiling:g} N: free the object, lower GripForceTask.force, or choose a "
+            "nearer target (ClosedLoop.reach)"
         )
         return Objection(StopReason.FORCE_CEILING, message)

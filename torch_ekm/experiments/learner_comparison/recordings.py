@@ -57,7 +57,8 @@ def load_recording(
             raise DescriptionError(os.environ["TORCH_EKM_DATA"], problem) from None
     if observation:
         if other := [key for key in ("targets", "predicted", "run") if columns.get(key)]:
-            raise ParameterError("observation", observation, f"given without {' and '.join(other)}")
+            valid = f"given without {' and '.join(other)}: or write the increments into a column, as targets"
+            raise ParameterError("observation", observation, valid)
         which = Columns(columns.get("inputs") or observation, (), observation)
         return load_own(name, which, clock=columns.get("clock")).stream(limit)
     if Path(name).suffix or columns.get("clock"):

@@ -113,8 +113,8 @@ class Comparison:
         return float(q * np.sqrt(k * (k + 1) / (6 * n)))
 
     def verdicts(self) -> list[str]:
-        """For each stream: which learner is best, which others are not distinguishable from it, how far off
-        the default is, on how many of how many rows, and whether a few of them decide."""
+        """For each stream: which learner is best and whether it helps, which others are not distinguishable
+        from it, how far off the default is, on how many of how many rows, whether a few of them decide."""
         sentences = []
         for stream in self.streams:
             best = self.best(stream.name).learner
@@ -124,9 +124,12 @@ class Comparison:
                 if name not in (best, "model alone")
             }
             level = [name for name, ratio in ratios.items() if ratio.low <= 1]
-            found = f"{self.error(stream.name, best):.3f}"
+            error = self.error(stream.name, best)
             by = "by the median " if self.measure(stream.name) == "median" else ""
-            text = f"{stream.name}: {best} is best, {by}{found} of the model alone"
+            text = f"{stream.name}: {best} is best, {by}{error:.3f} of the model alone"
+            if best != "model alone" and not error.high < 1:
+                text = f"{stream.name}: no learner is distinguished from the model alone. {best} has the"
+                text += f" least error, {by}{error:.3f} of the model's"
             if level:
                 text += f"; this recording does not distinguish it from {', '.join(level)}"
             behind = sorted((n for n in ratios if n not in level), key=lambda n: ratios[n].mean)

@@ -191,7 +191,8 @@ class _NaturalMaps:
         moved = self.own * y - self.rho_G @ x[:n_z] - self.rho_s  # y - rho s
         active = ~p.one_sided | (moved[:m] > 0)
         ahead = moved[m:].reshape(n_c, d)
-        radius, length = p.mu_s * moved[:n_c].clip(min=0.0), np.sqrt((ahead * ahead).sum(1))
+        with np.errstate(over="ignore"):  # in iterations that diverge
+            radius, length = p.mu_s * moved[:n_c].clip(min=0.0), np.sqrt((ahead * ahead).sum(1))
         slides = (radius > 0) & (length > radius)
         shrink = np.divide(radius, length, out=(radius > 0).astype(np.float64), where=slides)
         kept = np.concatenate([active, (shrink[:, None] * self.transmits).ravel()])
