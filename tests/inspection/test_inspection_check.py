@@ -156,8 +156,14 @@ def test_where_the_files_have_a_fault_no_other_force_is_tried(files, monkeypatch
     monkeypatch.setattr(module, "_gentler", lambda *of: tried.append(of) or ())
     monkeypatch.setattr(module, "_pinch", lambda *_: [module.Check("pinch", "error", "not tried")])
     urdf, transmission = files
-    check_hand(str(urdf), "can")
+    assert "collision shapes" not in {row.name for row in check_hand(str(urdf), "can")}
     assert len(tried) == 1
+    as_it_was = transmission.read_text()
+    transmission.write_text(as_it_was.replace("radius = 0.006", "radius = 0.009", 1))
+    (row,) = [row for row in check_hand(str(urdf), "can") if row.name == "collision shapes"]
+    assert "paste the <collision> of pad 'left'" in row.remedy
+    assert len(tried) == 1
+    transmission.write_text(as_it_was)
     transmission.write_text(transmission.read_text().replace("[0.0, -1.0, 0.0]", "[0.0, 1.0, 0.0]", 1))
     check_hand(str(urdf), "can")
     assert len(tried) == 1

@@ -59,7 +59,8 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
         return [Check("hand's files", "error", str(error), "see docs/reference/file_formats.md")]
     rows = [Check("hand's files", "ok", f"{description.n_q} joints, {description.n_a} actuators")]
     rows += [Check("MJCF", "warning", note) for note in description.notes]
-    rows += [*_pads(description), *_ranges(description), *_tensions(description)]
+    pads = list(_pads(description))
+    rows += [*pads, *_ranges(description), *_tensions(description)]
     try:
         obj = load_object(object)
     except (EKMError, OSError) as error:
@@ -69,6 +70,9 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
     pinch = list(_pinch(description, obj, picture, PlantConfig()))
     faulty = any(row.state == "error" for row in pinch)
     if faulty:
+        if not unfit and (other := [row.name for row in pads if row.state != "ok"]):
+            remedy = f"first paste the <collision> of {', '.join(other)} as printed above"
+            return [*rows, Check("collision shapes", "error", "not the pads touch", remedy), *pinch]
         # another force cures no fault of the files, and takes minutes to try
         return [*rows, *pinch, *(() if unfit else _gentler(description, obj))]
     return [*rows, *pinch, *_turn(description, obj), *_disturbed(description, obj)]
