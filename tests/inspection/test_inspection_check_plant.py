@@ -267,3 +267,17 @@ def test_the_command_checks_a_hand_on_a_bus(tmp_path) -> None:
         assert "my_hand.toml" in done.output
     done = CliRunner().invoke(app, ["check"])
     assert "--plant" in str(done.exception)
+
+
+def test_a_transposed_rotation_of_a_held_object() -> None:
+    pytest.importorskip("sapien")
+    from torch_ekm.simulation import SimulatedHand
+
+    inner = SimulatedHand("planar_two_finger", "can", preset="none")
+    inner.reset(seed=0)
+    transposed = Spoilt(inner, lambda seen: dataclasses.replace(seen, rotation=seen.rotation.mT))
+    for plant, state in ((inner, "ok"), (transposed, "warning")):
+        rows = check_plant(plant, inner.hand, load_object("can"))
+        (found,) = [row for row in rows if row.name == "pose's motions"]
+        assert found.state == state
+    assert "transposed" in found.remedy

@@ -30,6 +30,7 @@ _NEAR = 2.0  # of the best explanation's sum of squares: as good
 _FAR = 0.12  # [m] of an object from the middle of the pads
 _CLOCK = "Observation(time=time.monotonic(), ...) in the driver"
 _ANGLE = 0.3  # cosine between predicted and measured motion of the object
+_TURNED = 0.5 * _DEG  # [rad] of the object that show how it turns
 
 
 def check_plant(
@@ -261,7 +262,12 @@ class _Checked:
 
     def _frame(self, along: list[tuple[Array, Array]]) -> list[Check]:
         predicted, pose = (np.concatenate(list(part)) for part in zip(*along, strict=True))
-        cosine = self._cosine(predicted, pose)
+        cosine, turns = self._cosine(predicted, pose), np.tile([0.0] * 3 + [1.0] * 3, len(along))
+        turned = self._cosine(predicted * turns, pose * turns)
+        if cosine > _ANGLE and turned < _ANGLE and np.abs(predicted * turns).max() > _TURNED:
+            found = f"the object turns otherwise than the model predicts (cosine {turned:.2f})"
+            remedy = "the rotation is that of the object in the hand frame: is it transposed?"
+            return [Check("pose's motions", "warning", found, remedy)]
         if cosine > _ANGLE:
             return [Check("pose's motions", "ok", f"as the model predicts (cosine {cosine:.2f})")]
         found = f"the object moves otherwise than the model predicts (cosine {cosine:.2f}): another frame"
