@@ -257,7 +257,7 @@ def saturated(pads: list[int]):
 FAULTS = {
     "frozen driver": (frozen, {}, Reason.STALE_SENSOR, "encoders' reading was read at"),
     "frozen driver, running clock": (repeating, {}, Reason.STALE_SENSOR, "bit by bit after a motion"),
-    "frozen encoders": (frozen_encoders, {}, Reason.STALE_SENSOR, "while joints or object moved"),
+    "frozen encoders": (frozen_encoders, {}, Reason.STALE_SENSOR, "while joints and object moved"),
     "frozen camera": (frozen_pose, {}, Reason.STALE_SENSOR, "pose is the same bit by bit"),
     "late camera": (late_pose, {}, Reason.STALE_SENSOR, "0.700 s old, Guards.max_age is 0.4 s"),
     "covered camera": (unseen, {}, Reason.BLIND, "blind_motions is 2"),

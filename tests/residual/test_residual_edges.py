@@ -238,7 +238,6 @@ def test_a_learner_made_in_inference_mode_is_named(make):
         learner.update(torch.zeros(3), torch.zeros(2))
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("make", [default_learner, SparseOnlineGP])
 def test_samples_of_a_model_with_parameters_are_taken_without_their_graph(make):
     plain, given = make(3, 2), make(3, 2)
@@ -253,6 +252,7 @@ def test_a_width_of_the_default_learner_that_cannot_be_is_named():
         default_learner(-1, 2)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_an_option_of_the_default_learner_that_there_is_not_is_named():
     with pytest.raises(UnknownNameError, match=r"'forgetting'; valid are: capacity, .*batch_shape"):
         default_learner(3, 2, forgetting=0.99)

@@ -3,7 +3,6 @@ from __future__ import annotations
 import math
 from typing import Any, Literal
 
-from .._checks import check_count
 from ..exceptions import UnknownNameError
 from .kernels.linear import LinearKernel
 from .kernels.stationary import Matern32
@@ -46,7 +45,7 @@ def default_learner(
     unknown = [name for name in options if name not in _OPTIONS]
     if unknown:
         raise UnknownNameError("option", unknown[0], ("capacity", "output_offset", *_OPTIONS))
-    d, m = check_count("in_features", in_features), check_count("out_features", out_features)
+    d, m = in_features, out_features
     units = Standardize(output_offset=output_offset)
     every = 32  # samples between two rebuilds
     common: dict[str, Any] = {
@@ -68,4 +67,4 @@ def default_learner(
 
 def _long(d: int, fleet: dict[str, Any]) -> Matern32:
     """A kernel that reaches twice as far as that of the others: the smoothness of g is unknown."""
-    return Matern32(d, lengthscale=2.0 * math.sqrt(d), **fleet)
+    return Matern32(d, lengthscale=2.0 * math.sqrt(max(d, 1)), **fleet)

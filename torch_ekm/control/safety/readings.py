@@ -74,8 +74,8 @@ class ReadingTests:
             if all(self._same(seen).values()):
                 message = "encoders, joints and pose are the same bit by bit after a motion: check the driver"
                 return Objection(StopReason.STALE_SENSOR, message)
-            if self._still is not None and not agree(self._still, seen, self.guards):
-                message = "encoders are the same bit by bit while joints or object moved: check their driver"
+            if self._still is not None and self._hand_moved(self._still, seen):
+                message = "encoders are the same bit by bit while joints and object moved: check their driver"
                 return Objection(StopReason.STALE_SENSOR, message)
         for k, sensor in enumerate(taken._fields[:3]):  # fingertips: another reading stands in
             age, oldest = seen.time - taken[k], self.guards.max_age[k]
@@ -97,6 +97,11 @@ class ReadingTests:
                     StopReason.STALE_SENSOR, message, blind=sensor == "pose" and before is not None
                 )
         return None
+
+    def _hand_moved(self, one: Observation, other: Observation) -> bool:
+        """More than noise, and not the object alone, which may have slid."""
+        joint = float((other.q - one.q).abs().max())
+        return joint > math.sqrt(2) * self.guards.joint_noise and not agree(one, other, self.guards)
 
     def _repeats(self, seen: Observation, before: Observation | None) -> dict[str, float]:
         """Sensors that stand still bit by bit, and how far the encoders went meanwhile [rad]."""
