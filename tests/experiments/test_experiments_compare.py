@@ -67,12 +67,9 @@ def test_a_linear_stream_is_won_by_the_linear_learner_and_we_say_so(compared: Co
 
 
 def test_noise_is_not_called_learned() -> None:
-    stream = dataclasses.replace(
-        linear(120), y=torch.from_numpy(np.random.default_rng(3).normal(size=(120, 2)))
-    )
-    assert (
-        "no learner is distinguished from the model alone" in compare(stream, ("linear RLS",)).verdicts()[0]
-    )
+    noise = torch.from_numpy(np.random.default_rng(3).normal(size=(120, 2)))
+    said = compare(dataclasses.replace(linear(120), y=noise), ("linear RLS",)).verdicts()[0]
+    assert "no learner is distinguished from the model alone" in said
 
 
 def test_medians_decide_where_few_samples_make_the_rms() -> None:

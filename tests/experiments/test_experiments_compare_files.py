@@ -179,12 +179,10 @@ def test_increments_are_not_mixed_with_targets(tmp_path: Path) -> None:
 def test_predictions_in_another_order_are_noticed(tmp_path: Path) -> None:
     draw = np.random.default_rng(0)
     u, v = draw.normal(size=(2, 60, 1))
-    values = np.hstack(
-        [u, v, u + 0.1 * draw.normal(size=(60, 1)), v + 0.1 * draw.normal(size=(60, 1)), u * v]
-    )
-    path = write(tmp_path / "a.csv", values, "u,v,u_model,v_model,x")
-    told = [load_table(path, ["u", "v"], 60, ["x"], predicted=order).notes for order in
-            (["u_model", "v_model"], ["v_model", "u_model"])]  # fmt: skip
+    said = [one + 0.1 * draw.normal(size=(60, 1)) for one in (u, v)]
+    path = write(tmp_path / "a.csv", np.hstack([u, v, *said, u * v]), "u,v,u_model,v_model,x")
+    orders = ["u_model", "v_model"], ["v_model", "u_model"]
+    told = [load_table(path, ["u", "v"], 60, ["x"], predicted=order).notes for order in orders]
     assert told[0] == ""
     assert "u_model for u, v_model for v" in told[1]
 

@@ -262,16 +262,17 @@ class _Checked:
 
     def _frame(self, along: list[tuple[Array, Array]]) -> list[Check]:
         predicted, pose = (np.concatenate(list(part)) for part in zip(*along, strict=True))
-        cosine, turns = self._cosine(predicted, pose), np.tile([0.0] * 3 + [1.0] * 3, len(along))
+        turns = np.tile([0.0] * 3 + [1.0] * 3, len(along))
+        cosine = self._cosine(predicted, pose)
         turned = self._cosine(predicted * turns, pose * turns)
-        if cosine > _ANGLE and turned < _ANGLE and np.abs(predicted * turns).max() > _TURNED:
+        if cosine <= _ANGLE:
+            found = f"the object moves otherwise than the model predicts (cosine {cosine:.2f}): another frame"
+            return [Check("pose's motions", "error", found, "give WithPose(frame=...), or correct it")]
+        if turned < _ANGLE and np.abs(predicted * turns).max() > _TURNED:
             found = f"the object turns otherwise than the model predicts (cosine {turned:.2f})"
             remedy = "the rotation is that of the object in the hand frame: is it transposed?"
             return [Check("pose's motions", "warning", found, remedy)]
-        if cosine > _ANGLE:
-            return [Check("pose's motions", "ok", f"as the model predicts (cosine {cosine:.2f})")]
-        found = f"the object moves otherwise than the model predicts (cosine {cosine:.2f}): another frame"
-        return [Check("pose's motions", "error", found, "give WithPose(frame=...), or correct it")]
+        return [Check("pose's motions", "ok", f"as the model predicts (cosine {cosine:.2f})")]
 
     @staticmethod
     def _cosine(predicted: Array, pose: Array) -> float:

@@ -67,4 +67,5 @@ def default_learner(
 
 def _long(d: int, fleet: dict[str, Any]) -> Matern32:
     """A kernel that reaches twice as far as that of the others: the smoothness of g is unknown."""
+    # of a width below 1, which the kernel refuses, there is no root
     return Matern32(d, lengthscale=2.0 * math.sqrt(max(d, 1)), **fleet)

@@ -126,8 +126,9 @@ class Comparison:
             level = [name for name, ratio in ratios.items() if ratio.low <= 1]
             error = self.error(stream.name, best)
             by = "by the median " if self.measure(stream.name) == "median" else ""
-            text = f"{stream.name}: {best} is best, {by}{error:.3f} of the model alone"
-            if best != "model alone" and not error.high < 1:
+            if best == "model alone" or error.high < 1:
+                text = f"{stream.name}: {best} is best, {by}{error:.3f} of the model alone"
+            else:
                 text = f"{stream.name}: no learner is distinguished from the model alone. {best} has the"
                 text += f" least error, {by}{error:.3f} of the model's"
             if level:
