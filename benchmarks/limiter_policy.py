@@ -1,6 +1,6 @@
 """A policy instead of the limiting function: how long the next step shall be, learned on the KM alone.
 
-    python benchmarks/limiter_policy.py --objects box,can --seeds 1000:1004 --out FOLDER
+    python benchmarks/limiter_policy.py --objects box,can --seeds 1000:1010 --out FOLDER
 
 The paper's outlook (section VI): replace the limiting function by reinforcement learning. A policy is trained
 by proximal policy optimisation (stable-baselines3) on hands that are a kinematic model with figures drawn
@@ -200,7 +200,7 @@ def policy_table(policy: Callable[[Array], float]) -> Table:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = study_parser(
-        __doc__, "limiter_policy", objects="box,can", seeds="1000:1004", engine="sapien",
+        __doc__, "limiter_policy", objects="box,can", seeds="1000:1010", engine="sapien",
         quick="64 decisions of training, one object and seed",
     )  # fmt: skip
     given = parser.parse_args(arguments)
