@@ -78,11 +78,11 @@ CONTENDERS: dict[str, tuple[type[Generalize], str]] = {
 
 
 def run(objects: Sequence[str], seeds: Sequence[int], folder: Path, jobs: int) -> DataFrame:
-    """The turns of ``generalize`` of each contender, without the probes."""
+    """The turns of ``generalize`` of each contender, without the probes and the new objects."""
     found = {}
     for name, (protocol, controller) in CONTENDERS.items():
-        probes = {"long_step_deg": 0.0, "blind_deg": 0.0}
-        plan = protocol(Setting(sensing=True), tuple(objects), controllers=(controller,), **probes)
+        left_out = {"long_step_deg": 0.0, "blind_deg": 0.0, "new_objects": False}
+        plan = protocol(Setting(sensing=True), tuple(objects), controllers=(controller,), **left_out)
         kept = run_jobs(plan.run, plan.jobs(seeds), folder, jobs)
         found[name] = [TrialRecord.from_json(figures) for session in kept.values() for figures in session]
     trials = trial_frame(found, Setting().safety.rule.max_steps).rename(columns={"job": "contender"})
