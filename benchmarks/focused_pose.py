@@ -1,6 +1,6 @@
 """Focused poses of one to six directions: what is called reachable, and how near the object comes.
 
-    python benchmarks/focused_pose.py --objects box,can --seeds 1000:1004
+    python benchmarks/focused_pose.py --objects box,can --seeds 1000:1010
 
 Axes of the hand frame: a, about which the pinch turns the object; b, from the thumb to the fingers; c, across
 both. Every target is asked of a fresh grasp, of an E-KM that had three turns about a with the object and goes
@@ -271,7 +271,7 @@ class Outcome:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = study_parser(
-        __doc__, "focused_pose", objects="box,can", seeds="1000:1004", engine="mujoco",
+        __doc__, "focused_pose", objects="box,can", seeds="1000:1010", engine="mujoco",
         quick="one object, one seed, whole poses",
     )  # fmt: skip
     parser.add_argument("--preset", default="nominal")

@@ -1,6 +1,6 @@
 """Turns one after the other without a new grasp: there and back, and from target to target.
 
-    python benchmarks/there_and_back.py --objects box,can --seeds 1000:1005 --engine mujoco --out FOLDER
+    python benchmarks/there_and_back.py --objects box,can --seeds 1000:1010 --engine mujoco --out FOLDER
 
 With every object and hand an E-KM has three turns of warm-up. Then it turns one grasp to +15 deg and back to
 0, twenty times, and another one to ten random targets within 15 deg of where it began, each from where the
@@ -279,7 +279,7 @@ def _motions(turns: Iterable[Turn]) -> float | None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = study_parser(
-        __doc__, "there_and_back", objects="box,can", seeds="1000:1005", engine="mujoco",
+        __doc__, "there_and_back", objects="box,can", seeds="1000:1010", engine="mujoco",
         quick="one object, one seed, two turns of each",
     )  # fmt: skip
     parser.add_argument("--preset", default="nominal")

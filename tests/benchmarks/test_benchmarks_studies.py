@@ -18,7 +18,8 @@ from ablation import DISTURBANCES, Ablation, variants
 from foresight_study import Foresight
 from foresight_turn import ForesightTurn
 from made_up_sessions import made_up_generalize, made_up_turn
-from oracle import OracleGeneralize, run, table
+from oracle import OracleGeneralize, run
+from oracle import table as oracle_table
 
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.reproduce import Experiment, reproduce
@@ -79,7 +80,7 @@ def test_ablation_covers_every_disturbance_of_the_nominal_plant() -> None:
 
 def test_oracle_and_e_km_turn_the_same_objects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Generalize, "session", made_up_generalize)
-    rows = table(run(["tea_tin"], [0, 1], tmp_path, jobs=1)).rows
+    rows = oracle_table(run(["tea_tin"], [0, 1], tmp_path, jobs=1)).rows
     assert {row[2] for row in rows} == {"E-KM", "oracle"}
     # knowledge of an oracle is of another description: it cannot be carried to the next object
     assert not any("new object" in file.name for file in tmp_path.glob("*.json"))
