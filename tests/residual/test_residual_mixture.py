@@ -178,7 +178,15 @@ def test_a_fleet_is_so_many_single_mixtures():
 
 
 @pytest.mark.parametrize(
-    "options", [{"levels": ()}, {"levels": (1.5,)}, {"levels": (-0.1,)}, {"trends": (2.0,)}]
+    "options",
+    [
+        {"levels": ()},
+        {"levels": (1.5,)},
+        {"levels": (-0.1,)},
+        {"trends": (2.0,)},
+        {"doubts": (1.0, 1.0)},
+        {"doubts": (-1.0,)},
+    ],
 )
 def test_wrong_choices_are_named(options):
     with pytest.raises(ParameterError, match=next(iter(options))):
@@ -308,3 +316,45 @@ def test_the_default_keeps_a_linear_map() -> None:
     y = clean + torch.randn(900, 1, generator=draw, dtype=torch.float64)
     run = run_prequential(default_learner(32, 1), x, y)
     assert float((run.mean - clean)[600:].square().mean().sqrt()) < 0.37
+
+
+def test_one_sentinel_does_not_inflate_what_is_stated_for_long() -> None:
+    draw = torch.Generator().manual_seed(0)
+    x = torch.randn(420, 4, generator=draw, dtype=torch.float64)
+    y = torch.sin(x[:, :1]) + 0.05 * torch.randn(420, 1, generator=draw, dtype=torch.float64)
+    y[300] = -999.0
+    g, stated = default_learner(4, 1), []
+    for t in range(len(x)):
+        stated.append(float(g.predict(x[t], observation=True).stddev))
+        g.update(x[t], y[t])
+    assert stated[301] < 2 * stated[300]
+    assert stated[-1] < 1.5 * stated[300]
+
+
+def test_a_scale_that_grows_is_stated_soon() -> None:
+    draw = torch.Generator().manual_seed(0)
+    x, y = (torch.randn(360, d, generator=draw, dtype=torch.float64) for d in (2, 1))
+    y[300:] *= 1e3
+    g = default_learner(2, 1)
+    g.update(x, y)
+    assert 300 < float(g.predict(x[0], observation=True).stddev) < 6000
+
+
+def test_the_third_sample_of_a_stream_that_begins_close_together_is_not_extrapolated() -> None:
+    draw = torch.Generator().manual_seed(0)
+    x = torch.randn(3, 26, generator=draw, dtype=torch.float64)
+    x[1] = x[0] + 0.01 * x[1]
+    y = torch.tensor([[1.0], [1.2], [1.0]], dtype=torch.float64)
+    g = default_learner(26, 1)
+    g.update(x[:2], y[:2])
+    assert abs(float(g(x[2]))) < 6.0  # 18.6 if the line is believed like the others
+
+
+def test_a_doubt_is_there_again_after_a_reset() -> None:
+    g = MixtureResidual([linear(), linear()], doubts=(0.0, 2.0))
+    first = g.weights.clone()
+    assert float(first[0, 1] / first[0, 0]) == pytest.approx(math.exp(-2.0))
+    g.update(*noisy_pose(3, 40, 0.3))
+    assert not torch.equal(g.weights, first)
+    g.reset()
+    assert torch.equal(g.weights, first)

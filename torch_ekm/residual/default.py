@@ -62,7 +62,9 @@ def default_learner(
         SparseOnlineGP(d, m, parts=wanders, **late[2]),
         SparseOnlineGP(d, m, kernel=LinearKernel(d, **fleet), parts=keeps, **late[3]),
     ]
-    return MixtureResidual(members, levels=(0.0, 0.03, 0.1, 1.0), trends=(0.0, 0.5), **options)
+    # a line through two samples extrapolates to anything, so it is believed later
+    doubts = (0.0, 0.0, 0.0, 2.0)
+    return MixtureResidual(members, levels=(0.0, 0.03, 0.1, 1.0), trends=(0.0, 0.5), doubts=doubts, **options)
 
 
 def _long(d: int, fleet: dict[str, Any]) -> Matern32:

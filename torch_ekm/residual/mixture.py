@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -13,7 +14,18 @@ from torch.distributions import Distribution, Normal
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 from .base import ResidualLearner
-from .experts import FARTHEST, FREEDOM, LEAST, LEVEL_DECAY, RATE, RMS_LEAST, RMS_MOST, TREND_DECAY, YOUNG
+from .experts import (
+    FARTHEST,
+    FREEDOM,
+    LEAST,
+    LEVEL_DECAY,
+    RATE,
+    RMS_LEAST,
+    RMS_MOST,
+    SQUARE_MOST,
+    TREND_DECAY,
+    YOUNG,
+)
 from .mixture_engine import CompiledJudge
 from .report import MomentsWithJacobians, UpdateReport
 from .tails import MEMORY, ScaleMixture
@@ -53,10 +65,12 @@ class MixtureResidual(ResidualLearner):
     Args:
         learners: one or more of the same shapes; they belong to the mixture from now on.
         levels, trends: values of rho and beta to choose from; a trend goes with levels that are larger.
+        doubts: log evidence that each learner lacks at first, forgotten as evidence is; 0 if none is given.
         on_invalid: see ResidualLearner.
 
     Raises:
-        ParameterError: no learner, learners of different shapes, or an empty or impossible choice.
+        ParameterError: no learner, learners of different shapes, an empty or impossible choice, or doubts
+            that are not one finite number >= 0 for each learner.
     """
 
     def __init__(
@@ -65,6 +79,7 @@ class MixtureResidual(ResidualLearner):
         *,
         levels: Sequence[float] = (0.0, 0.03, 0.1),
         trends: Sequence[float] = (0.0,),
+        doubts: Sequence[float] = (),
         **options: Any,
     ) -> None:
         members = [learners] if isinstance(learners, ResidualLearner) else list(learners)
@@ -74,6 +89,10 @@ class MixtureResidual(ResidualLearner):
         for name, values in (("levels", levels), ("trends", trends)):
             if not values or not all(0 <= value <= 1 for value in values):
                 raise ParameterError(name, values, "one or more numbers in [0, 1]")
+        if doubts and not (len(doubts) == len(members) and all(0 <= doubt < math.inf for doubt in doubts)):
+            raise ParameterError(
+                "doubts", doubts, f"one finite number >= 0 for each of {len(members)} learners"
+            )
         self.learners = nn.ModuleList(members)
         rises = [(rho, beta) for rho in levels for beta in trends if beta == 0 or beta < rho]
         experts = itertools.product(range(len(members)), _SHARES, _CARRIES, rises, _CAPS)
@@ -88,7 +107,9 @@ class MixtureResidual(ResidualLearner):
         prior = torch.where(self.shares == 1.0, _PRIOR, (1 - _PRIOR) / (len(_SHARES) - 1)).log()
         self.prior = nn.Buffer(prior, persistent=False)
         wide = (*self.batch_shape, self.out_features, len(owner))
-        self.evidence = nn.Buffer(torch.zeros(wide, **factory))
+        doubted = self.owner @ torch.tensor(doubts or [0.0] * len(members), **factory)
+        self.first_evidence = nn.Buffer(-doubted.expand(wide), persistent=False)
+        self.evidence = nn.Buffer(self.first_evidence.clone())
         self.innovation = nn.Buffer(torch.zeros(wide, **factory))
         self.level = nn.Buffer(torch.zeros(wide, **factory))
         self.trend = nn.Buffer(torch.zeros(wide, **factory))
@@ -205,8 +226,9 @@ class MixtureResidual(ResidualLearner):
         """The learners, the experts' weights and what they carry over back to the prior."""
         for learner in self.members:
             learner.reset()
-        for buffer in (self.evidence, self.innovation, self.level, self.trend, self.count, self.n_refused):
+        for buffer in (self.innovation, self.level, self.trend, self.count, self.n_refused):
             buffer.zero_()
+        self.evidence.copy_(self.first_evidence)
         self.inflation.fill_(1.0)
         self.tails.reset()
         self._settle()
@@ -257,7 +279,8 @@ class MixtureResidual(ResidualLearner):
         trend, level = trend.where(sane, 0.0), level.where(sane, 0.0)
         z = _bounded((y - mean) / deviation)
         rate = (1.0 / (self.count - YOUNG + 2.0).clamp_min(1.0)).clamp_min(RATE).unsqueeze(-1)
-        inflation = (self.inflation + rate * (z.square() - self.inflation)).clamp_min(1e-12)
+        square = torch.minimum(z.square(), SQUARE_MOST * self.inflation)
+        inflation = (self.inflation + rate * (square - self.inflation)).clamp_min(1e-12)
         news = {
             "evidence": evidence, "innovation": innovation, "level": level, "trend": trend,
             "inflation": inflation,

@@ -14,7 +14,18 @@ import math
 import numpy as np
 from numba import njit, types
 
-from .experts import FARTHEST, FREEDOM, LEAST, LEVEL_DECAY, RATE, RMS_LEAST, RMS_MOST, TREND_DECAY, YOUNG
+from .experts import (
+    FARTHEST,
+    FREEDOM,
+    LEAST,
+    LEVEL_DECAY,
+    RATE,
+    RMS_LEAST,
+    RMS_MOST,
+    SQUARE_MOST,
+    TREND_DECAY,
+    YOUNG,
+)
 from .sparse_gp.engine.numba_kernels import _A1, _A2, _COMMON, _F, _INNER, _TINY
 from .tails import LARGEST, MEMORY
 
@@ -150,7 +161,8 @@ def fold_fleet(
                     most = max(most, logs[e])
                 for e in range(n):
                     logs[e] -= most
-                inflation[o] = max(inflation[o] + rate * (z * z - inflation[o]), 1e-12)
+                square = min(z * z, SQUARE_MOST * inflation[o])
+                inflation[o] = max(inflation[o] + rate * (square - inflation[o]), 1e-12)
                 _follow_tails(z, since, rates, freedoms, constants, log_scale[o], tail_evidence[o])
             nis[b] += z * z / inflation[o] / m
 
