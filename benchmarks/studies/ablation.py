@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
-from oracle import OracleGeneralize
+from oracle import TURNS_ALONE, OracleGeneralize
 from run_study import run_study
 
 from torch_ekm.control import (
@@ -290,10 +290,8 @@ class Ablation(Protocol):
             objects=(object,),
             angles_deg=angles,
             warm_up=self.warm_up,
-            long_step_deg=0.0,
-            blind_deg=0.0,
             controllers=variant.controllers,
-            new_objects=False,
+            **TURNS_ALONE,
         )
         return {name: (one, controller, seed) for name, (_, controller, seed) in one.jobs(seeds).items()}
 

@@ -70,6 +70,8 @@ class OracleGeneralize(Generalize):
         return {f"oracle_{name}": job for name, job in super().jobs(seeds).items()}
 
 
+#: Figures of :class:`Generalize` without probes and new objects.
+TURNS_ALONE: dict[str, Any] = {"long_step_deg": 0.0, "blind_deg": 0.0, "new_objects": False}
 #: Name -> how its turns are run, and the controller of the bench.
 CONTENDERS: dict[str, tuple[type[Generalize], str]] = {
     "E-KM": (Generalize, "E-KM"),
@@ -81,8 +83,7 @@ def run(objects: Sequence[str], seeds: Sequence[int], folder: Path, jobs: int) -
     """The turns of ``generalize`` of each contender, without the probes and the new objects."""
     found = {}
     for name, (protocol, controller) in CONTENDERS.items():
-        left_out = {"long_step_deg": 0.0, "blind_deg": 0.0, "new_objects": False}
-        plan = protocol(Setting(sensing=True), tuple(objects), controllers=(controller,), **left_out)
+        plan = protocol(Setting(sensing=True), tuple(objects), controllers=(controller,), **TURNS_ALONE)
         kept = run_jobs(plan.run, plan.jobs(seeds), folder, jobs)
         found[name] = [TrialRecord.from_json(figures) for session in kept.values() for figures in session]
     trials = trial_frame(found, Setting().safety.rule.max_steps).rename(columns={"job": "contender"})

@@ -43,7 +43,7 @@ class MixtureResidual(ResidualLearner):
         mean_e = h m_b(x) - kappa w_e + l_e
         i_e = y - mean_e,   w_e <- i_e / (1 + (i_e / c s)^2)
         d_e <- .98 d_e + beta w_e,   l_e <- .995 l_e + rho w_e + d_e
-        p_e ~ prior_e exp(sum_i memory^i log t_10(i_e(t-i) / s))
+        p_e ~ prior_e exp(sum_i memory^i log t_10(i_e(t-i) / s) - memory^t doubt_b)
 
     Differences of a noisy pose carry noise over: what one sample has too much, the next one lacks, so
     innovations correlate by up to -1/2 and ``kappa`` (the pose's share of the noise: the moving average
