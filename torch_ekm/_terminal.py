@@ -99,15 +99,15 @@ def print_table(
     screen = console if console.is_terminal else Console(width=_PIPED, markup=False)
     parts = _parts([_width(column) for column in zip(head, *cells, strict=True)], screen.width)
     for number, columns in enumerate(parts):
-        last = number == len(parts) - 1
         table = RichTable(title=as_printed(title) if title and not number else None)
-        table.caption = as_printed(note) if note and last else None
         for column in columns:
             figures = all(len(row[column]) <= _SHORT for row in cells)
             table.add_column(head[column], overflow="fold", no_wrap=figures and len(head[column]) <= _SHORT)
         for row in cells:
             table.add_row(*(row[column] for column in columns))
         screen.print(table)
+    if note:
+        screen.print(unbroken(as_printed(note), screen.width), highlight=False)
 
 
 def _width(column: Sequence[str]) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,14 @@ import torch
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
-from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
-from torch_ekm.experiments import compare
+from torch_ekm.exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
+from torch_ekm.experiments import Columns, compare, load_own
+from torch_ekm.experiments.learner_comparison.prequential import run_prequential
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
 from torch_ekm.experiments.learner_comparison.run import run_one
 from torch_ekm.experiments.learner_comparison.stream import in_own_units, load_table
 from torch_ekm.experiments.learner_comparison.table_file import open_table
+from torch_ekm.experiments.learners import learner_factory
 from torch_ekm.residual import UpdateReport, ZeroResidual
 
 
@@ -230,9 +233,33 @@ def test_how_many_of_how_many_rows_were_used_is_told(tmp_path: Path) -> None:
     stream = load_table(write(tmp_path / "a.csv", table(60)), limit=50)
     assert stream.used == "the first 50 of 60 rows"
     report = compare(stream, ("default", "linear RLS"))
-    assert report.verdicts()[0].endswith("On the first 50 of 60 rows.")
+    assert "On the first 50 of 60 rows." in report.verdicts()[0]
     assert "default" in report.verdicts()[0]
     assert report.tables()[0].rows[0][0] in ("default", "default *")
+
+
+def test_errors_of_each_output_are_given_in_the_units_of_the_file(tmp_path: Path) -> None:
+    values = table() * [1.0, 1.0, 1e-3, 50.0]  # two predictions, and two measurements in other units
+    values[:, 2:] += 4.0 * values[:, :2] * [1e-3, 50.0]
+    path = write(tmp_path / "a.csv", np.column_stack([values, 0 * values[:, :2]]), "a,b,u,v,f,g")
+    options = {"targets": ["u", "v"], "predicted": ["f", "g"], "inputs": ["a", "b"]}
+    report = compare(path, ("linear RLS", "model alone"), **options)
+    warm_up = report.streams[0].warm_up
+    alone = np.sqrt(np.square(values[warm_up:, 2:]).mean(0))
+    np.testing.assert_allclose(report.output_errors("a", "model alone"), alone, rtol=1e-12)
+    learned = report.output_errors("a", "linear RLS")
+    run = run_prequential(learner_factory("linear RLS")(2, 2), report.streams[0].x, report.streams[0].y)
+    scored = run.mean.numpy()[warm_up:] * report.streams[0].unit - values[warm_up:, 2:]
+    np.testing.assert_allclose(learned, np.sqrt(np.square(scored).mean(0)), rtol=1e-9)
+    sentence = f"u - f {learned[0]:.3g}, alone {alone[0]:.3g}; v - g {learned[1]:.3g}, alone {alone[1]:.3g}."
+    assert report.verdicts()[0].endswith(f"rms errors in the units of the file: {sentence}")
+    shown = report.tables()[-1]
+    assert [row[0] for row in shown.rows] == ["u - f", "v - g"]
+    np.testing.assert_allclose([row[2] for row in shown.rows], alone)
+    with pytest.raises(ShapeError, match="2 of each"):
+        dataclasses.replace(report.streams[0], outputs=("u",))
+    own = Columns(["a", "b"], ["u"], ["v"])
+    assert load_own(path, own).stream().outputs == ("v",)
 
 
 def test_units_come_from_the_warm_up_alone() -> None:

@@ -42,12 +42,14 @@ class OwnRecording:
         x: state and command ``(n, d)``, in the recording's units.
         y: what the model left over ``(n, m)``, in the units of the observation.
         about: what it is, and what "the model alone" predicts.
+        outputs: the observed columns.
     """
 
     name: str
     x: Float[Tensor, "n d"]
     y: Float[Tensor, "n m"]
     about: str
+    outputs: tuple[str, ...] = ()
 
     def stream(self, limit: int | None = None) -> Stream:
         """For :func:`compare`: the first ``limit`` motions (None: all), in units of their first tenth.
@@ -55,7 +57,8 @@ class OwnRecording:
         That (20 to 200 samples) is not scored. Only x is centred: 0 is what the model says.
         """
         x, y = self.x.numpy(), self.y.numpy()
-        return in_own_units(self.name, x, y, self.about, limit, centre_y=False, ddof=1)
+        options = {"outputs": self.outputs, "centre_y": False, "ddof": 1}
+        return in_own_units(self.name, x, y, self.about, limit, **options)
 
 
 def load_own(
@@ -102,4 +105,4 @@ def load_own(
     alone = "nothing moves" if model is None else getattr(model, "__name__", type(model).__name__)
     about = f"increments of {len(outputs)} columns of {path.name}; alone: {alone}"
     x, y = torch.from_numpy(np.hstack([s, u])), torch.from_numpy(moved - nominal)
-    return OwnRecording(path.stem, x, y, about)
+    return OwnRecording(path.stem, x, y, about, tuple(outputs))

@@ -20,7 +20,8 @@ class ComparisonReport(Comparison):
     def tables(self) -> list[Table]:
         """One for each stream; of several streams an overview first."""
         tables = [score_table(self, stream.name) for stream in self.streams]
-        return [overview_table(self), *tables] if len(tables) > 1 else tables
+        units = [output_table(self, stream.name) for stream in self.streams if stream.outputs]
+        return [*([overview_table(self)] if len(tables) > 1 else []), *tables, *units]
 
     def __str__(self) -> str:
         return "\n".join([str(self.tables()[0]), *self.verdicts()])
@@ -79,6 +80,15 @@ def score_table(comparison: Comparison, stream: str) -> Table:
     note += "rows makes more than half of the squared error. NLL: per sample and output. "
     note += "Time: one prediction and one update."
     return Table.of(f"scores_{stream}", f"{stream}: {one.about}", "learner", items, columns, note)
+
+
+def output_table(comparison: Comparison, stream: str) -> Table:
+    """rms error of each output in the units of the file, of the few learners that curves are drawn of."""
+    one, shown = comparison.stream(stream), curve_learners(comparison, stream)
+    columns = ["output", *(Column(name, ".3g") for name in shown)]
+    rms = np.transpose([comparison.output_errors(stream, name) for name in shown])
+    rows: list[list[Cell]] = [[name, *errors] for name, errors in zip(one.outputs, rms.tolist(), strict=True)]
+    return Table(f"outputs_{stream}", f"{stream}: rms errors in the units of the file", columns, rows)
 
 
 def overview_table(comparison: Comparison) -> Table:

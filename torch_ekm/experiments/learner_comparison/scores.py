@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -18,6 +19,7 @@ from .stream import Stream
 Measure = Literal["rms", "median"]
 _BLOCKS = 20
 _ABSURD = 100.0  # [nats] of one sample; errors of 14 deviations
+_NAMED = 4  # outputs; more are read in the table
 _DECIDED = 0.5
 """Share of the squared error, made by a hundredth of the samples, above which the rms says little."""
 
@@ -40,6 +42,8 @@ class Score:
     """One prediction with deviation and one update."""
     kilobytes: float
     """Of the state dict."""
+    rms_of_outputs: Sequence[float] = ()
+    """rms error of each output, in the stream's units."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,10 @@ class Comparison:
         """Over that of the model alone, by the stream's :meth:`measure`."""
         score = self.scores[stream, learner]
         return score.rms if self.measure(stream) == "rms" else score.median
+
+    def output_errors(self, stream: str, learner: str) -> Array:
+        """``(m,)``, rms error of each output in the units of the file, where these are known."""
+        return np.array(self.stream(stream).unit) * self.scores[stream, learner].rms_of_outputs
 
     def stream(self, name: str) -> Stream:
         """The stream of that name, with its samples."""
@@ -136,7 +144,7 @@ class Comparison:
             behind = sorted((n for n in ratios if n not in level), key=lambda n: ratios[n].mean)
             named = [name for k, name in enumerate(behind) if name == "default" or (k == 0 and not level)]
             text += "".join(f"; {name} has {ratios[name]:.3f} times its error" for name in named)
-            text += f". On {stream.used}."
+            text += f". On {stream.used}.{self._in_file_units(stream, best)}"
             if self.measure(stream.name) == "median":
                 share = 100 * rare_share(self.errors[stream.name, best])
                 text += f" Medians: one row in a hundred makes {share:.0f} % of the squared error."
@@ -147,6 +155,17 @@ class Comparison:
                 text += f" Errors far beyond the variance (NLL): {', '.join(sure)}; use no density of theirs."
             sentences.append(text)
         return sentences
+
+    def _in_file_units(self, stream: Stream, best: str) -> str:
+        """What the best learner makes of the model's errors, where a sentence can hold it."""
+        if best == "model alone" or not 0 < len(stream.outputs) <= _NAMED:
+            return ""
+        rms = self.output_errors(stream.name, best)
+        alone = np.array(stream.unit) * stream.y[stream.warm_up :].square().mean(0).sqrt().numpy()
+        pairs = (
+            f"{name} {a:.3g}, alone {b:.3g}" for name, a, b in zip(stream.outputs, rms, alone, strict=True)
+        )
+        return f" rms errors in the units of the file: {'; '.join(pairs)}."
 
 
 def rare_share(squared: Array) -> float:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +32,8 @@ class Stream:
         about: what it is, and what "the model alone" predicts.
         available: samples of the file or recording, of which these are the first; 0: nobody counted.
         notes: what the user should look at, such as a clock among the inputs.
+        outputs: names of the columns of y, and
+        unit: what 1 is in each, in the units of the file; empty: unknown.
 
     Raises:
         ShapeError: lengths do not fit.
@@ -46,6 +47,8 @@ class Stream:
     about: str = ""
     available: int = 0
     notes: str = ""
+    outputs: tuple[str, ...] = ()
+    unit: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.y)
@@ -53,6 +56,8 @@ class Stream:
             raise ShapeError("x", f"({n}, d)", self.x.shape, "one input for each output")
         if self.segments and sum(self.segments) != n:
             raise ShapeError("segments", f"lengths that add up to {n}", self.segments)
+        if len(self.outputs) != len(self.unit) or len(self.unit) not in (0, self.y.shape[1]):
+            raise ShapeError("outputs, unit", f"{self.y.shape[1]} of each", (len(self.outputs), len(self.unit)))
 
     def __len__(self) -> int:
         return len(self.y)
@@ -132,8 +137,9 @@ def load_table(
         notes += f" Like a clock or the number of a row: {', '.join(clocks)}; leave it out."
     if numbers := [name for name, column in zip(chosen, x.T, strict=True) if _is_number_of_run(column)]:
         notes += f" Like the number of a run: {', '.join(numbers)}; name it by --run (run=), or leave it out."
-    stream = in_own_units(Path(path).stem, x, y, about, limit, centre_y=not zero_is_model)
-    return dataclasses.replace(stream, segments=tuple(parts) if runs else (), notes=notes)
+    names = [f"{one} - {other}" for one, other in zip(outputs, model, strict=True)] if model else outputs
+    stream = in_own_units(Path(path).stem, x, y, about, limit, outputs=names, centre_y=not zero_is_model)
+    return replace(stream, segments=tuple(parts) if runs else (), notes=notes)
 
 
 def _other_order(measured: Array, predicted: Array, outputs: list[str], model: list[str]) -> str:
@@ -171,6 +177,7 @@ def in_own_units(
     about: str = "",
     limit: int | None = None,
     *,
+    outputs: Sequence[str] = (),
     centre_y: bool = True,
     ddof: int = 0,
 ) -> Stream:
@@ -181,19 +188,23 @@ def in_own_units(
 
     Args:
         limit: only the first so many samples.
+        outputs: names of the columns of y.
         centre_y: False: y is only scaled, so that 0 is still what the model says.
         ddof: of the standard deviations, as numpy has it.
     """
     available, x, y = len(x), x[:limit], y[:limit]
     warm_up = min(max(len(x) // 10, 20), 200)
 
-    def units(values: Array, centre: bool = True) -> Tensor:
+    def units(values: Array, centre: bool = True) -> tuple[Tensor, Array]:
         start = values[:warm_up]
         deviation = start.std(0, ddof=ddof)
         whole = values.std(0, ddof=ddof)
         moves = deviation > np.maximum(_REST * whole, 1e-9 * np.abs(values).max(0))
         deviation = np.where(moves, deviation, whole)
         away = values - start.mean(0) if centre else values
-        return torch.from_numpy(away / np.where(deviation > 0, deviation, 1.0))
+        unit = np.where(deviation > 0, deviation, 1.0)
+        return torch.from_numpy(away / unit), unit
 
-    return Stream(name, units(x), units(y, centre_y), warm_up, about=about, available=available)
+    (inputs, _), (targets, unit) = units(x), units(y, centre_y)
+    stream = Stream(name, inputs, targets, warm_up, about=about, available=available)
+    return replace(stream, outputs=tuple(outputs), unit=tuple(unit.tolist())) if outputs else stream
