@@ -56,8 +56,9 @@ class Stream:
             raise ShapeError("x", f"({n}, d)", self.x.shape, "one input for each output")
         if self.segments and sum(self.segments) != n:
             raise ShapeError("segments", f"lengths that add up to {n}", self.segments)
-        if len(self.outputs) != len(self.unit) or len(self.unit) not in (0, self.y.shape[1]):
-            raise ShapeError("outputs, unit", f"{self.y.shape[1]} of each", (len(self.outputs), len(self.unit)))
+        m, known = self.y.shape[1], (len(self.outputs), len(self.unit))
+        if known not in ((0, 0), (m, m)):
+            raise ShapeError("outputs, unit", f"{m} of each", known)
 
     def __len__(self) -> int:
         return len(self.y)
