@@ -133,6 +133,34 @@ def test_a_wrong_wiring_is_refused_with_the_line_to_change(name, tmp_path) -> No
     assert plant.farthest < 6 * DEG
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("motor's sign", "motor's unit"),
+        ("motor's unit", "swapped joints"),
+        ("motor's zero", "joint's unit"),
+        ("joint's unit", "joint's zero"),
+    ],
+)
+def test_two_wrong_entries_are_named_together(names, tmp_path) -> None:
+    wrong = [WRONG[name] for name in names]
+    plant = bench(tmp_path, [change for one in wrong for change in one[0]])
+    (row,) = errors(check_plant(plant, HAND))
+    parts = row.found.split("; ")
+    assert len(parts) == 2
+    for part, (_, where, key, words) in zip(parts, wrong, strict=True):
+        assert part.startswith(f"{where}: ")
+        assert words in part
+        assert f": {key} of '{where.split(chr(39))[1]}'" in row.remedy
+
+
+def test_explanations_that_fit_alike_are_alternatives(tmp_path) -> None:
+    names = "motor's sign", "joint's zero"
+    found = errors(check_plant(bench(tmp_path, [one for name in names for one in WRONG[name][0]]), HAND))
+    assert "joint 'left_1': zero" in found[0].found
+    assert [row.found.startswith("or instead: ") for row in found] == [False, True]
+
+
 @pytest.mark.parametrize("name", ["motor's sign", "motor's unit", "joint's sign", "swapped motors"])
 def test_near_its_zeros_a_wrong_wiring_shows_in_the_first_small_motion(name, tmp_path) -> None:
     """At rest everything reads about 0 then, whatever the sign and the unit. With noise of 0.3 deg a joint's

@@ -27,6 +27,7 @@ _WILD = 4 * _DEG  # [rad] more than any of these commands may move
 _LOOKS = 20
 _FITS = 1.8  # times the tolerance
 _NEAR = 2.0  # of the best explanation's sum of squares: as good
+_ALIKE = 3  # pairs of mistakes; more say nothing
 _FAR = 0.12  # [m] of an object from the middle of the pads
 _CLOCK = "Observation(time=time.monotonic(), ...) in the driver"
 _ANGLE = 0.3  # cosine between predicted and measured motion of the object
@@ -38,8 +39,9 @@ def check_plant(
 ) -> list[Check]:
     """Check the wiring of a hand: at rest first, then with motions of 1 deg, one motor after the other.
 
-    Found are: a wrong sign or unit, swapped motors or joints, a zero that is off by half a turn, a motor or
-    a sensor that is dead or constant, a clock that stands or is missing, float32, a pose in another frame.
+    Found are: a wrong sign or unit, swapped motors or joints, a zero that is off by half a turn, two of these
+    at once, a motor or a sensor that is dead or constant, a clock that stands or is missing, float32, a pose
+    in another frame. Explanations that fit as well begin with "or instead".
     Nothing moves while readings at rest contradict each other. Where dead zones swallow 1 deg, 2 and 4 deg
     are tried; each motor goes back. While an object is held, motors that shape the hand rest.
 
@@ -283,21 +285,37 @@ class _Checked:
     # -- what explains it ---------------------------------------------------------------------------
 
     def _explained(self, readings: Readings) -> Iterator[Check]:
-        """The single mistake that explains what was read, or those that explain it alike."""
-        found: list[tuple[float, Mistake]] = []
-        for mistake in self.test.mistakes(readings):
-            misfit = self.test.misfit(mistake.readings)
-            if (misfit <= _FITS).all():
-                found.append((float(np.square(misfit).sum()) + mistake.penalty, mistake))
-        if not found:
+        """The single mistake that explains what was read, else two, or those that explain it alike."""
+        found = self._explanations(readings) or self._explanations(readings, pairs=True)
+        least = min((score for score, _ in found), default=0.0)
+        alike = sorted((one for one in found if one[0] <= least + _NEAR), key=lambda one: one[0])
+        if not alike or (len(alike[0][1]) > 1 and len(alike) > _ALIKE):
             yield self._unexplained(readings)
             return
-        least = min(score for score, _ in found)
-        for _, one in sorted((pair for pair in found if pair[0] <= least + _NEAR), key=lambda pair: pair[0]):
-            at = [getattr(self.hand, _NAMES[one.kind]).index(name) for name in one.names]
-            remedy = "; ".join(self._remedy(one.kind, k, one.key) for k in at)
-            name = f"{one.kind[:-1]} " + " and ".join(f"'{name}'" for name in one.names)
-            yield Check(name, "error", one.what, remedy)
+        for number, (_, mistakes) in enumerate(alike):
+            name, what = mistakes[0].where, mistakes[0].what
+            if len(mistakes) > 1:
+                name, what = "wiring", "; ".join(f"{one.where}: {one.what}" for one in mistakes)
+            remedies = [self._remedy(one.kind, k, one.key) for one in mistakes for k in self._places(one)]
+            yield Check(name, "error", f"{'or instead: ' if number else ''}{what}", "; ".join(remedies))
+
+    def _places(self, mistake: Mistake) -> list[int]:
+        return [getattr(self.hand, _NAMES[mistake.kind]).index(name) for name in mistake.names]
+
+    def _explanations(
+        self, readings: Readings, pairs: bool = False
+    ) -> list[tuple[float, tuple[Mistake, ...]]]:
+        """Single mistakes, or pairs of them, without which all readings fit: sum of squares, mistakes."""
+        found = []
+        for number, first in enumerate(self.test.mistakes(readings)):
+            rest = list(self.test.mistakes(first.readings))[number + 1 :] if pairs else [None]
+            for second in rest:
+                mistakes = (first,) if second is None else (first, second)
+                misfit = self.test.misfit(mistakes[-1].readings)
+                if (misfit <= _FITS).all():
+                    score = float(np.square(misfit).sum()) + sum(one.penalty for one in mistakes)
+                    found.append((score, mistakes))
+        return found
 
     def _unexplained(self, readings: Readings) -> Check:
         off = readings.a - self.hand.actuator_offset - self.hand.actuation_jacobian @ readings.q

@@ -1,4 +1,4 @@
-"""Which single mistake of a wiring explains what a hand's sensors say."""
+"""Which mistakes of a wiring explain what a hand's sensors say."""
 
 from __future__ import annotations
 
@@ -57,6 +57,11 @@ class Mistake:
     what: str
     readings: Readings
     penalty: float = 0.0
+
+    @property
+    def where(self) -> str:
+        """Motor or joint, by name."""
+        return f"{self.kind[:-1]} " + " and ".join(f"'{name}'" for name in self.names)
 
 
 class WiringTest:
