@@ -1,6 +1,6 @@
 """Hands that are wrong in many ways: what the E-KM holds and reaches where integral action does.
 
-    python benchmarks/any_hand.py --families all --objects box,bottle --seeds 1000:1003
+    python benchmarks/any_hand.py --families all --objects box,bottle --seeds 1000:1010
 
 Each family is one way in which a plant departs from its description, at three strengths, on the preset
 "nominal"; the mixtures are the presets "odd_1" to "odd_5". Turns of 9, 19 and 27 deg; the E-KM has three
@@ -298,7 +298,7 @@ def records_by(keys: Mapping[str, Any], results: Mapping[str, Any]) -> dict[Any,
 def main() -> None:
     names = ", ".join((*FAMILIES, *OTHERS))
     parser = study_parser(
-        __doc__, "any_hand", objects="box,bottle", seeds="1000:1002", engine="sapien",
+        __doc__, "any_hand", objects="box,bottle", seeds="1000:1010", engine="sapien",
         quick="one plant, object and seed",
     )  # fmt: skip
     parser.add_argument(

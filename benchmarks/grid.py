@@ -1,6 +1,6 @@
 """A grid of conditions: friction, mass and size of the object, orientation of the palm, left hand, grasps.
 
-    python benchmarks/grid.py --objects box,can --seeds 1000:1004 --engine mujoco --out FOLDER
+    python benchmarks/grid.py --objects box,can --seeds 1000:1010 --engine mujoco --out FOLDER
 
 Preset "nominal" with every pair of friction and mass, and with one other change at a time: size, palm, the
 left hand, centred grasps. Turns of 9, 19 and 27 deg; the E-KM has three turns of warm-up with the object.
@@ -161,7 +161,7 @@ class Grid:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = study_parser(
-        __doc__, "grid", objects="box,can", seeds="1000:1004", engine="mujoco",
+        __doc__, "grid", objects="box,can", seeds="1000:1010", engine="mujoco",
         quick="one cell, object and seed",
     )  # fmt: skip
     parser.add_argument("--cells", default="", help="names separated by semicolons; all if left out")

@@ -1,6 +1,6 @@
 """A hand that has learned its figures with one object, and objects that it has never held.
 
-    python benchmarks/new_object.py --first box --then can,bottle,jar --seeds 1000:1003
+    python benchmarks/new_object.py --first box --then can,bottle,jar --seeds 1000:1010
 
 The hand makes thirty motions with the first object. Then it turns each of the others by 9, 19 and 27 deg,
 without any warm-up on it. Poses come from camera images, joint angles from Hall counts. ``--preset`` takes
@@ -265,7 +265,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("--first", default="box", help="name or path of the object that the hand learns with")
     parser.add_argument("--then", default="can,bottle,jar", help="names or paths")
-    parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1003"), help="FIRST:END")
+    parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1010"), help="FIRST:END")
     parser.add_argument("--preset", default="nominal", help="hands, see above; several give a row each")
     parser.add_argument("--engine", default="sapien", choices=ENGINES)
     parser.add_argument("--jobs", type=int, default=2, help="processes at once")

@@ -1,6 +1,6 @@
 """The paper's sensing in simulation: Hall fit, camera calibration, position controller, blind turns.
 
-    python benchmarks/sensing.py --objects box,can --seeds 1000:1004 --out FOLDER
+    python benchmarks/sensing.py --objects box,can --seeds 1000:1010 --out FOLDER
 
 Every hand (seed) has Hall channels, a lens and motors of its own. The lens is calibrated by OpenCV from
 pictures of a ChArUco board. An E-KM makes three turns with each object, then those that are counted: with
@@ -213,7 +213,7 @@ def jobs(setting: Setting, objects: Sequence[str], seeds: Sequence[int], quick: 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = study_parser(
-        __doc__, "sensing", objects="box,can", seeds="1000:1004", engine="mujoco",
+        __doc__, "sensing", objects="box,can", seeds="1000:1010", engine="mujoco",
         quick="one object, one seed, everything sensed, four blind motions",
     )  # fmt: skip
     parser.set_defaults(jobs=1)

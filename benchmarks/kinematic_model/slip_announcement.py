@@ -1,6 +1,6 @@
 """Are slips announced one motion ahead? The kinematic model's friction margins against the simulator.
 
-    python benchmarks/kinematic_model/slip_announcement.py --seeds 1000:1009
+    python benchmarks/kinematic_model/slip_announcement.py --seeds 1000:1010
 
 A look-and-move controller turns objects by more than they bear. Before each motion da the model says the
 friction margin that each contact will have after it, ``margins_after(da)``. A slip is announced where one of
@@ -341,7 +341,7 @@ def main(arguments: list[str] | None = None) -> list[str]:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seeds", default="1000:1009", help="FIRST:END")
+    parser.add_argument("--seeds", default="1000:1010", help="FIRST:END")
     parser.add_argument("--quick", action="store_true", help="one grasp of one object, three motions")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)

@@ -1,6 +1,6 @@
 """Foresight: how far an object can be turned, whether that was predicted, and a turn that nobody looks at.
 
-    python benchmarks/studies/foresight_study.py --seeds 1000:1020 --out FOLDER
+    python benchmarks/studies/foresight_study.py --seeds 1000:1010 --out FOLDER
 
 With 20 seeds, 280 sessions of 6 to 10 turns: an hour on two cores. Interrupted, it goes on where it stopped.
 """
