@@ -141,6 +141,8 @@ def test_wrong_kinds_and_widths_are_refused_by_name(generator: torch.Generator, 
         EnhancedModel(lambda s, a: a, SparseOnlineGP(N_S + N_A, N_A))(state[0].tolist(), action[0])
     with pytest.raises(ParameterError, match="indices"):
         EnhancedModel(model, SparseOnlineGP(N_S + N_A, 1), outputs=1)
+    with pytest.raises(ShapeError, match=f"learner's input.*state {N_S} \\+ action {N_A} entries"):
+        EnhancedModel(model, SparseOnlineGP(N_S, 3))(state[0], action[0])
     for learned, options in ((1, {}), (4, {}), (2, {"outputs": [1, 3]})):  # f has three entries
         ekm = EnhancedModel(model, SparseOnlineGP(N_S + N_A, learned), **options)
         with pytest.raises(ShapeError, match=r"f\(state, action\).*learner"):

@@ -88,6 +88,9 @@ def test_a_fleet_of_single_learners_and_a_learner_of_ones_own(tmp_path: Path) ->
     torch.save(Mine(3, 2, slope=0.5).state_dict(), tmp_path / "state.pt")
     with pytest.raises(exceptions.FileFormatError, match=r"not written by torch_ekm\.save"):
         torch_ekm.load(tmp_path / "state.pt")
+    (tmp_path / "joint.csv").write_text("x,y\n1,2\n")
+    with pytest.raises(exceptions.FileFormatError, match=r"not written by torch_ekm\.save"):
+        torch_ekm.load(tmp_path / "joint.csv")
 
 
 def test_an_enhanced_model_with_its_encoding(tmp_path: Path) -> None:

@@ -208,7 +208,7 @@ def test_every_kind_of_learner_in_the_package_contends() -> None:
 def test_an_absurd_density_is_told(compared: Comparison) -> None:
     scores = {key: dataclasses.replace(score, nll=1e6) for key, score in compared.scores.items()}
     absurd = dataclasses.replace(compared, scores=scores).verdicts()[0]
-    assert "Errors far beyond the variance (NLL): model alone, linear RLS, SOGP plain" in absurd
+    assert "Errors far beyond the stated variance (NLL): model alone, linear RLS, SOGP plain" in absurd
     assert "NLL" not in compared.verdicts()[0]
 
 

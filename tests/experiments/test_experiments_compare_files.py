@@ -144,6 +144,8 @@ def test_y_is_measured_less_predicted_and_runs_stand_for_themselves(tmp_path: Pa
     torch.testing.assert_close(stream.y, given.y)
     assert stream.segments == (10,) * 6
     assert load_table(path, ["seen"], 35, predicted=["said"], run="run").segments == (10, 10, 10, 5)
+    with pytest.raises(ParameterError, match=r"run = 'b' is not valid.*the same in all rows of a run"):
+        load_table(path, ["seen"], predicted=["said"], run="b")
     with pytest.raises(ParameterError, match="one for each measured column"):
         load_table(path, ["seen", "a"], predicted=["said"])
     arguments = ["compare", "--data", str(path), "--predicted", "said", "--learners", "linear RLS"]
@@ -194,10 +196,10 @@ def test_a_clock_among_the_inputs_is_suspected(tmp_path: Path) -> None:
     run = np.arange(60) // 20
     values = np.column_stack([np.arange(60) % 20, table()[:, 1:], run])
     stream = load_table(write(tmp_path / "a.csv", values, "time,b,c,y,run"), run="run")
-    assert "number of a row: time;" in compare(stream, ("linear RLS",)).verdicts()[0]
+    assert "number of a row, to be left out: time." in compare(stream, ("linear RLS",)).verdicts()[0]
     assert not load_table(write(tmp_path / "b.csv", table())).notes
     nameless = load_table(write(tmp_path / "c.csv", values, "time,b,c,y,run")).notes  # runs without --run
-    assert "number of a row: time;" in nameless
+    assert "number of a row, to be left out: time." in nameless
     assert "number of a run: run;" in nameless
     k, rest = np.arange(60), np.ones(60)
     wheel = np.column_stack([np.mod(0.7 * k, 6.3), k >= 30, rest, table()[:, 3]])
@@ -258,6 +260,13 @@ def test_errors_of_each_output_are_given_in_the_units_of_the_file(tmp_path: Path
     np.testing.assert_allclose([row[2] for row in shown.rows], alone)
     with pytest.raises(ShapeError, match="2 of each"):
         dataclasses.replace(report.streams[0], outputs=("u",))
+    values[30] *= 1e4  # a single row makes nearly all of the squared error
+    path = write(tmp_path / "b.csv", np.column_stack([values, 0 * values[:, :2]]), "a,b,u,v,f,g")
+    report = compare(path, ("model alone",), **options)
+    medians = np.median(np.abs(values[warm_up:, 2:]), axis=0)
+    assert report.measure("b") == "median"
+    np.testing.assert_allclose(report.output_errors("b", "model alone"), medians, rtol=1e-12)
+    assert report.tables()[-1].caption == "b: median errors in the units of the file"
     own = Columns(["a", "b"], ["u"], ["v"])
     assert load_own(path, own).stream().outputs == ("v",)
 

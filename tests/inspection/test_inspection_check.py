@@ -170,7 +170,7 @@ def test_where_the_files_have_a_fault_no_other_force_is_tried(files, monkeypatch
 
 def test_which_pad_opposes_which_is_said():
     (row,) = module._reach(load_hand("icub_right"), load_object("box"))
-    assert row.found == "pad thumb opposes index and middle, 30 mm between them"
+    assert row.found == "wide enough: pad thumb opposes index and middle, 30 mm between them"
 
 
 def test_a_xacro_file_is_told_which_command_comes_first(tmp_path):

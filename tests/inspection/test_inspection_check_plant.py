@@ -16,7 +16,7 @@ from torch_ekm.description import load_hand, load_object
 from torch_ekm.drivers import BusReading, HandDriver, Sighting, Wiring, WithPose
 from torch_ekm.inspection.check_plant import check_plant
 from torch_ekm.kinematics import ActuationMap
-from torch_ekm.plant import Observation, PlantWrapper
+from torch_ekm.plant import Observation, PlantStatus, PlantWrapper
 
 DEG = math.pi / 180
 HAND = load_hand("yale_t42")
@@ -161,6 +161,30 @@ def test_explanations_that_fit_alike_are_alternatives(tmp_path) -> None:
     assert [row.found.startswith("or instead: ") for row in found] == [False, True]
 
 
+def test_at_rest_a_swap_that_fits_is_always_listed_and_nothing_else_is_judged(tmp_path) -> None:
+    q, exchanged = torch.tensor([-0.342, 1.184, -0.367, 0.845]), torch.tensor([0.445, 0.813])
+    read = {
+        "q": q.double(),
+        "a": exchanged.double(),
+        "status": PlantStatus.HELD,
+    }  # a scale of a joint fits, too
+
+    class Flipped(Spoilt):
+        wiring = None  # a driver of one's own
+
+        def observe(self) -> Observation:
+            return dataclasses.replace(self.plant.observe(), **read)
+
+    plant = Flipped(bench(tmp_path), lambda seen: seen)
+    rows = check_plant(plant, load_hand("planar_two_finger"))
+    found = errors(rows)
+    assert ("motor 'left' and 'right'", "or instead: swapped") in {(row.name, row.found) for row in found}
+    assert all(row.found.startswith("or instead: ") for row in found[1:])
+    assert rows[-1].name == "motors"
+    assert rows[-1].found.startswith("not moved")
+    assert "pose" not in {row.name for row in rows}  # joints that are wrong put the pads elsewhere
+
+
 @pytest.mark.parametrize("name", ["motor's sign", "motor's unit", "joint's sign", "swapped motors"])
 def test_near_its_zeros_a_wrong_wiring_shows_in_the_first_small_motion(name, tmp_path) -> None:
     """At rest everything reads about 0 then, whatever the sign and the unit. With noise of 0.3 deg a joint's
@@ -279,7 +303,7 @@ def test_the_command_checks_a_hand_on_a_bus(tmp_path) -> None:
         done = CliRunner().invoke(app, ["check", "--plant", str(path)])
         assert done.exit_code == 0, done.output
         assert "no sensors at the joints of left" in done.output
-        assert "2 motors go as commanded" in done.output
+        assert "2 motors go as commanded; without joint sensors" in done.output
         assert "and joints with them" not in done.output  # none has a sensor
         bus.catch_up()
         bus.goals.clear()
@@ -293,6 +317,8 @@ def test_the_command_checks_a_hand_on_a_bus(tmp_path) -> None:
         done = CliRunner().invoke(app, ["check", "--plant", str(path)])
         assert done.exit_code == 1
         assert "my_hand.toml" in done.output
+    done = CliRunner().invoke(app, ["check", "icub_right", "--plant", str(path)])
+    assert "the wiring file names the hand" in str(done.exception)
     done = CliRunner().invoke(app, ["check"])
     assert "--plant" in str(done.exception)
 

@@ -80,6 +80,8 @@ def check(
     """
     from ..inspection.row import Check
 
+    if plant is not None and hand:
+        raise ParameterError("hand", hand, "left out: with --plant the wiring file names the hand")
     if plant is not None:
         from ..drivers import open_driver
         from ..inspection.check_plant import check_plant

@@ -193,7 +193,8 @@ class _Connection:
             yield
         except OSError as error:
             self.close()
-            raise BusError(f"YARP port {self.name}", f"{type(error).__name__}: {error}") from error
+            where = "{} at {}:{}".format(self.name, *self._where)
+            raise BusError(f"YARP port {where}", f"{type(error).__name__}: {error}") from error
 
 
 class _Stream:

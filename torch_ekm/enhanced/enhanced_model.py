@@ -151,6 +151,10 @@ class EnhancedModel(Recorded, nn.Module):
         scaled, encoded = self.action_scale * _checked_action(action), self.encode(state)
         if not isinstance(encoded, Tensor):
             raise ParameterError("state", type(encoded).__name__, "a tensor, or what encode= makes one of")
+        known, given = self.learner.in_features, encoded.shape[-1] + scaled.shape[-1]
+        if known != given:
+            parts = f"state {encoded.shape[-1]} + action {scaled.shape[-1]}"
+            raise ShapeError("learner's input", f"(..., {known})", (given,), f"it has {parts} entries")
         return torch.cat([encoded, scaled], dim=-1)
 
     def forward(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_s"]:

@@ -59,7 +59,9 @@ def load(
     known = known_classes(classes) | {"GraspState": GraspState}
     enhanced = isinstance(described, dict) and described.get("class") == "EnhancedModel"
     if enhanced != (model is not None):
-        valid = "f, since the file holds an EnhancedModel" if enhanced else "None for a learner"
+        valid = "None: the file holds a learner alone"
+        if enhanced:
+            valid = "the model f, as in load(path, model=f): the file holds f + g without f"
         raise ParameterError("model", model, valid)
     if model is not None:
         known["EnhancedModel"] = lambda **arguments: EnhancedModel(model, **arguments)

@@ -73,6 +73,9 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
         if not unfit and (other := [row.name for row in pads if row.state != "ok"]):
             remedy = f"first paste the <collision> of {', '.join(other)} as printed above"
             return [*rows, Check("collision shapes", "error", "not the pads touch", remedy), *pinch]
+        if wrong := [row.name for row in pads if row.state == "error"]:
+            first = f"first correct {', '.join(wrong)}"
+            pinch = [row._replace(remedy=first) if row.state == "error" else row for row in pinch]
         # another force cures no fault of the files, and takes minutes to try
         return [*rows, *pinch, *(() if unfit else _gentler(description, obj))]
     return [*rows, *pinch, *_turn(description, obj), *_disturbed(description, obj)]
@@ -193,8 +196,8 @@ def _reach(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
         yield Check("limits", state, f"{lack.part}: {lack.problem}", lack.remedy)
     if not lacks:
         first, *others = (pad.name for pad in problem.pads)
-        found = f"pad {first} opposes {' and '.join(others)}, {1e3 * obj.grasp_width:.0f} mm between them"
-        yield Check("limits", "ok", found)
+        apart = f"{1e3 * obj.grasp_width:.0f} mm between them"
+        yield Check("limits", "ok", f"wide enough: pad {first} opposes {' and '.join(others)}, {apart}")
 
 
 def _gentler(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
@@ -242,7 +245,7 @@ def _disturbed(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]
             failures.append(str(error))
     found = f"{_DISTURBED - len(failures)} of {_DISTURBED} held with the usual faults"
     if failures:
-        remedy = "stiffer springs, a smaller 'pinch_force' in [hand], more friction"
+        remedy = "as the message says, or a smaller 'pinch_force' in [hand], stiffer springs, more friction"
         yield Check("pinch, preset nominal", "warning", f"{found}; {failures[0]}", remedy)
     else:
         yield Check("pinch, preset nominal", "ok", found)

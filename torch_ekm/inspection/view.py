@@ -89,8 +89,8 @@ def view_hand(hand: HandDescription) -> View:
 
 def _grasp(plant: SimulatedHand, seen: Observation) -> View:
     """A pinch, and what each actuator does to it by itself."""
-    hand, start, grasp = plant.hand, _truth(seen), plant.snapshot()
-    states, rows = [start], [("at rest", *_moved(start, start), _forces(hand, seen))]
+    hand, start, grasp, axis = plant.hand, _truth(seen), plant.snapshot(), plant.rotation_axis
+    states, rows = [start], [("at rest", *_moved(start, start, axis), _forces(hand, seen))]
     for i, name in enumerate(hand.actuator_names):
         step = torch.zeros(hand.n_a, dtype=torch.float64)
         step[i] = _STEP
@@ -98,10 +98,10 @@ def _grasp(plant: SimulatedHand, seen: Observation) -> View:
         there = [_truth(one) for one in way]
         states += [*there, *reversed(there[:-1]), start]
         lost = ", lost" if way[-1].status is PlantStatus.LOST else ""
-        rows.append((name + lost, *_moved(start, there[-1]), _forces(hand, way[-1])))
+        rows.append((name + lost, *_moved(start, there[-1], axis), _forces(hand, way[-1])))
         plant.restore(grasp)
     moved = f"actuator, {_STEPS * math.degrees(_STEP):g} deg"
-    header = (moved, "object turned [deg]", "moved [mm]", "forces [N]")
+    header = (moved, "turned about its axis [deg]", "moved [mm]", "forces [N]")
     return View(f"{hand.name} holds {plant.object.name}", _scene(plant, states), header, tuple(rows))
 
 
@@ -188,9 +188,10 @@ def _truth(seen: Observation) -> GraspState:
     return seen.state if seen.truth is None else seen.truth.state
 
 
-def _moved(before: GraspState, after: GraspState) -> tuple[str, str]:
-    *_, x, y, z, a, b, c = after.minus(before).tolist()
-    return f"{math.degrees(math.hypot(a, b, c)):.1f}", f"{1e3 * math.hypot(x, y, z):.1f}"
+def _moved(before: GraspState, after: GraspState, axis: torch.Tensor) -> tuple[str, str]:
+    """Angle about ``axis`` [deg], with its sign, and distance [mm]."""
+    way = after.minus(before)
+    return f"{math.degrees(float(way[-3:] @ axis)):.1f}", f"{1e3 * float(way[-6:-3].norm()):.1f}"
 
 
 def _forces(hand: HandDescription, seen: Observation) -> str:

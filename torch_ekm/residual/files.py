@@ -82,6 +82,8 @@ def read(path: str | os.PathLike) -> tuple[dict[str, Any], dict[str, Any]]:
             return header["made_with"], {name: _unpack(one, tensors) for name, one in header["state"].items()}
     except (OSError, EKMError):
         raise
+    except zipfile.BadZipFile:
+        raise FileFormatError(path, "not written by torch_ekm.save, or cut short") from None
     except Exception as error:  # whatever a damaged file makes of zip, JSON and npy
         raise FileFormatError(path, f"cannot be read ({type(error).__name__}: {error})") from None
 

@@ -21,7 +21,7 @@ class ComparisonReport(Comparison):
         """One for each stream; of several streams an overview first."""
         tables = [score_table(self, stream.name) for stream in self.streams]
         units = [output_table(self, stream.name) for stream in self.streams if stream.outputs]
-        return [*([overview_table(self)] if len(tables) > 1 else []), *tables, *units]
+        return [overview_table(self), *tables, *units] if len(tables) > 1 else [*tables, *units]
 
     def __str__(self) -> str:
         return "\n".join([str(self.tables()[0]), *self.verdicts()])
@@ -39,7 +39,9 @@ class ComparisonReport(Comparison):
         for stream in (s.name for s in self.streams):
             shown, n = curve_learners(self, stream), len(self.learners)
             some = f": {len(shown)} of {n} learners" if len(shown) < n else ""
-            caption = f"{self.measure(stream)} error on {stream} over time, each sample predicted before it "
+            caption = (
+                f"The {self.measure(stream)} error on {stream} over time, each sample predicted before it "
+            )
             caption += f"is learned{some}."
             figure = plot_learning_curves(self, stream, shown)
             figures.append(save(figure, name=f"curve_{stream}", caption=caption))
@@ -51,6 +53,7 @@ class ComparisonReport(Comparison):
             tables=self.tables(),
             figures=figures,
             configuration={"learners": list(self.learners), "streams": streams},
+            leading=2 if len(self.streams) == 1 else 1,
         )
         report.write(Path(folder))
         return report
@@ -74,7 +77,8 @@ def score_table(comparison: Comparison, stream: str) -> Table:
     one = comparison.stream(stream)
     n, parts = len(one) - one.warm_up, len(one.segments)
     note = f"On {one.used}, of which {n} are scored{f' in {parts} parts' if parts else ''}; "
-    note += f"{one.x.shape[1]} inputs, {one.y.shape[1]} outputs. * best; below 1 a learner helps. "
+    d, m = one.x.shape[1], one.y.shape[1]
+    note += f"{d} inputs, {m} {'output' if m == 1 else 'outputs'}. * best; below 1 a learner helps. "
     note += f"95 % intervals; {measure} / best is paired: above 1 where its interval is. "
     note += "Median: of the absolute errors, insensitive to outliers; it decides where a hundredth of the "
     note += "rows makes more than half of the squared error. NLL: per sample and output. "
@@ -83,12 +87,14 @@ def score_table(comparison: Comparison, stream: str) -> Table:
 
 
 def output_table(comparison: Comparison, stream: str) -> Table:
-    """rms error of each output in the units of the file, of the few learners that curves are drawn of."""
+    """Error of each output in the units of the file, of the few learners that curves are drawn of."""
     one, shown = comparison.stream(stream), curve_learners(comparison, stream)
     columns = ["output", *(Column(name, ".3g") for name in shown)]
-    rms = np.transpose([comparison.output_errors(stream, name) for name in shown])
-    rows: list[list[Cell]] = [[name, *errors] for name, errors in zip(one.outputs, rms.tolist(), strict=True)]
-    return Table(f"outputs_{stream}", f"{stream}: rms errors in the units of the file", columns, rows)
+    errors = np.transpose([comparison.output_errors(stream, name) for name in shown]).tolist()
+    rows: list[list[Cell]] = [[name, *of] for name, of in zip(one.outputs, errors, strict=True)]
+    caption = f"{stream}: {comparison.measure(stream)} errors in the units of the file"
+    note = "All other errors are means over the outputs, each divided by its deviation in the first tenth."
+    return Table(f"outputs_{stream}", caption, columns, rows, note)
 
 
 def overview_table(comparison: Comparison) -> Table:

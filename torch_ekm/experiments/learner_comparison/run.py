@@ -121,6 +121,7 @@ def run_one(stream: Stream, factory: Factory) -> dict[str, Any]:
     return {
         "squared": [float(f"{value:.6g}") for value in _squared(run.error[start:])],
         "rms_of_outputs": run.error[start:].square().mean(0).sqrt().tolist(),
+        "median_of_outputs": run.error[start:].abs().quantile(0.5, dim=0).tolist(),
         "nll": run.nll(start),
         "coverage": float(run.coverage(start).mean()),
         "microseconds": 1e6 * run.seconds / len(stream),
@@ -168,7 +169,9 @@ def _job_name(stream: Stream, name: str, learner: ResidualLearner) -> str:
         made_with = describe(learner)
         first = run_prequential(learner, stream.x[:LEAST], stream.y[:LEAST], stream.segments)
     said = [f"{value:.6g}" for value in torch.cat([first.mean, first.deviation]).flatten().tolist()]
-    decides = hashlib.sha256(repr((name, stream.warm_up, stream.segments, made_with, said, "rms")).encode())
+    decides = hashlib.sha256(
+        repr((name, stream.warm_up, stream.segments, made_with, said, "outputs")).encode()
+    )
     for values in (stream.x, stream.y):
         decides.update(values.detach().cpu().numpy().tobytes())
     return re.sub(r"[^\w.+-]", "-", f"{stream.name}_{decides.hexdigest()[:8]}_{name}")

@@ -44,6 +44,8 @@ class Score:
     """Of the state dict."""
     rms_of_outputs: Sequence[float] = ()
     """rms error of each output, in the stream's units."""
+    median_of_outputs: Sequence[float] = ()
+    """Median of the absolute errors of each output, in the stream's units."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +81,10 @@ class Comparison:
         return score.rms if self.measure(stream) == "rms" else score.median
 
     def output_errors(self, stream: str, learner: str) -> Array:
-        """``(m,)``, rms error of each output in the units of the file, where these are known."""
-        return np.array(self.stream(stream).unit) * self.scores[stream, learner].rms_of_outputs
+        """``(m,)``, error of each output in the units of the file, by the stream's :meth:`measure`."""
+        score = self.scores[stream, learner]
+        errors = score.rms_of_outputs if self.measure(stream) == "rms" else score.median_of_outputs
+        return np.array(self.stream(stream).unit) * errors
 
     def stream(self, name: str) -> Stream:
         """The stream of that name, with its samples."""
@@ -152,7 +156,7 @@ class Comparison:
                 text += " The inputs give y: is what was measured among them?"
             text += stream.notes
             if sure := [score.learner for score in self.row(stream.name) if score.nll > _ABSURD]:
-                text += f" Errors far beyond the variance (NLL): {', '.join(sure)}; use no density of theirs."
+                text += f" Errors far beyond the stated variance (NLL): {', '.join(sure)}."
             sentences.append(text)
         return sentences
 
@@ -160,12 +164,14 @@ class Comparison:
         """What the best learner makes of the model's errors, where a sentence can hold it."""
         if best == "model alone" or not 0 < len(stream.outputs) <= _NAMED:
             return ""
-        rms = self.output_errors(stream.name, best)
-        alone = np.array(stream.unit) * stream.y[stream.warm_up :].square().mean(0).sqrt().numpy()
+        y, measure = stream.y[stream.warm_up :], self.measure(stream.name)
+        errors = self.output_errors(stream.name, best)
+        alone = y.square().mean(0).sqrt() if measure == "rms" else y.abs().quantile(0.5, dim=0)
+        alone = np.array(stream.unit) * alone.numpy()
         pairs = (
-            f"{name} {a:.3g}, alone {b:.3g}" for name, a, b in zip(stream.outputs, rms, alone, strict=True)
+            f"{name} {e:.3g}, alone {a:.3g}" for name, e, a in zip(stream.outputs, errors, alone, strict=True)
         )
-        return f" rms errors in the units of the file: {'; '.join(pairs)}."
+        return f" {measure} errors in the units of the file: {'; '.join(pairs)}."
 
 
 def rare_share(squared: Array) -> float:

@@ -105,7 +105,8 @@ def load_table(
         DescriptionError: the file cannot be used; the message names line and column. No target is named,
             and no column is called ``y``. A column is both input and target.
         UnknownNameError: there is no such column; the message lists the columns.
-        ParameterError: not one prediction for each target, or a recording of ROS without ``clock``.
+        ParameterError: not one prediction for each target, hardly two rows of a run, or a recording of ROS
+            without ``clock``.
     """
     names, read = open_table(Path(path), clock)
     wanted = inputs, targets, predicted, [run] if run else []
@@ -133,9 +134,11 @@ def load_table(
     about = f"{', '.join(outputs)} from {len(chosen)} columns of {Path(path).name}; alone: {alone}"
     number = np.pad(values[3][:limit].sum(1), 1, constant_values=np.nan)  # zeros without runs
     parts = np.diff(np.flatnonzero(np.diff(number))).tolist()
+    if runs and 3 * len(parts) > len(x[:limit]):
+        raise ParameterError("run", runs[0], "a column that is the same in all rows of a run")
     notes = _other_order(values[1], values[2], outputs, model) if len(model) > 1 else ""
     if clocks := [name for name, column in zip(chosen, x.T, strict=True) if _is_clock(column, len(parts))]:
-        notes += f" Like a clock or the number of a row: {', '.join(clocks)}; leave it out."
+        notes += f" Like a clock or the number of a row, to be left out: {', '.join(clocks)}."
     if numbers := [name for name, column in zip(chosen, x.T, strict=True) if _is_number_of_run(column)]:
         notes += f" Like the number of a run: {', '.join(numbers)}; name it by --run (run=), or leave it out."
     names = [f"{one} - {other}" for one, other in zip(outputs, model, strict=True)] if model else outputs
