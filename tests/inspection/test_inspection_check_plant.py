@@ -303,7 +303,7 @@ def test_the_command_checks_a_hand_on_a_bus(tmp_path) -> None:
         done = CliRunner().invoke(app, ["check", "--plant", str(path)])
         assert done.exit_code == 0, done.output
         assert "no sensors at the joints of left" in done.output
-        assert "2 motors go as commanded; without joint sensors" in done.output
+        assert "2 motors go as commanded; without" in done.output
         assert "and joints with them" not in done.output  # none has a sensor
         bus.catch_up()
         bus.goals.clear()
