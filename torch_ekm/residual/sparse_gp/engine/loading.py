@@ -14,7 +14,7 @@ from ....exceptions import SpeedWarning
 
 _OFF = "compiled loops are off, and learners take longer: {}; numba's folder is named by NUMBA_CACHE_DIR"
 _FIRST_TIME = (
-    "another process compiles loops, once and for some ten seconds; until then torch does the work, and "
+    "a process in the background compiles loops, once and for some ten seconds; until then torch works, and "
     "results may differ by rounding. torch_ekm.warm_up() waits for them"
 )
 
