@@ -103,9 +103,12 @@ class _Checked:
         if (self.test.misfit(readings) > _FITS).any():
             yield from self._explained(readings)
         elif not any(row.state == "error" for row in rows):
-            joints = ", and joints with them" if self.sensed.any() else "; without joint sensors their "
-            joints += "" if self.sensed.any() else "signs, order and units are not checked"
-            yield Check("wiring", "ok", f"{len(motions)} motors go as commanded{joints}")
+            found = f"{len(motions)} motors go as commanded"
+            if self.sensed.any():
+                found += ", and joints with them"
+            elif self.object is None or seen.status is not PlantStatus.HELD:
+                found += "; without joint sensors signs, order and units are not checked"
+            yield Check("wiring", "ok", found)
 
     # -- single readings ----------------------------------------------------------------------------
 
