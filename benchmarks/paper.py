@@ -1,6 +1,6 @@
 """Every figure and table of the paper, its numbers beside those found here.
 
-    python benchmarks/paper.py --seeds 1000:1010 --out FOLDER
+    python benchmarks/paper.py --seeds 1000:1020 --out FOLDER
 
 Numbers come from the other pages, or from folders that their runs left: ``--generalize``, ``--worn`` and
 ``--as-printed`` take either. Fig. 5 is made of sessions of ``torch-ekm reproduce online``: those that its
@@ -268,7 +268,7 @@ def main() -> None:
             f"--{name.replace('_', '-')}", type=Path, default=PAGES / f"{name}.md", help=about
         )
     parser.add_argument("--online", type=Path, help="the folder of 'torch-ekm reproduce online' [--out]")
-    parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1010"), help="FIRST:END")
+    parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1020"), help="FIRST:END")
     parser.add_argument("--out", type=Path, default=Path("paper_output"), help="keeps what is finished")
     parser.add_argument("--quick", action="store_true", help="small turns, two seeds: to see that it works")
     options = parser.parse_args()
