@@ -163,11 +163,8 @@ def test_explanations_that_fit_alike_are_alternatives(tmp_path) -> None:
 
 def test_at_rest_a_swap_that_fits_is_always_listed_and_nothing_else_is_judged(tmp_path) -> None:
     q, exchanged = torch.tensor([-0.342, 1.184, -0.367, 0.845]), torch.tensor([0.445, 0.813])
-    read = {
-        "q": q.double(),
-        "a": exchanged.double(),
-        "status": PlantStatus.HELD,
-    }  # a scale of a joint fits, too
+    # a scale of a joint fits, too
+    read = {"q": q.double(), "a": exchanged.double(), "status": PlantStatus.HELD}
 
     class Flipped(Spoilt):
         wiring = None  # a driver of one's own

@@ -80,9 +80,9 @@ def check(
     """
     from ..inspection.row import Check
 
-    if plant is not None and hand:
-        raise ParameterError("hand", hand, "left out: with --plant the wiring file names the hand")
     if plant is not None:
+        if hand:
+            raise ParameterError("hand", hand, "left out: with --plant the wiring file names the hand")
         from ..drivers import open_driver
         from ..inspection.check_plant import check_plant
 

@@ -147,7 +147,12 @@ class EnhancedModel(Recorded, nn.Module):
         return isinstance(getattr(self.learner, "kernel", None), ActionLinearKernel)
 
     def features(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_x"]:
-        """``x = [encode(s); action_scale * da]``."""
+        """``x = [encode(s); action_scale * da]``.
+
+        Raises:
+            ParameterError: the encoded state is no tensor, or the action none of floating-point numbers.
+            ShapeError: the learner takes another number of entries.
+        """
         scaled, encoded = self.action_scale * _checked_action(action), self.encode(state)
         if not isinstance(encoded, Tensor):
             raise ParameterError("state", type(encoded).__name__, "a tensor, or what encode= makes one of")

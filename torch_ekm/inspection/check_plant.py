@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -84,7 +84,8 @@ class _Checked:
             return
         yield from self._place(seen)
         blind = [n for n, found in zip(self.hand.actuator_names, self.test.rows, strict=True) if not found]
-        if blind and (self.object is None or seen.status is not PlantStatus.HELD):
+        watched = self.object is not None and seen.status is PlantStatus.HELD  # the object shows the signs
+        if blind and not watched:
             remedy = "look which way each goes, or check_plant(WithPose(...), hand, object) with an object"
             yield Check(
                 "signs", "warning", f"not checked: no sensors at the joints of {', '.join(blind)}", remedy
@@ -106,7 +107,7 @@ class _Checked:
             found = f"{len(motions)} motors go as commanded"
             if self.sensed.any():
                 found += ", and joints with them"
-            elif self.object is None or seen.status is not PlantStatus.HELD:
+            elif not watched:
                 found += "; without joint sensors signs, order and units are not checked"
             yield Check("wiring", "ok", found)
 
@@ -294,8 +295,8 @@ class _Checked:
 
     def _explained(self, readings: Readings) -> Iterator[Check]:
         """The single mistake that explains what was read, else two, or those that explain it alike."""
-        found = self._explanations(readings) or self._explanations(readings, pairs=True)
-        found.sort(key=lambda one: one[0])
+        singles = ((one,) for one in self.test.mistakes(readings))
+        found = self._fitting(singles) or self._fitting(self.test.pairs(readings))
         # a scale or a zero fits readings at rest by chance: a swap that fits is then listed, too
         alike = [
             one
@@ -316,20 +317,15 @@ class _Checked:
     def _places(self, mistake: Mistake) -> list[int]:
         return [getattr(self.hand, _NAMES[mistake.kind]).index(name) for name in mistake.names]
 
-    def _explanations(
-        self, readings: Readings, pairs: bool = False
-    ) -> list[tuple[float, tuple[Mistake, ...]]]:
-        """Single mistakes, or pairs of them, without which all readings fit: sum of squares, mistakes."""
+    def _fitting(self, candidates: Iterable[tuple[Mistake, ...]]) -> list[tuple[float, tuple[Mistake, ...]]]:
+        """Those without which all readings fit, with their sums of squares, the best first."""
         found = []
-        for number, first in enumerate(self.test.mistakes(readings)):
-            rest = list(self.test.mistakes(first.readings))[number + 1 :] if pairs else [None]
-            for second in rest:
-                mistakes = (first,) if second is None else (first, second)
-                misfit = self.test.misfit(mistakes[-1].readings)
-                if (misfit <= _FITS).all():
-                    score = float(np.square(misfit).sum()) + sum(one.penalty for one in mistakes)
-                    found.append((score, mistakes))
-        return found
+        for mistakes in candidates:
+            misfit = self.test.misfit(mistakes[-1].readings)
+            if (misfit <= _FITS).all():
+                score = float(np.square(misfit).sum()) + sum(one.penalty for one in mistakes)
+                found.append((score, mistakes))
+        return sorted(found, key=lambda one: one[0])
 
     def _unexplained(self, readings: Readings) -> Check:
         off = readings.a - self.hand.actuator_offset - self.hand.actuation_jacobian @ readings.q

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,6 +115,12 @@ class WiringTest:
                 yield Mistake(
                     kind, both, "id", "swapped", self._swapped(readings, kind, field, i, k), _TWO_ENTRIES
                 )
+
+    def pairs(self, readings: Readings) -> Iterator[tuple[Mistake, Mistake]]:
+        """Any two of these; the second has the readings without both."""
+        for number, first in enumerate(self.mistakes(readings), start=1):
+            for second in islice(self.mistakes(first.readings), number, None):
+                yield first, second
 
     def _swapped(self, readings: Readings, kind: str, field: str, i: int, k: int) -> Readings:
         """Each channel reads what the other one has read."""

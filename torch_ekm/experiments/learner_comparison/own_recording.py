@@ -57,8 +57,7 @@ class OwnRecording:
         That (20 to 200 samples) is not scored. Only x is centred: 0 is what the model says.
         """
         x, y = self.x.numpy(), self.y.numpy()
-        options = {"outputs": self.outputs, "centre_y": False, "ddof": 1}
-        return in_own_units(self.name, x, y, self.about, limit, **options)
+        return in_own_units(self.name, x, y, self.about, limit, outputs=self.outputs, centre_y=False, ddof=1)
 
 
 def load_own(

@@ -18,10 +18,12 @@ class ComparisonReport(Comparison):
     """A comparison that prints as a table and can be written."""
 
     def tables(self) -> list[Table]:
-        """One for each stream; of several streams an overview first."""
+        """One for each stream, and one of its outputs in the units of the file; of several streams an
+        overview first."""
         tables = [score_table(self, stream.name) for stream in self.streams]
         units = [output_table(self, stream.name) for stream in self.streams if stream.outputs]
-        return [overview_table(self), *tables, *units] if len(tables) > 1 else [*tables, *units]
+        overview = [overview_table(self)] if len(tables) > 1 else []
+        return [*overview, *tables, *units]
 
     def __str__(self) -> str:
         return "\n".join([str(self.tables()[0]), *self.verdicts()])
@@ -39,10 +41,8 @@ class ComparisonReport(Comparison):
         for stream in (s.name for s in self.streams):
             shown, n = curve_learners(self, stream), len(self.learners)
             some = f": {len(shown)} of {n} learners" if len(shown) < n else ""
-            caption = (
-                f"The {self.measure(stream)} error on {stream} over time, each sample predicted before it "
-            )
-            caption += f"is learned{some}."
+            caption = f"The {self.measure(stream)} error on {stream} over time, each sample predicted "
+            caption += f"before it is learned{some}."
             figure = plot_learning_curves(self, stream, shown)
             figures.append(save(figure, name=f"curve_{stream}", caption=caption))
         rows = {s.name: {"samples": len(s), "available": max(s.available, len(s))} for s in self.streams}

@@ -22,7 +22,7 @@ from ..learners import COMPARED, Factory, learner_factory
 from .prequential import run_prequential
 from .recordings import LIMIT, load_recording
 from .report import ComparisonReport
-from .scores import Score, block_bootstrap, blocks_of
+from .scores import Score, block_bootstrap, blocks_of, errors_of_outputs
 from .stream import LEAST, Stream
 
 
@@ -120,8 +120,7 @@ def run_one(stream: Stream, factory: Factory) -> dict[str, Any]:
     start = stream.warm_up
     return {
         "squared": [float(f"{value:.6g}") for value in _squared(run.error[start:])],
-        "rms_of_outputs": run.error[start:].square().mean(0).sqrt().tolist(),
-        "median_of_outputs": run.error[start:].abs().quantile(0.5, dim=0).tolist(),
+        "of_outputs": errors_of_outputs(run.error[start:]),
         "nll": run.nll(start),
         "coverage": float(run.coverage(start).mean()),
         "microseconds": 1e6 * run.seconds / len(stream),
@@ -170,7 +169,7 @@ def _job_name(stream: Stream, name: str, learner: ResidualLearner) -> str:
         first = run_prequential(learner, stream.x[:LEAST], stream.y[:LEAST], stream.segments)
     said = [f"{value:.6g}" for value in torch.cat([first.mean, first.deviation]).flatten().tolist()]
     decides = hashlib.sha256(
-        repr((name, stream.warm_up, stream.segments, made_with, said, "outputs")).encode()
+        repr((name, stream.warm_up, stream.segments, made_with, said, "of_outputs")).encode()
     )
     for values in (stream.x, stream.y):
         decides.update(values.detach().cpu().numpy().tobytes())

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..._extras import require
-from ...typing import Array
+from ...typing import Array, Float, Tensor
 from ..reporting.statistics import Estimate, bootstrap
 from .stream import Stream
 
@@ -42,10 +42,8 @@ class Score:
     """One prediction with deviation and one update."""
     kilobytes: float
     """Of the state dict."""
-    rms_of_outputs: Sequence[float] = ()
-    """rms error of each output, in the stream's units."""
-    median_of_outputs: Sequence[float] = ()
-    """Median of the absolute errors of each output, in the stream's units."""
+    of_outputs: Mapping[Measure, Sequence[float]] = field(default_factory=dict)
+    """rms error, and median of the absolute errors, of each output in the stream's units."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +80,7 @@ class Comparison:
 
     def output_errors(self, stream: str, learner: str) -> Array:
         """``(m,)``, error of each output in the units of the file, by the stream's :meth:`measure`."""
-        score = self.scores[stream, learner]
-        errors = score.rms_of_outputs if self.measure(stream) == "rms" else score.median_of_outputs
+        errors = self.scores[stream, learner].of_outputs[self.measure(stream)]
         return np.array(self.stream(stream).unit) * errors
 
     def stream(self, name: str) -> Stream:
@@ -164,14 +161,18 @@ class Comparison:
         """What the best learner makes of the model's errors, where a sentence can hold it."""
         if best == "model alone" or not 0 < len(stream.outputs) <= _NAMED:
             return ""
-        y, measure = stream.y[stream.warm_up :], self.measure(stream.name)
-        errors = self.output_errors(stream.name, best)
-        alone = y.square().mean(0).sqrt() if measure == "rms" else y.abs().quantile(0.5, dim=0)
-        alone = np.array(stream.unit) * alone.numpy()
+        measure, errors = self.measure(stream.name), self.output_errors(stream.name, best)
+        alone = np.array(stream.unit) * errors_of_outputs(stream.y[stream.warm_up :])[measure]
         pairs = (
             f"{name} {e:.3g}, alone {a:.3g}" for name, e, a in zip(stream.outputs, errors, alone, strict=True)
         )
         return f" {measure} errors in the units of the file: {'; '.join(pairs)}."
+
+
+def errors_of_outputs(error: Float[Tensor, "n m"]) -> dict[Measure, list[float]]:
+    """rms and median of the absolute errors of each output."""
+    medians = error.abs().quantile(0.5, dim=0)
+    return {"rms": error.square().mean(0).sqrt().tolist(), "median": medians.tolist()}
 
 
 def rare_share(squared: Array) -> float:

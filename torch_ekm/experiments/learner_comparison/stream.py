@@ -210,5 +210,7 @@ def in_own_units(
         return torch.from_numpy(away / unit), unit
 
     (inputs, _), (targets, unit) = units(x), units(y, centre_y)
-    stream = Stream(name, inputs, targets, warm_up, about=about, available=available)
-    return replace(stream, outputs=tuple(outputs), unit=tuple(unit.tolist())) if outputs else stream
+    outputs, unit = tuple(outputs), tuple(unit.tolist()) if outputs else ()
+    return Stream(
+        name, inputs, targets, warm_up, about=about, available=available, outputs=outputs, unit=unit
+    )
