@@ -16,7 +16,7 @@ from torch_ekm.experiments import Columns, compare, load_own
 from torch_ekm.experiments.learner_comparison.prequential import run_prequential
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
 from torch_ekm.experiments.learner_comparison.run import run_one
-from torch_ekm.experiments.learner_comparison.stream import in_own_units, load_table
+from torch_ekm.experiments.learner_comparison.stream import Stream, in_own_units, load_table
 from torch_ekm.experiments.learner_comparison.table_file import open_table
 from torch_ekm.experiments.learners import learner_factory
 from torch_ekm.residual import UpdateReport, ZeroResidual
@@ -154,6 +154,28 @@ def test_y_is_measured_less_predicted_and_runs_stand_for_themselves(tmp_path: Pa
     assert result.exit_code == 0, result.output
     assert "in 6 parts" in " ".join(result.output.split())
     assert isinstance(CliRunner().invoke(app, arguments).exception, ParameterError)
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_runs_may_have_names(tmp_path: Path, kind: str) -> None:
+    names = [("left", "2", "left", "0")[i // 15] for i in range(60)]  # no text is another's number
+    path = tmp_path / f"a.{kind}"
+
+    def stream() -> Stream:
+        if kind == "csv":
+            lines = [f"{a!r},{y!r},{run}" for (a, _, _, y), run in zip(table().tolist(), names, strict=True)]
+            path.write_text("\n".join(["a,y,run", *lines]))
+        else:
+            parquet, pyarrow = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("pyarrow")
+            columns = {"a": table()[:, 0], "y": table()[:, 3], "run": [name or None for name in names]}
+            parquet.write_table(pyarrow.table(columns), path)
+        return load_table(path, run="run")
+
+    assert stream().segments == (15,) * 4
+    assert stream().x.shape == (60, 1)
+    names[20] = ""
+    with pytest.raises(DescriptionError, match=r"2\d?, column 'run'.* is empty"):
+        stream()
 
 
 def test_zero_is_the_model_for_a_residual_in_any_form(tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ def compare(
     observation: Annotated[
         str, Option(help="In place of targets: columns whose next increments are predicted, from --inputs.")
     ] = "",
-    run_column: Annotated[str, Option("--run", help="Column with one number in each run.")] = "",
+    run_column: Annotated[str, Option("--run", help="Column with one number or text in each run.")] = "",
     clock: Annotated[
         str | None, Option(help="Of a ROS bag or MCAP: the topic whose messages set the rows.")
     ] = None,

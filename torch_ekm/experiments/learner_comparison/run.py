@@ -57,7 +57,7 @@ def compare(
         predicted: columns with what the model says of the targets, which are then what was measured.
         observation: in place of targets: columns whose increments are predicted, as :func:`load_own` does;
             from ``inputs``, or from themselves if none is named.
-        run: a column with one number in each run; learners get ``new_sequence()`` between runs.
+        run: a column with one number or text in each run; learners get ``new_sequence()`` between them.
         clock: the topic whose messages set the rows, in a recording of ROS.
         limit: only the first so many samples of a file or recording; None: all.
         folder: keeps what is finished, so that an interrupted comparison continues where it stopped. A result

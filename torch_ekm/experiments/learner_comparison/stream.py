@@ -98,7 +98,7 @@ def load_table(
         limit: only the first so many rows.
         inputs: columns to predict from; all others if none is named.
         predicted: what the model says of each target: y is target - predicted, and 0 is the model alone.
-        run: a column with one number in each run.
+        run: a column with one number or text in each run.
         clock: the topic whose messages set the rows, in a recording of ROS.
 
     Raises:
@@ -108,7 +108,7 @@ def load_table(
         ParameterError: not one prediction for each target, hardly two rows of a run, or a recording of ROS
             without ``clock``.
     """
-    names, read = open_table(Path(path), clock)
+    names, read = open_table(Path(path), clock, run)
     wanted = inputs, targets, predicted, [run] if run else []
     chosen, outputs, model, runs = (find_columns(columns, names) for columns in wanted)
     if model and len(model) != len(outputs):

@@ -20,13 +20,14 @@ _BAGS = (".mcap", ".db3", ".bag")
 Read = Callable[[Sequence[str]], Array]
 
 
-def open_table(path: Path, clock: str | None = None) -> tuple[Names, Read]:
+def open_table(path: Path, clock: str | None = None, label: str = "") -> tuple[Names, Read]:
     """Column names, and a function that reads some of the columns, rows in the order of time.
 
     CSV (``.csv``, ``.tsv``, ``.txt``): UTF-8, separated by comma, semicolon or tab; the first line names the
     columns, every other field is a number with a decimal point. Parquet (``.parquet``): every column is
     numeric. Nothing may be missing: a learner cannot guess what a hole means. Columns that are not read may
-    hold anything; a first one without a name, which pandas writes as its index, is skipped.
+    hold anything; a first one without a name, which pandas writes as its index, is skipped. In the column
+    ``label`` each text counts as a number of its own.
 
     A recording of ROS (MCAP, sqlite3, .bag, the folder of rosbag2) has a row for each message of the topic
     ``clock``.
@@ -50,7 +51,7 @@ def open_table(path: Path, clock: str | None = None) -> tuple[Names, Read]:
         raise DescriptionError(path, "there is no such file")
     if kind not in readers:
         raise DescriptionError(path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet")
-    names, read = readers[kind](path)
+    names, read = readers[kind](path, label)
     names = names[1:] if names[:1] == ("",) else names
     for i, name in enumerate(names):
         if not name:
@@ -78,7 +79,7 @@ def find_columns(wanted: str | Sequence[str], names: Sequence[str]) -> list[str]
     return found
 
 
-def _csv(path: Path) -> tuple[Names, Read]:
+def _csv(path: Path, label: str) -> tuple[Names, Read]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -97,6 +98,11 @@ def _csv(path: Path) -> tuple[Names, Read]:
         if len(row) != len(names):
             problem = f"has {len(row)} fields, but the header names {len(names)} columns"
             raise DescriptionError(path, f"line {line} {problem}")
+    if label in names:
+        place = names.index(label)
+        numbers = _numbers([row[place] for _, row in rows[1:]])
+        for (_, row), number in zip(rows[1:], numbers, strict=True):
+            row[place] = number
     return tuple(names), partial(_csv_values, path, names, rows[1:])
 
 
@@ -124,6 +130,15 @@ def _csv_values(
     return values
 
 
+def _numbers(texts: Sequence[str | None]) -> list[str]:
+    """As they are if all are figures; else each text gets a number, and what is empty stays empty."""
+    known = [text or "" for text in texts]
+    if all(_number(text) is not None for text in known if text):
+        return known
+    number_of = {text: str(number) for number, text in enumerate(dict.fromkeys(filter(None, known)))}
+    return [number_of.get(text, "") for text in known]
+
+
 def _number(field: str) -> float | None:
     try:
         return float(field)
@@ -131,7 +146,7 @@ def _number(field: str) -> float | None:
         return None
 
 
-def _parquet(path: Path) -> tuple[Names, Read]:
+def _parquet(path: Path, label: str) -> tuple[Names, Read]:
     parquet, pyarrow = require("pyarrow.parquet"), require("pyarrow")
     try:
         table = parquet.read_table(path)
@@ -140,6 +155,9 @@ def _parquet(path: Path) -> tuple[Names, Read]:
 
     def values(name: str) -> Array:
         column = table.column(name)
+        if name == label and pyarrow.types.is_string(column.type):
+            numbers = _numbers(column.to_pylist())
+            column = pyarrow.chunked_array([[float(number) if number else None for number in numbers]])
         kind = column.type
         if not (pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind)):
             problem = f"holds {kind}, not numbers; leave it out or encode it"
