@@ -12,7 +12,6 @@ import annotations as shapes  # beside this file
 import coarse_time
 import hypothesis
 import jaxtyping
-import pinches  # beside this file
 import pytest
 import torch
 
@@ -33,7 +32,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_finish() -> None:
-    pinches.install()
     from torch_ekm import warm_up  # behind the hook above
 
     warm_up()  # tests of bits must not depend on when loops are compiled
@@ -71,7 +69,14 @@ def unchecked(_checks_begin_again):
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
+class _NothingIsKnown(dict):
+    def __contains__(self, key: object) -> bool:
+        return False
+
+
 @pytest.fixture
 def planned_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """No pinch comes from an earlier grasp: the test compares a run with its repetition."""
-    monkeypatch.setattr(pinches, "remembers", False)
+    from torch_ekm.simulation.grasp_planning import remembered
+
+    monkeypatch.setattr(remembered, "_plans", _NothingIsKnown())

@@ -15,7 +15,7 @@ from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
-from torch_ekm.simulation.grasp_planning import pinch
+from torch_ekm.simulation.grasp_planning import pinch, remembered
 from torch_ekm.simulation.grasp_planning.pinch import (
     opposing_pads,
     pinch_problem,
@@ -23,6 +23,7 @@ from torch_ekm.simulation.grasp_planning.pinch import (
     turning_axis,
 )
 from torch_ekm.simulation.grasp_planning.pinch_problem import PinchRequest
+from torch_ekm.simulation.grasp_planning.remembered import remembered_pinch
 from torch_ekm.simulation.mechanism.assembly import make_transmission
 
 G = 9.81
@@ -193,3 +194,26 @@ def test_an_object_that_no_pinch_holds_is_refused_once(tmp_path, monkeypatch):
     with pytest.raises(EquilibriumError, match="too small"):
         plant.reset(1)
     assert len(descents) == often
+
+
+@pytest.mark.usefixtures("planned_anew")
+def test_a_known_pinch_is_that_which_would_be_planned(monkeypatch):
+    wanted, planned, plan = PinchRequest(along=0.004), [], pinch.plan_pinch
+    anew = plan(with_range(0.0, 150 * DEG), wanted)
+    monkeypatch.setattr(remembered, "_plans", {})
+    monkeypatch.setattr(remembered, "plan_pinch", lambda *what: planned.append(1) or plan(*what))
+    first = remembered_pinch(with_range(0.0, 150 * DEG), wanted)
+    for values in vars(first).values():
+        if isinstance(values, np.ndarray):
+            values += 1.0  # whoever has it may change it
+    again = remembered_pinch(with_range(0.0, 150 * DEG), wanted)
+    assert len(planned) == 1
+    for name, values in vars(anew).items():
+        np.testing.assert_array_equal(values, getattr(again, name))
+    remembered_pinch(with_range(0.0, 150 * DEG), PinchRequest(along=0.005))
+    remembered_pinch(with_range(0.0, 149 * DEG), wanted)
+    assert len(planned) == 3
+    monkeypatch.setattr(remembered, "_MOST", 3)
+    remembered_pinch(with_range(0.0, 148 * DEG), wanted)  # takes the place of the oldest
+    remembered_pinch(with_range(0.0, 150 * DEG), wanted)
+    assert len(planned) == 5

@@ -16,8 +16,9 @@ from ..kinematics import GraspState
 from ..plant import Observation, PlantStatus, Stamps, Truth
 from ..typing import Array, Float, Tensor
 from .config import PlantConfig
-from .grasp_planning.pinch import PinchPlan, exists, pinch_hint, pinch_problem, plan_pinch
+from .grasp_planning.pinch import PinchPlan, exists, pinch_hint, pinch_problem
 from .grasp_planning.pinch_problem import PinchRequest
+from .grasp_planning.remembered import remembered_pinch
 from .mechanism.assembly import true_hand, true_object
 from .parameters import PlantParameters
 from .physics.rig import COMMAND_TIME, Rig, RigState, changes_transmission
@@ -130,7 +131,7 @@ class SimulatedHand:
         for _ in range(_ATTEMPTS):
             request = self._request()
             try:
-                plan = plan_pinch(self._problem, request)
+                plan = remembered_pinch(self._problem, request)
             except EquilibriumError as refused:
                 unplanned += 1
                 if unplanned == 2 or not self._graspable(request, refused):
