@@ -41,7 +41,7 @@ def check_positive(name: str, value: float) -> float:
     """``value`` as a positive finite float, or ParameterError."""
     try:
         good = math.isfinite(value) and value > 0
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         good = False
     if not good:
         raise ParameterError(name, value, "positive and finite")
@@ -50,7 +50,11 @@ def check_positive(name: str, value: float) -> float:
 
 def check_fraction(name: str, value: float) -> float:
     """``value`` as a float in (0, 1], or ParameterError."""
-    if not 0 < value <= 1:
+    try:
+        good = 0 < value <= 1
+    except TypeError:
+        good = False
+    if not good:
         raise ParameterError(name, value, "in (0, 1]")
     return float(value)
 

@@ -163,7 +163,7 @@ def check_state(module: nn.Module, state: Mapping[str, Any]) -> None:
             counts below 0, or of a learner that was made otherwise.
     """
     own = module.state_dict()
-    wrong = _made_otherwise(module, own, state) or ill_formed(own, state) or _impossible(module, own, state)
+    wrong = _made_otherwise(module, own, state) or ill_formed(own, state) or _impossible(module, state)
     if wrong:
         raise StateMismatchError(wrong)
 
@@ -218,7 +218,7 @@ def _ill_formed_values(name: str, ours: Any, theirs: Any) -> list[str]:
     return []
 
 
-def _impossible(module: nn.Module, own: Mapping[str, Any], state: Mapping[str, Any]) -> list[str]:
+def _impossible(module: nn.Module, state: Mapping[str, Any]) -> list[str]:
     """Entries of the right form, with values that no module of this package comes to."""
     wrong: list[str] = []
     for prefix, one in module.named_modules():

@@ -12,8 +12,9 @@ from typing import Any
 
 __all__ = [
     "BusError", "CalibrationError", "CommandRefusedError", "DescriptionError", "DeviceError", "EKMError",
-    "EquilibriumError", "FileFormatError", "FolderInUseError", "GraspError", "JointMismatchError",
-    "MissingExtraError", "NeverAtRestError", "NoContactError", "NoDerivativeError", "NoStateError",
+    "EquilibriumError", "FileFormatError", "FolderInUseError", "GraspEndsError", "GraspError",
+    "JointMismatchError", "MissingExtraError", "NeverAtRestError", "NoContactError", "NoDerivativeError",
+    "NoStateError",
     "NonFiniteError", "NonMonotoneFitError", "ObjectLostError", "OutputError", "ParameterError",
     "PenetrationError", "ShapeError", "SingularGraspError", "SolverError", "SpeedWarning",
     "StaleReadingError", "StateMismatchError", "UnknownNameError", "UnstableGraspError", "WorkerDiedError",
@@ -245,7 +246,7 @@ class StateMismatchError(EKMError, RuntimeError):
 
 
 class NoStateError(EKMError, TypeError):
-    """A learner cannot be saved as plain figures.
+    """A learner cannot be saved as plain values.
 
     Attributes:
         learner: its kind.
@@ -253,7 +254,7 @@ class NoStateError(EKMError, TypeError):
 
     def __init__(self, learner: str, reason: str) -> None:
         self.learner = learner
-        super().__init__(f"{learner} cannot be saved as plain figures: {reason}")
+        super().__init__(f"{learner} cannot be saved as plain values: {reason}")
 
 
 class FileFormatError(EKMError, ValueError):

@@ -98,3 +98,11 @@ def test_scaling_scales_the_distance():
     np.testing.assert_allclose(
         signed_distance((shape.scaled(1.2),), 1.2 * points)[0], 1.2 * signed_distance((shape,), points)[0]
     )
+
+
+def test_on_the_axis_of_a_cylinder_a_normal_is_given():
+    long = Shape("cylinder", (0.02, 0.1), np.eye(4))
+    distance, normal = signed_distance((long,), np.zeros((2, 3)))
+    np.testing.assert_allclose(distance, -0.02)
+    np.testing.assert_array_equal(normal, [[1, 0, 0]] * 2)
+    np.testing.assert_array_equal(signed_distance((long,), np.zeros(3))[1], [1, 0, 0])

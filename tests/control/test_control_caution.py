@@ -305,3 +305,10 @@ def test_the_pace_of_a_model_that_does_not_learn_stays_1() -> None:
 def test_figures_outside_their_range_are_refused(kind, figures) -> None:
     with pytest.raises(ParameterError, match=next(iter(figures))):
         kind(**figures)
+
+
+def test_a_pace_outside_its_range_is_named() -> None:
+    with pytest.raises(ParameterError, match=r"smallest = -1.0 .* above 0"):
+        TrustRegion(smallest=-1.0)
+    with pytest.raises(ParameterError, match=r"start = 3.0 .* between 0.5 and 2"):
+        TrustRegion(start=3.0)

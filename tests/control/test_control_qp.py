@@ -90,6 +90,10 @@ def test_bad_problem_is_refused() -> None:
         build_qp(2, [Squares(np.eye(2), np.zeros(1))])
     with pytest.raises(ShapeError, match="h of Inequality"):
         build_qp(2, [Inequality(np.eye(2), np.zeros((2, 1)))])
+    with pytest.raises(ShapeError, match=r"upper of Bounds must have shape \(2,\), got \(3,\)"):
+        build_qp(2, [Bounds(np.zeros(2), np.ones(3))])
+    with pytest.raises(ParameterError, match="lower of Bounds = 'NaN'"):
+        build_qp(2, [EFFORT, Bounds(np.array([np.nan, 0.0]), np.ones(2))])
     with pytest.raises(ParameterError, match="unit of Squares"):
         build_qp(2, [Squares(np.eye(2), np.zeros(2), unit=0.0)])
 

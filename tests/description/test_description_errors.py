@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
 import re
 import tempfile
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torch_ekm.description import load_hand, load_object
+from torch_ekm.description.transmission_file import document
 from torch_ekm.exceptions import DescriptionError, EKMError, JointMismatchError, UnknownNameError
 
 HAND, BOX = load_hand("planar_two_finger"), load_object("box")
@@ -229,3 +232,20 @@ def test_damaged_files_never_raise_anything_else(which: bool, at: float, junk: s
 def test_unknown_object() -> None:
     with pytest.raises(UnknownNameError, match="toothpaste, applier, box, weighted_box, bottle, can"):
         load_object("banana")
+
+
+def test_a_table_that_is_none_is_named(files: tuple[Path, Path]) -> None:
+    urdf, transmission = files
+    text = transmission.read_text()
+    before = text.split("[[pads]]")[0]
+    assert before != text
+    transmission.write_text("pads = 3\n" + before)
+    with pytest.raises(DescriptionError, match=r"'pads' must be written as \[\[pads\]\]"):
+        load_hand(urdf)
+
+
+def test_a_date_stays_a_date(tmp_path: Path) -> None:
+    path = tmp_path / "dated.toml"
+    notes = {"notes": {"measured": datetime.date(2026, 1, 15)}}
+    path.write_text(document(notes))
+    assert tomllib.loads(path.read_text()) == notes

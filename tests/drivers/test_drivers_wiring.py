@@ -75,3 +75,12 @@ def test_a_motor_that_is_missing_and_a_file_that_is_not_there(tmp_path) -> None:
         open_driver(write(tmp_path, change='"dynamixel"|"mine"'))
     with pytest.raises(ParameterError, match="rate"):
         Limits(rate=0.0)
+
+
+def test_an_mjcf_next_to_the_file_is_its_hand(tmp_path) -> None:
+    pytest.importorskip("mujoco")
+    (tmp_path / "hand.xml").write_text("<mujoco><worldbody/></mujoco>")
+    with pytest.raises(
+        DescriptionError, match=re.escape(str(tmp_path / "hand."))
+    ):  # found, and without joints
+        read(write(tmp_path, T42.replace("yale_t42", "hand.xml")))

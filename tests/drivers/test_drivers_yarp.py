@@ -96,7 +96,7 @@ def test_a_port_that_is_not_there_is_named(yarp, tmp_path) -> None:
     [
         (b"[fail]\r\n", "answers"),
         (b"[is] encs (1.0 nan) [ok]\r\n", "no numbers"),
-        (b"[is] encs (1.0 2.0) 1.5 [ok]\r\n", "has 2 axes, .*needs 15|answers"),
+        (b"[is] encs (1.0 2.0) 1.5 [ok]\r\n", "has 2 axes, .*needs 16|answers"),
         (b"[is] encs (1.0\r\n", "answers"),
         (b"", "TimeoutError"),
     ],

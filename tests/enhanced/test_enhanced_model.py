@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -17,7 +19,13 @@ from torch_ekm.exceptions import (
 )
 from torch_ekm.kinematics.grasp_state import GraspState
 from torch_ekm.kinematics.se3 import exp
-from torch_ekm.residual import ActionLinearKernel, MixtureResidual, ReplayMLP, SparseOnlineGP
+from torch_ekm.residual import (
+    ActionLinearKernel,
+    MixtureResidual,
+    RecursiveLeastSquares,
+    ReplayMLP,
+    SparseOnlineGP,
+)
 
 N_S, N_A = 3, 2
 
@@ -276,3 +284,16 @@ def test_arguments_are_checked(wrong: dict) -> None:
     given = {"model": model, "learner": SparseOnlineGP(N_S + N_A, 3, capacity=4), **wrong}
     with pytest.raises(ParameterError, match=next(iter(wrong))):
         EnhancedModel(given.pop("model"), given.pop("learner"), **given)
+
+
+def test_a_linearized_model_has_the_dtype_of_the_action() -> None:
+    class Linear:
+        def linearize(self, state: torch.Tensor) -> SimpleNamespace:
+            return SimpleNamespace(manipulation_jacobian=torch.eye(2, dtype=torch.float64))
+
+        def __call__(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+            return action
+
+    model = EnhancedModel(Linear(), RecursiveLeastSquares(4, 2, dtype=torch.float32))
+    value, jacobian = model.linearize(torch.zeros(2), torch.ones(2))
+    assert value.dtype == jacobian.dtype == torch.float32

@@ -107,6 +107,7 @@ def test_bad_input_is_refused_bit_for_bit(unchecked) -> None:
     [
         ({"prior": [1.0, -1.0, 2.0]}, "prior"),
         ({"prior": torch.tensor([[1.0, 2.0], [2.0, 1.0]])}, "prior"),
+        ({"prior": torch.tensor([[1.0, 5.0], [0.0, 1.0]])}, "prior"),
         ({"start": [0.0]}, "start"),
         ({"lower": [1.0, -1.0]}, "start"),
         ({"upper": [math.nan, 1.0]}, "upper"),
@@ -173,3 +174,9 @@ def test_a_model_without_derivative_by_theta_is_refused() -> None:
         f.adapt(torch.zeros(1), torch.ones(1), torch.ones(1))
     with pytest.raises(ParameterError, match="noise_std"):
         AdaptiveModel(pendulum, theta, 0.0)
+
+
+def test_a_noise_of_another_width_is_named() -> None:
+    model = AdaptiveModel(lambda s, a, theta: theta * a, made(), noise_std=[0.1, 0.1, 0.1])
+    with pytest.raises(ShapeError, match="noise_std"):
+        model.adapt(torch.zeros(1), torch.ones(2, dtype=F64), torch.ones(2, dtype=F64))

@@ -34,6 +34,7 @@ def write(path: Path, values: np.ndarray, names: str = "a,b,c,y") -> Path:
 GOOD = "1,2,3\n" * 50
 BROKEN = {
     "text": ("a,b,y\n1,2,3\n4,wood,6\n", r"line 3, column 'b': 'wood' is no number"),
+    "a line of holes": ("a,b,y\n1,2,3\n,,\n4,5,6\n", r"line 3, column 'a' is empty"),
     "missing": ("a,b,y\n1,2,3\n4,,6\n", r"line 3, column 'b' is empty"),
     "nan": ("a,b,y\n1,2,3\n4,nan,6\n", r"line 3, column 'b': 'nan' is not finite"),
     "decimal comma": ("a;b;y\n1,5;2;3\n" * 2, r"line 2, column 'a': '1,5' has a decimal comma"),
@@ -167,8 +168,8 @@ def test_runs_may_have_names(tmp_path: Path, kind: str) -> None:
             path.write_text("\n".join(["a,y,run", *lines]))
         else:
             parquet, pyarrow = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("pyarrow")
-            columns = {"a": table()[:, 0], "y": table()[:, 3], "run": [name or None for name in names]}
-            parquet.write_table(pyarrow.table(columns), path)
+            runs = pyarrow.array([name or None for name in names], pyarrow.large_string())
+            parquet.write_table(pyarrow.table({"a": table()[:, 0], "y": table()[:, 3], "run": runs}), path)
         return load_table(path, run="run")
 
     assert stream().segments == (15,) * 4
@@ -327,6 +328,7 @@ def test_icub_grasp_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert recording.segments == (18, 18, 18)
     assert recording.x.shape == (54, 23)
     torch.testing.assert_close(recording.y, torch.ones(54, 9, dtype=torch.float64))  # 10 deg a step, unit 10
+    assert load_recording("icub_grasp", limit=20).used == "the first 36 of 54 rows"
     firsts = recording.x[::18, 0] * 30.0
     assert firsts.tolist() == pytest.approx([11.0, 12.0, 20.0])  # trials 1, 2, 10 in this order
 

@@ -24,6 +24,7 @@ from torch_ekm.exceptions import ParameterError
 from torch_ekm.interop import to_casadi
 from torch_ekm.residual import (
     ActionLinearKernel,
+    DeepKernel,
     LinearKernel,
     Matern32,
     Matern52,
@@ -159,3 +160,13 @@ def test_casadi_names_what_it_cannot_say() -> None:
         to_casadi(RecursiveLeastSquares(3, 2))
     with pytest.raises(ParameterError, match="one model"):
         to_casadi(SparseOnlineGP(3, 2, batch_shape=(2,)))
+
+
+def test_casadi_takes_no_subclass_for_its_base() -> None:
+    class Flat(SquaredExponential):
+        def phi(self, d2: torch.Tensor) -> torch.Tensor:
+            return torch.ones_like(d2)
+
+    kernel = DeepKernel(Flat(1), hidden=(2,), features=1)
+    with pytest.raises(ParameterError, match=r"Flat.*no subclass"):
+        to_casadi(SparseOnlineGP(1, 1, kernel=kernel))

@@ -12,6 +12,8 @@ import torch
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
 from torch_ekm.interop import log_to_mcap, read_bag
+from torch_ekm.interop.bags import _numbers
+from torch_ekm.interop.mcap_log import _multi_array
 from torch_ekm.kinematics import se3
 from torch_ekm.plant import Observation, PlantStatus, Trajectory, TrialLog, Truth
 
@@ -138,3 +140,12 @@ def test_other_topics_stand_as_they_were_last_heard(kind: str, tmp_path: Path) -
     (tmp_path / "broken.mcap").write_bytes(b"not a recording")
     with pytest.raises(DescriptionError, match="cannot be read"):
         read_bag(tmp_path / "broken.mcap", clock="/command")
+
+
+def test_strides_of_a_layout_count_all_later_sizes() -> None:
+    layout = _multi_array("std_msgs/msg/UInt8MultiArray", np.zeros((4, 5, 3), np.uint8)).layout
+    assert [(one.size, one.stride) for one in layout.dim] == [(4, 60), (5, 15), (3, 3)]
+
+
+def test_switches_of_a_message_are_numbers() -> None:
+    assert dict(_numbers(np.array([True, False]), "on")) == {"on[0]": 1.0, "on[1]": 0.0}

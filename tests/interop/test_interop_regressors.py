@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torch_ekm import LearnHyperparameters, SparseOnlineGP, Standardize, interop
-from torch_ekm.exceptions import MissingExtraError, ParameterError, ShapeError
+from torch_ekm.exceptions import MissingExtraError, NonFiniteError, ParameterError, ShapeError
 from torch_ekm.interop import OnlineRegressor, as_river
 from torch_ekm.interop.online_regressor import make_learner
 
@@ -107,3 +107,20 @@ def test_predictions_are_those_of_the_learner() -> None:
     assert np.allclose(deviation, law.stddev.numpy(), rtol=1e-9)
     low, high = regressor.interval(x, 0.95)
     assert np.allclose(high - low, 2 * 1.959963984540054 * deviation, rtol=1e-12)
+
+
+def test_a_refused_sample_of_a_stream_changes_nothing() -> None:
+    regressor = as_river(small(2, 1))
+    regressor.learn_one({"a": 1.0, "b": 2.0}, 1.0)
+    for x in ({"a": np.nan, "b": 2.0}, {"a": np.inf, "b": 2.0}):
+        with pytest.raises(NonFiniteError):
+            regressor.learn_one(x, 1.0)
+    regressor.learn_one({"b": 2.0}, 1.0)  # a is put at its mean, 1
+    assert regressor.predict_one({"b": 2.0}) == regressor.predict_one({"a": 1.0, "b": 2.0})
+
+
+def test_a_first_target_that_is_skipped_is_not_the_offset() -> None:
+    regressor = OnlineRegressor(SparseOnlineGP(1, 1, on_invalid="skip"))
+    regressor.learn(np.zeros(1), np.array([np.nan]))
+    regressor.learn(np.zeros(1), np.array([5.0]))
+    assert regressor.predict(np.zeros((1, 1)))[0][0, 0] == pytest.approx(5.0)

@@ -18,6 +18,7 @@ from torch_ekm.description import Shape, load_hand, load_object
 from torch_ekm.exceptions import NonFiniteError, ShapeError, SingularGraspError
 from torch_ekm.kinematics import GraspState, HandKinematics
 from torch_ekm.model import KinematicModel, ModelOptions, ModelStatus
+from torch_ekm.model.validity import _of_missing_forces
 
 
 def kinds(lin):
@@ -179,6 +180,9 @@ def test_the_name_of_the_actuator_that_cannot_move():
             rebuilt(toy, options=options, actuation_jacobian=doubled, actuators=actuators).linearize(
                 toy.state
             )
+        moved = dataclasses.replace(toy.state, q=toy.state.q.clone().requires_grad_())
+        with pytest.raises(SingularGraspError, match=r"actuator '[ps]' cannot move alone"):
+            rebuilt(toy, options=options, actuation_jacobian=doubled, actuators=actuators).linearize(moved)
 
 
 @pytest.mark.parametrize("toy", [three_finger, soft_two_finger])
@@ -224,3 +228,11 @@ def test_a_batch_is_judged_by_its_worst_state():
     lin = rebuilt(toy, options=options).linearize(states, contacts)
     doubt = next(d for d in lin.doubts if d.kind is ModelStatus.UNEXPLAINED_TORQUE)
     assert doubt.value == pytest.approx(float(lin.forces.residual.norm(dim=-1).max()))
+
+
+def test_forces_of_a_solver_that_failed_are_unknown():
+    toy = three_finger()
+    failed = dataclasses.replace(toy.forces(), violation=torch.full((), torch.nan))
+    message = _of_missing_forces(failed, reused=False).message
+    assert "nan" not in message
+    assert "the contact forces are unknown: the step leaves out their stiffness" in message

@@ -215,3 +215,18 @@ def test_bad_input_changes_nothing_and_a_state_dict_carries_all() -> None:
     other.update(v, w)
     plant.servo.update(v, w)
     assert torch.equal(other.estimate, plant.servo.estimate)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("delta_a", "error"),
+    [([math.nan] * 3, NonFiniteError), ([0.1], ShapeError), ([0.1] * 4, ShapeError), (0.1, ShapeError)],
+)
+def test_a_wrong_increment_moves_nothing(delta_a, error: type[Exception]) -> None:
+    servos = Servos()
+    plant = ServoInverse(servos, HAND)
+    before = {name: value.clone() for name, value in plant.servo.named_buffers()}
+    with pytest.raises(error, match="delta_a"):
+        plant.command(torch.tensor(delta_a, dtype=torch.float64))
+    assert not servos.a.any()
+    assert all(torch.equal(value, before[name]) for name, value in plant.servo.named_buffers())

@@ -9,7 +9,7 @@ import torch
 from fakes import FakePlant
 
 from torch_ekm.exceptions import NonFiniteError, ParameterError
-from torch_ekm.plant import Observation, Plant, PlantWrapper, Truth
+from torch_ekm.plant import Observation, Plant, PlantWrapper, RecordingPlant, ReplayedPlant, Truth
 
 EYE, ORIGIN = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
 
@@ -78,3 +78,20 @@ def test_an_array_where_a_tensor_is_expected_is_named() -> None:
         with pytest.raises(ParameterError, match=r"Observation\.q = .*it must be a torch tensor"):
             dataclasses.replace(seen, q=value)
     assert dataclasses.replace(seen, fingertip_force=None).fingertip_force is None
+
+
+def test_what_is_recorded_in_mid_grasp_can_be_replayed() -> None:
+    inner = Counter()
+    inner.reset(3)
+    plant = RecordingPlant(inner)
+    plant.command(torch.tensor(2))
+    assert [int(seen.q[0]) for seen in plant.trajectory.observations] == [3, 5]
+    again = ReplayedPlant(plant.trajectory)
+    assert int(again.observe().q[0]) == 3
+    assert int(again.command(torch.tensor(2)).q[0]) == 5
+    with pytest.raises(ParameterError, match="command = 2 is not valid; it must be at most 1"):
+        again.command(torch.tensor(2))
+    looked = RecordingPlant(inner)
+    looked.observe()
+    looked.observe()
+    assert len(looked.trajectory.observations) == 1

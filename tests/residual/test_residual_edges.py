@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import copy
 import itertools
+from collections.abc import Callable
 
 import pytest
 import torch
 from as_published import deep_sogp, sogp
 
+from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.residual import (
     ActionLinearKernel,
@@ -20,6 +22,7 @@ from torch_ekm.residual import (
     ProcessNoise,
     RandomFeatureRLS,
     RecursiveLeastSquares,
+    ReplayMLP,
     RobustWeight,
     SparseOnlineGP,
     SquaredExponential,
@@ -275,3 +278,41 @@ def test_masks_may_be_lists_of_bools_only():
     assert report.accepted.tolist() == [True, False]
     with pytest.raises(ShapeError, match="int64"):
         gp.update(x[0], y[0], [1, 0])
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: RecursiveLeastSquares(1, 1, forgetting_factor="0.9"), "factor"),
+        (lambda: ForgettingFactor(None), "factor"),
+        (lambda: ProcessNoise("a"), "share"),
+        (lambda: ProcessNoise(1.0), "share"),
+        (lambda: RobustWeight(10**400), "threshold"),
+        (lambda: MixtureResidual(ZeroResidual(1, 1), levels=(0.0,), trends=(0.5,)), "trends"),
+        (lambda: EnhancedModel(torch.add, ZeroResidual(1, 1), action_scale="2"), "action_scale"),
+        (lambda: EnhancedModel(torch.add, ZeroResidual(1, 1), output_scale=None), "output_scale"),
+    ],
+)
+def test_arguments_of_another_kind_are_named(make: Callable[[], object], named: str) -> None:
+    with pytest.raises(ParameterError, match=named):
+        make()
+
+
+def test_a_seed_may_be_a_time() -> None:
+    learner = ReplayMLP(1, 1, seed=2**60, hidden=(4,), members=1)
+    learner.update(torch.zeros(1), torch.ones(1))
+    assert int(learner.count) == 1
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7, 12, 32, 40])
+def test_as_many_gradient_steps_as_asked_for(steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+    descend = LearnHyperparameters.descend
+    monkeypatch.setattr(
+        LearnHyperparameters, "descend", lambda *what, **how: made.append(1) or descend(*what, **how)
+    )
+    learner = SparseOnlineGP(1, 1, refresh_every=32, parts=[LearnHyperparameters(steps=steps)])
+    for x in torch.linspace(-1, 1, 64)[:, None]:
+        learner.update(x, x.sin())
+    assert len(made) == 2 * min(steps, 32)

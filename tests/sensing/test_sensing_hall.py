@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -363,3 +364,14 @@ def test_estimator_refuses_what_does_not_fit(hand, generator):
         estimator(torch.full((15,), 100.0), torch.zeros(4))
     with pytest.raises(NonFiniteError, match="actuators"):
         estimator(torch.full((15,), 100.0), torch.full((hand.n_a,), torch.inf))
+
+
+def test_couplings_of_an_estimate_hold_from_the_rest_on(hand):
+    rest = np.zeros(20)
+    rest[hand.joint_names.index("ring_0")] = 0.1
+    other = dataclasses.replace(hand, spring_rest=rest)
+    sensors = HallSensors(other, seed=0)
+    counts = sensors.read(torch.from_numpy(rest)[None], torch.Generator().manual_seed(0))
+    q = JointEstimator(other, calibrated(sensors))(counts, torch.from_numpy(hand.actuator_offset)[None]).q[0]
+    apart = torch.from_numpy(hand.coupling) @ (q - torch.from_numpy(rest))
+    assert float(apart.abs().max()) < 1e-3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import torch
 from turning_step import true_state, turning_step
 
+from torch_ekm.description import load_hand
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.config import Setting
 from torch_ekm.kinematics.se3 import log
@@ -119,6 +121,15 @@ def test_native_tendons_make_the_same_turn(hand: str, name: str) -> None:
     (start, computed), (_, native) = ends
     assert angle(start, computed) > 1.0
     assert angle(computed, native) < 0.002
+
+
+@pytest.mark.parametrize("tendon", ["computed", "native"])
+def test_couplings_hold_from_the_rest_on(tendon: str) -> None:
+    hand, rest = load_hand("icub_right"), np.zeros(20)
+    rest[hand.joint_names.index("ring_0")], rest[hand.joint_names.index("little_1")] = 0.1, -0.05
+    plant = SimulatedHand(dataclasses.replace(hand, spring_rest=rest), "box", engine="mujoco", tendon=tendon)
+    q = plant.reset(3).truth.q.numpy()
+    np.testing.assert_allclose(hand.coupling @ (q - rest), 0, atol=0.01)
 
 
 def test_soft_pads_give_way_by_force_over_stiffness() -> None:

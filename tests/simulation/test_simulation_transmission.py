@@ -166,3 +166,28 @@ def test_description_is_not_changed():
     offset = dataclasses.replace(hand).actuator_offset.copy()
     transmission.lengthen(0.1)
     np.testing.assert_array_equal(hand.actuator_offset, offset)
+
+
+def resting_off_zero():
+    """The iCub hand with another rest of its coupled joints: followers do not rest where leaders do."""
+    hand, rest = load_hand("icub_right"), np.zeros(20)
+    rest[hand.joint_names.index("ring_0")], rest[hand.joint_names.index("little_1")] = 0.1, -0.05
+    return dataclasses.replace(hand, spring_rest=rest)
+
+
+def test_couplings_hold_from_the_rest_on():
+    hand, transmission = make(resting_off_zero())
+    assert np.abs(hand.coupling @ hand.spring_rest).max() > 0.04
+    at_rest = hand.actuator_offset + hand.actuation_jacobian @ hand.spring_rest
+    np.testing.assert_allclose(transmission.stretch(hand.spring_rest, at_rest), 0, atol=1e-12)
+    np.testing.assert_allclose(torque(transmission, hand.spring_rest, at_rest), 0, atol=1e-12)
+    away = hand.spring_rest + coupled_posture(hand.coupling) @ np.full(hand.n_q, 0.2)
+    motor = hand.actuator_offset + hand.actuation_jacobian @ away
+    np.testing.assert_allclose(transmission.stretch(away, motor), 0, atol=1e-12)
+    springs = -hand.spring_stiffness * (away - hand.spring_rest)
+    np.testing.assert_allclose(torque(transmission, away, motor), springs, atol=1e-12)
+    _, other = make(resting_off_zero(), stiffness=2.0)
+    other.take_over(transmission, away, motor + 0.1)  # without a jolt
+    np.testing.assert_allclose(
+        torque(other, away, motor + 0.1), torque(transmission, away, motor + 0.1), atol=1e-9
+    )

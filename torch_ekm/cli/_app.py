@@ -73,7 +73,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     """``"1000:1006"`` as 1000..1005; a single number as itself.
 
     Raises:
-        ParameterError: it is neither, a seed is negative or above 2^31, or there are more than 10,000.
+        ParameterError: it is neither, a seed is negative or not below 2^31, or there are more than 10,000.
     """
     try:
         numbers = [int(part) for part in text.split(":")]
@@ -85,7 +85,8 @@ def parse_seeds(text: str) -> tuple[int, ...]:
         if numbers[1] - numbers[0] <= _MOST_SEEDS:
             return tuple(range(*numbers))
         raise ParameterError("seeds", text, f"at most {_MOST_SEEDS} seeds")
-    raise ParameterError("seeds", text, "FIRST:END with 0 <= FIRST < END, e.g. 1000:1006, or one number")
+    valid = f"FIRST:END with 0 <= FIRST < END <= {_LARGEST_SEED}, e.g. 1000:1006, or one number below that"
+    raise ParameterError("seeds", text, valid)
 
 
 def parse_angles(text: str) -> tuple[float, ...]:

@@ -24,9 +24,9 @@ def demo(
     object: Annotated[str, Argument(help=AN_OBJECT)] = "box",
     out: Annotated[Path, Option(help="Folder for the report.")] = Path("demo_output"),
     hand: Hand = "icub_right",
-    seeds: Annotated[str, Option(help="FIRST:END, e.g. 1000:1008; each seed is one grasp.")] = "1000:1008",
+    seeds: Annotated[str, Option(help="FIRST:END, e.g. 1000:1008; each seed is one hand.")] = "1000:1008",
     jobs: Jobs = 2,
-    quick: Annotated[bool, Option(help="Two grasps, two angles: a trial run.")] = False,
+    quick: Annotated[bool, Option(help="Two seeds, two angles: a trial run.")] = False,
 ) -> None:
     """Turn an object with the KM and with the E-KM, and report.
 
@@ -103,7 +103,7 @@ def compare(
         str,
         Option(
             help="Names, separated by commas: default, SOGP, linear RLS, model alone, ...; an "
-            "unknown name lists all. If left out: all but those of other libraries."
+            "unknown name lists all. If left out: all but rbf, action-linear and those of other libraries."
         ),
     ] = "",
     targets: Annotated[str, Option("--targets", "--measured", help="To predict; else y, y1, ...")] = "",

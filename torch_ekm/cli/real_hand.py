@@ -86,7 +86,7 @@ def health(
     opened = [TrialLog.open(log) for log in logs]
     name = hand or opened[0].configuration.get("hand")
     if not name:
-        raise ParameterError("hand", name, "--hand NAME: the log names none")
+        raise ParameterError("hand", name, "given by --hand NAME, since the log names no hand")
     motions: list[int] = []
 
     def trials() -> Iterator[tuple[int, Trajectory]]:  # one at a time: logs may be long

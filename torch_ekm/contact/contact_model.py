@@ -27,8 +27,8 @@ class ContactModel(Enum):
 def contact_models(contacts: ContactSet, *, planar: bool = False) -> tuple[ContactModel, ...]:
     """The model that each contact's coefficients ask for.
 
-    No friction: frictionless; a torsional coefficient ``gamma > 0``: soft finger; else point contact
-    with friction.
+    No friction: frictionless. Else, in a planar hand: planar point contact with friction; in space a soft
+    finger if the torsional coefficient ``gamma > 0``, else a point contact with friction.
     """
     models = []
     for mu_s, gamma in zip(contacts.friction.tolist(), contacts.torsional_friction.tolist(), strict=True):

@@ -55,7 +55,9 @@ def signed_distance(shapes: tuple[Shape, ...], points: Array) -> tuple[Array, Ar
             rho = np.linalg.norm(p[..., :2], axis=-1)
             half = np.array([shape.size[0], shape.size[1] / 2])
             d, flat = _box_distances(np.stack([rho, p[..., 2]], axis=-1), half)
-            radial = p[..., :2] / np.maximum(rho, 1e-12)[..., None]
+            on_axis = rho < 1e-12
+            radial = p[..., :2] / np.where(on_axis, 1.0, rho)[..., None]
+            radial[on_axis] = 1.0, 0.0
             n = np.concatenate([radial * flat[..., :1], flat[..., 1:]], axis=-1)
         else:
             half, radius = _rounded_box(shape)

@@ -199,6 +199,9 @@ class TrustRegion:
 
     Source: trust regions of nonlinear optimisation, Conn, Gould and Toint, Trust-Region Methods (2000), with
     the measured motion in the place of the cost.
+
+    Raises:
+        ParameterError: a figure outside its range.
     """
 
     start: float = 0.7
@@ -207,7 +210,10 @@ class TrustRegion:
     largest: float = 2.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.smallest <= self.start <= self.largest:
+        if not 0 < self.smallest <= self.largest:
+            valid = f"above 0 and at most largest = {self.largest:g}"
+            raise ParameterError("smallest", self.smallest, valid)
+        if not self.smallest <= self.start <= self.largest:
             raise ParameterError("start", self.start, f"between {self.smallest:g} and {self.largest:g}")
 
     def disagreement(

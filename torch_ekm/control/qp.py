@@ -200,11 +200,18 @@ def _check(row: Rows, n_u: int) -> None:
     kind, A, b = type(row).__name__, as_array(row[0]), as_array(row[1])
     if A.shape[-1:] not in ((), (n_u,)):
         raise ShapeError(f"rows of {kind}", f"(n, {n_u})", A.shape)
-    if not isinstance(row, Bounds) and b.shape not in ((), A.shape[:-1]):
+    if isinstance(row, Bounds):
+        for name, value in zip(row._fields, (A, b), strict=True):
+            if value.shape not in ((), (n_u,)):
+                raise ShapeError(f"{name} of Bounds", f"({n_u},)", value.shape)
+            if np.isnan(value).any():
+                raise ParameterError(f"{name} of Bounds", "NaN", "a number, or infinite")
+        return
+    if b.shape not in ((), A.shape[:-1]):
         raise ShapeError(f"{row._fields[1]} of {kind}", f"{A.shape[:-1]}", b.shape, "one entry for each row")
     if isinstance(row, Squares | Inequality) and not (as_array(row.unit) > 0).all():
         raise ParameterError(f"unit of {kind}", row.unit, "greater than 0")
-    if not (np.isfinite(A).all() and np.isfinite(b).all()) and not isinstance(row, Bounds):
+    if not (np.isfinite(A).all() and np.isfinite(b).all()):
         raise ParameterError(f"{row._fields[0]}, {row._fields[1]} of {kind}", "NaN or infinity", "finite")
 
 

@@ -35,8 +35,7 @@ def compile_mjcf(path: Path) -> tuple[Any, set[str]]:
             MuJoCo refuses what it says.
         MissingExtraError: mujoco is not installed.
     """
-    reader = _Reader(path)
-    root = reader.read(path, ())
+    root = _read(path)[0]
     strict = ET.Element("mujoco", model=root.get("model", path.stem))
     ET.SubElement(strict, "compiler", boundmass="1e-6", boundinertia="1e-12", balanceinertia="true")
     for element in root:
@@ -48,6 +47,8 @@ def compile_mjcf(path: Path) -> tuple[Any, set[str]]:
     mujoco = require("mujoco")
     try:
         return mujoco.MjModel.from_xml_string(ET.tostring(strict, encoding="unicode")), meshes
+    except RecursionError:
+        raise DescriptionError(path, "elements are nested too deep") from None
     except (ValueError, RuntimeError) as error:
         raise DescriptionError(path, f"MuJoCo: {' '.join(str(error).split())}") from None
 
@@ -58,9 +59,16 @@ def mjcf_files(path: Path) -> list[Path]:
     Raises:
         DescriptionError: as :func:`compile_mjcf`, of the files alone.
     """
+    return _read(path)[1]
+
+
+def _read(path: Path) -> tuple[ET.Element, list[Path]]:
+    """The root element, includes in their places, and the files that were read."""
     reader = _Reader(path)
-    reader.read(path, ())
-    return reader.files
+    try:
+        return reader.read(path, ()), reader.files
+    except RecursionError:
+        raise DescriptionError(path, "elements are nested too deep") from None
 
 
 class _Reader:

@@ -125,7 +125,9 @@ def _check_filled_in(path: Path, data: dict[str, Any]) -> None:
 
 def _each(top: TomlTable, key: str, read: Callable[[str, Any], T], minimum: int = 0) -> list[T]:
     entries = top.data.get(key, [])
-    if not isinstance(entries, list) or len(entries) < minimum:
+    if not isinstance(entries, list):
+        raise DescriptionError(top.path, f"'{key}' must be written as [[{key}]], one table for each")
+    if len(entries) < minimum:
         raise DescriptionError(top.path, f"[[{key}]]: at least {minimum} such table(s) must be given")
     results = []
     for k, data in enumerate(entries):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import math
 from pathlib import Path
@@ -76,6 +77,8 @@ def _value(value: Any) -> str:
         return "{ " + ", ".join(f"{toml_key(key)} = {_value(entry)}" for key, entry in value.items()) + " }"
     if isinstance(value, list):
         return "[" + ", ".join(map(_value, value)) + "]"
+    if isinstance(value, datetime.date | datetime.time):
+        return value.isoformat()
     # numbers, booleans and strings are written alike in JSON and in TOML
     return json.dumps(value, ensure_ascii=False)
 

@@ -159,7 +159,9 @@ class HandDriver(ABC):
 
         Raises:
             ShapeError, NonFiniteError: it is not ``n_a`` finite numbers; nothing moves.
-            CommandRefusedError: beyond ``limits.increment``; nothing moves.
+            CommandRefusedError: beyond ``limits.increment``, or a motor reads more than 15 deg outside its
+                range; nothing moves.
+            StaleReadingError: a sensor sends nothing new.
             BusError: a device does not answer.
             NeverAtRestError: the motion does not end; the motors are commanded to hold.
         """

@@ -156,7 +156,7 @@ class Wiring:
             name = head.text("description")
             beside = path.parent / name
             try:
-                hand = load_hand(beside if beside.suffix == ".urdf" else name)
+                hand = load_hand(beside if beside.suffix in (".urdf", ".xml") else name)
             except UnknownNameError as error:
                 raise head.error(f"'description': {error}") from None
 

@@ -74,7 +74,7 @@ class YarpPlant(HandDriver):
             motors, moving = [encoders[k] for k in self._axes], not all(done[k] for k in self._axes)
         except IndexError:
             raise BusError(
-                self.part, f"has {len(encoders)} axes, [[motors]] needs {max(self._axes)}"
+                self.part, f"has {len(encoders)} axes, [[motors]] needs {max(self._axes) + 1}"
             ) from None
         read = {kind: self._stream(kind) for kind in self._streams}
         joints, joints_taken = read.get("joints", ((), math.inf))

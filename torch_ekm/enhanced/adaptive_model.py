@@ -65,4 +65,6 @@ class AdaptiveModel(nn.Module):
         check_shape("increment", increment, predicted.shape, "as the prediction has")
         if rows is None:
             raise NoDerivativeError("its result carries none by theta")
+        if self.noise_std.dim():
+            check_shape("noise_std", self.noise_std, predicted.shape, "or one for all")
         return self.theta.update(increment - predicted, rows, self.noise_std.square().expand(len(predicted)))

@@ -66,9 +66,9 @@ class EnhancedModel(Recorded, nn.Module):
     ) -> None:
         super().__init__()
         _check_arguments(model, learner, encode, outputs, jacobian)
-        if not math.isfinite(action_scale) or action_scale == 0:
+        if not isinstance(action_scale, int | float) or not math.isfinite(action_scale) or action_scale == 0:
             raise ParameterError("action_scale", action_scale, "a finite number other than 0")
-        scale = torch.as_tensor(output_scale)
+        scale = torch.as_tensor(math.nan if output_scale is None else output_scale)
         if scale.shape not in ((), (learner.out_features,)) or not bool(
             (scale.isfinite() & (scale != 0)).all()
         ):
@@ -264,6 +264,7 @@ class EnhancedModel(Recorded, nn.Module):
         if J is not None:
             if action.shape[-1:] != J.shape[-1:]:
                 raise ShapeError("action", f"(*batch, {J.shape[-1]})", action.shape)
+            J = J.to(action)
             return (J @ action.unsqueeze(-1)).squeeze(-1), J
         if self.jacobian is None:
             return differentiated(self.nominal, state, action)

@@ -81,6 +81,7 @@ class ParameterFilter(Recorded, nn.Module):
         if covariance.dim() == 1:
             covariance = torch.diag(vector("prior", prior).square())
         good = covariance.shape == (n, n) and bool(covariance.isfinite().all())
+        good = good and torch.allclose(covariance, covariance.mT)
         if not good or float(torch.linalg.eigvalsh(covariance)[0]) <= 0:
             raise ParameterError("prior", prior, f"{n} standard deviations, or a covariance {n} x {n}")
         self.prior = nn.Buffer(covariance, persistent=False)

@@ -17,13 +17,13 @@ from .enhanced_model import EnhancedModel
 
 
 def save(learner: ResidualLearner | EnhancedModel, path: str | os.PathLike) -> None:
-    """Write what it was made with, and all that it has learned; for an enhanced model without f itself.
+    """Write how a learner was made and all that it has learned; of an enhanced model everything but f.
 
     The file is a zip archive of a JSON header and arrays. It appears whole or not at all.
 
     Raises:
-        NoStateError: it holds something that is no plain figure, such as a function for ``encode`` (save its
-            ``learner``) or another library's objects; the message names it.
+        NoStateError: it holds something that is not a plain value, such as a function for ``encode`` (save
+            its ``learner``) or another library's objects; the message names it.
         OutputError: the file cannot be written.
     """
     if isinstance(learner, EnhancedModel):

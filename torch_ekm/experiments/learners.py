@@ -1,4 +1,4 @@
-"""Every learner by name, for any stream and for a grasp, and the enhanced model around one."""
+"""Every learner by name, for any stream and for a grasp."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -
 
     Args:
         n_s, n_a: features of the state, actuators.
-        capacity: basis vectors, window or random frequencies; networks and RLS have no such figure.
+        capacity: basis vectors or random frequencies; networks and RLS have no such figure.
         options: instead of the factory's own choices.
 
     Raises:

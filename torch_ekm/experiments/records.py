@@ -30,7 +30,8 @@ class Trial:
     object: str
     """Its name, or the stem of its file."""
     kind: str
-    """"turn", "warm-up", "long step" (one motion without feedback) or "camera off" (at the end)."""
+    """"turn", "warm-up", "first" (learning the hand), "new object", "long step" (one motion without feedback)
+    or "camera off" (at the end)."""
     controller: str
     seed: int
     trial: int

@@ -220,7 +220,7 @@ class Bench:
         return self.model if self.enhanced is None else self.enhanced
 
     def look_and_move(self, focus: FocusedPose | None = None) -> LookAndMoveController:
-        """The controller of the next turn, by what is known now; None: about the hand's axis."""
+        """The controller of the next turn, with what is known now; by default about the hand's axis."""
         setting, focused = self.setting, self.hand.rotation_axis if focus is None else focus
         return self.controllers(self._predictor, focused, setting.tasks, setting.limits, self.pace)
 

@@ -1,4 +1,4 @@
-"""What a sequence of motions does by f + g, and turns with the camera off."""
+"""Turns with the camera off: the object's pose from the model, the joints and the fingertips."""
 
 from __future__ import annotations
 

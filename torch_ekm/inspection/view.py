@@ -73,9 +73,9 @@ def view(what: str, object: str | None = None, seed: int = 0, *, reach: bool = F
 
 
 def view_hand(hand: HandDescription) -> View:
-    """``q(a) = argmin 1/2 q^T K_s q  s.t.  J_a q = a - a_0,  C q = 0``: each actuator closes and opens.
+    """``q(a) = argmin 1/2 (q - q0)^T K_s (q - q0)  s.t.  J_a q = a - a_0,  C (q - q0) = 0``.
 
-    The hand touches nothing; joint stops are kept.
+    Each actuator closes and opens. The hand touches nothing; joint stops are kept.
     """
     upper = np.array([part.upper for part in hand.actuators])
     start = np.clip(0.0, [part.lower for part in hand.actuators], upper)

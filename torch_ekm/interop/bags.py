@@ -99,7 +99,7 @@ def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
                     yield f"{place}.{field.name}.{label}", float(one)
             else:
                 yield from _numbers(part, f"{place}.{field.name}")
-    elif isinstance(value, bool | int | float | np.number):
+    elif isinstance(value, bool | int | float | np.number | np.bool_):
         yield place, float(value)
     elif isinstance(value, list | np.ndarray) and len(value) <= _MOST:
         for i, one in enumerate(value):

@@ -96,6 +96,9 @@ def covariance(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> t
 
 def _phi(kernel: Kernel) -> _Function:
     """Correlation at a squared scaled distance."""
+    if type(kernel) not in (SquaredExponential, Matern32, Matern52):
+        valid = "squared exponential, Matern 3/2 or Matern 5/2, and no subclass"
+        raise ParameterError("kernel", type(kernel).__name__, valid)
     if isinstance(kernel, SquaredExponential):
         return lambda d2: ca.exp(-0.5 * d2)
     root = math.sqrt(3.0 if isinstance(kernel, Matern32) else 5.0)

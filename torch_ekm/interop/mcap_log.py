@@ -83,7 +83,11 @@ def _of_rows(place: str, array: np.ndarray) -> tuple[str, Any]:
 
 def _multi_array(kind: str, row: np.ndarray) -> Any:
     dimension = "std_msgs/msg/MultiArrayDimension"
-    sizes = [_message(dimension, label="", size=size, stride=size) for size in row.shape]
+    strides = np.cumprod(row.shape[::-1])[::-1]
+    sizes = [
+        _message(dimension, label="", size=size, stride=int(stride))
+        for size, stride in zip(row.shape, strides, strict=True)
+    ]
     layout = _message("std_msgs/msg/MultiArrayLayout", dim=sizes, data_offset=0)
     return _message(kind, layout=layout, data=np.atleast_1d(row).ravel())
 

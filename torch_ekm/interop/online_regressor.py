@@ -42,7 +42,8 @@ class OnlineRegressor:
         """
         first = np.array(y, dtype=float) if self.first is None else self.first
         self.learner.update(torch.tensor(x, dtype=torch.float64), torch.from_numpy(y - first))
-        self.first = first
+        if np.isfinite(first).all():  # a learner that leaves bad samples out takes a NaN without an error
+            self.first = first
 
     def predict(self, x: Array) -> tuple[Array, Array]:
         """Mean and standard deviation (noise included) of y, each ``(n, out)``, at x ``(n, in)``."""

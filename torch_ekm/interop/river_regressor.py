@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Iterator, Mapping
 from typing import Any
 
@@ -35,8 +36,8 @@ class _Columns:
                 row[self.places[name]] = float(value)
         return row
 
-    def take(self, x: Mapping[Hashable, Any]) -> None:
-        """Give columns to new names, and follow the means."""
+    def assign(self, x: Mapping[Hashable, Any]) -> None:
+        """Give columns to new names."""
         new = sorted((name for name in x if name not in self.places), key=str)
         if self.strict and len(self.places) + len(new) > self.width:
             names = [*self.places, *new]
@@ -44,8 +45,11 @@ class _Columns:
             raise ShapeError("x", f"at most {self.width} features, as the learner", (len(names),), hint)
         for name in new[: self.width - len(self.places)]:
             self.places[name] = len(self.places)
+
+    def follow(self, x: Mapping[Hashable, Any]) -> None:
+        """Take the features of a sample that was learned into their means."""
         for name, value in x.items():
-            if (place := self.places.get(name)) is not None:
+            if (place := self.places.get(name)) is not None and math.isfinite(value):
                 self.count[place] += 1
                 self.mean[place] += (float(value) - self.mean[place]) / self.count[place]
 
@@ -75,8 +79,9 @@ class RiverRegressor(base.Regressor):
             width = self.learner.in_features if isinstance(self.learner, ResidualLearner) else max(len(x), 1)
             regressor = OnlineRegressor(make_learner(self.learner, width, 1))
             self._columns, self._regressor = _Columns(width, given), regressor
-        self._columns.take(x)
+        self._columns.assign(x)
         self._regressor.learn(self._columns.row(x), np.array([float(y)]))
+        self._columns.follow(x)
 
     def predict_one(self, x: dict) -> float | None:
         """Mean of y at these features; None before the first sample."""

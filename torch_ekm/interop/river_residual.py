@@ -73,9 +73,10 @@ class RiverResidual(SingleLearner):
         row = dict(enumerate(x.tolist()))
         for model, target in zip(self._models, y.tolist(), strict=True):
             model.learn_one(row, target)
+        nis = (error / self.noise).mean(-1)
         self.noise.lerp_(error, max(0.02, 1.0 / (self._count + 2)))
         self._count += 1
-        return UpdateReport.of((error / self.noise).mean(-1), mask)
+        return UpdateReport.of(nis, mask)
 
     def get_extra_state(self) -> dict[str, Any]:
         """None: reading river's objects from a file would mean to run what the file says.

@@ -53,7 +53,6 @@ class ForceBalance:
         self.low = np.where(stops, hand.joint_lower + STOP_TOLERANCE, -np.inf)
         self.high = np.where(stops, hand.joint_upper - STOP_TOLERANCE, np.inf)
         gram = self.joint_basis.T @ self.joint_basis
-        self.weight = None if np.allclose(gram, np.eye(len(gram))) else np.linalg.inv(gram)
         # smallest joint torques that make up a generalised residual
         self.lift = self.joint_basis @ np.linalg.inv(gram)
         # in a plane the third row of the pose basis is the rotation
@@ -134,7 +133,6 @@ class ForceBalance:
                 bound_matrix=-self.joint_basis[joints].T,
                 bound_lower=lower,
                 bound_upper=upper,
-                weight=self.weight,
                 measured_normal=None if measured is None else measured[k],
                 expected=None if prior is None else prior.mean[k],
                 expected_covariance=None if prior is None else prior.covariance[k],

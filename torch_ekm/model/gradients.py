@@ -127,8 +127,7 @@ def differentiable_forces(
     G = object_matrix * row_scale[:, None] * s[:n_h]
     bound = tensor(eq.bound_matrix.reshape(len(eq.hand_load), n - n_h - n_a))
     M = torch.cat([hand_matrix, actuator_matrix, bound], dim=1) * s
-    W = tensor(np.eye(len(eq.hand_load)) if eq.weight is None else eq.weight) / options.torque_std**2
-    stationary = M.mT @ (W @ (M @ x_t + hand_load))
+    stationary = M.mT @ (M @ x_t + hand_load) / options.torque_std**2
     stationary = stationary + torch.nn.functional.pad(G.mT @ tensor(nu[:n_e]), (0, n - n_h))
     balance = G @ x_t[:n_h] - object_load * row_scale
     r = torch.cat([stationary, balance, stationary.new_zeros(len(E) - n_e)])

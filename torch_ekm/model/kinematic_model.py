@@ -278,7 +278,7 @@ class KinematicModel(nn.Module):
             PenetrationError: a finger lies deep inside the object.
             SingularGraspError: a motion meets no stiffness, or rigid actuators contradict each other.
             UnstableGraspError: the grasp buckles (unless ``on_unstable="flag"``).
-            NonFiniteError, ShapeError, UnknownNameError: bad input.
+            NonFiniteError, ParameterError, ShapeError, UnknownNameError: bad input.
         """
         check_state(self.hand, state, contacts, self.weight.dtype)
         poses = self.kinematics(state.q)

@@ -42,7 +42,7 @@ class Reduction(nn.Module):
 
     Args:
         hand: the hand.
-        options: L, compliances.
+        options: whether the actuators are compliant.
         dtype: of the buffers.
     """
 

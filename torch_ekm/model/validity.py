@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -110,6 +111,11 @@ def _of_missing_forces(forces: GraspForces, reused: bool) -> Doubt:
         f"no forces inside the friction cones balance the object, {missing:.2g} N are missing: {stand_in}; "
         "check mass, friction and pose of the object, and contact_margin if a pad is missing"
     )
+    if math.isnan(missing):
+        message = (
+            f"the solver of the force problem failed, so the contact forces are unknown: {stand_in}; check "
+            "mass and pose of the object"
+        )
     return Doubt(kind, "grasp", missing, 0.0, "N", message)
 
 

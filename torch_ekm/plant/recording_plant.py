@@ -37,7 +37,9 @@ class RecordingPlant(PlantWrapper):
     def observe(self) -> Observation:
         """Read the sensors; recorded in the place of the last reading, since the hand has not moved."""
         observation = self.plant.observe()
-        if self.trajectory.observations:
+        if not self.trajectory.observations:  # the plant held the object before it was recorded
+            self.trajectory.observations.append(observation)
+        else:
             before = self.trajectory.observations[-1].info
             if "events" in before:
                 info = {**observation.info, "events": before["events"]}
@@ -47,6 +49,8 @@ class RecordingPlant(PlantWrapper):
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Pass the increment [rad] on; it and the observation after it are recorded."""
+        if not self.trajectory.observations:
+            self.observe()
         observation = self.plant.command(delta_a)
         self.trajectory.commands.append(torch.as_tensor(delta_a).detach().cpu().double().clone())
         self.trajectory.observations.append(observation)

@@ -37,8 +37,8 @@ class ReplayedPlant:
             ParameterError: the trajectory ends here.
         """
         if self._place >= len(self.trajectory.commands):
-            valid = f"at most {len(self.trajectory.commands)}: it ends there"
-            raise ParameterError("command", self._place, valid)
+            valid = f"at most {len(self.trajectory.commands)}: the recording ends there"
+            raise ParameterError("command", self._place + 1, valid)
         self._place += 1
         return self.observe()
 

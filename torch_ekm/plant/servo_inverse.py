@@ -4,6 +4,7 @@ from typing import Any
 
 import torch
 
+from .._checks import check_finite, check_shape
 from ..description import HandDescription
 from ..kinematics import ServoModel
 from ..kinematics.servo_model import IdealServos
@@ -51,8 +52,11 @@ class ServoInverse(PlantWrapper):
         Set-points stay in the actuators' range.
 
         Raises:
-            ShapeError, NonFiniteError: the increment is no finite figure for each actuator.
+            ShapeError, NonFiniteError: the increment is not ``n_a`` finite numbers; nothing moves.
         """
+        names = self.servo.names
+        check_shape("delta_a", torch.as_tensor(delta_a), (len(names),), f"in order: {', '.join(names)}")
+        check_finite("delta_a", torch.as_tensor(delta_a))
         seen = self.observe() if self._seen is None else self._seen
         v = self._within_range(seen.a, self.servo.command(delta_a))
         after = super().command(v)

@@ -145,7 +145,8 @@ class TrialLog:
         Raises:
             ParameterError: there is such a trial already, ``outcome`` is nothing that JSON can hold, or the
                 log was opened to be read, or closed.
-            OutputError: the file cannot be written; the log is what it was.
+            OutputError: the trial cannot be written, and the log is what it was; or the index cannot: the
+                trial is then kept, and the next run writes the index.
         """
         if self._lock is None:
             raise ParameterError("log", str(self.folder), "opened with TrialLog(folder, configuration)")

@@ -128,7 +128,7 @@ def _load(urdf: Path, name: str) -> Any:
     except Exception as error:  # whatever a stranger's file makes trimesh raise
         raise ValueError(f"the mesh '{name}' cannot be read: {error or type(error).__name__}") from None
     if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
-        raise ValueError(f"the mesh '{name}' has no faces, or figures that are none")
+        raise ValueError(f"the mesh '{name}' has no faces, or vertices that are not finite")
     return mesh
 
 

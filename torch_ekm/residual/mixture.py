@@ -43,7 +43,10 @@ class MixtureResidual(ResidualLearner):
         mean_e = h m_b(x) - kappa w_e + l_e
         i_e = y - mean_e,   w_e <- i_e / (1 + (i_e / c s)^2)
         d_e <- .98 d_e + beta w_e,   l_e <- .995 l_e + rho w_e + d_e
-        p_e ~ prior_e exp(sum_i memory^i log t_10(i_e(t-i) / s) - memory^t doubt_b)
+        p_e ~ prior_e exp(sum_j memory^j log t_10(i_e(t-j) / s') - memory^t doubt_b)
+
+    s is the learners' deviation times the typical scale of ScaleMixture; s' is the larger of s and half the
+    running rms, at most 6 s; memory = 0.99.
 
     Differences of a noisy pose carry noise over: what one sample has too much, the next one lacks, so
     innovations correlate by up to -1/2 and ``kappa`` (the pose's share of the noise: the moving average
@@ -95,6 +98,8 @@ class MixtureResidual(ResidualLearner):
             )
         self.learners = nn.ModuleList(members)
         rises = [(rho, beta) for rho in levels for beta in trends if beta == 0 or beta < rho]
+        if not rises:
+            raise ParameterError("trends", trends, f"one of 0, or one below a level of {tuple(levels)}")
         experts = itertools.product(range(len(members)), _SHARES, _CARRIES, rises, _CAPS)
         flat = [(b, h, kappa, *rise, c) for b, h, kappa, rise, c in experts]
         owner, *values = zip(*flat, strict=True)
@@ -235,7 +240,10 @@ class MixtureResidual(ResidualLearner):
 
     @torch.no_grad()
     def new_sequence(self) -> None:
-        """The next sample does not follow on the last one: nothing is carried over."""
+        """The next sample does not follow on the last one: innovation, trends and fast levels are dropped.
+
+        Levels with rho up to 0.2 stay.
+        """
         self.innovation.zero_()
         self.trend.zero_()
         self.level.mul_(self._experts[2] <= _SLOW)

@@ -28,8 +28,9 @@ class UpdateReport:
         event: an :class:`UpdateEvent` per sample.
         novelty: share of the prior variance at x that the basis does not explain, 0 to 1
             (0 for learners without a basis).
-        nis: normalised innovation squared ``i^2 / (v + s2)``, mean over the outputs, before the update;
-            expected to be 1 (NaN for learners without uncertainty).
+        nis: normalised innovation squared ``i^2 / (v + s2)``, mean over the outputs, before the update
+            (a MixtureResidual divides by its running variance, this sample included); expected to be 1
+            (NaN for learners without uncertainty).
         weight: weight given to the sample, 1 unless a robust update distrusted it.
     """
 

@@ -29,8 +29,9 @@ def write(buffer: Float[Tensor, "*batch places n"], place: int, values: Float[Te
 class RunningScale(nn.Module):
     """``z = (x - shift) / scale`` of columns whose units are unknown; columns may be exempt from the shift.
 
-    Of each block of samples the fourth that lies farthest from its median is cut to what a normal law like
-    that of the others would hold (the eighth, where the others hardly move: these are no outliers). Mean and
+    In each block, samples farther from the median than a normal law would hold are clipped to that distance.
+    Its deviation is estimated without the fourth that lies farthest out (the eighth, where the others hardly
+    move: these are no outliers). Mean and
     root of the spread of what is left are pooled over the last ``memory`` samples. Where large samples
     come in company, next to each other in time much more often than chance has it, they are bursts of motion
     and ten times as much is left. So outliers decide

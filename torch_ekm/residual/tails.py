@@ -21,7 +21,8 @@ class ScaleMixture(nn.Module):
         log s_e += rate_e ((nu_e + 1) r/(nu_e + r) - 1),   r = (z/s_e)^2
         p_e ~ exp(sum_i memory^i log t(z_{t-i}; nu_e, s_e))
 
-    The score is bounded, so one outlier moves a scale by at most ``nu rate`` (Harvey, Dynamic models
+    The score is bounded, so one outlier moves log s by at most ``nu rate`` (more
+    among the first samples, whose rates are larger; Harvey, Dynamic models
     for volatility and heavy tails, 2013). Weights are Bayes' with exponential forgetting (Raftery et
     al., Technometrics 52, 2010). Shapes ``(*batch, out, experts)``.
 
@@ -48,7 +49,7 @@ class ScaleMixture(nn.Module):
         self.evidence = nn.Buffer(torch.zeros(shape, **factory))
 
     def law(self, mean: Float[Tensor, "*any out"], deviation: Float[Tensor, "*any out"]) -> MixtureSameFamily:
-        """The law of y = mean + deviation z. Its variance is infinite (one expert has nu = 2)."""
+        """The law of y = mean + deviation z. Its variance is infinite (some experts have nu = 2)."""
         deviation = deviation.unsqueeze(-1)
         t = StudentT(self.freedoms, mean.unsqueeze(-1), deviation * self.log_scale.exp(), validate_args=False)
         logits = self.evidence.expand(t.batch_shape)

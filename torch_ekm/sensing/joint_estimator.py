@@ -32,7 +32,7 @@ class JointEstimate(NamedTuple):
 
 
 class JointEstimator:
-    r"""``min_q sum_k ((q_k - h_k) / s_k)^2 + |(J_a q + a_0 - a) / s_a|^2 + |C q / s_c|^2``.
+    r"""``min_q sum_k ((q_k - h_k) / s_k)^2 + |(J_a q + a_0 - a) / s_a|^2 + |C (q - q_0) / s_c|^2``.
 
     Hall channels know single joints, encoders sums of them, rigid couplings differences: together they cover
     joints without a channel, or with one that is saturated or stuck. q stays within the range that such a
@@ -41,7 +41,7 @@ class JointEstimator:
     has this deviation of every encoder. A weak prior, uniform over each joint's range, keeps q finite.
 
     Args:
-        hand: joints, actuation Jacobian and couplings; ``C q = 0`` is taken to hold, not just ``C dq = 0``.
+        hand: joints, actuation Jacobian and couplings, which hold from the rest angles q_0 on.
         calibration: of its Hall channels.
 
     Raises:
@@ -61,7 +61,8 @@ class JointEstimator:
         lower, upper = (torch.from_numpy(x.copy()) for x in (hand.joint_lower, hand.joint_upper))
         # a locked joint has no range: a small one keeps the information finite
         prior = 12 / (upper - lower).clamp(min=1e-3) ** 2
-        self._middle = prior * (lower + upper) / 2
+        rest = torch.from_numpy(hand.spring_rest)
+        self._middle = prior * (lower + upper) / 2 + C.mT @ (C @ rest) / COUPLING_STD**2
         self._fixed = torch.diag(prior) + C.mT @ C / COUPLING_STD**2
 
     def __call__(

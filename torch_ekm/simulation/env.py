@@ -7,6 +7,7 @@ Importing this module registers ``torch_ekm/InHandRotation-v0``;
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -77,8 +78,8 @@ class InHandRotation(gymnasium.Env):
 
     def __init__(
         self,
-        hand: HandDescription | str = "icub_right",
-        object: ObjectDescription | str = "box",
+        hand: HandDescription | str | Path = "icub_right",
+        object: ObjectDescription | str | Path = "box",
         parameters: PlantParameters | str = "nominal",
         config: PlantConfig | None = None,
         angles: tuple[float, float] = (5 * _DEG, 25 * _DEG),

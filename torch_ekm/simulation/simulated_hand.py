@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,14 +69,14 @@ class SimulatedHand:
             another kind; they cannot be changed in mid-run.
 
     Raises:
-        UnknownNameError: there is no such hand, object, preset or engine; the message lists them.
+        UnknownNameError: no such hand, object, preset, engine or kind of tendon; the message lists them.
         ParameterError: both ``parameters`` and ``preset`` are given; native tendons cannot be as they say.
     """
 
     def __init__(
         self,
-        hand: HandDescription | str = "icub_right",
-        object: ObjectDescription | str = "box",
+        hand: HandDescription | str | Path = "icub_right",
+        object: ObjectDescription | str | Path = "box",
         config: PlantConfig | None = None,
         parameters: PlantParameters | None = None,
         preset: str | None = None,
@@ -90,8 +91,8 @@ class SimulatedHand:
         if engine not in ENGINES:
             raise UnknownNameError("engine", engine, ENGINES)
         self.engine = engine
-        self.hand = load_hand(hand) if isinstance(hand, str) else hand
-        self.object = load_object(object) if isinstance(object, str) else object
+        self.hand = load_hand(hand) if isinstance(hand, str | Path) else hand
+        self.object = load_object(object) if isinstance(object, str | Path) else object
         self.config = PlantConfig() if config is None else config
         if self.config.gravity is not None:
             self.hand = dataclasses.replace(self.hand, gravity=self.config.gravity)

@@ -56,8 +56,6 @@ class BalanceEquations:
     """Z^T of unit joint torques with bounds of their own (stops), ``(n_z, n_t)``."""
     bound_lower: Array = field(default_factory=lambda: np.zeros(0))
     bound_upper: Array = field(default_factory=lambda: np.zeros(0))
-    weight: Array | None = None
-    """(Z^T Z)^-1: whitens r where the permitted motions are not orthonormal."""
     measured_normal: Array | None = None
     """Measured normal forces [N], NaN where there is none."""
     expected: Array | None = None

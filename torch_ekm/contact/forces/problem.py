@@ -40,7 +40,7 @@ def force_cost(eq: BalanceEquations, options: ForceOptions) -> ForceCost:
     """What the forces should be, in ``x = [mu; lam; tau]``, all scaled to newtons.
 
     ```
-    min  p(mu) + eps |lam r/L|^2 + |r|^2/sigma^2
+    min  p(mu) + eps (|arm lam/L|^2 + |tau/L|^2/100) + |r|^2/sigma^2
          + sum (f_n - measured)^2/sigma_n^2
     s.t. G mu = V_p
     p(mu) = eps |mu|^2, or (mu - expected)^T Sigma^-1 (mu - expected) where forces are expected
@@ -61,7 +61,7 @@ def force_cost(eq: BalanceEquations, options: ForceOptions) -> ForceCost:
     balance[:, :n_h] = eq.object_matrix * eq.row_scale[:, None] * scale[:n_h]
     bound = eq.bound_matrix.reshape(len(eq.hand_load), n_t)
     joint = np.concatenate([eq.hand_matrix, eq.actuator_matrix, bound], axis=1) * scale
-    WJ = joint / options.torque_std**2 if eq.weight is None else eq.weight @ joint / options.torque_std**2
+    WJ = joint / options.torque_std**2
     P, q = joint.T @ WJ, WJ.T @ eq.hand_load
     diagonal = np.full(n, _FORCE_WEIGHT)
     diagonal[n_h + n_a :] *= 1e-2

@@ -20,7 +20,8 @@ class Prequential:
     """Predictions of each sample before it was learned, and what happened.
 
     ``mean``, ``deviation`` (observation noise included) and ``y`` are ``(n, m)``; ``density`` is the log
-    density of y under the learner's predictive law, where that is not normal.
+    density of y under the learner's predictive law, where that is not normal. ``seconds`` are those of
+    predictions and updates, without the density.
     """
 
     mean: Float[Tensor, "n m"]
@@ -55,17 +56,20 @@ def run_prequential(
     It calls the learner's ``new_sequence`` between ``segments``, given by their lengths.
     """
     starts = set(itertools.accumulate(segments))
-    means, deviations, densities, begin = [], [], [], time.perf_counter()
+    means, deviations, densities, seconds = [], [], [], 0.0
     heavy = type(learner).predictive is not ResidualLearner.predictive
     for t in range(len(x)):
         if t in starts:
             learner.new_sequence()
+        begin = time.perf_counter()
         law = learner.predict(x[t], observation=True)
         means.append(law.mean.detach())
         deviations.append(law.stddev.detach())
+        predicted = time.perf_counter()
         if heavy:
             densities.append(learner.predictive(x[t]).log_prob(y[t]).detach())
+        asked = time.perf_counter()
         learner.update(x[t], y[t])
-    seconds = time.perf_counter() - begin
+        seconds += predicted - begin + time.perf_counter() - asked
     density = torch.stack(densities) if heavy else None
     return Prequential(torch.stack(means), torch.stack(deviations), y, seconds, density)

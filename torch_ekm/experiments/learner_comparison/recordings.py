@@ -142,7 +142,7 @@ def _t42(limit: int | None) -> Stream:
 def _icub_grasp(limit: int | None) -> Stream:
     """Next increment of the 9 encoders from encoders, last increment and the 5 fingers' touch."""
     folder = _need("icub_grasp/iCubGraspDataset")
-    x, y, segments = [], [], []
+    x, y, segments, available = [], [], [], 0
     for path in sorted(folder.glob("*.txt"), key=_trial):
         if path.name.startswith("full_coke"):  # its authors say not to trust it
             continue
@@ -153,15 +153,15 @@ def _icub_grasp(limit: int | None) -> Stream:
             continue
         encoders = np.array([a for a, _ in slices], dtype=float)
         touch, step = np.array([b for _, b in slices], dtype=float), np.diff(encoders, axis=0)
-        x.append(np.hstack([encoders[1:-1], step[:-1], touch[1:-1]]))
-        y.append(step[1:])
-        segments.append(len(step) - 1)
-        if limit is not None and sum(segments) >= limit:
-            break
+        available += len(step) - 1
+        if limit is None or sum(segments) < limit:  # the last grasp is whole
+            x.append(np.hstack([encoders[1:-1], step[:-1], touch[1:-1]]))
+            y.append(step[1:])
+            segments.append(len(step) - 1)
     about = "iCub hand closing on 10 objects (Soh et al.), 10 deg as unit; alone: nothing moves"
     units = np.repeat([30.0, 10.0, 50.0], [9, 9, 5])  # [deg], [deg], [of 255]
     inputs, outputs = torch.from_numpy(np.vstack(x) / units), torch.from_numpy(np.vstack(y) / 10.0)
-    return Stream("icub_grasp", inputs, outputs, 0, tuple(segments), about)
+    return Stream("icub_grasp", inputs, outputs, 0, tuple(segments), about, available)
 
 
 def _trial(path: Path) -> tuple[int, str]:

@@ -89,7 +89,7 @@ def _csv(path: Path, label: str) -> tuple[Names, Read]:
     if first is None:
         raise DescriptionError(path, "the file is empty")
     reader = csv.reader(lines, delimiter=max(",;\t", key=first.count))
-    rows = [(reader.line_num, [field.strip() for field in row]) for row in reader if any(row)]
+    rows = [(reader.line_num, [field.strip() for field in row]) for row in reader if row]
     number, names = rows[0]
     if all(_number(field) is not None for field in names):
         problem = "holds numbers only; the first line must name the columns"
@@ -155,10 +155,11 @@ def _parquet(path: Path, label: str) -> tuple[Names, Read]:
 
     def values(name: str) -> Array:
         column = table.column(name)
-        if name == label and pyarrow.types.is_string(column.type):
+        kind = column.type
+        if name == label and (pyarrow.types.is_string(kind) or pyarrow.types.is_large_string(kind)):
             numbers = _numbers(column.to_pylist())
             column = pyarrow.chunked_array([[float(number) if number else None for number in numbers]])
-        kind = column.type
+            kind = column.type
         if not (pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind)):
             problem = f"holds {kind}, not numbers; leave it out or encode it"
             raise DescriptionError(path, f"column '{name}' {problem}")

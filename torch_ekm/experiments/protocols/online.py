@@ -38,7 +38,7 @@ class Online(Protocol):
     from 1, as in the paper.
 
     Raises:
-        ParameterError: an interval or an index outside its range.
+        ParameterError: an interval or the number of a trial outside its range.
     """
 
     setting: Setting = field(default_factory=Setting)
@@ -57,6 +57,9 @@ class Online(Protocol):
             raise ParameterError("angle_range_deg", self.angle_range_deg, "0 < low <= high < 180 deg")
         if self.trials < 1:
             raise ParameterError("trials", self.trials, "at least 1")
+        if self.tendons_replaced < 0 or any(trial < 1 for trial in self.dislocations):
+            numbers = self.dislocations, self.tendons_replaced
+            raise ParameterError("dislocations, tendons_replaced", numbers, "trials from 1 on; 0: no tendons")
 
     @property
     def events(self) -> tuple[int, ...]:

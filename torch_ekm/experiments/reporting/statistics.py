@@ -137,7 +137,8 @@ class LearningCurve:
     upper: Array
     """b(k), upper end of the one-sided 95 % interval of ``ours - theirs``; NaN for k = 1."""
     last_negative: int
-    """Last Index of Negative Result: the last k (from 1) with p(k) > alpha; 0 if none."""
+    """Last Index of Negative Result: the last k with p(k) > alpha. k = 1 cannot be tested and counts
+    as negative."""
 
     @property
     def last_upper(self) -> float:

@@ -27,13 +27,15 @@ def calibrate(
     recordings: Iterable[Recording],
     parameters: Iterable[str] = ("springs", "moment_arms", "stiffness", "offset"),
 ) -> Calibration:
-    """``min_x |W r(x)|^2 + |x|^2``: figures of the hand from measured motions, and how sure they are.
+    """``min_x sum_k rho((W r)_k^2) + sum_j rho(x_j^2)``, ``rho(z) = 2 (sqrt(1 + z) - 1)``.
+
+    The figures of the hand from measured motions, and how sure they are.
 
     ``r``: motions against ``J_m``, joint torques that no force explains, fingertip forces. ``x``: distance of
-    each parameter from its description, in units of its prior. ``W``: one standard deviation for each kind of
-    residual, estimated from the residuals in turn with x. Bounds: five priors, and no negative play. The
-    derivative is that of :meth:`KinematicModel.linearize`; solved by scipy's trust-region reflective least
-    squares.
+    each parameter from its description, in units of its prior. ``W``: the inverse of one standard deviation
+    for each kind of residual, estimated from the residuals in turn with x. Bounds: five priors, and no
+    negative play. The derivative is that of :meth:`KinematicModel.linearize`; solved by scipy's trust-region
+    reflective least squares.
 
     The scale of all springs and stiffnesses together is determined by fingertip forces alone (and a little by
     the object's weight): without them expect ratios.
@@ -56,7 +58,7 @@ def calibrate(
     nominal = np.zeros(len(unknowns))
     start = np.maximum(nominal, unknowns.bounds[0] + _INSIDE)  # no derivative leads off a bound
     if not any(one and other for usable in evidence.usable for one, other in pairwise(usable)):
-        reason = "with two states in a row at which the object is held and its forces are found"
+        reason = "motions between two successive states in which the object is held and its forces are found"
         raise ParameterError("recordings", "no usable motion", reason)
     before = evidence(nominal, jacobian=False)
     problem, x = _Problem(evidence, before), start

@@ -1,6 +1,6 @@
 """Potential energy of springs and gravity, its gradient and its second-order terms.
 
-``V(q, p) = 1/2 (q - q0)^T K_s (q - q0) - m g . (o + R c) - sum_l m_l g . x_l(q)``
+``V(q, p) = 1/2 (q - q0)^T K_s (q - q0) - m g . (o + R c)``; the weight of the links is left out.
 
 One convention for everything of second order: the components of the gradient are differentiated
 along ``dp = (do, dphi)``, world axes, about the object point ("moving frame"). The blocks are not symmetric

@@ -130,7 +130,7 @@ class ReplayMLP(ScaledLearner, SingleLearner):
         self.inputs[n % self.memory], self.targets[n % self.memory] = x, y
         self.count += 1
         # the sample's number seeds its minibatches, so that a reloaded learner draws the same
-        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + n)
+        generator = torch.Generator().manual_seed((self.seed * 1_000_003 + n) % 2**63)
         for step in range(_STEPS):
             size = (self.members, _MINIBATCH)
             index = torch.randint(min(n + 1, self.memory), size, generator=generator)

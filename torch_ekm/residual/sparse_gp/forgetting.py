@@ -57,9 +57,9 @@ class ProcessNoise(Part):
 
     def __init__(self, share: float) -> None:
         super().__init__()
-        if not 0 < share < 1:
+        self.share = check_fraction("share", share)
+        if self.share == 1:
             raise ParameterError("share", share, "in (0, 1)")
-        self.share = float(share)
 
     def on_rebuild(self, learner: Host) -> None:
         """Wander by the samples since the last rebuild."""

@@ -79,7 +79,6 @@ class LearnHyperparameters(Part):
         self.window_y = nn.Buffer(like.new_zeros(*fleet, self.window, posterior.out_features))
         self.window_on = nn.Buffer(like.new_zeros(*fleet, self.window))
         self.n_steps = nn.Buffer(like.new_zeros(fleet))
-        self.stride = max(self.window // self.steps, 1)
         self.loss = PrequentialLoss(posterior, factor, None if weight is None else weight.threshold)
         parameters = [*learner.kernel.parameters(), learner.log_noise_variance]
         self.adam = Adam(parameters, betas=(0.9, 0.99))
@@ -101,7 +100,8 @@ class LearnHyperparameters(Part):
         self.window_on.select(-1, place).copy_(weight)
         if self.past is not None:
             self.past.offer(x, y, weight)
-        if due or ((place + 1) % self.stride == 0 and place + self.stride < self.window):
+        between = (place + 1) * self.steps // self.window > place * self.steps // self.window
+        if due or (between and place + 1 < self.window):
             if moved := due and self.steps > 1:
                 self._move(learner)
             self.descend(learner, moved=moved)

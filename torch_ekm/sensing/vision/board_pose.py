@@ -41,13 +41,14 @@ def estimate_board_pose(
     A planar target has two local minima, mirrored about the line of sight. Both are computed in
     closed form (IPPE, Collins and Bartoli, IJCV 2014) and refined by Levenberg-Marquardt; the
     better one counts, and the other is kept as ``mirror`` unless it is worse by a hundred units of
-    ``chi^2 = sum r^2 / corner_std^2``. Where it is worse by less than nine and the two differ by
-    more than 10 deg the result is ``ambiguous``, and the one nearer to ``prior`` is taken.
+    ``chi^2 = sum r^2 / sigma_c^2``, ``sigma_c = 0.2 px`` of a corner. Where it is worse by less than
+    nine and the two differ by more than 10 deg the result is ``ambiguous``, and the one nearer to
+    ``prior`` is taken.
 
     Corners farther than 1 px from the fit, or than four robust deviations, are left
     out, the worst first (a corner half hidden by a finger is found, but at a wrong place).
 
-    The covariance is ``sigma^2 (J^T J)^-1`` with ``sigma`` the larger of ``corner_std`` and the
+    The covariance is ``sigma^2 (J^T J)^-1`` with ``sigma`` the larger of ``sigma_c`` and the
     residual's own estimate.
 
     Args:

@@ -19,12 +19,12 @@ _STIFF = 20.0  # [N m/rad] at a joint; up to here the late part damps little
 class Transmission:
     """The torque on the joints of a hand whose motors stand at ``m``::
 
-        tau = -K_s (q - q0) + J_a^T k_a (m - a0 - J_a q) - C^T k_c C q - tau_f
+        tau = -K_s (q - q0) + J_a^T k_a (m - a0 - J_a q) - C^T k_c C (q - q0) - tau_f
 
     A rigid coupling (index, ring and little spread alike) is a spring ``k_c`` from the joints that follow
     to those that lead, and the actuators act on the joints that lead alone: ``J_a`` above stands for
-    ``J_a S`` with ``S q`` the posture whose followers obey the couplings. So a coupled joint that leads
-    is as stiff as if the coupling were rigid, for any ``k_c``.
+    ``J_a S``, with ``q0 + S (q - q0)`` the posture whose followers obey the couplings. So a coupled joint
+    that leads is as stiff as if the coupling were rigid, for any ``k_c``.
 
     PhysX integrates a joint drive implicitly and an external torque explicitly, which is unstable
     for tendons as stiff as these. So each joint gets one drive, whose stiffness is the diagonal of
@@ -70,6 +70,8 @@ class Transmission:
         self.spring_stiffness, self.spring_rest = hand.spring_stiffness, hand.spring_rest
         self.friction = hand.joint_friction
         self.shape, self.losses = shape, losses
+        self._followed = (self.J_a - self._lead) @ shape.excursion(self.spring_rest)
+        self._apart = self._M[self.n_a :] @ self.spring_rest
         rubs = (self.friction > 0) | ((self.losses.capstan > 0) & self._lead.any(axis=0))
         self._k_f = np.where(rubs, _BRISTLE_STIFFNESS, 0.0)
         self._bends = self._reach(self.friction)
@@ -92,6 +94,11 @@ class Transmission:
         """Series stiffness k_a of each actuator, ``(n_a,)`` [N m/rad]."""
         return self._k[: self.n_a]
 
+    @property
+    def origin(self) -> Array:
+        """``a0``, and what followers add by their rest: the joints that lead see the motor minus it."""
+        return self.offset + self._followed
+
     def parts(self) -> Iterator[tuple[Array, float, bool]]:
         """Actuators, then couplings: moment arms ``(n_q,)``, stiffness [N m/rad], whether it only pulls."""
         return zip(self._M, self._k.tolist(), self._pulls_only.tolist(), strict=True)
@@ -104,7 +111,7 @@ class Transmission:
 
     def stretch(self, q: Array, motor: Array) -> Array:
         """``m - a0 - J_a q``: elastic stretch of each transmission [rad]; negative: a tendon is slack."""
-        return motor - self.offset - self._lead @ self.shape.excursion(q)
+        return motor - self.origin - self._lead @ self.shape.excursion(q)
 
     def actuator_torque(self, q: Array, motor: Array) -> Array:
         """``-lam``: torque of each actuator along ``+a`` [N m]; never negative for a tendon."""
@@ -146,7 +153,7 @@ class Transmission:
         pull = self._pull(stretch)
         if self.losses.hysteresis > 0:
             pull = pull + self._hysteresis(stretch)
-        apart = self._M[self.n_a :] @ inner
+        apart = self._M[self.n_a :] @ inner - self._apart
         force = np.concatenate([pull, -self._k[self.n_a :] * apart])
         if self._any_tendon:
             force[self._pulls_only & (force < 0)] = 0.0
@@ -191,7 +198,7 @@ class Transmission:
         before, ``J^T k s = J_o^T k_o s_o``, which says how much the new tendon is stretched."""
         along = np.einsum("aq,aq->a", self._lead, other._lead) / np.einsum("aq,aq->a", self._lead, self._lead)
         stretch = self.stretched(along * other._pull(other.stretch(q, motor)))
-        self.offset = motor - self._lead @ self.shape.excursion(q) - stretch
+        self.offset = motor - self._followed - self._lead @ self.shape.excursion(q) - stretch
         half = self.losses.play / 2
         self._anchor, self._lean, self._bent = other._anchor, np.clip(other._lean, -half, half), None
 

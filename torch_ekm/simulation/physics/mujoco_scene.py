@@ -108,7 +108,7 @@ class MujocoScene:
                 if arm != 0:
                     tendon.wrap_joint(name, arm)
             if k >= hand.n_a:  # a coupling
-                tendon.stiffness[0], tendon.springlength = stiffness, [0.0, 0.0]
+                tendon.stiffness[0], tendon.springlength = stiffness, 2 * [float(row @ native.spring_rest)]
                 continue
             actuator = spec.add_actuator(
                 name=hand.actuators[k].name, target=tendon.name, trntype=self._mj.mjtTrn.mjTRN_TENDON

@@ -12,10 +12,13 @@ from types import ModuleType
 
 from ....exceptions import SpeedWarning
 
-_OFF = "compiled loops are off, and learners take longer: {}; numba's folder is named by NUMBA_CACHE_DIR"
+_OFF = (
+    "compiled loops are off, so learners take longer: {}; if numba cannot write its cache, set "
+    "NUMBA_CACHE_DIR to a folder that can be written"
+)
 _FIRST_TIME = (
-    "a process in the background compiles loops, once and for some ten seconds; until then torch works, and "
-    "results may differ by rounding. torch_ekm.warm_up() waits for them"
+    "a process in the background compiles loops, once and for some ten seconds; until then torch does the "
+    "work, and results may differ by rounding. torch_ekm.warm_up() waits for them"
 )
 
 

@@ -175,11 +175,11 @@ def _add_and_prune(moments, vectors, s, p, work_c, work_q, gain, grow, i, w):
 
 
 @njit(
-    types.int64(_I1, _A1, _A1, _F, _F, _A1, _A2, _A1, _I1, _I1, _A3, _A3, _A1, _A1, _F, _F, _A1, _A1),
+    types.int64(_A1, _A1, _F, _F, _A1, _A2, _A1, _I1, _I1, _A3, _A3, _A1, _A1, _F, _F, _A1, _A1),
     **_INNER,
 )
 def _absorb(
-    flags, z, t, prior, s2, k, basis, active, count, slot_, moments, vectors, robust, level, threshold,
+    z, t, prior, s2, k, basis, active, count, slot_, moments, vectors, robust, level, threshold,
     jitter, figures, error,
 ):  # fmt: skip
     """One sample of one model, see ``absorb``; returns the event."""
@@ -331,7 +331,7 @@ def absorb_fleet(
                 k, none, False,
             )  # fmt: skip
         event[b] = _absorb(
-            flags, z, t, prior, s2, k, basis[b], active[b], count[b : b + 1], slot[b : b + 1], moments[b],
+            z, t, prior, s2, k, basis[b], active[b], count[b : b + 1], slot[b : b + 1], moments[b],
             vectors[b], robust, levels[b : b + 1], threshold, jitter, found, errors[b * m : (b + 1) * m],
         )  # fmt: skip
         for r in range(4):
