@@ -191,7 +191,10 @@ class Comparison:
             "motions", "n", Column("KM, median [deg]", ".3f"), Column("KM, rms [deg]", ".3f"),
             Column("step, median [deg]", ".3f"), Column("step, rms [deg]", ".3f"),
         ]  # fmt: skip
-        note = "Error of the object's rotation, all axes, after one motion; hand as described, true states."
+        note = (
+            "Error of the object's rotation, all axes, after one motion; hand as described, true states."
+            " Motions that the step refuses are left out."
+        )
         return Table("steps", "One motion", columns, rows, note)
 
     def turns(self) -> Table:
@@ -213,7 +216,7 @@ class Comparison:
         note = (
             "Error of the rotation, all axes, at the end of a turn of 9 to 25 motions, predicted from its"
             " first state and the motions of the encoders. The KM, whose contacts stick, is linearized after"
-            " each motion."
+            " each motion. Left out: turns that the step says end before, or in which the object is lost."
         )
         return Table("turns", "Whole turns", columns, rows, note)
 
@@ -277,7 +280,8 @@ class Comparison:
         return (
             f"slid: KM {_median(x['km'] for x in slid):.2f}, step {_median(x['step'] for x in slid):.2f} deg;"
             f" whole turns {_median(turns):.2f} deg;"
-            f" slips announced {100 * _mean(slips):.0f} %, false {100 * _mean(calm):.0f} %;"
+            f" slips of sensed and nominal hands announced {100 * _mean(slips):.0f} %,"
+            f" false {100 * _mean(calm):.0f} %;"
             f" a step {_median(x['ms'] for x in every):.1f} ms"
         )
 

@@ -192,7 +192,12 @@ def table_ii(here: dict[str, Objects]) -> Table:
     paper = mean_text(TABLE_II)
     rows.append(["mean of the five", paper, nominal.mean(), worn.mean()])
     rows.append(
-        ["mean, by [the system as printed](as_printed.md)", paper, as_printed(here["as_printed"]), None]
+        [
+            "mean, by [the system as printed](as_printed.md) in MuJoCo, poses plus noise",
+            paper,
+            as_printed(here["as_printed"]),
+            None,
+        ]
     )
     columns = ["object", "paper", "here", "here, worn hand"]
     note = "Error [deg]: KM; E-KM; ratio. Intervals: 95 %, over pairs of object and seed."

@@ -173,8 +173,13 @@ class Outcome:
         ]
 
     def ratio(self, part: str) -> float | None:
-        """Motions of a series over those of turns of the same sizes from fresh grasps, object by object."""
-        pairs = [[_motions(self.of(one, item)) for one in (part, BESIDE[part])] for item in self.objects]
+        """Motions of a series over those of turns of the same sizes from fresh grasps, means over objects and
+        directions."""
+        pairs = [
+            [_motions(self.of(one, item, sign)) for one in (part, BESIDE[part])]
+            for item in self.objects
+            for sign in (1, -1)
+        ]
         known = [(mine, fresh) for mine, fresh in pairs if mine is not None and fresh is not None]
         return sum(mine for mine, _ in known) / sum(fresh for _, fresh in known) if known else None
 
@@ -200,7 +205,7 @@ class Outcome:
         ]
         return (
             f"lost {sum(turn.lost for turn in series)} of {len(series)}; motions {np.mean(ratios):.2f} times"
-            f" those of fresh grasps; drift {' mm, undone '.join(f'{mm:.1f}' for mm in moved)} mm"
+            f" those of fresh grasps; drift at the end {' mm, undone '.join(f'{mm:.1f}' for mm in moved)} mm"
         )
 
     def table(self) -> Table:
@@ -221,7 +226,7 @@ class Outcome:
         ratios = [f"{part} {ratio:.2f}" for part in BESIDE if (ratio := self.ratio(part)) is not None]
         note = (
             "Mean motions of turns that reached the target, and true errors of objects that were not lost."
-            f" Motions over those of fresh grasps, means over objects: {', '.join(ratios)}."
+            f" Motions over those of fresh grasps, means over objects and directions: {', '.join(ratios)}."
         )
         return Table("turns", "Turns without a new grasp, and from fresh ones", columns, rows, note)
 

@@ -248,13 +248,13 @@ class Outcome:
         """The position controller's errors."""
         items = {name: np.abs(errors) for name, errors in self.motors.items() if errors}
         columns: dict[Column, Callable[[Any], Cell]] = {
-            Column("motions"): lambda e: len(e),
+            Column("motor motions"): lambda e: len(e),
             Column("rms [deg]"): rms,
             Column("95 % below [deg]"): lambda e: float(np.quantile(e, 0.95)),
             Column("largest [deg]"): lambda e: float(e.max()),
             Column("within 1 deg [%]", ".0f", percent=True): lambda e: float((e <= 1).mean()),
         }
-        note = "Encoder's change minus the command, of each motor in each motion that commands it."
+        note = "Encoder's change minus the planned one, of each motor in each motion that moves it."
         return Table.of("motors", "Position controller", "controller", items, columns, note)
 
     def blind_table(self) -> Table:

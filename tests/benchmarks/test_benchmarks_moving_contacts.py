@@ -34,7 +34,8 @@ def test_slips_are_announced_and_false_alarms_counted(tmp_path: Path) -> None:
     }  # fmt: skip
     found = Comparison(results)
     assert found.verdict == (
-        "slid: KM 1.00, step 0.20 deg; whole turns 0.50 deg; slips announced 67 %, false 100 %; a step 2.0 ms"
+        "slid: KM 1.00, step 0.20 deg; whole turns 0.50 deg; slips of sensed and nominal hands announced"
+        " 67 %, false 100 %; a step 2.0 ms"
     )
     rows = {tuple(row[:2]): row[2:] for row in found.slips().text()}
     assert rows["nominal", "step"] == ["67 % of 3", "0 % of 1", "100 % of 1", "100 % of 1"]

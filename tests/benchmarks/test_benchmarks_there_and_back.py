@@ -41,15 +41,17 @@ def test_losses_motions_and_drift_are_those_of_the_series() -> None:
             turn(RANDOM, 0, 8.0, motions=6),
             turn(RANDOM, 1, -8.0, motions=40, **away),
             turn(BESIDE[BACK], 0, 15.0, motions=7),
+            turn(BESIDE[BACK], 1, 15.0, motions=7),  # another mix of directions than the series have
+            turn(BESIDE[BACK], 2, -15.0, motions=5),
             turn(BESIDE[RANDOM], 0, 8.0, motions=5),
             turn(BESIDE[RANDOM], 1, -8.0, motions=5),
         ]
     )
-    assert outcome.ratio(BACK) == pytest.approx(1.0)
+    assert outcome.ratio(BACK) == pytest.approx(14 / 12)
     assert outcome.ratio(RANDOM) == pytest.approx(1.2)
     assert (
         outcome.verdict
-        == "lost 1 of 8; motions 1.07 times those of fresh grasps; drift 2.0 mm, undone 0.1 mm"
+        == "lost 1 of 8; motions 1.18 times those of fresh grasps; drift at the end 2.0 mm, undone 0.1 mm"
     )
     rows = {row[0]: row[1:] for row in outcome.table().text()}
     assert rows["random targets, -"] == ["1", "1", "0", "-", "-", "1 object lost"]

@@ -22,7 +22,8 @@ LEGEND = {
     "KM": "the kinematic model alone; increments are added to what the encoders read",
     "KM+I": "the same model with integral action: increments add up on the set-point; it learns nothing",
     "KM+S": "the same model on the servo inverse, which finds the dead zones of the motors on the encoders",
-    "E-KM": "the kinematic model and what was learned of its errors, on the same servo inverse",
+    "E-KM": "the same servo inverse; the model follows the figures of the hand, which it learns, and a "
+    "learner corrects it; its steps may be up to twice as large",
 }
 _MEANINGS = {
     StopReason.REACHED.value: "the measured error stays within the tolerance",
@@ -89,8 +90,9 @@ def motion_table(trials: DataFrame) -> Table:
         "Mean and 95 % bootstrap interval over pairs of object and seed. Beyond angle / step: motions until "
         f"the measured error stays within {BAND_DEG:g} deg, less the angle over {STEP_DEG:g} deg, rounded "
         "up; below 0 where the pace is above 1. A turn that never settles counts with the limit. First "
-        "motion, all motions: by how much more or less a motion changed the error than it was to. Off the "
-        "axis: rotation at the end, of objects that were not lost."
+        "motion, all motions (that ask for 0.5 deg or more and do not go back): by how much more or less a "
+        "motion changed the error than it was to. Off the axis: rotation at the end, of objects that were "
+        "not lost."
     )
     items = by_controller(trials)
     return Table.of("motions", "The motions of each controller", "controller", items, columns, note)
