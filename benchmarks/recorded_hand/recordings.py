@@ -89,7 +89,7 @@ def find_file(data: str | Path) -> Path:
         if path.is_file():
             return path
     raise DescriptionError(
-        data / Path(FILE).name, "there is no such file; 'torch-ekm recorded-hand --help' names its source"
+        data / Path(FILE).name, "there is no such file; 'torch-ekm compare --help' names its source (t42)"
     )
 
 
