@@ -14,8 +14,8 @@ from torch_ekm._versions import versions_of
 ROOT = Path(__file__).resolve().parents[1]
 #: What decides the figures, and the peers that are measured, too.
 PACKAGES = (
-    "torch_ekm", "torch", "numpy", "scipy", "sapien", "coal", "qpsolvers", "piqp", "numba",
-    "gpytorch", "scikit-learn", "river", "capymoa",
+    "torch_ekm", "torch", "numpy", "scipy", "sapien", "mujoco", "opencv-python", "coal", "qpsolvers",
+    "piqp", "numba", "gpytorch", "scikit-learn", "river", "capymoa", "stable-baselines3",
 )  # fmt: skip
 
 _MOST_ROWS = {True: 10, False: 16}  # of a table that is not folded, with a picture of it and without
