@@ -164,6 +164,7 @@ class Witness:
         mu = np.linalg.lstsq(np.concatenate(rows), np.concatenate(rhs))[0].reshape(contacts.n_c, -1)
         friction = contacts.friction.numpy()
         margin = friction * mu[:, 0] - np.linalg.norm(mu[:, 1:3], axis=-1)
+        self.misfit = float(np.abs(np.concatenate(rows) @ mu.ravel() - np.concatenate(rhs)).max())
         return {name: float(m) for name, m, f in zip(contacts.finger, margin, normal, strict=True) if f > 0}
 
 
