@@ -14,9 +14,8 @@ __all__ = [
     "BusError", "CalibrationError", "CommandRefusedError", "DescriptionError", "DeviceError", "EKMError",
     "EquilibriumError", "FileFormatError", "FolderInUseError", "GraspEndsError", "GraspError",
     "JointMismatchError", "MissingExtraError", "NeverAtRestError", "NoContactError", "NoDerivativeError",
-    "NoStateError",
-    "NonFiniteError", "NonMonotoneFitError", "ObjectLostError", "OutputError", "ParameterError",
-    "PenetrationError", "ShapeError", "SingularGraspError", "SolverError", "SpeedWarning",
+    "NoStateError", "NonFiniteError", "NonMonotoneFitError", "ObjectLostError", "OutputError",
+    "ParameterError", "PenetrationError", "ShapeError", "SingularGraspError", "SolverError", "SpeedWarning",
     "StaleReadingError", "StateMismatchError", "UnknownNameError", "UnstableGraspError", "WorkerDiedError",
 ]  # fmt: skip
 

@@ -14,6 +14,8 @@ from .objects import ObjectDescription, read_object
 from .transmission import read_transmission
 from .urdf import read_urdf
 
+HAND_FILES = (".urdf", ".xml")
+"""How the file of a hand may end: URDF, MJCF."""
 _HANDS = {
     "icub_right": "icub_right_hand.urdf",
     "icub_left": "icub_left_hand.urdf",
@@ -87,7 +89,7 @@ def hand_paths(name: str | Path) -> tuple[Path, Path]:
         UnknownNameError: as :func:`load_hand`.
     """
     known = {key: urdf_folder() / file for key, file in _HANDS.items()}
-    path = _resolve("hand", name, known, (".urdf", ".xml"))
+    path = _resolve("hand", name, known, HAND_FILES)
     return path, path.with_suffix(".transmission.toml")
 
 

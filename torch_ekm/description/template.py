@@ -12,6 +12,7 @@ import numpy as np
 from .._files import write_whole
 from ..exceptions import DescriptionError, UnknownNameError
 from .mjcf_hand import MjcfHand, read_mjcf
+from .registry import HAND_FILES
 from .transmission import TODO
 from .transmission_file import document, toml_key
 from .urdf import UrdfModel, read_urdf
@@ -74,7 +75,7 @@ def write_template(urdf: str | Path) -> Path:
         OutputError: the folder cannot be written to.
     """
     path = Path(urdf)
-    if path.suffix not in (".urdf", ".xml"):
+    if path.suffix not in HAND_FILES:
         raise UnknownNameError("URDF or MJCF", str(urdf), ("a path to a .urdf or .xml file",))
     mjcf = read_mjcf(path) if path.suffix == ".xml" else None
     model = read_urdf(path) if mjcf is None else mjcf.urdf

@@ -10,6 +10,7 @@ from typing import Any
 from .._checks import check_positive
 from ..description import Actuator, HandDescription, load_hand
 from ..description._toml import TomlTable, read_toml
+from ..description.registry import HAND_FILES
 from ..exceptions import DescriptionError, ParameterError, UnknownNameError
 
 _TABLES = ("hand", "bus", "motors", "joints", "fingertips", "limits")
@@ -156,7 +157,7 @@ class Wiring:
             name = head.text("description")
             beside = path.parent / name
             try:
-                hand = load_hand(beside if beside.suffix in (".urdf", ".xml") else name)
+                hand = load_hand(beside if beside.suffix in HAND_FILES else name)
             except UnknownNameError as error:
                 raise head.error(f"'description': {error}") from None
 

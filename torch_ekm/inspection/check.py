@@ -72,16 +72,8 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
     if faulty:
         if not unfit and (other := [row.name for row in pads if row.state != "ok"]):
             remedy = f"first paste the <collision> of {', '.join(other)} as printed above"
-            return [
-                *rows,
-                Check(
-                    "collision shapes",
-                    "error",
-                    "parts of the hand other than the pads touch the object",
-                    remedy,
-                ),
-                *pinch,
-            ]
+            found = "parts of the hand other than the pads touch the object"
+            return [*rows, Check("collision shapes", "error", found, remedy), *pinch]
         if wrong := [row.name for row in pads if row.state == "error"]:
             first = f"first correct {', '.join(wrong)}"
             pinch = [row._replace(remedy=first) if row.state == "error" else row for row in pinch]

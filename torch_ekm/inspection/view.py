@@ -11,6 +11,7 @@ import torch
 
 from ..control import ClosedLoop, LookAndMoveController
 from ..description import HandDescription, list_hands, load_hand, load_object
+from ..description.registry import HAND_FILES
 from ..exceptions import DescriptionError, ParameterError, UnknownNameError
 from ..kinematics import ActuationMap, GraspState
 from ..kinematics.se3 import log as rotation_vector
@@ -54,7 +55,7 @@ def view(what: str, object: str | None = None, seed: int = 0, *, reach: bool = F
         EquilibriumError, GraspError: the object cannot be pinched by this hand.
     """
     path = Path(what)
-    if what not in list_hands() and path.suffix not in (".urdf", ".xml"):
+    if what not in list_hands() and path.suffix not in HAND_FILES:
         if not path.exists():
             raise UnknownNameError("hand or log", what, (*list_hands(), "a URDF file", "a log's folder"))
         if object is not None:

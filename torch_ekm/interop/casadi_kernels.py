@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -71,20 +71,21 @@ def covariance(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> t
         return _action_linear(kernel, basis, inputs)
     if isinstance(kernel, LinearKernel):
         return _linear(kernel, basis, inputs)
+    base: Any = kernel.base if isinstance(kernel, DeepKernel) else kernel
+    if type(base) not in (SquaredExponential, Matern32, Matern52):
+        valid = "squared exponential, Matern, action-linear, linear or deep, and no subclass"
+        raise ParameterError("kernel", type(base).__name__, valid)
+    phi = _phi(base)
     if isinstance(kernel, DeepKernel):
-        phi, base = _phi(kernel.base), kernel.base
         points = inputs.take("embedded", lambda: kernel.embed(basis()))
         embed = _embedding(kernel, inputs)
-    elif isinstance(kernel, SquaredExponential | Matern32 | Matern52):
-        phi, base = _phi(kernel), kernel
+    else:
         w = inputs.take("inverse_lengthscale", lambda: base.log_lengthscale.neg().exp())
         points = inputs.take("scaled", lambda: basis() * base.log_lengthscale.neg().exp())
 
         def embed(z: ca.SX, /) -> ca.SX:
             return z * w
-    else:
-        valid = "squared exponential, Matern, action-linear, linear or deep"
-        raise ParameterError("kernel", type(kernel).__name__, valid)
+
     v = inputs.take("variance", lambda: base.log_variance.exp())
 
     def column(z: ca.SX) -> ca.SX:
@@ -96,9 +97,6 @@ def covariance(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> t
 
 def _phi(kernel: Kernel) -> _Function:
     """Correlation at a squared scaled distance."""
-    if type(kernel) not in (SquaredExponential, Matern32, Matern52):
-        valid = "squared exponential, Matern 3/2 or Matern 5/2, and no subclass"
-        raise ParameterError("kernel", type(kernel).__name__, valid)
     if isinstance(kernel, SquaredExponential):
         return lambda d2: ca.exp(-0.5 * d2)
     root = math.sqrt(3.0 if isinstance(kernel, Matern32) else 5.0)

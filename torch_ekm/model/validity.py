@@ -107,14 +107,15 @@ def _of_missing_forces(forces: GraspForces, reused: bool) -> Doubt:
     missing = float(forces.violation.max())
     kind = ModelStatus.REUSED_FORCES if reused else ModelStatus.NO_FORCES
     stand_in = "those of the step before stand in" if reused else "the step leaves out their stiffness"
-    message = (
-        f"no forces inside the friction cones balance the object, {missing:.2g} N are missing: {stand_in}; "
-        "check mass, friction and pose of the object, and contact_margin if a pad is missing"
-    )
     if math.isnan(missing):
         message = (
             f"the solver of the force problem failed, so the contact forces are unknown: {stand_in}; check "
             "mass and pose of the object"
+        )
+    else:
+        message = (
+            f"no forces inside the friction cones balance the object, {missing:.2g} N are missing: "
+            f"{stand_in}; check mass, friction and pose of the object, and contact_margin if a pad is missing"
         )
     return Doubt(kind, "grasp", missing, 0.0, "N", message)
 

@@ -37,14 +37,12 @@ class RecordingPlant(PlantWrapper):
     def observe(self) -> Observation:
         """Read the sensors; recorded in the place of the last reading, since the hand has not moved."""
         observation = self.plant.observe()
-        if not self.trajectory.observations:  # the plant held the object before it was recorded
-            self.trajectory.observations.append(observation)
-        else:
-            before = self.trajectory.observations[-1].info
-            if "events" in before:
-                info = {**observation.info, "events": before["events"]}
-                observation = dataclasses.replace(observation, info=info)
-            self.trajectory.observations[-1] = observation
+        known = self.trajectory.observations
+        before = known[-1].info if known else {}  # a plant may have held the object before it was recorded
+        if "events" in before:
+            info = {**observation.info, "events": before["events"]}
+            observation = dataclasses.replace(observation, info=info)
+        known[-1:] = [observation]
         return observation
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:

@@ -54,9 +54,9 @@ class ServoInverse(PlantWrapper):
         Raises:
             ShapeError, NonFiniteError: the increment is not ``n_a`` finite numbers; nothing moves.
         """
-        names = self.servo.names
-        check_shape("delta_a", torch.as_tensor(delta_a), (len(names),), f"in order: {', '.join(names)}")
-        check_finite("delta_a", torch.as_tensor(delta_a))
+        delta_a, names = torch.as_tensor(delta_a), self.servo.names
+        check_shape("delta_a", delta_a, (len(names),), f"in order: {', '.join(names)}")
+        check_finite("delta_a", delta_a)
         seen = self.observe() if self._seen is None else self._seen
         v = self._within_range(seen.a, self.servo.command(delta_a))
         after = super().command(v)

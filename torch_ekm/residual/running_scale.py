@@ -31,12 +31,11 @@ class RunningScale(nn.Module):
 
     In each block, samples farther from the median than a normal law would hold are clipped to that distance.
     Its deviation is estimated without the fourth that lies farthest out (the eighth, where the others hardly
-    move: these are no outliers). Mean and
-    root of the spread of what is left are pooled over the last ``memory`` samples. Where large samples
-    come in company, next to each other in time much more often than chance has it, they are bursts of motion
-    and ten times as much is left. So outliers decide
-    nothing, a stream that starts at rest gets its units when it moves, one that comes to rest keeps them,
-    and slow changes are followed. A column that has not varied keeps scale 1.
+    move: these are no outliers). Mean and root of the spread of what is left are pooled over the last
+    ``memory`` samples. Where large samples come in company, next to each other in time much more often than
+    chance has it, they are bursts of motion and ten times as much is left. So outliers decide nothing, a
+    stream that starts at rest gets its units when it moves, one that comes to rest keeps them, and slow
+    changes are followed. A column that has not varied keeps scale 1.
     Exempt columns are scaled by their root mean square. Nothing is squared before it is divided by the
     largest: 1e150 is a number like others. A past that is 1e20 times as large as what comes is forgotten.
 

@@ -21,10 +21,9 @@ class ScaleMixture(nn.Module):
         log s_e += rate_e ((nu_e + 1) r/(nu_e + r) - 1),   r = (z/s_e)^2
         p_e ~ exp(sum_i memory^i log t(z_{t-i}; nu_e, s_e))
 
-    The score is bounded, so one outlier moves log s by at most ``nu rate`` (more
-    among the first samples, whose rates are larger; Harvey, Dynamic models
-    for volatility and heavy tails, 2013). Weights are Bayes' with exponential forgetting (Raftery et
-    al., Technometrics 52, 2010). Shapes ``(*batch, out, experts)``.
+    The score is bounded, so one outlier moves log s by at most ``nu rate`` (more among the first samples,
+    whose rates are larger; Harvey, Dynamic models for volatility and heavy tails, 2013). Weights are Bayes'
+    with exponential forgetting (Raftery et al., Technometrics 52, 2010). Shapes ``(*batch, out, experts)``.
 
     Args:
         out_features: number of outputs, each with experts of its own.

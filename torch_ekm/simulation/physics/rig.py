@@ -24,7 +24,7 @@ _STILL = 2e-3  # [rad/s] and [m/s x 10]: slower than this is settled
 _RAMP_TIME = 0.2  # in which a command is carried out [s]
 _RATE_LIMIT = 100 * np.pi / 180  # fastest motion of a motor [rad/s]; a large command takes longer
 COMMAND_TIME = 0.5  # least time of one command, ramp and settling [s]
-_SETTLE_LIMIT = 1.0  # less COMMAND_TIME: the longest further wait for a still object [s]
+_FURTHER = 0.5  # longest further wait for a still object [s]
 _CLOSING, _HOLDING, _SETTLING = 0.2, 0.3, 1.0  # [s] of a grasp, object held fixed in the first two
 
 
@@ -125,7 +125,7 @@ class Rig:
         """Wait that long [s], then until the object is still, 0.5 s more at most."""
         c = self.config
         self.wait(max(least, c.time_step))
-        for _ in range(round((_SETTLE_LIMIT - COMMAND_TIME) / 0.05)):
+        for _ in range(round(_FURTHER / 0.05)):
             linear, angular = self.scene.object_speed
             if max(10 * linear, angular) < _STILL:
                 break
