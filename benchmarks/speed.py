@@ -1,9 +1,9 @@
-"""What a user waits for: update and prediction of the default learner, a motion of the E-KM, its plan, the
-start; and what an update costs as the basis grows.
+"""What a user waits for: update and prediction of the default learner, a motion of the E-KM, the start; and
+what a sample costs as the basis grows.
 
 ``speed.py`` prints the table, ``--out DIR`` writes a report with the picture; ``--quick`` shows that it runs.
 One thread. A motion is all that the loop does between two readings: linearize, decide, guard, learn (the box
-turned by the simulated iCub hand, the simulator's time taken out); a plan is the controller's part of it.
+turned by the simulated iCub hand, the simulator's time taken out); most of it is decision and learning.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).with_name("learners")))
 
-from bench_learners import PlainC, alternately, filled, gpytorch_fantasy, river_forest, timed, updates
+from bench_learners import PlainC, alternately, filled, gpytorch_fantasy, river_forest, samples, timed
 
 from torch_ekm import EnhancedModel, default_learner, warm_up
 from torch_ekm.control import ClosedLoop, LookAndMoveController, PoseTarget
@@ -50,7 +50,7 @@ print(there - torch_there, time.perf_counter() - made)"""
 
 @dataclass
 class Speed:
-    """Seconds of single calls by what was called, and microseconds of an update by basis size."""
+    """Seconds of single calls by what was called, and microseconds of a sample by basis size."""
 
     times: dict[str, list[float]] = field(default_factory=dict)
     sizes: Sequence[int] = ()
@@ -80,18 +80,24 @@ class Speed:
         return Table("speed", "Times that a user notices", columns, rows, note)
 
     def picture(self):
-        """Cost of an update against the size of the basis."""
+        """Cost of a sample against the size of the basis."""
         figure, (axes,) = new_figure(5.0, 3.2)
         for name, microseconds in self.costs.items():
             axes.plot(self.sizes, microseconds, marker="o", label=name)
         axes.set(
-            xscale="log", yscale="log", xlabel="basis vectors (river: samples seen)", ylabel="update [us]"
+            xscale="log",
+            yscale="log",
+            xlabel="basis vectors (river: samples seen)",
+            ylabel="update and prediction [us]",
         )
         axes.legend()
         return figure
 
     def report(self, folder: Path) -> None:
-        caption = f"Update of one sample, {IN} inputs, {OUT} outputs; medians of one run, in turns."
+        caption = (
+            f"Update with one sample, then a prediction; {IN} inputs, {OUT} outputs. Medians of one run, in"
+            " turns; plain C, which predicts with Jacobians: the fastest of five series."
+        )
         shown = save_figure(self.picture(), folder, "speed", caption)
         Report("Speed", f"{self.verdict}.", [self.table()], [shown]).write(folder)
 
@@ -142,13 +148,13 @@ def of_motions(turns: Sequence[float]) -> dict[str, list[float]]:
     model = KinematicModel(plant.hand, plant.object)
     ekm = EnhancedModel.for_grasp(model, seen.state)
     loop = ClosedLoop(plant, LookAndMoveController(ekm, focus=plant.rotation_axis))
-    times: dict[str, list[float]] = {"motion": [], "plan": [], "linearize": []}
+    times: dict[str, list[float]] = {"motion": [], "decision and learning": [], "linearize": []}
     for degrees in turns:
         target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=degrees)
         begin, before = time.perf_counter(), plant.seconds
         for step in loop.steps(target):
             times["motion"].append(time.perf_counter() - begin - (plant.seconds - before))
-            times["plan"].append(step.seconds)
+            times["decision and learning"].append(step.seconds)
             times["linearize"].append(timed(lambda s=step: model.linearize(s.after.state)))
             begin, before = time.perf_counter(), plant.seconds
     plant.close()
@@ -166,13 +172,14 @@ def of_start(environment: dict[str, str], name: str) -> dict[str, list[float]]:
 
 
 def by_size(sizes: Sequence[int], rounds: int, budget: float) -> dict[str, list[float]]:
-    """Microseconds of an update, by size of the basis."""
+    """Microseconds of an update and a prediction, by size of the basis."""
     costs: dict[str, list[float]] = {name: [] for name in ("torch_ekm", "plain C", "GPyTorch", "river")}
     for capacity in sizes:
         makes = {"GPyTorch": gpytorch_fantasy, "river": river_forest}
         calls = {name: make(capacity, OUT) for name, make in makes.items()}
-        calls["torch_ekm"] = updates(filled(capacity, OUT), OUT)
-        costs["plain C"].append(PlainC(capacity, OUT).microseconds("update"))
+        calls["torch_ekm"] = samples(filled(capacity, OUT), OUT)
+        limit = PlainC(capacity, OUT)
+        costs["plain C"].append(limit.microseconds("update") + limit.microseconds("predict"))
         for name, microseconds in alternately(calls, rounds, budget).items():
             costs[name].append(microseconds)
     return costs

@@ -88,6 +88,11 @@ def predictions(gp: SparseOnlineGP, m: int, shape: tuple[int, ...] = ()) -> Time
     return Timed(call, stream(64, m, shape)[0])
 
 
+def samples(learner: Any, m: int) -> Timed:
+    """An update with a sample, then a prediction."""
+    return Timed(lambda x, y: (learner.update(x, y), learner.predict(x + 0.1)), *stream(64, m))
+
+
 class PlainC:
     """The textbook recursion in C."""
 
@@ -208,19 +213,19 @@ def sklearn_refit(capacity: int, m: int) -> Callable:
 
 
 def river_forest(capacity: int, m: int) -> Callable:
-    """river's adaptive random forest, one per output."""
+    """An update and a prediction of river's adaptive random forest, one per output."""
     from torch_ekm.interop import RiverResidual
 
     learner = RiverResidual(D, m)
     learner.update(*stream(capacity, m))
-    return Timed(learner.update, *stream(64, m))
+    return samples(learner, m)
 
 
 PEERS = {
     "GPyTorch fantasy + predict": gpytorch_fantasy,
     "GPyTorch SVGP step": gpytorch_svgp,
     "scikit-learn refit + predict": sklearn_refit,
-    "river ARF update": river_forest,
+    "river ARF update + predict": river_forest,
 }
 
 
@@ -361,9 +366,7 @@ def of_peers() -> Table:
     for name, make in PEERS.items():
         module = name.split()[0].replace("scikit-learn", "sklearn")
         if importlib.util.find_spec(module.lower()) is not None:
-            gp = filled(100, 6)
-            ours = Timed(lambda x, y, gp=gp: (gp.update(x, y), gp.predict(x + 0.1)), *stream(64, 6))
-            found = alternately({"peer": make(100, 6), "ours": ours}, rounds=3)
+            found = alternately({"peer": make(100, 6), "ours": samples(filled(100, 6), 6)}, rounds=3)
             rows.append((name, found["peer"], found["ours"], found["peer"] / found["ours"]))
     columns = "what, 100 points, 6 outputs | peer [us] | update and prediction here [us] | ratio"
     return Table("Other libraries", columns, rows)

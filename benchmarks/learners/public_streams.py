@@ -118,7 +118,7 @@ def river_peers() -> dict[str, Callable[[], Any]]:
 
 def fried(method: str, factory: Callable, x: Array, y: Array) -> Iterator[Row]:
     """The first 1000 samples and all of them, in one pass."""
-    model, spread = CapyMOARegressor(learner=factory), float(np.ptp(y))
+    model = CapyMOARegressor(learner=factory)
     ends, begin = np.empty((len(y), 3)), time.perf_counter()
     for t, (row, target) in enumerate(zip(x, y, strict=True)):
         instance = SimpleNamespace(x=row, y_value=target)
@@ -127,7 +127,7 @@ def fried(method: str, factory: Callable, x: Array, y: Array) -> Iterator[Row]:
         if t + 1 in (1000, len(y)):
             low, mean, high = ends[: t + 1].T
             error, milliseconds = y[: t + 1] - mean, 1e3 * (time.perf_counter() - begin) / (t + 1)
-            held, width = (low <= y[: t + 1]) & (y[: t + 1] <= high), (high - low).mean() / spread
+            held, width = (low <= y[: t + 1]) & (y[: t + 1] <= high), (high - low).mean() / np.ptp(y[: t + 1])
             name = "Fried, first 1000" if t + 1 == 1000 else "Fried"
             rms = math.sqrt(np.square(error).mean())
             yield Row(name, method, t + 1, np.abs(error).mean(), rms, milliseconds, held.mean(), width)

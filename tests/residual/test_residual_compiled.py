@@ -247,8 +247,9 @@ def test_a_fresh_installation_learns_while_another_process_compiles(monkeypatch)
     monkeypatch.setattr(loading, "_loader", loading.Loader())
     x, y = hard_stream(120)
     gp, reference = pair("all")[1], pair("all")[0]
-    with pytest.warns(SpeedWarning, match="warm_up"):
+    with pytest.warns(SpeedWarning, match="warm_up") as given:
         gp.update(x[:80], y[:80])
+    assert given[0].filename == __file__  # a user sees their own line
     reference.update(x[:80], y[:80])
     assert torch.equal(gp(x[0]), reference(x[0]))
     assert not used(gp, lambda: gp(x[0]), pytest.MonkeyPatch())

@@ -52,7 +52,7 @@ class Loader:
                 )  # fmt: skip
             except OSError:
                 return False
-            warnings.warn(_FIRST_TIME, SpeedWarning, stacklevel=2)
+            _warn(_FIRST_TIME)
         return self._compiler.poll() is None
 
 
@@ -69,12 +69,20 @@ def _imported() -> ModuleType | None:
         from . import numba_network
     except ImportError as error:
         if error.name not in ("numba", "llvmlite"):  # it is there, and does not fit
-            warnings.warn(_OFF.format(error), SpeedWarning, stacklevel=2)
+            _warn(_OFF.format(error))
         return None
     except RuntimeError as error:
-        warnings.warn(_OFF.format(error), SpeedWarning, stacklevel=2)
+        _warn(_OFF.format(error))
         return None
     return numba_network
+
+
+def _warn(message: str) -> None:
+    """Shows the user's line that led here: the first outside this package, torch and type checks."""
+    level, frame, passed = 1, sys._getframe(), ("torch_ekm", "torch", "jaxtyping", "beartype")
+    while frame.f_back and frame.f_globals["__name__"].partition(".")[0] in passed:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, SpeedWarning, stacklevel=level)
 
 
 def _is_cached() -> bool:
