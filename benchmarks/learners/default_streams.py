@@ -134,6 +134,10 @@ MADE = {
     "smooth": smooth, "friedman": friedman, "wide and noisy": wide_and_noisy, "from rest": from_rest,
     "arm": arm, "pure noise": pure_noise,
 }  # fmt: skip
+#: Their files are sorted in ways of their own: they are shuffled.
+_SHUFFLED = ("sarcos", "kin40k", "powerplant")
+#: Those that depend on the seed.
+SEEDED = (*MADE, *_SHUFFLED)
 
 
 def streams(n: int, seed: int) -> dict[str, Samples]:
@@ -145,7 +149,7 @@ def streams(n: int, seed: int) -> dict[str, Samples]:
         except EKMError:
             continue
         x, y = one.x.double(), one.y.double()
-        if name in ("sarcos", "kin40k", "powerplant"):  # files are sorted in ways of their own
+        if name in _SHUFFLED:
             order = torch.randperm(len(x), generator=torch.Generator().manual_seed(seed))
             x, y = x[order], y[order]
         found[name] = Samples(x, y, y)
