@@ -9,9 +9,9 @@ import qpsolvers
 from torch_ekm.contact.forces.active_set import EqualityProgram, solve_by_active_set
 
 
-def drawn(seed: int):
+def drawn(seed: int, n: int = 10):
     draw = np.random.default_rng(seed)
-    n, m, k = 8, 2, 12
+    m, k = 2, 12
     root = draw.normal(size=(n, n))
     A, G = draw.normal(size=(m, n)), draw.normal(size=(k, n))
     x = draw.normal(size=n)  # keeps all rows: there is an optimum
@@ -36,9 +36,22 @@ def test_the_optimum_and_its_certificate(seed: int) -> None:
     np.testing.assert_allclose(again.x, found.x, atol=1e-12)
 
 
+def test_at_a_vertex_it_may_find_none_but_nothing_wrong() -> None:
+    """With as many rows as unknowns the next row has no multipliers: rounding decides which row leaves."""
+    answers = 0
+    for seed in range(20):
+        P, q, A, b, G, h = drawn(seed, n=8)
+        found = solve_by_active_set(EqualityProgram(P, q, A, b), G, h, [])
+        if found is not None:
+            other = qpsolvers.solve_problem(qpsolvers.Problem(P, q, G, h, A, b), "piqp")
+            np.testing.assert_allclose(found.x, other.x, rtol=0, atol=1e-5)
+            answers += 1
+    assert answers >= 17
+
+
 def test_rows_that_contradict_each_other_are_left_to_another_method() -> None:
     P, q, A, b, _, _ = drawn(0)
-    G = np.stack([np.eye(8)[0], -np.eye(8)[0]])
+    G = np.stack([np.eye(10)[0], -np.eye(10)[0]])
     assert solve_by_active_set(EqualityProgram(P, q, A, b), G, np.array([-1.0, -1.0]), []) is None
 
 

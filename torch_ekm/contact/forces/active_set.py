@@ -69,8 +69,9 @@ def solve_by_active_set(program: EqualityProgram, G: Array, h: Array, active: li
 
     From one guess to the next the row with the most negative multiplier leaves, or else the row that is
     violated most enters. An answer keeps all conditions of Karush, Kuhn and Tucker and is exact to rounding;
-    where none is found (None) an interior-point method has to do it. See Nocedal and Wright, Numerical
-    Optimization (2006), ch. 16.
+    where none is found (None) an interior-point method has to do it. At a vertex, where as many rows hold as
+    there are unknowns, rounding decides which row leaves, and none may be found. See Nocedal and Wright,
+    Numerical Optimization (2006), ch. 16.
 
     Args:
         active: the first guess.
