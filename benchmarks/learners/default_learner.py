@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 from default_streams import (
-    SEEDED,
     Samples,
     arm,
     from_rest,
@@ -68,11 +67,10 @@ def table(n: int, seeds: Sequence[int], only: Sequence[str] = ()) -> None:
     """Each learner on each stream."""
     print("| stream | " + " | ".join(LEARNERS) + " | default : best | coverage of 90 % |")
     print("|---" * (len(LEARNERS) + 3) + "|")
-    drawn = {seed: streams(n, seed) for seed in seeds}
-    for name in only or drawn[seeds[0]]:
+    drawn = streams(n, seeds)
+    for name in only or drawn:
         errors, coverages = [], []
-        for seed in seeds if name in SEEDED else seeds[:1]:
-            samples = drawn[seed][name]
+        for samples in drawn[name]:
             half = len(samples.x) // 2
             runs = [run(make, samples) for make in LEARNERS.values()]
             errors.append([ratio(r.mean[half:], samples.y[half:]) for r in runs])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -134,23 +135,18 @@ MADE = {
     "smooth": smooth, "friedman": friedman, "wide and noisy": wide_and_noisy, "from rest": from_rest,
     "arm": arm, "pure noise": pure_noise,
 }  # fmt: skip
-#: Their files are sorted in ways of their own: they are shuffled.
-_SHUFFLED = ("sarcos", "kin40k", "powerplant")
-#: Those that depend on the seed.
-SEEDED = (*MADE, *_SHUFFLED)
 
 
-def streams(n: int, seed: int) -> dict[str, Samples]:
-    """Those made here, and the recordings that are at hand."""
-    found = {name: make(n, seed) for name, make in MADE.items()}
+def streams(n: int, seeds: Sequence[int]) -> dict[str, list[Samples]]:
+    """Those made here, and the recordings that are at hand: one of each seed, or one that depends on none."""
+    found = {name: [make(n, seed) for seed in seeds] for name, make in MADE.items()}
     for name in RECORDINGS:
         try:
             one = load_recording(name, n)
         except EKMError:
             continue
-        x, y = one.x.double(), one.y.double()
-        if name in _SHUFFLED:
-            order = torch.randperm(len(x), generator=torch.Generator().manual_seed(seed))
-            x, y = x[order], y[order]
-        found[name] = Samples(x, y, y)
+        x, y, orders = one.x.double(), one.y.double(), [torch.arange(len(one.x))]
+        if name in ("sarcos", "kin40k", "powerplant"):  # files are sorted in ways of their own
+            orders = [torch.randperm(len(x), generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+        found[name] = [Samples(x[order], y[order], y[order]) for order in orders]
     return found

@@ -18,11 +18,8 @@ def drawn(seed: int, n: int = 10):
     return root @ root.T + 0.1 * np.eye(n), 5 * draw.normal(size=n), A, A @ x, G, G @ x + draw.uniform(size=k)
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_the_optimum_and_its_certificate(seed: int) -> None:
-    P, q, A, b, G, h = drawn(seed)
-    found = solve_by_active_set(EqualityProgram(P, q, A, b), G, h, [])
-    assert found is not None
+def certify(P, q, A, b, G, h, found) -> None:
+    """Keeps the conditions of Karush, Kuhn and Tucker; PIQP agrees; its rows lead to it again."""
     slope = P @ found.x + q + found.equality @ A + found.inequality @ G[found.active]
     np.testing.assert_allclose(slope, 0, atol=1e-9)
     np.testing.assert_allclose(A @ found.x, b, atol=1e-9)
@@ -36,17 +33,22 @@ def test_the_optimum_and_its_certificate(seed: int) -> None:
     np.testing.assert_allclose(again.x, found.x, atol=1e-12)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_the_optimum_and_its_certificate(seed: int) -> None:
+    P, q, A, b, G, h = drawn(seed)
+    found = solve_by_active_set(EqualityProgram(P, q, A, b), G, h, [])
+    assert found is not None
+    certify(P, q, A, b, G, h, found)
+
+
 def test_at_a_vertex_it_may_find_none_but_nothing_wrong() -> None:
     """With as many rows as unknowns the next row has no multipliers: rounding decides which row leaves."""
-    answers = 0
-    for seed in range(20):
-        P, q, A, b, G, h = drawn(seed, n=8)
-        found = solve_by_active_set(EqualityProgram(P, q, A, b), G, h, [])
+    programs = [drawn(seed, n=8) for seed in range(20)]
+    answers = [solve_by_active_set(EqualityProgram(*program[:4]), *program[4:], []) for program in programs]
+    for program, found in zip(programs, answers, strict=True):
         if found is not None:
-            other = qpsolvers.solve_problem(qpsolvers.Problem(P, q, G, h, A, b), "piqp")
-            np.testing.assert_allclose(found.x, other.x, rtol=0, atol=1e-5)
-            answers += 1
-    assert answers >= 17
+            certify(*program, found)
+    assert answers.count(None) <= 1
 
 
 def test_rows_that_contradict_each_other_are_left_to_another_method() -> None:

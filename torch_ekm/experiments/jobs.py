@@ -12,7 +12,6 @@ import json
 import os
 import threading
 import time
-import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -22,6 +21,7 @@ from typing import Any
 
 from .._extras import require
 from .._files import WriterLock, make_folder, write_whole
+from .._warnings import warn
 from ..exceptions import WorkerDiedError
 
 Jobs = Mapping[str, tuple[Any, ...]]
@@ -67,7 +67,7 @@ def run_jobs(
                 try:
                     results[name] = read_result(path, name)
                 except ValueError as error:
-                    warnings.warn(f"{path}: {error}; the job is run again", stacklevel=2)
+                    warn(f"{path}: {error}; the job is run again")
         for name in results:
             report(name)
         waiting = {name: arguments for name, arguments in jobs.items() if name not in results}

@@ -6,13 +6,13 @@ import csv
 import io
 import os
 import re
-import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from .._files import WriterLock, make_folder, told_as_output_error, write_whole
 from .._versions import versions_of
+from .._warnings import warn
 from ..exceptions import DescriptionError, OutputError, ParameterError
 from .trajectory import Trajectory, plain
 from .trial_file import read_trial
@@ -183,7 +183,7 @@ class TrialLog:
             aside = self.path(trial).with_name(self.path(trial).name + DAMAGED)
             os.replace(self.path(trial), aside)
             what = f"{problem}; kept as {aside.name}, and missing from the log"
-            warnings.warn(f"{aside.with_suffix('')}: {what}", stacklevel=4)
+            warn(f"{aside.with_suffix('')}: {what}")
         for path in self.folder.glob("*.part"):
             if path.stem == INDEX or _NAME.fullmatch(path.stem):
                 path.unlink()

@@ -2,10 +2,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import warnings
 
 import torch
 
+from .._warnings import warn
 from ..contact.contact_kinematics import contact_kinematics
 from ..contact.detector import ContactDetector
 from ..description import HandDescription, ObjectDescription
@@ -141,10 +141,9 @@ class ContactAligned(PlantWrapper):
         if joint not in self._named:
             self._named.add(joint)
             names = " or ".join(f"'{self.hand.joint_names[j]}'" for j in alike)
-            warnings.warn(
+            warn(
                 f"the sensor of joint {names} contradicts pad '{pad}', which presses; until the next grasp "
-                "contacts alone say where the joint is: check the sensor",
-                stacklevel=5,
+                "contacts alone say where the joint is: check the sensor"
             )
 
     def _touching(

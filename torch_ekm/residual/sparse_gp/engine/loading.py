@@ -6,10 +6,10 @@ import importlib.util
 import os
 import subprocess
 import sys
-import warnings
 from pathlib import Path
 from types import ModuleType
 
+from ...._warnings import warn
 from ....exceptions import SpeedWarning
 
 _OFF = (
@@ -52,7 +52,7 @@ class Loader:
                 )  # fmt: skip
             except OSError:
                 return False
-            _warn(_FIRST_TIME)
+            warn(_FIRST_TIME, SpeedWarning)
         return self._compiler.poll() is None
 
 
@@ -69,20 +69,12 @@ def _imported() -> ModuleType | None:
         from . import numba_network
     except ImportError as error:
         if error.name not in ("numba", "llvmlite"):  # it is there, and does not fit
-            _warn(_OFF.format(error))
+            warn(_OFF.format(error), SpeedWarning)
         return None
     except RuntimeError as error:
-        _warn(_OFF.format(error))
+        warn(_OFF.format(error), SpeedWarning)
         return None
     return numba_network
-
-
-def _warn(message: str) -> None:
-    """Shows the user's line that led here: the first outside this package, torch and type checks."""
-    level, frame, passed = 1, sys._getframe(), ("torch_ekm", "torch", "jaxtyping", "beartype")
-    while frame.f_back and frame.f_globals["__name__"].partition(".")[0] in passed:
-        level, frame = level + 1, frame.f_back
-    warnings.warn(message, SpeedWarning, stacklevel=level)
 
 
 def _is_cached() -> bool:
