@@ -48,6 +48,18 @@ def check_positive(name: str, value: float) -> float:
     return float(value)
 
 
+def check_sizes(name: str, values: float | Sequence[float] | Tensor, n: int) -> list[float]:
+    """n finite floats of 0 or more, of one or of n; or ParameterError."""
+    valid = f"one number or {n}, finite and not negative"
+    try:
+        found = [float(value) for value in (values if isinstance(values, Iterable) else [values] * n)]
+    except (TypeError, ValueError):
+        raise ParameterError(name, values, valid) from None
+    if len(found) != n or not all(math.isfinite(value) and value >= 0 for value in found):
+        raise ParameterError(name, values, valid)
+    return found
+
+
 def check_fraction(name: str, value: float) -> float:
     """``value`` as a float in (0, 1], or ParameterError."""
     try:

@@ -58,6 +58,10 @@ class KRLSTracker(ScaledLearner, SingleLearner, DoubleStateLearner):
         self.active = nn.Buffer(torch.zeros(M, dtype=torch.bool, device=self.device))
         self._make_units(self.kernel.shift_invariant(self.in_features), torch.float64)
 
+    def _clear(self, models: Tensor | None = None) -> None:
+        for buffer in (self.basis, self.mu, self.Sigma, self.Q, self.active):
+            buffer.zero_()
+
     def _mean(self, z: Tensor) -> Tensor:
         return self._cross(z) @ self.Q @ self.mu
 

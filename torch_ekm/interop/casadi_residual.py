@@ -10,6 +10,7 @@ import numpy as np
 from .._extras import require
 from ..exceptions import ParameterError
 from ..residual import MixtureResidual, ResidualLearner, SparseOnlineGP
+from ..residual.base import FARTHEST
 from ..typing import Array
 from .casadi_kernels import Inputs, covariance
 
@@ -76,7 +77,7 @@ def _build(learner: ResidualLearner, inputs: Inputs, variance: bool) -> _Express
 
 
 def _sparse(learner: SparseOnlineGP, inputs: Inputs, variance: bool) -> _Expression:
-    """``mean = scale alpha'k + offset``, ``var = scale^2 (k** + k'Ck)``, k in the learner's units."""
+    """``mean = scale alpha'k + offset``, ``var = scale^2 (k** + k'Ck)``, in the learner's units and bound."""
     units, posterior = learner.units, learner.posterior
     shift, wide, scale, offset = 0.0, 1.0, ca.SX.ones(learner.out_features), 0.0
     if units.affine():
@@ -84,15 +85,18 @@ def _sparse(learner: SparseOnlineGP, inputs: Inputs, variance: bool) -> _Express
         shift, wide, offset, scale = (
             inputs.take(name, lambda i=i: units.affine()[i]) for i, name in enumerate(names)
         )
+    reach = None if units.input is None or not units.input.cuts else ca.DM(units.input.reach.tolist())
+    bounded = _bounded(learner, inputs)
     column, diagonal = covariance(learner.kernel, lambda: posterior.basis, inputs)
     alpha = inputs.take("alpha", lambda: posterior.alpha)
     C = inputs.take("C", lambda: posterior.covariance) if variance else None
 
     def expression(x: ca.SX) -> tuple[ca.SX, ca.SX]:
         z = (x - shift) / wide
+        z = z if reach is None else ca.fmin(ca.fmax(z, -reach), reach)
         k = column(z)
         latent = ca.SX(0) if C is None else diagonal(z) + k.T @ (C @ k)
-        return scale * (alpha.T @ k) + offset, scale * scale * latent
+        return bounded(scale * (alpha.T @ k) + offset), scale * scale * latent
 
     return expression
 
@@ -104,8 +108,9 @@ def _mixture(learner: MixtureResidual, inputs: Inputs, variance: bool) -> _Expre
     noises = [inputs.take("noise", lambda one=one: _noise(one)) for one in noisy]
     gain = inputs.take("gain", lambda: learner.gain)
     offset = inputs.take("offset", lambda: learner.offset)
+    bounded = _bounded(learner, inputs)
     if not variance:
-        return lambda x: (_weighted(gain, [member(x)[0] for member in members]) + offset, ca.SX(0))
+        return lambda x: (bounded(_weighted(gain, [member(x)[0] for member in members]) + offset), ca.SX(0))
     beliefs = inputs.take("beliefs", lambda: learner.beliefs)
     carried = inputs.take("carried", lambda: learner.carried)
     share = inputs.take("weights", lambda: learner.weights)
@@ -117,7 +122,7 @@ def _mixture(learner: MixtureResidual, inputs: Inputs, variance: bool) -> _Expre
     def expression(x: ca.SX) -> tuple[ca.SX, ca.SX]:
         each = [member(x) for member in members]
         means, variances = (ca.horzcat(*part) for part in zip(*each, strict=True))
-        mean = _weighted(gain, [m for m, _ in each]) + offset
+        mean = bounded(_weighted(gain, [m for m, _ in each]) + offset)
         apart = (means @ owner) * ca.repmat(h, means.shape[0], 1) + carried - mean @ one
         inside = (variances @ owner) * ca.repmat(h * h, means.shape[0], 1)
         spread = ca.sum2(beliefs * (inside + apart * apart))
@@ -125,6 +130,12 @@ def _mixture(learner: MixtureResidual, inputs: Inputs, variance: bool) -> _Expre
         return mean, ca.if_else(spread <= most, spread, most)
 
     return expression
+
+
+def _bounded(learner: ResidualLearner, inputs: Inputs) -> Callable[[ca.SX], ca.SX]:
+    """See :meth:`ResidualLearner.bounded`."""
+    most = inputs.take("largest", lambda: FARTHEST * learner.largest)
+    return lambda mean: ca.fmin(ca.fmax(mean, -most), most)
 
 
 def _weighted(weights: ca.SX, columns: list[ca.SX]) -> ca.SX:

@@ -43,7 +43,8 @@ class RiverResidual(SingleLearner):
         self._models = [self._prototype.clone() for _ in range(self.out_features)]
         self._count = 0
         self.noise.fill_(1.0)
-        self.n_refused.zero_()
+        for count in (self.n_refused, self.largest):
+            count.zero_()
 
     def forward(self, x: Tensor) -> Tensor:
         """Predictions of the regressors; no gradient reaches x."""
@@ -51,7 +52,7 @@ class RiverResidual(SingleLearner):
         rows = x.detach().reshape(-1, self.in_features).tolist()
         values = [[self._value(model, row) for model in self._models] for row in rows]
         mean = torch.tensor(values, dtype=self.dtype, device=self.device).reshape(*x.shape[:-1], -1)
-        return mean + 0.0 * x[..., :1]
+        return self.bounded(mean) + 0.0 * x[..., :1]
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """The same variance with and without noise: river makes no difference."""

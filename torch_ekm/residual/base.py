@@ -20,6 +20,9 @@ from ..exceptions import ParameterError, ShapeError
 from ..typing import Bool, Float, Tensor
 from .report import UpdateReport
 
+#: times the largest |y| that was learned, beyond which no prediction goes
+FARTHEST = 2.0
+
 
 class ResidualLearner(Recorded, nn.Module, ABC):
     """g(x), learned from a stream: ``y ~ N(g(x), R)``, and ``g = 0`` before the first sample.
@@ -32,7 +35,8 @@ class ResidualLearner(Recorded, nn.Module, ABC):
 
     A subclass implements ``forward``, ``predict``, ``absorb`` and, unless all its buffers start at 0,
     ``reset``. It keeps all it has learned in buffers of fixed size, so that ``state_dict``, ``deepcopy``,
-    ``.to()`` move all of it.
+    ``.to()`` move all of it. It passes means and slopes through :meth:`bounded`: ``|g|`` is at most twice the
+    largest ``|y|`` that was learned, whatever the stream.
 
     Threads: updates of one learner come one after the other. A query does not wait for them; where another
     thread updates, query ``with learner.lock:`` to see the state before an update or after it.
@@ -71,6 +75,9 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         self.lock = threading.RLock()
         # An empty float tensor follows .to() and so remembers dtype and device for all subclasses.
         self._like = nn.Buffer(torch.empty(0, dtype=dtype, device=device), persistent=False)
+        shape = (*self.batch_shape, self.out_features)
+        self.largest = nn.Buffer(torch.zeros(shape, dtype=self._kept, device=device))
+        """Largest ``|y|`` that was learned, ``(*batch, out)``."""
 
     # -- what a learner is ------------------------------------------------------------------
 
@@ -123,6 +130,17 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         x = self.check_query(x)
         mean, J = value_and_jacobian(self, x)
         return mean, x.new_zeros(*mean.shape, x.shape[-1]) if J is None else J
+
+    def slope_deviation(
+        self, x: Float[Tensor, "*any in_features"]
+    ) -> Float[Tensor, "*all out_features in_features"]:
+        """Standard deviation of each entry of ``dg/dx``: what the slope of :meth:`linearize` is worth.
+
+        That of an input which never moved is large: nothing was seen of its slope. NaN: the learner states
+        none.
+        """
+        x = self.check_query(x)
+        return x.new_full((*x.shape[:-1], self.out_features, self.in_features), math.nan)
 
     def export(self, path: str | pathlib.Path, *, format: Literal["onnx", "pt2"] = "pt2") -> pathlib.Path:
         """Write what the learner predicts now to a file that other runtimes read, and return its path.
@@ -196,7 +214,21 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         x, y = x.to(self._kept), y.to(self._kept)
         if mask is not None and not mask.is_cuda and not bool(mask.any()):
             return UpdateReport.of_nothing(mask, self.dtype)
+        size = y.abs() if mask is None else y.abs() * mask.unsqueeze(-1)
+        torch.maximum(self.largest, size, out=self.largest)
         return self.absorb(x, y, mask)
+
+    def bounded(self, mean: Float[Tensor, "*all out"]) -> Float[Tensor, "*all out"]:
+        """A mean, cut at ``2 largest``: what is linear in x extrapolates to anything."""
+        most = (FARTHEST * self.largest).to(mean.dtype)
+        return mean.clamp(-most, most)
+
+    def bounded_slope(
+        self, mean: Float[Tensor, "*all out"], slope: Float[Tensor, "*all out in"]
+    ) -> tuple[Float[Tensor, "*all out"], Float[Tensor, "*all out in"]]:
+        """The same with its derivative, which is 0 where the mean is cut."""
+        cut = self.bounded(mean)
+        return cut, slope * (cut == mean).unsqueeze(-1)
 
     # -- state ----------------------------------------------------------------------------------
 
@@ -340,7 +372,7 @@ class SingleLearner(ResidualLearner):
     def step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         if mask is not None and not bool(mask):
             return UpdateReport.of_nothing(mask, self.dtype)
-        return self.absorb(x.to(self._kept), y.to(self._kept), None)
+        return super().step(x, y, None)
 
 
 def recordable(x: Any) -> Any:

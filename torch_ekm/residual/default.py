@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from ..exceptions import UnknownNameError
@@ -24,6 +25,8 @@ def default_learner(
     *,
     capacity: int = 100,
     output_offset: Literal["zero", "learned"] = "zero",
+    input_resolution: float | Sequence[float] = 0.0,
+    output_scale: float | Sequence[float] = 0.0,
     **options: Any,
 ) -> MixtureResidual:
     """The recommended learner where nothing is known of the data: a mixture of four, in constant memory.
@@ -36,6 +39,8 @@ def default_learner(
     Args:
         capacity: basis vectors of each of the four.
         output_offset: ``"learned"`` if y is no residual but has a mean of its own.
+        input_resolution, output_scale: sizes below which x and y mean nothing, if they are known, see
+            Standardize.
         options: see ResidualLearner.
 
     Raises:
@@ -46,7 +51,7 @@ def default_learner(
     if unknown:
         raise UnknownNameError("option", unknown[0], ("capacity", "output_offset", *_OPTIONS))
     d, m = in_features, out_features
-    units = Standardize(output_offset=output_offset)
+    units = Standardize(output_offset, input_resolution, output_scale)
     every = 32  # samples between two rebuilds
     common: dict[str, Any] = {
         "capacity": capacity, "standardize": units, "refresh_every": every, **options

@@ -137,8 +137,7 @@ class MixtureResidual(ResidualLearner):
     def forward(self, x: Tensor) -> Tensor:
         """Mean of all experts by their weights, ``sum_b gain_b m_b(x) + offset``."""
         x = self.check_query(x)
-        means = torch.stack([learner(x).to(x.dtype) for learner in self.members], dim=-1)
-        return (self.gain * means).sum(-1) + self.offset
+        return self._mean(torch.stack([learner(x).to(x.dtype) for learner in self.members], dim=-1))
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """Moments of the mixture, or mean and running variance of y with ``observation=True``."""
@@ -152,7 +151,7 @@ class MixtureResidual(ResidualLearner):
             return Normal(found[0], found[1], validate_args=False)
         mean, deviation, means = self._together([(m, v) for m, _, v in each])
         deviation = deviation * self.inflation.sqrt()
-        variances = torch.stack([v for _, v, _ in each], dim=-1).to(x.dtype)
+        variances = self._wide(torch.stack([v for _, v, _ in each], dim=-1).to(x.dtype))
         variance = self._spread(variances, self._apart(means, mean))
         # y is measured: experts that disagree by more than y scatters do not know less of g than of y
         return Normal(mean, torch.minimum(variance.sqrt(), deviation), validate_args=False)
@@ -165,9 +164,21 @@ class MixtureResidual(ResidualLearner):
         """The learners' slopes, weighted; what is carried over does not depend on x."""
         x = self.check_query(x)
         pairs = [learner.linearize(x) for learner in self.members]
-        means = torch.stack([mean for mean, _ in pairs], dim=-1).to(x.dtype)
-        slopes = torch.stack([slope for _, slope in pairs], dim=-1).to(x.dtype)
-        return (self.gain * means).sum(-1) + self.offset, (self.gain.unsqueeze(-2) * slopes).sum(-1)
+        means, slopes = (torch.stack(part, dim=-1).to(x.dtype) for part in zip(*pairs, strict=True))
+        slope = (self.gain.unsqueeze(-2) * _finite(slopes)).sum(-1)
+        return self.bounded_slope(self._sum(_finite(means)), slope)
+
+    def slope_deviation(self, x: Tensor) -> Tensor:
+        """Of the experts' slopes, within them and between them::
+
+        var = sum_e p_e (h_e^2 var_b + (h_e J_b - J)^2)
+        """
+        x = self.check_query(x)
+        J = _finite(torch.stack([learner.linearize(x)[1].to(x.dtype) for learner in self.members], dim=-1))
+        s = torch.stack([learner.slope_deviation(x).to(x.dtype) for learner in self.members], dim=-1)
+        p, h = self.mass.unsqueeze(-3), self._shares
+        apart = h * J.unsqueeze(-1) - (self.gain.unsqueeze(-2) * J).sum(-1)[..., None, None]
+        return (p * (h.square() * s.square().unsqueeze(-1) + apart.square())).sum((-2, -1)).sqrt()
 
     def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> MomentsWithJacobians:
         """Mean, variance (as :meth:`predict`) and both derivatives, from those of the learners::
@@ -184,19 +195,20 @@ class MixtureResidual(ResidualLearner):
                 raise ParameterError("learners", type(learner).__name__, valid)
         each = [cast("Any", learner).predict_with_jacobians(x) for learner in self.members]
         m, v, dm, dv = (torch.stack(part, dim=-1).to(x.dtype) for part in zip(*each, strict=True))
-        noisy = [learner.moments(x, observation=True)[1] for learner in self.members]
-        mean = (self.gain * m).sum(-1) + self.offset
+        m, v, dm, dv = _finite(m), self._wide(v), _finite(dm), _finite(dv)
+        noisy = torch.stack([learner.moments(x, observation=True)[1] for learner in self.members], dim=-1)
+        mean, jacobian = self.bounded_slope(self._sum(m), (self.gain.unsqueeze(-2) * dm).sum(-1))
         apart, p, h = self._apart(m, mean), self.mass, self._shares
         variance = self._spread(v, apart)
         of_v, of_m = p @ h.square(), 2.0 * (p * apart) @ h
         slope = (of_v.unsqueeze(-2) * dv).sum(-1) + (of_m.unsqueeze(-2) * dm).sum(-1)
         share, inflation = self.weights, self.inflation
-        most = inflation * (share * torch.stack(noisy, dim=-1).to(x.dtype)).sum(-1)
+        most = inflation * (share * self._wide(noisy.to(x.dtype))).sum(-1)
         steepest = inflation.unsqueeze(-1) * (share.unsqueeze(-2) * dv).sum(-1)
         return MomentsWithJacobians(
             mean,
             torch.minimum(variance, most),
-            (self.gain.unsqueeze(-2) * dm).sum(-1),
+            jacobian,
             torch.where((variance <= most).unsqueeze(-1), slope, steepest),
         )
 
@@ -231,7 +243,8 @@ class MixtureResidual(ResidualLearner):
         """The learners, the experts' weights and what they carry over back to the prior."""
         for learner in self.members:
             learner.reset()
-        for buffer in (self.innovation, self.level, self.trend, self.count, self.n_refused):
+        counts = self.count, self.n_refused, self.largest
+        for buffer in (self.innovation, self.level, self.trend, *counts):
             buffer.zero_()
         self.evidence.copy_(self.first_evidence)
         self.inflation.fill_(1.0)
@@ -306,6 +319,16 @@ class MixtureResidual(ResidualLearner):
         self._settle()
         return nis
 
+    def _mean(self, means: Float[Tensor, "*any out learners"]) -> Float[Tensor, "*any out"]:
+        return self.bounded(self._sum(_finite(means)))
+
+    def _sum(self, means: Float[Tensor, "*any out learners"]) -> Float[Tensor, "*any out"]:
+        return (self.gain * means).sum(-1) + self.offset
+
+    def _wide(self, variances: Float[Tensor, "*any out learners"]) -> Tensor:
+        """A learner whose variance is not finite knows as little as the spread of y."""
+        return variances.where(variances.isfinite(), self.largest.square().unsqueeze(-1).to(variances))
+
     def _means(self, means: Float[Tensor, "*any out learners"]) -> Float[Tensor, "*any out experts"]:
         return self.shares * (means @ self.owner.mT) + self.carried
 
@@ -333,8 +356,13 @@ class MixtureResidual(ResidualLearner):
 
     def _together(self, moments: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
         means, variances = (torch.stack(part, dim=-1).to(self.dtype) for part in zip(*moments, strict=True))
-        mean = (self.gain * means).sum(-1) + self.offset
-        return mean, (self.weights * variances).sum(-1).sqrt(), means
+        means = _finite(means)
+        return self._mean(means), (self.weights * self._wide(variances)).sum(-1).sqrt(), means
+
+
+def _finite(values: Tensor) -> Tensor:
+    """A learner that is not finite has no say: what it says counts as 0, the model alone."""
+    return values.nan_to_num(0.0, 0.0, 0.0)
 
 
 def _bounded(z: Tensor) -> Tensor:

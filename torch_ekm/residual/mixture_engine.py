@@ -9,6 +9,7 @@ import torch
 from torch.distributions import StudentT
 
 from ..typing import Array, Tensor
+from .base import FARTHEST
 from .sparse_gp.engine.compiled import is_plain_one, sources_of
 from .sparse_gp.engine.loading import load_loops
 
@@ -54,13 +55,14 @@ class CompiledJudge:
         for i, (mean, variance) in enumerate(moments):
             means[:, i] = mean.numpy().reshape(rows)
             variances[:, i] = variance.numpy().reshape(rows)
+        self._make_finite(means, variances)
         on = np.ones(self._n, np.bool_) if mask is None else mask.numpy().reshape(self._n).copy()
         nis, loops, a = np.empty(self._n), self._loops, self._arrays
         with np.errstate(all="ignore"):
             loops.measure_fleet(
                 y.contiguous().numpy().reshape(rows), means, variances, self._experts, a["innovation"],
-                a["level"], a["gain"], a["mass"], self._offset, self._inflation, *self._tails, far, ratio,
-                figures,
+                a["level"], a["gain"], a["mass"], self._offset, self._inflation, FARTHEST * self._largest,
+                *self._tails, far, ratio, figures,
             )  # fmt: skip
             np.log1p(ratio, out=ratio)
             loops.fold_fleet(
@@ -86,12 +88,20 @@ class CompiledJudge:
             return None
         a, out = self._arrays, np.empty((3, self._offset.size))
         rows = [np.array([t.numpy().reshape(-1) for t in part]) for part in zip(*each, strict=True)]
-        parts = [np.ascontiguousarray(part.T, dtype=np.float64) for part in rows]
+        parts = [np.array(part.T, dtype=np.float64, order="C") for part in rows]
+        self._make_finite(*parts)
         self._loops.combine_fleet(
             *parts, self._experts, a["gain"], a["mass"], a["shift"], a["spread"], self._offset,
-            self._inflation, out,
+            self._inflation, FARTHEST * self._largest, out,
         )  # fmt: skip
         return torch.from_numpy(out.reshape(3, *g.offset.shape))
+
+    def _make_finite(self, means: Array, *variances: Array) -> None:
+        """See ``_finite`` and ``_wide`` of the mixture."""
+        if not np.isfinite(means.sum() + sum(v.sum() for v in variances)):
+            np.nan_to_num(means, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+            for v in variances:
+                np.copyto(v, np.square(self._largest)[:, None], where=~np.isfinite(v))
 
     def _takes(self, g: Any) -> bool:
         """Whether compiled loops can do it; prepares the arrays."""
@@ -116,6 +126,7 @@ class CompiledJudge:
         names = "evidence", "innovation", "level", "trend", "gain", "mass", "shift", "spread"
         self._arrays: dict[str, Array] = {k: g.get_buffer(k).numpy().reshape(rows, -1) for k in names}
         self._offset, self._inflation = g.offset.numpy().reshape(-1), g.inflation.numpy().reshape(-1)
+        self._largest = g.largest.numpy().reshape(-1)
         self._count, self._prior = g.count.numpy().reshape(-1), g.prior.double().numpy()
         self._experts, tails = g.get_buffer("_experts").numpy(), g.tails
         at_zero = StudentT(tails.freedoms).log_prob(torch.zeros_like(tails.freedoms))

@@ -52,15 +52,16 @@ def _typical(log_scale, evidence):
     return math.exp(mean / total)
 
 
-@njit(types.void(_A1, _A2, _A2, _A2, _A2, _A2, _A2, _A2, _A1, _A1, _A2, _A2, _A2, _A2, _A2), **_COMMON)
+@njit(types.void(_A1, _A2, _A2, _A2, _A2, _A2, _A2, _A2, _A1, _A1, _A1, _A2, _A2, _A2, _A2, _A2), **_COMMON)
 def measure_fleet(
-    y, means, variances, experts, innovation, level, gain, mass, offset, inflation, log_scale, tail_evidence,
-    far, ratio, figures,
+    y, means, variances, experts, innovation, level, gain, mass, offset, inflation, largest, log_scale,
+    tail_evidence, far, ratio, figures,
 ):  # fmt: skip
-    """How far y lies from each expert's mean: ``far`` in typical scales, ``ratio = r / 10`` as it is judged.
+    r"""How far y lies from each expert's mean: ``far`` in typical scales, ``ratio = r / 10`` as it is judged.
 
     Args:
         means, variances: of the learners' predictions of y.
+        largest: \|mean\| of the mixture, of each output.
         figures: standardised innovation of the mixture's mean, and typical scale, of each output.
     """
     h, kappa, n_learners = experts[0], experts[1], means.shape[1]
@@ -71,7 +72,7 @@ def measure_fleet(
             mean += gain[o, i] * means[o, i]
             for s in range(n_shares):
                 variance += mass[o, i * n_shares + s] * variances[o, i]
-        deviation = math.sqrt(variance)
+        mean, deviation = min(max(mean, -largest[o]), largest[o]), math.sqrt(variance)
         typical = _typical(log_scale[o], tail_evidence[o])
         scale = deviation * typical
         figures[o, _Z], figures[o, _SCALE] = _bounded((y[o] - mean) / deviation), scale
@@ -195,8 +196,8 @@ def settle_fleet(on, p, experts, innovation, level, mass, shift, spread, gain, o
             offset[o] += carried / total
 
 
-@njit(types.void(_A2, _A2, _A2, _A2, _A2, _A2, _A2, _A2, _A1, _A1, _A2), **_COMMON)
-def combine_fleet(means, latent, noisy, experts, gain, mass, shift, spread, offset, inflation, out):
+@njit(types.void(_A2, _A2, _A2, _A2, _A2, _A2, _A2, _A2, _A1, _A1, _A1, _A2), **_COMMON)
+def combine_fleet(means, latent, noisy, experts, gain, mass, shift, spread, offset, inflation, largest, out):
     """Mean and deviations of g and of y in the rows of ``out``, see ``MixtureResidual.predict``.
 
     Args:
@@ -208,6 +209,7 @@ def combine_fleet(means, latent, noisy, experts, gain, mass, shift, spread, offs
         mean, variance, scatter = offset[o], 0.0, 0.0
         for i in range(n_learners):
             mean += gain[o, i] * means[o, i]
+        mean = min(max(mean, -largest[o]), largest[o])
         for i in range(n_learners):
             for s in range(n_shares):
                 g = i * n_shares + s

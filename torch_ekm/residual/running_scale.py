@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,7 +8,7 @@ import torch
 from torch import nn
 
 from .._arrays import is_plain, namespace
-from ..typing import AnyArray, Float, Tensor
+from ..typing import AnyArray, Bool, Float, Tensor
 
 BLOCK = 32  #: samples of a block; those before the first one is full count from the first on
 _TRIMMED = (8.0, 4.0)  # an eighth, or a fourth of a block
@@ -18,6 +19,7 @@ _BURST_CLIP = 10.0  # times as much for columns whose large samples come in comp
 _COMPANY = 0.5  # of what chance would leave alone
 _DOUBT = 2.0  # so many large ones are taken to be alone beforehand
 _REST = 0.1, 0.05  # a block that varies less than this share of all before has this weight: it stands still
+REACH = 10.0  #: scales beyond which z goes no further, in columns where that matters
 ALIEN = 1e-20  #: a variation below this share is no rest either: what was before was wrong
 
 
@@ -42,9 +44,14 @@ class RunningScale(nn.Module):
     :meth:`observe` takes samples in, :meth:`settle` adopts what was found. In between ``shift`` and ``scale``
     stand still, so that what was computed with them stays valid.
 
+    An input that stood still has the scale of its jitter until it moves: then its z is of any size. What
+    grows with z without end takes it for ``REACH`` at most.
+
     Args:
         features: width of x.
         shifted: columns that are centred (none by default).
+        grows: columns whose z is cut (none by default).
+        least: smallest scale of each column, and the first; 0: there is none, and 1 is the first.
         batch_shape: shape of the fleet.
     """
 
@@ -54,6 +61,8 @@ class RunningScale(nn.Module):
         self,
         features: int,
         shifted: list[bool] | None = None,
+        grows: list[bool] | None = None,
+        least: list[float] | None = None,
         *,
         batch_shape: tuple[int, ...] = (),
         dtype: torch.dtype = torch.float64,
@@ -62,7 +71,8 @@ class RunningScale(nn.Module):
         super().__init__()
         shape, factory = (*batch_shape, features), {"dtype": dtype, "device": device}
         self.shift = nn.Buffer(torch.zeros(shape, **factory))
-        self.scale = nn.Buffer(torch.ones(shape, **factory))
+        self.least = nn.Buffer(torch.tensor(least or [0.0] * features, **factory), persistent=False)
+        self.scale = nn.Buffer(self._first().expand(shape).clone())
         self.centre = nn.Buffer(torch.zeros(shape, **factory))
         self.spread = nn.Buffer(torch.zeros(shape, **factory))
         self.weight = nn.Buffer(torch.zeros(shape, **factory))
@@ -71,15 +81,26 @@ class RunningScale(nn.Module):
         self.block_on = nn.Buffer(torch.zeros(*batch_shape, BLOCK, 1, **factory))
         columns = torch.tensor(shifted or [False] * features, dtype=dtype, device=device)
         self.shifted = nn.Buffer(columns)
+        self.cuts = any(grows or ())
+        reach = [REACH if cut else math.inf for cut in grows or [False] * features]
+        self.reach = nn.Buffer(torch.tensor(reach, **factory), persistent=False)
 
     def forward(self, x: Float[Tensor, "*batch features"]) -> Float[Tensor, "*batch features"]:
         """x, or its first columns, in the learner's units."""
         n = x.shape[-1]
-        return (x - self.shift[..., :n]) / self.scale[..., :n]
+        return self._cut((x - self.shift[..., :n]) / self.scale[..., :n])
 
     def of_sets(self, x: Float[Tensor, "*batch n features"]) -> Float[Tensor, "*batch n features"]:
         """n samples of each model in the learner's units."""
-        return (x - self.shift.unsqueeze(-2)) / self.scale.unsqueeze(-2)
+        return self._cut((x - self.shift.unsqueeze(-2)) / self.scale.unsqueeze(-2))
+
+    def _cut(self, z: Tensor) -> Tensor:
+        reach = self.reach[: z.shape[-1]]
+        return z.clamp(-reach, reach) if self.cuts else z
+
+    def follows(self, z: Float[Tensor, "*any features"]) -> Bool[Tensor, "*any features"]:
+        """Columns in which z changes with x: where it was not cut."""
+        return z.abs() < self.reach
 
     def observe(self, place: int, x: Float[Tensor, "*batch features"], on: Tensor | None) -> None:
         """A sample ``(*batch, features)`` of the models ``on``, at its place in the block; the last pools.
@@ -105,7 +126,7 @@ class RunningScale(nn.Module):
         weight, centre, spread = map(torch.as_tensor, found[:3])
         floor = 100 * torch.finfo(spread.dtype).eps * centre.abs()
         usable = (spread > floor) & (spread > torch.finfo(spread.dtype).tiny)
-        scale = torch.where(usable, spread, 1.0)
+        scale = torch.where(usable, spread.maximum(self.least), self._first())
         off = torch.maximum(scale / self.scale, self.scale / scale) - 1.0
         off = off + (centre - self.shift).abs() / torch.minimum(scale, self.scale)
         change = (weight > 0) & (off > (0.0 if young else settled))
@@ -115,12 +136,22 @@ class RunningScale(nn.Module):
         self.scale.copy_(scale)
         return offset, ratio
 
+    def forget(self, models: Bool[Tensor, "*batch"]) -> None:
+        """What comes decides alone on these models' scales; until then they are what they were."""
+        for buffer in (self.weight, self.centre, self.spread):
+            buffer.masked_fill_(models.unsqueeze(-1), 0.0)
+        for buffer in (self.large, self.block_on):
+            buffer.masked_fill_(models[..., None, None], 0.0)
+
     def reset(self) -> None:
         """Forget all samples: shift 0 and scale 1 again."""
         kept = self.shift, self.centre, self.spread, self.weight, self.large, self.block, self.block_on
         for buffer in kept:
             buffer.zero_()
-        self.scale.fill_(1.0)
+        self.scale.copy_(self._first())
+
+    def _first(self) -> Float[Tensor, " features"]:
+        return torch.where(self.least > 0, self.least, 1.0)
 
     def extra_repr(self) -> str:
         if self.scale.numel() > 12:

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from ..._checks import check_count, check_fraction, check_positive
-from ...typing import Float, Tensor
+from ...typing import Bool, Float, Tensor
 from ..kernels.kernel import log_parameter
 from ..report import UpdateReport
 from ..running_scale import BLOCK
@@ -35,6 +35,7 @@ class LinearInFeatures(ScaledLearner):
     """
 
     refresh_every = 16  #: samples between two rebuilds
+    grows = False  #: whether features grow with x without end
 
     def __init__(
         self,
@@ -60,7 +61,7 @@ class LinearInFeatures(ScaledLearner):
         self.covariance = nn.Buffer(prior.expand(*self.batch_shape, f, f).clone())
         self.weights = nn.Buffer(zeros(*self.batch_shape, f, self.out_features))
         self.pending = nn.Buffer(zeros(self.batch_shape))
-        self._make_units([True] * self.in_features, self.dtype)
+        self._make_units([True] * self.in_features, self.dtype, [self.grows] * self.in_features)
 
     @abstractmethod
     def features(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any f"]:
@@ -75,12 +76,27 @@ class LinearInFeatures(ScaledLearner):
         v = (phi @ self.covariance @ phi.mT).squeeze(-1).clamp_min(torch.finfo(phi.dtype).tiny)
         return (phi @ self.weights).squeeze(-2), v + self.noise_variance if observation else v
 
-    def _clear(self) -> None:
+    @abstractmethod
+    def _feature_slopes(self, z: Tensor) -> Float[Tensor, "*any f in"]:
+        """dphi/dz."""
+
+    def _slopes(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        return self._mean(z), self.weights.mT @ self._feature_slopes(z)
+
+    def _slope_variance(self, z: Tensor) -> Tensor:
+        """``(dphi/dz)' P dphi/dz`` by column."""
+        slopes = self._feature_slopes(z)
+        return (slopes * (self.covariance @ slopes)).sum(-2)
+
+    def _clear(self, models: Bool[Tensor, "*batch"] | None = None) -> None:
         """Back to w ~ N(0, v I)."""
-        for buffer in (self.information, self.target, self.weights, self.pending):
-            buffer.zero_()
-        self.covariance.zero_()
-        self.covariance.diagonal(dim1=-2, dim2=-1).fill_(self.weight_variance)
+        models = torch.ones_like(self.pending, dtype=torch.bool) if models is None else models
+        self.pending.masked_fill_(models, 0.0)
+        models = models[..., None, None]
+        for buffer in (self.information, self.target, self.weights, self.covariance):
+            buffer.masked_fill_(models, 0.0)
+        prior = self.weight_variance * models.squeeze(-1)
+        self.covariance.diagonal(dim1=-2, dim2=-1).add_(prior)
 
     def _learn(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         s2, column = self.noise_variance, self.features(x).unsqueeze(-1)
@@ -130,16 +146,18 @@ class RecursiveLeastSquares(LinearInFeatures):
         options: see LinearInFeatures.
     """
 
+    grows = True
+
     def __init__(self, in_features: int, out_features: int, **options: Any) -> None:
         super().__init__(in_features, out_features, in_features + 1, **options)
 
     def features(self, x: Tensor) -> Tensor:
         return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1)
 
-    def _slopes(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """The slope is W itself, everywhere."""
-        slope = self.weights.mT[..., : self.in_features]
-        return self._mean(z), slope.expand(*z.shape[:-1], *slope.shape[-2:])
+    def _feature_slopes(self, z: Tensor) -> Tensor:
+        """The identity, and 0 for the constant."""
+        slopes = torch.eye(self.in_features + 1, self.in_features, dtype=z.dtype, device=z.device)
+        return slopes.expand(*z.shape[:-1], *slopes.shape)
 
     def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
         """``new phi = T phi``: ``A <- T A T'``, ``b <- T (b + A 1 o) r``, 1 being the bias' place."""
@@ -193,9 +211,7 @@ class RandomFeatureRLS(LinearInFeatures):
         """Features of other units are others: the block is learned again, but for the sample that comes."""
         self._learn_block(BLOCK - 1)
 
-    def _slopes(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """``dphi/dx = sqrt(1/D) [-sin(.) Omega; cos(.) Omega]``."""
-        phi = self.features(z)
-        cos, sin = phi.chunk(2, dim=-1)
-        slope = torch.cat([-sin, cos], dim=-1).unsqueeze(-1) * self.frequencies.repeat(2, 1)
-        return (phi.unsqueeze(-2) @ self.weights).squeeze(-2), self.weights.mT @ slope
+    def _feature_slopes(self, z: Tensor) -> Tensor:
+        """``dphi/dz = sqrt(1/D) [-sin(.) Omega; cos(.) Omega]``."""
+        cos, sin = self.features(z).chunk(2, dim=-1)
+        return torch.cat([-sin, cos], dim=-1).unsqueeze(-1) * self.frequencies.repeat(2, 1)

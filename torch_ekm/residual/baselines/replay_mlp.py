@@ -84,7 +84,7 @@ class ReplayMLP(ScaledLearner, SingleLearner):
             return mean, v + self.noise if observation else v
         return mean, self.noise.expand_as(mean)
 
-    def _clear(self) -> None:
+    def _clear(self, models: Tensor | None = None) -> None:
         """New weights from the seed, empty memory."""
         for buffer in (self.inputs, self.targets, self.count):
             buffer.zero_()

@@ -1,14 +1,18 @@
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
 from torch.distributions import Normal
 
+from ..._checks import check_sizes
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..base import ResidualLearner
+from ..misled import Misled
 from ..report import UpdateReport
 from ..running_scale import BLOCK, RunningScale
 
@@ -22,13 +26,15 @@ class ScaledLearner(ResidualLearner):
     Units are those of :class:`~torch_ekm.residual.running_scale.RunningScale`. They are adopted after 1, 2,
     4, 8, 16 samples, which are then learned again, and from 32 samples on every 32, by what a subclass does
     in ``_follow``; after a change by a factor of ten the last 31 are learned again. Targets beyond 6 units
-    count as 6: one outlier does not spoil a learner that trusts all samples alike.
+    count as 6: one outlier does not spoil a learner that trusts all samples alike. A learner that is
+    :class:`~torch_ekm.residual.misled.Misled` starts again.
 
     A subclass implements f: ``_mean``, ``_law``, ``_slopes``, ``_learn``, ``_clear`` and ``_follow``.
 
     Args:
         standardize: whether it learns units; else x and y are taken as they are.
         output_offset: ``"zero"``, or ``"learned"``: y is centred too.
+        input_resolution, output_scale: sizes below which x and y mean nothing, see Standardize.
         options: see ResidualLearner.
     """
 
@@ -41,21 +47,28 @@ class ScaledLearner(ResidualLearner):
         *,
         standardize: bool = True,
         output_offset: Literal["zero", "learned"] = "zero",
+        input_resolution: float | Sequence[float] = 0.0,
+        output_scale: float | Sequence[float] = 0.0,
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
         if output_offset not in ("zero", "learned"):
             raise ParameterError("output_offset", output_offset, "'zero' or 'learned'")
         self.standardize, self.output_offset = bool(standardize), output_offset
+        self._least = (
+            check_sizes("input_resolution", input_resolution, in_features),
+            check_sizes("output_scale", output_scale, out_features),
+        )
+        self.misled = Misled(tuple(self.batch_shape), self._kept, self.device)
         self.n_samples = 0
 
-    def _make_units(self, shifted: list[bool], dtype: torch.dtype) -> None:
+    def _make_units(self, shifted: list[bool], dtype: torch.dtype, grows: list[bool] | None = None) -> None:
         """Last in a constructor."""
         options = {"batch_shape": self.batch_shape, "dtype": dtype, "device": self.device}
         if self.standardize:
             centred = [self.output_offset == "learned"] * self.out_features
-            self.input = RunningScale(self.in_features, shifted, **options)
-            self.output = RunningScale(self.out_features, centred, **options)
+            self.input = RunningScale(self.in_features, shifted, grows, self._least[0], **options)
+            self.output = RunningScale(self.out_features, centred, least=self._least[1], **options)
 
     # -- f, in its own units --------------------------------------------------------------------
 
@@ -71,15 +84,17 @@ class ScaledLearner(ResidualLearner):
         """f(z) and df/dz; autograd here."""
         raise NotImplementedError
 
+    def _slope_variance(self, z: Tensor) -> Tensor:
+        """Of each column of df/dz, ``(*any, in)``; NaN: not stated."""
+        return torch.full_like(z, math.nan)
+
     @abstractmethod
     def _learn(self, z: Tensor, t: Tensor, mask: Bool[Tensor, "*batch"] | None) -> UpdateReport:
         """One sample per model."""
 
-    def _clear(self) -> None:
-        """f as it was made; here all buffers of its own are 0."""
-        for buffer in self.buffers(recurse=False):
-            if buffer is not self.n_refused:
-                buffer.zero_()
+    @abstractmethod
+    def _clear(self, models: Bool[Tensor, "*batch"] | None = None) -> None:
+        """f as it was made, of all models or of these."""
 
     @abstractmethod
     def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
@@ -101,15 +116,27 @@ class ScaledLearner(ResidualLearner):
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         if type(self)._slopes is ScaledLearner._slopes:
             return super().linearize(x)
-        mean, slope = self._slopes(self._inputs(self.check_query(x)))
+        z = self._inputs(self.check_query(x))
+        mean, slope = self._slopes(z)
         if self.standardize:
             slope = slope * self.output.scale.unsqueeze(-1) / self.input.scale.unsqueeze(-2)
-        return self._value(mean), slope.to(self.dtype)
+            slope = slope * self.input.follows(z).unsqueeze(-2)
+        return self.bounded_slope(self._unbounded(mean), slope.to(self.dtype))
+
+    def slope_deviation(self, x: Tensor) -> Tensor:
+        """Of the same for all outputs, but for their scales."""
+        z = self._inputs(self.check_query(x))
+        deviation = self._slope_variance(z).clamp_min(0.0).sqrt().unsqueeze(-2)
+        if self.standardize:
+            deviation = deviation * self.output.scale.unsqueeze(-1) / self.input.scale.unsqueeze(-2)
+        return deviation.expand(*deviation.shape[:-2], self.out_features, -1).to(self.dtype)
 
     def reset(self) -> None:
         """Forget all samples and the units that were found in them."""
-        self.n_refused.zero_()
+        for count in (self.n_refused, self.largest):
+            count.zero_()
         self.n_samples = 0
+        self.misled.level.zero_()
         self._clear()
         if self.standardize:
             self.input.reset()
@@ -119,7 +146,14 @@ class ScaledLearner(ResidualLearner):
         if self.standardize:
             self._observe(x, y, mask)
         self.n_samples += 1
-        return self._learn(self._inputs(x), self._targets(y), mask)
+        z = self._inputs(x)
+        error = y - self._value(self._mean(z))
+        misled = self.misled.observe(error, y if not self.standardize else y - self.output.shift, mask)
+        if bool(misled.any()):
+            self._clear(misled)
+            if self.standardize:
+                self.output.forget(misled)
+        return self._learn(z, self._targets(y), mask)
 
     def _observe(self, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
         n, on = self.n_samples, None if mask is None else mask.to(x.dtype)
@@ -142,9 +176,11 @@ class ScaledLearner(ResidualLearner):
         """Again, from the first n samples of the present block only."""
         self._clear()
         for i in range(n):
-            on = self.input.block_on[..., i, 0] > 0 if self.batch_shape else None
+            on = self.input.block_on[..., i, 0] * self.output.block_on[..., i, 0] > 0
+            if not bool(on.any()):  # nothing, or of a time that is forgotten
+                continue
             x, y = self.input.block[..., i, :], self.output.block[..., i, :]
-            self._learn(self._inputs(x), self._targets(y), on)
+            self._learn(self._inputs(x), self._targets(y), on if self.batch_shape else None)
 
     def _inputs(self, x: Float[Tensor, "*any in"]) -> Tensor:
         return self.input(x) if self.standardize else x
@@ -153,6 +189,9 @@ class ScaledLearner(ResidualLearner):
         return self.output(y).clamp(-_CUT, _CUT) if self.standardize else y
 
     def _value(self, mean: Float[Tensor, "*any out"]) -> Tensor:
+        return self.bounded(self._unbounded(mean))
+
+    def _unbounded(self, mean: Float[Tensor, "*any out"]) -> Tensor:
         if self.standardize:
             mean = mean * self.output.scale + self.output.shift
         return mean.to(self.dtype)

@@ -97,6 +97,9 @@ class ActionLinearKernel(Kernel):
         state = self.state_kernel.shift_invariant(self.state_features)
         return state + [False] * self.action_features
 
+    def grows(self, in_features: int) -> list[bool]:
+        return self.state_kernel.grows(self.state_features) + [True] * self.action_features
+
 
 def action_covariance(learner: Any, s: Float[Tensor, "*any n_s"]) -> Float[Tensor, "*any out n_a n_a"]:
     """V(s) with ``var(s, a)_j = a' V_j(s) a`` exactly::

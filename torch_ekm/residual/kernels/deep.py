@@ -123,6 +123,11 @@ class DeepKernel(Kernel):
         v = self.base.log_variance.exp().unsqueeze(-1)
         return v * phi, (v * psi).unsqueeze(-1) * (near * w + far @ slope.mT)
 
+    def derivative_variance(self, x: Tensor) -> Tensor:
+        w = self.base.log_lengthscale.neg().exp()
+        metric = w.square() + self.net_jacobian(x)[1].square().sum(-1)
+        return metric * self.base.curvature().unsqueeze(-1)
+
     def shift_invariant(self, in_features: int) -> list[bool]:
         # not invariant, but the network learns any shift: centred inputs keep tanh in its range
         return [True] * in_features

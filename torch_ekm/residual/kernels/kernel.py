@@ -80,6 +80,18 @@ class Kernel(Recorded, nn.Module, ABC):
         """Columns of x whose origin does not matter; a normaliser may centre these and no others."""
         return [False] * in_features
 
+    def derivative_variance(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
+        """Prior variance of dg/dx_j, ``d2k(x, z)/dx_j dz_j`` at ``z = x``."""
+        with torch.inference_mode(False), torch.enable_grad():
+            z = x.detach().clone().requires_grad_(True)
+            slopes = self.with_gradient(x.detach().clone(), z.unsqueeze(-2))[1].squeeze(-2)
+            by = [torch.autograd.grad(one.sum(), z, retain_graph=True)[0] for one in slopes.unbind(-1)]
+        return torch.stack([one[..., j] for j, one in enumerate(by)], dim=-1)
+
+    def grows(self, in_features: int) -> list[bool]:
+        """Columns of x along which functions drawn from the prior grow without end."""
+        return [False] * in_features
+
 
 @contextmanager
 def _differentiable(kernel: Kernel) -> Iterator[None]:

@@ -67,3 +67,6 @@ class LinearKernel(Kernel):
     def shift_invariant(self, in_features: int) -> list[bool]:
         # the constant takes up any shift: affine functions of x stay affine
         return [True] * in_features
+
+    def grows(self, in_features: int) -> list[bool]:
+        return [True] * in_features

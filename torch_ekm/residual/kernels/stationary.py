@@ -127,6 +127,15 @@ class StationaryKernel(Kernel):
         v = self.log_variance.exp().unsqueeze(-1)
         return v * phi, (v * psi).unsqueeze(-1) * (u * w)
 
+    def derivative_variance(self, x: Tensor) -> Tensor:
+        w = self.log_lengthscale.neg().exp()
+        return (w.square() * self.curvature().unsqueeze(-1)).expand(x.shape)
+
+    def curvature(self) -> Float[Tensor, "*batch"]:
+        """``v psi(0)``, the variance of a slope by a scaled input."""
+        v = self.log_variance.exp()
+        return v * self.phi_psi(torch.zeros_like(v))[1]
+
     def shift_invariant(self, in_features: int) -> list[bool]:
         return [True] * in_features
 

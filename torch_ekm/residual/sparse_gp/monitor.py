@@ -9,6 +9,7 @@ from torch import nn
 
 from ..._checks import check_positive
 from ...typing import Float, Tensor
+from ..misled import Misled
 from .part import Host, Part, Sample
 
 _CALIBRATION_RATE = 0.2  # of the logarithm of a factor on the noise
@@ -89,7 +90,9 @@ class DetectChanges(Part):
 
         a += ([z2 > 5] - a)/8,   alarm: a > 0.6
 
-    A tenth of gross outliers never reaches it; an abrupt change does within eight samples or some more.
+    A tenth of gross outliers never reaches it; an abrupt change does within eight samples or some more. So do
+    predictions that are much worse than none (:class:`~torch_ekm.residual.misled.Misled`): then the outputs'
+    scales are those of what comes, too.
     The samples since ``a`` last lay below what a single one raises it to are the new system's: the learner
     forgets all and learns these. After an alarm it waits before the next.
 
@@ -103,6 +106,7 @@ class DetectChanges(Part):
         self.inputs = nn.Buffer(zeros(_MEMORY, *fleet, learner.in_features))
         self.targets = nn.Buffer(zeros(_MEMORY, *fleet, learner.out_features))
         self.levels = nn.Buffer(zeros(_MEMORY, *fleet))
+        self.misled = Misled(fleet, self.level.dtype, self.level.device)
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Take a sample in; models that face another system start again."""
@@ -112,10 +116,17 @@ class DetectChanges(Part):
         level = self.level if mask is None else self.level.where(mask > 0, math.inf)  # inf: no sample
         for kept, value in ((self.inputs, sample.x), (self.targets, sample.y), (self.levels, level)):
             kept.select(0, place).copy_(value)
-        if float(self.level.amax()) > _ALARM:
-            changed = self.level > _ALARM
+        misled = self.misled.observe(sample.innovation, learner.units.targets(sample.y), mask)
+        changed = misled | (self.level > _ALARM)
+        if bool(changed.any()):
+            learner.units.forget(misled)
             self.level.masked_fill_(changed, _COOL)
             x, y, levels = (t.roll(-1 - place, 0) for t in (self.inputs, self.targets, self.levels))
             later = (levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0) > 0
             learner.start_anew(changed, x, y, later & levels.isfinite())
         return False
+
+    def reset(self) -> None:
+        """No sample was seen."""
+        super().reset()
+        self.misled.level.zero_()

@@ -55,6 +55,11 @@ class Units:
             z if self.input is None else z * self.input.scale.unsqueeze(-2) + self.input.shift.unsqueeze(-2)
         )
 
+    def forget(self, models: Bool[Tensor, "*batch"]) -> None:
+        """The outputs' scales of these models are those of what comes."""
+        if self.output is not None:
+            self.output.forget(models)
+
     def value(self, value: Float[Tensor, "*any out_or_1"], power: int) -> Tensor:
         """An output in its own unit, or (power 2) a variance in its square."""
         if self.output is None:
@@ -63,12 +68,15 @@ class Units:
             return value * self.output.scale + self.output.shift
         return value * _power(self.output.scale, power)
 
-    def slope(self, slope: Float[Tensor, "*any out_or_1 columns"], power: int) -> Tensor:
-        """The derivative of such a value by the last columns of x."""
+    def slope(
+        self, slope: Float[Tensor, "*any out_or_1 in"], power: int, z: Float[Tensor, "*any in"]
+    ) -> Float[Tensor, "*any out in"]:
+        """The derivative of such a value by x; z is that x in the learner's units."""
         if self.input is None or self.output is None:
             return slope
-        by = self.input.scale[..., None, self.input.scale.shape[-1] - slope.shape[-1] :]
-        return slope * _power(self.output.scale, power).unsqueeze(-1) / by
+        by = self.input.scale.unsqueeze(-2)
+        slope = slope * _power(self.output.scale, power).unsqueeze(-1) / by
+        return slope * self.input.follows(z).unsqueeze(-2) if self.input.cuts else slope
 
     def curvature(self, curvature: Float[Tensor, "*any out_or_1 columns columns"]) -> Tensor:
         """The second derivative of a variance by the last columns of x."""
@@ -83,6 +91,11 @@ class Units:
         if self.input is None or self.output is None:
             return ()
         return self.input.shift, self.input.scale, self.output.shift, self.output.scale
+
+    @property
+    def reach(self) -> Tensor | None:
+        """How far each column of z goes, ``(in,)``; None: without end."""
+        return None if self.input is None else self.input.reach
 
 
 def _power(scale: Tensor, power: int) -> Tensor:

@@ -141,6 +141,10 @@ class SparseOnlineGP(Host):
         """Mean and its derivative, ``(alpha'k, alpha' dk/dx)``, in closed form."""
         return self.engine.linearize(self, x)
 
+    def slope_deviation(self, x: Tensor) -> Tensor:
+        """Root of ``d2k(x, z)/dx dz + (dk/dx)' C dk/dx`` at ``z = x``, by column."""
+        return self.engine.slope_deviation(self, x)
+
     def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> MomentsWithJacobians:
         """Mean, latent variance and both derivatives, in closed form.
 
@@ -172,8 +176,8 @@ class SparseOnlineGP(Host):
         self.posterior.reset()
         for part in self._parts:
             part.reset()
-        self.pending.zero_()
-        self.n_refused.zero_()
+        for count in (self.pending, self.n_refused, self.largest):
+            count.zero_()
         self.n_samples, self.drifts = 0, False
 
     def update(self, x: Tensor, y: Tensor, mask: Tensor | None = None) -> UpdateReport:
@@ -181,7 +185,7 @@ class SparseOnlineGP(Host):
         if mask is None:
             with self.lock:
                 if self.engine.accepts(self, x, y):
-                    return self.absorb(x, y, None)
+                    return self.step(x, y, None)
         return super().update(x, y, mask)
 
     @torch.no_grad()

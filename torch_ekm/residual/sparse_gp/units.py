@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
 
+from ..._checks import check_sizes
 from ...exceptions import ParameterError
 from ...typing import Tensor
 from ..running_scale import ALIEN, BLOCK, RunningScale
@@ -26,16 +28,25 @@ class Standardize(Part):
     Args:
         output_offset: ``"zero"``: g is 0 far from all samples, as a model's residual needs it;
             ``"learned"``: the mean of y.
+        input_resolution: size of changes of x that mean something, one number or one per input; 0: not known.
+            An input that only jitters below it is none: its slope is 0.
+        output_scale: size of y that matters, one number or one per output; 0: not known.
 
     Raises:
-        ParameterError: an unknown offset.
+        ParameterError: an unknown offset, or a size that is none.
     """
 
-    def __init__(self, output_offset: Literal["zero", "learned"] = "zero") -> None:
+    def __init__(
+        self,
+        output_offset: Literal["zero", "learned"] = "zero",
+        input_resolution: float | Sequence[float] = 0.0,
+        output_scale: float | Sequence[float] = 0.0,
+    ) -> None:
         super().__init__()
         if output_offset not in ("zero", "learned"):
             raise ParameterError("output_offset", output_offset, "'zero' or 'learned'")
         self.output_offset = output_offset
+        self.input_resolution, self.output_scale = input_resolution, output_scale
 
     def bind(self, learner: Host) -> None:
         """Running moments of x and y, 0 and 1 at the start."""
@@ -43,8 +54,11 @@ class Standardize(Part):
         fleet = {"batch_shape": learner.posterior.batch_shape, "dtype": like.dtype, "device": like.device}
         shifted = learner.kernel.shift_invariant(learner.in_features)
         centred = [self.output_offset == "learned"] * learner.out_features
-        self.input = RunningScale(learner.in_features, shifted, **fleet)
-        self.output = RunningScale(learner.out_features, centred, **fleet)
+        grows = learner.kernel.grows(learner.in_features)
+        resolution = check_sizes("input_resolution", self.input_resolution, learner.in_features)
+        least = check_sizes("output_scale", self.output_scale, learner.out_features)
+        self.input = RunningScale(learner.in_features, shifted, grows, resolution, **fleet)
+        self.output = RunningScale(learner.out_features, centred, least=least, **fleet)
         learner.units = Units(self.input, self.output, centred=self.output_offset == "learned")
 
     def before_update(self, learner: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> None:

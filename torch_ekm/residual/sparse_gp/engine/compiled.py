@@ -13,6 +13,7 @@ from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from ...._arrays import is_plain
 from ....typing import Array, Tensor
+from ...base import FARTHEST
 from ...kernels.action_linear import ActionLinearKernel
 from ...kernels.deep import DeepKernel
 from ...kernels.kernel import Kernel
@@ -129,7 +130,7 @@ class CompiledEngine(ReferenceEngine):
             _, inputs, by = network.of(x, self._units_x, slopes)
         self._query(
             self._flags, inputs, basis, active, moments, vectors, *self._hyper, *self._units,
-            variance, slopes, mean, v, J, dv,
+            FARTHEST * self._largest, variance, slopes, mean, v, J, dv,
         )  # fmt: skip
         if network is not None and slopes:
             J, dv = (network.by_x(a, by, self._units_x[1]) if a.size else a for a in (J, dv))
@@ -180,7 +181,7 @@ class CompiledEngine(ReferenceEngine):
         self._parameters = tuple(own[1] if own is not None else gp.kernel.parameters())
         robust = [part for part in gp.weighing if type(part) is RobustWeight]
         levels = [part.level for part in robust]
-        tensors = (*state, gp.log_noise_variance, *self._parameters, *units, *levels)
+        tensors = (*state, gp.log_noise_variance, gp.largest, *self._parameters, *units, *levels)
         self._sources = sources_of(gp, tensors)
         on_host = all(t.is_cpu and t.is_contiguous() for t in tensors) and gp.dtype == torch.float64
         plain = not any(t.is_inference() for t in tensors)  # these have no version
@@ -199,21 +200,24 @@ class CompiledEngine(ReferenceEngine):
         self._noise = gp.log_noise_variance.detach().numpy().reshape(n, -1)
         self._hyper: tuple[Array, ...] = np.zeros((1, 0)), np.zeros(1), np.zeros((1, 0))
         self._units: tuple[Array, ...] = (
-            np.zeros((1, self._d)), np.ones((1, self._d)), np.zeros((1, self._m)), np.ones((1, self._m))
+            np.zeros((1, self._d)), np.ones((1, self._d)), np.zeros((1, self._m)), np.ones((1, self._m)),
+            np.full(self._d, np.inf),
         )  # fmt: skip
+        self._largest = gp.largest.numpy().reshape(n, self._m)
         if own is not None:
             lengthscale, variance, *others = (p.detach().numpy() for p in self._parameters)
             rows = variance.reshape(-1)
             action = others[0] if n_actions else np.zeros((len(rows), 0))
             self._hyper = lengthscale.reshape(len(rows), -1), rows, action.reshape(len(rows), -1)
             if units:
-                self._units = tuple(t.numpy().reshape(n, -1) for t in units)
+                assert gp.units.reach is not None
+                self._units = *(t.numpy().reshape(n, -1) for t in units), gp.units.reach.numpy()
             if isinstance(gp.kernel, DeepKernel):
                 self._network = Embedding(loops, gp.kernel, posterior)
                 self._width = width = self._network.width
                 self._units_x = self._units[:2]
                 plain = np.zeros((len(self._units[2]), width))
-                self._units = plain, plain + 1.0, *self._units[2:]
+                self._units = plain, plain + 1.0, *self._units[2:4], np.full(width, np.inf)
                 self._hyper = np.zeros((len(rows), width)), rows, action.reshape(len(rows), 0)
                 self._state = self._network.basis, *self._state[1:]
         self._absorb: Callable = loops.absorb_fleet

@@ -36,7 +36,7 @@ _INNER = {**_COMMON, "no_cpython_wrapper": True}  # called from loops alone
 _A1, _A2, _A3, _A4 = (types.Array(types.float64, n, "C") for n in (1, 2, 3, 4))
 _I1, _F = types.Array(types.int64, 1, "C"), types.float64
 _HYPER = (_A2, _A1, _A2)  # log lengthscales, log variance, log action variances
-_UNITS = (_A2, _A2, _A2, _A2)  # shift and scale of inputs and of outputs
+_UNITS = (_A2, _A2, _A2, _A2, _A1)  # shift and scale of inputs and of outputs, reach of inputs
 
 
 @njit(types.Tuple((_F, _F))(types.int64, _F), **_INNER)
@@ -293,7 +293,7 @@ def _slopes(alpha, dk, out):
 def absorb_fleet(
     flags, on, x, y, given_k, given_prior,
     basis, active, count, slot, moments, vectors,
-    log_lengthscale, log_variance, log_action, log_noise, shift, scale, shift_y, scale_y,
+    log_lengthscale, log_variance, log_action, log_noise, shift, scale, shift_y, scale_y, reach,
     robust, levels, threshold, jitter, event, figures, errors,
 ):  # fmt: skip
     """One sample per model where ``on``.
@@ -315,7 +315,7 @@ def absorb_fleet(
             continue
         own, unit = min(b, log_variance.shape[0] - 1), min(b, shift.shape[0] - 1)
         for j in range(d):
-            z[j] = (x[b * d + j] - shift[unit, j]) / scale[unit, j]
+            z[j] = min(max((x[b * d + j] - shift[unit, j]) / scale[unit, j], -reach[j]), reach[j])
         log_s2 = 0.0
         for o in range(m):
             t[o] = (y[b * m + o] - shift_y[unit, o]) / scale_y[unit, o]
@@ -340,16 +340,20 @@ def absorb_fleet(
 
 @njit(
     types.void(
-        _I1, _A1, _A3, _A2, _A4, _A4, *_HYPER, *_UNITS, types.boolean, types.boolean, _A1, _A1, _A1, _A1
+        _I1, _A1, _A3, _A2, _A4, _A4, *_HYPER, *_UNITS, _A2, types.boolean, types.boolean, _A1, _A1, _A1, _A1
     ),
     **_COMMON,
 )  # fmt: skip
 def query_fleet(
     flags, x, basis, active, moments, vectors,
-    log_lengthscale, log_variance, log_action, shift, scale, shift_y, scale_y,
+    log_lengthscale, log_variance, log_action, shift, scale, shift_y, scale_y, reach, most,
     with_variance, with_slopes, mean, variance, jacobian, slope,
 ):  # fmt: skip
-    """One query per model, in the outputs' own units: see ``SparseOnlineGP.predict_with_jacobians``."""
+    r"""One query per model, in the outputs' own units: see ``SparseOnlineGP.predict_with_jacobians``.
+
+    Args:
+        most: largest \|mean\|, of each model and output.
+    """
     B, M, d, m = basis.shape[0], basis.shape[1], basis.shape[2], vectors.shape[3]
     n_a, J = flags[ACTIONS], np.empty((m, d))
     z, k, Ck, dv = np.empty(d), np.empty(M), np.zeros(M), np.zeros(d)
@@ -357,7 +361,7 @@ def query_fleet(
     for b in range(B):
         own, unit = min(b, log_variance.shape[0] - 1), min(b, shift.shape[0] - 1)
         for j in range(d):
-            z[j] = (x[b * d + j] - shift[unit, j]) / scale[unit, j]
+            z[j] = min(max((x[b * d + j] - shift[unit, j]) / scale[unit, j], -reach[j]), reach[j])
         prior = _kernel(
             flags, z, basis[b], active[b], log_lengthscale[own], log_variance[own], log_action[own],
             k, dk, with_slopes,
@@ -373,8 +377,12 @@ def query_fleet(
         if with_slopes:
             _slopes(alpha, dk, J)
             for o in range(m):
+                inside = abs(value[o]) <= most[b, o]
                 for j in range(d):
-                    jacobian[(b * m + o) * d + j] = J[o, j] * scale_y[unit, o] / scale[unit, j]
+                    slope_j = J[o, j] * scale_y[unit, o] / scale[unit, j]
+                    jacobian[(b * m + o) * d + j] = slope_j if inside and abs(z[j]) < reach[j] else 0.0
+        for o in range(m):
+            value[o] = min(max(value[o], -most[b, o]), most[b, o])
         if not with_variance:
             continue
         _times(moments[b, 0], k, Ck)
@@ -395,4 +403,4 @@ def query_fleet(
             for o in range(m):
                 for j in range(d):
                     by = scale_y[unit, o] * scale_y[unit, o] / scale[unit, j]
-                    slope[(b * m + o) * d + j] = dv[j] * by
+                    slope[(b * m + o) * d + j] = dv[j] * by if abs(z[j]) < reach[j] else 0.0

@@ -36,10 +36,11 @@ class ReferenceEngine:
     def linearize(self, gp: Host, x: Float[Tensor, "*any in"]) -> tuple[Tensor, Tensor]:
         """Mean and its derivative, ``(alpha'k, alpha' dk/dx)``, in closed form."""
         # free slots need no mask here: their rows in alpha and C are 0
-        k, dk = gp.kernel.with_gradient(gp.units.inputs(gp.check_query(x)), gp.posterior.basis)
+        z = gp.units.inputs(gp.check_query(x))
+        k, dk = gp.kernel.with_gradient(z, gp.posterior.basis)
         coefficients = gp.posterior.alpha.mT
         mean, jacobian = (coefficients @ k.unsqueeze(-1)).squeeze(-1), coefficients @ dk
-        return _out(gp, mean, 1), _out_slope(gp, jacobian, 1)
+        return gp.bounded_slope(_out(gp, mean, 1), _out_slope(gp, jacobian, 1, z))
 
     def jacobians(self, gp: Host, x: Float[Tensor, "*any in"]) -> MomentsWithJacobians:
         """Both moments and ``d mean/dx = alpha' dk/dx``, ``d var/dx = dk(x,x)/dx + 2 (Ck)' dk/dx``."""
@@ -53,12 +54,18 @@ class ReferenceEngine:
         values, slopes = (left @ column).squeeze(-1), left @ dk
         v = (gp.kernel.diagonal(z) + values[..., -1]).clamp_min(0.0).unsqueeze(-1)
         dv = gp.kernel.diagonal_gradient(z).unsqueeze(-2) + 2.0 * slopes[..., -1:, :]
-        return MomentsWithJacobians(
-            _out(gp, values[..., :-1], 1),
-            _out(gp, v, 2),
-            _out_slope(gp, slopes[..., :-1, :], 1),
-            _out_slope(gp, dv, 2),
+        mean, slope = gp.bounded_slope(
+            _out(gp, values[..., :-1], 1), _out_slope(gp, slopes[..., :-1, :], 1, z)
         )
+        return MomentsWithJacobians(mean, _out(gp, v, 2), slope, _out_slope(gp, dv, 2, z))
+
+    def slope_deviation(self, gp: Host, x: Float[Tensor, "*any in"]) -> Tensor:
+        """Root of ``d2k(x, z)/dx dz + (dk/dx)' C dk/dx`` at ``z = x``, by column, ``(*all, out, in)``."""
+        z = gp.units.inputs(gp.check_query(x))
+        _, dk = gp.kernel.with_gradient(z, gp.posterior.basis)
+        v = gp.kernel.derivative_variance(z) + (dk * (gp.posterior.covariance @ dk)).sum(-2)
+        # where z is cut g is flat, but what is known of it does not grow
+        return _out_slope(gp, v.clamp_min(0.0).sqrt().unsqueeze(-2), 1, torch.zeros_like(z))
 
     def accepts(self, gp: Host, x: Tensor, y: Tensor) -> bool:
         """Whether this is one good sample for each model, so that :meth:`absorb` may take it unchecked."""
@@ -76,7 +83,7 @@ def _cross(gp: Host, z: Tensor) -> Tensor:
 
 
 def _mean(gp: Host, k: Tensor) -> Tensor:
-    return _out(gp, (k.unsqueeze(-2) @ gp.posterior.alpha).squeeze(-2), 1)
+    return gp.bounded(_out(gp, (k.unsqueeze(-2) @ gp.posterior.alpha).squeeze(-2), 1))
 
 
 def _out(gp: Host, value: Tensor, power: int) -> Tensor:
@@ -85,7 +92,7 @@ def _out(gp: Host, value: Tensor, power: int) -> Tensor:
     return value.expand(*value.shape[:-1], gp.out_features).to(gp.dtype)
 
 
-def _out_slope(gp: Host, slope: Tensor, power: int) -> Tensor:
-    """``(*any, out or 1, columns)``: derivative by the last columns of x."""
-    slope = gp.units.slope(slope, power)
+def _out_slope(gp: Host, slope: Tensor, power: int, z: Tensor) -> Tensor:
+    """Derivative by x of what is ``(*any, out or 1)`` in the learner's units."""
+    slope = gp.units.slope(slope, power, z)
     return slope.expand(*slope.shape[:-2], gp.out_features, slope.shape[-1]).to(gp.dtype)
