@@ -75,6 +75,7 @@ def check_residual_learner(
         learner.reset()
         _check_prior(learner, x)
         _check_reset(learner, factory, x)
+        _check_bounds(learner)
 
 
 def _stream(learner: ResidualLearner, n: int) -> tuple[Tensor, Tensor]:
@@ -214,6 +215,21 @@ def _check_reset(learner: ResidualLearner, factory: Callable, x: Tensor) -> None
     if all(torch.equal(a, b) for a, b in zip(learner.parameters(), fresh.parameters(), strict=True)):
         deviations = learner.predict(x).stddev, fresh.predict(x).stddev
         _close(*deviations, learner, "reset() leaves the deviation of what was learned")
+
+
+def _check_bounds(learner: ResidualLearner) -> None:
+    """Nothing that an input does which stood still makes the learner say nonsense."""
+    x, y = _stream(learner, 48)
+    x[:24, ..., -1] *= 1e-12
+    for t in range(len(x)):
+        mean, most = learner(x[t]), y[:t].abs().amax(0) if t else 0.0 * y[0]
+        assert bool(mean.isfinite().all()), (
+            "an input that stood still and moves makes the mean NaN or infinite"
+        )
+        assert bool((mean.abs() <= 3.0 * most + 1e-9).all()), (
+            "an input that stood still and moves makes |g| more than 3 times the largest |y|: self.bounded(mean)"
+        )
+        learner.update(x[t], y[t])
 
 
 def _check_persistence(

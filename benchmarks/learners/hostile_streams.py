@@ -1,4 +1,4 @@
-"""What learners say on streams that are meant to break them: NaN, and how large |g| is by the largest |y| seen.
+"""What learners say on streams that are meant to break them: NaN, and |g| by the largest |y| seen.
 
 ``hostile_streams.py --seeds 1000:1040``; ``--quick`` runs short streams of one seed. A stream draws, from its
 seed, the units of x and y from 1e-9 to 1e9, an origin of x, a jitter from 1e-15 to 1e-2 of an input or output

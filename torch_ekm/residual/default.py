@@ -10,7 +10,7 @@ from .kernels.stationary import Matern32
 from .mixture import MixtureResidual
 from .sparse_gp.deep import DeepKernelSOGP
 from .sparse_gp.defaults import fleet_options
-from .sparse_gp.forgetting import ProcessNoise
+from .sparse_gp.forgetting import ForgettingFactor, ProcessNoise
 from .sparse_gp.hyperparameters import LearnHyperparameters
 from .sparse_gp.monitor import DetectChanges, RobustWeight
 from .sparse_gp.sparse_online_gp import SparseOnlineGP
@@ -32,7 +32,7 @@ def default_learner(
     """The recommended learner where nothing is known of the data: a mixture of four, in constant memory.
 
     Two learners keep the past and learn features, of which one distrusts large samples and one does not (rare
-    ones may be outliers, or what is worth learning); one lets g wander; one is linear in x.
+    ones may be outliers, or what is worth learning); one lets g wander; one is linear in x and forgets.
     The model alone, and the last residual alone, are among the experts. Evidence decides,
     for each output. It predicts the *next* sample: see MixtureResidual.
 
@@ -60,12 +60,12 @@ def default_learner(
     late = [{**common, "refresh_offset": offset} for offset in (0, 12, 6, 22)]
     fleet = fleet_options(options)
     wanders = [RobustWeight(3.0), ProcessNoise(0.003), LearnHyperparameters()]
-    keeps = [RobustWeight(3.0), LearnHyperparameters()]
+    fades = [RobustWeight(3.0), ForgettingFactor(0.998), LearnHyperparameters()]
     members = [
         DeepKernelSOGP(d, m, base=_long(d, fleet), parts=[RobustWeight(3.0), DetectChanges()], **late[0]),
         DeepKernelSOGP(d, m, parts=[DetectChanges()], **late[1]),
         SparseOnlineGP(d, m, parts=wanders, **late[2]),
-        SparseOnlineGP(d, m, kernel=LinearKernel(d, **fleet), parts=keeps, **late[3]),
+        SparseOnlineGP(d, m, kernel=LinearKernel(d, **fleet), parts=fades, **late[3]),
     ]
     # a line through two samples extrapolates to anything, so it is believed later
     doubts = (0.0, 0.0, 0.0, 2.0)

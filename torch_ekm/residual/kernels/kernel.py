@@ -68,8 +68,8 @@ class Kernel(Recorded, nn.Module, ABC):
 
         return found[0].detach(), found[1].detach(), pullback
 
-    def vector(self, x: Float[Tensor, "*batch d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
-        """k(x, z_j) for one query per model, ``(*batch, m)``."""
+    def vector(self, x: Float[Tensor, "*any d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
+        """k(x, z_j) for one query per model, ``(*batch, m)``; further axes go in front."""
         return self(x.unsqueeze(-2), z).squeeze(-2)
 
     def diagonal_of_set(self, x: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n"]:

@@ -1,0 +1,275 @@
+"""No stream makes a learner say nonsense, and a slope comes with what it is worth."""
+
+from __future__ import annotations
+
+import copy
+
+import hostile_streams
+import pytest
+import torch
+from hostile_streams import EVENTS, LEARNERS, Hostile, judge
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from torch_ekm.exceptions import ParameterError
+from torch_ekm.residual import (
+    ActionLinearKernel,
+    DeepKernel,
+    LinearKernel,
+    Matern32,
+    Matern52,
+    MixtureResidual,
+    RandomFeatureRLS,
+    RecursiveLeastSquares,
+    ReplayMLP,
+    SparseOnlineGP,
+    SquaredExponential,
+    Standardize,
+    ZeroResidual,
+    default_learner,
+)
+from torch_ekm.residual.kernels.kernel import Kernel
+from torch_ekm.residual.sparse_gp.engine.reference import ReferenceEngine
+
+EVERY = pytest.mark.parametrize("name", LEARNERS)
+POWERS = st.floats(-9.0, 9.0).map(lambda power: 10.0**power)
+
+
+@EVERY
+@settings(max_examples=6, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(
+    st.builds(
+        Hostile,
+        seed=st.integers(0, 10**6),
+        n=st.just(60),
+        x_unit=POWERS,
+        y_unit=POWERS,
+        origin=st.sampled_from([0.0, 0.0, 100.0, -1e4]),
+        jitter=st.floats(-15.0, -2.0).map(lambda power: 10.0**power),
+        events=st.lists(st.sampled_from(EVENTS), min_size=1, max_size=3, unique=True).map(tuple),
+    )
+)
+def test_no_stream_makes_it_say_nonsense(name, hostile):
+    verdict = judge(LEARNERS[name](6), *hostile.samples())
+    assert verdict.not_finite == 0, hostile
+    assert verdict.ratio <= 3.0, hostile
+
+
+@EVERY
+@pytest.mark.parametrize("jitter", [1e-12, 1e-6])
+def test_an_input_that_stood_still_begins_to_move(name, jitter):
+    """Without bounds 1e10 and 1e4 times y with a linear kernel, and NaN for good."""
+    stream = Hostile(0, 80, 1.0, 1.0, 0.0, jitter, ("input stands still",))
+    verdict = judge(LEARNERS[name](20), *stream.samples())
+    assert verdict.not_finite == 0
+    assert verdict.ratio <= 2.0
+
+
+@pytest.mark.parametrize(
+    "make",
+    [SparseOnlineGP, RecursiveLeastSquares, RandomFeatureRLS, ReplayMLP, default_learner],
+    ids=lambda make: make.__name__,
+)
+def test_where_y_shrinks_by_a_thousand_what_was_learned_is_let_go(make):
+    """Without that bare learners err by 300 to 700 times the model's error for hundreds of samples."""
+    x, y = Hostile(3, 240, 1.0, 1.0, 0.0, 0.0, ()).samples()
+    y[100:] *= 1e-3
+    learner = make(4, 2)
+    learner.update(x[:140], y[:140])
+    errors = []
+    for x_t, y_t in zip(x[140:], y[140:], strict=True):
+        errors.append(learner(x_t) - y_t)
+        learner.update(x_t, y_t)
+    assert float(torch.stack(errors).square().mean().sqrt() / y[140:].square().mean().sqrt()) < 1.2
+
+
+def test_models_of_a_fleet_let_go_one_by_one():
+    x, y = Hostile(3, 140, 1.0, 1.0, 0.0, 0.0, ()).samples()
+    one = RecursiveLeastSquares(4, 2)
+    one.update(x, y)
+    fleet, shrunk = RecursiveLeastSquares(4, 2, batch_shape=(2,)), y.clone()
+    shrunk[100:] *= 1e-3
+    fleet.update(torch.stack([x, x], 1), torch.stack([y, shrunk], 1))
+    found = fleet(x[:5].unsqueeze(1))
+    torch.testing.assert_close(
+        found[:, 0], one(x[:5]), rtol=0.0, atol=0.3
+    )  # of units that all follow at once
+    assert float(found[:, 1].abs().max()) < 0.05
+
+
+class Fails(ZeroResidual):
+    """A learner of somebody else that divides by 0 where x[0] is positive."""
+
+    def forward(self, x):
+        x = self.check_query(x)
+        return torch.where(x[..., :1] > 0, torch.nan, 0.0 * x[..., :1]).expand(*x.shape[:-1], 2)
+
+    def predict(self, x, *, observation=False):
+        law = super().predict(x, observation=observation)
+        return torch.distributions.Normal(law.mean, law.stddev + law.mean, validate_args=False)
+
+
+@pytest.mark.parametrize("reference", [False, True])
+def test_a_member_that_is_not_finite_has_no_say(reference, monkeypatch):
+    if reference:
+        monkeypatch.setattr("torch_ekm.residual.mixture_engine.load_loops", lambda: None)
+    x, y = Hostile(5, 120, 1.0, 1.0, 0.0, 0.0, ()).samples()
+    alone = MixtureResidual([SparseOnlineGP(4, 2)])
+    both = MixtureResidual([SparseOnlineGP(4, 2), Fails(4, 2)])
+    for learner in (alone, both):
+        learner.update(x, y)
+    ask = x[:20]
+    for value in (both(ask), *both.linearize(ask), both.predict(ask).stddev, both.predict(x[0]).stddev):
+        assert bool(value.isfinite().all())
+    error, best = ((learner(ask) - y[:20]).square().mean().sqrt() for learner in (both, alone))
+    assert float(error) < 1.1 * float(best)
+
+
+# -- what a slope is worth ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "kernel",
+    [
+        SquaredExponential(4, lengthscale=[0.5, 1.0, 2.0, 3.0], variance=2.0),
+        Matern32(4),
+        Matern52(4),
+        DeepKernel(Matern32(4), hidden=(8,), features=3),
+        LinearKernel(4, slope_variance=[1.0, 2.0, 0.5, 3.0]),
+        ActionLinearKernel(4, 2),
+    ],
+    ids=lambda kernel: type(kernel).__name__,
+)
+def test_slope_deviations_are_those_of_differences(kernel):
+    """``Var[(g(x + h) - g(x - h))/2h]`` from the posterior covariance of the two; prior ones by autograd."""
+    learner = SparseOnlineGP(4, 2, kernel=kernel, parts=[], standardize=False, capacity=50)
+    x, y = Hostile(7, 30, 1.0, 1.0, 0.0, 0.0, ()).samples()
+    learner.update(x, y)
+    point, h = x[3] + 0.2, 1e-3
+    found = learner.slope_deviation(point)
+    assert found.shape == (2, 4)
+    torch.testing.assert_close(kernel.derivative_variance(point), Kernel.derivative_variance(kernel, point))
+    for j in range(4):
+        step = h * torch.eye(4, dtype=torch.float64)[j]
+        pair = torch.stack([point + step, point - step])
+        k = kernel(learner.posterior.basis, pair) * learner.posterior.active.unsqueeze(-1)
+        covariance = kernel(pair, pair + 0.0) + k.mT @ learner.posterior.covariance @ k
+        weights = torch.tensor([0.5 / h, -0.5 / h], dtype=torch.float64)
+        expected = (weights @ covariance @ weights).clamp_min(0.0).sqrt()
+        torch.testing.assert_close(found[0, j], expected, rtol=2e-2, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "make", [RecursiveLeastSquares, lambda d, m: RandomFeatureRLS(d, m, n_frequencies=30)]
+)
+def test_slope_deviations_of_linear_learners_are_those_of_differences(make):
+    learner = make(4, 2)
+    x, y = Hostile(7, 60, 1e-2, 1e3, 5.0, 0.0, ()).samples()
+    learner.update(x, y)
+    h, point = 1e-5, x[3]
+    for j in range(4):
+        step = h * torch.eye(4, dtype=torch.float64)[j]
+        z = learner._inputs(torch.stack([point + step, point - step]))
+        phi = learner.features(z)
+        difference = (phi[0] - phi[1]) / (2 * h)
+        expected = (difference @ learner.covariance @ difference).sqrt() * learner.output.scale
+        torch.testing.assert_close(learner.slope_deviation(point)[:, j], expected, rtol=1e-4, atol=0.0)
+
+
+def test_a_slope_by_an_input_that_never_moved_is_within_what_is_stated_of_it():
+    """6e4 where the truth is 0: the learner cannot know that the jitter is none of it, and says so."""
+    x, y = Hostile(0, 150, 1.0, 1.0, 0.0, 0.0, ()).samples()
+    x[:, 3] *= 1e-6
+    learner = default_learner(4, 2, capacity=30)
+    learner.update(x, y)
+    slope, deviation = learner.linearize(x[:20])[1], learner.slope_deviation(x[:20])
+    assert float(slope[..., 3].abs().max()) > 1e3
+    assert bool((slope[..., 3].abs() < 3.0 * deviation[..., 3]).all())
+    assert float(deviation[..., :3].max()) < 2.0
+    assert bool(ReplayMLP(4, 2).slope_deviation(x[0]).isnan().all())
+
+
+def test_a_mixture_s_slopes_are_apart_by_what_its_learners_disagree():
+    x, y = Hostile(2, 80, 1.0, 1.0, 0.0, 0.0, ()).samples()
+    mixture = MixtureResidual([SparseOnlineGP(4, 2), RecursiveLeastSquares(4, 2)])
+    mixture.update(x, y)
+    point = x[:3]
+    variance = torch.zeros(3, 2, 4, dtype=torch.float64)
+    mean = mixture.linearize(point)[1]
+    for p, share, owner in zip(mixture.beliefs.unbind(-1), mixture.shares, mixture.owner, strict=True):
+        learner = mixture.members[int(owner.argmax())]
+        apart = share * learner.linearize(point)[1] - mean
+        variance += p.unsqueeze(-1) * ((share * learner.slope_deviation(point)).square() + apart.square())
+    torch.testing.assert_close(mixture.slope_deviation(point), variance.sqrt())
+
+
+# -- scales that are known ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [default_learner, SparseOnlineGP, RecursiveLeastSquares, RandomFeatureRLS])
+def test_what_lies_below_the_resolution_is_no_input(make):
+    x, y = Hostile(0, 120, 1.0, 1.0, 0.0, 0.0, ()).samples()
+    x[:, 3] *= 1e-6
+    known: dict = {"input_resolution": [0.0, 0.0, 0.0, 1e-2]}
+    made = make(4, 2, standardize=Standardize(**known)) if make is SparseOnlineGP else make(4, 2, **known)
+    made.update(x, y)
+    still = x.clone()
+    still[:, 3] = 0.0
+    without = make(4, 2)
+    without.update(still, y)
+    slope = made.linearize(x[5])[1]
+    assert float(slope[:, 3].abs().max()) < 30.0  # 1e4 and more without it: here .3 of y in one resolution
+    torch.testing.assert_close(slope[:, :3], without.linearize(still[5])[1][:, :3], rtol=1e-2, atol=1e-2)
+
+
+def test_an_output_below_its_scale_is_noise_of_that_scale():
+    x, y = Hostile(0, 60, 1.0, 1e-9, 0.0, 0.0, ()).samples()
+    for make in (SparseOnlineGP, RecursiveLeastSquares):
+        known: dict = {"output_scale": 1e-3}
+        made = make(4, 2, standardize=Standardize(**known)) if make is SparseOnlineGP else make(4, 2, **known)
+        before = made.predict(x[0], observation=True).stddev
+        torch.testing.assert_close(before, make(4, 2).predict(x[0], observation=True).stddev * 1e-3)
+        made.update(x, y)
+        assert float(made.predict(x[0], observation=True).stddev.min()) > 1e-5
+
+
+@pytest.mark.parametrize("bad", [-1.0, float("nan"), [1.0, 2.0], "a", [1.0, None, 1.0, 1.0]])
+@pytest.mark.usefixtures("unchecked")
+def test_a_scale_that_is_none_is_refused(bad):
+    with pytest.raises(ParameterError, match="input_resolution"):
+        default_learner(4, 2, input_resolution=bad)
+
+
+@EVERY
+def test_bounds_are_part_of_the_state(name):
+    x, y = Hostile(0, 30, 1.0, 1.0, 0.0, 0.0, ()).samples()
+    learner = LEARNERS[name](8)
+    learner.update(x, y)
+    torch.testing.assert_close(learner.largest, y.abs().amax(0))
+    fresh = LEARNERS[name](8)
+    fresh.load_state_dict(copy.deepcopy(learner.state_dict()))
+    assert torch.equal(fresh.largest, learner.largest)
+    learner.reset()
+    assert not bool(learner.largest.any())
+
+
+@pytest.mark.parametrize("kernel", [LinearKernel(4), ActionLinearKernel(4, 1)], ids=["linear", "action"])
+def test_compiled_loops_cut_where_torch_does(kernel):
+    x, y = Hostile(1, 60, 1.0, 1.0, 0.0, 1e-9, ("input stands still",)).samples()
+    learners = [SparseOnlineGP(4, 2, kernel=copy.deepcopy(kernel), capacity=12) for _ in range(2)]
+    learners[1].engine = ReferenceEngine()
+    cut = 0
+    for x_t, y_t in zip(x, y, strict=True):
+        for far in (x_t, 100.0 * x_t):
+            ours, theirs = (learner.predict_with_jacobians(far) for learner in learners)
+            for a, b in zip(ours, theirs, strict=True):
+                torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-9)
+            cut += int((ours.mean.abs() == 2.0 * learners[0].largest).sum())
+        for learner in learners:
+            learner.update(x_t, y_t)
+    assert cut > 5
+
+
+def test_the_command_ends_with_what_it_found(capsys):
+    hostile_streams.main(["--quick"])
+    assert "NaN 0, largest |g|/|y|" in capsys.readouterr().out.splitlines()[-1]
