@@ -221,14 +221,12 @@ def _check_bounds(learner: ResidualLearner) -> None:
     """Nothing that an input does which stood still makes the learner say nonsense."""
     x, y = _stream(learner, 48)
     x[:24, ..., -1] *= 1e-12
+    moves = "an input that stood still and moves"
     for t in range(len(x)):
         mean, most = learner(x[t]), y[:t].abs().amax(0) if t else 0.0 * y[0]
-        assert bool(mean.isfinite().all()), (
-            "an input that stood still and moves makes the mean NaN or infinite"
-        )
-        assert bool((mean.abs() <= 3.0 * most + 1e-9).all()), (
-            "an input that stood still and moves makes |g| more than 3 times the largest |y|: self.bounded(mean)"
-        )
+        assert bool(mean.isfinite().all()), f"{moves} makes the mean NaN or infinite"
+        within = mean.abs() <= 3.0 * most + 1e-9
+        assert bool(within.all()), f"{moves} makes |g| 3 times the largest |y| and more: self.bounded(mean)"
         learner.update(x[t], y[t])
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import nn
 
+from .._arrays import is_plain
 from ..typing import Bool, Float, Tensor
 
 _WORSE = 16.0  # squared errors of so many times the square of y
@@ -30,11 +32,20 @@ class Misled(nn.Module):
 
     def observe(
         self, error: Float[Tensor, "*batch out"], y: Float[Tensor, "*batch out"], mask: Tensor | None
-    ) -> Bool[Tensor, "*batch"]:
-        """Models that are misled, given errors before the update; they start to count again."""
-        worse = error.square().sum(-1) > _WORSE * y.square().sum(-1)
-        step = _RATE * (worse.to(self.level.dtype) - self.level)
-        self.level += step if mask is None else step * mask
-        misled = self.level > _ALARM
-        self.level.masked_fill_(misled, 0.0)
+    ) -> Bool[Tensor, "*batch"] | None:
+        """Models that are misled, given errors before the update; they begin to count again. None: none."""
+        level = self.level
+        if mask is None and is_plain(error, y, level):
+            e, t, a = error.numpy(), y.numpy(), level.numpy()
+            a += _RATE * ((np.square(e).sum(-1) > _WORSE * np.square(t).sum(-1)) - a)
+            if a.max() <= _ALARM:
+                return None
+        else:
+            worse = error.square().sum(-1) > _WORSE * y.square().sum(-1)
+            step = _RATE * (worse.to(level.dtype) - level)
+            level += step if mask is None else step * mask
+        misled = level > _ALARM
+        if not misled.is_cuda and not bool(misled.any()):  # on a GPU looking would mean waiting
+            return None
+        level.masked_fill_(misled, 0.0)
         return misled

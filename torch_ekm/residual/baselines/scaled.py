@@ -149,7 +149,7 @@ class ScaledLearner(ResidualLearner):
         z = self._inputs(x)
         error = y - self._value(self._mean(z))
         misled = self.misled.observe(error, y if not self.standardize else y - self.output.shift, mask)
-        if bool(misled.any()):
+        if misled is not None:
             self._clear(misled)
             if self.standardize:
                 self.output.forget(misled)

@@ -117,9 +117,11 @@ class DetectChanges(Part):
         for kept, value in ((self.inputs, sample.x), (self.targets, sample.y), (self.levels, level)):
             kept.select(0, place).copy_(value)
         misled = self.misled.observe(sample.innovation, learner.units.targets(sample.y), mask)
-        changed = misled | (self.level > _ALARM)
-        if bool(changed.any()):
+        changed = self.level > _ALARM
+        if misled is not None:
+            changed = changed | misled
             learner.units.forget(misled)
+        if bool(changed.any()):
             self.level.masked_fill_(changed, _COOL)
             x, y, levels = (t.roll(-1 - place, 0) for t in (self.inputs, self.targets, self.levels))
             later = (levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0) > 0
