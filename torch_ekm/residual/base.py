@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import os
 import pathlib
+import pickle
 import threading
+import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Literal
@@ -24,6 +28,39 @@ from .report import UpdateReport
 FARTHEST = 2.0
 
 
+_alive: weakref.WeakSet[ResidualLearner] = weakref.WeakSet()
+_held: list[ResidualLearner] = []
+_PATIENCE = 5.0  # for an update under way [s]
+
+
+def _before_fork() -> None:
+    """No update is under way: a child has only the thread that forked, so it would stay half done there."""
+    _held.extend(learner for learner in list(_alive) if learner.lock.acquire(timeout=_PATIENCE))
+
+
+def _in_parent() -> None:
+    while _held:
+        _held.pop().lock.release()
+
+
+def _in_child() -> None:
+    _held.clear()
+    for learner in _alive:
+        learner.lock = threading.RLock()
+    if len(_alive):  # torch's own threads do not exist here
+        torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_before_fork, after_in_parent=_in_parent, after_in_child=_in_child)
+
+
+def _unpickled(kind: type[ResidualLearner], state: bytes) -> ResidualLearner:
+    made = kind.__new__(kind)
+    made.__setstate__(pickle.loads(state))
+    return made
+
+
 class ResidualLearner(Recorded, nn.Module, ABC):
     """g(x), learned from a stream: ``y ~ N(g(x), R)``, and ``g = 0`` before the first sample.
 
@@ -39,7 +76,8 @@ class ResidualLearner(Recorded, nn.Module, ABC):
     largest ``|y|`` that was learned, whatever the stream.
 
     Threads: updates of one learner come one after the other. A query does not wait for them; where another
-    thread updates, query ``with learner.lock:`` to see the state before an update or after it.
+    thread updates, query ``with learner.lock:`` to see the state before an update or after it. Processes: a
+    learner that is pickled or inherited is a copy; one that is forked computes with one thread.
 
     Args:
         in_features: width of x.
@@ -73,6 +111,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         self.on_invalid = on_invalid
         self.n_refused = nn.Buffer(torch.zeros(self.batch_shape, dtype=torch.int64, device=device))
         self.lock = threading.RLock()
+        _alive.add(self)
         # An empty float tensor follows .to() and so remembers dtype and device for all subclasses.
         self._like = nn.Buffer(torch.empty(0, dtype=dtype, device=device), persistent=False)
         shape = (*self.batch_shape, self.out_features)
@@ -179,7 +218,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
 
         Args:
             x: inputs ``(*batch_shape, in)`` or ``(n, *batch_shape, in)``.
-            y: targets, the same with ``out``.
+            y: targets, the same with ``out``; the axis of a single output may be left out.
             mask: models that have a sample, ``(*batch_shape)`` or ``(n, *batch_shape)``; all if None.
 
         Raises:
@@ -195,6 +234,8 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         if self._like.is_inference():  # torch refuses to change these later on
             raise ParameterError("learner", "made within torch.inference_mode()", "made outside of it")
         x, y = self._cast(x).detach(), self._cast(y, "y").detach()
+        if self.out_features == 1 and y.shape == x.shape[:-1]:
+            y = y.unsqueeze(-1)
         if mask is not None and not isinstance(mask, Tensor):
             try:
                 mask = torch.as_tensor(mask, device=self.device)
@@ -239,6 +280,16 @@ class ResidualLearner(Recorded, nn.Module, ABC):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self.lock = threading.RLock()
+        _alive.add(self)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy in another process, too: torch would share a tensor's memory with it."""
+        return _unpickled, (type(self), pickle.dumps(self.__getstate__()))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ResidualLearner:
+        made = memo[id(self)] = type(self).__new__(type(self))
+        made.__setstate__(copy.deepcopy(self.__getstate__(), memo))
+        return made
 
     def get_extra_state(self) -> dict[str, Any]:
         """What it was made with, so that no other learner takes its state. Subclasses add to it."""

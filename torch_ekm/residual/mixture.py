@@ -27,6 +27,7 @@ from .experts import (
     YOUNG,
 )
 from .mixture_engine import CompiledJudge
+from .printed import mixture
 from .report import MomentsWithJacobians, UpdateReport
 from .tails import MEMORY, ScaleMixture
 
@@ -236,6 +237,9 @@ class MixtureResidual(ResidualLearner):
     def carried(self) -> Float[Tensor, "*batch out experts"]:
         """What each expert adds to its learner's mean: ``l - kappa w``."""
         return self.level - self._experts[1] * self.innovation
+
+    def __repr__(self) -> str:
+        return "\n  ".join([f"{type(self).__name__}({self.extra_repr()})", *mixture(self)])
 
     # -- learning -------------------------------------------------------------------------------
 

@@ -8,9 +8,9 @@ learner's own adaptation moves them (a plain optimiser would leave its caches st
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import nn
@@ -56,15 +56,15 @@ class Kernel(Recorded, nn.Module, ABC):
 
         Here by autograd; a kernel with a closed form overrides it.
         """
-        with _differentiable(self):
-            found = self(x[..., :rows, :], x), self.diagonal_of_set(x)
+        twin = copy.deepcopy(self).requires_grad_(True)  # another thread may query the kernel itself
+        with torch.enable_grad():
+            found = twin(x[..., :rows, :], x), twin.diagonal_of_set(x)
 
         def pullback(by_matrix: Tensor, by_diagonal: Tensor) -> Sequence[Tensor | None]:
-            with _differentiable(self):
-                by, parameters = [by_matrix, by_diagonal], list(self.parameters())
-                if not parameters:
-                    return ()
-                return torch.autograd.grad(found, parameters, by, allow_unused=True)
+            parameters = list(twin.parameters())
+            if not parameters:
+                return ()
+            return torch.autograd.grad(found, parameters, [by_matrix, by_diagonal], allow_unused=True)
 
         return found[0].detach(), found[1].detach(), pullback
 
@@ -91,17 +91,6 @@ class Kernel(Recorded, nn.Module, ABC):
     def grows(self, in_features: int) -> list[bool]:
         """Columns of x along which functions drawn from the prior grow without end."""
         return [False] * in_features
-
-
-@contextmanager
-def _differentiable(kernel: Kernel) -> Iterator[None]:
-    """Inside, the kernel's parameters carry a graph."""
-    try:
-        kernel.requires_grad_(True)
-        with torch.enable_grad():
-            yield
-    finally:
-        kernel.requires_grad_(False)
 
 
 def log_parameter(

@@ -11,6 +11,7 @@ from ..._checks import check_count
 from ...typing import Float, Tensor
 from ..kernels.kernel import Kernel, check_kernel, log_parameter
 from ..kernels.stationary import Matern32
+from ..printed import sparse_gp
 from ..report import MomentsWithJacobians, UpdateReport
 from .defaults import chosen_parts
 from .engine.compiled import CompiledEngine
@@ -168,6 +169,9 @@ class SparseOnlineGP(Host):
     def basis_inputs(self) -> Float[Tensor, "*batch slots in"]:
         """Basis points in the inputs' own units; only slots with ``posterior.active == 1`` count."""
         return self.units.sets_as_given(self.posterior.basis).to(self.dtype)
+
+    def __repr__(self) -> str:
+        return "\n  ".join([f"{type(self).__name__}({self.extra_repr()})", *sparse_gp(self)])
 
     # -- learning -------------------------------------------------------------------------------
 

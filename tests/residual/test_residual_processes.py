@@ -1,0 +1,132 @@
+"""A learner in threads, in other processes, and on a screen; targets without an axis of their own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import threading
+
+import pytest
+import torch
+
+from torch_ekm.residual import (
+    LinearKernel,
+    MixtureResidual,
+    RecursiveLeastSquares,
+    ReplayMLP,
+    SparseOnlineGP,
+    default_learner,
+)
+
+
+def learned(make, n: int = 40):
+    g = torch.Generator().manual_seed(0)
+    x = torch.rand(n, 2, generator=g, dtype=torch.float64)
+    learner = make(2, 1)
+    learner.update(x, x[:, :1])
+    return learner, x
+
+
+def _learn(learner, done) -> None:
+    for k in range(30):
+        learner.update(torch.full((2,), 0.1 * k), torch.tensor([5.0]))
+    done.put(float(learner(torch.full((2,), 0.1))))
+
+
+@pytest.mark.parametrize("method", ["spawn", "fork"])
+def test_what_another_process_learns_is_not_learned_here(method):
+    """torch shares a tensor's memory with a process to which it is sent."""
+    if method not in multiprocessing.get_all_start_methods():
+        pytest.skip(f"there is no {method} here")
+    learner, _ = learned(SparseOnlineGP)
+    x = torch.full((2,), 0.1)
+    before = learner(x).item()
+    context = multiprocessing.get_context(method)
+    done = context.Queue()
+    process = context.Process(target=_learn, args=(learner, done), daemon=True)
+    process.start()
+    there = done.get(timeout=300)
+    process.join()
+    assert learner(x).item() == before != there
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
+def test_a_fork_while_another_thread_updates_goes_on():
+    """Its lock would be held for ever there; torch's threads would be waited for."""
+    learner, x = learned(lambda d, m: SparseOnlineGP(d, m, kernel=LinearKernel(d)))
+    stop = threading.Event()
+
+    def work() -> None:
+        while not stop.is_set():
+            learner.update(x[0], x[0, :1])
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    context = multiprocessing.get_context("fork")
+    try:
+        for _ in range(4):
+            done = context.Queue()
+            process = context.Process(target=_learn, args=(learner, done), daemon=True)
+            process.start()
+            done.get(timeout=300)
+            process.join()
+    finally:
+        stop.set()
+        thread.join()
+    learner.update(x[0], x[0, :1])
+
+
+@pytest.mark.parametrize("make", [default_learner, SparseOnlineGP, RecursiveLeastSquares, ReplayMLP])
+def test_the_axis_of_a_single_output_may_be_left_out(make):
+    learner, x = learned(make)
+    other = make(2, 1)
+    other.update(x, x[:, 0])
+    assert torch.equal(other(x), learner(x))
+    for one, y in ((learner, x[0, :1]), (other, x[0, 0])):
+        one.update(x[0], y)
+    assert torch.equal(other(x), learner(x))
+
+
+def test_it_may_be_left_out_in_a_fleet():
+    fleets = [SparseOnlineGP(2, 1, batch_shape=(3,)) for _ in range(2)]
+    x = torch.rand(5, 3, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    fleets[0].update(x, x[..., :1])
+    fleets[1].update(x, x[..., 0])
+    assert torch.equal(fleets[0](x), fleets[1](x))
+
+
+def test_a_pickled_learner_goes_on_as_the_learner_does():
+    learner, x = learned(default_learner)
+    other = pickle.loads(pickle.dumps(learner))
+    assert other.lock is not learner.lock
+    for one in (learner, other):
+        one.update(x[:5], x[:5, :1])
+    assert torch.equal(other(x), learner(x))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [default_learner, lambda d, m: MixtureResidual([SparseOnlineGP(d, m), RecursiveLeastSquares(d, m)])],
+    ids=["default", "two"],
+)
+def test_a_print_fits_on_a_screen_and_says_what_is_known(make):
+    learner = make(20, 2)
+    x = torch.rand(40, 20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    learner.update(x, x[:, :2])
+    lines = repr(learner).splitlines()
+    assert len(lines) < 24
+    text = "\n".join(lines)
+    for words in ("in_features=20", "40 samples", "40 of 100 points", "noise of y", "units: (x - ["):
+        assert words in text
+    of_learners = [line.split("[")[1].split("]")[0] for line in lines if line.startswith("    [")]
+    assert len(of_learners) == len(learner.members)
+    for told, weights in zip(of_learners, learner.weights.unbind(-1), strict=True):
+        found = torch.tensor([float(w) for w in told.split(", ")], dtype=torch.float64)  # one where equal
+        torch.testing.assert_close(found.expand_as(weights), weights, rtol=0.0, atol=0.01)
+
+
+def test_a_sparse_gp_prints_its_parts():
+    text = repr(SparseOnlineGP(3, 1))
+    assert "0 of 100 basis vectors" in text
+    assert "ProcessNoise(share=0.001)" in text
