@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,7 +17,11 @@ from ..exceptions import FileFormatError, ParameterError
 from ..kinematics import ServoModel
 from ..kinematics.servo_model import IdealServos
 from ..residual.files import known_classes, read, rebuild, write
+from ..typing import Tensor
 from .force_sensitivity import ForceSensitivity
+
+KEPT = 8
+"""Motions whose lessons can be taken back."""
 
 
 class HandKnowledge(Recorded, nn.Module):
@@ -46,6 +51,7 @@ class HandKnowledge(Recorded, nn.Module):
         self.servo, self.forces, self.figures = servo, forces, figures
         self.pace = nn.Buffer(torch.tensor(0.0, dtype=torch.float64))
         """p at the end of the last turn, if that reached its target; else 0."""
+        self._before: deque[dict[str, Tensor]] = deque(maxlen=KEPT)  # states before the last motions
 
     @classmethod
     def of(cls, hand: HandDescription, *, learns: bool = True, adapts: bool = True) -> HandKnowledge:
@@ -75,6 +81,18 @@ class HandKnowledge(Recorded, nn.Module):
             raise ParameterError("knowledge", f"of {shape[0]} pads and {shape[1]} actuators", valid)
         self.figures.check(hand)
 
+    def checkpoint(self) -> None:
+        """Before a motion is learned: what is known now can be had back by :meth:`take_back`."""
+        self._before.append({name: value.clone() for name, value in self.state_dict().items()})
+
+    def take_back(self, motions: int = 1) -> int:
+        """All parts are as they were before the last ``motions`` checkpoints, eight of which are kept; how
+        many that were."""
+        taken = [self._before.pop() for _ in range(min(motions, len(self._before)))]
+        if taken:
+            super().load_state_dict(taken[-1], strict=False)  # a part may have been exchanged since
+        return len(taken)
+
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
@@ -85,6 +103,7 @@ class HandKnowledge(Recorded, nn.Module):
         """
         if strict:
             check_state(self, state_dict)
+        self._before.clear()
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     def save(self, path: str | os.PathLike) -> None:
