@@ -125,10 +125,15 @@ def test_what_motions_taught_can_be_taken_back(driven) -> None:
         now = knowledge.state_dict()
         return all(torch.equal(now[name], value) for name, value in states[motion].items())
 
-    assert knowledge.take_back() == 1 and as_before(11) and not as_before(10)
-    assert knowledge.take_back(3) == 3 and as_before(8)
-    assert knowledge.take_back(100) == 4 and as_before(4)  # eight are kept
-    assert knowledge.take_back() == 0 and as_before(4)
+    assert knowledge.take_back() == 1
+    assert as_before(11)
+    assert not as_before(10)
+    assert knowledge.take_back(3) == 3
+    assert as_before(8)
+    assert knowledge.take_back(100) == 4
+    assert as_before(4)
+    assert knowledge.take_back() == 0
+    assert as_before(4)
     knowledge.checkpoint()
     knowledge.load_state_dict(knowledge.state_dict())
     assert knowledge.take_back() == 0  # of another state

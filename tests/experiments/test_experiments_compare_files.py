@@ -60,7 +60,7 @@ def test_a_broken_file_is_told_by_line_and_column(case: str, tmp_path: Path) -> 
 
 
 def test_other_files(tmp_path: Path) -> None:
-    with pytest.raises(DescriptionError, match="no such file"):
+    with pytest.raises(DescriptionError, match="no such CSV file"):
         load_table(tmp_path / "nothing.csv")
     (tmp_path / "a.xlsx").write_text("x")
     with pytest.raises(DescriptionError, match=r"'\.xlsx' are not read"):

@@ -12,9 +12,8 @@ from typing import Any
 
 from .._extras import require
 from ..exceptions import DescriptionError
-from ._toml import read_bounded
+from ._xml import read_xml
 
-_LARGEST_FILE = 4 << 20  # bytes
 _MOST_ELEMENTS = 20_000  # of all files together
 _MOST_FILES = 50
 _READ = ("compiler", "option", "default", "worldbody", "tendon", "equality", "actuator")
@@ -86,13 +85,7 @@ class _Reader:
         if real in above:
             raise DescriptionError(above[-1], f"<include> of '{path.name}', which includes this file")
         self.files.append(path)
-        content = read_bounded(path, "MJCF file", _LARGEST_FILE)
-        try:
-            root = ET.fromstring(content)  # fetches no external entity, refuses those that blow up
-        except (ET.ParseError, ValueError, LookupError) as error:
-            raise DescriptionError(path, f"not well-formed XML: {error}") from None
-        if root.tag not in ("mujoco", "mujocoinclude"):
-            raise DescriptionError(path, f"the root element must be <mujoco>, found <{root.tag}>")
+        root = read_xml(path, "MJCF file", "mujoco", "mujocoinclude")
         self.elements += sum(1 for _ in root.iter())
         if self.elements > _MOST_ELEMENTS or len(self.files) > _MOST_FILES:
             most = f"at most {_MOST_ELEMENTS} elements and {_MOST_FILES} files are read"

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..exceptions import DescriptionError, ParameterError
+from .._files import told_as_damage
+from ..exceptions import ParameterError
 from ..typing import Tensor
 from .observation import Observation, PlantStatus, Stamps, Truth
 from .trial_file import read_trial, write_trial
@@ -60,10 +61,8 @@ class Trajectory:
         """
         path = Path(path)
         seed, about, arrays = read_trial(path)
-        try:
+        with told_as_damage(path, "recording"):  # its digest is right and its contents are not: nobody's
             return cls.from_arrays(seed, about, arrays)
-        except Exception as error:  # its digest is right and its contents are not: nobody's recording
-            raise DescriptionError(path, f"damaged recording: {type(error).__name__}: {error}") from None
 
     @classmethod
     def from_arrays(cls, seed: int, about: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Trajectory:

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .._files import WriterLock, make_folder, told_as_output_error, write_whole
+from .._files import WriterLock, make_folder, told_as_damage, told_as_output_error, write_whole
 from .._versions import versions_of
 from .._warnings import warn
 from ..exceptions import DescriptionError, OutputError, ParameterError
@@ -218,10 +218,8 @@ def read_entry(folder: Path, trial: int) -> tuple[TrialEntry, dict[str, Any]]:
     if about.get("trial", trial) != trial:
         raise DescriptionError(path, f"holds trial {about['trial']!r}")
     configuration = about.get("configuration", {})
-    try:
+    with told_as_damage(path, "trial"):
         return _entry(trial, seed, about, arrays), dict(configuration)
-    except (AttributeError, KeyError, TypeError, ValueError, UnicodeDecodeError) as error:
-        raise DescriptionError(path, f"no trial: {type(error).__name__}: {error}") from None
 
 
 def index_lines(entries: Mapping[int, TrialEntry]) -> bytes:

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from .._files import read_file
 from ..description.registry import file_digests
-from ..exceptions import EKMError, ParameterError
+from ..exceptions import DescriptionError, EKMError, ParameterError
 from .trajectory import Trajectory
 from .trial_log import (
     DAMAGED,
@@ -19,6 +20,8 @@ from .trial_log import (
     trial_path,
     trials_in,
 )
+
+_LARGEST_INDEX = 64 << 20  # bytes
 
 
 class Finding(NamedTuple):
@@ -71,8 +74,8 @@ def verify_log(folder: str | Path) -> list[Finding]:
 
 def _index(folder: Path, entries: Mapping[int, TrialEntry], n_trials: int) -> Finding:
     try:
-        written = (folder / INDEX).read_bytes()
-    except OSError:
+        written = read_file(folder / INDEX, "index", _LARGEST_INDEX)
+    except DescriptionError:
         return Finding(INDEX, "wrong", "missing; the next run makes it from the files")
     right = index_lines(entries)
     if written == right:
