@@ -7,8 +7,9 @@ import os
 import stat
 import weakref
 from collections.abc import Iterator
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from ._extras import require
 from .exceptions import DescriptionError, EKMError, FileFormatError, FolderInUseError, OutputError
@@ -43,7 +44,7 @@ def check_file(path: str | os.PathLike, what: str, largest: int, refusal: Refusa
 @contextlib.contextmanager
 def opened(
     path: str | os.PathLike, what: str, largest: int, refusal: Refusal = DescriptionError
-) -> Iterator[BinaryIO]:
+) -> Iterator[BufferedReader]:
     """A file to be read, see :func:`check_file`.
 
     Raises:

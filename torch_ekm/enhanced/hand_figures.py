@@ -45,6 +45,10 @@ class Figure(NamedTuple):
     """Standard deviation of the factor."""
     identified: bool
     """Motions determine it; otherwise it stays where the prior and the other figures put it."""
+    described: float
+    """1; of a backlash its width [rad]."""
+    is_width: bool
+    """It is a backlash."""
 
 
 class Change(NamedTuple):
@@ -311,7 +315,9 @@ class HandFigures(ParameterFilter):
     def figures(self) -> tuple[Figure, ...]:
         """Each figure against its description."""
         std = self._prior_std * self.stddev.numpy() * np.where(self._is_play, 1.0, self._factors)
-        columns = self.names, self.factors.tolist(), std.tolist(), self._told.tolist()
+        described = np.where(self._is_play, self._described, 1.0).tolist()
+        known = self.factors.tolist(), std.tolist(), self._told.tolist()
+        columns = self.names, *known, described, self._is_play.tolist()
         return tuple(Figure(*row) for row in zip(*columns, strict=True))
 
     @property
@@ -346,9 +352,9 @@ class HandFigures(ParameterFilter):
         figures = self.figures
         lines = [
             f"{one.name}: {math.degrees(one.factor):.2f} deg, +-{math.degrees(one.std):.2f}"
-            if play
+            if one.is_width
             else f"{one.name}: {one.factor:.2f} times the description, +-{one.std:.2f}"
-            for one, play in zip(figures, self._is_play.tolist(), strict=True)
+            for one in figures
             if one.identified
         ]
         rest = [one.name for one in figures if not one.identified]

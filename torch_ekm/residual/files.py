@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import math
 import os
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -25,6 +26,8 @@ _FORMAT = "torch_ekm learner 1"
 _HEADER = "header.json"
 _LARGEST = 4 << 30  # bytes
 _LARGEST_HEADER = 10_000_000
+_MOST_OBJECTS = 2000  # that a learner is made of
+_MOST_CHOICES = 10_000  # of an object: the product of the lengths of its lists
 
 
 def write(path: str | os.PathLike, described: Mapping[str, Any], state: Mapping[str, Any]) -> None:
@@ -105,12 +108,25 @@ def rebuild(
     """
     there = sum(one.nbytes for one in state.values() if isinstance(one, torch.Tensor))
     with told_as_damage(path, "description", FileFormatError), _Sized(path, there):
+        if _objects(described) > _MOST_OBJECTS:
+            raise FileFormatError(path, f"more than {_MOST_OBJECTS} objects, or choices without number")
         made = make(described, known)
     if not isinstance(made, nn.Module):
         raise FileFormatError(path, "describes no learner")
     check_state(made, state)
     made.load_state_dict(state)
     return made
+
+
+def _objects(described: Any) -> int:
+    """How many a description makes; one with too many choices counts for all."""
+    if not isinstance(described, dict | list):
+        return 0
+    inside = list(described.values()) if isinstance(described, dict) else described
+    lengths = (len(one) for one in inside if isinstance(one, list) and one)
+    many = isinstance(described, dict) and math.prod(lengths) > _MOST_CHOICES
+    own = isinstance(described, dict) and "class" in described
+    return own + many * (_MOST_OBJECTS + 1) + sum(map(_objects, inside))
 
 
 class _Sized(TorchDispatchMode):
