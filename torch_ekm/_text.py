@@ -42,10 +42,8 @@ def decode(content: bytes, path: str | os.PathLike) -> str:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line, byte = content.count(b"\n", 0, error.start) + 1, content[error.start]
-        problem = (
-            f"line {line}: byte {error.start}, 0x{byte:02x}, is not UTF-8, but may be Windows-1252 or Latin-1"
-        )
-        raise DescriptionError(path, f"{problem}; {_convert('WINDOWS-1252')}") from None
+        problem = f"line {line}: byte {error.start}, 0x{byte:02x}, is not UTF-8; the file may be Latin-1"
+        raise DescriptionError(path, f"{problem}; {_convert('LATIN1')}") from None
 
 
 def _convert(name: str) -> str:

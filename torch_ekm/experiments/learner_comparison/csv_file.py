@@ -47,26 +47,29 @@ def open_csv(path: Path, label: str) -> tuple[Names, Read]:
     content = read_file(path, "CSV file", _LARGEST)
     decode(content, path)
     before, given = _preamble(content)
-    best: tuple[tuple[bool, int], Records, list[str]] | None = None
-    for separator in given or _SEPARATORS:
-        records = partial(_records, path, content, before, separator)
-        first = [row for _, row in itertools.islice(records(), _TRIED)]
-        if not first:
-            raise DescriptionError(path, "the file is empty")
-        names = _trimmed(first[0], len(first[0]) - 1)
-        fit = (
-            len(names) > 1 and all(len(_trimmed(row, len(names))) == len(names) for row in first),
-            len(names),
-        )
-        if best is None or fit > best[0]:
-            best = fit, records, names
-    assert best is not None
-    _, records, names = best
-    number, _ = next(records())
+    tried = [partial(_records, path, content, before, one) for one in given or _SEPARATORS]
+    records = max(tried, key=_fit)
+    number, names = next(records(), (0, []))
+    if not names:
+        raise DescriptionError(path, "the file is empty")
+    names = _trimmed(names, len(names) - 1)
     if all(figure(field) is not None for field in names):
         problem = "holds numbers only; the first line must name the columns"
         raise DescriptionError(path, f"line {number} {problem}")
     return tuple(names), partial(_read, path, tuple(names), records, label)
+
+
+def _fit(records: Records) -> tuple[bool, int]:
+    """How well a separator does: whether the first lines have as many fields as the header, and how many."""
+    first: list[list[str]] = []
+    try:
+        for _, row in itertools.islice(records(), _TRIED):
+            first.append(row)
+    except DescriptionError:
+        first.append([])
+    names = _trimmed(first[0], len(first[0]) - 1) if first else []
+    same = all(len(_trimmed(row, len(names))) == len(names) for row in first)
+    return same and len(names) > 1, len(names)
 
 
 def _preamble(content: bytes) -> tuple[int, str]:
@@ -111,7 +114,7 @@ def _records(path: Path, content: bytes, before: int, separator: str) -> Iterato
 
 def _trimmed(row: list[str], n: int) -> list[str]:
     """Without what an n + 1st separator at the end of a line makes."""
-    return row[:n] if n and len(row) == n + 1 and not row[-1] else row
+    return row[:n] if n > 0 and len(row) == n + 1 and not row[-1] else row
 
 
 def _read(path: Path, names: Names, records: Records, label: str, columns: Sequence[str]) -> Array:
