@@ -57,9 +57,10 @@ BROKEN = {
     "a comment too late": ("a,b,y\n1,2,3\n# gripper opens\n", r"line 3 has 1 fields"),
     "an open quote": ('a,b,y\n1,2,"3\n' + GOOD, r"line 52, column 'y': '3"),
     "one long field": (f"a,b,y\n1,2,3\n1,{'9' * 200_000},3\n", r"line 3: field larger than field limit"),
-    "a long line": ("a,b,y\n" + "1," * 600_000, r"line 2 has more than 1048576 characters"),
+    "a long line": ("a,b,y\n" + "1," * 600_000, r"line 2 ends 1048576 characters without"),
+    "nothing but lines": ("\n" * 2_000_000, r"line 1048577 ends 1048576 characters without a figure"),
     "wide": (",".join(f"a{i}" for i in range(100_000)) + "\n", r"100000 columns; at most 4096"),
-    "spread over lines": ("a,b,y\n" + '"1\n",' * 300_000, r"a quote and does not close it"),
+    "spread over lines": ("a,b,y\n" + '"1\n",' * 300_000, r"in a quote that does not close"),
     "no numbers of its own": ("# a,b,y\n1,2,3\n", r"line 2 holds numbers only"),
 }
 

@@ -6,6 +6,7 @@ Meshes and textures are never opened, and no file outside the folder of the firs
 
 from __future__ import annotations
 
+import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
@@ -70,16 +71,20 @@ def _read(path: Path) -> tuple[ET.Element, list[Path]]:
         raise DescriptionError(path, "elements are nested too deep") from None
 
 
+def _real(path: Path) -> Path:
+    return Path(os.path.realpath(path))  # as resolve(), which raises where links lead in a circle
+
+
 class _Reader:
     """Files of one folder, each in the place of its ``<include>``."""
 
     def __init__(self, path: Path) -> None:
-        self.folder = path.resolve().parent
+        self.folder = _real(path).parent
         self.elements = 0
         self.files: list[Path] = []
 
     def read(self, path: Path, above: tuple[Path, ...]) -> ET.Element:
-        real = path.resolve()
+        real = _real(path)
         if not real.is_relative_to(self.folder):
             raise DescriptionError(above[-1], f"<include> of '{path}', which is outside {self.folder}")
         if real in above:

@@ -66,12 +66,15 @@ def read(path: str | os.PathLike) -> tuple[dict[str, Any], dict[str, Any]]:
     Raises:
         FileFormatError: it is no such file, or damaged.
     """
-    with opened(path, "file of a learner", _LARGEST, FileFormatError) as file:
+    with (
+        opened(path, "file of a learner", _LARGEST, FileFormatError) as file,
+        told_as_damage(path, "file", FileFormatError),
+    ):
         try:
             archive = zipfile.ZipFile(file)
         except zipfile.BadZipFile:
             raise FileFormatError(path, "not written by torch_ekm.save, or cut short") from None
-        with told_as_damage(path, "file", FileFormatError), archive:
+        with archive:
             entries = archive.infolist()
             if _HEADER not in archive.namelist():
                 raise FileFormatError(path, "not written by torch_ekm.save")

@@ -74,8 +74,11 @@ def _fit(records: Records) -> tuple[bool, int]:
 
 def _preamble(content: bytes) -> tuple[int, str]:
     """Lines before the header, and the separator that they say."""
-    separator = ""
+    separator, length = "", 0
     for number, line in enumerate(_text(content)):
+        length += len(line)
+        if length > _LONGEST:
+            break
         line = line.strip("\r\n")
         told = _EXCEL.fullmatch(line)
         if told is None and line.strip() and not line.startswith("#"):
@@ -98,15 +101,15 @@ def _records(path: Path, content: bytes, before: int, separator: str) -> Iterato
         for line in itertools.islice(_text(content), before, None):
             length += len(line)
             if length > _LONGEST:
-                problem = f"has more than {_LONGEST} characters, or opens a quote and does not close it"
+                problem = f"ends {_LONGEST} characters without a figure, or in a quote that does not close"
                 raise DescriptionError(path, f"line {before + reader.line_num + 1} {problem}")
             yield line
 
     reader = csv.reader(lines(), delimiter=separator, skipinitialspace=True)
     try:
         for row in reader:
-            length = 0
             if len(row) > 1 or (row and row[0].strip()):
+                length = 0
                 yield before + reader.line_num, [field.strip() for field in row]
     except csv.Error as error:
         raise DescriptionError(path, f"line {before + reader.line_num}: {error}") from None

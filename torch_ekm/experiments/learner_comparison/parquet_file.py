@@ -22,8 +22,9 @@ def open_parquet(path: Path, label: str) -> tuple[Names, Read]:
     """Column names, and a function that reads some of them; these hold numbers.
 
     Checksums of pages are compared where they were written, and figures with the statistics of their row
-    group (least, largest, number of missing ones), which nearly all programs write. What changes a figure
-    within these, and has no checksum, cannot be seen.
+    group (least, largest, number of missing ones), which nearly all programs write. A figure that was
+    changed within these cannot be told from the one that was written, unless there are checksums
+    (``write_page_checksum=True`` of pyarrow).
 
     Raises:
         DescriptionError: no Parquet file, damaged, or some kB that announce GB. The function raises it, too.
