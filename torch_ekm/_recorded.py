@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from .exceptions import ParameterError, StateMismatchError
+from .exceptions import ParameterError, StateError, StateMismatchError
 
 #: options that decide nothing of what a state means
 _FREE = ("device", "on_invalid")
@@ -91,14 +91,15 @@ def make(described: Any, known: Mapping[str, Any]) -> Any:
     """What :func:`describe` wrote down, made again of the classes ``known`` by their names.
 
     Raises:
-        ParameterError: a name is not known, or something had no plain terms.
+        ParameterError: a name is not known.
+        StateError: something had no plain terms.
     """
     if isinstance(described, list):
         return [make(one, known) for one in described]
     if not isinstance(described, dict):
         return described
     if "opaque" in described:
-        raise ParameterError("file", described["opaque"], "of learners whose arguments are plain values")
+        raise StateError(f"a {described['opaque']} stands where learners of files have plain values")
     if "tensor" in described or "dtype" in described:
         dtype = getattr(torch, str(described["dtype"]), None)
         if not isinstance(dtype, torch.dtype):

@@ -16,7 +16,8 @@ __all__ = [
     "JointMismatchError", "MissingExtraError", "NeverAtRestError", "NoContactError", "NoDerivativeError",
     "NoStateError", "NonFiniteError", "NonMonotoneFitError", "ObjectLostError", "OutputError",
     "ParameterError", "PenetrationError", "ShapeError", "SingularGraspError", "SolverError", "SpeedWarning",
-    "StaleReadingError", "StateMismatchError", "UnknownNameError", "UnstableGraspError", "WorkerDiedError",
+    "StaleReadingError", "StateError", "StateMismatchError", "UnknownNameError", "UnstableGraspError",
+    "WorkerDiedError",
 ]  # fmt: skip
 
 _LONGEST = 2000  # characters of a message
@@ -156,6 +157,13 @@ class ParameterError(EKMError, ValueError):
         if len(shown) > _LONGEST_VALUE:  # a large tensor, a whole module
             shown = f"{' '.join(shown.split())[:_LONGEST_VALUE]}..."
         super().__init__(f"{name} = {shown} is not valid; it must be {valid}")
+
+
+class StateError(EKMError, RuntimeError):
+    """Something is not as it must be for what is asked of it: not started, closed, empty, of another hand.
+
+    The message says what it is, and what would be right.
+    """
 
 
 # -- the grasp cannot be modelled -----------------------------------------------------------

@@ -22,7 +22,7 @@ from torch_ekm.control import (
 from torch_ekm.control.force_sensitivity import ForceSensitivity
 from torch_ekm.control.knowledge import previous
 from torch_ekm.enhanced import EnhancedModel, ParameterFilter, save
-from torch_ekm.exceptions import FileFormatError, ParameterError, StateMismatchError
+from torch_ekm.exceptions import FileFormatError, ParameterError, StateError, StateMismatchError
 from torch_ekm.kinematics import ServoModel
 from torch_ekm.kinematics.servo_model import IdealServos
 from torch_ekm.residual import SparseOnlineGP
@@ -86,7 +86,7 @@ def test_a_plain_model_learns_nothing_of_the_servos(held) -> None:
 
 def test_knowledge_of_another_hand_and_another_file_are_refused(held, driven, tmp_path) -> None:
     seen, axis, model = held
-    with pytest.raises(ParameterError, match="a hand with the actuators"):
+    with pytest.raises(StateError, match="a hand with the actuators"):
         ClosedLoop(
             Obedient(model, seen),
             LookAndMoveController(model, axis),
@@ -95,7 +95,7 @@ def test_knowledge_of_another_hand_and_another_file_are_refused(held, driven, tm
     other = HandKnowledge(
         ServoModel(model.hand.actuator_names), ForceSensitivity(2, model.hand.n_a), DescribedFigures()
     )
-    with pytest.raises(ParameterError, match="a hand with 5 pads and 9 actuators"):
+    with pytest.raises(StateError, match="the hand has 5 pads and 9 actuators"):
         other.check(model.hand)
     save(SparseOnlineGP(2, 1), tmp_path / "learner.ekm")
     with pytest.raises(FileFormatError, match="holds a SparseOnlineGP, no HandKnowledge"):

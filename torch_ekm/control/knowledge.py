@@ -16,7 +16,7 @@ from .._files import write_whole
 from .._recorded import Recorded, bound_problems, check_state, describe, make
 from ..description import HandDescription
 from ..enhanced.hand_figures import DescribedFigures, HandFigures
-from ..exceptions import FileFormatError, ParameterError, StateMismatchError
+from ..exceptions import FileFormatError, ParameterError, StateError, StateMismatchError
 from ..kinematics import ServoModel
 from ..kinematics.servo_model import IdealServos
 from ..residual.files import known_classes, read, rebuild, write
@@ -73,16 +73,17 @@ class HandKnowledge(Recorded, nn.Module):
         """That it is of this hand.
 
         Raises:
-            ParameterError: actuators, pads or figures of its description are others.
+            StateError: actuators, pads or figures of its description are others.
         """
         if tuple(self.servo.names) != tuple(hand.actuator_names):
-            names = ", ".join(self.servo.names)
-            valid = f"that of a hand with the actuators {', '.join(hand.actuator_names)}"
-            raise ParameterError("knowledge", f"of a hand with the actuators {names}", valid)
+            ours, theirs = (", ".join(names) for names in (self.servo.names, hand.actuator_names))
+            raise StateError(f"the knowledge is of a hand with the actuators {ours}; this one has {theirs}")
         shape = tuple(self.forces.correction.shape)
         if shape != (len(hand.pads), hand.n_a):
-            valid = f"that of a hand with {len(hand.pads)} pads and {hand.n_a} actuators"
-            raise ParameterError("knowledge", f"of {shape[0]} pads and {shape[1]} actuators", valid)
+            here = f"{len(hand.pads)} pads and {hand.n_a} actuators"
+            raise StateError(
+                f"the knowledge is of {shape[0]} pads and {shape[1]} actuators, the hand has {here}"
+            )
         self.figures.check(hand)
 
     def checkpoint(self) -> None:

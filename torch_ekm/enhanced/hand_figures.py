@@ -14,7 +14,7 @@ from torch import nn
 from .._checks import check_finite, check_shape
 from .._recorded import Recorded
 from ..description import HandDescription
-from ..exceptions import GraspError, ParameterError
+from ..exceptions import GraspError, StateError
 from ..kinematics.play import Play, PlayState
 from ..model import Linearization
 from ..model.calibration.parameters import PRIORS, Parameter, Unknowns
@@ -159,7 +159,7 @@ class HandFigures(ParameterFilter):
         """That they are of this hand.
 
         Raises:
-            ParameterError: another hand's, or its description has other figures.
+            StateError: another hand's, or its description has other figures.
         """
         ours = {one.label: one.nominal for one in self._entries}
         theirs = {
@@ -169,9 +169,9 @@ class HandFigures(ParameterFilter):
         other = [name for name in {**ours, **theirs} if ours.get(name) != theirs.get(name)]
         if other:
             had, has = (figures.get(other[0], "no such figure") for figures in (ours, theirs))
-            value = f"of '{self.hand}' ({_digest(ours)}): {other[0]} {had} there, {has} in the description"
-            valid = f"those of '{hand.name}' ({_digest(theirs)})"
-            raise ParameterError("knowledge", value, valid)
+            where = f"{other[0]} {had} there, {has} in the description"
+            those = f"those of '{self.hand}' ({_digest(ours)}), not of '{hand.name}' ({_digest(theirs)})"
+            raise StateError(f"the figures are {those}: {where}")
 
     @property
     def factors(self) -> Float[Tensor, " n"]:

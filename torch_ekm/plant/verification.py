@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 from .._files import read_file
 from ..description.registry import file_digests
-from ..exceptions import DescriptionError, EKMError, ParameterError
+from ..exceptions import DescriptionError, EKMError, StateError
 from .trajectory import Trajectory
 from .trial_log import (
     DAMAGED,
@@ -60,7 +60,7 @@ def verify_log(folder: str | Path) -> list[Finding]:
             check_configuration(shared, configuration, folder)
             if len(recording.observations) not in (len(recording.commands) + 1, 0):
                 sizes = f"{len(recording.commands)} commands and {len(recording.observations)} observations"
-                raise ParameterError("recording", sizes, "one observation more than commands")
+                raise StateError(f"{sizes}; there must be one observation more than commands")
             entries[trial] = entry
             what = f"{entry.commands} commands, {entry.reason or entry.status}"
             found.append(Finding(path.name, "ok", what))
