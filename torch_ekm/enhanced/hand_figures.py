@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from .._checks import check_finite, check_shape
+from .._checks import check_finite, check_kind, check_shape
 from .._recorded import Recorded
 from ..description import HandDescription
 from ..exceptions import GraspError, StateError
@@ -283,6 +283,7 @@ class HandFigures(ParameterFilter):
         Raises:
             ShapeError, NonFiniteError: nothing is changed.
         """
+        check_kind("lin", lin, Linearization, "a Linearization, e.g. model.linearize(state)")
         for name, value, like in (("moved", moved, lin.manipulation_jacobian[0]),
                                   ("increment", increment, lin.manipulation_jacobian[:, 0])):  # fmt: skip
             check_shape(name, value, like.shape, "of the motors" if name == "moved" else "")
