@@ -234,7 +234,7 @@ def test_actions_stand_by_their_hashes() -> None:
     used = [
         (path.name, line)
         for path in sorted((ROOT / ".github" / "workflows").glob("*.yml"))
-        for line in re.findall(r"uses: (.*)", path.read_text(encoding="utf-8"))
+        for line in re.findall(r"- uses: (.*)", path.read_text(encoding="utf-8"))
     ]
     assert len(used) > 10
     assert [one for one in used if not re.fullmatch(r"[\w/-]+@[0-9a-f]{40}  # v[\d.]+", one[1])] == []
